@@ -1,0 +1,55 @@
+# Everything that a checkout can do. Needs only make and Python 3.11 or newer: the rest is installed
+# into .venv, once, in the versions that constraints.txt names.
+
+PYTHON  ?= python3
+WORKERS ?= 2
+
+VENV  := .venv
+BIN   := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test slow check clean
+
+help: ## list the targets
+	@echo "Undertow: make <target>    (PYTHON=$(PYTHON), WORKERS=$(WORKERS))"
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)$$/  \1	\2/p' Makefile
+
+setup: $(STAMP) ## install everything into .venv (the other targets do it by themselves)
+
+demo: $(STAMP) ## repeat the paper's experiment, tables and figures into results/
+	$(BIN)/undertow reproduce --out results
+
+test: $(STAMP) ## run the tests, but for the slow ones
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+slow: $(STAMP) ## run the slow tests; having none is fine (pytest then exits with 5)
+	$(BIN)/python -m pytest -n $(WORKERS) -m slow || [ $$? -eq 5 ]
+
+check: $(STAMP) ## formatting, lint, types, direction of imports
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+clean: ## remove .venv, caches and results/
+	rm -rf $(VENV) results dist build
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# One environment for all targets, made afresh when what it is made from changes.
+$(STAMP): pyproject.toml constraints.txt
+	@command -v "$(PYTHON)" >/dev/null || { \
+	    echo "error: no Python found under the name '$(PYTHON)'."; \
+	    echo "Install Python 3.11 or newer, or name one: make PYTHON=/path/to/python"; \
+	    exit 1; } >&2
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "error: Undertow needs Python 3.11 or newer; '$(PYTHON)' is $$("$(PYTHON)" --version 2>&1)."; \
+	    echo "Name a newer one: make PYTHON=/path/to/python"; \
+	    exit 1; } >&2
+	@"$(PYTHON)" -m venv --clear $(VENV) || { \
+	    echo "error: '$(PYTHON) -m venv' failed; some systems package it apart (python3-venv)."; \
+	    exit 1; } >&2
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bounds,dev]'
+	@touch $@

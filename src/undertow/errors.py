@@ -1,0 +1,77 @@
+"""Conditions that Undertow raises: each carries the offending value, the limit and the remedy.
+
+One root, :class:`UndertowError`; a few conditions below it. Every message reads
+*what is wrong: the value, the limit. The remedy.*
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "ArtefactError",
+    "InfeasibleError",
+    "InvalidInputError",
+    "MissingExtraError",
+    "ModelError",
+    "SingularSurfaceError",
+    "UndertowError",
+    "UnstableSurfaceError",
+]
+
+
+class UndertowError(Exception):
+    """Root of all conditions raised by Undertow.
+
+    Parameters
+    ----------
+    what
+        What is wrong, in one clause.
+    value
+        The value that was met, or ``None`` where there is no single value.
+    limit
+        The limit that it should have kept, in words or numbers.
+    remedy
+        What the user can do about it, as a sentence.
+    """
+
+    def __init__(
+        self, what: str, *, value: object = None, limit: object = None, remedy: str = ""
+    ) -> None:
+        self.what = what
+        self.value = value
+        self.limit = limit
+        self.remedy = remedy
+        facts = [
+            f"{label} {fact}"
+            for label, fact in (("got", value), ("must be", limit))
+            if fact is not None
+        ]
+        message = what + (": " + ", ".join(facts) if facts else "")
+        super().__init__(f"{message}. {remedy}" if remedy else message + ".")
+
+
+class InvalidInputError(UndertowError, ValueError):
+    """A number, name or shape that was passed in cannot be used."""
+
+
+class ModelError(UndertowError, ValueError):
+    """A mechanism breaks an assumption of the class of systems treated here."""
+
+
+class UnstableSurfaceError(UndertowError, ValueError):
+    """A surface whose sliding dynamics are not exponentially stable, (35)-(36)."""
+
+
+class SingularSurfaceError(UndertowError, ValueError):
+    """The law does not exist: α_a − α_u M_uu⁻¹ M_auᵀ is singular there, (37)."""
+
+
+class InfeasibleError(UndertowError):
+    """No admissible surface was found for the task."""
+
+
+class MissingExtraError(UndertowError, ImportError):
+    """An optional dependency is not installed."""
+
+
+class ArtefactError(UndertowError, OSError):
+    """A file or folder could not be read or written."""

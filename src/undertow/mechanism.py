@@ -1,0 +1,663 @@
+"""Mechanisms: what moves. ``M(q) q̈ = f(q, q̇) + B u``, symbolic, with parameters as data.
+
+The coordinates come actuated first, ``q = (q_a, q_u)`` as in (1), and the state is
+``x = (q, q̇)``.  Everything that runs later (kernels, laws, certificates, C) is generated
+from the expressions kept here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike, NDArray
+
+from undertow.codegen import Tape, compile_numpy
+from undertow.errors import InvalidInputError, ModelError
+
+__all__ = ["TIME", "Coordinate", "Input", "Mechanism", "Parameter", "Partition"]
+
+FloatArray = NDArray[np.float64]
+
+#: The symbol of time in disturbances, s.
+TIME = sp.Symbol("t", real=True)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A physical parameter: a number with its unit, its bounds and where it comes from.
+
+    Parameters
+    ----------
+    name
+        Identifier; also the name of the SymPy symbol.
+    value
+        The value, in ``unit``.
+    unit
+        SI unit, as text ("kg m²").
+    description
+        What it is, in words.
+    low, high
+        The open interval of values that make physical sense.
+    source
+        Where the number was found.
+    """
+
+    name: str
+    value: float
+    unit: str
+    description: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a value that is not finite or not inside its interval."""
+        if not self.name.isidentifier():
+            raise InvalidInputError(
+                "parameter name", value=repr(self.name), limit="a Python identifier"
+            )
+        if not math.isfinite(self.value) or not self.low < self.value < self.high:
+            interval = f"finite and inside ({self.low:g}, {self.high:g}) {self.unit}".rstrip()
+            raise InvalidInputError(
+                f"parameter '{self.name}'" + f" ({self.description})" * bool(self.description),
+                value=f"{self.value:g}",
+                limit=interval,
+                remedy="Give a value inside the interval",
+            )
+
+    @property
+    def symbol(self) -> sp.Symbol:
+        """The SymPy symbol that stands for this parameter."""
+        return sp.Symbol(self.name, real=True)
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A generalised coordinate; its velocity is named ``<name>_dot``.
+
+    Parameters
+    ----------
+    name
+        Identifier, e.g. ``"phi"``.
+    unit
+        ``"rad"`` or ``"m"``.
+    description
+        What it measures, with the sense that counts as positive.
+    """
+
+    name: str
+    unit: str = "rad"
+    description: str = ""
+
+    @property
+    def symbol(self) -> sp.Symbol:
+        """The SymPy symbol of the coordinate."""
+        return sp.Symbol(self.name, real=True)
+
+    @property
+    def velocity(self) -> sp.Symbol:
+        """The SymPy symbol of its time derivative."""
+        return sp.Symbol(f"{self.name}_dot", real=True)
+
+
+@dataclass(frozen=True)
+class Input:
+    """An actuator input u_i with its symmetric limit ``|u_i| ≤ limit``, (38).
+
+    Parameters
+    ----------
+    name
+        Identifier, e.g. ``"voltage"``.
+    unit
+        SI unit, e.g. ``"V"`` or ``"N m"``.
+    limit
+        Largest magnitude that the actuator can deliver; ``inf`` for none.
+    """
+
+    name: str
+    unit: str
+    limit: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Refuse a limit that is not positive."""
+        if not self.limit > 0:
+            raise InvalidInputError(
+                f"limit of input '{self.name}'",
+                value=f"{self.limit:g} {self.unit}",
+                limit="positive",
+                remedy="Give the largest magnitude that the actuator can deliver",
+            )
+
+    @property
+    def symbol(self) -> sp.Symbol:
+        """The SymPy symbol of the input."""
+        return sp.Symbol(self.name, real=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Partition:
+    """The blocks of (1) on a tape, with ``M_uu`` eliminated once for all later use.
+
+    ``X = M_uu⁻¹ M_auᵀ``, ``y = M_uu⁻¹ f_u``, ``S = M_aa − M_au X`` (2) and
+    ``h = f_a − M_au y``, so that ``S q̈_a = h + B u`` (4) and ``q̈_u = y − X q̈_a`` (3).
+    """
+
+    tape: Tape
+    M_aa: sp.Matrix
+    M_au: sp.Matrix
+    M_uu: sp.Matrix
+    f_a: sp.Matrix
+    f_u: sp.Matrix
+    B: sp.Matrix
+    X: sp.Matrix
+    y: sp.Matrix
+    S: sp.Matrix
+    h: sp.Matrix
+
+    def accelerations(self, u: sp.Matrix) -> list[sp.Expr]:
+        """Return q̈ = (q̈_a, q̈_u) for the inputs u, equations (3)-(4), as tape atoms."""
+        tape = self.tape
+        force = tape.matrix(self.h + self.B * u)
+        qdd_a = tape.cholesky(self.S).solve(force)
+        qdd_u = tape.matrix(self.y - self.X * qdd_a)
+        return [*qdd_a, *qdd_u]
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """An underactuated mechanism ``M(q) q̈ = f(q, q̇) + (B u, 0)``: immutable.
+
+    Parameters
+    ----------
+    name
+        Short identifier.
+    coordinates
+        The n coordinates, the m actuated ones first; the target is x = 0.
+    inputs
+        The m < n inputs, with their limits.
+    mass_matrix
+        M(q), (n, n), symmetric positive definite, as SymPy expressions.
+    force
+        f(q, q̇), (n,): Coriolis, centrifugal, conservative and dissipative forces.
+    input_matrix
+        B, (m, m), invertible; the identity by default.
+    parameters
+        All physical parameters that occur in the expressions.
+    disturbance_bounds
+        |g_i| ≤ bound, one per coordinate, in generalised force units (N m or N); the
+        gains (13)-(14) are computed from them.  Zero by default.
+    potential
+        Potential energy, J, where there is one (used by the energy balance).
+    start
+        A usual initial state, by names, for examples and the command line.
+    description, source
+        In words, and where the model comes from.
+
+    Raises
+    ------
+    ModelError
+        When shapes, symbols or definiteness are wrong; the message names the entry.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> rig.n, rig.m, rig.state_names
+    (2, 1, ('theta', 'phi', 'theta_dot', 'phi_dot'))
+    """
+
+    name: str
+    coordinates: tuple[Coordinate, ...]
+    inputs: tuple[Input, ...]
+    mass_matrix: sp.ImmutableDenseMatrix
+    force: sp.ImmutableDenseMatrix
+    input_matrix: sp.ImmutableDenseMatrix | None = None
+    parameters: tuple[Parameter, ...] = ()
+    disturbance_bounds: tuple[float, ...] = ()
+    potential: sp.Expr | None = None
+    start: Mapping[str, float] = field(default_factory=dict)
+    description: str = ""
+    source: str = ""
+
+    # -- construction -------------------------------------------------------------------
+
+    def __post_init__(self) -> None:
+        """Check shapes, names, symbols and the definiteness of M; freeze the matrices."""
+        n, m = len(self.coordinates), len(self.inputs)
+        if not 0 < m < n:
+            raise ModelError(
+                f"'{self.name}' is not underactuated",
+                value=f"{n} coordinates and {m} inputs",
+                limit="at least one input and fewer inputs than coordinates",
+                remedy="Fully actuated mechanisms need no sliding surface of this kind",
+            )
+        given = sp.eye(m) if self.input_matrix is None else self.input_matrix
+        for attribute, value, shape in (
+            ("mass_matrix", self.mass_matrix, (n, n)),
+            ("force", self.force, (n, 1)),
+            ("input_matrix", given, (m, m)),
+        ):
+            matrix = sp.ImmutableDenseMatrix(value)
+            if matrix.shape != shape:
+                raise ModelError(
+                    f"{attribute} of '{self.name}'", value=matrix.shape, limit=f"shape {shape}"
+                )
+            object.__setattr__(self, attribute, matrix)
+        bounds = tuple(float(b) for b in self.disturbance_bounds) or (0.0,) * n
+        if len(bounds) != n or not all(math.isfinite(b) and b >= 0 for b in bounds):
+            raise InvalidInputError(
+                f"disturbance_bounds of '{self.name}'",
+                value=bounds,
+                limit=f"{n} finite numbers ≥ 0, one per coordinate",
+            )
+        object.__setattr__(self, "disturbance_bounds", bounds)
+        self._check_names()
+        self._check_inertia()
+        self.state(**self.start)
+
+    def _check_names(self) -> None:
+        names = [
+            *self.state_names,
+            *(i.name for i in self.inputs),
+            *(p.name for p in self.parameters),
+            TIME.name,
+        ]
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ModelError(
+                f"a name of '{self.name}' is used twice",
+                value=", ".join(repeated),
+                limit="unique among coordinates, inputs, parameters and the time t",
+                remedy="Rename one of them",
+            )
+        for what, matrix, allowed in (
+            ("mass_matrix", self.mass_matrix, {*self.q, *self.parameter_symbols}),
+            ("input_matrix", self.input_matrix, {*self.parameter_symbols}),
+            ("force", self.force, {*self.x, *self.parameter_symbols, TIME}),
+        ):
+            unknown = sorted(str(s) for s in matrix.free_symbols - allowed)
+            if unknown:
+                raise ModelError(
+                    f"{what} of '{self.name}' has unknown symbols",
+                    value=", ".join(unknown),
+                    limit=f"among {', '.join(sorted(str(s) for s in allowed))}",
+                    remedy="Declare them as parameters, or as coordinates, with real symbols",
+                )
+        if self.mass_matrix != self.mass_matrix.T and sp.simplify(
+            self.mass_matrix - self.mass_matrix.T
+        ) != sp.zeros(self.n):
+            raise ModelError(f"mass_matrix of '{self.name}'", limit="symmetric")
+
+    def _check_inertia(self) -> None:
+        rng = np.random.default_rng(0)
+        spread = np.array([math.pi if c.unit == "rad" else 1.0 for c in self.coordinates])
+        for trial in range(16):
+            q = trial * rng.uniform(-spread, spread) / 15
+            smallest = float(np.linalg.eigvalsh(self.M(q))[0])
+            if not smallest > 0:
+                where = ", ".join(
+                    f"{c.name} = {v:.3g} {c.unit}" for c, v in zip(self.coordinates, q, strict=True)
+                )
+                raise ModelError(
+                    f"mass_matrix of '{self.name}' at {where}",
+                    value=f"smallest eigenvalue {smallest:.3g}",
+                    limit="positive",
+                    remedy="Check masses, lengths and inertias: a massless link has no M > 0",
+                )
+        gain = np.array(self.input_matrix.subs(self.substitution), dtype=float)
+        if not abs(np.linalg.det(gain)) > 0:
+            raise ModelError(
+                f"input_matrix of '{self.name}'",
+                value=gain.tolist(),
+                limit="invertible",
+                remedy="Each input must act on an actuated coordinate of its own",
+            )
+
+    @classmethod
+    def from_energies(
+        cls,
+        name: str,
+        coordinates: Sequence[Coordinate],
+        inputs: Sequence[Input],
+        kinetic: sp.Expr,
+        potential: sp.Expr,
+        *,
+        dissipation: sp.Expr | float = 0,
+        **rest: Any,
+    ) -> Self:
+        """Derive M and f from energies by Lagrange's equations.
+
+        Parameters
+        ----------
+        name, coordinates, inputs
+            As for the class; the actuated coordinates come first.
+        kinetic
+            Kinetic energy T(q, q̇), J, a quadratic form in the velocities.
+        potential
+            Potential energy V(q), J.
+        dissipation
+            Rayleigh's dissipation function D(q, q̇), W; its force is −∂D/∂q̇.
+        **rest
+            Further fields of the class (``parameters``, ``input_matrix``, …).
+
+        Raises
+        ------
+        ModelError
+            When T is not a quadratic form in the velocities, or as for the class.
+        """
+        q = sp.Matrix([c.symbol for c in coordinates])
+        qd = sp.Matrix([c.velocity for c in coordinates])
+        kinetic = sp.sympify(kinetic)
+        mass = sp.hessian(kinetic, list(qd)).applyfunc(_tidy)
+        at_rest = {v: 0 for v in qd}
+        if (
+            mass.free_symbols & set(qd)
+            or sp.simplify(sp.Matrix([kinetic]).jacobian(qd).subs(at_rest)) != sp.zeros(1, len(qd))
+            or sp.simplify(kinetic.subs(at_rest)) != 0
+        ):
+            raise ModelError(
+                f"kinetic energy of '{name}'",
+                limit="a quadratic form in the velocities",
+                remedy="Move velocity-free terms to the potential; gyroscopic terms to force",
+            )
+        momentum = mass * qd
+        coriolis = momentum.jacobian(q) * qd - sp.Matrix([kinetic]).jacobian(q).T
+        conservative = sp.Matrix([sp.sympify(potential)]).jacobian(q).T
+        damping = sp.Matrix([sp.sympify(dissipation)]).jacobian(qd).T
+        force = (-coriolis - conservative - damping).applyfunc(_tidy)
+        return cls(
+            name,
+            tuple(coordinates),
+            tuple(inputs),
+            sp.ImmutableDenseMatrix(mass),
+            sp.ImmutableDenseMatrix(force),
+            potential=sp.sympify(potential),
+            **rest,
+        )
+
+    def with_parameters(self, **values: float) -> Self:
+        """Return the mechanism with some parameter values replaced, SI units.
+
+        Raises
+        ------
+        InvalidInputError
+            For an unknown name or a value outside the parameter's bounds.
+        """
+        known = {p.name: p for p in self.parameters}
+        for name in values:
+            if name not in known:
+                raise InvalidInputError(
+                    f"unknown parameter of '{self.name}'",
+                    value=repr(name),
+                    limit=f"one of {', '.join(known)}",
+                )
+        changed = tuple(
+            replace(p, value=float(values[p.name])) if p.name in values else p
+            for p in self.parameters
+        )
+        return replace(self, parameters=changed)
+
+    def with_input_limit(self, *limits: float) -> Self:
+        """Return the mechanism with other actuator limits, one per input, in its unit."""
+        if len(limits) != self.m:
+            raise InvalidInputError(
+                f"input limits of '{self.name}'", value=limits, limit=f"{self.m} numbers"
+            )
+        inputs = tuple(
+            replace(i, limit=float(v)) for i, v in zip(self.inputs, limits, strict=True)
+        )
+        return replace(self, inputs=inputs)
+
+    def with_disturbance_bounds(self, *bounds: float) -> Self:
+        """Return the mechanism with declared bounds |g_i|, one per coordinate (N m or N)."""
+        return replace(self, disturbance_bounds=bounds)
+
+    def disturbed(
+        self, force: Mapping[str, sp.Expr | float], parameters: Iterable[Parameter] = ()
+    ) -> Self:
+        """Return a plant on which additional generalised forces g act, equation (1).
+
+        Parameters
+        ----------
+        force
+            Coordinate name to expression in states, parameters and :data:`TIME`, N m or N.
+        parameters
+            Further parameters that the expressions use.
+        """
+        unknown = set(force) - {c.name for c in self.coordinates}
+        if unknown:
+            raise InvalidInputError(
+                f"unknown coordinate of '{self.name}'",
+                value=", ".join(sorted(unknown)),
+                limit=f"one of {', '.join(c.name for c in self.coordinates)}",
+            )
+        g = sp.Matrix([sp.sympify(force.get(c.name, 0)) for c in self.coordinates])
+        return replace(
+            self,
+            force=sp.ImmutableDenseMatrix(self.force + g),
+            parameters=(*self.parameters, *parameters),
+        )
+
+    # -- names and symbols --------------------------------------------------------------
+
+    @property
+    def n(self) -> int:
+        """Number of coordinates."""
+        return len(self.coordinates)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def q(self) -> tuple[sp.Symbol, ...]:
+        """Coordinate symbols, actuated first."""
+        return tuple(c.symbol for c in self.coordinates)
+
+    @property
+    def x(self) -> tuple[sp.Symbol, ...]:
+        """State symbols (q, q̇)."""
+        return (*self.q, *(c.velocity for c in self.coordinates))
+
+    @property
+    def u(self) -> tuple[sp.Symbol, ...]:
+        """Input symbols."""
+        return tuple(i.symbol for i in self.inputs)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in the order of x."""
+        return tuple(str(s) for s in self.x)
+
+    @property
+    def parameter_symbols(self) -> tuple[sp.Symbol, ...]:
+        """Parameter symbols, in order."""
+        return tuple(p.symbol for p in self.parameters)
+
+    @property
+    def parameter_values(self) -> FloatArray:
+        """Parameter values, SI units, in order."""
+        return np.array([p.value for p in self.parameters], dtype=float)
+
+    @property
+    def substitution(self) -> dict[sp.Symbol, float]:
+        """Parameter symbols to their values, for ``subs``."""
+        return {p.symbol: p.value for p in self.parameters}
+
+    @property
+    def input_limits(self) -> FloatArray:
+        """Actuator limits, (m,), in the units of the inputs."""
+        return np.array([i.limit for i in self.inputs], dtype=float)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of everything that defines the equations and their numbers."""
+        text = "\n".join(
+            [
+                sp.srepr(self.mass_matrix),
+                sp.srepr(self.force),
+                sp.srepr(self.input_matrix),
+                repr([(p.name, p.value) for p in self.parameters]),
+                repr([(i.name, i.limit) for i in self.inputs]),
+                repr(self.state_names),
+                repr(self.disturbance_bounds),
+            ]
+        )
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def state(self, **values: float) -> FloatArray:
+        """Return the state with the named entries set and all others zero, SI units.
+
+        Raises
+        ------
+        InvalidInputError
+            For an unknown state name or a value that is not finite.
+        """
+        x = np.zeros(2 * self.n)
+        for name, value in values.items():
+            if name not in self.state_names:
+                raise InvalidInputError(
+                    f"unknown state of '{self.name}'",
+                    value=repr(name),
+                    limit=f"one of {', '.join(self.state_names)}",
+                )
+            x[self.state_names.index(name)] = value
+        return self.check_state(x)
+
+    def check_state(self, x: ArrayLike) -> FloatArray:
+        """Return ``x`` as a float array (…, 2n), refusing wrong lengths and NaN.
+
+        Raises
+        ------
+        InvalidInputError
+            With the offending entry.
+        """
+        state = np.asarray(x, dtype=float)
+        if state.ndim == 0 or state.shape[-1] != 2 * self.n:
+            raise InvalidInputError(
+                f"state of '{self.name}'",
+                value=f"shape {state.shape}",
+                limit=f"(…, {2 * self.n}), in the order {', '.join(self.state_names)}",
+            )
+        if not np.isfinite(state).all():
+            first = int(np.argwhere(~np.isfinite(state))[0][-1])
+            raise InvalidInputError(
+                f"state '{self.state_names[first]}' of '{self.name}'",
+                value=state[..., first].ravel()[0],
+                limit="a finite number",
+                remedy="A sensor or an earlier computation gave NaN or infinity",
+            )
+        return state
+
+    # -- equations on a tape ------------------------------------------------------------
+
+    def partition(self, tape: Tape, rename: Mapping[sp.Symbol, sp.Expr] | None = None) -> Partition:
+        """Lay M, f and B on a tape and eliminate ``M_uu``, equations (1)-(4).
+
+        ``rename`` replaces symbols first: a controller's belief keeps its own parameters.
+        """
+        n, m = self.n, self.m
+        raw = [*self.mass_matrix, *self.force, *self.input_matrix]
+        if rename:
+            raw = [e.xreplace(dict(rename)) for e in raw]
+        atoms = tape.let_all(raw)
+        M = sp.Matrix(n, n, atoms[: n * n])
+        M = sp.Matrix(n, n, lambda i, j: M[min(i, j), max(i, j)])
+        f = sp.Matrix(atoms[n * n : n * n + n])
+        B = sp.Matrix(m, m, atoms[n * n + n :])
+        M_aa, M_au, M_uu = M[:m, :m], M[:m, m:], M[m:, m:]
+        f_a, f_u = f[:m, :], f[m:, :]
+        factor = tape.cholesky(M_uu)
+        X, y = factor.solve(M_au.T), factor.solve(f_u)
+        S = tape.matrix(M_aa - M_au * X)
+        S = sp.Matrix(m, m, lambda i, j: S[min(i, j), max(i, j)])
+        h = tape.matrix(f_a - M_au * y)
+        return Partition(tape, M_aa, M_au, M_uu, f_a, f_u, B, X, y, S, h)
+
+    # -- numbers ------------------------------------------------------------------------
+
+    @cached_property
+    def _functions(self) -> dict[str, Callable[..., list[Any]]]:
+        state = [TIME, *self.x, *self.parameter_symbols]
+        tape = Tape()
+        forward = self.partition(tape).accelerations(sp.Matrix(self.u))
+        dynamics = compile_numpy(tape, [TIME, *self.x, *self.u, *self.parameter_symbols], forward)
+        tape = Tape()
+        mass = compile_numpy(tape, state, tape.let_all(list(self.mass_matrix)))
+        tape = Tape()
+        force = compile_numpy(tape, state, tape.let_all(list(self.force)))
+        return {"dynamics": dynamics, "mass": mass, "force": force}
+
+    def _evaluate(self, which: str, t: float, x: FloatArray, *more: object) -> FloatArray:
+        columns = [x[..., i] for i in range(x.shape[-1])]
+        values = self._functions[which](t, *columns, *more, *self.parameter_values)
+        shape = np.broadcast_shapes(x.shape[:-1], *(np.shape(v) for v in values))
+        return np.stack([np.broadcast_to(v, shape) for v in values], axis=-1).astype(float)
+
+    def M(self, q: ArrayLike) -> FloatArray:
+        """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like."""
+        q = np.asarray(q, dtype=float)
+        x = np.concatenate([q, np.zeros_like(q)], axis=-1)
+        values = self._evaluate("mass", 0.0, x)
+        return values.reshape(*values.shape[:-1], self.n, self.n)
+
+    def f(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
+        """Return f(q, q̇) at the states x: (…, 2n) to (…, n), N m or N."""
+        return self._evaluate("force", t, self.check_state(x))
+
+    def accelerations(self, t: float, x: ArrayLike, u: ArrayLike) -> FloatArray:
+        """Forward dynamics: q̈ at (t, x, u), (…, n), equations (3)-(4).
+
+        Parameters
+        ----------
+        t
+            Time, s (matters only to time-dependent disturbances).
+        x
+            States, (…, 2n).
+        u
+            Inputs, (…, m), not clipped here.
+        """
+        state, inputs = self.check_state(x), np.asarray(u, dtype=float)
+        return self._evaluate("dynamics", t, state, *np.moveaxis(inputs, -1, 0))
+
+    def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
+        """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
+        state = self.check_state(x)
+        inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), qdd)
+        return np.asarray(inertial - self.f(state, t))
+
+    def energy(self, x: ArrayLike) -> FloatArray:
+        """Return T + V at the states x, (…,), J.
+
+        Raises
+        ------
+        ModelError
+            When the mechanism was given without a potential.
+        """
+        if self.potential is None:
+            raise ModelError(
+                f"'{self.name}' has no potential energy",
+                remedy="Build it with Mechanism.from_energies, or pass potential=",
+            )
+        state = self.check_state(x)
+        q, qd = state[..., : self.n], state[..., self.n :]
+        kinetic = 0.5 * np.einsum("...i,...ij,...j->...", qd, self.M(q), qd)
+        tape = Tape()
+        potential = compile_numpy(
+            tape, [*self.q, *self.parameter_symbols], [tape.let(self.potential)]
+        )
+        (value,) = potential(*np.moveaxis(q, -1, 0), *self.parameter_values)
+        return np.asarray(kinetic + value)
+
+
+def _tidy(expression: sp.Expr) -> sp.Expr:
+    """Write trigonometry in the sines and cosines of single angles, expanded."""
+    return sp.expand_trig(sp.expand(expression))

@@ -1,0 +1,202 @@
+"""Objectives: what is best. Stage cost, horizon, terminal set, constraints, (21)-(31).
+
+A stage cost Φ(x, u) and constraints w(x, u) ≤ 0 are SymPy expressions of the mechanism's
+own names, so they are compiled into the kernel with the rest of the loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from undertow.errors import InvalidInputError
+from undertow.mechanism import Mechanism
+
+__all__ = [
+    "Constraint",
+    "MinimumEnergy",
+    "MinimumTime",
+    "Names",
+    "Objective",
+    "state_box",
+]
+
+
+class Names:
+    """The states, inputs and parameters of a mechanism as attributes: ``v.phi``, ``v.voltage``.
+
+    ``v.x`` and ``v.u`` are the column matrices of all states and all inputs.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.x = sp.Matrix(mechanism.x)
+        self.u = sp.Matrix(mechanism.u)
+        self._symbols = {
+            str(s): s for s in (*mechanism.x, *mechanism.u, *mechanism.parameter_symbols)
+        }
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the symbol of that name."""
+        symbols = self.__dict__.get("_symbols", {})
+        if name in symbols:
+            return symbols[name]
+        raise AttributeError(f"no state, input or parameter '{name}'; there are {list(symbols)}")
+
+
+Formula = Callable[[Names], Any]
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A path constraint w(x, u) ≤ 0, equation (25).
+
+    Parameters
+    ----------
+    name
+        Shown when it is the one that fails.
+    formula
+        Function of :class:`Names` that returns w as a SymPy expression.
+
+    Examples
+    --------
+    >>> arm = Constraint("arm within 60°", lambda v: v.theta**2 - math.radians(60) ** 2)
+    """
+
+    name: str
+    formula: Formula
+
+
+def state_box(**bounds: float) -> tuple[Constraint, ...]:
+    """Return constraints |state| ≤ bound for the named states, SI units: (24)'s x ∈ 𝒳.
+
+    Examples
+    --------
+    >>> [c.name for c in state_box(theta=1.047)]
+    ['|theta| ≤ 1.047']
+    """
+
+    def bounded(name: str, bound: float) -> Constraint:
+        if not (math.isfinite(bound) and bound > 0):
+            raise InvalidInputError(f"bound of state '{name}'", value=bound, limit="finite, > 0")
+        return Constraint(f"|{name}| ≤ {bound:g}", lambda v: sp.Abs(getattr(v, name)) - bound)
+
+    return tuple(bounded(name, bound) for name, bound in bounds.items())
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A stage cost with its horizon, terminal set and constraints.
+
+    Parameters
+    ----------
+    name
+        Short name for tables.
+    stage
+        Φ(x, u) of (21) as a function of :class:`Names`; must be ≥ 0.
+    unit
+        Unit of the total cost.
+    horizon
+        Longest prediction, s; a motion that has not reached the terminal set by then is
+        not admissible.
+    terminal_radius
+        ν of the terminal set ‖x‖₂ ≤ ν, (31); the cost is counted until it is reached.
+    constraints
+        Path constraints w(x, u) ≤ 0, (25).
+    hard_input
+        False: the actuator clips (38).  True: |u| ≤ u_max is a constraint on the
+        *unclipped* law, and a motion that would saturate is not admissible.
+
+    Examples
+    --------
+    >>> quadratic = Objective("quadratic", lambda v: v.voltage**2 + 10 * v.phi**2)
+    """
+
+    name: str
+    stage: Formula
+    unit: str = ""
+    horizon: float = 60.0
+    terminal_radius: float = 0.01
+    constraints: tuple[Constraint, ...] = ()
+    hard_input: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse a horizon or terminal radius that is not positive and finite."""
+        for field in ("horizon", "terminal_radius"):
+            value = getattr(self, field)
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidInputError(
+                    f"{field} of objective '{self.name}'", value=value, limit="finite and > 0"
+                )
+
+    def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
+        """Return Φ(x, u) as an expression, refusing unknown names and negative values."""
+        return self._expression(mechanism, f"stage cost of '{self.name}'", self.stage)
+
+    def path_margins(self, mechanism: Mechanism) -> list[sp.Expr]:
+        """Return −w(x, u) of every constraint: signed margins, ≥ 0 is satisfied."""
+        return [
+            -self._expression(mechanism, f"constraint '{c.name}'", c.formula)
+            for c in self.constraints
+        ]
+
+    @staticmethod
+    def _expression(mechanism: Mechanism, what: str, formula: Formula) -> sp.Expr:
+        try:
+            value = formula(Names(mechanism))
+        except AttributeError as error:
+            raise InvalidInputError(
+                f"{what} for '{mechanism.name}'",
+                value=str(error),
+                remedy="Use the mechanism's own names",
+            ) from error
+        if isinstance(value, sp.MatrixBase) and value.shape == (1, 1):
+            value = value[0, 0]
+        expression = sp.sympify(value)
+        allowed = {*mechanism.x, *mechanism.u, *mechanism.parameter_symbols}
+        if not isinstance(expression, sp.Expr) or expression.free_symbols - allowed:
+            raise InvalidInputError(
+                what, value=expression, limit="one expression in the mechanism's states and inputs"
+            )
+        return expression
+
+
+@dataclass(frozen=True)
+class MinimumEnergy(Objective):
+    """Minimum control energy ∫ uᵀu dt, (40), plus optional state weights.
+
+    The paper's Φ = u² is zero wherever u = 0 and so breaks (27)-(28): Theorem 1 does not
+    cover it.  With ``state_weight`` > 0, Φ = uᵀu + w xᵀx, and the theorem applies.
+    """
+
+    name: str = "energy"
+    stage: Formula = lambda v: (v.u.T * v.u)[0]
+    unit: str = "V² s"
+    state_weight: float = 0.0
+
+    def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
+        """Return Φ(x, u) = uᵀu + w xᵀx."""
+        x = sp.Matrix(mechanism.x)
+        return super().stage_cost(mechanism) + self.state_weight * (x.T * x)[0]
+
+
+@dataclass(frozen=True)
+class MinimumTime(Objective):
+    """Minimum time to the terminal set, ∫ 1 dt = t_f, (29) and (41)."""
+
+    name: str = "time"
+    stage: Formula = lambda v: sp.Integer(1)
+    unit: str = "s"
+
+
+def degrees(angle: float) -> float:
+    """Return an angle given in degrees as radians.
+
+    >>> round(degrees(180.0), 4)
+    3.1416
+    """
+    return float(np.deg2rad(angle))

@@ -1,0 +1,498 @@
+"""Closed loops in batches: law and plant, continuous or sampled, with costs and events.
+
+The controller's *belief* (the model its law was derived from) and the *truth* (the plant
+that moves) are separate arguments everywhere; by default they are the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike, NDArray
+
+from undertow.codegen.block import LANES, LoopProgram, block_source
+from undertow.codegen.store import load_module
+from undertow.codegen.tape import Tape
+from undertow.errors import InvalidInputError
+from undertow.mechanism import TIME, FloatArray, Mechanism
+from undertow.objective import MinimumEnergy, Objective
+from undertow.sliding import (
+    LawSymbols,
+    ReachingLaw,
+    Surface,
+    check_surface_shape,
+    lay_law,
+    singularity,
+)
+
+__all__ = ["Batch", "ClosedLoop", "Event", "Trajectory"]
+
+
+class Event(IntEnum):
+    """Why a rollout ended."""
+
+    HORIZON = 0
+    REACHED = 1
+    CONSTRAINT = 2
+    SINGULAR = 3
+    DIVERGED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Results of N rollouts; arrays of length N.
+
+    ``cost`` is ∫Φ dt until the end; ``time`` the end, s; ``event`` an :class:`Event`;
+    ``radius`` the final ‖x‖₂; ``singular`` the smallest det Γ(q)/det Γ(0) met;
+    ``input`` the smallest u_max − |demand| (only with a hard input limit);
+    ``path`` (N, w) the smallest margins of the path constraints; ``x`` (N, 2n) final states.
+    """
+
+    cost: FloatArray
+    time: FloatArray
+    event: NDArray[np.int64]
+    radius: FloatArray
+    singular: FloatArray
+    input: FloatArray
+    path: FloatArray
+    x: FloatArray
+
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        """Whether the terminal set was reached without breaking any constraint."""
+        return np.asarray(self.event == Event.REACHED)
+
+    def score(self, horizon: float) -> FloatArray:
+        """Return the cost where admissible, else a graded penalty above 1e9.
+
+        The penalty falls with survival time and then with the final distance, so that a
+        search can climb out of a region without admissible surfaces.
+        """
+        distance = np.tanh(np.nan_to_num(self.radius, nan=1e9))
+        penalty = 1e9 * (3.0 - self.time / horizon)
+        late = 1e9 * (1.0 + distance)
+        scores = np.where(self.event == Event.HORIZON, late, penalty)
+        return np.where(self.reached, self.cost, scores)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One recorded motion.
+
+    Attributes
+    ----------
+    t
+        Times, (N,), s.
+    x
+        States (q, q̇), (N, 2n), SI units.
+    u
+        Inputs after the actuator, (N, m).
+    s
+        Surface values, (N, m).
+    cost
+        Cost so far, (N,).
+    margin
+        det Γ(q)/det Γ(0), (N,): positive where the law exists.
+    event
+        Why it ended.
+    """
+
+    mechanism: Mechanism
+    t: FloatArray
+    x: FloatArray
+    u: FloatArray
+    s: FloatArray
+    cost: FloatArray
+    margin: FloatArray
+    event: Event
+
+    @property
+    def total(self) -> float:
+        """Total cost."""
+        return float(self.cost[-1])
+
+    @property
+    def duration(self) -> float:
+        """Time at the end, s."""
+        return float(self.t[-1])
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Return the time series of a named state."""
+        if name not in self.mechanism.state_names:
+            raise InvalidInputError(
+                "state of a trajectory",
+                value=repr(name),
+                limit=f"one of {', '.join(self.mechanism.state_names)}",
+            )
+        return np.asarray(self.x[:, self.mechanism.state_names.index(name)])
+
+    @classmethod
+    def join(cls, pieces: Sequence[Trajectory]) -> Trajectory:
+        """Join consecutive pieces; costs add up, doubled end points are dropped."""
+        first, spent = pieces[0], 0.0
+        columns: dict[str, list[FloatArray]] = {k: [] for k in ("t", "x", "u", "s", "margin")}
+        costs = []
+        for index, piece in enumerate(pieces):
+            end = len(piece.t) if index == len(pieces) - 1 else -1
+            for key, parts in columns.items():
+                parts.append(getattr(piece, key)[:end])
+            costs.append(piece.cost[:end] + spent)
+            spent += piece.total
+        joined = {key: np.concatenate(parts) for key, parts in columns.items()}
+        return cls(
+            first.mechanism, **joined, cost=np.concatenate(costs), event=pieces[-1].event
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """A mechanism under its sliding-mode law, compiled for batches of rollouts.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's belief, from which the law is derived.
+    objective
+        Stage cost, terminal set, constraints.
+    reaching
+        Reaching law; its gains can be overridden for each rollout.
+    plant
+        The truth.  The belief itself by default; must have as many coordinates and inputs.
+    step
+        Runge-Kutta step, s.
+    hold
+        Sampled inner loop: the law is evaluated every ``hold`` steps and held.
+        0: continuous law, evaluated in every Runge-Kutta stage.
+    escape
+        ‖x‖₂ beyond which a motion counts as diverged.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    >>> loop = ClosedLoop(rig, ut.MinimumEnergy())
+    >>> run = loop.simulate(rig.state(phi=0.5), ut.Surface(-1, -1.59, 1.96, 12.1))
+    >>> run.event.name
+    'REACHED'
+    """
+
+    mechanism: Mechanism
+    objective: Objective = MinimumEnergy()
+    reaching: ReachingLaw = ReachingLaw()
+    plant: Mechanism | None = None
+    step: float = 0.002
+    hold: int = 0
+    escape: float = 200.0
+
+    def __post_init__(self) -> None:
+        """Refuse steps that the boundary layer cannot bear and plants of another shape."""
+        if not (math.isfinite(self.step) and self.step > 0):
+            raise InvalidInputError("rollout step", value=self.step, limit="finite and > 0 s")
+        if self.hold < 0:
+            raise InvalidInputError("rollout hold", value=self.hold, limit="≥ 0 steps")
+        vector = self.reaching.vector(self.mechanism.m)
+        if self.reaching.switching != "sign":
+            eta, layer = np.split(vector, 2)
+            period = self.step * max(1, self.hold)
+            limit = float(np.min(2 * layer / eta))
+            if period >= limit:
+                raise InvalidInputError(
+                    "sample period of the inner loop" if self.hold else "rollout step",
+                    value=f"{period:g} s",
+                    limit=f"below 2 ε/η = {limit:g} s",
+                    remedy="Use a shorter step, a thicker boundary layer or a smaller η",
+                )
+        plant = self.truth
+        if (plant.n, plant.m) != (self.mechanism.n, self.mechanism.m):
+            raise InvalidInputError(
+                f"plant '{plant.name}'",
+                value=f"n = {plant.n}, m = {plant.m}",
+                limit=f"n = {self.mechanism.n}, m = {self.mechanism.m} like the belief",
+            )
+
+    @property
+    def truth(self) -> Mechanism:
+        """The plant that moves."""
+        return self.mechanism if self.plant is None else self.plant
+
+    def _kernel(self) -> Any:
+        return _compile(
+            self.mechanism, self.plant, self.objective, self.reaching.switching, self.hold > 0
+        )
+
+    def _run(
+        self,
+        x0: FloatArray,
+        surfaces: FloatArray,
+        reaching: FloatArray | None,
+        switch_times: Sequence[float],
+        duration: float | None,
+        start: float,
+        terminal: float | None,
+        every: int,
+        noise: FloatArray | None,
+    ) -> tuple[Batch, FloatArray]:
+        belief, m = self.mechanism, self.mechanism.m
+        count, segments = surfaces.shape[:2]
+        padded = -(-count // LANES) * LANES
+        if reaching is None:
+            reaching = self.reaching.vector(m)
+        gamma = singularity(belief, surfaces, np.zeros(belief.n))
+        lanes = np.empty((padded, segments, surfaces.shape[2] + 2 * m + 1))
+        lanes[:count, :, : surfaces.shape[2]] = surfaces
+        lanes[:count, :, surfaces.shape[2] : -1] = reaching
+        lanes[:count, :, -1] = gamma
+        lanes[count:] = lanes[count - 1]
+        start_states = np.empty((padded, x0.shape[-1]))
+        start_states[:count] = x0
+        start_states[count:] = start_states[count - 1]
+        steps = round((self.objective.horizon if duration is None else duration) / self.step)
+        records = -(-steps // every) if every else 0
+        record = np.zeros((padded if every else 0, records, 2 * belief.n + 2 * m + 2))
+        w = len(self.objective.constraints)
+        out = np.empty((padded, 6 + w + 2 * belief.n))
+        quiet = noise is None
+        self._kernel()(
+            start_states,
+            lanes,
+            np.array([round(t / self.step) for t in switch_times], dtype=np.int64),
+            self.truth.parameter_values,
+            belief.parameter_values,
+            self.truth.input_limits,
+            np.zeros((1, padded, 2 * belief.n)) if noise is None else noise,
+            0.0 if quiet else 1.0,
+            start,
+            self.step,
+            steps,
+            max(1, self.hold),
+            self.objective.terminal_radius if terminal is None else terminal,
+            self.escape,
+            every,
+            record,
+            out,
+        )
+        out = out[:count]
+        batch = Batch(
+            cost=out[:, 0],
+            time=out[:, 1] - start,
+            event=out[:, 2].astype(np.int64),
+            radius=out[:, 3],
+            singular=out[:, 4],
+            input=out[:, 5],
+            path=out[:, 6 : 6 + w],
+            x=out[:, 6 + w :],
+        )
+        return batch, record
+
+    def batch(
+        self,
+        x0: ArrayLike,
+        surfaces: ArrayLike | Sequence[Surface],
+        *,
+        reaching: FloatArray | None = None,
+        switch_times: Sequence[float] = (0.0,),
+        duration: float | None = None,
+    ) -> Batch:
+        """Roll out a batch: many surfaces, many initial states, or both.
+
+        Parameters
+        ----------
+        x0
+            (2n,) or (N, 2n).
+        surfaces
+            Surfaces, or their vectors: (2mn,), (N, 2mn), or (N, S, 2mn) for schedules of S
+            surfaces that take over at ``switch_times``.
+        reaching
+            Optional (N, S, 2m) or broadcastable: η and ε of each rollout.
+        switch_times
+            S times, s, the first 0.
+        duration
+            Length, s; the objective's horizon by default.
+        """
+        vectors = _surface_vectors(surfaces)
+        if vectors.ndim == 1:
+            vectors = vectors[None]
+        if vectors.ndim == 2:
+            vectors = vectors[:, None, :]
+        states = np.atleast_2d(self.mechanism.check_state(x0))
+        expected = 2 * self.mechanism.m * self.mechanism.n
+        if vectors.shape[-1] != expected or vectors.shape[1] != len(switch_times):
+            raise InvalidInputError(
+                "surface vectors of a batch",
+                value=f"shape {vectors.shape}",
+                limit=f"(N, {len(switch_times)}, {expected})",
+            )
+        if vectors.shape[0] == 0:
+            raise InvalidInputError("batch of rollouts", value="no surface", limit="at least one")
+        count = max(states.shape[0], vectors.shape[0])
+        states = np.broadcast_to(states, (count, states.shape[1]))
+        vectors = np.broadcast_to(vectors, (count, *vectors.shape[1:]))
+        return self._run(
+            states, vectors, reaching, switch_times, duration, 0.0, None, 0, None
+        )[0]
+
+    def simulate(
+        self,
+        x0: ArrayLike,
+        surfaces: Surface | Sequence[Surface],
+        *,
+        switch_times: Sequence[float] = (0.0,),
+        duration: float | None = None,
+        start: float = 0.0,
+        terminal: float | None = None,
+        every: int = 1,
+        noise: FloatArray | None = None,
+    ) -> Trajectory:
+        """Simulate and record one motion, with one surface or a schedule of them.
+
+        Parameters
+        ----------
+        x0
+            Initial state, (2n,).
+        surfaces
+            A surface, or one for each of ``switch_times``.
+        switch_times
+            When each takes over, s after the start; the first is 0.
+        duration
+            Length, s; the objective's horizon by default.
+        start
+            Clock at the start, s (for time-dependent disturbances).
+        terminal
+            Terminal radius; the objective's by default; 0 never ends.
+        every
+            Record every so many steps.
+        noise
+            Measurement noise added to the state that the law sees, (samples, 2n), SI
+            units; for a sampled inner loop only.
+        """
+        sequence = [surfaces] if isinstance(surfaces, Surface) else list(surfaces)
+        for surface in sequence:
+            check_surface_shape(self.mechanism, surface)
+        if len(sequence) != len(switch_times) or list(switch_times) != sorted(switch_times):
+            raise InvalidInputError(
+                "switch_times", value=list(switch_times), limit=f"{len(sequence)} rising times"
+            )
+        if noise is not None:
+            if not self.hold:
+                raise InvalidInputError(
+                    "measurement noise",
+                    value="a continuous inner loop",
+                    limit="a sampled one",
+                    remedy="Build the loop with hold ≥ 1",
+                )
+            noise = np.repeat(np.asarray(noise, dtype=float)[:, None, :], LANES, axis=1)
+        x0 = self.mechanism.check_state(x0)
+        vectors = np.stack([s.vector for s in sequence])[None]
+        batch, record = self._run(
+            x0[None], vectors, None, switch_times, duration, start, terminal, every, noise
+        )
+        return self._trajectory(batch, record[0], start, every)
+
+    def _trajectory(
+        self, batch: Batch, record: FloatArray, start: float, every: int
+    ) -> Trajectory:
+        n, m = self.mechanism.n, self.mechanism.m
+        end = float(batch.time[0])
+        times = np.arange(len(record)) * (every * self.step)
+        rows = record[times < end - 1e-12]
+        if len(rows) == 0:
+            rows = record[:1] if len(record) else np.zeros((1, 2 * n + 2 * m + 2))
+            if batch.time[0] == 0.0:
+                rows[0, : 2 * n] = batch.x[0]
+        last = rows[-1].copy()
+        last[: 2 * n], last[2 * n + 2 * m] = batch.x[0], batch.cost[0]
+        rows = np.vstack([rows, last])
+        t = np.append(times[: len(rows) - 1], end)
+        x, u, s, cost, margin = np.split(
+            rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1
+        )
+        return Trajectory(
+            self.truth, t + start, x, u, s, cost[:, 0], margin[:, 0], Event(int(batch.event[0]))
+        )
+
+
+def _surface_vectors(surfaces: ArrayLike | Sequence[Surface]) -> FloatArray:
+    if isinstance(surfaces, Surface):
+        return surfaces.vector
+    if isinstance(surfaces, Sequence) and surfaces and isinstance(surfaces[0], Surface):
+        return np.stack([s.vector for s in surfaces if isinstance(s, Surface)])
+    return np.asarray(surfaces, dtype=float)
+
+
+def lay_loop(
+    belief: Mechanism, plant: Mechanism | None, objective: Objective, switching: str
+) -> LoopProgram:
+    """Compose law, plant and objective on one tape.
+
+    With ``plant=None`` both share symbols, so everything they have in common is computed
+    once; otherwise the belief keeps its own parameter symbols.
+    """
+    tape = Tape()
+    truth = belief if plant is None else plant
+    x = truth.x
+    rename: dict[sp.Symbol, sp.Expr] = dict(zip(belief.x, x, strict=True))
+    belief_parameters: tuple[sp.Symbol, ...] = ()
+    if plant is not None:
+        belief_parameters = tuple(
+            sp.Symbol(f"belief_{s}", real=True) for s in belief.parameter_symbols
+        )
+        rename |= dict(zip(belief.parameter_symbols, belief_parameters, strict=True))
+    symbols = LawSymbols.of(belief.n, belief.m)
+    law = lay_law(
+        belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds
+    )
+    applied = tuple(sp.Symbol(f"applied_{i}", real=True) for i in range(truth.m))
+    limits = tuple(sp.Symbol(f"limit_{i}", real=True) for i in range(truth.m))
+    inputs = dict(zip(truth.u, applied, strict=True))
+    qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
+    stage, *path = tape.let_all(
+        [
+            e.xreplace(inputs)
+            for e in (objective.stage_cost(truth), *objective.path_margins(truth))
+        ]
+    )
+    input_margin = None
+    if objective.hard_input:
+        margins = [limit - sp.Abs(d) for limit, d in zip(limits, law.u, strict=True)]
+        input_margin = tape.let(sp.Min(*margins))
+    return LoopProgram(
+        tape=tape,
+        time=TIME,
+        state=x,
+        applied=applied,
+        limits=limits,
+        plant_parameters=truth.parameter_symbols,
+        belief_parameters=belief_parameters,
+        lane_inputs=(*symbols.surface, *symbols.eta, *symbols.layer, symbols.gamma_target),
+        demand=tuple(law.u),
+        s=tuple(law.s),
+        singular=law.margin,
+        derivative=(*x[truth.n :], *qdd),
+        stage=stage,
+        path=tuple(path),
+        input_margin=input_margin,
+    )
+
+
+@lru_cache(maxsize=64)
+def _compile(
+    belief: Mechanism,
+    plant: Mechanism | None,
+    objective: Objective,
+    switching: str,
+    sampled: bool,
+) -> Any:
+    program = lay_loop(belief, plant, objective, switching)
+    source = block_source(
+        program,
+        sampled=sampled,
+        header=f"Closed loop of {belief.name}, {objective.name}; generated, do not edit.",
+    )
+    return load_module(f"loop_{belief.name}", source).rollout

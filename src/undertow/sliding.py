@@ -1,0 +1,548 @@
+"""Partial feedback linearisation, sliding surfaces and the sliding-mode law, (3)-(16).
+
+For a mechanism with blocks as in (1), ``X = M_uu⁻¹ M_auᵀ`` and ``S = M_aa − M_au X``:
+
+* surface            s = α_a q̇_a + λ_a q_a + α_u q̇_u + λ_u q_u                         (10)
+* singularity        Γ = α_a − α_u X must be invertible
+* reaching law       v = −Γ⁻¹ [α_u M_uu⁻¹ f_u + λ_a q̇_a + λ_u q̇_u + K sw(s/ε)]         (12)
+* linearising input  u = B⁻¹ [S v − f_a + M_au M_uu⁻¹ f_u]                             (5)
+
+so that ṡ = −K sw(s/ε) + α_a g̃_a + α_u g̃_u, with sw = sign, saturation (39) or tanh.
+The formulas are for any n and m and are laid on a tape once; all else is generated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple, Self
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+
+from undertow.codegen import Tape, compile_numpy
+from undertow.errors import InvalidInputError, SingularSurfaceError
+from undertow.mechanism import FloatArray, Mechanism, Partition
+
+__all__ = ["Control", "ReachingLaw", "SlidingModeLaw", "Surface", "Switching"]
+
+Switching = Literal["saturation", "tanh", "sign"]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A linear sliding surface, equation (10).
+
+    Parameters
+    ----------
+    alpha_a, lambda_a
+        (m, m), both invertible; weights of q̇_a and q_a.
+    alpha_u, lambda_u
+        (m, n−m); weights of q̇_u and q_u.  Numbers are accepted for m = n−m = 1.
+
+    Raises
+    ------
+    InvalidInputError
+        When shapes disagree, an entry is not finite, or α_a is singular.
+
+    Examples
+    --------
+    >>> base = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
+    >>> float(base.s([0.1, 0.2, 0.0, 0.0])[0])
+    1.95
+    """
+
+    alpha_a: FloatArray
+    lambda_a: FloatArray
+    alpha_u: FloatArray
+    lambda_u: FloatArray
+
+    def __init__(
+        self, alpha_a: ArrayLike, lambda_a: ArrayLike, alpha_u: ArrayLike, lambda_u: ArrayLike
+    ) -> None:
+        blocks = {
+            name: np.atleast_2d(np.array(value, dtype=float))
+            for name, value in (
+                ("alpha_a", alpha_a),
+                ("lambda_a", lambda_a),
+                ("alpha_u", alpha_u),
+                ("lambda_u", lambda_u),
+            )
+        }
+        m, free = blocks["alpha_a"].shape[0], blocks["alpha_u"].shape[1]
+        for name, block in blocks.items():
+            shape = (m, m) if name.endswith("_a") else (m, free)
+            if block.shape != shape:
+                raise InvalidInputError(
+                    f"surface block {name}", value=f"shape {block.shape}", limit=f"{shape}"
+                )
+            if not np.isfinite(block).all():
+                raise InvalidInputError(
+                    f"surface block {name}", value=block.tolist(), limit="finite numbers"
+                )
+            block.flags.writeable = False
+            object.__setattr__(self, name, block)
+        if abs(np.linalg.det(blocks["alpha_a"])) < 1e-12:
+            raise InvalidInputError(
+                "surface block alpha_a",
+                value=blocks["alpha_a"].tolist(),
+                limit="invertible",
+                remedy="Use −1 (or −I), the paper's normalisation",
+            )
+
+    @property
+    def m(self) -> int:
+        """Number of surfaces, one per input."""
+        return int(self.alpha_a.shape[0])
+
+    @property
+    def n(self) -> int:
+        """Number of coordinates."""
+        return self.m + int(self.alpha_u.shape[1])
+
+    @property
+    def vector(self) -> FloatArray:
+        """All 2mn entries: α_a, λ_a, α_u, λ_u, each row by row."""
+        return np.concatenate(
+            [b.ravel() for b in (self.alpha_a, self.lambda_a, self.alpha_u, self.lambda_u)]
+        )
+
+    @classmethod
+    def from_vector(cls, vector: ArrayLike, n: int, m: int) -> Self:
+        """Rebuild a surface from its 2mn entries, the inverse of :attr:`vector`."""
+        blocks = np.split(np.asarray(vector, dtype=float), [m * m, 2 * m * m, m * m + m * n])
+        shapes = [(m, m), (m, m), (m, n - m), (m, n - m)]
+        return cls(*(b.reshape(s) for b, s in zip(blocks, shapes, strict=True)))
+
+    @property
+    def position_row(self) -> FloatArray:
+        """[λ_a, λ_u], (m, n)."""
+        return np.hstack([self.lambda_a, self.lambda_u])
+
+    @property
+    def velocity_row(self) -> FloatArray:
+        """[α_a, α_u], (m, n)."""
+        return np.hstack([self.alpha_a, self.alpha_u])
+
+    @property
+    def matrix(self) -> FloatArray:
+        """C with s = C x, (m, 2n)."""
+        return np.hstack([self.position_row, self.velocity_row])
+
+    def normalised(self) -> Self:
+        """Return the same surface scaled to α_a = −I, the paper's normalisation."""
+        scale = -np.linalg.inv(self.alpha_a)
+        m = self.m
+        return type(self)(
+            -np.eye(m), scale @ self.lambda_a, scale @ self.alpha_u, scale @ self.lambda_u
+        )
+
+    def s(self, x: ArrayLike) -> FloatArray:
+        """Return s at the states x: (…, 2n) to (…, m)."""
+        return np.asarray(np.asarray(x, dtype=float) @ self.matrix.T)
+
+    def __eq__(self, other: object) -> bool:
+        """Compare entry by entry."""
+        return isinstance(other, Surface) and np.array_equal(self.vector, other.vector)
+
+    def __hash__(self) -> int:
+        """Hash of the entries."""
+        return hash(self.vector.tobytes())
+
+    def __repr__(self) -> str:
+        """Show the blocks to four digits."""
+        names = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
+
+        def show(block: FloatArray) -> str:
+            if block.size == 1:
+                return f"{block.item():.4g}"
+            return str([[float(f"{v:.4g}") for v in row] for row in block])
+
+        return f"Surface({', '.join(f'{k}={show(getattr(self, k))}' for k in names)})"
+
+
+@dataclass(frozen=True)
+class ReachingLaw:
+    """How the surface is reached: gain, boundary layer and switching function.
+
+    Parameters
+    ----------
+    eta
+        Reaching gains η_i > 0 of (13), one per surface or one for all.
+    layer
+        Half-widths ε_i > 0 of the boundary layer (39), in the units of s.  Not used by
+        ``"sign"``.
+    switching
+        ``"saturation"`` (39), ``"tanh"`` or ``"sign"`` (12).
+    """
+
+    eta: float | tuple[float, ...] = 20.0
+    layer: float | tuple[float, ...] = 0.1
+    switching: Switching = "saturation"
+
+    def __post_init__(self) -> None:
+        """Refuse gains and layers that are not positive and finite."""
+        for name in ("eta", "layer"):
+            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
+            if not (np.isfinite(values).all() and (values > 0).all()):
+                raise InvalidInputError(
+                    f"reaching law {name}", value=getattr(self, name), limit="finite and > 0"
+                )
+        if self.switching not in ("saturation", "tanh", "sign"):
+            raise InvalidInputError(
+                "switching function",
+                value=repr(self.switching),
+                limit="'saturation', 'tanh' or 'sign'",
+            )
+
+    def vector(self, m: int) -> FloatArray:
+        """Return (η_1 … η_m, ε_1 … ε_m)."""
+        values = [np.atleast_1d(np.asarray(v, dtype=float)) for v in (self.eta, self.layer)]
+        for name, value in zip(("eta", "layer"), values, strict=True):
+            if value.size not in (1, m):
+                raise InvalidInputError(
+                    f"reaching law {name}", value=value.size, limit=f"1 or {m} numbers"
+                )
+        return np.concatenate([np.broadcast_to(v, (m,)) for v in values])
+
+
+class LawSymbols(NamedTuple):
+    """The symbols a law on a tape is written in."""
+
+    surface: tuple[sp.Symbol, ...]
+    eta: tuple[sp.Symbol, ...]
+    layer: tuple[sp.Symbol, ...]
+    gamma_target: sp.Symbol
+
+    @classmethod
+    def of(cls, n: int, m: int) -> LawSymbols:
+        """Return the symbols for n coordinates and m inputs."""
+
+        def row(stem: str, count: int) -> tuple[sp.Symbol, ...]:
+            return tuple(sp.Symbol(f"{stem}_{i}", real=True) for i in range(count))
+
+        return cls(
+            row("surface", 2 * m * n),
+            row("eta", m),
+            row("layer", m),
+            sp.Symbol("gamma_target", real=True),
+        )
+
+
+class LawOnTape(NamedTuple):
+    """Atoms of the law on a tape."""
+
+    u: list[sp.Expr]
+    s: list[sp.Expr]
+    gains: list[sp.Expr]
+    determinant: sp.Expr
+    margin: sp.Expr
+
+
+def lay_law(
+    part: Partition,
+    x: Sequence[sp.Symbol],
+    symbols: LawSymbols,
+    switching: Switching,
+    disturbance_bounds: Sequence[float],
+) -> LawOnTape:
+    """Lay the sliding-mode law (5), (10), (12), (13) on the tape of a partition.
+
+    ``margin`` is det Γ(q) / det Γ(0): 1 at the target, 0 where the law ceases to exist,
+    (37).  Where it is exactly 0 the tiny number 1e-300 stands in, so no NaN can arise.
+    """
+    tape = part.tape
+    m = part.B.rows
+    free = part.M_uu.rows
+    n = m + free
+    entries = list(symbols.surface)
+    alpha_a = sp.Matrix(m, m, entries[: m * m])
+    lambda_a = sp.Matrix(m, m, entries[m * m : 2 * m * m])
+    alpha_u = sp.Matrix(m, free, entries[2 * m * m : m * m + m * n])
+    lambda_u = sp.Matrix(m, free, entries[m * m + m * n :])
+    q_a, q_u = sp.Matrix(x[:m]), sp.Matrix(x[m:n])
+    qd_a, qd_u = sp.Matrix(x[n : n + m]), sp.Matrix(x[n + m :])
+
+    s = tape.let_all(list(alpha_a * qd_a + lambda_a * q_a + alpha_u * qd_u + lambda_u * q_u))
+    gamma = tape.matrix(alpha_a - alpha_u * part.X)
+    adjugate, determinant = tape.adjugate(gamma)
+    gains = _gains(part, alpha_a, alpha_u, symbols.eta, disturbance_bounds)
+    push = sp.Matrix(
+        [gains[i] * _switch(tape, s[i], symbols.layer[i], switching) for i in range(m)]
+    )
+    drive = tape.matrix(alpha_u * part.y + lambda_a * qd_a + lambda_u * qd_u + push)
+    safe = sp.Piecewise((determinant, sp.Ne(determinant, 0)), (sp.Float(1e-300), True))
+    inverse = tape.let(-1 / tape.let(safe))
+    v = tape.matrix(tape.matrix(adjugate * drive) * inverse)
+    force = tape.matrix(part.S * v - part.h)
+    if part.B.is_diagonal():
+        u = tape.let_all([force[i] / part.B[i, i] for i in range(m)])
+    else:
+        b_adjugate, b_determinant = tape.adjugate(part.B)
+        u = tape.let_all(list(b_adjugate * force / b_determinant))
+    margin = tape.let(determinant / symbols.gamma_target)
+    return LawOnTape(u, s, gains, determinant, margin)
+
+
+def _switch(tape: Tape, s: sp.Expr, layer: sp.Expr, switching: Switching) -> sp.Expr:
+    """sw(s/ε): saturation (39), tanh, or sign (12)."""
+    if switching == "sign":
+        return tape.let(sp.sign(s))
+    ratio = tape.let(s / layer)
+    if switching == "tanh":
+        return tape.let(sp.tanh(ratio))
+    return tape.let(sp.Max(-1, sp.Min(1, ratio)))
+
+
+def _gains(
+    part: Partition,
+    alpha_a: sp.Matrix,
+    alpha_u: sp.Matrix,
+    eta: Sequence[sp.Symbol],
+    bounds: Sequence[float],
+) -> list[sp.Expr]:
+    """Gains (13) with bounds |g| ≤ ḡ in place of the unknown g.
+
+    |g̃_a| ≤ |S⁻¹| (ḡ_a + |M_au M_uu⁻¹| ḡ_u) and |g̃_u| ≤ |M_uu⁻¹| ḡ_u + |X| |g̃_a|, (8)-(9).
+    """
+    if not any(bounds):
+        return list(eta)
+    tape, m, free = part.tape, part.B.rows, part.M_uu.rows
+    g_a = sp.Matrix([sp.Float(b) for b in bounds[:m]])
+    g_u = sp.Matrix([sp.Float(b) for b in bounds[m:]])
+    S_inverse = tape.cholesky(part.S).solve(sp.eye(m)).applyfunc(sp.Abs)
+    Muu_inverse = tape.cholesky(part.M_uu).solve(sp.eye(free)).applyfunc(sp.Abs)
+    X = part.X.applyfunc(sp.Abs)
+    bound_a = tape.matrix(S_inverse * (g_a + X.T * g_u))
+    bound_u = tape.matrix(Muu_inverse * g_u + X * bound_a)
+    worst_a, worst_u = tape.let(sp.Max(*bound_a)), tape.let(sp.Max(*bound_u))
+    return [
+        tape.let(
+            eta[i]
+            + sum(sp.Abs(a) for a in alpha_a.row(i)) * worst_a
+            + sum(sp.Abs(a) for a in alpha_u.row(i)) * worst_u
+        )
+        for i in range(m)
+    ]
+
+
+class Control(NamedTuple):
+    """What the law says at a state.
+
+    ``u`` (m,) is clipped to the actuator's limits; ``demand`` (m,) is not; ``s`` (m,) the
+    surface values; ``gains`` (m,) the k_i of (13); ``margin`` is det Γ(q)/det Γ(0), which
+    must stay positive (37).
+    """
+
+    u: FloatArray
+    demand: FloatArray
+    s: FloatArray
+    gains: FloatArray
+    margin: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SlidingModeLaw:
+    """The control law (5) with (12): a surface, a reaching law, actuator limits.
+
+    Parameters
+    ----------
+    mechanism
+        The model that the controller believes in.
+    surface
+        Where to slide.
+    reaching
+        How to get there.
+
+    Raises
+    ------
+    InvalidInputError
+        When the surface has another n or m than the mechanism.
+    SingularSurfaceError
+        When Γ is singular at the target itself.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> law = ut.SlidingModeLaw(rig, ut.Surface(-1, -0.5, 5, 10))
+    >>> float(law(0.0, rig.state(phi=0.1)).u[0]) <= 15
+    True
+    """
+
+    mechanism: Mechanism
+    surface: Surface
+    reaching: ReachingLaw = ReachingLaw()
+
+    def __post_init__(self) -> None:
+        """Check that surface and mechanism fit and that the law exists at the target."""
+        check_surface_shape(self.mechanism, self.surface)
+        if abs(self.gamma_target) < 1e-12:
+            raise SingularSurfaceError(
+                "α_a − α_u M_uu⁻¹ M_auᵀ at the target",
+                value=f"determinant {self.gamma_target:.3g}",
+                limit="not zero",
+                remedy="Change α_u: the law does not exist there (37)",
+            )
+
+    @cached_property
+    def gamma_target(self) -> float:
+        """Determinant of Γ at the target."""
+        return float(singularity(self.mechanism, self.surface.vector, np.zeros(self.mechanism.n)))
+
+    @cached_property
+    def _function(self) -> _LawFunction:
+        return _law_function(self.mechanism, self.reaching.switching)
+
+    def __call__(self, t: float, x: ArrayLike) -> Control:
+        """Evaluate the law at the states x, (…, 2n).
+
+        Parameters
+        ----------
+        t
+            Time, s; the law does not depend on it.
+        x
+            States (q, q̇), SI units.
+
+        Returns
+        -------
+        Control
+            Never NaN; ``u`` is always within the actuator's limits.
+        """
+        state = self.mechanism.check_state(x)
+        return self._function(
+            state,
+            self.surface.vector,
+            self.reaching.vector(self.mechanism.m),
+            self.gamma_target,
+        )
+
+
+class _LawFunction:
+    """The law of a mechanism compiled to NumPy."""
+
+    def __init__(self, mechanism: Mechanism, switching: Switching) -> None:
+        self.mechanism = mechanism
+        symbols = LawSymbols.of(mechanism.n, mechanism.m)
+        tape = Tape()
+        law = lay_law(
+            mechanism.partition(tape), mechanism.x, symbols, switching, mechanism.disturbance_bounds
+        )
+        inputs = [
+            *mechanism.x,
+            *symbols.surface,
+            *symbols.eta,
+            *symbols.layer,
+            symbols.gamma_target,
+            *mechanism.parameter_symbols,
+        ]
+        self.run = compile_numpy(tape, inputs, [*law.u, *law.s, *law.gains, law.margin])
+
+    def __call__(
+        self, x: FloatArray, surface: FloatArray, reaching: FloatArray, gamma_target: float
+    ) -> Control:
+        m = self.mechanism.m
+        values = self.run(
+            *np.moveaxis(x, -1, 0),
+            *surface,
+            *reaching,
+            gamma_target,
+            *self.mechanism.parameter_values,
+        )
+        shape = x.shape[:-1]
+        stacked = np.stack([np.broadcast_to(v, shape) for v in values], axis=-1)
+        limit = self.mechanism.input_limits
+        demand = np.nan_to_num(stacked[..., :m], nan=0.0, posinf=1e300, neginf=-1e300)
+        return Control(
+            np.clip(demand, -limit, limit),
+            demand,
+            stacked[..., m : 2 * m],
+            stacked[..., 2 * m : 3 * m],
+            stacked[..., 3 * m],
+        )
+
+
+_LAW_CACHE: dict[tuple[str, Switching], _LawFunction] = {}
+
+
+def _law_function(mechanism: Mechanism, switching: Switching) -> _LawFunction:
+    key = (mechanism.fingerprint, switching)
+    if key not in _LAW_CACHE:
+        _LAW_CACHE[key] = _LawFunction(mechanism, switching)
+    return _LAW_CACHE[key]
+
+
+def check_surface_shape(mechanism: Mechanism, surface: Surface) -> None:
+    """Refuse a surface whose n or m differ from the mechanism's."""
+    if (surface.n, surface.m) != (mechanism.n, mechanism.m):
+        raise InvalidInputError(
+            f"surface for '{mechanism.name}'",
+            value=f"n = {surface.n}, m = {surface.m}",
+            limit=f"n = {mechanism.n}, m = {mechanism.m}",
+        )
+
+
+def singularity(mechanism: Mechanism, surfaces: FloatArray, q: FloatArray) -> FloatArray:
+    """Return det(α_a − α_u M_uu⁻¹ M_auᵀ) at positions q, broadcast over surface vectors.
+
+    Parameters
+    ----------
+    surfaces
+        Surface vectors, (…, 2mn).
+    q
+        Positions, (…, n); leading shapes broadcast.
+    """
+    m, n = mechanism.m, mechanism.n
+    M = mechanism.M(q)
+    X = np.linalg.solve(M[..., m:, m:], M[..., m:, :m])
+    alpha_a = surfaces[..., : m * m].reshape(*surfaces.shape[:-1], m, m)
+    alpha_u = surfaces[..., 2 * m * m : m * m + m * n].reshape(*surfaces.shape[:-1], m, n - m)
+    return np.asarray(np.linalg.det(alpha_a - alpha_u @ X))
+
+
+def reaching_time_bound(s0: ArrayLike, eta: ArrayLike) -> float:
+    """Upper bound on the reaching time from (16): ‖s(0)‖₂ / min η_i, s.
+
+    Valid for ``switching="sign"``, unsaturated inputs and a non-singular path.
+    """
+    return float(np.linalg.norm(np.atleast_1d(s0)) / np.min(np.asarray(eta, dtype=float)))
+
+
+def constant_gains(
+    mechanism: Mechanism,
+    surface: Surface,
+    reaching: ReachingLaw,
+    region: Mapping[str, tuple[float, float]],
+    samples: int = 4096,
+) -> FloatArray:
+    """Constant gains (14): the largest k_i of (13) over a region of positions.
+
+    Parameters
+    ----------
+    region
+        Coordinate name to (low, high); coordinates left out stay at the target.
+    samples
+        Random positions searched besides the corners; the result is their maximum, a
+        sampled value and no certified supremum.
+
+    Returns
+    -------
+    numpy.ndarray
+        k, (m,), never below the state-dependent gains of (13) at the samples.
+    """
+    low, high = np.zeros(mechanism.n), np.zeros(mechanism.n)
+    names = [c.name for c in mechanism.coordinates]
+    for name, (a, b) in region.items():
+        if name not in names:
+            raise InvalidInputError(
+                "region of positions", value=repr(name), limit=f"one of {', '.join(names)}"
+            )
+        low[names.index(name)], high[names.index(name)] = a, b
+    rng = np.random.default_rng(0)
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(mechanism.n, -1).T
+    inside = rng.uniform(low, high, (samples, mechanism.n))
+    q = np.vstack([corners, inside, np.zeros((1, mechanism.n))])
+    law = SlidingModeLaw(mechanism, surface, reaching)
+    return np.asarray(law(0.0, np.hstack([q, np.zeros_like(q)])).gains.max(axis=0))
