@@ -3,12 +3,17 @@
 from math import radians as deg
 
 from undertow import mechanisms
+from undertow.cascade import Cascade, Run
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
+from undertow.optimiser import Budget, Optimiser, Proposal
 from undertow.rollout import ClosedLoop, Event, Trajectory
 from undertow.sliding import ReachingLaw, SlidingModeLaw, Surface
+from undertow.stability import check_surface, first_surface, placed_surface, surface_margins
 
 __all__ = [
+    "Budget",
+    "Cascade",
     "ClosedLoop",
     "Constraint",
     "Coordinate",
@@ -18,12 +23,19 @@ __all__ = [
     "MinimumEnergy",
     "MinimumTime",
     "Objective",
+    "Optimiser",
     "Parameter",
+    "Proposal",
     "ReachingLaw",
+    "Run",
     "SlidingModeLaw",
     "Surface",
     "Trajectory",
+    "check_surface",
     "deg",
+    "first_surface",
     "mechanisms",
+    "placed_surface",
     "state_box",
+    "surface_margins",
 ]

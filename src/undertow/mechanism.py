@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 import sympy as sp
@@ -24,6 +24,9 @@ from undertow.errors import InvalidInputError, ModelError
 __all__ = ["TIME", "Coordinate", "Input", "Mechanism", "Parameter", "Partition"]
 
 FloatArray = NDArray[np.float64]
+
+#: Stands for the identity of the right size until ``__post_init__`` knows m.
+_IDENTITY = cast(sp.ImmutableDenseMatrix, None)
 
 #: The symbol of time in disturbances, s.
 TIME = sp.Symbol("t", real=True)
@@ -218,7 +221,7 @@ class Mechanism:
     inputs: tuple[Input, ...]
     mass_matrix: sp.ImmutableDenseMatrix
     force: sp.ImmutableDenseMatrix
-    input_matrix: sp.ImmutableDenseMatrix | None = None
+    input_matrix: sp.ImmutableDenseMatrix = _IDENTITY
     parameters: tuple[Parameter, ...] = ()
     disturbance_bounds: tuple[float, ...] = ()
     potential: sp.Expr | None = None
@@ -311,7 +314,7 @@ class Mechanism:
                     limit="positive",
                     remedy="Check masses, lengths and inertias: a massless link has no M > 0",
                 )
-        gain = np.array(self.input_matrix.subs(self.substitution), dtype=float)
+        gain = numbers(self.input_matrix.subs(self.substitution))
         if not abs(np.linalg.det(gain)) > 0:
             raise ModelError(
                 f"input_matrix of '{self.name}'",
@@ -356,7 +359,7 @@ class Mechanism:
         qd = sp.Matrix([c.velocity for c in coordinates])
         kinetic = sp.sympify(kinetic)
         mass = sp.hessian(kinetic, list(qd)).applyfunc(_tidy)
-        at_rest = {v: 0 for v in qd}
+        at_rest = dict.fromkeys(qd, 0)
         if (
             mass.free_symbols & set(qd)
             or sp.simplify(sp.Matrix([kinetic]).jacobian(qd).subs(at_rest)) != sp.zeros(1, len(qd))
@@ -410,9 +413,7 @@ class Mechanism:
             raise InvalidInputError(
                 f"input limits of '{self.name}'", value=limits, limit=f"{self.m} numbers"
             )
-        inputs = tuple(
-            replace(i, limit=float(v)) for i, v in zip(self.inputs, limits, strict=True)
-        )
+        inputs = tuple(replace(i, limit=float(v)) for i, v in zip(self.inputs, limits, strict=True))
         return replace(self, inputs=inputs)
 
     def with_disturbance_bounds(self, *bounds: float) -> Self:
@@ -604,7 +605,7 @@ class Mechanism:
 
     def M(self, q: ArrayLike) -> FloatArray:
         """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like."""
-        q = np.asarray(q, dtype=float)
+        q = np.asarray(q, dtype=np.float64)
         x = np.concatenate([q, np.zeros_like(q)], axis=-1)
         values = self._evaluate("mass", 0.0, x)
         return values.reshape(*values.shape[:-1], self.n, self.n)
@@ -631,7 +632,7 @@ class Mechanism:
     def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
         """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
         state = self.check_state(x)
-        inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), qdd)
+        inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), np.asarray(qdd))
         return np.asarray(inertial - self.f(state, t))
 
     def energy(self, x: ArrayLike) -> FloatArray:
@@ -656,6 +657,11 @@ class Mechanism:
         )
         (value,) = potential(*np.moveaxis(q, -1, 0), *self.parameter_values)
         return np.asarray(kinetic + value)
+
+
+def numbers(matrix: Any) -> FloatArray:
+    """Return a SymPy matrix without symbols as a float array."""
+    return np.array(matrix, dtype=np.float64)
 
 
 def _tidy(expression: sp.Expr) -> sp.Expr:

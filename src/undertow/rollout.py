@@ -27,6 +27,7 @@ from undertow.sliding import (
     LawSymbols,
     ReachingLaw,
     Surface,
+    Switching,
     check_surface_shape,
     lay_law,
     singularity,
@@ -146,9 +147,7 @@ class Trajectory:
             costs.append(piece.cost[:end] + spent)
             spent += piece.total
         joined = {key: np.concatenate(parts) for key, parts in columns.items()}
-        return cls(
-            first.mechanism, **joined, cost=np.concatenate(costs), event=pieces[-1].event
-        )
+        return cls(first.mechanism, **joined, cost=np.concatenate(costs), event=pieces[-1].event)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,9 +333,7 @@ class ClosedLoop:
         count = max(states.shape[0], vectors.shape[0])
         states = np.broadcast_to(states, (count, states.shape[1]))
         vectors = np.broadcast_to(vectors, (count, *vectors.shape[1:]))
-        return self._run(
-            states, vectors, reaching, switch_times, duration, 0.0, None, 0, None
-        )[0]
+        return self._run(states, vectors, reaching, switch_times, duration, 0.0, None, 0, None)[0]
 
     def simulate(
         self,
@@ -395,9 +392,7 @@ class ClosedLoop:
         )
         return self._trajectory(batch, record[0], start, every)
 
-    def _trajectory(
-        self, batch: Batch, record: FloatArray, start: float, every: int
-    ) -> Trajectory:
+    def _trajectory(self, batch: Batch, record: FloatArray, start: float, every: int) -> Trajectory:
         n, m = self.mechanism.n, self.mechanism.m
         end = float(batch.time[0])
         times = np.arange(len(record)) * (every * self.step)
@@ -427,7 +422,7 @@ def _surface_vectors(surfaces: ArrayLike | Sequence[Surface]) -> FloatArray:
 
 
 def lay_loop(
-    belief: Mechanism, plant: Mechanism | None, objective: Objective, switching: str
+    belief: Mechanism, plant: Mechanism | None, objective: Objective, switching: Switching
 ) -> LoopProgram:
     """Compose law, plant and objective on one tape.
 
@@ -445,18 +440,13 @@ def lay_loop(
         )
         rename |= dict(zip(belief.parameter_symbols, belief_parameters, strict=True))
     symbols = LawSymbols.of(belief.n, belief.m)
-    law = lay_law(
-        belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds
-    )
+    law = lay_law(belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds)
     applied = tuple(sp.Symbol(f"applied_{i}", real=True) for i in range(truth.m))
     limits = tuple(sp.Symbol(f"limit_{i}", real=True) for i in range(truth.m))
     inputs = dict(zip(truth.u, applied, strict=True))
     qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
     stage, *path = tape.let_all(
-        [
-            e.xreplace(inputs)
-            for e in (objective.stage_cost(truth), *objective.path_margins(truth))
-        ]
+        [e.xreplace(inputs) for e in (objective.stage_cost(truth), *objective.path_margins(truth))]
     )
     input_margin = None
     if objective.hard_input:
@@ -486,7 +476,7 @@ def _compile(
     belief: Mechanism,
     plant: Mechanism | None,
     objective: Objective,
-    switching: str,
+    switching: Switching,
     sampled: bool,
 ) -> Any:
     program = lay_loop(belief, plant, objective, switching)

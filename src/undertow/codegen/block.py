@@ -65,7 +65,7 @@ class LoopProgram:
     input_margin: sp.Expr | None
 
 
-class _Printer(PythonCodePrinter):
+class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
     """Python code that numba turns into vector arithmetic."""
 
     def _print_Pow(self, expr: sp.Pow, **_: object) -> str:
@@ -103,7 +103,7 @@ class _Printer(PythonCodePrinter):
         return self._nest("min", expr.args)
 
     def _nest(self, name: str, args: Sequence[sp.Expr]) -> str:
-        text = self._print(args[0])
+        text = str(self._print(args[0]))
         for arg in args[1:]:
             text = f"{name}({text}, {self._print(arg)})"
         return text
@@ -250,9 +250,8 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
     state_needs = set(program.state)
     if sampled:
         sample = [*control([f"Y_{j}" for j in range(nx)], monitored), *store_u, *store_law]
-        sample = [f"Y_{j} = {X[j]}" + f" + noise[sample, b + i, {j}] * noisy" for j in range(nx)] + [
-            line for line in sample
-        ]
+        measured = [f"Y_{j} = {X[j]} + noise[sample, b + i, {j}] * noisy" for j in range(nx)]
+        sample = [*measured, *sample]
         body, needs = flow([*rates, *program.path], set())
         first = [*loads(needs | state_needs, X), *held, *body, *path_out, *first_out]
         body, needs = flow(rates, set())
@@ -281,7 +280,7 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
             f"{low} = min({low}, {now}) if active > 0.0 else {low}"
             for low, now in zip(MIN, margins, strict=True)
         ),
-        f"broken = active > 0.0 and not (worst >= 0.0)",
+        "broken = active > 0.0 and not (worst >= 0.0)",
         f"{TEND} = t if broken else {TEND}",
         f"{CODE} = (3.0 if not ({SINGULAR} >= 0.0) else 2.0) if broken else {CODE}",
         f"{ACT} = 0.0 if broken else active",
@@ -419,7 +418,7 @@ def _hoist(program: LoopProgram) -> _Hoisted:
     """Classify tape lines by what they depend on and keep those that later lines use."""
     constants = {*program.plant_parameters, *program.belief_parameters, *program.limits}
     per_lane = {*program.lane_inputs}
-    level: dict[sp.Symbol, int] = {s: 0 for s in constants} | {s: 1 for s in per_lane}
+    level: dict[sp.Symbol, int] = dict.fromkeys(constants, 0) | dict.fromkeys(per_lane, 1)
     outputs = [
         *program.demand,
         *program.s,
@@ -445,8 +444,6 @@ def _hoist(program: LoopProgram) -> _Hoisted:
         if level[line.symbol] == 1:
             used_by_lane |= line.expression.free_symbols
     call = [
-        a.symbol
-        for a in live
-        if level[a.symbol] == 0 and a.symbol in used_by_state | used_by_lane
+        a.symbol for a in live if level[a.symbol] == 0 and a.symbol in used_by_state | used_by_lane
     ]
     return _Hoisted(call, lane)

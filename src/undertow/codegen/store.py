@@ -46,7 +46,8 @@ def load_module(name: str, source: str) -> ModuleType:
             file.write(source)
         os.replace(temporary, path)
     spec = importlib.util.spec_from_file_location(module_name, path)
-    assert spec is not None and spec.loader is not None  # a plain .py file always has both
+    assert spec is not None  # a plain .py file always has a spec and a loader
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module
     spec.loader.exec_module(module)

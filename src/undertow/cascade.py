@@ -1,0 +1,360 @@
+"""The two-rate cascade: sliding-mode law inside, surface optimiser outside, a gate between.
+
+The cascade is a pure state machine: it holds no clock and no thread, and every decision is
+a function of its arguments, so a recorded run can be replayed.  The runtime, or
+:meth:`Cascade.simulate`, supplies the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.errors import InvalidInputError
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.objective import MinimumEnergy, Objective
+from undertow.optimiser import INADMISSIBLE, Budget, Optimiser, Proposal
+from undertow.rollout import ClosedLoop, Event, Trajectory
+from undertow.sliding import Control, ReachingLaw, SlidingModeLaw, Surface
+from undertow.stability import check_surface, stability_margin
+
+__all__ = ["Admission", "Cascade", "CascadeState", "Gate", "Run", "Update", "cost_gate"]
+
+
+@dataclass(frozen=True)
+class Admission:
+    """The gate's decision on a proposal: accepted or not, and why.
+
+    ``cost`` is the predicted cost of the surface that stays in use, new or old.
+    """
+
+    accepted: bool
+    reason: str
+    cost: float
+
+
+Gate = Callable[[ClosedLoop, Surface, Surface, FloatArray, float], Admission]
+
+
+def cost_gate(
+    loop: ClosedLoop, old: Surface, new: Surface, x: FloatArray, horizon: float
+) -> Admission:
+    """Admit a surface that is stable, feasible from x, and does not raise the cost.
+
+    Both surfaces are rolled out afresh from the present state: nothing that the optimiser
+    says of them is believed.  This is the step of Lemma 3, J̃_{k+1} ≤ Ĵ_{k+1}.
+
+    Parameters
+    ----------
+    loop
+        The predicted closed loop.
+    old, new
+        The surface in use and the proposed one.
+    x
+        Present state, (2n,).
+    horizon
+        Longest prediction, s.
+    """
+    pair = loop.batch(x, [old, new], duration=horizon)
+    old_cost, new_cost = pair.score(horizon)
+    old_cost = float(old_cost) if old_cost < INADMISSIBLE else math.inf
+    stability = float(stability_margin(loop.mechanism, new))
+    if not stability > 0:
+        return Admission(False, f"unstable: margin {stability:.3g} 1/s", old_cost)
+    if new_cost >= INADMISSIBLE:
+        event = Event(int(pair.event[1])).name.lower()
+        return Admission(
+            False, f"not feasible from here: {event} at {pair.time[1]:.3g} s", old_cost
+        )
+    if new_cost > old_cost:
+        return Admission(
+            False, f"raises the predicted cost: {new_cost:.6g} > {old_cost:.6g}", old_cost
+        )
+    return Admission(True, "stable, feasible, cost not raised", float(new_cost))
+
+
+@dataclass(frozen=True)
+class CascadeState:
+    """What the cascade remembers between steps.
+
+    ``surface`` is in use; ``sequence`` is the number of the last proposal considered;
+    ``predicted`` is the predicted cost J̃_k at the last decision.
+    """
+
+    surface: Surface
+    sequence: int = 0
+    predicted: float = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """One decision of the outer loop, as recorded.
+
+    ``t`` and ``x`` are when and where; ``surface`` the one in use afterwards; ``predicted``
+    its J̃_k; ``spent`` the cost spent since the decision before.
+    """
+
+    t: float
+    x: FloatArray
+    proposal: Proposal
+    admission: Admission
+    surface: Surface
+    predicted: float
+    spent: float
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A simulated run of the cascade.
+
+    Attributes
+    ----------
+    trajectory
+        The motion of the plant.
+    updates
+        The decisions of the outer loop, in order.
+    """
+
+    trajectory: Trajectory
+    updates: tuple[Update, ...]
+
+    @property
+    def cost(self) -> float:
+        """Total cost of the motion."""
+        return self.trajectory.total
+
+    @property
+    def time(self) -> float:
+        """Time at which the terminal set was reached, or the run ended, s."""
+        return self.trajectory.duration
+
+    @property
+    def reached(self) -> bool:
+        """Whether the terminal set was reached."""
+        return self.trajectory.event == Event.REACHED
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The surface in use after each decision."""
+        return tuple(update.surface for update in self.updates)
+
+    @property
+    def descent(self) -> FloatArray:
+        """Slack of Lemma 3 at each decision, J̃_k − spent − J̃_{k+1}, in units of cost.
+
+        Never negative, to integration tolerance, where belief and truth agree; for
+        minimum time it is t_{f,k} − Δt − t_{f,k+1}.
+        """
+        return np.array(
+            [
+                before.predicted - after.spent - after.predicted
+                for before, after in zip(self.updates, self.updates[1:], strict=False)
+            ]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Cascade:
+    """The controller a user runs: law, optimiser and gate.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's belief.
+    objective
+        What is best.
+    reaching
+        Reaching law of the inner loop.
+    period
+        Δt between re-optimisations, s.
+    first
+        First surface, checked; designed by itself by default.
+    step, hold
+        Runge-Kutta step of the predictions, s, and steps per sample of the inner loop
+        (0: continuous), as for :class:`undertow.ClosedLoop`.
+    cold, warm
+        Budgets of the first optimisation and of the later ones.
+    gate
+        Admission gate.
+    seed
+        Seed of the optimiser.
+
+    Raises
+    ------
+    InvalidInputError
+        For a period that is not a whole number of steps.
+    UnstableSurfaceError, SingularSurfaceError
+        For a first surface that cannot be used.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    >>> run = ut.Cascade(rig, ut.MinimumTime()).simulate(phi=ut.deg(20))
+    >>> run.reached
+    True
+    """
+
+    mechanism: Mechanism
+    objective: Objective = MinimumEnergy()
+    reaching: ReachingLaw = ReachingLaw()
+    period: float = 0.1
+    first: Surface | None = None
+    step: float = 0.002
+    hold: int = 0
+    cold: Budget = Budget(3072)
+    warm: Budget = Budget(256)
+    gate: Gate = cost_gate
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the period and the first surface before any work starts."""
+        stride = self.step * max(1, self.hold)
+        count = self.period / stride
+        if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
+            raise InvalidInputError(
+                "period of the cascade",
+                value=f"{self.period:g} s",
+                limit=f"a whole multiple of the inner step, {stride:g} s",
+                remedy="Change the period, or the step",
+            )
+        if self.first is not None:
+            check_surface(self.mechanism, self.first)
+
+    @cached_property
+    def loop(self) -> ClosedLoop:
+        """The predicted closed loop: belief as plant."""
+        return ClosedLoop(
+            self.mechanism, self.objective, self.reaching, step=self.step, hold=self.hold
+        )
+
+    @cached_property
+    def optimiser(self) -> Optimiser:
+        """The optimiser of the outer loop."""
+        return Optimiser(self.loop, self.first, self.cold, self.warm, seed=self.seed)
+
+    # -- the state machine ----------------------------------------------------------------
+
+    def start(self, x: ArrayLike) -> tuple[CascadeState, Proposal]:
+        """Run the first, global optimisation.
+
+        Raises
+        ------
+        InfeasibleError
+            When no admissible surface was found.
+        """
+        proposal = self.optimiser.require(x)
+        assert proposal.surface is not None  # require() raises otherwise
+        return CascadeState(proposal.surface, 0, proposal.cost), proposal
+
+    def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
+        """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits."""
+        return SlidingModeLaw(self.mechanism, state.surface, self.reaching)(t, x)
+
+    def propose(
+        self, state: CascadeState, x: ArrayLike, t: float = 0.0, horizon: float | None = None
+    ) -> Proposal:
+        """Slow step: re-optimise from x, warm-started; an exception becomes a status."""
+        sequence = state.sequence + 1
+        try:
+            return self.optimiser.propose(
+                x,
+                incumbent=state.surface,
+                horizon=horizon,
+                sequence=sequence,
+                computed_for=t,
+            )
+        except Exception as error:  # the inner loop must survive whatever the outer loop does
+            message = f"{type(error).__name__}: {error}"
+            return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, message)
+
+    def consider(
+        self,
+        state: CascadeState,
+        proposal: Proposal,
+        x: ArrayLike,
+        horizon: float | None = None,
+    ) -> tuple[CascadeState, Admission]:
+        """Pass a proposal through the gate; the last good surface stays unless it is admitted.
+
+        Proposals that are not newer than the last one considered are refused.
+        """
+        span = self.objective.horizon if horizon is None else horizon
+        current = self.mechanism.check_state(x)
+        if proposal.sequence <= state.sequence:
+            stale = f"stale: number {proposal.sequence} after {state.sequence}"
+            return state, Admission(False, stale, state.predicted)
+        state = replace(state, sequence=proposal.sequence)
+        if proposal.surface is None:
+            kept = self.loop.batch(current, [state.surface], duration=span)
+            score = float(kept.score(span)[0])
+            cost = score if score < INADMISSIBLE else math.inf
+            reason = f"{proposal.status}: {proposal.message or 'no surface'}"
+            return replace(state, predicted=cost), Admission(False, reason, cost)
+        admission = self.gate(self.loop, state.surface, proposal.surface, current, span)
+        surface = proposal.surface if admission.accepted else state.surface
+        return replace(state, surface=surface, predicted=admission.cost), admission
+
+    # -- simulation -----------------------------------------------------------------------
+
+    def simulate(
+        self,
+        x0: ArrayLike | None = None,
+        *,
+        plant: Mechanism | None = None,
+        duration: float | None = None,
+        progress: Callable[[float, float], None] | None = None,
+        **state: float,
+    ) -> Run:
+        """Simulate the cascade until the terminal set is reached.
+
+        Parameters
+        ----------
+        x0
+            Initial state, (2n,); or give its non-zero entries by name (``phi=0.7``).
+        plant
+            The truth; the belief by default.
+        duration
+            Longest run, s; the objective's horizon by default.  Predictions end there too.
+        progress
+            Called with (time, duration) after each period.
+
+        Raises
+        ------
+        InfeasibleError
+            When the first optimisation finds no admissible surface.
+        InvalidInputError
+            For an unknown state name or a state that is not finite.
+        """
+        x = self.mechanism.state(**state) if x0 is None else self.mechanism.check_state(x0)
+        total = self.objective.horizon if duration is None else duration
+        truth = replace(self.loop, plant=plant)
+        memory, proposal = self.start(x)
+        admission = Admission(True, "first optimum", memory.predicted)
+        updates = [Update(0.0, x, proposal, admission, memory.surface, memory.predicted, 0.0)]
+        pieces: list[Trajectory] = []
+        for k in range(math.ceil(total / self.period - 1e-9)):
+            t = k * self.period
+            if k > 0:
+                proposal = self.propose(memory, x, t, total - t)
+                memory, admission = self.consider(memory, proposal, x, total - t)
+                updates.append(
+                    Update(
+                        t, x, proposal, admission, memory.surface, memory.predicted,
+                        pieces[-1].total,
+                    )
+                )  # fmt: skip
+            pieces.append(
+                truth.simulate(x, memory.surface, duration=min(self.period, total - t), start=t)
+            )
+            x = pieces[-1].x[-1]
+            if progress is not None:
+                progress(t + self.period, total)
+            if pieces[-1].event != Event.HORIZON:
+                break
+        return Run(Trajectory.join(pieces), tuple(updates))
