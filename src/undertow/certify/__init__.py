@@ -1,0 +1,28 @@
+"""Certificates: claims about a surface with a verdict, a margin and a witness.
+
+Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when first used.
+"""
+
+from undertow.certify.reaching import DisturbanceBound, ReachingCertificate, reaching
+from undertow.certify.surface import (
+    CriticalMode,
+    closed_forms,
+    critical_mode,
+    hurwitz,
+    nonsingular,
+    singular_distance,
+)
+from undertow.certify.verdict import Verdict
+
+__all__ = [
+    "CriticalMode",
+    "DisturbanceBound",
+    "ReachingCertificate",
+    "Verdict",
+    "closed_forms",
+    "critical_mode",
+    "hurwitz",
+    "nonsingular",
+    "reaching",
+    "singular_distance",
+]
