@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,7 +32,8 @@ def compile_numpy(
     source = "\n".join(
         [f"def run({', '.join(str(names[s]) for s in inputs)}):", *body, f"    return [{results}]"]
     )
-    scope: dict[str, Any] = {"numpy": np}
+    # SymPy prints Max and Min as functools.reduce over NumPy's ufuncs.
+    scope: dict[str, Any] = {"numpy": np, "functools": functools}
     exec(compile(source, "<undertow tape>", "exec"), scope)
     function: VectorFunction = scope["run"]
     return function
