@@ -38,6 +38,9 @@ class Admission:
     cost: float
 
 
+#: Relative tolerance of the linear tail in the optimiser's rollouts.
+TAIL = 5e-3
+
 Gate = Callable[[ClosedLoop, Surface, Surface, FloatArray, float], Admission]
 
 
@@ -83,12 +86,13 @@ class CascadeState:
     """What the cascade remembers between steps.
 
     ``surface`` is in use; ``sequence`` is the number of the last proposal considered;
-    ``predicted`` is the predicted cost J̃_k at the last decision.
+    ``predicted`` is the predicted cost J̃_k at the last decision; ``scale`` that of the first.
     """
 
     surface: Surface
     sequence: int = 0
     predicted: float = math.inf
+    scale: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +183,9 @@ class Cascade:
         (0: continuous), as for :class:`undertow.ClosedLoop`.
     cold, warm
         Budgets of the first optimisation and of the later ones.
+    resolution
+        Differences in predicted cost below this part of the first one are not worth a
+        search.
     gate
         Admission gate.
     seed
@@ -208,7 +215,8 @@ class Cascade:
     step: float = 0.002
     hold: int = 0
     cold: Budget = Budget(3072)
-    warm: Budget = Budget(256)
+    warm: Budget = Budget(1024)
+    resolution: float = 1e-4
     gate: Gate = cost_gate
     seed: int = 0
 
@@ -228,15 +236,16 @@ class Cascade:
 
     @cached_property
     def loop(self) -> ClosedLoop:
-        """The predicted closed loop: belief as plant."""
+        """The predicted closed loop, belief as plant, integrated to its end: the gate's."""
         return ClosedLoop(
             self.mechanism, self.objective, self.reaching, step=self.step, hold=self.hold
         )
 
     @cached_property
     def optimiser(self) -> Optimiser:
-        """The optimiser of the outer loop."""
-        return Optimiser(self.loop, self.first, self.cold, self.warm, seed=self.seed)
+        """The optimiser of the outer loop; its rollouts end in the exact linear tail."""
+        loop = replace(self.loop, tail=TAIL)
+        return Optimiser(loop, self.first, self.cold, self.warm, seed=self.seed)
 
     # -- the state machine ----------------------------------------------------------------
 
@@ -250,7 +259,16 @@ class Cascade:
         """
         proposal = self.optimiser.require(x)
         assert proposal.surface is not None  # require() raises otherwise
-        return CascadeState(proposal.surface, 0, proposal.cost), proposal
+        cost = self._exact_cost(proposal.surface, x, self.objective.horizon)
+        if not math.isfinite(cost):  # the linear end was too hopeful: integrate throughout
+            proposal = replace(self.optimiser, loop=self.loop).require(x)
+            assert proposal.surface is not None
+            cost = self._exact_cost(proposal.surface, x, self.objective.horizon)
+        return CascadeState(proposal.surface, 0, cost, cost), proposal
+
+    def _exact_cost(self, surface: Surface, x: ArrayLike, horizon: float) -> float:
+        score = float(self.loop.batch(x, [surface], duration=horizon).score(horizon)[0])
+        return score if score < INADMISSIBLE else math.inf
 
     def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
         """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits."""
@@ -268,6 +286,7 @@ class Cascade:
                 horizon=horizon,
                 sequence=sequence,
                 computed_for=t,
+                resolution=self.resolution * state.scale,
             )
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             message = f"{type(error).__name__}: {error}"
@@ -291,9 +310,7 @@ class Cascade:
             return state, Admission(False, stale, state.predicted)
         state = replace(state, sequence=proposal.sequence)
         if proposal.surface is None:
-            kept = self.loop.batch(current, [state.surface], duration=span)
-            score = float(kept.score(span)[0])
-            cost = score if score < INADMISSIBLE else math.inf
+            cost = self._exact_cost(state.surface, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}"
             return replace(state, predicted=cost), Admission(False, reason, cost)
         admission = self.gate(self.loop, state.surface, proposal.surface, current, span)

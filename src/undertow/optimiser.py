@@ -30,6 +30,9 @@ Status = Literal["converged", "budget spent", "infeasible", "failed"]
 #: Costs from here on mark inadmissible motions (see ``Batch.score``).
 INADMISSIBLE = 1e8
 
+#: Rollouts are given up when their cost exceeds the best one so far by this factor.
+HOPELESS = 3.0
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -119,7 +122,7 @@ class Optimiser:
     loop: ClosedLoop
     first: Surface | None = None
     cold: Budget = field(default_factory=lambda: Budget(3072))
-    warm: Budget = field(default_factory=lambda: Budget(256))
+    warm: Budget = field(default_factory=lambda: Budget(1024))
     population: int = 32
     seed: int = 0
 
@@ -130,6 +133,11 @@ class Optimiser:
         self._anchor = self.first.normalised().vector[self._fixed :]
         scale = np.abs(self._anchor)
         self._width = 0.1 * np.maximum(scale, 0.05 * scale.max())
+
+    @property
+    def _promptness(self) -> float:
+        """Part of the horizon to plan for: the linear end may be late by its tolerance."""
+        return 1.0 - min(0.5 * self.loop.tail, 0.1)
 
     @property
     def _fixed(self) -> int:
@@ -153,6 +161,7 @@ class Optimiser:
         horizon: float | None = None,
         sequence: int = 0,
         computed_for: float = 0.0,
+        resolution: float = 0.0,
         budget: Budget | None = None,
     ) -> Proposal:
         """Optimise the surface from the state x.
@@ -168,6 +177,8 @@ class Optimiser:
             Longest prediction, s; the objective's by default.
         sequence, computed_for
             Number and time stamp of the proposal.
+        resolution
+            Differences in cost below this are not worth a search.
         budget
             Overrides ``warm`` or ``cold``.
 
@@ -183,8 +194,9 @@ class Optimiser:
         task = _Task(
             self,
             state,
-            self.loop.objective.horizon if horizon is None else horizon,
+            (self.loop.objective.horizon if horizon is None else horizon) * self._promptness,
             budget,
+            resolution,
             began,
             np.random.default_rng([self.seed, sequence]),
         )
@@ -222,11 +234,12 @@ class _Task:
         x: FloatArray,
         horizon: float,
         budget: Budget,
+        resolution: float,
         began: float,
         rng: np.random.Generator,
     ) -> None:
         self.owner, self.x, self.horizon = owner, x, horizon
-        self.budget, self.began, self.rng = budget, began, rng
+        self.budget, self.resolution, self.began, self.rng = budget, resolution, began, rng
         self.evaluations = 0
         self.best_cost, self.best_vector = math.inf, None
         self.incumbent_cost = math.inf
@@ -242,7 +255,12 @@ class _Task:
         stable = margins > 0
         self.evaluations += len(vectors)
         if stable.any():
-            batch = self.owner.loop.batch(self.x, vectors[stable], duration=self.horizon)
+            cap = math.inf
+            if self.best_cost < INADMISSIBLE:
+                cap = HOPELESS * self.best_cost + self.resolution
+            batch = self.owner.loop.batch(
+                self.x, vectors[stable], duration=self.horizon, cap=cap, slack=self.resolution
+            )
             scores[stable] = batch.score(self.horizon)
         best = int(np.argmin(scores))
         if scores[best] < self.best_cost:
@@ -258,8 +276,15 @@ class _Task:
 
     def _descend(self, z: FloatArray, sigma: float, evaluations: int, tolerance: float) -> bool:
         search = CMAES(z, sigma, self.owner.population, self.rng)
-        minimise(search, self.cost, evaluations=evaluations, tolerance=tolerance, stop=self.late)
-        return search.spread <= tolerance
+        minimise(
+            search,
+            self.cost,
+            evaluations=evaluations,
+            tolerance=tolerance,
+            resolution=self.resolution,
+            stop=self.late,
+        )
+        return search.converged
 
     def global_search(self) -> bool:
         """Sample widely, then descend from the three best; refine the winner."""
@@ -367,6 +392,7 @@ def motion_margins(
     ending = {
         Event.REACHED: f"reaches the terminal set at {batch.time[0]:.3g} s",
         Event.HORIZON: f"is still at ‖x‖ = {batch.radius[0]:.3g} after {batch.time[0]:.3g} s",
+        Event.COSTLY: "costs too much",
         Event.DIVERGED: f"diverges at {batch.time[0]:.3g} s",
         Event.SINGULAR: f"meets the singularity (37) at {batch.time[0]:.3g} s",
         Event.CONSTRAINT: f"breaks '{worst.name}' by {-worst.value:.3g} {worst.unit} "

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,11 +29,17 @@ from undertow.sliding import (
     Surface,
     Switching,
     check_surface_shape,
+    coupling,
+    gains_at_target,
+    gamma_determinant,
     lay_law,
-    singularity,
 )
+from undertow.tail import LinearEnd, Prepared, quadratic_stage
 
 __all__ = ["Batch", "ClosedLoop", "Event", "Trajectory"]
+
+#: Stands in for noise and tails that are not there.
+_NOTHING = np.zeros((1, 1, 1))
 
 
 class Event(IntEnum):
@@ -44,6 +50,7 @@ class Event(IntEnum):
     CONSTRAINT = 2
     SINGULAR = 3
     DIVERGED = 4
+    COSTLY = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +178,11 @@ class ClosedLoop:
         0: continuous law, evaluated in every Runge-Kutta stage.
     escape
         ‖x‖₂ beyond which a motion counts as diverged.
+    tail
+        Relative tolerance δ at which a batch hands over to the exact linear end, see
+        :mod:`undertow.tail`; 0 integrates to the end.  Used by :meth:`batch` where belief
+        and truth agree, the loop is continuous, there are no path constraints and the
+        stage cost has a second-order model; otherwise everything is integrated.
 
     Examples
     --------
@@ -189,6 +201,7 @@ class ClosedLoop:
     step: float = 0.002
     hold: int = 0
     escape: float = 200.0
+    tail: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
@@ -221,62 +234,107 @@ class ClosedLoop:
         """The plant that moves."""
         return self.mechanism if self.plant is None else self.plant
 
+    @cached_property
     def _kernel(self) -> Any:
         return _compile(
             self.mechanism, self.plant, self.objective, self.reaching.switching, self.hold > 0
         )
 
+    @cached_property
+    def _numbers(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Plant parameters, belief parameters, input limits, X at the target."""
+        belief, truth = self.mechanism, self.truth
+        at_target = coupling(belief, np.zeros(belief.n))
+        return truth.parameter_values, belief.parameter_values, truth.input_limits, at_target
+
+    @cached_property
+    def _linear_end(self) -> LinearEnd | None:
+        """The exact end of the horizon, where this loop allows one."""
+        smooth = self.hold == 0 and self.reaching.switching != "sign"
+        if not (self.tail and smooth) or self.plant is not None or self.objective.constraints:
+            return None
+        stage = quadratic_stage(self.mechanism, self.objective)
+        return None if stage is None else LinearEnd(self.mechanism, self.objective, stage)
+
+    def _prepare(self, lanes: FloatArray) -> Prepared | None:
+        """Linearise the last surface of every lane, (N, 2mn + 2m + 1)."""
+        if self._linear_end is None:
+            return None
+        m = self.mechanism.m
+        surfaces, eta, layer = (
+            lanes[:, : -2 * m - 1],
+            lanes[:, -2 * m - 1 : -m - 1],
+            lanes[:, -m - 1 : -1],
+        )
+        gains = eta
+        if any(self.mechanism.disturbance_bounds):
+            gains = gains_at_target(self.mechanism, surfaces, eta)
+        return self._linear_end.prepare(surfaces, gains, layer)
+
     def _run(
         self,
         x0: FloatArray,
         surfaces: FloatArray,
-        reaching: FloatArray | None,
-        switch_times: Sequence[float],
-        duration: float | None,
-        start: float,
-        terminal: float | None,
-        every: int,
-        noise: FloatArray | None,
+        *,
+        reaching: FloatArray | None = None,
+        switch_times: Sequence[float] = (0.0,),
+        duration: float | None = None,
+        start: float = 0.0,
+        terminal: float | None = None,
+        cap: float = math.inf,
+        slack: float = 0.0,
+        every: int = 0,
+        noise: FloatArray | None = None,
     ) -> tuple[Batch, FloatArray]:
-        belief, m = self.mechanism, self.mechanism.m
-        count, segments = surfaces.shape[:2]
+        """Call the kernel on states (N, 2n) and surfaces (N, S, 2mn)."""
+        n, m = self.mechanism.n, self.mechanism.m
+        plant, belief, limits, at_target = self._numbers
+        count, segments, width = surfaces.shape
         padded = -(-count // LANES) * LANES
-        if reaching is None:
-            reaching = self.reaching.vector(m)
-        gamma = singularity(belief, surfaces, np.zeros(belief.n))
-        lanes = np.empty((padded, segments, surfaces.shape[2] + 2 * m + 1))
-        lanes[:count, :, : surfaces.shape[2]] = surfaces
-        lanes[:count, :, surfaces.shape[2] : -1] = reaching
-        lanes[:count, :, -1] = gamma
+        lanes = np.empty((padded, segments, width + 2 * m + 1))
+        lanes[:count, :, :width] = surfaces
+        lanes[:count, :, width:-1] = self.reaching.vector(m) if reaching is None else reaching
+        lanes[:count, :, -1] = gamma_determinant(at_target, surfaces)
         lanes[count:] = lanes[count - 1]
-        start_states = np.empty((padded, x0.shape[-1]))
-        start_states[:count] = x0
-        start_states[count:] = start_states[count - 1]
+        states = np.empty((padded, 2 * n))
+        states[:count] = x0
+        states[count:] = states[count - 1]
         steps = round((self.objective.horizon if duration is None else duration) / self.step)
-        records = -(-steps // every) if every else 0
-        record = np.zeros((padded if every else 0, records, 2 * belief.n + 2 * m + 2))
+        record = np.zeros((padded, -(-steps // every), 2 * n + 2 * m + 2) if every else (0, 0, 0))
         w = len(self.objective.constraints)
-        out = np.empty((padded, 6 + w + 2 * belief.n))
-        quiet = noise is None
-        self._kernel()(
-            start_states,
+        out = np.empty((padded, 6 + w + 2 * n))
+        # A sampled kernel reads the noise of every lane, even where it is multiplied by 0.
+        quiet = np.zeros((1, padded, 2 * n)) if self.hold else _NOTHING
+        prepared = None if every else self._prepare(lanes[:, -1])
+        end = self._linear_end
+        self._kernel(
+            states,
             lanes,
             np.array([round(t / self.step) for t in switch_times], dtype=np.int64),
-            self.truth.parameter_values,
-            belief.parameter_values,
-            self.truth.input_limits,
-            np.zeros((1, padded, 2 * belief.n)) if noise is None else noise,
-            0.0 if quiet else 1.0,
+            plant,
+            belief,
+            limits,
+            quiet if noise is None else noise,
+            0.0 if noise is None else 1.0,
             start,
             self.step,
             steps,
             max(1, self.hold),
             self.objective.terminal_radius if terminal is None else terminal,
             self.escape,
+            cap,
+            0.0 if prepared is None else self.tail,
+            1.0 if end is not None and end.counts_cost else 0.0,
+            slack,
+            _NOTHING if prepared is None else prepared.A,
+            _NOTHING if prepared is None else prepared.P,
+            _NOTHING[0, 0] if prepared is None else prepared.rate,
             every,
             record,
             out,
-        )
+        )  # fmt: skip
+        if end is not None and prepared is not None:
+            end.complete(prepared, out, start + steps * self.step)
         out = out[:count]
         batch = Batch(
             cost=out[:, 0],
@@ -298,6 +356,8 @@ class ClosedLoop:
         reaching: FloatArray | None = None,
         switch_times: Sequence[float] = (0.0,),
         duration: float | None = None,
+        cap: float = math.inf,
+        slack: float = 0.0,
     ) -> Batch:
         """Roll out a batch: many surfaces, many initial states, or both.
 
@@ -314,6 +374,10 @@ class ClosedLoop:
             S times, s, the first 0.
         duration
             Length, s; the objective's horizon by default.
+        cap
+            Cost beyond which a rollout is given up (``COSTLY``).
+        slack
+            Absolute error in cost that the linear end may make besides its relative one.
         """
         vectors = _surface_vectors(surfaces)
         if vectors.ndim == 1:
@@ -333,7 +397,15 @@ class ClosedLoop:
         count = max(states.shape[0], vectors.shape[0])
         states = np.broadcast_to(states, (count, states.shape[1]))
         vectors = np.broadcast_to(vectors, (count, *vectors.shape[1:]))
-        return self._run(states, vectors, reaching, switch_times, duration, 0.0, None, 0, None)[0]
+        return self._run(
+            states,
+            vectors,
+            reaching=reaching,
+            switch_times=switch_times,
+            duration=duration,
+            cap=cap,
+            slack=slack,
+        )[0]
 
     def simulate(
         self,
@@ -388,7 +460,14 @@ class ClosedLoop:
         x0 = self.mechanism.check_state(x0)
         vectors = np.stack([s.vector for s in sequence])[None]
         batch, record = self._run(
-            x0[None], vectors, None, switch_times, duration, start, terminal, every, noise
+            x0[None],
+            vectors,
+            switch_times=switch_times,
+            duration=duration,
+            start=start,
+            terminal=terminal,
+            every=every,
+            noise=noise,
         )
         return self._trajectory(batch, record[0], start, every)
 

@@ -64,6 +64,7 @@ class CMAES:
         self.best_x = self.mean.copy()
         self.best_f = math.inf
         self.generation = 0
+        self.converged = False
 
         mu = population // 2
         raw = math.log((population + 1) / 2) - np.log(np.arange(1, mu + 1))  # (49)
@@ -137,6 +138,8 @@ def minimise(
     *,
     evaluations: int,
     tolerance: float = 1e-4,
+    resolution: float = 0.0,
+    patience: int = 4,
     stop: Callable[[], bool] = lambda: False,
 ) -> int:
     """Run a search until its budget is spent, it has converged, or ``stop()`` says so.
@@ -149,6 +152,10 @@ def minimise(
         Budget; the last generation that fits is the last.
     tolerance
         Converged when the spread of the distribution falls below it.
+    resolution
+        Converged when ``patience`` generations together improve the cost by less; 0: never.
+    patience
+        Generations.
 
     Returns
     -------
@@ -156,8 +163,14 @@ def minimise(
         Evaluations spent.
     """
     spent = 0
-    while spent + search.population <= evaluations and search.spread > tolerance and not stop():
+    bests = [search.best_f]
+    while spent + search.population <= evaluations and not stop():
         x = search.ask()
         search.tell(x, cost(x))
         spent += search.population
+        bests.append(search.best_f)
+        stagnant = len(bests) > patience and not bests[-1 - patience] - bests[-1] > resolution
+        search.converged = search.spread <= tolerance or (resolution > 0 and stagnant)
+        if search.converged:
+            break
     return spent

@@ -441,16 +441,22 @@ class _LawFunction:
         self.run = compile_numpy(tape, inputs, [*law.u, *law.s, *law.gains, law.margin])
 
     def __call__(
-        self, x: FloatArray, surface: FloatArray, reaching: FloatArray, gamma_target: float
+        self,
+        x: FloatArray,
+        surface: FloatArray,
+        reaching: FloatArray,
+        gamma_target: float | FloatArray,
     ) -> Control:
         m = self.mechanism.m
-        values = self.run(
-            *np.moveaxis(x, -1, 0),
-            *surface,
-            *reaching,
-            gamma_target,
-            *self.mechanism.parameter_values,
-        )
+        # At absurd states powers overflow; the lines below turn what comes out into limits.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            values = self.run(
+                *np.moveaxis(x, -1, 0),
+                *surface,
+                *reaching,
+                gamma_target,
+                *self.mechanism.parameter_values,
+            )
         shape = x.shape[:-1]
         stacked = np.stack([np.broadcast_to(v, shape) for v in values], axis=-1)
         limit = self.mechanism.input_limits
@@ -484,7 +490,24 @@ def check_surface_shape(mechanism: Mechanism, surface: Surface) -> None:
         )
 
 
-def singularity(mechanism: Mechanism, surfaces: FloatArray, q: FloatArray) -> FloatArray:
+def coupling(mechanism: Mechanism, q: ArrayLike) -> FloatArray:
+    """Return X = M_uu⁻¹ M_auᵀ at positions q, (…, n) to (…, n−m, m)."""
+    m = mechanism.m
+    M = mechanism.M(q)
+    return np.asarray(np.linalg.solve(M[..., m:, m:], M[..., m:, :m]), dtype=np.float64)
+
+
+def gamma_determinant(X: FloatArray, surfaces: FloatArray) -> FloatArray:
+    """Return det(α_a − α_u X) for surface vectors, (…, 2mn); leading shapes broadcast."""
+    free, m = X.shape[-2:]
+    lead = surfaces.shape[:-1]
+    alpha_a = surfaces[..., : m * m].reshape(*lead, m, m)
+    alpha_u = surfaces[..., 2 * m * m : 2 * m * m + m * free].reshape(*lead, m, free)
+    gamma = alpha_a - alpha_u @ X
+    return np.asarray(gamma[..., 0, 0] if m == 1 else np.linalg.det(gamma))
+
+
+def singularity(mechanism: Mechanism, surfaces: FloatArray, q: ArrayLike) -> FloatArray:
     """Return det(α_a − α_u M_uu⁻¹ M_auᵀ) at positions q, broadcast over surface vectors.
 
     Parameters
@@ -494,12 +517,7 @@ def singularity(mechanism: Mechanism, surfaces: FloatArray, q: FloatArray) -> Fl
     q
         Positions, (…, n); leading shapes broadcast.
     """
-    m, n = mechanism.m, mechanism.n
-    M = mechanism.M(q)
-    X = np.linalg.solve(M[..., m:, m:], M[..., m:, :m])
-    alpha_a = surfaces[..., : m * m].reshape(*surfaces.shape[:-1], m, m)
-    alpha_u = surfaces[..., 2 * m * m : m * m + m * n].reshape(*surfaces.shape[:-1], m, n - m)
-    return np.asarray(np.linalg.det(alpha_a - alpha_u @ X))
+    return gamma_determinant(coupling(mechanism, q), surfaces)
 
 
 def reaching_time_bound(s0: ArrayLike, eta: ArrayLike) -> float:
@@ -508,6 +526,15 @@ def reaching_time_bound(s0: ArrayLike, eta: ArrayLike) -> float:
     Valid for ``switching="sign"``, unsaturated inputs and a non-singular path.
     """
     return float(np.linalg.norm(np.atleast_1d(s0)) / np.min(np.asarray(eta, dtype=float)))
+
+
+def gains_at_target(mechanism: Mechanism, surfaces: FloatArray, eta: FloatArray) -> FloatArray:
+    """Return the gains (13) at the target for surface vectors (N, 2mn) and η (N, m)."""
+    function = _law_function(mechanism, "saturation")
+    m = mechanism.m
+    reaching = np.concatenate([eta, np.ones_like(eta)], axis=-1)
+    origin = np.zeros((len(surfaces), 2 * mechanism.n))
+    return function(origin, surfaces.T, reaching.T, np.ones(len(surfaces))).gains.reshape(-1, m)
 
 
 def constant_gains(

@@ -190,6 +190,10 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
     SINGULAR, INPUT = rows.take(2)
     PATH = rows.take(nw)
     MIN = rows.take(2 + nw)
+    n = nx // 2
+    LINEAR = [rows.take(nx) for _ in range(n)]
+    VALUE = [rows.take(nx) for _ in range(nx)]
+    RATE, RECENT, EARLIER = rows.take(3)
     ACT, TEND, CODE, RADIUS = rows.take(4)
     names = [str(s) for s in program.state]
     given_call = set(hoist.call)
@@ -285,6 +289,25 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
         f"{CODE} = (3.0 if not ({SINGULAR} >= 0.0) else 2.0) if broken else {CODE}",
         f"{ACT} = 0.0 if broken else active",
     ]
+    hand_over = [
+        *(f"x_{j} = {row}" for j, row in enumerate(X)),
+        *(f"p_{j} = " + " + ".join(f"{VALUE[j][k]} * x_{k}" for k in range(nx)) for j in range(nx)),
+        *(
+            f"r_{j} = {ACC[n + j]} - ("
+            + " + ".join(f"{LINEAR[j][k]} * x_{k}" for k in range(nx))
+            + ")"
+            for j in range(n)
+        ),
+        "level = " + " + ".join(f"p_{j} * x_{j}" for j in range(nx)),
+        "residual = 2.0 * (" + " + ".join(f"abs(p_{n + j} * r_{j})" for j in range(n)) + ")",
+        f"{RECENT} = max({RECENT}, residual)",
+        f"worst = max({RECENT}, {EARLIER})",
+        f"calm = {ACT} > 0.0 and worst <= {RATE} * (tail * (level + counted * {COST}) + slack)",
+        *(f"calm = calm and abs({U[j]}) <= 0.5 * limit_{j}" for j in range(m)),
+        f"{CODE} = 6.0 if calm else {CODE}",
+        f"{ACT} = 0.0 if calm else {ACT}",
+    ]
+    forget = [f"{EARLIER} = {RECENT}", f"{RECENT} = 0.0"]
     advance = [
         "active = " + ACT,
         *(f"n_{j} = {X[j]} + sixth * {ACC[j]}" for j in range(nx)),
@@ -299,9 +322,11 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
         *(f"{X[j]} = n_{j} if active > 0.0 else {X[j]}" for j in range(nx)),
         f"{COST} = {COST} + part * (c_new - {COST}) if active > 0.0 else {COST}",
         f"{TEND} = t + part * h if active > 0.0 else {TEND}",
-        f"{CODE} = (4.0 if lost else (1.0 if reached else 0.0)) if active > 0.0 else {CODE}",
+        f"costly = {COST} > cap",
+        "code = 4.0 if lost else (1.0 if reached else (5.0 if costly else 0.0))",
+        f"{CODE} = code if active > 0.0 else {CODE}",
         f"{RADIUS} = radius if active > 0.0 else before",
-        f"{ACT} = 0.0 if (lost or reached) else active",
+        f"{ACT} = 0.0 if (lost or reached or costly) else active",
     ]
     recorded = [*X, *U, *S, COST, SINGULAR]
     out_columns = [COST, TEND, CODE, RADIUS, *MIN, *X]
@@ -325,11 +350,18 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
         *lane_lines,
         *(f"{row} = {s}" for s, row in KEEP.items()),
     ]
+    load_tail = [
+        *(f"{LINEAR[j][k]} = linear[b + i, {j}, {k}]" for j in range(n) for k in range(nx)),
+        *(f"{VALUE[j][k]} = value[b + i, {j}, {k}]" for j in range(nx) for k in range(nx)),
+        f"{RATE} = rate[b + i]",
+        f"{RECENT} = math.inf",
+        f"{EARLIER} = math.inf",
+    ]
     reset = [
         *(f"{row} = x0[b + i, {j}]" for j, row in enumerate(X)),
         "radius = math.sqrt(" + " + ".join(f"{row} * {row}" for row in X) + ")",
         f"{COST} = 0.0",
-        f"{TEND} = 0.0",
+        f"{TEND} = start",
         f"{RADIUS} = radius",
         f"{CODE} = 1.0 if radius <= terminal else 0.0",
         f"{ACT} = 0.0 if radius <= terminal else 1.0",
@@ -363,7 +395,9 @@ LANES = {LANES}
 )
 def rollout(
     x0, lanes, switch, plant, belief, limits, noise, noisy,
-    start, h, steps, hold, terminal, escape, every, record, out,
+    start, h, steps, hold, terminal, escape, cap, tail, counted, slack,
+    linear, value, rate,
+    every, record, out,
 ):
 {parameters}
     W = np.empty({rows.count * LANES})
@@ -371,6 +405,8 @@ def rollout(
     for b in range(0, x0.shape[0], {LANES}):
         segment = 0
 {loop(reset, 2)}
+        if tail > 0.0:
+{loop(load_tail, 3)}
         for step in range(steps):
             t = start + step * h
             if segment < switch.shape[0] and step == switch[segment]:
@@ -382,6 +418,10 @@ def rollout(
 {loop(watch, 3)}
             if every > 0 and step % every == 0:
 {loop(record, 4)}
+            if tail > 0.0 and step % 16 == 0 and segment == switch.shape[0]:
+{loop(hand_over, 4)}
+                if step % 128 == 0:
+{loop(forget, 5)}
             for rk in range(3):
                 weight = 1.0 if rk == 2 else 2.0
                 reach = half if rk == 0 else h
@@ -389,7 +429,7 @@ def rollout(
 {loop(later, 4)}
             t = start + step * h
 {loop(advance, 3)}
-            if step % 8 == 7:
+            if step % 8 == 0:
                 alive = 0.0
                 for i in range({LANES}):
                     alive += {ACT}
