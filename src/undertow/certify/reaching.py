@@ -284,10 +284,13 @@ def _alone(
 ) -> DisturbanceBound:
     n, m = mechanism.n, mechanism.m
     unit_load = [1.0 if k == j else 0.0 for k in range(n)]
-    positive = all(
-        minimise_proved(lambda q, i=i: spare(q)[i], box, stop_above=0.0, stop_below=0.0).lower > 0
-        for i in range(m)
-    )
+
+    def least(i: int) -> float:
+        return minimise_proved(
+            lambda q: spare(q)[i], box, stop_above=0.0, stop_below=0.0, max_boxes=max_boxes
+        ).lower
+
+    positive = all(least(i) > 0 for i in range(m))
     proved, refuted, point = 0.0, 0.0, tuple(0.0 for _ in box)
     if positive:
         proved, refuted, point = _factor(spare, weights, box, unit_load, m, tolerance, max_boxes)
