@@ -257,14 +257,18 @@ class Cascade:
         InfeasibleError
             When no admissible surface was found.
         """
-        proposal = self.optimiser.require(x)
-        assert proposal.surface is not None  # require() raises otherwise
-        cost = self._exact_cost(proposal.surface, x, self.objective.horizon)
+        proposal, surface, cost = self._global(self.optimiser, x)
         if not math.isfinite(cost):  # the linear end was too hopeful: integrate throughout
-            proposal = replace(self.optimiser, loop=self.loop).require(x)
-            assert proposal.surface is not None
-            cost = self._exact_cost(proposal.surface, x, self.objective.horizon)
-        return CascadeState(proposal.surface, 0, cost, cost), proposal
+            exact = replace(self.optimiser, loop=self.loop)
+            proposal, surface, cost = self._global(exact, x)
+        return CascadeState(surface, 0, cost, cost), proposal
+
+    def _global(self, optimiser: Optimiser, x: ArrayLike) -> tuple[Proposal, Surface, float]:
+        """Return a global optimum, its surface and its cost integrated to the end."""
+        proposal = optimiser.require(x)
+        surface = proposal.surface
+        assert surface is not None  # require() raises otherwise
+        return proposal, surface, self._exact_cost(surface, x, self.objective.horizon)
 
     def _exact_cost(self, surface: Surface, x: ArrayLike, horizon: float) -> float:
         score = float(self.loop.batch(x, [surface], duration=horizon).score(horizon)[0])

@@ -248,20 +248,25 @@ class _Task:
         return self.evaluate(self.owner.decode(z))
 
     def evaluate(self, vectors: FloatArray) -> FloatArray:
-        """Score surface vectors, keeping the best: unstable 1e10 and up, inadmissible 1e9."""
-        mechanism = self.owner.loop.mechanism
-        margins = stability_margin(mechanism, vectors)
-        scores = 1e10 * (2.0 + np.tanh(-margins))
-        stable = margins > 0
+        """Score surface vectors, keeping the best: unstable 1e10, inadmissible 1e9 and up."""
+        loop = self.owner.loop
         self.evaluations += len(vectors)
+        cap = math.inf
+        if self.best_cost < INADMISSIBLE:
+            cap = HOPELESS * self.best_cost + self.resolution
+        scores = np.full(len(vectors), 1e10)
+        stable = np.full(len(vectors), True)
+        if loop.linear_end is None:
+            stable = stability_margin(loop.mechanism, vectors) > 0
         if stable.any():
-            cap = math.inf
-            if self.best_cost < INADMISSIBLE:
-                cap = HOPELESS * self.best_cost + self.resolution
-            batch = self.owner.loop.batch(
-                self.x, vectors[stable], duration=self.horizon, cap=cap, slack=self.resolution
-            )
-            scores[stable] = batch.score(self.horizon)
+            scores[stable] = loop.batch(
+                self.x,
+                vectors[stable],
+                duration=self.horizon,
+                cap=cap,
+                slack=self.resolution,
+                stable_only=True,
+            ).score(self.horizon)
         best = int(np.argmin(scores))
         if scores[best] < self.best_cost:
             self.best_cost, self.best_vector = float(scores[best]), vectors[best].copy()
@@ -307,7 +312,9 @@ class _Task:
         vector = incumbent.normalised().vector
         self.incumbent_cost = float(self.evaluate(vector[None])[0])
         here = self.owner.encode(incumbent)
-        wide = max(1, min(self.left, self.owner.population))
+        wide = min(self.left, self.owner.population)
+        if wide == 0:
+            return False
         steps = np.geomspace(0.03, 1.0, wide)[:, None]
         self.cost(here + steps * self.rng.standard_normal((wide, here.size)))
         return self._descend(self._best_z(), 0.1, self.left, 1e-3)
@@ -392,6 +399,7 @@ def motion_margins(
     ending = {
         Event.REACHED: f"reaches the terminal set at {batch.time[0]:.3g} s",
         Event.HORIZON: f"is still at ‖x‖ = {batch.radius[0]:.3g} after {batch.time[0]:.3g} s",
+        Event.UNSTABLE: "is unstable",
         Event.COSTLY: "costs too much",
         Event.DIVERGED: f"diverges at {batch.time[0]:.3g} s",
         Event.SINGULAR: f"meets the singularity (37) at {batch.time[0]:.3g} s",

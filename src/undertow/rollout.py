@@ -34,7 +34,7 @@ from undertow.sliding import (
     gamma_determinant,
     lay_law,
 )
-from undertow.tail import LinearEnd, Prepared, quadratic_stage
+from undertow.tail import LinearEnd, Prepared
 
 __all__ = ["Batch", "ClosedLoop", "Event", "Trajectory"]
 
@@ -51,6 +51,7 @@ class Event(IntEnum):
     SINGULAR = 3
     DIVERGED = 4
     COSTLY = 5
+    UNSTABLE = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +88,7 @@ class Batch:
         penalty = 1e9 * (3.0 - self.time / horizon)
         late = 1e9 * (1.0 + distance)
         scores = np.where(self.event == Event.HORIZON, late, penalty)
+        scores = np.where(self.event == Event.UNSTABLE, 1e10, scores)
         return np.where(self.reached, self.cost, scores)
 
 
@@ -248,17 +250,26 @@ class ClosedLoop:
         return truth.parameter_values, belief.parameter_values, truth.input_limits, at_target
 
     @cached_property
-    def _linear_end(self) -> LinearEnd | None:
-        """The exact end of the horizon, where this loop allows one."""
-        smooth = self.hold == 0 and self.reaching.switching != "sign"
-        if not (self.tail and smooth) or self.plant is not None or self.objective.constraints:
+    def linear_end(self) -> LinearEnd | None:
+        """The linear model of this loop at the target, where it has one."""
+        if self.hold or self.reaching.switching == "sign" or self.plant is not None:
             return None
-        stage = quadratic_stage(self.mechanism, self.objective)
-        return None if stage is None else LinearEnd(self.mechanism, self.objective, stage)
+        return LinearEnd(self.mechanism, self.objective)
+
+    @cached_property
+    def _hands_over(self) -> bool:
+        """Whether rollouts may end in the linear model."""
+        end = self.linear_end
+        return bool(
+            self.tail > 0
+            and end is not None
+            and end.stage is not None
+            and not self.objective.constraints
+        )
 
     def _prepare(self, lanes: FloatArray) -> Prepared | None:
         """Linearise the last surface of every lane, (N, 2mn + 2m + 1)."""
-        if self._linear_end is None:
+        if self.linear_end is None:
             return None
         m = self.mechanism.m
         surfaces, eta, layer = (
@@ -269,7 +280,19 @@ class ClosedLoop:
         gains = eta
         if any(self.mechanism.disturbance_bounds):
             gains = gains_at_target(self.mechanism, surfaces, eta)
-        return self._linear_end.prepare(surfaces, gains, layer)
+        return self.linear_end.prepare(surfaces, gains, layer)
+
+    def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:
+        """Return the steps at which surfaces take over; the kernel meets them one by one."""
+        steps = np.array([round(t / self.step) for t in switch_times], dtype=np.int64)
+        if steps[0] != 0 or not (np.diff(steps) > 0).all():
+            raise InvalidInputError(
+                "switch_times",
+                value=list(switch_times),
+                limit=f"0 first, each later than the one before by a step of {self.step:g} s",
+                remedy="Leave out the surfaces that never act",
+            )
+        return steps
 
     def _run(
         self,
@@ -283,6 +306,7 @@ class ClosedLoop:
         terminal: float | None = None,
         cap: float = math.inf,
         slack: float = 0.0,
+        stable_only: bool = False,
         every: int = 0,
         noise: FloatArray | None = None,
     ) -> tuple[Batch, FloatArray]:
@@ -305,12 +329,15 @@ class ClosedLoop:
         out = np.empty((padded, 6 + w + 2 * n))
         # A sampled kernel reads the noise of every lane, even where it is multiplied by 0.
         quiet = np.zeros((1, padded, 2 * n)) if self.hold else _NOTHING
-        prepared = None if every else self._prepare(lanes[:, -1])
-        end = self._linear_end
+        hands_over = self._hands_over and not every
+        prepared = self._prepare(lanes[:, -1]) if hands_over or stable_only else None
+        end = self.linear_end
+        live = prepared.stable if prepared is not None and stable_only else np.ones(padded)
         self._kernel(
             states,
+            live,
             lanes,
-            np.array([round(t / self.step) for t in switch_times], dtype=np.int64),
+            self._switch_steps(switch_times),
             plant,
             belief,
             limits,
@@ -323,7 +350,7 @@ class ClosedLoop:
             self.objective.terminal_radius if terminal is None else terminal,
             self.escape,
             cap,
-            0.0 if prepared is None else self.tail,
+            self.tail if hands_over else 0.0,
             1.0 if end is not None and end.counts_cost else 0.0,
             slack,
             _NOTHING if prepared is None else prepared.A,
@@ -333,7 +360,7 @@ class ClosedLoop:
             record,
             out,
         )  # fmt: skip
-        if end is not None and prepared is not None:
+        if hands_over and end is not None and prepared is not None:
             end.complete(prepared, out, start + steps * self.step)
         out = out[:count]
         batch = Batch(
@@ -358,6 +385,7 @@ class ClosedLoop:
         duration: float | None = None,
         cap: float = math.inf,
         slack: float = 0.0,
+        stable_only: bool = False,
     ) -> Batch:
         """Roll out a batch: many surfaces, many initial states, or both.
 
@@ -378,6 +406,9 @@ class ClosedLoop:
             Cost beyond which a rollout is given up (``COSTLY``).
         slack
             Absolute error in cost that the linear end may make besides its relative one.
+        stable_only
+            Do not roll out surfaces that are unstable at the target (``UNSTABLE``); for
+            loops with a linear model, see :attr:`linear_end`.
         """
         vectors = _surface_vectors(surfaces)
         if vectors.ndim == 1:
@@ -405,6 +436,7 @@ class ClosedLoop:
             duration=duration,
             cap=cap,
             slack=slack,
+            stable_only=stable_only,
         )[0]
 
     def simulate(
@@ -456,7 +488,14 @@ class ClosedLoop:
                     limit="a sampled one",
                     remedy="Build the loop with hold ≥ 1",
                 )
-            noise = np.repeat(np.asarray(noise, dtype=float)[:, None, :], LANES, axis=1)
+            noise = np.asarray(noise, dtype=float)
+            if noise.ndim != 2 or noise.shape[1] != 2 * self.mechanism.n or noise.size == 0:
+                raise InvalidInputError(
+                    "measurement noise",
+                    value=f"shape {noise.shape}",
+                    limit=f"(samples, {2 * self.mechanism.n})",
+                )
+            noise = np.repeat(self.mechanism.check_state(noise)[:, None, :], LANES, axis=1)
         x0 = self.mechanism.check_state(x0)
         vectors = np.stack([s.vector for s in sequence])[None]
         batch, record = self._run(

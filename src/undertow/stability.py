@@ -9,6 +9,7 @@ damping the same condition reads (35)-(37) at the target.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -370,7 +371,10 @@ def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
         )
     A, T = _regular_form(mechanism)
     try:
-        placed = scipy.signal.place_poles(A[:free, :free], A[:free, free:], wanted)
+        with warnings.catch_warnings():
+            # The poles are placed; only the conditioning may not be the best there is.
+            warnings.filterwarnings("ignore", "Convergence was not reached", UserWarning)
+            placed = scipy.signal.place_poles(A[:free, :free], A[:free, free:], wanted)
     except ValueError as error:
         if controllability(mechanism) < 1e-9:
             raise _uncontrollable(mechanism) from error

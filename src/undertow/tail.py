@@ -83,14 +83,23 @@ class LinearEnd:
     ----------
     mechanism, objective
         The closed loop's.
+
+    Attributes
+    ----------
     stage
-        Second-order model of the stage cost.
+        Second-order model of the stage cost; ``None`` where it has none, and then only
+        stability can be read off.
     """
 
-    def __init__(self, mechanism: Mechanism, objective: Objective, stage: QuadraticStage) -> None:
+    def __init__(self, mechanism: Mechanism, objective: Objective) -> None:
         lin = linearise(mechanism)
         m = mechanism.m
-        self.objective, self.stage = objective, stage
+        self.objective = objective
+        self.stage = quadratic_stage(mechanism, objective)
+        n = mechanism.n
+        self._weights = self.stage or QuadraticStage(
+            0.0, np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m)), np.zeros((m, m))
+        )
         M_uu, M_au = lin.M[m:, m:], lin.M[:m, m:]
         forces = np.hstack([lin.F, lin.D])
         self.X = np.ascontiguousarray(np.linalg.solve(M_uu, M_au.T))
@@ -99,7 +108,7 @@ class LinearEnd:
         self.S = lin.M[:m, :m] - M_au @ self.X
         self.B_inverse = np.linalg.inv(lin.B)
         # Where Φ has no quadratic part (minimum time) the state itself must be exact.
-        self.counts_cost = bool(np.abs(stage.xx).max() + np.abs(stage.uu).max() > 0)
+        self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
 
     def prepare(self, surfaces: FloatArray, gains: FloatArray, layers: FloatArray) -> Prepared:
         """Linearise the closed loops of N surfaces and solve their Lyapunov equations.
@@ -118,7 +127,7 @@ class LinearEnd:
             np.empty(count),
             np.empty(count),
         )
-        stage = self.stage
+        stage = self._weights
         _prepare(
             np.ascontiguousarray(surfaces), gains / layers, self.X, self.Y, self.H, self.S,
             self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, m,
@@ -129,13 +138,13 @@ class LinearEnd:
     def complete(self, prepared: Prepared, out: FloatArray, horizon: float) -> None:
         """Add the linear ends to the kernel's results, (N, columns), in place.
 
-        Lanes that handed over (code 6) become reached (1), with the cost still to come
+        Lanes that handed over (code −1) become reached (1), with the cost still to come
         added and the time at which the terminal set is entered, or run into the
         horizon (0).
         """
         _complete(
             prepared.A, prepared.P, out, horizon, self.objective.terminal_radius,
-            self.stage.rest, self.counts_cost,
+            self._weights.rest, self.counts_cost,
         )  # fmt: skip
 
 
@@ -199,15 +208,15 @@ def _prepare(  # type: ignore[no-untyped-def]
                     work[row, index[i, k]] += full[k, j]
                 right[row, 0] = -Q[i, j]
                 right[row, 1] = -1.0 if i == j else 0.0
-        solution = np.linalg.solve(work, right)
+        _solve(work, right)
         # P_I > 0 if and only if A is Hurwitz (Lyapunov); its trace bounds the slowest rate.
         trace = 0.0
         definite = True
         L = np.zeros((N, N))
         for i in range(N):
-            trace += solution[index[i, i], 1]
+            trace += right[index[i, i], 1]
             for j in range(i + 1):
-                value = solution[index[i, j], 1]
+                value = right[index[i, j], 1]
                 for k in range(j):
                     value -= L[i, k] * L[j, k]
                 if i == j:
@@ -224,7 +233,7 @@ def _prepare(  # type: ignore[no-untyped-def]
         which = 0 if counts_cost else 1
         for i in range(N):
             for j in range(N):
-                P[lane, i, j] = solution[index[i, j], which]
+                P[lane, i, j] = right[index[i, j], which]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -235,7 +244,7 @@ def _complete(A, P, out, horizon, terminal, rest, counts_cost):  # type: ignore[
     full, E, square = np.zeros((N, N)), np.empty((N, N)), np.empty((N, N))
     here, following = np.empty(N), np.empty(N)
     for lane in range(count):
-        if out[lane, 2] != 6.0:
+        if out[lane, 2] != -1.0:
             continue
         full[:] = 0.0
         for i in range(n):
@@ -283,6 +292,36 @@ def _complete(A, P, out, horizon, terminal, rest, counts_cost):  # type: ignore[
         out[lane, 2] = 1.0 if radius <= terminal and t <= horizon else 0.0
         out[lane, 3] = radius
         out[lane, first:] = here
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _solve(a, b):  # type: ignore[no-untyped-def]
+    """Overwrite b with a⁻¹ b: Gaussian elimination with partial pivoting; a is spoilt."""
+    size, columns = b.shape
+    for k in range(size):
+        pivot = k
+        for i in range(k + 1, size):
+            if abs(a[i, k]) > abs(a[pivot, k]):
+                pivot = i
+        if pivot != k:
+            for j in range(k, size):
+                a[k, j], a[pivot, j] = a[pivot, j], a[k, j]
+            for j in range(columns):
+                b[k, j], b[pivot, j] = b[pivot, j], b[k, j]
+        inverse = 1.0 / a[k, k]
+        for i in range(k + 1, size):
+            factor = a[i, k] * inverse
+            if factor != 0.0:
+                for j in range(k + 1, size):
+                    a[i, j] -= factor * a[k, j]
+                for j in range(columns):
+                    b[i, j] -= factor * b[k, j]
+    for k in range(size - 1, -1, -1):
+        for j in range(columns):
+            value = b[k, j]
+            for i in range(k + 1, size):
+                value -= a[k, i] * b[i, j]
+            b[k, j] = value / a[k, k]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

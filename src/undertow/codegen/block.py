@@ -304,7 +304,7 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
         f"worst = max({RECENT}, {EARLIER})",
         f"calm = {ACT} > 0.0 and worst <= {RATE} * (tail * (level + counted * {COST}) + slack)",
         *(f"calm = calm and abs({U[j]}) <= 0.5 * limit_{j}" for j in range(m)),
-        f"{CODE} = 6.0 if calm else {CODE}",
+        f"{CODE} = -1.0 if calm else {CODE}",
         f"{ACT} = 0.0 if calm else {ACT}",
     ]
     forget = [f"{EARLIER} = {RECENT}", f"{RECENT} = 0.0"]
@@ -363,8 +363,8 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
         f"{COST} = 0.0",
         f"{TEND} = start",
         f"{RADIUS} = radius",
-        f"{CODE} = 1.0 if radius <= terminal else 0.0",
-        f"{ACT} = 0.0 if radius <= terminal else 1.0",
+        f"{CODE} = 1.0 if radius <= terminal else (0.0 if live[b + i] > 0.0 else 6.0)",
+        f"{ACT} = 1.0 if {CODE} == 0.0 else 0.0",
         *(f"{row} = math.inf" for row in MIN),
         *(f"{row} = 0.0" for row in [*U, *S, *PATH]),
         f"{SINGULAR} = 1.0",
@@ -394,7 +394,7 @@ LANES = {LANES}
     cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
 )
 def rollout(
-    x0, lanes, switch, plant, belief, limits, noise, noisy,
+    x0, live, lanes, switch, plant, belief, limits, noise, noisy,
     start, h, steps, hold, terminal, escape, cap, tail, counted, slack,
     linear, value, rate,
     every, record, out,
