@@ -93,11 +93,26 @@ class Coordinate:
         ``"rad"`` or ``"m"``.
     description
         What it measures, with the sense that counts as positive.
+    low, high
+        Range of travel, in ``unit``; infinite where nothing stops the joint.  Data for
+        constraints, checks and pictures: the equations know no end stop.
     """
 
     name: str
     unit: str = "rad"
     description: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Refuse an empty range of travel."""
+        if not self.low < self.high:
+            raise InvalidInputError(
+                f"range of coordinate '{self.name}'",
+                value=f"[{self.low:g}, {self.high:g}] {self.unit}",
+                limit="low < high",
+                remedy="Give the lower end first",
+            )
 
     @property
     def symbol(self) -> sp.Symbol:

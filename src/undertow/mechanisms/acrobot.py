@@ -1,0 +1,72 @@
+"""The Acrobot: two links, the motor at the elbow, balanced upright.
+
+Link 1 leans by q_1 from the upright and turns freely about the shoulder; the motor turns
+link 2 by q_2 against link 1, so its torque acts on q_2 alone: the actuated coordinate, and
+the first one here.
+"""
+
+from __future__ import annotations
+
+import math
+
+from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
+from undertow.mechanisms.chain import chain_energies
+
+__all__ = ["acrobot"]
+
+SPONG = "Spong, The swing up control problem for the Acrobot, IEEE Control Systems 15 (1995) 49"
+DRAKE = "Drake, examples/acrobot (Russ Tedrake and the Drake Development Team)"
+
+
+def acrobot(**values: float) -> Mechanism:
+    """Return the Acrobot at its top position.
+
+    Parameters
+    ----------
+    **values
+        Parameter values to replace, SI units:
+        ``m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g``.
+
+    Returns
+    -------
+    Mechanism
+        Coordinates (q_2, q_1), rad, the elbow first; one input, the elbow torque, limited to
+        ±30 N m.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown parameter or a value outside its bounds.
+    """
+    parameters = (
+        Parameter("m_1", 1.0, "kg", "mass of link 1", 0, math.inf, SPONG),
+        Parameter("m_2", 1.0, "kg", "mass of link 2", 0, math.inf, SPONG),
+        Parameter("l_1", 1.0, "m", "length of link 1", 0, math.inf, SPONG),
+        Parameter("a_1", 0.5, "m", "joint to centre of link 1", 0, math.inf, SPONG),
+        Parameter("a_2", 1.0, "m", "joint to centre of link 2", 0, math.inf, SPONG),
+        Parameter("J_1", 0.083, "kg m²", "link 1 about its centre", 0, math.inf, SPONG),
+        Parameter("J_2", 0.33, "kg m²", "link 2 about its centre", 0, math.inf, SPONG),
+        Parameter("b_1", 0.1, "N m s/rad", "damping of the shoulder", -1e-12, math.inf, DRAKE),
+        Parameter("b_2", 0.1, "N m s/rad", "damping of the elbow", -1e-12, math.inf, DRAKE),
+        Parameter("g", 9.81, "m/s²", "gravity", 0, math.inf, "standard"),
+    )
+    m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g = (p.symbol for p in parameters)
+    elbow = Coordinate("q_2", "rad", "angle of link 2 against link 1")
+    shoulder = Coordinate("q_1", "rad", "lean of link 1 from the upright")
+    angles = [shoulder.symbol, shoulder.symbol + elbow.symbol]
+    rates = [shoulder.velocity, shoulder.velocity + elbow.velocity]
+    kinetic, potential = chain_energies(
+        angles, rates, [m_1, m_2], [J_1, J_2], [a_1, a_2], [l_1, l_1], g
+    )
+    return Mechanism.from_energies(
+        "acrobot",
+        [elbow, shoulder],
+        [Input("torque", "N m", 30.0)],
+        kinetic=kinetic,
+        potential=potential,
+        dissipation=b_1 * shoulder.velocity**2 / 2 + b_2 * elbow.velocity**2 / 2,
+        parameters=parameters,
+        start={"q_1": math.radians(3), "q_2": math.radians(-3)},
+        description="two links, the motor at the elbow, balanced upright (limit chosen)",
+        source=SPONG,
+    ).with_parameters(**values)

@@ -1,0 +1,39 @@
+"""Ways to bring a mechanism: equations, energies, SymPy's mechanics, URDF and MJCF files.
+
+Whatever comes in, a :class:`~undertow.mechanism.Mechanism` comes out: actuated coordinates
+first, the target at x = 0, physical parameters as data.
+"""
+
+from undertow.modelling.coordinates import ActuatedForm, actuate
+from undertow.modelling.drives import DCMotor, voltage_driven
+from undertow.modelling.equations import from_energies, from_matrices
+from undertow.modelling.equilibrium import find_equilibrium, holding_input, move_target
+from undertow.modelling.mjcf import from_mjcf, read_mjcf
+from undertow.modelling.rigid_body import mechanism_from_tree
+from undertow.modelling.sympy_mechanics import from_kane, from_lagrange
+from undertow.modelling.tree import Actuator, Coupling, Joint, Link, Tree
+from undertow.modelling.urdf import from_urdf, read_urdf
+
+__all__ = [
+    "ActuatedForm",
+    "Actuator",
+    "Coupling",
+    "DCMotor",
+    "Joint",
+    "Link",
+    "Tree",
+    "actuate",
+    "find_equilibrium",
+    "from_energies",
+    "from_kane",
+    "from_lagrange",
+    "from_matrices",
+    "from_mjcf",
+    "from_urdf",
+    "holding_input",
+    "mechanism_from_tree",
+    "move_target",
+    "read_mjcf",
+    "read_urdf",
+    "voltage_driven",
+]

@@ -1,0 +1,288 @@
+"""Mechanisms from equations of motion: from M, f and B, or from energies, in any coordinates.
+
+:class:`~undertow.mechanism.Mechanism` itself takes M, f and B with the actuated coordinates
+first and the target at x = 0.  The functions here take the equations as they come: inputs
+through a constant (n, m) matrix, coordinates in any order, a target that is not zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from undertow.codegen import Tape, compile_numpy
+from undertow.errors import InvalidInputError, ModelError
+from undertow.mechanism import TIME, Coordinate, Input, Mechanism, Parameter
+from undertow.modelling.coordinates import actuate, exact_angle, tidy
+
+__all__ = ["from_energies", "from_matrices", "lagrange_force", "unit_inputs"]
+
+
+def from_matrices(
+    name: str,
+    coordinates: Sequence[Coordinate],
+    inputs: Sequence[Input],
+    mass_matrix: sp.Matrix,
+    force: sp.Matrix,
+    input_matrix: sp.Matrix,
+    *,
+    parameters: Sequence[Parameter] = (),
+    potential: sp.Expr | None = None,
+    equilibrium: Mapping[str, float] | None = None,
+    actuated: Sequence[Coordinate | None] | None = None,
+    gains: Sequence[sp.Expr | None] | None = None,
+    disturbance_bounds: Sequence[float] = (),
+    start: Mapping[str, float] | None = None,
+    description: str = "",
+    source: str = "",
+) -> Mechanism:
+    """Build a mechanism from ``M(q) q̈ = f(q, q̇) + B u`` with a constant (n, m) matrix B.
+
+    Parameters
+    ----------
+    name, inputs, parameters, description, source
+        As for :class:`~undertow.mechanism.Mechanism`.
+    coordinates
+        The n coordinates q, in any order.
+    mass_matrix, force
+        M(q), (n, n), and f(q, q̇), (n,), without the inputs.
+    input_matrix
+        B, (n, m), constant (parameters are allowed), of rank m.
+    potential
+        V(q), J, where there is one.
+    equilibrium
+        The target, coordinate name to value in rad or m; zero where left out.  The
+        coordinates of the result are errors from it.
+    actuated, gains
+        Names of the coordinates that the inputs act on, where these are combinations of the
+        given ones, and their scales; see :func:`~undertow.modelling.coordinates.actuate`.
+    disturbance_bounds
+        |g_i| ≤ bound in the given coordinates, (n,).
+    start
+        A usual initial state by the names of the result's states (errors from the target).
+
+    Returns
+    -------
+    Mechanism
+        In coordinates of which the first m are acted upon; the target is x = 0.
+
+    Raises
+    ------
+    ModelError
+        When M is not symmetric positive definite, B depends on the state or lacks rank.
+    InvalidInputError
+        For an equilibrium of unknown coordinates.
+    """
+    coordinates = tuple(coordinates)
+    values = {p.symbol: p.value for p in parameters}
+    M = _symmetric(name, sp.Matrix(mass_matrix), coordinates, values)
+    f = sp.Matrix(force)
+    V = None if potential is None else sp.sympify(potential)
+    if equilibrium:
+        coordinates, (M, f, V) = shifted(name, coordinates, equilibrium, M, f, V)
+    form = actuate(
+        coordinates,
+        M,
+        f,
+        input_matrix,
+        potential=V,
+        values=values,
+        actuated=actuated,
+        gains=gains,
+    )
+    bounds = form.bounds(disturbance_bounds, values) if len(disturbance_bounds) else ()
+    return Mechanism(
+        name,
+        form.coordinates,
+        tuple(inputs),
+        sp.ImmutableDenseMatrix(form.mass_matrix),
+        sp.ImmutableDenseMatrix(form.force),
+        sp.ImmutableDenseMatrix(form.input_matrix),
+        parameters=tuple(parameters),
+        disturbance_bounds=tuple(bounds),
+        potential=form.potential,
+        start=dict(start or {}),
+        description=description,
+        source=source,
+    )
+
+
+def from_energies(
+    name: str,
+    coordinates: Sequence[Coordinate],
+    inputs: Sequence[Input],
+    kinetic: sp.Expr,
+    potential: sp.Expr,
+    input_matrix: sp.Matrix,
+    *,
+    dissipation: sp.Expr | float = 0,
+    **rest: Any,
+) -> Mechanism:
+    """Build a mechanism from energies, with inputs through a constant (n, m) matrix.
+
+    :meth:`Mechanism.from_energies <undertow.mechanism.Mechanism.from_energies>` is the shorter
+    way where the actuated coordinates come first and the target is zero.
+
+    Parameters
+    ----------
+    name, coordinates, inputs, input_matrix, **rest
+        As for :func:`from_matrices`.
+    kinetic
+        T(q, q̇), J, a quadratic form in the velocities.
+    potential
+        V(q), J.
+    dissipation
+        Rayleigh's function D(q, q̇), W; its force is −∂D/∂q̇.
+
+    Raises
+    ------
+    ModelError
+        When T is not a quadratic form in the velocities, or as for :func:`from_matrices`.
+    """
+    velocities = [c.velocity for c in coordinates]
+    kinetic = sp.expand(sp.sympify(kinetic))
+    mass = sp.hessian(kinetic, velocities).applyfunc(tidy)
+    qd = sp.Matrix(velocities)
+    rest_of_kinetic = tidy(kinetic - (qd.T * mass * qd)[0, 0] / 2)
+    if mass.free_symbols & set(velocities) or sp.simplify(rest_of_kinetic) != 0:
+        raise ModelError(
+            f"kinetic energy of '{name}'",
+            limit="a quadratic form in the velocities",
+            remedy="Move velocity-free terms to the potential; gyroscopic terms to force",
+        )
+    force = lagrange_force(coordinates, mass, potential, dissipation)
+    return from_matrices(
+        name, coordinates, inputs, mass, force, input_matrix, potential=potential, **rest
+    )
+
+
+def lagrange_force(
+    coordinates: Sequence[Coordinate],
+    mass: sp.Matrix,
+    potential: sp.Expr,
+    dissipation: sp.Expr | float = 0,
+) -> sp.Matrix:
+    """Return f(q, q̇) = −(Ṁ q̇ − ½ ∂(q̇ᵀM q̇)/∂q) − ∂V/∂q − ∂D/∂q̇, (n, 1)."""
+    q = sp.Matrix([c.symbol for c in coordinates])
+    qd = sp.Matrix([c.velocity for c in coordinates])
+    n = len(q)
+    slopes = [[[sp.diff(mass[i, j], q[k]) for k in range(n)] for j in range(n)] for i in range(n)]
+    V, D = sp.sympify(potential), sp.sympify(dissipation)
+    force = []
+    for i in range(n):
+        inertial = sum(
+            (slopes[i][j][k] - slopes[j][k][i] / 2) * qd[j] * qd[k]
+            for j in range(n)
+            for k in range(n)
+        )
+        force.append(tidy(-inertial - sp.diff(V, q[i]) - sp.diff(D, qd[i])))
+    return sp.Matrix(force)
+
+
+def unit_inputs(coordinates: Sequence[Coordinate], actuated: Sequence[str]) -> sp.Matrix:
+    """Return the (n, m) input matrix of inputs that act on single coordinates, by name.
+
+    Raises
+    ------
+    InvalidInputError
+        For a name that does not exist, or one that occurs twice.
+    """
+    names = [c.name for c in coordinates]
+    for joint in actuated:
+        if joint not in names:
+            raise InvalidInputError(
+                "actuated coordinate",
+                value=repr(joint),
+                limit=f"one of {', '.join(names)}",
+                remedy="Check the spelling, and that the joint moves",
+            )
+        if list(actuated).count(joint) > 1:
+            raise InvalidInputError(
+                "actuated coordinate",
+                value=f"{joint!r} named twice",
+                limit="once each",
+                remedy="Name every actuated joint once",
+            )
+    B = sp.zeros(len(names), len(actuated))
+    for j, joint in enumerate(actuated):
+        B[names.index(joint), j] = 1
+    return B
+
+
+def shifted(
+    name: str,
+    coordinates: tuple[Coordinate, ...],
+    equilibrium: Mapping[str, float],
+    *expressions: Any,
+) -> tuple[tuple[Coordinate, ...], list[Any]]:
+    """Replace q by q* + e; the errors e keep the coordinates' names."""
+    known = {c.name: c for c in coordinates}
+    for joint, value in equilibrium.items():
+        if joint not in known:
+            raise InvalidInputError(
+                f"equilibrium of '{name}'",
+                value=repr(joint),
+                limit=f"one of {', '.join(known)}",
+                remedy="Name the coordinates as the equations do",
+            )
+        if not np.isfinite(value):
+            raise InvalidInputError(
+                f"equilibrium of '{name}', {joint}", value=value, limit="a finite number"
+            )
+    shift = {
+        c.symbol: c.symbol + (exact_angle(v) if c.unit == "rad" else sp.Float(v))
+        for c in coordinates
+        if (v := float(equilibrium.get(c.name, 0.0)))
+    }
+    moved = tuple(
+        Coordinate(
+            c.name,
+            c.unit,
+            c.description,
+            c.low - equilibrium.get(c.name, 0.0),
+            c.high - equilibrium.get(c.name, 0.0),
+        )
+        for c in coordinates
+    )
+    results: list[Any] = []
+    for expression in expressions:
+        if expression is None:
+            results.append(None)
+        elif isinstance(expression, sp.MatrixBase):
+            results.append(expression.xreplace(shift).applyfunc(tidy))
+        else:
+            results.append(tidy(expression.xreplace(shift)))
+    return moved, results
+
+
+def _symmetric(
+    name: str,
+    mass: sp.Matrix,
+    coordinates: Sequence[Coordinate],
+    values: Mapping[sp.Symbol, float],
+) -> sp.Matrix:
+    """Return the upper half mirrored, after a numeric look at M − Mᵀ where it is not plain."""
+    n = len(coordinates)
+    if mass.shape != (n, n):
+        raise ModelError(f"mass_matrix of '{name}'", value=mass.shape, limit=f"shape {(n, n)}")
+    symbols = [c.symbol for c in coordinates]
+    unknown = mass.free_symbols - {*symbols, *values}
+    if mass != mass.T and not unknown:
+        tape = Tape()
+        gap = compile_numpy(tape, [*symbols, *values], tape.let_all([*(mass - mass.T), *mass]))
+        q = np.random.default_rng(0).uniform(-1, 1, (n, 16))
+        entries = [np.broadcast_to(e, 16) for e in gap(*q, *values.values())]
+        worst = float(np.abs(entries[: n * n]).max())
+        if worst > 1e-10 * float(np.abs(entries[n * n :]).max()):
+            raise ModelError(
+                f"mass_matrix of '{name}'",
+                value=f"|M − Mᵀ| up to {worst:.3g}",
+                limit="symmetric",
+                remedy="Multiply the equations so that they are Lagrange's, row by row",
+            )
+    if TIME in mass.free_symbols:
+        raise ModelError(f"mass_matrix of '{name}'", value="a function of time", limit="of q only")
+    return sp.Matrix(n, n, lambda i, j: mass[min(i, j), max(i, j)])

@@ -1,0 +1,168 @@
+"""Target equilibria: found from a guess, and made the origin of error coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import sympy as sp
+
+from undertow.errors import InvalidInputError, ModelError
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.modelling.equations import shifted
+
+__all__ = ["find_equilibrium", "holding_input", "move_target"]
+
+#: |f_u| at an equilibrium, relative to the largest force that gravity and springs exert.
+_RESIDUAL = 1e-9
+
+
+def holding_input(mechanism: Mechanism, q: FloatArray | None = None) -> FloatArray:
+    """Return the input that holds the mechanism at rest at q, −B⁻¹ f_a(q, 0), (m,).
+
+    Parameters
+    ----------
+    q
+        Positions, (n,); the target x = 0 by default.
+    """
+    n, m = mechanism.n, mechanism.m
+    x = np.zeros(2 * n)
+    if q is not None:
+        x[:n] = q
+    B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=np.float64)
+    return np.asarray(-np.linalg.solve(B, mechanism.f(x)[:m]))
+
+
+def find_equilibrium(mechanism: Mechanism, **guess: float) -> dict[str, float]:
+    """Find an equilibrium near a guess: f_u(q, 0) = 0 with the actuated coordinates as given.
+
+    Parameters
+    ----------
+    mechanism
+        The model.
+    **guess
+        Coordinate values, rad or m; zero where left out.  The m actuated ones are kept, the
+        n − m free ones are solved for.
+
+    Returns
+    -------
+    dict
+        All n coordinates, by name.
+
+    Raises
+    ------
+    ModelError
+        When no equilibrium is found near the guess, with the force that is left.
+    InvalidInputError
+        For an unknown coordinate.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> round(find_equilibrium(rig, phi=3.0)["phi"], 6)
+    3.141593
+    """
+    from scipy.optimize import root
+
+    n, m = mechanism.n, mechanism.m
+    q = _positions(mechanism, guess)
+
+    def force(q_u: FloatArray) -> FloatArray:
+        x = np.zeros(2 * n)
+        x[:m], x[m:n] = q[:m], q_u
+        return np.asarray(mechanism.f(x)[m:] / scale)
+
+    scale = _force_scale(mechanism)
+    solution = root(force, q[m:], tol=1e-14)
+    left = scale * float(np.abs(force(solution.x)).max())
+    if not left <= _RESIDUAL * scale:
+        raise ModelError(
+            f"equilibrium of '{mechanism.name}' near {dict(guess)}",
+            value=f"|f_u| = {left:.3g} left",
+            limit=f"below {_RESIDUAL * scale:.3g}",
+            remedy="Start from another guess, or hold the actuated coordinates elsewhere",
+        )
+    q[m:] = solution.x
+    names = [c.name for c in mechanism.coordinates]
+    return dict(zip(names, (float(v) for v in q), strict=True))
+
+
+def move_target(mechanism: Mechanism, **equilibrium: float) -> Mechanism:
+    """Return the mechanism in error coordinates from another equilibrium.
+
+    Parameters
+    ----------
+    mechanism
+        The model.
+    **equilibrium
+        The new target in the coordinates of ``mechanism``, rad or m; zero where left out.
+
+    Returns
+    -------
+    Mechanism
+        Its coordinates keep their names and read zero at the new target.  The start state is
+        dropped: it belonged to the old one.
+
+    Raises
+    ------
+    ModelError
+        When it is no equilibrium of the free coordinates, f_u ≠ 0.
+    """
+    n, m = mechanism.n, mechanism.m
+    q = _positions(mechanism, equilibrium)
+    residual = np.abs(mechanism.f(np.concatenate([q, np.zeros(n)]))[m:])
+    limit = _RESIDUAL * _force_scale(mechanism)
+    if not residual.max() <= limit:
+        worst = mechanism.coordinates[m + int(np.argmax(residual))].name
+        raise ModelError(
+            f"target of '{mechanism.name}'",
+            value=f"a force of {residual.max():.4g} on '{worst}', which no input balances",
+            limit=f"an equilibrium, |f_u| ≤ {limit:.2g}",
+            remedy="Solve for one: undertow.modelling.find_equilibrium(mechanism, ...)",
+        )
+    coordinates, (mass, force, potential) = shifted(
+        mechanism.name,
+        mechanism.coordinates,
+        equilibrium,
+        sp.Matrix(mechanism.mass_matrix),
+        sp.Matrix(mechanism.force),
+        mechanism.potential,
+    )
+    return Mechanism(
+        mechanism.name,
+        coordinates,
+        mechanism.inputs,
+        sp.ImmutableDenseMatrix(mass),
+        sp.ImmutableDenseMatrix(force),
+        mechanism.input_matrix,
+        parameters=mechanism.parameters,
+        disturbance_bounds=mechanism.disturbance_bounds,
+        potential=potential,
+        description=mechanism.description,
+        source=mechanism.source,
+    )
+
+
+def _positions(mechanism: Mechanism, values: Mapping[str, float]) -> FloatArray:
+    names = [c.name for c in mechanism.coordinates]
+    for name in values:
+        if name not in names:
+            raise InvalidInputError(
+                f"coordinate of '{mechanism.name}'",
+                value=repr(name),
+                limit=f"one of {', '.join(names)}",
+            )
+    q = np.array([float(values.get(name, 0.0)) for name in names])
+    if not np.isfinite(q).all():
+        raise InvalidInputError(
+            f"coordinates of '{mechanism.name}'", value=dict(values), limit="finite numbers"
+        )
+    return q
+
+
+def _force_scale(mechanism: Mechanism) -> float:
+    """Largest force at rest over random positions, N m or N; 1 where there is none."""
+    q = np.random.default_rng(0).uniform(-1, 1, (64, mechanism.n))
+    forces = mechanism.f(np.hstack([q, np.zeros_like(q)]))
+    return float(np.abs(forces).max()) or 1.0

@@ -1,0 +1,243 @@
+"""Mechanisms from SymPy's own mechanics: ``LagrangesMethod`` and ``KanesMethod`` objects.
+
+Coordinates and inputs are ``dynamicsymbols`` there; they become the plain symbols of a
+:class:`~undertow.mechanism.Mechanism`, and the inputs are recognised as what the equations
+are linear in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import sympy as sp
+
+from undertow.errors import InvalidInputError, ModelError
+from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
+from undertow.modelling.coordinates import tidy
+from undertow.modelling.equations import from_matrices
+
+if TYPE_CHECKING:
+    from sympy.physics.mechanics import KanesMethod, LagrangesMethod
+
+__all__ = ["from_kane", "from_lagrange"]
+
+
+def from_lagrange(
+    name: str,
+    method: LagrangesMethod,
+    inputs: Mapping[Any, Input],
+    *,
+    parameters: Sequence[Parameter] = (),
+    units: Mapping[str, str] | None = None,
+    **rest: Any,
+) -> Mechanism:
+    """Build a mechanism from a ``sympy.physics.mechanics.LagrangesMethod``.
+
+    Parameters
+    ----------
+    name
+        Short identifier.
+    method
+        With its coordinates, forces and Lagrangian; ``form_lagranges_equations`` is called
+        where it has not been.
+    inputs
+        The symbol (or dynamicsymbol) of each input in the forces, to its
+        :class:`~undertow.mechanism.Input`, in the order wanted.
+    parameters
+        All other symbols of the equations, by name.
+    units
+        Coordinate name to ``"m"`` where it is not ``"rad"``.
+    **rest
+        ``equilibrium``, ``actuated``, ``start``, … of
+        :func:`~undertow.modelling.equations.from_matrices`.
+
+    Raises
+    ------
+    ModelError
+        For constraints, inputs that do not enter linearly, or a direction of action that
+        changes with the state.
+    InvalidInputError
+        For a symbol that is neither coordinate, input nor parameter.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
+    >>> x, p, F = dynamicsymbols("x phi F")
+    >>> M, m, l, g = sp.symbols("m_c m_p l g")
+    >>> L = (M + m) * x.diff() ** 2 / 2 + m * l * sp.cos(p) * x.diff() * p.diff()
+    >>> L += m * l**2 * p.diff() ** 2 / 2 - m * g * l * sp.cos(p)
+    >>> N = sp.physics.mechanics.ReferenceFrame("N")
+    >>> P = sp.physics.mechanics.Point("P"); P.set_vel(N, x.diff() * N.x)
+    >>> method = LagrangesMethod(L, [x, p], forcelist=[(P, F * N.x)], frame=N)
+    >>> numbers = {"m_c": 1.0, "m_p": 0.1, "l": 0.5, "g": 9.81}
+    >>> data = [Parameter(k, v, "") for k, v in numbers.items()]
+    >>> rig = from_lagrange("cart", method, {F: Input("F", "N")}, parameters=data, units={"x": "m"})
+    >>> rig.state_names
+    ('x', 'phi', 'x_dot', 'phi_dot')
+    """
+    if getattr(method, "coneqs", None):
+        raise _constrained(name, "LagrangesMethod")
+    if method.eom is None:
+        method.form_lagranges_equations()
+    q = list(method.q)
+    resting = dict.fromkeys((c.diff(_time()) for c in q), 0)
+    Lagrangian = method._L  # the only place where SymPy keeps it
+    potential = -Lagrangian.subs(resting)
+    return _build(
+        name, q, method.mass_matrix, method.forcing, potential, inputs, parameters, units, rest
+    )
+
+
+def from_kane(
+    name: str,
+    method: KanesMethod,
+    inputs: Mapping[Any, Input],
+    *,
+    parameters: Sequence[Parameter] = (),
+    units: Mapping[str, str] | None = None,
+    potential: sp.Expr | None = None,
+    **rest: Any,
+) -> Mechanism:
+    """Build a mechanism from a ``sympy.physics.mechanics.KanesMethod``.
+
+    Generalised speeds may be any invertible combination of the q̇, ``u = G(q) q̇``; the
+    equations are brought back to ``Gᵀ M G q̈ = Gᵀ (f − M Ġ q̇)``.
+
+    Parameters
+    ----------
+    method
+        After ``kanes_equations``; without dependent coordinates or speeds.
+    potential
+        V(q), J, where it is known (Kane's method does not keep one).
+    name, inputs, parameters, units, **rest
+        As for :func:`from_lagrange`.
+
+    Raises
+    ------
+    ModelError
+        For dependent speeds (constraints), or as for :func:`from_lagrange`.
+    """
+    if len(method.u) != len(method.q) or getattr(method, "_udep", None):
+        raise _constrained(name, "KanesMethod")
+    t = _time()
+    q, u = list(method.q), list(method.u)
+    rates = sp.Matrix([method.kindiffdict()[c.diff(t)] for c in q])
+    Y = rates.jacobian(u)
+    drift = (rates - Y * sp.Matrix(u)).applyfunc(sp.simplify)
+    if drift != sp.zeros(len(q), 1):
+        raise ModelError(
+            f"kinematic equations of '{name}'",
+            value=drift.T.tolist(),
+            limit="linear in the speeds, q̇ = Y(q) u",
+            remedy="Use coordinates in which nothing moves on its own",
+        )
+    G = Y.inv()
+    if sp.eye(len(q)) != Y:
+        G = G.applyfunc(sp.simplify)
+    qd = sp.Matrix([c.diff(t) for c in q])
+    speeds = dict(zip(u, G * qd, strict=True))
+    mass, forcing = method.mass_matrix, method.forcing.subs(speeds)
+    inertial = mass * G.diff(t) * qd
+    return _build(
+        name,
+        q,
+        G.T * mass * G,
+        G.T * (forcing - inertial),
+        potential,
+        inputs,
+        parameters,
+        units,
+        rest,
+    )
+
+
+def _build(
+    name: str,
+    q: Sequence[Any],
+    mass: sp.Matrix,
+    forcing: sp.Matrix,
+    potential: sp.Expr | None,
+    inputs: Mapping[Any, Input],
+    parameters: Sequence[Parameter],
+    units: Mapping[str, str] | None,
+    rest: Mapping[str, Any],
+) -> Mechanism:
+    """Translate symbols, take the inputs out of the forcing, and build."""
+    t = _time()
+    units = dict(units or {})
+    names = [_plain(c) for c in q]
+    unknown = sorted(set(units) - set(names))
+    if unknown:
+        raise InvalidInputError(
+            f"units of '{name}'", value=", ".join(unknown), limit=f"one of {', '.join(names)}"
+        )
+    coordinates = [Coordinate(c, units.get(c, "rad")) for c in names]
+    translate: dict[Any, Any] = {}
+    for symbol, coordinate in zip(q, coordinates, strict=True):
+        translate[symbol.diff(t)] = coordinate.velocity
+        translate[symbol] = coordinate.symbol
+    translate |= {symbol: given.symbol for symbol, given in inputs.items()}
+    by_name = {p.name: p.symbol for p in parameters}
+
+    def plain(expression: Any) -> sp.Expr:
+        moved = sp.sympify(expression).subs(translate)
+        free = {s for s in moved.free_symbols if s.name in by_name}
+        return moved.xreplace({s: by_name[s.name] for s in free})
+
+    pushes = [given.symbol for given in inputs.values()]
+    force = forcing.applyfunc(plain)
+    B = force.jacobian(pushes).applyfunc(lambda e: sp.trigsimp(tidy(e)))
+    if B.free_symbols & set(pushes):
+        raise ModelError(
+            f"inputs of '{name}'",
+            value="forces that are not linear in them",
+            limit="M q̈ = f + B u",
+            remedy="Redefine the input, for example the force of an actuator, not its command",
+        )
+    passive = force.subs(dict.fromkeys(pushes, 0)).applyfunc(tidy)
+    M = mass.applyfunc(plain).applyfunc(tidy)
+    known = {*by_name.values(), *(c.symbol for c in coordinates)}
+    known |= {c.velocity for c in coordinates}
+    stray = (M.free_symbols | passive.free_symbols | B.free_symbols) - known
+    stray |= {f for e in (*M, *passive, *B) for f in e.atoms(sp.Function) if f.has(t)}
+    if stray:
+        raise InvalidInputError(
+            f"symbols of '{name}'",
+            value=", ".join(sorted(str(s) for s in stray)),
+            limit="coordinates, inputs or parameters",
+            remedy="Declare them in parameters= or inputs=",
+        )
+    return from_matrices(
+        name,
+        coordinates,
+        list(inputs.values()),
+        M,
+        passive,
+        B,
+        parameters=parameters,
+        potential=None if potential is None else plain(potential),
+        **rest,
+    )
+
+
+def _time() -> sp.Symbol:
+    """SymPy's symbol of time, by which its dynamicsymbols are functions."""
+    from sympy.physics.mechanics import dynamicsymbols
+
+    return dynamicsymbols._t
+
+
+def _plain(symbol: Any) -> str:
+    """Name of a dynamicsymbol without its (t)."""
+    return str(symbol.func.__name__ if symbol.args else symbol.name)
+
+
+def _constrained(name: str, method: str) -> ModelError:
+    return ModelError(
+        f"'{name}' from a {method}",
+        value="constraints between its coordinates or speeds",
+        limit="independent coordinates",
+        remedy="Eliminate the constraints first; closed loops and rolling need minimal coordinates",
+    )

@@ -1,0 +1,243 @@
+"""Trees of links and joints: the data of a rigid-body mechanism, checked as a whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from undertow.errors import ModelError
+from undertow.mechanism import FloatArray
+
+__all__ = ["WORLD", "Actuator", "Coupling", "Joint", "Link", "Tree", "Vector"]
+
+#: Name of the fixed frame that carries the root links.
+WORLD = "world"
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A rigid body.
+
+    Parameters
+    ----------
+    name
+        Unique in the tree.
+    mass
+        kg; zero for frames that carry nothing.
+    com
+        Centre of mass in the link's frame, m.
+    inertia
+        About the centre of mass in the axes of the link's frame, kg m², (3, 3).
+    """
+
+    name: str
+    mass: float = 0.0
+    com: Vector = (0.0, 0.0, 0.0)
+    inertia: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint between two links, and where the child sits while it reads ``reference``.
+
+    Parameters
+    ----------
+    name
+        Unique in the tree.
+    kind
+        ``"hinge"``, ``"slide"`` or ``"fixed"``.
+    parent, child
+        Link names; :data:`WORLD` for the fixed frame.
+    rotation, position
+        Pose of the child's frame in its parent's, (3, 3) and m.
+    axis
+        In the child's frame; normalised here.
+    anchor
+        A point of the hinge's axis in the child's frame, m.
+    damping, stiffness, rest
+        Force −damping · q̇ − stiffness · (q − rest), SI units.
+    armature
+        Rotor inertia (hinge, kg m²) or mass (slide, kg) that turns with the joint.
+    friction
+        Largest dry friction, N m or N: becomes a bound of the disturbance.
+    low, high
+        Range of travel, rad or m.
+    effort
+        Largest force of the joint's actuator, N m or N.
+    reference
+        Reading of the joint in the pose given.
+    """
+
+    name: str
+    kind: Literal["hinge", "slide", "fixed"]
+    parent: str
+    child: str
+    rotation: FloatArray = field(default_factory=lambda: np.eye(3))
+    position: Vector = (0.0, 0.0, 0.0)
+    axis: Vector = (0.0, 0.0, 1.0)
+    anchor: Vector = (0.0, 0.0, 0.0)
+    damping: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    armature: float = 0.0
+    friction: float = 0.0
+    low: float = -math.inf
+    high: float = math.inf
+    effort: float = math.inf
+    reference: float = 0.0
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A linear combination of joints, Σ c_j q_j, that is damped, sprung or carries inertia."""
+
+    name: str
+    coefficients: Mapping[str, float]
+    damping: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    armature: float = 0.0
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """An input u that pushes along a stroke, Σ c_j q_j, with the force ``gain`` · u.
+
+    Parameters
+    ----------
+    name
+        Of the input.
+    coefficients
+        Joint name to c_j.
+    gain
+        Force along the stroke for each unit of input.
+    limit, unit
+        Of the input.
+    stroke
+        Name of Σ c_j q_j, which becomes a coordinate where it is no joint by itself.
+    """
+
+    name: str
+    coefficients: Mapping[str, float]
+    gain: float = 1.0
+    limit: float = math.inf
+    unit: str = ""
+    stroke: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """A tree of links and joints under gravity, m/s², with its actuators."""
+
+    name: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+    gravity: Vector = (0.0, 0.0, -9.81)
+    couplings: tuple[Coupling, ...] = ()
+    actuators: tuple[Actuator, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse repeated names, dangling ends, loops, and links that carry no inertia."""
+        for what, names in (
+            ("link", [link.name for link in self.links]),
+            ("joint", [joint.name for joint in self.joints]),
+            ("actuator", [actuator.name for actuator in self.actuators]),
+        ):
+            repeated = sorted({n for n in names if names.count(n) > 1})
+            if repeated:
+                raise ModelError(
+                    f"a {what} of '{self.name}' is named twice",
+                    value=", ".join(repeated),
+                    limit="unique names",
+                    remedy=f"Rename one {what}",
+                )
+        known = {WORLD, *(link.name for link in self.links)}
+        parents: dict[str, str] = {}
+        for joint in self.joints:
+            for end in (joint.parent, joint.child):
+                if end not in known:
+                    raise ModelError(
+                        f"joint '{joint.name}' of '{self.name}'",
+                        value=f"link {end!r}",
+                        limit=f"one of {', '.join(sorted(known))}",
+                        remedy="Declare the link, or correct its name",
+                    )
+            if joint.child in parents:
+                raise ModelError(
+                    f"link '{joint.child}' of '{self.name}' closes a loop",
+                    value=f"child of joints '{parents[joint.child]}' and '{joint.name}'",
+                    limit="a tree: one parent for each link",
+                    remedy="Cut the loop, or eliminate it and give M, f and B",
+                )
+            parents[joint.child] = joint.name
+        ordered = self.ordered()
+        if len(ordered) != len(self.joints):
+            astray = sorted({j.name for j in self.joints} - {j.name for j in ordered})
+            raise ModelError(
+                f"joints of '{self.name}' that do not hang on the fixed frame",
+                value=", ".join(astray),
+                limit="a tree rooted in the fixed frame",
+                remedy="A loop among them has no root: cut it, or fix one link to the world",
+            )
+        self._check_inertia()
+
+    def ordered(self) -> list[Joint]:
+        """Return the joints from the root outwards."""
+        children: dict[str, list[Joint]] = {}
+        for joint in self.joints:
+            children.setdefault(joint.parent, []).append(joint)
+        order: list[Joint] = []
+        frontier = [WORLD]
+        while frontier:
+            hanging = children.get(frontier.pop(0), [])
+            order += hanging
+            frontier += [joint.child for joint in hanging]
+        return order
+
+    @property
+    def moving(self) -> list[Joint]:
+        """The hinge and slide joints, from the root outwards: the coordinates."""
+        return [joint for joint in self.ordered() if joint.kind != "fixed"]
+
+    def _check_inertia(self) -> None:
+        links = {link.name: link for link in self.links}
+        for link in self.links:
+            inertia = np.asarray(link.inertia, dtype=float)
+            values = np.linalg.eigvalsh(inertia)
+            sound = np.isfinite([link.mass, *link.com, *inertia.ravel()]).all()
+            if not sound or link.mass < 0 or values[0] < -1e-9 * max(1e-12, values[-1]):
+                raise ModelError(
+                    f"inertia of link '{link.name}'",
+                    value=f"mass {link.mass:g} kg, principal moments {values.round(9).tolist()}",
+                    limit="mass ≥ 0 and no negative moment of inertia",
+                    remedy="Check the units and the signs of the products of inertia",
+                )
+        armed = {j for c in self.couplings if c.armature > 0 for j in c.coefficients}
+        for joint in self.moving:
+            beyond, frontier = [joint.child], [joint.child]
+            while frontier:
+                end = frontier.pop()
+                ends = [j.child for j in self.joints if j.parent == end]
+                beyond += ends
+                frontier += ends
+            carried = [links[name] for name in beyond]
+            mass = sum(link.mass for link in carried)
+            turning = sum(float(np.trace(link.inertia)) for link in carried)
+            if joint.kind == "hinge":
+                turning += sum(link.mass * float(np.dot(link.com, link.com)) for link in carried)
+                turning += mass if len(beyond) > 1 else 0.0
+                turning += mass * float(np.dot(joint.anchor, joint.anchor))
+            heavy = mass > 0 if joint.kind == "slide" else turning > 0
+            if not (heavy or joint.armature > 0 or joint.name in armed):
+                raise ModelError(
+                    f"link '{joint.child}' of '{self.name}', moved by joint '{joint.name}'",
+                    value="mass 0 kg, no inertia" if mass == 0 else "no inertia about the joint",
+                    limit="> 0: a massless link has no M > 0",
+                    remedy="Give the link a mass and an inertia, or make the joint fixed",
+                )

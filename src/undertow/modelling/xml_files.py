@@ -1,0 +1,109 @@
+"""What URDF and MJCF share: reading XML safely, and numbers out of attributes."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from undertow.errors import ArtefactError, InvalidInputError, ModelError
+from undertow.mechanism import FloatArray
+
+__all__ = ["numbers_of", "parse_xml", "rotation_from_quaternion", "rotation_from_rpy"]
+
+
+def parse_xml(source: str | Path, root: str) -> ET.Element:
+    """Parse XML text (it starts with ``<``) or a file, and check the name of its root.
+
+    Raises
+    ------
+    ArtefactError
+        When the file cannot be read.
+    InvalidInputError
+        For XML that is not well formed, or declares entities.
+    ModelError
+        For another root element.
+    """
+    text = source if isinstance(source, str) and source.lstrip().startswith("<") else None
+    if text is None:
+        try:
+            text = Path(source).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ArtefactError(
+                f"model file {str(source)!r}",
+                value=getattr(error, "strerror", None) or "no UTF-8 text",
+                limit="a readable file, or XML text",
+                remedy="Check the path",
+            ) from error
+    if "<!ENTITY" in text:
+        raise InvalidInputError(
+            f"<{root}> file",
+            value="entity declarations",
+            limit="plain XML",
+            remedy="Expand the entities first",
+        )
+    try:
+        element = ET.fromstring(text)
+    except ET.ParseError as error:
+        line, column = error.position
+        raise InvalidInputError(
+            f"<{root}> file is no well-formed XML",
+            value=f"{error.msg.split(':')[0]} at line {line}, column {column}",
+            limit="every tag closed and every attribute quoted",
+            remedy="Correct the file there",
+        ) from error
+    if element.tag != root:
+        raise ModelError("model file", value=f"root <{element.tag}>", limit=f"<{root}>")
+    return element
+
+
+def numbers_of(
+    element: ET.Element, attribute: str, default: str | None = None, count: int | None = None
+) -> list[float]:
+    """Return the numbers of an attribute.
+
+    Raises
+    ------
+    InvalidInputError
+        When the attribute is missing (and has no default), holds something else than finite
+        numbers, or another count of them.
+    """
+    text = element.get(attribute, default)
+    label = f"{attribute} of <{element.tag} name={element.get('name', '')!r}>"
+    if text is None:
+        raise InvalidInputError(label, value="missing", limit="given")
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError as error:
+        raise InvalidInputError(label, value=repr(text), limit="numbers") from error
+    if not all(math.isfinite(v) for v in values):
+        raise InvalidInputError(label, value=repr(text), limit="finite numbers")
+    if count is not None and len(values) != count:
+        raise InvalidInputError(label, value=repr(text), limit=f"{count} numbers")
+    return values
+
+
+def rotation_from_rpy(rpy: list[float]) -> FloatArray:
+    """URDF's fixed-axis roll, pitch, yaw: R = R_z(yaw) R_y(pitch) R_x(roll), (3, 3)."""
+    (cr, cp, cy), (sr, sp_, sy) = np.cos(rpy), np.sin(rpy)
+    Rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    Ry = np.array([[cp, 0, sp_], [0, 1, 0], [-sp_, 0, cp]])
+    Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return np.asarray(Rz @ Ry @ Rx)
+
+
+def rotation_from_quaternion(quaternion: list[float]) -> FloatArray:
+    """Rotation matrix of a quaternion (w, x, y, z) of any length but zero, (3, 3)."""
+    length = float(np.linalg.norm(quaternion))
+    if not length > 0:
+        raise InvalidInputError("quaternion", value=quaternion, limit="not zero")
+    w, x, y, z = np.asarray(quaternion) / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
