@@ -76,11 +76,17 @@ class Surface:
             shape = (m, m) if name.endswith("_a") else (m, free)
             if block.shape != shape:
                 raise InvalidInputError(
-                    f"surface block {name}", value=f"shape {block.shape}", limit=f"{shape}"
+                    f"surface block {name}",
+                    value=f"shape {block.shape}",
+                    limit=f"{shape}",
+                    remedy="Blocks with _a are (m, m), those with _u are (m, n−m)",
                 )
             if not np.isfinite(block).all():
                 raise InvalidInputError(
-                    f"surface block {name}", value=block.tolist(), limit="finite numbers"
+                    f"surface block {name}",
+                    value=block.tolist(),
+                    limit="finite numbers",
+                    remedy="Keep the surface that was in use before",
                 )
             block.flags.writeable = False
             object.__setattr__(self, name, block)
@@ -188,13 +194,17 @@ class ReachingLaw:
             values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             if not (np.isfinite(values).all() and (values > 0).all()):
                 raise InvalidInputError(
-                    f"reaching law {name}", value=getattr(self, name), limit="finite and > 0"
+                    f"reaching law {name}",
+                    value=getattr(self, name),
+                    limit="finite and > 0",
+                    remedy="The paper uses η = 20 and a layer of 0.1",
                 )
         if self.switching not in ("saturation", "tanh", "sign"):
             raise InvalidInputError(
                 "switching function",
                 value=repr(self.switching),
                 limit="'saturation', 'tanh' or 'sign'",
+                remedy="Choose 'saturation' for the paper's law (39)",
             )
 
     def vector(self, m: int) -> FloatArray:
@@ -203,7 +213,10 @@ class ReachingLaw:
         for name, value in zip(("eta", "layer"), values, strict=True):
             if value.size not in (1, m):
                 raise InvalidInputError(
-                    f"reaching law {name}", value=value.size, limit=f"1 or {m} numbers"
+                    f"reaching law {name}",
+                    value=f"{value.size} numbers",
+                    limit="1" if m == 1 else f"1 or {m}",
+                    remedy="Give one number for all surfaces, or one per input",
                 )
         return np.concatenate([np.broadcast_to(v, (m,)) for v in values])
 
@@ -487,6 +500,7 @@ def check_surface_shape(mechanism: Mechanism, surface: Surface) -> None:
             f"surface for '{mechanism.name}'",
             value=f"n = {surface.n}, m = {surface.m}",
             limit=f"n = {mechanism.n}, m = {mechanism.m}",
+            remedy="Design a surface for this mechanism: undertow.first_surface",
         )
 
 
@@ -564,7 +578,10 @@ def constant_gains(
     for name, (a, b) in region.items():
         if name not in names:
             raise InvalidInputError(
-                "region of positions", value=repr(name), limit=f"one of {', '.join(names)}"
+                "region of positions",
+                value=repr(name),
+                limit=f"one of {', '.join(names)}",
+                remedy="Name coordinates; those left out stay at the target",
             )
         low[names.index(name)], high[names.index(name)] = a, b
     rng = np.random.default_rng(0)

@@ -1,0 +1,38 @@
+"""Settings of the whole suite, and the closed loops that several files share."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from hypothesis import settings
+
+import undertow as ut
+
+# The same examples on every run: a failure on one machine is a failure on all.
+settings.register_profile("undertow", deadline=None, derandomize=True, database=None)
+settings.load_profile("undertow")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep generated kernels in the checkout: workers share them, the user's cache stays clean."""
+    if config.cache is not None:
+        os.environ.setdefault("UNDERTOW_CACHE", str(config.cache.mkdir("kernels")))
+
+
+@pytest.fixture(scope="session")
+def rig() -> ut.Mechanism:
+    """The paper's rotary pendulum with the damping that its printed totals imply."""
+    return ut.mechanisms.rotary_pendulum(d_e=0.025)
+
+
+@pytest.fixture(scope="session")
+def base() -> ut.Surface:
+    """The base case of Tables 1 and 2."""
+    return ut.Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
+
+
+@pytest.fixture(scope="session")
+def quick() -> ut.Surface:
+    """A surface that brings the rotary pendulum home within a few seconds."""
+    return ut.Surface(alpha_a=-1, lambda_a=-1.59, alpha_u=1.96, lambda_u=12.1)
