@@ -38,7 +38,7 @@ from undertow.tail import LinearEnd, Prepared
 
 __all__ = ["Batch", "ClosedLoop", "Event", "Trajectory"]
 
-#: Stands in for noise and tails that are not there.
+#: Stands in for linear ends that are not there.
 _NOTHING = np.zeros((1, 1, 1))
 
 
