@@ -327,7 +327,7 @@ class ClosedLoop:
         record = np.zeros((padded, -(-steps // every), 2 * n + 2 * m + 2) if every else (0, 0, 0))
         w = len(self.objective.constraints)
         out = np.empty((padded, 6 + w + 2 * n))
-        # A sampled kernel reads the noise of every lane, even where it is multiplied by 0.
+        # A sampled kernel reads the noise of every lane.
         quiet = np.zeros((1, padded, 2 * n)) if self.hold else _NOTHING
         hands_over = self._hands_over and not every
         prepared = self._prepare(lanes[:, -1]) if hands_over or stable_only else None
@@ -342,7 +342,6 @@ class ClosedLoop:
             belief,
             limits,
             quiet if noise is None else noise,
-            0.0 if noise is None else 1.0,
             start,
             self.step,
             steps,
