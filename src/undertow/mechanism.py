@@ -8,6 +8,7 @@ from the expressions kept here.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -64,7 +65,10 @@ class Parameter:
         """Refuse a value that is not finite or not inside its interval."""
         if not self.name.isidentifier():
             raise InvalidInputError(
-                "parameter name", value=repr(self.name), limit="a Python identifier"
+                "parameter name",
+                value=repr(self.name),
+                limit="a Python identifier",
+                remedy="Use letters, digits and underscores, a letter first",
             )
         if not math.isfinite(self.value) or not self.low < self.value < self.high:
             interval = f"finite and inside ({self.low:g}, {self.high:g}) {self.unit}".rstrip()
@@ -265,7 +269,10 @@ class Mechanism:
             matrix = sp.ImmutableDenseMatrix(value)
             if matrix.shape != shape:
                 raise ModelError(
-                    f"{attribute} of '{self.name}'", value=matrix.shape, limit=f"shape {shape}"
+                    f"shape of {attribute} of '{self.name}'",
+                    value=matrix.shape,
+                    limit=f"{shape}",
+                    remedy="Give one row per coordinate, the actuated ones first",
                 )
             object.__setattr__(self, attribute, matrix)
         bounds = tuple(float(b) for b in self.disturbance_bounds) or (0.0,) * n
@@ -274,6 +281,7 @@ class Mechanism:
                 f"disturbance_bounds of '{self.name}'",
                 value=bounds,
                 limit=f"{n} finite numbers ≥ 0, one per coordinate",
+                remedy="Give bounds on |g_i|, 0 where nothing disturbs",
             )
         object.__setattr__(self, "disturbance_bounds", bounds)
         self._check_names()
@@ -308,10 +316,16 @@ class Mechanism:
                     limit=f"among {', '.join(sorted(str(s) for s in allowed))}",
                     remedy="Declare them as parameters, or as coordinates, with real symbols",
                 )
-        if self.mass_matrix != self.mass_matrix.T and sp.simplify(
-            self.mass_matrix - self.mass_matrix.T
-        ) != sp.zeros(self.n):
-            raise ModelError(f"mass_matrix of '{self.name}'", limit="symmetric")
+        skew = self.mass_matrix - self.mass_matrix.T
+        for j, i in itertools.combinations(range(self.n), 2):
+            if skew[i, j] != 0 and sp.simplify(skew[i, j]) != 0:
+                raise ModelError(
+                    f"mass_matrix of '{self.name}'",
+                    value=f"{self.mass_matrix[j, i]} at [{j}, {i}] and "
+                    f"{self.mass_matrix[i, j]} at [{i}, {j}]",
+                    limit="symmetric",
+                    remedy="Derive M from the kinetic energy: Mechanism.from_energies",
+                )
 
     def _check_inertia(self) -> None:
         rng = np.random.default_rng(0)
@@ -415,6 +429,7 @@ class Mechanism:
                     f"unknown parameter of '{self.name}'",
                     value=repr(name),
                     limit=f"one of {', '.join(known)}",
+                    remedy="Use a declared name; values are in SI units",
                 )
         changed = tuple(
             replace(p, value=float(values[p.name])) if p.name in values else p
@@ -426,7 +441,10 @@ class Mechanism:
         """Return the mechanism with other actuator limits, one per input, in its unit."""
         if len(limits) != self.m:
             raise InvalidInputError(
-                f"input limits of '{self.name}'", value=limits, limit=f"{self.m} numbers"
+                f"input limits of '{self.name}'",
+                value=limits,
+                limit=f"{self.m} numbers",
+                remedy="Give one limit per input",
             )
         inputs = tuple(replace(i, limit=float(v)) for i, v in zip(self.inputs, limits, strict=True))
         return replace(self, inputs=inputs)
@@ -453,6 +471,7 @@ class Mechanism:
                 f"unknown coordinate of '{self.name}'",
                 value=", ".join(sorted(unknown)),
                 limit=f"one of {', '.join(c.name for c in self.coordinates)}",
+                remedy="Forces act on coordinates, by their names",
             )
         g = sp.Matrix([sp.sympify(force.get(c.name, 0)) for c in self.coordinates])
         return replace(
@@ -544,6 +563,7 @@ class Mechanism:
                     f"unknown state of '{self.name}'",
                     value=repr(name),
                     limit=f"one of {', '.join(self.state_names)}",
+                    remedy="Use a coordinate's name, or its velocity's",
                 )
             x[self.state_names.index(name)] = value
         return self.check_state(x)
@@ -562,6 +582,7 @@ class Mechanism:
                 f"state of '{self.name}'",
                 value=f"shape {state.shape}",
                 limit=f"(…, {2 * self.n}), in the order {', '.join(self.state_names)}",
+                remedy="Set states by name: mechanism.state(name=value)",
             )
         if not np.isfinite(state).all():
             first = int(np.argwhere(~np.isfinite(state))[0][-1])
@@ -660,7 +681,9 @@ class Mechanism:
         """
         if self.potential is None:
             raise ModelError(
-                f"'{self.name}' has no potential energy",
+                f"energy of '{self.name}'",
+                value="no potential energy",
+                limit="given at construction",
                 remedy="Build it with Mechanism.from_energies, or pass potential=",
             )
         state = self.check_state(x)

@@ -7,7 +7,7 @@ own names, so they are compiled into the kernel with the rest of the loop.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,15 +40,25 @@ class Names:
             str(s): s for s in (*mechanism.x, *mechanism.u, *mechanism.parameter_symbols)
         }
 
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
+        return iter(self._symbols)
+
     def __getattr__(self, name: str) -> Any:
         """Return the symbol of that name."""
         symbols = self.__dict__.get("_symbols", {})
         if name in symbols:
             return symbols[name]
-        raise AttributeError(f"no state, input or parameter '{name}'; there are {list(symbols)}")
+        message = f"no state, input or parameter '{name}'; there are {', '.join(symbols)}"
+        raise AttributeError(message, name=name, obj=self)
 
 
 Formula = Callable[[Names], Any]
+
+_REMEDIES = {
+    "horizon": "Give the longest motion worth waiting for, s",
+    "terminal_radius": "Motions end in a small ball around the target; the paper's is 0.01",
+}
 
 
 @dataclass(frozen=True)
@@ -82,7 +92,12 @@ def state_box(**bounds: float) -> tuple[Constraint, ...]:
 
     def bounded(name: str, bound: float) -> Constraint:
         if not (math.isfinite(bound) and bound > 0):
-            raise InvalidInputError(f"bound of state '{name}'", value=bound, limit="finite, > 0")
+            raise InvalidInputError(
+                f"bound of state '{name}'",
+                value=bound,
+                limit="finite and > 0",
+                remedy="The box is |state| ≤ bound; leave out states without a bound",
+            )
         return Constraint(f"|{name}| ≤ {bound:g}", lambda v: sp.Abs(getattr(v, name)) - bound)
 
     return tuple(bounded(name, bound) for name, bound in bounds.items())
@@ -130,12 +145,32 @@ class Objective:
             value = getattr(self, field)
             if not (math.isfinite(value) and value > 0):
                 raise InvalidInputError(
-                    f"{field} of objective '{self.name}'", value=value, limit="finite and > 0"
+                    f"{field} of objective '{self.name}'",
+                    value=value,
+                    limit="finite and > 0",
+                    remedy=_REMEDIES[field],
                 )
 
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
-        """Return Φ(x, u) as an expression, refusing unknown names and negative values."""
-        return self._expression(mechanism, f"stage cost of '{self.name}'", self.stage)
+        """Return Φ(x, u) as an expression.
+
+        Raises
+        ------
+        InvalidInputError
+            For unknown names, and where Φ is negative or no number at one of 256 random
+            states and inputs.
+        """
+        what = f"stage cost of '{self.name}'"
+        stage = self._expression(mechanism, what, self.stage)
+        lowest = _lowest(mechanism, stage)
+        if not lowest >= 0:
+            raise InvalidInputError(
+                what,
+                value=f"{lowest:.3g} for some states and inputs",
+                limit="≥ 0 everywhere: (21) is a cost that only grows",
+                remedy="Use squares or moduli",
+            )
+        return stage
 
     def path_margins(self, mechanism: Mechanism) -> list[sp.Expr]:
         """Return −w(x, u) of every constraint: signed margins, ≥ 0 is satisfied."""
@@ -151,16 +186,24 @@ class Objective:
         except AttributeError as error:
             raise InvalidInputError(
                 f"{what} for '{mechanism.name}'",
-                value=str(error),
+                value=f"'{error.name}'",
+                limit=f"among {', '.join(Names(mechanism))}",
                 remedy="Use the mechanism's own names",
             ) from error
         if isinstance(value, sp.MatrixBase) and value.shape == (1, 1):
             value = value[0, 0]
         expression = sp.sympify(value)
         allowed = {*mechanism.x, *mechanism.u, *mechanism.parameter_symbols}
-        if not isinstance(expression, sp.Expr) or expression.free_symbols - allowed:
+        if (
+            not isinstance(expression, sp.Expr)
+            or isinstance(expression, sp.MatrixBase)  # which SymPy counts as an expression
+            or expression.free_symbols - allowed
+        ):
             raise InvalidInputError(
-                what, value=expression, limit="one expression in the mechanism's states and inputs"
+                what,
+                value=expression,
+                limit="one expression in the mechanism's states and inputs",
+                remedy="Take symbols from the argument: lambda v: v.phi**2",
             )
         return expression
 
@@ -178,6 +221,17 @@ class MinimumEnergy(Objective):
     unit: str = "V² s"
     state_weight: float = 0.0
 
+    def __post_init__(self) -> None:
+        """Refuse a negative weight, besides what every objective refuses."""
+        super().__post_init__()
+        if not (math.isfinite(self.state_weight) and self.state_weight >= 0):
+            raise InvalidInputError(
+                f"state_weight of objective '{self.name}'",
+                value=self.state_weight,
+                limit="finite and ≥ 0",
+                remedy="Theorem 1 wants a small positive one; the paper has 0",
+            )
+
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
         """Return Φ(x, u) = uᵀu + w xᵀx."""
         x = sp.Matrix(mechanism.x)
@@ -191,6 +245,18 @@ class MinimumTime(Objective):
     name: str = "time"
     stage: Formula = lambda v: sp.Integer(1)
     unit: str = "s"
+
+
+def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
+    """Return the smallest of 256 random values of a stage cost; NaN where one is no number."""
+    rng = np.random.default_rng(0)
+    symbols = [*mechanism.x, *mechanism.u]
+    function = sp.lambdify(symbols, stage.subs(mechanism.substitution), "numpy")
+    reach = np.ones(len(symbols)) * math.pi
+    reach[2 * mechanism.n :] = np.minimum(mechanism.input_limits, 100.0)
+    samples = rng.uniform(-1, 1, (256, len(symbols))) * reach
+    with np.errstate(all="ignore"):
+        return float(np.min(np.real_if_close(function(*samples.T))))
 
 
 def degrees(angle: float) -> float:
