@@ -16,8 +16,9 @@ settings.load_profile("undertow")
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep generated kernels in the checkout: workers share them, the user's cache stays clean."""
-    if config.cache is not None:
-        os.environ.setdefault("UNDERTOW_CACHE", str(config.cache.mkdir("kernels")))
+    cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
+    if cache is not None:
+        os.environ.setdefault("UNDERTOW_CACHE", str(cache.mkdir("kernels")))
 
 
 @pytest.fixture(scope="session")
