@@ -21,8 +21,8 @@ from undertow.mechanism import Coordinate, FloatArray
 
 __all__ = ["ActuatedForm", "actuate", "exact_angle", "number", "tidy"]
 
-#: Expressions longer than this are left as they are: expanding them would not pay.
-_EXPANDABLE = 3000
+#: Expressions of more operations than this are left as they are.
+_EXPANDABLE = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,17 +232,21 @@ def number(value: sp.Expr | float) -> sp.Expr:
 
 
 def tidy(expression: sp.Expr) -> sp.Expr:
-    """Write trigonometry in the sines and cosines of single angles, expanded, if not too long.
+    """Expand, with trigonometry in single angles, where that makes an expression no longer.
 
-    Terms whose numbers cancelled to less than rounding are dropped.
+    Planar mechanisms get short formulas by expanding; spatial ones with tilted axes would
+    explode, and are kept nested.  Terms whose numbers cancelled to rounding are dropped.
     """
     expression = sp.sympify(expression)
-    if expression.is_Atom or sp.count_ops(expression) > _EXPANDABLE:
+    if expression.is_Atom:
+        return expression
+    size = sp.count_ops(expression)
+    if size > _EXPANDABLE:
         return expression
     expanded = sp.expand_trig(sp.expand(expression))
     if expanded.has(sp.Float):
         expanded = sp.Add(*(t for t in sp.Add.make_args(expanded) if not _negligible(t)))
-    return expanded
+    return expanded if sp.count_ops(expanded) <= size else expression
 
 
 def _negligible(term: sp.Expr) -> bool:

@@ -339,7 +339,7 @@ def _body(link: Link, frame: _Frame, book: _Book) -> tuple[sp.Matrix, sp.Expr]:
 def _rotation(axis: sp.Matrix, q: sp.Expr) -> sp.Matrix:
     """Rodrigues' formula, exact for the axes of the frame."""
     K = _cross(axis)
-    s, c = sp.expand_trig(sp.sin(q)), sp.expand_trig(sp.cos(q))
+    s, c = sp.sin(q), sp.cos(q)
     along = axis * axis.T
     return (c * (sp.eye(3) - along) + s * K + along).applyfunc(tidy)
 

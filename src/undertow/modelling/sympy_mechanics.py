@@ -83,8 +83,8 @@ def from_lagrange(
         method.form_lagranges_equations()
     q = list(method.q)
     resting = dict.fromkeys((c.diff(_time()) for c in q), 0)
-    Lagrangian = method._L  # the only place where SymPy keeps it
-    potential = -Lagrangian.subs(resting)
+    # The only place where SymPy keeps the Lagrangian, as a (1, 1) matrix.
+    potential = -sp.Matrix([method._L])[0].subs(resting)
     return _build(
         name, q, method.mass_matrix, method.forcing, potential, inputs, parameters, units, rest
     )

@@ -117,12 +117,12 @@ def read_urdf(
     return tree, tuple(transmitted)
 
 
-def _pose(element: ET.Element) -> tuple[FloatArray, Vector]:
+def _pose(element: ET.Element, of: str) -> tuple[FloatArray, Vector]:
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), (0.0, 0.0, 0.0)
-    x, y, z = numbers_of(origin, "xyz", "0 0 0", 3)
-    return rotation_from_rpy(numbers_of(origin, "rpy", "0 0 0", 3)), (x, y, z)
+    x, y, z = numbers_of(origin, "xyz", "0 0 0", 3, of=of)
+    return rotation_from_rpy(numbers_of(origin, "rpy", "0 0 0", 3, of=of)), (x, y, z)
 
 
 def _name(element: ET.Element) -> str:
@@ -132,10 +132,10 @@ def _name(element: ET.Element) -> str:
     return name
 
 
-def _child(element: ET.Element, tag: str) -> ET.Element:
+def _child(element: ET.Element, tag: str, of: str) -> ET.Element:
     found = element.find(tag)
     if found is None:
-        raise ModelError(f"<{element.tag}> '{_name(element)}'", value=f"no <{tag}>", limit="one")
+        raise ModelError(f"<{element.tag}> of '{of}'", value=f"no <{tag}>", limit="one")
     return found
 
 
@@ -144,8 +144,8 @@ def _link(element: ET.Element) -> Link:
     inertial = element.find("inertial")
     if inertial is None:
         return link
-    R, com = _pose(inertial)
-    (mass,) = numbers_of(_child(inertial, "mass"), "value", None, 1)
+    R, com = _pose(inertial, link.name)
+    (mass,) = numbers_of(_child(inertial, "mass", link.name), "value", None, 1, of=link.name)
     tensor = np.zeros((3, 3))
     given = inertial.find("inertia")
     if given is not None:
@@ -153,7 +153,7 @@ def _link(element: ET.Element) -> Link:
             "ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2),
             "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2),
         }.items():  # fmt: skip
-            tensor[i, j] = tensor[j, i] = numbers_of(given, label, "0", 1)[0]
+            tensor[i, j] = tensor[j, i] = numbers_of(given, label, "0", 1, of=link.name)[0]
     rotated = R @ tensor @ R.T
     rotated[np.abs(rotated) < 1e-14 * max(np.abs(rotated).max(), 1e-300)] = 0.0
     return replace(link, mass=mass, com=com, inertia=(rotated + rotated.T) / 2)
@@ -179,30 +179,32 @@ def _joint(element: ET.Element) -> Joint:
             limit="independent joints",
             remedy="Eliminate it and give M, f and B, or make the joint fixed",
         )
-    R, position = _pose(element)
-    parent = _child(element, "parent").get("link", "")
-    child = _child(element, "child").get("link", "")
+    R, position = _pose(element, name)
+    parent = _child(element, "parent", name).get("link", "")
+    child = _child(element, "child", name).get("link", "")
     joint = Joint(name, _KINDS[kind], parent, child, R, position)
     if joint.kind == "fixed":
         return joint
     axis_element = element.find("axis")
     x, y, z = (
-        (1.0, 0.0, 0.0) if axis_element is None else numbers_of(axis_element, "xyz", "1 0 0", 3)
+        (1.0, 0.0, 0.0)
+        if axis_element is None
+        else numbers_of(axis_element, "xyz", "1 0 0", 3, of=name)
     )
     joint = replace(joint, axis=(x, y, z))
     dynamics = element.find("dynamics")
     if dynamics is not None:
-        (damping,) = numbers_of(dynamics, "damping", "0", 1)
-        (friction,) = numbers_of(dynamics, "friction", "0", 1)
+        (damping,) = numbers_of(dynamics, "damping", "0", 1, of=name)
+        (friction,) = numbers_of(dynamics, "friction", "0", 1, of=name)
         joint = replace(joint, damping=damping, friction=friction)
     limit = element.find("limit")
     if limit is not None:
-        (effort,) = numbers_of(limit, "effort", "0", 1)
+        (effort,) = numbers_of(limit, "effort", "0", 1, of=name)
         # URDF demands an effort and writes 0 for "not known".
         joint = replace(joint, effort=effort if effort > 0 else math.inf)
         if kind != "continuous":
-            (low,) = numbers_of(limit, "lower", "0", 1)
-            (high,) = numbers_of(limit, "upper", "0", 1)
+            (low,) = numbers_of(limit, "lower", "0", 1, of=name)
+            (high,) = numbers_of(limit, "upper", "0", 1, of=name)
             if low < high:
                 joint = replace(joint, low=low, high=high)
     return joint

@@ -60,9 +60,14 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
 
 
 def numbers_of(
-    element: ET.Element, attribute: str, default: str | None = None, count: int | None = None
+    element: ET.Element,
+    attribute: str,
+    default: str | None = None,
+    count: int | None = None,
+    *,
+    of: str = "",
 ) -> list[float]:
-    """Return the numbers of an attribute.
+    """Return the numbers of an attribute; ``of`` names what the element belongs to.
 
     Raises
     ------
@@ -71,7 +76,8 @@ def numbers_of(
         numbers, or another count of them.
     """
     text = element.get(attribute, default)
-    label = f"{attribute} of <{element.tag} name={element.get('name', '')!r}>"
+    owner = of or element.get("name", "")
+    label = f"{attribute} of <{element.tag}>" + f" of '{owner}'" * bool(owner)
     if text is None:
         raise InvalidInputError(label, value="missing", limit="given")
     try:
