@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -180,7 +181,8 @@ def test_each_rollout_may_have_its_own_reaching_law(
     rig: ut.Mechanism, loop: ut.ClosedLoop, starts: FloatArray, quick: ut.Surface
 ) -> None:
     reaching = np.array([[[20.0, 0.1]], [[12.0, 0.4]], [[35.0, 0.2]]])
-    together = loop.batch(starts[:3], [quick] * 3, reaching=reaching, duration=3.0)
+    vectors = np.tile(quick.vector, (3, 1))
+    together = loop.batch(starts[:3], vectors, reaching=reaching, duration=3.0)
     for i, (eta, layer) in enumerate(reaching[:, 0]):
         own = ut.ClosedLoop(rig, reaching=ut.ReachingLaw(eta, layer))
         alone = own.batch(starts[i], [quick], duration=3.0)
@@ -226,30 +228,42 @@ def wrong_belief(rig: ut.Mechanism) -> ut.Mechanism:
     )
 
 
-@pytest.mark.parametrize("hold", [1, 4])
+@pytest.mark.parametrize("truthful", [True, False])
 def test_sampled_loops_equal_a_plain_reference(
-    rig: ut.Mechanism, wrong_belief: ut.Mechanism, quick: ut.Surface, hold: int
+    rig: ut.Mechanism, wrong_belief: ut.Mechanism, quick: ut.Surface, truthful: bool
 ) -> None:
     """Law on the believed model and the measured state, held; plant on its own equations."""
-    loop = ut.ClosedLoop(rig, plant=wrong_belief, hold=hold)
-    x0, samples = rig.state(phi=0.4, theta=0.1), 60 // hold
+    loop = ut.ClosedLoop(rig, plant=None if truthful else wrong_belief, hold=4)
+    loop = loop if truthful else interpreted(loop)
+    x0, samples = rig.state(phi=0.4, theta=0.1), 10
     noise = np.random.default_rng(6).normal(0, 2e-3, (samples, 4))
-    run = loop.simulate(x0, quick, duration=0.12, terminal=0.0, noise=noise, start=0.7)
+    run = loop.simulate(x0, quick, duration=0.08, terminal=0.0, noise=noise, start=0.7)
     law = ut.SlidingModeLaw(rig, quick)
 
     def sampled(t: float, x: FloatArray) -> FloatArray:
-        return law(t, x + noise[round((t - 0.7) / (0.002 * hold))]).u
+        return law(t, x + noise[round((t - 0.7) / 0.008)]).u
 
-    expected = runge_kutta(wrong_belief, sampled, x0, 0.002, 60, hold=hold, start=0.7)
+    expected = runge_kutta(loop.truth, sampled, x0, 0.002, 40, hold=4, start=0.7)
     np.testing.assert_allclose(run.x, expected, rtol=1e-9, atol=1e-9)
-    held = run.u[:-1, 0].reshape(samples, hold)
-    np.testing.assert_array_equal(held, np.repeat(held[:, :1], hold, axis=1))
-    quiet = loop.simulate(x0, quick, duration=0.12, terminal=0.0, start=0.7)
-    silent = loop.simulate(
-        x0, quick, duration=0.12, terminal=0.0, start=0.7, noise=np.zeros((samples, 4))
+    held = run.u[:-1, 0].reshape(samples, 4)
+    np.testing.assert_array_equal(held, np.repeat(held[:, :1], 4, axis=1))
+    quiet, silent = (
+        loop.simulate(x0, quick, duration=0.08, terminal=0.0, start=0.7, noise=none)
+        for none in (None, np.zeros((samples, 4)))
     )
     np.testing.assert_array_equal(quiet.x, silent.x)
     assert np.abs(quiet.x - run.x).max() > 1e-4
+
+
+def test_noise_that_runs_out_keeps_its_last_sample(rig: ut.Mechanism, quick: ut.Surface) -> None:
+    loop, x0 = ut.ClosedLoop(rig, hold=4), rig.state(phi=0.3)
+    short = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.01, 0.0, 0.1]])
+    long = np.vstack([short, np.tile(short[1], (8, 1))])
+    one, two = (
+        loop.simulate(x0, quick, duration=0.08, terminal=0.0, noise=noise)
+        for noise in (short, long)
+    )
+    np.testing.assert_array_equal(one.x, two.x)
 
 
 def test_sampled_batches_without_noise_read_none(rig: ut.Mechanism, quick: ut.Surface) -> None:
@@ -280,16 +294,17 @@ def test_a_plant_like_the_belief_changes_nothing_but_rounding(
     rig: ut.Mechanism, wrong_belief: ut.Mechanism, quick: ut.Surface
 ) -> None:
     right = wrong_belief.with_parameters(m=0.125, d_e=0.025, push=0.0)
-    one, two = (
-        ut.ClosedLoop(rig, plant=plant, hold=4).simulate(rig.state(phi=0.4), quick, duration=1.0)
-        for plant in (None, right)
-    )
-    np.testing.assert_allclose(one.x, two.x, atol=1e-10)
+    x0 = rig.state(phi=0.4)
+    one = ut.ClosedLoop(rig, hold=4).simulate(x0, quick, duration=0.08)
+    twin = interpreted(ut.ClosedLoop(rig, plant=right, hold=4))
+    two = twin.simulate(x0, quick, duration=0.08)
+    np.testing.assert_allclose(one.x, two.x, atol=1e-12)
 
 
 # -- reaching and the boundary layer ---------------------------------------------------------
 
 
+@pytest.mark.slow  # a kernel of its own; in test_sliding.py NumPy proves the same for any n, m
 def test_sign_switching_reaches_the_surface_within_16_under_disturbance(
     rig: ut.Mechanism, quick: ut.Surface
 ) -> None:
@@ -558,7 +573,7 @@ def refusals(rig: ut.Mechanism, s: ut.Surface) -> dict[str, tuple[Callable[[], o
         "surface": (lambda: loop.simulate(x0, random_surface(3, 1)), "n = 3, m = 1"),
         "vector": (lambda: loop.batch(x0, np.ones(5)), r"\(1, 1, 5\)"),
         "no surface": (lambda: loop.batch(x0, np.ones((0, 4))), "at least one"),
-        "late start": (lambda: loop.simulate(x0, s, switch_times=(0.1,)), r"\[0\.1\].*0 first"),
+        "late start": (lambda: loop.simulate(x0, s, switch_times=(0.1,)), r"times.*\[0\.1\]"),
         "falling times": (
             lambda: loop.simulate(x0, [s, s, s], switch_times=(0.0, 0.2, 0.1)),
             r"\[0\.0, 0\.2, 0\.1\]",
@@ -590,7 +605,8 @@ def refusals(rig: ut.Mechanism, s: ut.Surface) -> dict[str, tuple[Callable[[], o
 
 def test_bad_input_is_refused_with_value_and_limit(rig: ut.Mechanism, quick: ut.Surface) -> None:
     for what, (attempt, message) in refusals(rig, quick).items():
-        with pytest.raises(InvalidInputError, match=message) as caught:
+        with pytest.raises(InvalidInputError) as caught:
             attempt()
+        assert re.search(message, str(caught.value)), (what, str(caught.value))
         assert caught.value.value is not None, what
         assert caught.value.limit is not None, what
