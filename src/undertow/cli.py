@@ -1,0 +1,270 @@
+"""The command line: parse and dispatch only."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from undertow import inputs, results
+from undertow.cascade import Cascade
+from undertow.errors import UndertowError
+from undertow.optimiser import Budget, Optimiser
+from undertow.rollout import ClosedLoop
+from undertow.stability import check_surface, first_surface
+
+__all__ = ["app", "main"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _examples(*lines: str) -> str:
+    return "\n\n".join(["[bold]Examples[/bold]", *lines])
+
+
+def _reports_errors(command: Callable[P, R]) -> Callable[P, R]:
+    """Turn a condition into one line on standard error; exit 2 for bad input, else 1."""
+
+    @wraps(command)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return command(*args, **kwargs)
+        except UndertowError as error:
+            typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
+            typer.echo(" ".join(str(error).split()), err=True)
+            raise typer.Exit(2 if isinstance(error, ValueError) else 1) from None
+
+    return guarded
+
+
+def _console(*, stderr: bool = False) -> Console:
+    return Console(stderr=stderr, highlight=False)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, float], None]]:
+    """Show progress on standard error: a bar on a terminal, else a line for each new part."""
+    console = _console(stderr=True)
+    if not console.is_terminal:
+        told: list[str] = []
+
+        def tell(what: str, _fraction: float) -> None:
+            if what not in told:
+                told.append(what)
+                console.print(f"… {what}", soft_wrap=True, markup=False)
+
+        yield tell
+        return
+    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
+
+
+def _write(console: Console, out: Path, files: Mapping[str, bytes]) -> None:
+    earlier = results.write_files(out, files)
+    if earlier is not None:
+        console.print(f"Earlier results moved to {earlier}/", soft_wrap=True, markup=False)
+    console.print(f"Written to {out}/: {', '.join(files)}", soft_wrap=True, markup=False)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"undertow {results.versions()['undertow'] or '(from source)'}")
+        raise typer.Exit
+
+
+Name = Annotated[str, typer.Argument(help="Mechanism, e.g. rotary_pendulum.")]
+Start = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Initial state, with its unit: phi=40deg, theta_dot=10deg/s, x=0.2m. Repeatable; "
+        "what is not named is zero. Default: the mechanism's usual start.",
+        metavar="STATE=VALUE",
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Parameter in SI units. Repeatable.", metavar="NAME=VALUE"),
+]
+Goal = Annotated[Literal["energy", "time"], typer.Option(help="What is minimised.")]
+Horizon = Annotated[float, typer.Option(help="Longest motion, s.")]
+Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Optimal sliding-mode cascade control of underactuated mechanisms."""
+
+
+@app.command(
+    epilog=_examples(
+        "undertow reproduce",
+        "undertow reproduce --out results --seed 1",
+        "undertow reproduce --quick",
+    )
+)
+@_reports_errors
+def reproduce(
+    out: Annotated[Path, typer.Option(help="Folder for tables, figures and manifest.")] = Path(
+        "results"
+    ),
+    seed: Seed = 0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A look: one condition, short searches, no bounds.")
+    ] = False,
+) -> None:
+    """Run the paper's experiment: Tables 1 and 2 beside the paper's, Figures 3 to 6."""
+    from undertow import paper
+
+    results.check_folder(out)
+    began = time.perf_counter()
+    effort = paper.Effort.quick() if quick else paper.Effort()
+    with _progress() as progress:
+        result = paper.reproduce(seed=seed, effort=effort, progress=progress)
+    console = _console()
+    console.print(paper.report(result))
+    console.print()
+    _write(console, out, paper.files(result))
+    console.print(f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
+
+
+@app.command(
+    epilog=_examples(
+        "undertow simulate rotary_pendulum --start phi=35deg",
+        "undertow simulate rotary_pendulum --start phi=40deg --objective time --set d_e=0.025 "
+        "--out motion",
+        "undertow simulate rotary_pendulum --start phi=20deg "
+        "--surface 'lambda_a=-0.5 alpha_u=5 lambda_u=10'",
+        "undertow simulate rotary_pendulum --control one-time --plant m=0.15",
+    )
+)
+@_reports_errors
+def simulate(
+    name: Name,
+    start: Start = None,
+    objective: Goal = "energy",
+    control: Annotated[
+        Literal["cascade", "one-time", "first"],
+        typer.Option(
+            help="cascade: re-optimised every period. one-time: optimised at the start. "
+            "first: the designed surface."
+        ),
+    ] = "cascade",
+    surface: Annotated[
+        str | None,
+        typer.Option(
+            help="A surface of your own instead: 'lambda_a=-0.5 alpha_u=5 lambda_u=10'; commas "
+            "between entries of a row, semicolons between rows; alpha_a is -1 if not given.",
+            metavar="BLOCKS",
+        ),
+    ] = None,
+    setting: Settings = None,
+    plant: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Parameter of the true plant that the controller does not know of, SI units. "
+            "Repeatable.",
+            metavar="NAME=VALUE",
+        ),
+    ] = None,
+    horizon: Horizon = 60.0,
+    period: Annotated[float, typer.Option(help="Time between re-optimisations, s.")] = 0.1,
+    seed: Seed = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for motion.csv, motion.png and manifest.json.")
+    ] = None,
+) -> None:
+    """Simulate a mechanism under its sliding-mode law, from a start to the target."""
+    from undertow import report
+
+    request = {k: v for k, v in locals().items() if k not in ("report", "out")}
+    belief = inputs.mechanism_named(name, setting or ())
+    truth = belief.with_parameters(**inputs.parse_values(plant)) if plant else None
+    x0 = inputs.parse_start(belief, start or ())
+    goal = inputs.objective_named(objective, belief, horizon)
+    given = None if surface is None else inputs.parse_surface(belief, surface)
+    if out is not None:
+        results.check_folder(out)
+    run = None
+    if given is None and control == "cascade":
+        cascade = Cascade(belief, goal, period=period, seed=seed)
+        with _progress() as progress:
+            run = cascade.simulate(
+                x0, plant=truth, progress=lambda t, end: progress("cascade", t / end)
+            )
+        motion, surfaces = run.trajectory, run.surfaces
+    else:
+        if given is None:
+            given = first_surface(belief)
+            if control == "one-time":
+                given = Optimiser(ClosedLoop(belief, goal), seed=seed).require(x0).surface or given
+        check_surface(belief, given, x0)
+        motion = ClosedLoop(belief, goal, plant=truth).simulate(x0, given)
+        surfaces = (given,)
+    console = _console()
+    console.print(report.motion_report(belief, goal, x0, motion, surfaces[0], run))
+    if out is not None:
+        _write(console, out, report.motion_files(request, motion, motion.total, surfaces))
+    if motion.event.name != "REACHED":
+        raise typer.Exit(1)
+
+
+@app.command(
+    epilog=_examples(
+        "undertow optimise rotary_pendulum --start phi=40deg",
+        "undertow optimise rotary_pendulum --start phi=41deg --objective time --set d_e=0.025",
+        "undertow optimise rotary_pendulum --evaluations 20000 --seed 3 --out answer",
+    )
+)
+@_reports_errors
+def optimise(
+    name: Name,
+    start: Start = None,
+    objective: Goal = "energy",
+    setting: Settings = None,
+    horizon: Horizon = 60.0,
+    evaluations: Annotated[int, typer.Option(help="Rollouts that the search may spend.")] = 3072,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for proposal.json.")] = None,
+) -> None:
+    """Find the best surface from a start: one global optimisation, with its margins."""
+    from undertow import report
+
+    request: dict[str, Any] = {k: v for k, v in locals().items() if k not in ("report", "out")}
+    belief = inputs.mechanism_named(name, setting or ())
+    x0 = inputs.parse_start(belief, start or ())
+    goal = inputs.objective_named(objective, belief, horizon)
+    if out is not None:
+        results.check_folder(out)
+    optimiser = Optimiser(ClosedLoop(belief, goal), cold=Budget(evaluations), seed=seed)
+    proposal = optimiser.require(x0)
+    console = _console()
+    console.print(report.proposal_report(belief, goal, x0, proposal))
+    if out is not None:
+        _write(console, out, report.proposal_files(request, proposal))
+
+
+def main() -> None:
+    """Run the command line."""
+    app()

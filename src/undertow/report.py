@@ -1,0 +1,219 @@
+"""What `undertow simulate` and `undertow optimise` show and leave behind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from undertow import results
+from undertow.cascade import Run
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.objective import Objective
+from undertow.optimiser import Proposal
+from undertow.plot import display, figure_bytes, motion_figure
+from undertow.rollout import Event, Trajectory
+from undertow.sliding import Surface
+from undertow.stability import Margin
+
+__all__ = ["motion_files", "motion_report", "proposal_files", "proposal_report"]
+
+_ENDINGS = {
+    Event.REACHED: "reached the target, ‖x‖ ≤ {radius:g}",
+    Event.HORIZON: "had not reached ‖x‖ ≤ {radius:g} by the horizon",
+    Event.CONSTRAINT: "broke a path constraint or the hard input limit",
+    Event.SINGULAR: "met the singularity (37): the law does not exist further on",
+    Event.DIVERGED: "diverged",
+}
+
+
+def _facts(rows: Sequence[tuple[str, str]]) -> Table:
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="dim")
+    grid.add_column()
+    for name, value in rows:
+        grid.add_row(name, Text(value))
+    return grid
+
+
+def _state_words(mechanism: Mechanism, x: FloatArray) -> str:
+    """Return the non-zero entries of a state, angles in degrees."""
+    words = []
+    for index, (name, value) in enumerate(zip(mechanism.state_names, x, strict=True)):
+        coordinate = mechanism.coordinates[index % mechanism.n]
+        factor, unit = display(coordinate.unit, index >= mechanism.n)
+        if value != 0:
+            words.append(
+                f"{name} = {factor * value:.4g}{'' if unit.startswith('°') else ' '}{unit}"
+            )
+    return ", ".join(words) or "at the target"
+
+
+def _surface_words(surface: Surface) -> str:
+    return repr(surface).removeprefix("Surface(").removesuffix(")")
+
+
+def _head(mechanism: Mechanism, objective: Objective, start: FloatArray) -> list[tuple[str, str]]:
+    return [
+        ("mechanism", f"{mechanism.name}: {mechanism.description}"),
+        ("objective", f"minimum {objective.name}, {objective.unit}"),
+        ("start", _state_words(mechanism, start)),
+    ]
+
+
+def ended(motion: Trajectory, objective: Objective) -> str:
+    """Say in words how a motion ended."""
+    words = _ENDINGS[motion.event].format(radius=objective.terminal_radius)
+    return f"{words}, at {motion.duration:.3f} s"
+
+
+def motion_report(
+    mechanism: Mechanism,
+    objective: Objective,
+    start: FloatArray,
+    motion: Trajectory,
+    surface: Surface,
+    run: Run | None = None,
+) -> RenderableType:
+    """Return a simulated motion for the terminal.
+
+    Parameters
+    ----------
+    mechanism, objective, start
+        What was asked for.
+    motion
+        What the plant did.
+    surface
+        The (first) surface.
+    run
+        The cascade's record, where a cascade was run.
+    """
+    rows = _head(mechanism, objective, start)
+    if run is None:
+        rows.append(("surface", _surface_words(surface)))
+    else:
+        admitted = sum(update.admission.accepted for update in run.updates)
+        rows += [
+            ("first surface", _surface_words(surface)),
+            ("last surface", _surface_words(run.surfaces[-1])),
+            ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
+        ]
+        if len(run.descent):
+            rows.append(
+                ("Lemma 3", f"smallest slack {run.descent.min():.2e} {objective.unit} (≥ 0 wanted)")
+            )
+    rows += [
+        ("cost", f"{motion.total:.6g} {objective.unit}"),
+        (
+            "largest input",
+            ", ".join(
+                f"|{channel.name}| = {abs(motion.u[:, i]).max():.3g} of {channel.limit:g} "
+                f"{channel.unit}"
+                for i, channel in enumerate(mechanism.inputs)
+            ),
+        ),
+    ]
+    good = motion.event == Event.REACHED
+    mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
+    return Group(_facts(rows), mark + Text(ended(motion, objective)))
+
+
+def motion_files(
+    request: Mapping[str, object], motion: Trajectory, cost: float, surfaces: Sequence[Surface]
+) -> dict[str, bytes]:
+    """Return a motion's files: ``motion.csv`` (SI units), ``motion.png``, ``manifest.json``.
+
+    Parameters
+    ----------
+    request
+        What was asked for, to be kept in the manifest.
+    motion
+        The motion.
+    cost
+        Its total.
+    surfaces
+        The surfaces in use, in order.
+    """
+    mechanism = motion.mechanism
+    header = [
+        "t",
+        *mechanism.state_names,
+        *(channel.name for channel in mechanism.inputs),
+        *(f"s_{i}" for i in range(mechanism.m)),
+        "cost",
+        "margin_37",
+    ]
+    columns = (motion.t, *motion.x.T, *motion.u.T, *motion.s.T, motion.cost, motion.margin)
+    table = results.to_csv(
+        header, ([f"{value:.9g}" for value in row] for row in zip(*columns, strict=True))
+    )
+    facts = {
+        **_manifest("undertow simulate", request),
+        "ended": motion.event.name.lower(),
+        "time_s": motion.duration,
+        "cost": cost,
+        "surfaces": [surface.vector.tolist() for surface in surfaces],
+    }
+    return {
+        "motion.csv": table,
+        "motion.png": figure_bytes(motion_figure({"motion": motion})),
+        "manifest.json": results.to_json(facts),
+    }
+
+
+def proposal_report(
+    mechanism: Mechanism, objective: Objective, start: FloatArray, proposal: Proposal
+) -> RenderableType:
+    """Return one optimisation's answer for the terminal, with its margins."""
+    assert proposal.surface is not None  # require() raises otherwise
+    rows = [
+        *_head(mechanism, objective, start),
+        ("surface", _surface_words(proposal.surface)),
+        ("predicted cost", f"{proposal.cost:.6g} {objective.unit}"),
+        ("status", proposal.status),
+        ("work", f"{proposal.evaluations} rollouts in {proposal.seconds:.2f} s"),
+    ]
+    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
+    table.add_column("margin (≥ 0 is satisfied)")
+    table.add_column("value", justify="right")
+    table.add_column("")
+    for margin in proposal.margins:
+        table.add_row(Text(margin.name), f"{margin.value:.4g}", margin.unit)
+    return Group(_facts(rows), "", table)
+
+
+def proposal_files(request: Mapping[str, object], proposal: Proposal) -> dict[str, bytes]:
+    """Return one optimisation's answer as ``proposal.json``."""
+    surface = proposal.surface
+    assert surface is not None  # require() raises otherwise
+    return {
+        "proposal.json": results.to_json(
+            {
+                **_manifest("undertow optimise", request),
+                "surface": {
+                    "alpha_a": surface.alpha_a.tolist(),
+                    "lambda_a": surface.lambda_a.tolist(),
+                    "alpha_u": surface.alpha_u.tolist(),
+                    "lambda_u": surface.lambda_u.tolist(),
+                },
+                "cost": proposal.cost,
+                "status": proposal.status,
+                "margins": [_margin(margin) for margin in proposal.margins],
+                "evaluations": proposal.evaluations,
+                "seconds": round(proposal.seconds, 4),
+            }
+        )
+    }
+
+
+def _margin(margin: Margin) -> dict[str, Any]:
+    value = margin.value if isfinite(margin.value) else None
+    return {"name": margin.name, "value": value, "unit": margin.unit}
+
+
+def _manifest(what: str, request: Mapping[str, object]) -> dict[str, object]:
+    return {"what": what, "versions": results.versions(), "request": dict(request)}
