@@ -20,6 +20,7 @@ from undertow.errors import (
 )
 from undertow.optimiser import Proposal
 from undertow.paper import CASES
+from undertow.plan import Plan
 
 GOOD = CASES["4 one-time, time"]
 BASE = CASES["1 base case"]
@@ -112,7 +113,7 @@ def test_same_seed_same_bits(run: ut.Run, cascade: ut.Cascade) -> None:
 def test_replay_of_the_record_gives_the_same_decisions(run: ut.Run, cascade: ut.Cascade) -> None:
     """The recorded states and proposals, passed through the gate again, decide the same."""
     first = run.updates[0]
-    state = CascadeState(first.surface, 0, first.predicted)
+    state = CascadeState(first.plan, 0, first.predicted)
     for update in run.updates[1:]:
         state, admission = cascade.consider(state, update.proposal, update.x, 60.0 - update.t)
         assert admission == update.admission
@@ -140,19 +141,19 @@ def crash(_: Proposal) -> Proposal:
 
 
 def nothing(answer: Proposal) -> Proposal:
-    return replace(answer, surface=None, status="infeasible", message="gave up")
+    return replace(answer, plan=None, status="infeasible", message="gave up")
 
 
 def unstable(answer: Proposal) -> Proposal:
-    return replace(answer, surface=ut.Surface(-1, 0.5, 5, 10), cost=0.0)
+    return replace(answer, plan=Plan.of(ut.Surface(-1, 0.5, 5, 10)), cost=0.0)
 
 
 def nearly_singular(answer: Proposal) -> Proposal:
-    return replace(answer, surface=ut.Surface(-1, -1.0, 1.05, 9.0), cost=0.0)
+    return replace(answer, plan=Plan.of(ut.Surface(-1, -1.0, 1.05, 9.0)), cost=0.0)
 
 
 def costly(answer: Proposal) -> Proposal:
-    return replace(answer, surface=CASES["2 one-time, energy"], cost=0.0)
+    return replace(answer, plan=Plan.of(CASES["2 one-time, energy"]), cost=0.0)
 
 
 def stale(answer: Proposal) -> Proposal:
@@ -222,7 +223,7 @@ def test_failures_now_and_then_cost_little(cascade: ut.Cascade) -> None:
 
 def test_bad_measurement_is_refused_before_anything_is_decided(cascade: ut.Cascade) -> None:
     """NaN in the state names the sensor's entry; the cascade's memory is untouched."""
-    state = CascadeState(GOOD, 3, 1.0)
+    state = CascadeState(Plan.of(GOOD), 3, 1.0)
     proposal = cascade.propose(state, np.array([0.0, np.nan, 0.0, 0.0]))
     assert proposal.status == "failed"
     assert "'phi'" in proposal.message
@@ -236,11 +237,11 @@ def test_bad_measurement_is_refused_before_anything_is_decided(cascade: ut.Casca
 def test_gate_believes_nothing_that_the_optimiser_says(cascade: ut.Cascade) -> None:
     """A proposal that claims cost 0 is judged by a rollout of its own."""
     x = cascade.mechanism.state(phi=ut.deg(30))
-    admission = cost_gate(cascade.loop, GOOD, BASE, x, 60.0)
+    admission = cost_gate(cascade.loop, Plan.of(GOOD), Plan.of(BASE), x, 60.0)
     kept, new = cascade.loop.batch(x, [GOOD, BASE]).cost
     assert not admission.accepted
     assert admission.cost == kept < new
-    swapped = cost_gate(cascade.loop, BASE, GOOD, x, 60.0)
+    swapped = cost_gate(cascade.loop, Plan.of(BASE), Plan.of(GOOD), x, 60.0)
     assert swapped.accepted
     assert swapped.cost == kept
 
@@ -248,17 +249,17 @@ def test_gate_believes_nothing_that_the_optimiser_says(cascade: ut.Cascade) -> N
 def test_equal_cost_is_admitted_and_any_more_is_not(cascade: ut.Cascade) -> None:
     """The gate is tight: the surface in use passes, a slightly dearer one does not."""
     x = cascade.mechanism.state(phi=ut.deg(30))
-    assert cost_gate(cascade.loop, GOOD, GOOD, x, 60.0).accepted
+    assert cost_gate(cascade.loop, Plan.of(GOOD), Plan.of(GOOD), x, 60.0).accepted
     worse = ut.Surface(-1, GOOD.lambda_a * 0.999, GOOD.alpha_u, GOOD.lambda_u)
     costs = cascade.loop.batch(x, [GOOD, worse]).cost
     assert costs[1] > costs[0]
-    assert not cost_gate(cascade.loop, GOOD, worse, x, 60.0).accepted
+    assert not cost_gate(cascade.loop, Plan.of(GOOD), Plan.of(worse), x, 60.0).accepted
 
 
 def test_proposals_out_of_order_are_refused(cascade: ut.Cascade) -> None:
     """A number that is not newer than the last one considered changes nothing."""
     x = cascade.mechanism.state(phi=ut.deg(30))
-    state = CascadeState(BASE, 0, math.inf)
+    state = CascadeState(Plan.of(BASE), 0, math.inf)
     proposal = cascade.propose(state, x)
     after, admission = cascade.consider(state, proposal, x)
     assert admission.accepted
@@ -285,7 +286,7 @@ def test_fast_step_is_bounded_and_never_nan(cascade: ut.Cascade) -> None:
     """At any state, singular ones too, the input is a number within the limit."""
     rng = np.random.default_rng(0)
     states = rng.uniform(-1, 1, (2000, 4)) * [10, np.pi, 50, 50]
-    control = cascade.control(CascadeState(GOOD), 0.0, states)
+    control = cascade.control(CascadeState(Plan.of(GOOD)), 0.0, states)
     assert np.isfinite(control.u).all()
     assert np.abs(control.u).max() <= 15.0
 

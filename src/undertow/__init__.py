@@ -4,9 +4,11 @@ from math import radians as deg
 
 from undertow import mechanisms
 from undertow.cascade import Cascade, Run
+from undertow.decision import Freedom
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
 from undertow.optimiser import Budget, Optimiser, Proposal
+from undertow.plan import Plan
 from undertow.rollout import ClosedLoop, Event, Trajectory
 from undertow.sliding import ReachingLaw, SlidingModeLaw, Surface
 from undertow.stability import check_surface, first_surface, placed_surface, surface_margins
@@ -18,6 +20,7 @@ __all__ = [
     "Constraint",
     "Coordinate",
     "Event",
+    "Freedom",
     "Input",
     "Mechanism",
     "MinimumEnergy",
@@ -25,6 +28,7 @@ __all__ = [
     "Objective",
     "Optimiser",
     "Parameter",
+    "Plan",
     "Proposal",
     "ReachingLaw",
     "Run",

@@ -15,10 +15,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.decision import Freedom
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Objective
 from undertow.optimiser import INADMISSIBLE, Budget, Optimiser, Proposal
+from undertow.plan import Plan
 from undertow.rollout import ClosedLoop, Event, Trajectory
 from undertow.sliding import Control, ReachingLaw, SlidingModeLaw, Surface
 from undertow.stability import check_surface, stability_margin
@@ -41,15 +43,13 @@ class Admission:
 #: Relative tolerance of the linear tail in the optimiser's rollouts.
 TAIL = 5e-3
 
-Gate = Callable[[ClosedLoop, Surface, Surface, FloatArray, float], Admission]
+Gate = Callable[[ClosedLoop, Plan, Plan, FloatArray, float], Admission]
 
 
-def cost_gate(
-    loop: ClosedLoop, old: Surface, new: Surface, x: FloatArray, horizon: float
-) -> Admission:
-    """Admit a surface that is stable, feasible from x, and does not raise the cost.
+def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
+    """Admit a plan that is stable, feasible from x, and does not raise the cost.
 
-    Both surfaces are rolled out afresh from the present state: nothing that the optimiser
+    Both plans are rolled out afresh from the present state: nothing that the optimiser
     says of them is believed.  This is the step of Lemma 3, J̃_{k+1} ≤ Ĵ_{k+1}.
 
     Parameters
@@ -57,7 +57,7 @@ def cost_gate(
     loop
         The predicted closed loop.
     old, new
-        The surface in use and the proposed one.
+        The plan in use, shifted to now, and the proposed one.
     x
         Present state, (2n,).
     horizon
@@ -66,7 +66,7 @@ def cost_gate(
     pair = loop.batch(x, [old, new], duration=horizon)
     old_cost, new_cost = pair.score(horizon)
     old_cost = float(old_cost) if old_cost < INADMISSIBLE else math.inf
-    stability = float(stability_margin(loop.mechanism, new))
+    stability = float(stability_margin(loop.mechanism, new.surfaces[-1]))
     if not stability > 0:
         return Admission(False, f"unstable: margin {stability:.3g} 1/s", old_cost)
     if new_cost >= INADMISSIBLE:
@@ -85,21 +85,32 @@ def cost_gate(
 class CascadeState:
     """What the cascade remembers between steps.
 
-    ``surface`` is in use; ``sequence`` is the number of the last proposal considered;
-    ``predicted`` is the predicted cost J̃_k at the last decision; ``scale`` that of the first.
+    ``plan`` is in use since the time ``since``; ``sequence`` is the number of the last
+    proposal considered; ``predicted`` is the predicted cost J̃_k at the last decision;
+    ``scale`` that of the first.
     """
 
-    surface: Surface
+    plan: Plan
     sequence: int = 0
     predicted: float = math.inf
     scale: float = 0.0
+    since: float = 0.0
+
+    @property
+    def surface(self) -> Surface:
+        """The first surface of the plan in use."""
+        return self.plan.surfaces[0]
+
+    def at(self, t: float) -> Plan:
+        """Return what is left of the plan in use at time t, s."""
+        return self.plan.shifted(t - self.since)
 
 
 @dataclass(frozen=True, eq=False)
 class Update:
     """One decision of the outer loop, as recorded.
 
-    ``t`` and ``x`` are when and where; ``surface`` the one in use afterwards; ``predicted``
+    ``t`` and ``x`` are when and where; ``plan`` the one in use afterwards; ``predicted``
     its J̃_k; ``spent`` the cost spent since the decision before.
     """
 
@@ -107,9 +118,14 @@ class Update:
     x: FloatArray
     proposal: Proposal
     admission: Admission
-    surface: Surface
+    plan: Plan
     predicted: float
     spent: float
+
+    @property
+    def surface(self) -> Surface:
+        """The surface in use after the decision."""
+        return self.plan.surfaces[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +197,12 @@ class Cascade:
     step, hold
         Runge-Kutta step of the predictions, s, and steps per sample of the inner loop
         (0: continuous), as for :class:`undertow.ClosedLoop`.
+    freedom
+        What may be chosen besides the paper's surface parameters: reaching gains, a
+        schedule of surfaces.  Times of a schedule are multiples of the period.
     cold, warm
-        Budgets of the first optimisation and of the later ones.
+        Budgets of the first optimisation and of the later ones; by default as the method
+        needs.
     resolution
         Differences in predicted cost below this part of the first one are not worth a
         search.
@@ -214,8 +234,9 @@ class Cascade:
     first: Surface | None = None
     step: float = 0.002
     hold: int = 0
-    cold: Budget = Budget(3072)
-    warm: Budget = Budget(1024)
+    freedom: Freedom = Freedom()
+    cold: Budget | None = None
+    warm: Budget | None = None
     resolution: float = 1e-4
     gate: Gate = cost_gate
     seed: int = 0
@@ -231,6 +252,13 @@ class Cascade:
                 limit=f"a whole multiple of the inner step, {stride:g} s",
                 remedy="Change the period, or the step",
             )
+        if any(abs(t / self.period - round(t / self.period)) > 1e-6 for t in self.freedom.times):
+            raise InvalidInputError(
+                "times of a schedule",
+                value=self.freedom.times,
+                limit=f"multiples of the period, {self.period:g} s",
+                remedy="Then what is left of a plan is a plan again",
+            )
         if self.first is not None:
             check_surface(self.mechanism, self.first)
 
@@ -245,7 +273,7 @@ class Cascade:
     def optimiser(self) -> Optimiser:
         """The optimiser of the outer loop; its rollouts end in the exact linear tail."""
         loop = replace(self.loop, tail=TAIL)
-        return Optimiser(loop, self.first, self.cold, self.warm, seed=self.seed)
+        return Optimiser(loop, self.first, self.cold, self.warm, self.freedom, seed=self.seed)
 
     # -- the state machine ----------------------------------------------------------------
 
@@ -257,26 +285,27 @@ class Cascade:
         InfeasibleError
             When no admissible surface was found.
         """
-        proposal, surface, cost = self._global(self.optimiser, x)
+        proposal, plan, cost = self._global(self.optimiser, x)
         if not math.isfinite(cost):  # the linear end was too hopeful: integrate throughout
             exact = replace(self.optimiser, loop=self.loop)
-            proposal, surface, cost = self._global(exact, x)
-        return CascadeState(surface, 0, cost, cost), proposal
+            proposal, plan, cost = self._global(exact, x)
+        return CascadeState(plan, 0, cost, cost), proposal
 
-    def _global(self, optimiser: Optimiser, x: ArrayLike) -> tuple[Proposal, Surface, float]:
-        """Return a global optimum, its surface and its cost integrated to the end."""
+    def _global(self, optimiser: Optimiser, x: ArrayLike) -> tuple[Proposal, Plan, float]:
+        """Return a global optimum, its plan and its cost integrated to the end."""
         proposal = optimiser.require(x)
-        surface = proposal.surface
-        assert surface is not None  # require() raises otherwise
-        return proposal, surface, self._exact_cost(surface, x, self.objective.horizon)
+        plan = proposal.plan
+        assert plan is not None  # require() raises otherwise
+        return proposal, plan, self._exact_cost(plan, x, self.objective.horizon)
 
-    def _exact_cost(self, surface: Surface, x: ArrayLike, horizon: float) -> float:
-        score = float(self.loop.batch(x, [surface], duration=horizon).score(horizon)[0])
+    def _exact_cost(self, plan: Plan, x: ArrayLike, horizon: float) -> float:
+        score = float(self.loop.batch(x, plan, duration=horizon).score(horizon)[0])
         return score if score < INADMISSIBLE else math.inf
 
     def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
         """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits."""
-        return SlidingModeLaw(self.mechanism, state.surface, self.reaching)(t, x)
+        surface, law = state.plan.at(t - state.since)
+        return SlidingModeLaw(self.mechanism, surface, law or self.reaching)(t, x)
 
     def propose(
         self, state: CascadeState, x: ArrayLike, t: float = 0.0, horizon: float | None = None
@@ -286,7 +315,7 @@ class Cascade:
         try:
             return self.optimiser.propose(
                 x,
-                incumbent=state.surface,
+                incumbent=state.at(t),
                 horizon=horizon,
                 sequence=sequence,
                 computed_for=t,
@@ -312,14 +341,16 @@ class Cascade:
         if proposal.sequence <= state.sequence:
             stale = f"stale: number {proposal.sequence} after {state.sequence}"
             return state, Admission(False, stale, state.predicted)
-        state = replace(state, sequence=proposal.sequence)
-        if proposal.surface is None:
-            cost = self._exact_cost(state.surface, current, span)
+        t = proposal.computed_for
+        old = state.at(t)
+        state = replace(state, plan=old, since=t, sequence=proposal.sequence)
+        if proposal.plan is None:
+            cost = self._exact_cost(old, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}"
             return replace(state, predicted=cost), Admission(False, reason, cost)
-        admission = self.gate(self.loop, state.surface, proposal.surface, current, span)
-        surface = proposal.surface if admission.accepted else state.surface
-        return replace(state, surface=surface, predicted=admission.cost), admission
+        admission = self.gate(self.loop, old, proposal.plan, current, span)
+        plan = proposal.plan if admission.accepted else old
+        return replace(state, plan=plan, predicted=admission.cost), admission
 
     # -- simulation -----------------------------------------------------------------------
 
@@ -357,7 +388,7 @@ class Cascade:
         truth = replace(self.loop, plant=plant)
         memory, proposal = self.start(x)
         admission = Admission(True, "first optimum", memory.predicted)
-        updates = [Update(0.0, x, proposal, admission, memory.surface, memory.predicted, 0.0)]
+        updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
         pieces: list[Trajectory] = []
         for k in range(math.ceil(total / self.period - 1e-9)):
             t = k * self.period
@@ -366,12 +397,12 @@ class Cascade:
                 memory, admission = self.consider(memory, proposal, x, total - t)
                 updates.append(
                     Update(
-                        t, x, proposal, admission, memory.surface, memory.predicted,
+                        t, x, proposal, admission, memory.plan, memory.predicted,
                         pieces[-1].total,
                     )
                 )  # fmt: skip
             pieces.append(
-                truth.simulate(x, memory.surface, duration=min(self.period, total - t), start=t)
+                truth.simulate(x, memory.plan, duration=min(self.period, total - t), start=t)
             )
             x = pieces[-1].x[-1]
             if progress is not None:

@@ -1,25 +1,29 @@
 """One optimisation of the surface: global the first time, warm-started afterwards.
 
-The search runs in symmetric-logarithmic coordinates z with p = w sinh z, entry by entry,
-around a first surface: entries may change sign, and small and large values are resolved
-alike.  Unstable surfaces never reach the rollout; inadmissible motions get a graded
-penalty, see :meth:`undertow.rollout.Batch.score`.
+A population search over the coordinates of :mod:`undertow.decision`.  Unstable surfaces
+are not rolled out; inadmissible motions get a graded penalty, see
+:meth:`undertow.rollout.Batch.score`.  Minimum time with at least 2n free parameters is
+left to :mod:`undertow.shooting` in the end.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.decision import Decision, Freedom
 from undertow.errors import InfeasibleError, InvalidInputError, SingularSurfaceError, UndertowError
 from undertow.mechanism import FloatArray
+from undertow.plan import Plan
 from undertow.rollout import ClosedLoop, Event
 from undertow.search import CMAES, minimise
+from undertow.shooting import Shooting
 from undertow.sliding import Surface
 from undertow.stability import Margin, first_surface, stability_margin, surface_margins
 
@@ -32,6 +36,9 @@ INADMISSIBLE = 1e8
 
 #: Rollouts are given up when their cost exceeds the best one so far by this factor.
 HOPELESS = 3.0
+
+#: Stands for a final state of a motion that broke off.
+MISSED = 1e3
 
 
 @dataclass(frozen=True)
@@ -65,8 +72,8 @@ class Proposal:
 
     Attributes
     ----------
-    surface
-        The best surface found, ``None`` when there is none.
+    plan
+        The best plan found, ``None`` when there is none.
     status
         ``converged``, ``budget spent``, ``infeasible`` (no admissible surface) or
         ``failed`` (the optimiser raised; see ``message``).
@@ -86,7 +93,7 @@ class Proposal:
         What went wrong, in words.
     """
 
-    surface: Surface | None
+    plan: Plan | None
     status: Status
     cost: float
     incumbent_cost: float
@@ -97,10 +104,15 @@ class Proposal:
     computed_for: float
     message: str = ""
 
+    @property
+    def surface(self) -> Surface | None:
+        """The first surface of the plan."""
+        return None if self.plan is None else self.plan.surfaces[0]
+
 
 @dataclass(eq=False)
 class Optimiser:
-    """Selects the surface that minimises the predicted cost of a closed loop.
+    """Selects the plan that minimises the predicted cost of a closed loop.
 
     Parameters
     ----------
@@ -108,10 +120,11 @@ class Optimiser:
         The predicted closed loop (the controller's belief).
     first
         Surface to start from; designed by :func:`undertow.first_surface` by default.
-    cold
-        Budget of a global optimisation.
-    warm
-        Budget of a re-optimisation from an incumbent.
+    cold, warm
+        Budgets of a global optimisation and of a re-optimisation from an incumbent; by
+        default as the method needs.
+    freedom
+        What may be chosen besides the paper's surface parameters.
     population
         Candidates per generation.
     seed
@@ -121,57 +134,58 @@ class Optimiser:
 
     loop: ClosedLoop
     first: Surface | None = None
-    cold: Budget = field(default_factory=lambda: Budget(3072))
-    warm: Budget = field(default_factory=lambda: Budget(1024))
+    cold: Budget | None = None
+    warm: Budget | None = None
+    freedom: Freedom = Freedom()
     population: int = 32
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Design the first surface and the scale of the search around it."""
+        """Design the first surface and the coordinates of the search around it."""
         if self.first is None:
             self.first = first_surface(self.loop.mechanism)
-        self._anchor = self.first.normalised().vector[self._fixed :]
-        scale = np.abs(self._anchor)
-        self._width = 0.1 * np.maximum(scale, 0.05 * scale.max())
+        self.decision = Decision(self.loop, self.first, self.freedom)
+
+    @property
+    def shoots(self) -> bool:
+        """Whether this is a minimum-time task with enough parameters to aim with."""
+        end = self.loop.linear_end
+        counts_time = end is not None and end.stage is not None and end.stage.rest > 0
+        enough = self.decision.size >= 2 * self.loop.mechanism.n
+        return counts_time and enough and end is not None and not end.counts_cost
+
+    def _budget(self, warm: bool) -> Budget:
+        given = self.warm if warm else self.cold
+        if given is not None:
+            return given
+        if self.shoots:
+            return Budget(40_000 if warm else 160_000)
+        return Budget(1024 if warm else 3072)
 
     @property
     def _promptness(self) -> float:
         """Part of the horizon to plan for: the linear end may be late by its tolerance."""
         return 1.0 - min(0.5 * self.loop.tail, 0.1)
 
-    @property
-    def _fixed(self) -> int:
-        return self.loop.mechanism.m**2
-
-    def encode(self, surface: Surface) -> FloatArray:
-        """Return the search coordinates of a surface, (2mn − m²,)."""
-        return np.asarray(np.arcsinh(surface.normalised().vector[self._fixed :] / self._width))
-
-    def decode(self, z: FloatArray) -> FloatArray:
-        """Return the surface vectors at search coordinates: (N, 2mn − m²) to (N, 2mn)."""
-        alpha_a = -np.eye(self.loop.mechanism.m).ravel()
-        free = self._width * np.sinh(np.clip(z, -20.0, 20.0))
-        return np.hstack([np.broadcast_to(alpha_a, (len(z), alpha_a.size)), free])
-
     def propose(
         self,
         x: ArrayLike,
         *,
-        incumbent: Surface | None = None,
+        incumbent: Surface | Plan | None = None,
         horizon: float | None = None,
         sequence: int = 0,
         computed_for: float = 0.0,
         resolution: float = 0.0,
         budget: Budget | None = None,
     ) -> Proposal:
-        """Optimise the surface from the state x.
+        """Optimise the plan from the state x.
 
         Parameters
         ----------
         x
             State, (2n,).
         incumbent
-            The surface in use: warm start, and the answer is never worse than it.
+            The plan in use, shifted to now: warm start, and the answer is never worse.
             ``None``: global optimisation.
         horizon
             Longest prediction, s; the objective's by default.
@@ -189,18 +203,21 @@ class Optimiser:
         """
         began = time.perf_counter()
         state = self.loop.mechanism.check_state(x)
-        if budget is None:
-            budget = self.cold if incumbent is None else self.warm
         task = _Task(
             self,
             state,
             (self.loop.objective.horizon if horizon is None else horizon) * self._promptness,
-            budget,
+            budget or self._budget(incumbent is not None),
             resolution,
             began,
             np.random.default_rng([self.seed, sequence]),
         )
-        converged = task.global_search() if incumbent is None else task.local_search(incumbent)
+        if incumbent is None:
+            converged = task.global_search()
+        else:
+            converged = task.local_search(Plan.of(incumbent))
+        if self.shoots:
+            converged = task.shoot()
         return task.answer(converged, sequence, computed_for)
 
     def require(self, x: ArrayLike) -> Proposal:
@@ -212,7 +229,7 @@ class Optimiser:
             When no candidate was admissible; says what the best of them broke.
         """
         proposal = self.propose(x)
-        if proposal.surface is None:
+        if proposal.plan is None:
             worst = min(proposal.margins, key=lambda m: m.value, default=None)
             raise InfeasibleError(
                 f"no admissible surface for '{self.loop.mechanism.name}' "
@@ -226,7 +243,7 @@ class Optimiser:
 
 
 class _Task:
-    """The state of one running optimisation."""
+    """The state of one running optimisation: the best plan so far at any moment."""
 
     def __init__(
         self,
@@ -240,15 +257,42 @@ class _Task:
     ) -> None:
         self.owner, self.x, self.horizon = owner, x, horizon
         self.budget, self.resolution, self.began, self.rng = budget, resolution, began, rng
+        self.decision = owner.decision
         self.evaluations = 0
-        self.best_cost, self.best_vector = math.inf, None
+        self.best_cost = math.inf
+        self.best: Plan | None = None
         self.incumbent_cost = math.inf
+        self._last = began
+        self._pace = 0.0
+
+    # -- budget ----------------------------------------------------------------------------
+
+    def late(self) -> bool:
+        """Whether another batch, taking as long as the last one, would overrun the time."""
+        now = time.perf_counter()
+        self._pace, self._last = now - self._last, now
+        return now - self.began + self._pace >= self.budget.seconds
+
+    @property
+    def left(self) -> int:
+        """Evaluations that are left."""
+        return self.budget.evaluations - self.evaluations
+
+    # -- evaluation ------------------------------------------------------------------------
 
     def cost(self, z: FloatArray) -> FloatArray:
-        return self.evaluate(self.owner.decode(z))
+        """Score coordinates (N, d), keeping the best: unstable 1e10, inadmissible 1e9 up."""
+        vectors, gains = self.decision.decode(z)
+        scores = self._score(vectors, gains, self.owner.freedom.times)
+        best = int(np.argmin(scores))
+        if scores[best] < self.best_cost:
+            self.best_cost = float(scores[best])
+            self.best = self.decision.plan(vectors[best], None if gains is None else gains[best])
+        return scores
 
-    def evaluate(self, vectors: FloatArray) -> FloatArray:
-        """Score surface vectors, keeping the best: unstable 1e10, inadmissible 1e9 and up."""
+    def _score(
+        self, vectors: FloatArray, gains: FloatArray | None, times: Sequence[float]
+    ) -> FloatArray:
         loop = self.owner.loop
         self.evaluations += len(vectors)
         cap = math.inf
@@ -257,34 +301,28 @@ class _Task:
         scores = np.full(len(vectors), 1e10)
         stable = np.full(len(vectors), True)
         if loop.linear_end is None:
-            stable = stability_margin(loop.mechanism, vectors) > 0
+            stable = stability_margin(loop.mechanism, vectors[:, -1]) > 0
         if stable.any():
             scores[stable] = loop.batch(
                 self.x,
                 vectors[stable],
+                reaching=None if gains is None else gains[stable],
+                switch_times=times,
                 duration=self.horizon,
                 cap=cap,
                 slack=self.resolution,
                 stable_only=True,
             ).score(self.horizon)
-        best = int(np.argmin(scores))
-        if scores[best] < self.best_cost:
-            self.best_cost, self.best_vector = float(scores[best]), vectors[best].copy()
-        return np.asarray(scores)
+        return scores
 
-    def late(self) -> bool:
-        return time.perf_counter() - self.began >= self.budget.seconds
-
-    @property
-    def left(self) -> int:
-        return self.budget.evaluations - self.evaluations
+    # -- search ----------------------------------------------------------------------------
 
     def _descend(self, z: FloatArray, sigma: float, evaluations: int, tolerance: float) -> bool:
         search = CMAES(z, sigma, self.owner.population, self.rng)
         minimise(
             search,
             self.cost,
-            evaluations=evaluations,
+            evaluations=min(evaluations, self.left),
             tolerance=tolerance,
             resolution=self.resolution,
             stop=self.late,
@@ -295,34 +333,74 @@ class _Task:
         """Sample widely, then descend from the three best; refine the winner."""
         owner, rng = self.owner, self.rng
         assert owner.first is not None
-        anchor = owner.encode(owner.first)
-        draws = max(owner.population, self.budget.evaluations // 6)
-        z = np.vstack(
-            [anchor, *self._designs(16), anchor + rng.standard_normal((draws, anchor.size))]
-        )
-        scores = self.cost(z)
+        anchor = self.decision.encode(Plan.of(owner.first))
+        total = min(self.budget.evaluations, 3072)
+        draws = max(owner.population, total // 6)
+        draw = anchor + self.decision.steps(rng, np.ones(draws))
+        z = np.vstack([anchor, *self._designs(16), draw])
+        scores = self.cost(z[: max(1, self.left)])
         starts = z[np.argsort(scores, kind="stable")[:3]]
-        share = self.left // 4
+        share = (total - len(z)) // 4
         for start in starts:
             self._descend(start, 0.3, share, 3e-3)
-        return self._descend(self._best_z(), 0.03, self.left, 1e-4)
+        assert self.best is not None  # cost() has run at least once
+        return self._descend(self.decision.encode(self.best), 0.03, share, 1e-4)
 
-    def local_search(self, incumbent: Surface) -> bool:
+    def local_search(self, incumbent: Plan) -> bool:
         """Start from the incumbent: a wide look around, then descend from the best."""
-        vector = incumbent.normalised().vector
-        self.incumbent_cost = float(self.evaluate(vector[None])[0])
-        here = self.owner.encode(incumbent)
+        law = self.owner.loop.reaching
+        gains = None if incumbent.reaching is None else incumbent.gains(law)[None]
+        score = float(self._score(incumbent.vectors[None], gains, incumbent.times)[0])
+        self.best, self.best_cost, self.incumbent_cost = incumbent, score, score
+        here = self.decision.encode(incumbent)
         wide = min(self.left, self.owner.population)
-        if wide == 0:
+        if wide < 1:
             return False
-        steps = np.geomspace(0.03, 1.0, wide)[:, None]
-        self.cost(here + steps * self.rng.standard_normal((wide, here.size)))
-        return self._descend(self._best_z(), 0.1, self.left, 1e-3)
+        self.cost(here + self.decision.steps(self.rng, np.geomspace(0.03, 1.0, wide)))
+        return self._descend(self.decision.encode(self.best), 0.1, min(self.left, 1024), 1e-3)
 
-    def _best_z(self) -> FloatArray:
-        assert self.best_vector is not None  # evaluate() has run at least once
-        mechanism = self.owner.loop.mechanism
-        return self.owner.encode(Surface.from_vector(self.best_vector, mechanism.n, mechanism.m))
+    def shoot(self) -> bool:
+        """Shrink the time of arrival; starts are the best plan and random ones."""
+        loop, rng = self.owner.loop, self.rng
+        aim = Shooting(self._miss, 0.9 * loop.objective.terminal_radius, loop.step, self._exhausted)
+        while not self._exhausted():
+            known = self.best_cost if self.best_cost < INADMISSIBLE else self.horizon
+            assert self.best is not None  # a search has run before
+            start = self._start(self.decision.encode(self.best), known, rng)
+            z = aim.correct(*start, 20)
+            if z is not None:
+                shortest, _ = aim.kick(*aim.shrink(z, start[1]), rng, 20)
+                self.cost(shortest[None])
+        return False
+
+    def _start(
+        self, best: FloatArray, known: float, rng: np.random.Generator
+    ) -> tuple[FloatArray, float]:
+        """Draw parameters around the best ones and a time at which they nearly arrive."""
+        step = self.owner.loop.step
+        T = max(1, round(known * rng.uniform(0.5, 1.0) / step)) * step
+        z = best + self.decision.steps(rng, 10 ** rng.uniform(-1.0, 0.2, 128))
+        miss = np.linalg.norm(self._miss(z, T), axis=1)
+        nearest = int(np.argmin(miss))
+        return z[nearest], T
+
+    def _exhausted(self) -> bool:
+        return self.left < 4 * self.decision.size or self.late()
+
+    def _miss(self, z: FloatArray, T: float) -> FloatArray:
+        """Final states at T, (N, 2n); a motion that breaks off counts as far away."""
+        vectors, gains = self.decision.decode(z)
+        self.evaluations += len(z)
+        batch = self.owner.loop.batch(
+            self.x,
+            vectors,
+            reaching=gains,
+            switch_times=self.owner.freedom.times,
+            duration=T,
+            terminal=0.0,
+        )
+        sound = (batch.event == Event.HORIZON) & np.isfinite(batch.x).all(axis=1)
+        return np.where(sound[:, None], batch.x, MISSED)
 
     def _designs(self, count: int) -> list[FloatArray]:
         """Quadratic designs with random weights: all of them locally stable."""
@@ -330,26 +408,24 @@ class _Task:
         designs = []
         for weights in 10 ** self.rng.uniform(-2, 2, (count, 2 * mechanism.n)):
             try:
-                designs.append(self.owner.encode(first_surface(mechanism, list(weights))))
+                surface = first_surface(mechanism, list(weights))
             except UndertowError:
                 continue
+            designs.append(self.decision.encode(Plan.of(surface)))
         return designs
 
     def answer(self, converged: bool, sequence: int, computed_for: float) -> Proposal:
-        """Pack the best admissible surface with its margins."""
-        mechanism = self.owner.loop.mechanism
-        found = self.best_vector is not None and self.best_cost < INADMISSIBLE
-        surface, margins, message = None, (), ""
-        if self.best_vector is not None:
-            candidate = Surface.from_vector(self.best_vector, mechanism.n, mechanism.m)
-            margins, message = motion_margins(self.owner.loop, candidate, self.x, self.horizon)
-            if found:
-                surface, message = candidate, ""
+        """Pack the best admissible plan with its margins."""
+        found = self.best_cost < INADMISSIBLE
+        margins: tuple[Margin, ...] = ()
+        message = ""
+        if self.best is not None:
+            margins, message = motion_margins(self.owner.loop, self.best, self.x, self.horizon)
         status: Status = "infeasible"
         if found:
             status = "converged" if converged else "budget spent"
         return Proposal(
-            surface,
+            self.best if found else None,
             status,
             self.best_cost if found else math.inf,
             self.incumbent_cost if self.incumbent_cost < INADMISSIBLE else math.inf,
@@ -358,20 +434,20 @@ class _Task:
             time.perf_counter() - self.began,
             sequence,
             computed_for,
-            message,
+            "" if found else message,
         )
 
 
 def motion_margins(
-    loop: ClosedLoop, surface: Surface, x: FloatArray, horizon: float
+    loop: ClosedLoop, plan: Plan, x: FloatArray, horizon: float
 ) -> tuple[tuple[Margin, ...], str]:
-    """Return the margins of a surface and of its predicted motion, and how that ends."""
+    """Return the margins of a plan and of its predicted motion, and how that ends."""
     objective = loop.objective
     try:
-        margins = list(surface_margins(loop.mechanism, surface, x[: loop.mechanism.n]))
+        margins = list(surface_margins(loop.mechanism, plan.surfaces[-1]))
     except SingularSurfaceError as error:
         return (), str(error)
-    batch = loop.batch(x, [surface], duration=horizon)
+    batch = loop.batch(x, plan, duration=horizon)
     margins.append(
         Margin(
             "(37) along the motion: min det Γ(q)/det Γ(0)",

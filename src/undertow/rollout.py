@@ -23,6 +23,7 @@ from undertow.codegen.tape import Tape
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Objective
+from undertow.plan import Plan
 from undertow.sliding import (
     LawSymbols,
     ReachingLaw,
@@ -377,30 +378,33 @@ class ClosedLoop:
     def batch(
         self,
         x0: ArrayLike,
-        surfaces: ArrayLike | Sequence[Surface],
+        surfaces: ArrayLike | Surface | Plan | Sequence[Surface | Plan],
         *,
         reaching: FloatArray | None = None,
         switch_times: Sequence[float] = (0.0,),
         duration: float | None = None,
+        terminal: float | None = None,
         cap: float = math.inf,
         slack: float = 0.0,
         stable_only: bool = False,
     ) -> Batch:
-        """Roll out a batch: many surfaces, many initial states, or both.
+        """Roll out a batch: many surfaces or plans, many initial states, or both.
 
         Parameters
         ----------
         x0
             (2n,) or (N, 2n).
         surfaces
-            Surfaces, or their vectors: (2mn,), (N, 2mn), or (N, S, 2mn) for schedules of S
-            surfaces that take over at ``switch_times``.
+            Surfaces or plans, one for each rollout; or vectors: (2mn,), (N, 2mn), or
+            (N, S, 2mn) for S surfaces that take over at ``switch_times``.
         reaching
-            Optional (N, S, 2m) or broadcastable: η and ε of each rollout.
+            With vectors: (N, S, 2m) or broadcastable, η and ε of each.
         switch_times
-            S times, s, the first 0.
+            With vectors: S times, s, the first 0.
         duration
             Length, s; the objective's horizon by default.
+        terminal
+            Terminal radius; the objective's by default; 0 never ends.
         cap
             Cost beyond which a rollout is given up (``COSTLY``).
         slack
@@ -409,11 +413,15 @@ class ClosedLoop:
             Do not roll out surfaces that are unstable at the target (``UNSTABLE``); for
             loops with a linear model, see :attr:`linear_end`.
         """
-        vectors = _surface_vectors(surfaces)
-        if vectors.ndim == 1:
-            vectors = vectors[None]
-        if vectors.ndim == 2:
-            vectors = vectors[:, None, :]
+        plans = _plans(surfaces)
+        if plans:
+            switch_times, vectors, reaching = Plan.align(plans, self.reaching)
+        else:
+            vectors = np.asarray(surfaces, dtype=float)
+            if vectors.ndim == 1:
+                vectors = vectors[None]
+            if vectors.ndim == 2:
+                vectors = vectors[:, None, :]
         states = np.atleast_2d(self.mechanism.check_state(x0))
         expected = 2 * self.mechanism.m * self.mechanism.n
         if vectors.shape[-1] != expected or vectors.shape[1] != len(switch_times):
@@ -433,6 +441,7 @@ class ClosedLoop:
             reaching=reaching,
             switch_times=switch_times,
             duration=duration,
+            terminal=terminal,
             cap=cap,
             slack=slack,
             stable_only=stable_only,
@@ -441,7 +450,7 @@ class ClosedLoop:
     def simulate(
         self,
         x0: ArrayLike,
-        surfaces: Surface | Sequence[Surface],
+        surfaces: Surface | Plan | Sequence[Surface],
         *,
         switch_times: Sequence[float] = (0.0,),
         duration: float | None = None,
@@ -450,14 +459,14 @@ class ClosedLoop:
         every: int = 1,
         noise: FloatArray | None = None,
     ) -> Trajectory:
-        """Simulate and record one motion, with one surface or a schedule of them.
+        """Simulate and record one motion, with one surface, several of them, or a plan.
 
         Parameters
         ----------
         x0
             Initial state, (2n,).
         surfaces
-            A surface, or one for each of ``switch_times``.
+            A plan, a surface, or one surface for each of ``switch_times``.
         switch_times
             When each takes over, s after the start; the first is 0.
         duration
@@ -472,13 +481,9 @@ class ClosedLoop:
             Measurement noise added to the state that the law sees, (samples, 2n), SI
             units; for a sampled inner loop only.
         """
-        sequence = [surfaces] if isinstance(surfaces, Surface) else list(surfaces)
-        for surface in sequence:
+        plan = Plan.of(surfaces, switch_times)
+        for surface in plan.surfaces:
             check_surface_shape(self.mechanism, surface)
-        if len(sequence) != len(switch_times) or list(switch_times) != sorted(switch_times):
-            raise InvalidInputError(
-                "switch_times", value=list(switch_times), limit=f"{len(sequence)} rising times"
-            )
         if noise is not None:
             if not self.hold:
                 raise InvalidInputError(
@@ -496,11 +501,11 @@ class ClosedLoop:
                 )
             noise = np.repeat(self.mechanism.check_state(noise)[:, None, :], LANES, axis=1)
         x0 = self.mechanism.check_state(x0)
-        vectors = np.stack([s.vector for s in sequence])[None]
         batch, record = self._run(
             x0[None],
-            vectors,
-            switch_times=switch_times,
+            plan.vectors[None],
+            reaching=plan.gains(self.reaching)[None],
+            switch_times=plan.times,
             duration=duration,
             start=start,
             terminal=terminal,
@@ -530,12 +535,13 @@ class ClosedLoop:
         )
 
 
-def _surface_vectors(surfaces: ArrayLike | Sequence[Surface]) -> FloatArray:
-    if isinstance(surfaces, Surface):
-        return surfaces.vector
-    if isinstance(surfaces, Sequence) and surfaces and isinstance(surfaces[0], Surface):
-        return np.stack([s.vector for s in surfaces if isinstance(s, Surface)])
-    return np.asarray(surfaces, dtype=float)
+def _plans(what: object) -> list[Plan]:
+    """Return the plans that were given as such or as surfaces; [] for plain numbers."""
+    if isinstance(what, Surface | Plan):
+        return [Plan.of(what)]
+    if isinstance(what, Sequence) and all(isinstance(item, Surface | Plan) for item in what):
+        return [Plan.of(item) for item in what]
+    return []
 
 
 def lay_loop(

@@ -102,8 +102,8 @@ class Row:
 class Effort:
     """What the optimisations may spend, and whether bounds are computed."""
 
-    cold: Budget = Cascade.cold
-    warm: Budget = Cascade.warm
+    cold: Budget = Budget(3072)
+    warm: Budget = Budget(1024)
     bounds: bool = True
     conditions: tuple[str, ...] = tuple(CONDITIONS)
 

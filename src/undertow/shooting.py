@@ -1,0 +1,110 @@
+"""Minimum time as a shrinking sequence of hitting problems; knows nothing of control.
+
+The first time at which a motion touches the terminal set is a discontinuous function of
+the parameters, and a population search gets stuck on its steps.  The state at a *fixed*
+time T is smooth.  So: find parameters with x(T) = 0 by Levenberg-Marquardt, shorten T,
+correct, and go on until no correction is found; then kick the parameters along the many
+directions that T leaves free, and try again.  A Jacobian is one batch of rollouts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Shooting"]
+
+FloatArray = NDArray[np.float64]
+
+#: Miss of N parameter vectors at time T: (N, d), T to (N, k).
+Miss = Callable[[FloatArray, float], FloatArray]
+
+
+@dataclass(eq=False)
+class Shooting:
+    """Shrinks the time at which a miss can be brought to zero.
+
+    Parameters
+    ----------
+    miss
+        Residuals at a time T, vectorised over parameters; more parameters than residuals.
+    tolerance
+        ‖miss‖₂ below which a shot has hit.
+    grid
+        Times are tried on multiples of it, s.
+    stop
+        Asked before each batch; the best so far stands when it says True.
+    """
+
+    miss: Miss
+    tolerance: float
+    grid: float
+    stop: Callable[[], bool] = lambda: False
+
+    def correct(self, z: FloatArray, T: float, iterations: int) -> FloatArray | None:
+        """Return parameters near z that hit at T, or ``None``.
+
+        Levenberg-Marquardt with the damping searched over a batch, step length at most 1.
+        """
+        d = z.size
+        probe = 1e-4 * np.vstack([np.eye(d), -np.eye(d)])
+        damping = 1e-2
+        residual = self.miss(z[None], T)[0]
+        error = float(np.linalg.norm(residual))
+        for _ in range(iterations):
+            if error <= self.tolerance:
+                break
+            if self.stop():
+                return None
+            shots = self.miss(z + probe, T)
+            jacobian = ((shots[:d] - shots[d:]) / 2e-4).T
+            if not np.isfinite(jacobian).all():
+                return None
+            U, sigma, Vt = np.linalg.svd(jacobian, full_matrices=False)
+            dampings = damping * np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3])
+            filters = sigma / (sigma**2 + dampings[:, None])
+            steps = -(filters * (U.T @ residual)) @ Vt
+            length = np.linalg.norm(steps, axis=1, keepdims=True)
+            steps *= np.minimum(1.0, 1.0 / np.maximum(length, 1e-12))
+            misses = self.miss(z + steps, T)
+            errors = np.linalg.norm(misses, axis=1)
+            best = int(np.argmin(errors))
+            if errors[best] < 0.9995 * error:
+                z, residual, error = z + steps[best], misses[best], float(errors[best])
+                damping = float(np.clip(dampings[best], 1e-8, 1e4))
+            else:
+                damping *= 100.0
+                if damping > 1e6:
+                    return None
+        return z if error <= self.tolerance else None
+
+    def shrink(self, z: FloatArray, T: float) -> tuple[FloatArray, float]:
+        """Shorten T as far as corrections follow; z must hit at T."""
+        step = 20 * self.grid
+        while step >= self.grid and not self.stop():
+            shorter = max(round((T - step) / self.grid), 1) * self.grid
+            corrected = self.correct(z, shorter, 12) if shorter < T else None
+            if corrected is None:
+                step /= 2
+            else:
+                z, T = corrected, shorter
+        return z, T
+
+    def kick(
+        self, z: FloatArray, T: float, rng: np.random.Generator, count: int
+    ) -> tuple[FloatArray, float]:
+        """Perturb, correct and shrink ``count`` times, keeping what is shorter."""
+        for _ in range(count):
+            if self.stop():
+                break
+            size = 0.3 * 10 ** rng.uniform(-1.0, 0.3)
+            kicked = self.correct(z + size * rng.standard_normal(z.size), T, 12)
+            if kicked is None:
+                continue
+            shorter, earlier = self.shrink(kicked, T)
+            if earlier < T:
+                z, T = shorter, earlier
+        return z, T
