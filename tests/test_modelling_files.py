@@ -278,6 +278,36 @@ def test_dry_friction_becomes_a_disturbance_bound() -> None:
     assert modelling.from_mjcf(text).disturbance_bounds == (0.5, 0.0)
 
 
+def test_motors_named_after_their_joints() -> None:
+    """Claim: a motor may bear its joint's name, as files often have it."""
+    text = changed(CART_MJCF, 'name="force"', 'name="x"')
+    assert [i.name for i in modelling.from_mjcf(text).inputs] == ["x_motor"]
+
+
+def test_names_that_differ_in_punctuation_only_are_refused() -> None:
+    """Claim: two links that would share a parameter are refused, not merged."""
+    text = changed(CART_URDF, '"rod"', '"cart."')
+    assert modelling.from_urdf(text).n == 2
+    both = changed(text.replace('"cart"', '"cart-"'), '"rail"', '"rail"')
+    with pytest.raises(ModelError, match="punctuation"):
+        modelling.from_urdf(both)
+
+
+def test_the_outermost_default_class_is_the_main_one() -> None:
+    """Claim: defaults apply whatever the outermost class is called."""
+    text = changed(
+        CART_MJCF, "<worldbody>", '<default class="own"><joint armature="2"/></default><worldbody>'
+    )
+    rig, read = modelling.from_mjcf(CART_MJCF), modelling.from_mjcf(text)
+    assert np.allclose(read.M(np.zeros(2)) - rig.M(np.zeros(2)), 2 * np.eye(2))
+
+
+def test_a_target_that_is_no_equilibrium_is_refused() -> None:
+    """Claim: a pose that gravity moves is no target."""
+    with pytest.raises(ModelError, match="on 'phi', which no input balances"):
+        modelling.from_urdf(CART_URDF, equilibrium={"phi": 1.0})
+
+
 def test_files_are_read_from_disk(tmp_path: Path) -> None:
     """Claim: a path works as the text does; one that is not there is named."""
     path = tmp_path / "cart.urdf"

@@ -18,6 +18,9 @@ from undertow.errors import InvalidInputError, ModelError
 from undertow.mechanism import TIME, Coordinate, Input, Mechanism, Parameter
 from undertow.modelling.coordinates import actuate, exact_angle, tidy
 
+#: |f_u| at an equilibrium, relative to the largest force that gravity and springs exert.
+BALANCE = 1e-9
+
 __all__ = ["from_energies", "from_matrices", "lagrange_force", "unit_inputs"]
 
 
@@ -72,7 +75,8 @@ def from_matrices(
     Raises
     ------
     ModelError
-        When M is not symmetric positive definite, B depends on the state or lacks rank.
+        When M is not symmetric positive definite, B depends on the state or lacks rank, or
+        ``equilibrium`` is none.
     InvalidInputError
         For an equilibrium of unknown coordinates.
     """
@@ -94,7 +98,7 @@ def from_matrices(
         gains=gains,
     )
     bounds = form.bounds(disturbance_bounds, values) if len(disturbance_bounds) else ()
-    return Mechanism(
+    mechanism = Mechanism(
         name,
         form.coordinates,
         tuple(inputs),
@@ -108,6 +112,37 @@ def from_matrices(
         description=description,
         source=source,
     )
+    if equilibrium:
+        check_balanced(mechanism)
+    return mechanism
+
+
+def check_balanced(mechanism: Mechanism) -> None:
+    """Refuse a target on which a force acts that no input balances, f_u(0, 0) ≠ 0.
+
+    Raises
+    ------
+    ModelError
+        With the largest force and the coordinate that it acts on.
+    """
+    n, m = mechanism.n, mechanism.m
+    residual = np.abs(mechanism.f(np.zeros(2 * n))[m:])
+    limit = BALANCE * force_scale(mechanism)
+    if not residual.max() <= limit:
+        worst = mechanism.coordinates[m + int(np.argmax(residual))].name
+        raise ModelError(
+            f"target of '{mechanism.name}'",
+            value=f"a force of {residual.max():.4g} on '{worst}', which no input balances",
+            limit=f"an equilibrium, |f_u| ≤ {limit:.2g}",
+            remedy="Solve for one: undertow.modelling.find_equilibrium(mechanism, ...)",
+        )
+
+
+def force_scale(mechanism: Mechanism) -> float:
+    """Largest force at rest over random positions, N m or N; 1 where there is none."""
+    q = np.random.default_rng(0).uniform(-1, 1, (64, mechanism.n))
+    forces = mechanism.f(np.hstack([q, np.zeros_like(q)]))
+    return float(np.abs(forces).max()) or 1.0
 
 
 def from_energies(

@@ -9,12 +9,9 @@ import sympy as sp
 
 from undertow.errors import InvalidInputError, ModelError
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.modelling.equations import shifted
+from undertow.modelling.equations import BALANCE, check_balanced, force_scale, shifted
 
 __all__ = ["find_equilibrium", "holding_input", "move_target"]
-
-#: |f_u| at an equilibrium, relative to the largest force that gravity and springs exert.
-_RESIDUAL = 1e-9
 
 
 def holding_input(mechanism: Mechanism, q: FloatArray | None = None) -> FloatArray:
@@ -73,14 +70,14 @@ def find_equilibrium(mechanism: Mechanism, **guess: float) -> dict[str, float]:
         x[:m], x[m:n] = q[:m], q_u
         return np.asarray(mechanism.f(x)[m:] / scale)
 
-    scale = _force_scale(mechanism)
+    scale = force_scale(mechanism)
     solution = root(force, q[m:], tol=1e-14)
     left = scale * float(np.abs(force(solution.x)).max())
-    if not left <= _RESIDUAL * scale:
+    if not left <= BALANCE * scale:
         raise ModelError(
             f"equilibrium of '{mechanism.name}' near {dict(guess)}",
             value=f"|f_u| = {left:.3g} left",
-            limit=f"below {_RESIDUAL * scale:.3g}",
+            limit=f"below {BALANCE * scale:.3g}",
             remedy="Start from another guess, or hold the actuated coordinates elsewhere",
         )
     q[m:] = solution.x
@@ -109,18 +106,7 @@ def move_target(mechanism: Mechanism, **equilibrium: float) -> Mechanism:
     ModelError
         When it is no equilibrium of the free coordinates, f_u ≠ 0.
     """
-    n, m = mechanism.n, mechanism.m
-    q = _positions(mechanism, equilibrium)
-    residual = np.abs(mechanism.f(np.concatenate([q, np.zeros(n)]))[m:])
-    limit = _RESIDUAL * _force_scale(mechanism)
-    if not residual.max() <= limit:
-        worst = mechanism.coordinates[m + int(np.argmax(residual))].name
-        raise ModelError(
-            f"target of '{mechanism.name}'",
-            value=f"a force of {residual.max():.4g} on '{worst}', which no input balances",
-            limit=f"an equilibrium, |f_u| ≤ {limit:.2g}",
-            remedy="Solve for one: undertow.modelling.find_equilibrium(mechanism, ...)",
-        )
+    _positions(mechanism, equilibrium)
     coordinates, (mass, force, potential) = shifted(
         mechanism.name,
         mechanism.coordinates,
@@ -129,7 +115,7 @@ def move_target(mechanism: Mechanism, **equilibrium: float) -> Mechanism:
         sp.Matrix(mechanism.force),
         mechanism.potential,
     )
-    return Mechanism(
+    moved = Mechanism(
         mechanism.name,
         coordinates,
         mechanism.inputs,
@@ -142,6 +128,8 @@ def move_target(mechanism: Mechanism, **equilibrium: float) -> Mechanism:
         description=mechanism.description,
         source=mechanism.source,
     )
+    check_balanced(moved)
+    return moved
 
 
 def _positions(mechanism: Mechanism, values: Mapping[str, float]) -> FloatArray:
@@ -159,10 +147,3 @@ def _positions(mechanism: Mechanism, values: Mapping[str, float]) -> FloatArray:
             f"coordinates of '{mechanism.name}'", value=dict(values), limit="finite numbers"
         )
     return q
-
-
-def _force_scale(mechanism: Mechanism) -> float:
-    """Largest force at rest over random positions, N m or N; 1 where there is none."""
-    q = np.random.default_rng(0).uniform(-1, 1, (64, mechanism.n))
-    forces = mechanism.f(np.hstack([q, np.zeros_like(q)]))
-    return float(np.abs(forces).max()) or 1.0

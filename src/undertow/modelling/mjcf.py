@@ -128,11 +128,12 @@ class _Reader:
         self.root = root
         self.links: list[Link] = []
         self.joints: list[Joint] = []
-        settings: dict[str, str] = {}
-        for compiler in root.iterfind("compiler"):
-            settings |= compiler.attrib
+        compiler = ET.Element("compiler")
+        for given in root.iterfind("compiler"):
+            compiler.attrib |= given.attrib
+        settings = compiler.attrib
         for name in ("boundmass", "boundinertia", "settotalmass"):
-            if float(settings.get(name, "0")) > 0:
+            if numbers_of(compiler, name, "0", 1)[0] > 0:
                 raise _unread(f"compiler {name}", "Write the masses out as they are meant")
         if "inertiagrouprange" in settings:
             raise _unread("compiler inertiagrouprange", "Give the bodies an <inertial>")
@@ -146,6 +147,8 @@ class _Reader:
         self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for default in root.iterfind("default"):
             self._defaults(default, default.get("class", "main"), {})
+            # The outermost class is the main one, whatever its name.
+            self.classes["main"] = self.classes[default.get("class", "main")]
 
     def _defaults(
         self, element: ET.Element, name: str, inherited: Mapping[str, dict[str, str]]
@@ -158,7 +161,9 @@ class _Reader:
         for child in element.iterfind("default"):
             self._defaults(child, child.get("class", ""), table)
 
-    def _filled(self, element: ET.Element, childclass: str | None) -> ET.Element:
+    def _filled(
+        self, element: ET.Element, childclass: str | None, tag: str | None = None
+    ) -> ET.Element:
         """A copy of the element with the attributes of its class filled in."""
         name = element.get("class") or childclass or "main"
         if name not in self.classes:
@@ -166,7 +171,7 @@ class _Reader:
                 f"class of <{element.tag}>", value=repr(name), limit="declared in <default>"
             )
         filled = copy.copy(element)
-        defaults = self.classes[name].get(element.tag, {})
+        defaults = self.classes[name].get(tag or element.tag, {})
         filled.attrib = {**defaults, **element.attrib}
         return filled
 
@@ -191,7 +196,7 @@ class _Reader:
                 if part.tag not in _BODY_PARTS:
                     raise _unread(f"<{part.tag}> in a body", "Write the bodies out")
             name = body.get("name") or f"body_{len(self.links) + 1}"
-            if float(body.get("gravcomp", "0")) != 0 or body.get("mocap") == "true":
+            if numbers_of(body, "gravcomp", "0", 1)[0] != 0 or body.get("mocap") == "true":
                 raise _unread(f"gravcomp or mocap on body '{name}'", "Leave it out")
             inner = body.get("childclass") or childclass
             geoms = [self._filled(g, inner) for g in body.iterfind("geom")]
@@ -288,10 +293,9 @@ class _Reader:
         for element in self.root.iterfind("tendon/*"):
             if element.tag != "fixed":
                 raise _unread(f"<{element.tag}> tendon", "Only fixed tendons are linear in q")
-            filled = copy.copy(element)
-            name = element.get("class") or "main"
-            filled.attrib = {**self.classes[name].get("tendon", {}), **element.attrib}
-            if float(filled.get("frictionloss", "0")) or filled.get("range") is not None:
+            filled = self._filled(element, None, "tendon")
+            dry = numbers_of(filled, "frictionloss", "0", 1)[0] != 0
+            if dry or filled.get("range") is not None:
                 raise _unread("friction or limits on a tendon", "Put them on joints")
             coefficients: dict[str, float] = {}
             for part in element.iterfind("joint"):

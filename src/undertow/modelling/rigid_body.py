@@ -129,6 +129,13 @@ class _Book:
     def take(
         self, name: str, value: float, unit: str, description: str, positive: bool = False
     ) -> sp.Symbol:
+        if name in self.parameters:
+            raise ModelError(
+                "links or joints whose names differ in punctuation only",
+                value=f"both give the parameter {name!r}",
+                limit="names that stay different as identifiers",
+                remedy="Rename one of them",
+            )
         low = -1e-12 if positive else -math.inf
         self.parameters[name] = Parameter(name, float(value), unit, description, low)
         return self.parameters[name].symbol
@@ -182,7 +189,14 @@ def _inputs(
                     remedy="Check the spelling, and that the joint moves",
                 )
             B[index[joint], k] += number(actuator.gain) * number(coefficient)
-    return [Input(identifier(a.name), a.unit, a.limit) for a in tree.actuators], B
+    taken = {c.name for c in coordinates} | {c.velocity.name for c in coordinates}
+    taken |= {identifier(a.stroke) for a in tree.actuators if a.stroke}
+    names = [identifier(a.name) for a in tree.actuators]
+    # Motors are often named after their joints; inputs and coordinates are told apart.
+    return [
+        Input(f"{name}_motor" if name in taken else name, a.unit, a.limit)
+        for name, a in zip(names, tree.actuators, strict=True)
+    ], B
 
 
 def _strokes(tree: Tree) -> tuple[list[Coordinate | None], list[sp.Expr | None]]:
