@@ -78,8 +78,8 @@ _GREEK = {
 
 _LINES: tuple[dict[str, Any], ...] = (
     {"color": COLOURS["grey"], "linestyle": (0, (4, 2))},
-    {"color": COLOURS["orange"], "linestyle": "-"},
     {"color": COLOURS["blue"], "linestyle": "-"},
+    {"color": COLOURS["orange"], "linestyle": "-"},
     {"color": COLOURS["green"], "linestyle": (0, (6, 1.5, 1, 1.5))},
 )
 
@@ -263,7 +263,8 @@ def motion_figure(
         if title:
             panels[0].set_title(title, loc="left")
         if len(trajectories) > 1:
-            panels[0].legend(ncols=len(trajectories), loc="upper right")
+            handles = panels[0].get_legend_handles_labels()
+            figure.legend(*handles, loc="outside upper right", ncols=min(len(trajectories), 4))
         figure.align_ylabels()
     return figure
 

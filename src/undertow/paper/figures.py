@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import degrees
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from undertow.mechanism import FloatArray
 from undertow.paper.data import CONDITIONS, ROWS
 from undertow.paper.experiment import Reproduction
 from undertow.paper.repeats import Repeats
@@ -16,6 +19,9 @@ from undertow.plot import COLOURS, input_series, phase, state_series, style, sur
 from undertow.rollout import Trajectory
 
 __all__ = ["comparison", "figures", "phase_plane", "repeats_figure"]
+
+#: What Figure 5 shows of the motion, s: later on the surface hardly moves.
+PHASE_TIME = 1.0
 
 ROW_LINES: Mapping[str, dict[str, Any]] = {
     "base": {"color": COLOURS["grey"], "linestyle": (0, (4, 1.5))},
@@ -135,9 +141,10 @@ def phase_plane(result: Reproduction) -> Figure:
             if motion.trajectory is None:
                 axes.text(0.5, 0.5, motion.reason, transform=axes.transAxes, ha="center")
                 continue
+            trajectory = _first(motion.trajectory, PHASE_TIME)
             surface_trace(
                 axes,
-                motion.trajectory,
+                trajectory,
                 motion.surfaces,
                 motion.switch_times,
                 "phi",
@@ -145,29 +152,41 @@ def phase_plane(result: Reproduction) -> Figure:
                 linewidth=1.2,
                 label="sliding surface, s = 0",
             )
-            phase(axes, motion.trajectory, "phi", color=COLOURS["blue"], label="motion")
-            _mark_switches(axes, motion.trajectory, motion.switch_times)
+            phase(axes, trajectory, "phi", color=COLOURS["blue"], label="motion")
+            switches = [t for t in motion.switch_times if 0 < t < PHASE_TIME]
+            _mark_switches(axes, trajectory, switches)
         figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         grid[-1].set_ylabel("")
         figure.suptitle(
-            f"Minimum-energy cascade, {_where('matched')}", x=0.01, ha="left", fontsize=10
+            f"Minimum-energy cascade, {_where('matched')}, first {PHASE_TIME:g} s",
+            x=0.01,
+            ha="left",
+            fontsize=10,
         )
     return figure
 
 
-def _mark_switches(axes: Any, motion: Trajectory, times: tuple[float, ...]) -> None:
+def _first(motion: Trajectory, end: float) -> Trajectory:
+    """Return the beginning of a motion, up to a time, s."""
+    rows = motion.t < end - 1e-9
+    columns = ("t", "x", "u", "s", "cost", "margin")
+    return replace(motion, **{name: getattr(motion, name)[rows] for name in columns})
+
+
+def _mark_switches(axes: Axes, motion: Trajectory, times: Sequence[float]) -> None:
     """Mark on the motion where another surface takes over, with the time where there is room."""
-    rows = np.searchsorted(motion.t, np.asarray(times[1:]) - 1e-9)
-    x, y = np.degrees(motion["phi"][rows]), np.degrees(motion["phi_dot"][rows])
+    rows = np.searchsorted(motion.t, np.asarray(times) - 1e-9)
+    points = np.degrees(np.column_stack([motion["phi"][rows], motion["phi_dot"][rows]]))
     axes.plot(
-        x, y, "o",
+        *points.T, "o",
         color=COLOURS["blue"], markersize=4, markerfacecolor="white", label="surface replaced",
     )  # fmt: skip
-    span = np.array([np.ptp(np.degrees(motion["phi"])), np.ptp(np.degrees(motion["phi_dot"]))])
-    labelled: list[Any] = [np.zeros(2)]
-    for t, here in zip(times[1:], np.column_stack([x, y]) / span, strict=True):
-        if min(np.linalg.norm(here - other) for other in labelled) > 0.12:
+    span = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
+    labelled: list[FloatArray] = [np.zeros(2)]
+    for t, here in zip(times, points, strict=True):
+        if min(float(np.linalg.norm((here - other) / span)) for other in labelled) > 0.1:
             labelled.append(here)
             axes.annotate(
-                f"{t:.1f} s", here * span, xytext=(6, -11), textcoords="offset points", fontsize=8
-            )
+                f"{t:.1f} s", here, xytext=(6, -11), textcoords="offset points", fontsize=8,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
+            )  # fmt: skip

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow import results
+from undertow.optimiser import Budget
 from undertow.paper.data import CASES, CONDITIONS, OBJECTIVES, PERIOD, ROWS
 from undertow.paper.experiment import Reproduction, Row
 from undertow.paper.figures import figures
@@ -78,6 +79,10 @@ def reasons(result: Reproduction) -> list[dict[str, str]]:
     ]
 
 
+def _budget(budget: Budget | None) -> str:
+    return "the cascade's own" if budget is None else f"{budget.evaluations} rollouts"
+
+
 def manifest(result: Reproduction) -> dict[str, Any]:
     """Return what the run was made with, and what the tables have no room for."""
     return {
@@ -85,8 +90,8 @@ def manifest(result: Reproduction) -> dict[str, Any]:
         "versions": results.versions(),
         "seed": result.seed,
         "effort": {
-            "first optimisation, rollouts": result.effort.cold.evaluations,
-            "re-optimisation, rollouts": result.effort.warm.evaluations,
+            "first optimisation": _budget(result.effort.cold),
+            "re-optimisations": _budget(result.effort.warm),
             "bounds": result.effort.bounds,
         },
         "period_s": PERIOD,
