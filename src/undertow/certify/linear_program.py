@@ -27,6 +27,13 @@ def minimise_linear(
         x, or ``None`` where no solution was reached (infeasible, unbounded, or too ill
         conditioned).  It feeds a search whose result is verified elsewhere.
     """
+    with np.errstate(all="ignore"):  # an infeasible program overflows, and ends as None
+        return _solve(c, A, b, iterations, tolerance)
+
+
+def _solve(
+    c: FloatArray, A: FloatArray, b: FloatArray, iterations: int, tolerance: float
+) -> FloatArray | None:
     rows = np.abs(A).max(axis=1)
     columns = np.abs(A).max(axis=0)
     columns[columns == 0] = 1.0
@@ -47,12 +54,14 @@ def minimise_linear(
         H = (A * (z / s)[:, None]).T @ A
         H[np.diag_indices(n)] += 1e-13 * np.trace(H) / n
         try:
-            factor = scipy.linalg.cho_factor(H, check_finite=False)
-        except np.linalg.LinAlgError:
+            factor = scipy.linalg.cho_factor(H)
+        except (np.linalg.LinAlgError, ValueError):
             break
         centring = -s * z
         for corrector in (False, True):
-            dx = scipy.linalg.cho_solve(factor, -dual - A.T @ ((centring + z * primal) / s))
+            dx = scipy.linalg.cho_solve(
+                factor, -dual - A.T @ ((centring + z * primal) / s), check_finite=False
+            )
             ds = -primal - A @ dx
             dz = (centring - z * ds) / s
             reach = 0.995 if corrector else 1.0
@@ -62,11 +71,10 @@ def minimise_linear(
                 after = float((s + step_p * ds) @ (z + step_d * dz)) / m
                 centring = centring - ds * dz + (after / gap) ** 3 * gap
         x, s, z = x + step_p * dx, s + step_p * ds, z + step_d * dz
-        if not np.isfinite(x).all() or np.abs(x).max() > 1e12:
+        if not np.isfinite(np.concatenate([x, s, z])).all() or np.abs(x).max() > 1e12:
             return None
     return np.asarray(x / columns) if np.max(A @ x - b) < 1e-7 else None
 
 
 def _longest(v: FloatArray, dv: FloatArray) -> float:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.min(np.where(dv < 0, -v / dv, np.inf)))
+    return float(np.min(np.where(dv < 0, -v / dv, np.inf)))

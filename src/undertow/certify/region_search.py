@@ -30,9 +30,6 @@ __all__ = ["ProvedRegion", "prove_region", "search_region"]
 
 FloatArray = NDArray[np.float64]
 
-#: V on the candidate's sampled boundary; between the samples it must still be ≥ 1.
-_EDGE = 1.02
-
 
 @dataclass(frozen=True)
 class ProvedRegion:
@@ -122,11 +119,11 @@ def _quadratic(
     # Units in which the linear motion is about round.
     base = scipy.linalg.solve_continuous_lyapunov(A.T, -np.eye(size))
     units = 1 / np.sqrt(np.diag(base))
-    rays = _rays(rng, 1500, size)
+    rays = _rays(rng, 800, size)
     best, chosen, root = -1.0, np.eye(size), np.eye(size)
     width = 0.8
     # A (1+1) evolution strategy over the square root of Q, with the 1/5 success rule.
-    for trial in range(400):
+    for trial in range(240):
         change = width * rng.normal(size=(size, size))
         attempt = (
             np.diag(np.exp(rng.normal(size=size)))
@@ -255,13 +252,20 @@ class _Grower:
             radius = np.where(bad, 0.97 * radius, radius)
         return np.asarray(radius[:, None] * rays)
 
+    def around(self, V: LyapunovFunction, shell: FloatArray, growth: float) -> FloatArray:
+        """Points outside the candidate but in the box that the checker will take."""
+        box = 1.1 * np.abs(shell).max(axis=0)
+        x = box * self.rng.uniform(-1, 1, (len(shell), self.size))
+        limit = np.linalg.norm(self.shell(V, _unit(x), growth), axis=1)
+        return np.asarray(x[np.linalg.norm(x, axis=1) > limit])
+
     def decrease(self, x: FloatArray) -> FloatArray:
         """Rows of V̇/|x|² + t ≤ 0."""
         rows = self.basis.rates(x) / np.sum(x * x, axis=1)[:, None]
         return np.hstack([rows, np.ones((len(x), 1))])
 
     def boundary(self, x: FloatArray) -> FloatArray:
-        """Rows of −V ≤ −_EDGE."""
+        """Rows of −V ≤ −(more than 1)."""
         return np.hstack([-self.basis.values(x), np.zeros((len(x), 1))])
 
     def near_zero(self, coefficients: FloatArray) -> FloatArray:
@@ -287,7 +291,6 @@ class _Grower:
         rays = _rays(self.rng, 15000, self.size)
         shell = self.shell(V, rays, growth)
         inner = shell * self.rng.random((len(shell), 1)) ** (1 / 2)
-        inner = np.vstack([inner, self.near_zero(row)])
         score = self.basis.rates(inner) @ row / np.sum(inner**2, axis=1)
         for width in (0.05, 0.02, 0.005):
             worst = inner[np.argsort(score)[-150:]]
@@ -300,9 +303,14 @@ class _Grower:
             near = near[np.linalg.norm(near, axis=1) <= limit]
             inner = np.vstack([inner, near])
             score = np.concatenate([score, self.basis.rates(near) @ row / np.sum(near**2, axis=1)])
-        bad = np.argsort(score)[::-1][: int(np.sum(score > -0.3 * t))]
+        bad = inner[score > -0.3 * t]
+        # A random part of the offenders: the worst ones crowd together.
+        bad = bad[self.rng.permutation(len(bad))[:300]]
+        core = self.near_zero(row)
+        score = self.basis.rates(core) @ row / np.sum(core**2, axis=1)
+        shell = np.vstack([shell, self.around(V, shell, growth)])
         edge = shell[self.basis.values(shell) @ row < 1.0]
-        return inner[bad[:400]], edge[:400]
+        return np.vstack([bad, core[score > -0.3 * t]]), edge[:300]
 
 
 def _unit(x: FloatArray) -> FloatArray:
@@ -325,13 +333,22 @@ def _grow(
     growth, step = 0.06, 0.04
     while growth > 0.004 and time.monotonic() - started < seconds:
         reach = extent(V, way)
-        shell = grower.shell(V, _rays(rng, samples, motion_size(basis)), growth)
-        inner = np.vstack([shell * rng.random((len(shell), 1)) ** 0.5, 0.999 * shell])
+        # On the samples of the boundary; between them V must still be ≥ 1.
+        edge_value = 1 + 0.25 * growth
+        shell = grower.shell(V, _rays(rng, samples, basis.motion.size), growth)
+        inner = np.vstack(
+            [
+                shell * rng.random((len(shell), 1)) ** 0.5,
+                0.999 * shell,
+                1e-3 * _rays(rng, samples // 4, basis.motion.size),
+            ]
+        )
+        beyond = grower.around(V, shell, growth)[::2]
         targets = np.linspace(0.1, 1.0, 10)[:, None] * (reach * (1 + step) * way)
         on_way = basis.values(targets @ basis.T_inverse.T)
         rows = [
             grower.decrease(inner),
-            grower.boundary(shell[::2]),
+            grower.boundary(np.vstack([shell[::2], beyond])),
             -grower.boundary(shell[::2]),
             np.hstack([on_way, np.zeros((10, 1))]),
             np.eye(1, len(coefficients) + 1, len(coefficients)),
@@ -340,7 +357,7 @@ def _grow(
         right = np.concatenate(
             [
                 np.zeros(len(inner)),
-                np.full(count, -_EDGE),
+                np.full(count + len(beyond), -edge_value),
                 np.full(count, 1.8),
                 np.linspace(0.1, 1.0, 10),
                 [0.5 * rate],
@@ -352,8 +369,6 @@ def _grow(
         accepted = None
         for _ in range(7):
             x = minimise_linear(goal, A, right)
-            if progress is not None:
-                progress(f"    lp {None if x is None else x[-1] / rate} rows {len(A)} growth {growth:.3f} step {step:.3f} t {time.monotonic() - started:.1f}")
             if x is None or x[-1] < 1e-3 * rate:
                 break
             inside, edge = grower.counterexamples(V, x[:-1], growth, x[-1])
@@ -361,7 +376,7 @@ def _grow(
                 accepted = x
                 break
             A = np.vstack([A, grower.decrease(inside), grower.boundary(edge)])
-            right = np.concatenate([right, np.zeros(len(inside)), np.full(len(edge), -_EDGE)])
+            right = np.concatenate([right, np.zeros(len(inside)), np.full(len(edge), -edge_value)])
         candidate = None if accepted is None else basis.function(accepted[:-1])
         if candidate is not None and extent(candidate, way) > reach * 1.0005:
             V = candidate
@@ -374,11 +389,6 @@ def _grow(
         else:
             growth, step = growth / 1.5, step / 1.5
     return V
-
-
-def motion_size(basis: _Basis) -> int:
-    """N of the basis's motion."""
-    return basis.motion.size
 
 
 def prove_region(

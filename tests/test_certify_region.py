@@ -1,0 +1,206 @@
+"""Proved regions on the surface: sound against simulation, tight, refused where they must be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import undertow as ut
+from undertow.certify.linear_program import minimise_linear
+from undertow.certify.region import (
+    LyapunovFunction,
+    SurfaceMotion,
+    first_crossing,
+    verify_region,
+)
+from undertow.certify.region_search import prove_region, search_region
+from undertow.errors import InvalidInputError, UnstableSurfaceError
+from undertow.sliding import SlidingModeLaw
+from undertow.stability import sliding_matrix
+
+pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+
+RIG = ut.mechanisms.rotary_pendulum()
+MOTION = SurfaceMotion(RIG, ut.Surface(-1, -1.59, 1.96, 12.1))
+SQUARES = np.array([[2, 0, 0], [0, 2, 0], [0, 0, 2]])
+
+
+@pytest.fixture(scope="module")
+def ellipsoid() -> LyapunovFunction:
+    """The quadratic V that the search starts from, a little inside."""
+    return search_region(MOTION, (1, 0, 0), degrees=(2,), seconds=0.0).times(1.02)
+
+
+def steps(motion: SurfaceMotion, y: np.ndarray, seconds: float, h: float) -> np.ndarray:
+    """RK4 states (K, B, N) of a batch on the surface."""
+    path = [y]
+    for _ in range(round(seconds / h)):
+        a = motion(y)
+        b = motion(y + 0.5 * h * a)
+        c = motion(y + 0.5 * h * b)
+        d = motion(y + h * c)
+        y = y + h / 6 * (a + 2 * b + 2 * c + d)
+        path.append(y)
+    return np.array(path)
+
+
+def inside(V: LyapunovFunction, count: int, seed: int) -> np.ndarray:
+    """Points of {V ≤ 1}, half of them on its boundary."""
+    rng = np.random.default_rng(seed)
+    rays = rng.normal(size=(count, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    part = np.where(rng.random(count) < 0.5, 0.9999, rng.random(count))
+    return np.asarray((rays * (first_crossing(V, rays) * part)[:, None]) @ V.scale.T)
+
+
+def test_the_motion_is_the_mechanisms_on_its_surface() -> None:
+    """ẏ equals what the plant does under the unsaturated law with s = 0."""
+    surface, mechanism = MOTION.surface, RIG
+    law = SlidingModeLaw(mechanism, surface)
+    rng = np.random.default_rng(0)
+    ratio = float(surface.lambda_u[0, 0] / surface.lambda_a[0, 0])
+    for phi, phi_dot, w in rng.uniform(-0.6, 0.6, (20, 3)):
+        theta = w - ratio * phi
+        theta_dot = -float(
+            (surface.lambda_a[0, 0] * w + surface.alpha_u[0, 0] * phi_dot) / surface.alpha_a[0, 0]
+        )
+        x = np.array([theta, phi, theta_dot, phi_dot])
+        qdd = mechanism.accelerations(0.0, x, law(0.0, x).demand)
+        expected = [phi_dot, qdd[1], theta_dot + ratio * phi_dot]
+        assert MOTION([phi, phi_dot, w]) == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+def test_its_linearisation_has_the_sliding_eigenvalues() -> None:
+    """For another size too, (3, 1): the same spectrum as the sliding matrix."""
+    q = [ut.Coordinate(name) for name in ("a", "b", "c")]
+    _, b, c = (k.symbol for k in q)
+    mechanism = ut.Mechanism(
+        "chain", tuple(q), (ut.Input("u", "N m"),),
+        sp.ImmutableDenseMatrix([
+            [3, sp.cos(b), sp.cos(c) / 2],
+            [sp.cos(b), 2, sp.cos(b - c) / 3],
+            [sp.cos(c) / 2, sp.cos(b - c) / 3, 1],
+        ]),
+        sp.ImmutableDenseMatrix([0, 9 * sp.sin(b), 4 * sp.sin(c)]),
+    )  # fmt: skip
+    surface = ut.first_surface(mechanism)
+    motion = SurfaceMotion(mechanism, surface)
+    h = 1e-6 * np.eye(5)
+    A = (motion(h) - motion(-h)).T / 2e-6
+    assert np.sort_complex(np.linalg.eigvals(A)) == pytest.approx(
+        np.sort_complex(np.linalg.eigvals(sliding_matrix(mechanism, surface))), rel=1e-6, abs=1e-6
+    )
+
+
+def test_an_ellipsoid_is_proved_and_no_trajectory_leaves(ellipsoid: LyapunovFunction) -> None:
+    """Proved; then 2000 motions started inside keep V decreasing and converge."""
+    verdict = verify_region(MOTION, ellipsoid)
+    assert verdict.kind == "proved"
+    y = inside(ellipsoid, 2000, seed=3)
+    path = steps(MOTION, y, seconds=3.0, h=0.006)
+    values = ellipsoid(path)
+    assert values.max() <= 1.0
+    assert (np.diff(values[:50], axis=0) < 1e-9).all()
+    assert values[-1].max() < 1e-6
+
+
+def test_a_raised_level_is_refuted_with_a_witness(ellipsoid: LyapunovFunction) -> None:
+    """A few per cent more, and the checker names a point where V grows."""
+    verdict = verify_region(MOTION, ellipsoid.times(0.85))
+    assert verdict.kind == "refuted"
+    y = np.array(list(verdict.witness.values()))
+    assert ellipsoid(y) <= 1 / 0.85
+    step = 1e-6 * MOTION(y)
+    assert ellipsoid(y + step) > ellipsoid(y - step)
+
+
+def test_a_level_set_that_crosses_the_singularity_is_not_proved() -> None:
+    """Locally fine, but {V ≤ 1} reaches past arccos ε."""
+    verdict = verify_region(
+        MOTION, LyapunovFunction(np.diag([1.1, 5.0, 8.0]), SQUARES, np.ones(3)), max_seconds=20
+    )
+    assert verdict.kind in ("refuted", "undecided")
+
+
+def test_an_unbounded_level_set_is_not_proved() -> None:
+    """V without w: {V ≤ 1} is a cylinder, and no box holds it."""
+    flat = LyapunovFunction(np.eye(3) * 0.1, SQUARES[:2], np.ones(2))
+    verdict = verify_region(MOTION, flat)
+    assert not verdict
+    assert "no box" in verdict.method
+
+
+def test_a_known_region_is_found_to_its_edge() -> None:
+    """ẋ = −x + x³ in each direction: {x² < 1} is the region; 2 % more is refuted.
+
+    The surface motion of a mechanism made for it: with E = 1 and λ_a = α_a the angle's own
+    motion is b̈ = −2ḃ − b + (ḃ + b)³, so v = ḃ + b obeys v̇ = −v + v³.
+    """
+    a, b = ut.Coordinate("a"), ut.Coordinate("b")
+    v = b.velocity + b.symbol
+    # M_au = 0 keeps the surface out of b's equation: f_u is the motion.
+    mechanism = ut.Mechanism(
+        "cubic", (a, b), (ut.Input("u", "N m"),), sp.ImmutableDenseMatrix([[1, 0], [0, 1]]),
+        sp.ImmutableDenseMatrix([0, -2 * b.velocity - b.symbol + v**3]),
+    )  # fmt: skip
+    motion = SurfaceMotion(mechanism, ut.Surface(1, 1, 0, 0))
+
+    def cylinder(radius: float) -> LyapunovFunction:
+        # y = (b, ḃ, w); V = (v/radius)² + (b/10)² + (w/10)², whose V̇ < 0 iff |v| < 1.
+        inverse = np.array([[1 / radius, 1 / radius, 0], [0.1, 0, 0], [0, 0, 0.1]])
+        return LyapunovFunction(np.linalg.inv(inverse), SQUARES, np.ones(3))
+
+    assert verify_region(motion, cylinder(0.98)).kind == "proved"
+    assert verify_region(motion, cylinder(1.02)).kind == "refuted"
+
+
+def test_another_plant_in_a_parameter_box(ellipsoid: LyapunovFunction) -> None:
+    """±0.5 % in the mass's lever r_o is proved for a smaller set; ±30 % is not."""
+    smaller = ellipsoid.times(1.5)
+    assert verify_region(MOTION, smaller, parameters={"r_o": (0.2145, 0.2155)})
+    assert not verify_region(MOTION, smaller, parameters={"r_o": (0.15, 0.28)}, max_seconds=5)
+    with pytest.raises(InvalidInputError, match="parameter box"):
+        verify_region(MOTION, smaller, parameters={"nothing": (0.0, 1.0)})
+
+
+def test_effort_runs_out_honestly(ellipsoid: LyapunovFunction) -> None:
+    """Too few boxes: undecided, and where."""
+    verdict = verify_region(MOTION, ellipsoid, max_boxes=50, chunk=32)
+    assert verdict.kind == "undecided"
+    assert set(verdict.witness) == {"phi", "phi_dot", "w_theta"}
+
+
+def test_functions_that_cannot_be_lyapunov_functions_are_refused() -> None:
+    """Odd or constant monomials, and a surface that is not stable."""
+    for exponents in ([[1, 0, 0]], [[0, 0, 0]], [[1, 2, 0]]):
+        with pytest.raises(InvalidInputError, match="even sum"):
+            LyapunovFunction(np.eye(3), np.array(exponents), np.ones(1))
+    unstable = SurfaceMotion(RIG, ut.Surface(-1, -8.0, 1.96, 12.1))
+    with pytest.raises(UnstableSurfaceError):
+        search_region(unstable, (1, 0, 0), seconds=1.0)
+
+
+def test_a_dead_actuated_coordinate_is_refused() -> None:
+    """λ_a = 0: w does not exist and θ would not converge."""
+    with pytest.raises(InvalidInputError, match="λ_a"):
+        SurfaceMotion(RIG, ut.Surface(-1, 0.0, 5, 10))
+
+
+def test_the_linear_program_reaches_a_known_optimum() -> None:
+    """Max x + 2y on a triangle: the corner; and an empty set gives None."""
+    A = np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    x = minimise_linear(np.array([-1.0, -2.0]), A, np.array([1.0, 0.0, 0.0]))
+    assert x == pytest.approx([0.0, 1.0], abs=1e-6)
+    empty = minimise_linear(np.array([1.0]), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
+    assert empty is None
+
+
+@pytest.mark.slow
+def test_degree_four_reaches_further_than_the_ellipsoid(ellipsoid: LyapunovFunction) -> None:
+    """The search grows the set, and the checker proves it."""
+    found = prove_region(MOTION, (1, 0, 0), degrees=(4,), seconds=20.0)
+    start = 1 / np.sqrt(ellipsoid(np.array([1.0, 0, 0])))
+    assert found.verdict.kind == "proved"
+    assert found.extent > float(start)
+    assert found.function(np.array([found.extent, 0.0, 0.0])) <= 1.0
