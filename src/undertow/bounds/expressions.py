@@ -1,0 +1,90 @@
+"""SymPy expressions to CasADi ones, and absolute values to smooth constraints."""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from itertools import product
+from typing import Any
+
+import sympy as sp
+
+from undertow.errors import InvalidInputError
+
+__all__ = ["smooth", "translate"]
+
+FUNCTIONS = {
+    sp.Abs: "fabs",
+    sp.acos: "acos",
+    sp.asin: "asin",
+    sp.atan: "atan",
+    sp.atan2: "atan2",
+    sp.cos: "cos",
+    sp.cosh: "cosh",
+    sp.exp: "exp",
+    sp.log: "log",
+    sp.Max: "fmax",
+    sp.Min: "fmin",
+    sp.sign: "sign",
+    sp.sin: "sin",
+    sp.sinh: "sinh",
+    sp.tan: "tan",
+    sp.tanh: "tanh",
+    sp.StrictLessThan: "lt",
+    sp.LessThan: "le",
+    sp.StrictGreaterThan: "gt",
+    sp.GreaterThan: "ge",
+    sp.Equality: "eq",
+    sp.Unequality: "ne",
+    sp.And: "logic_and",
+    sp.Or: "logic_or",
+    sp.Not: "logic_not",
+}
+
+
+def translate(ca: Any, expression: sp.Basic, known: dict[sp.Basic, Any]) -> Any:
+    """Return a SymPy expression as a CasADi one; ``known`` maps its symbols."""
+    if expression in known:
+        return known[expression]
+    if isinstance(expression, sp.Expr) and expression.is_number:
+        return float(expression)
+    if expression in (sp.true, sp.false):
+        return float(bool(expression))
+    if isinstance(expression, sp.Piecewise):
+        value: Any = math.nan
+        for branch, condition in reversed(expression.args):
+            test, then = (translate(ca, e, known) for e in (condition, branch))
+            value = ca.if_else(test, then, value)
+        return value
+    arguments = [translate(ca, argument, known) for argument in expression.args]
+    if isinstance(expression, sp.Add):
+        return reduce(lambda a, b: a + b, arguments)
+    if isinstance(expression, sp.Mul):
+        return reduce(lambda a, b: a * b, arguments)
+    if isinstance(expression, sp.Pow):
+        base, exponent = arguments
+        return ca.sqrt(base) if exponent == 0.5 else base**exponent
+    name = FUNCTIONS.get(expression.func)
+    if name is None:
+        raise InvalidInputError(
+            "function in the problem of the bound",
+            value=str(expression),
+            limit=f"one of {', '.join(sorted(f.__name__ for f in FUNCTIONS))}",
+        )
+    function = getattr(ca, name)
+    return reduce(function, arguments) if len(arguments) > 1 else function(*arguments)
+
+
+def smooth(margin: sp.Expr) -> list[sp.Expr]:
+    """Split a margin c − Σ k_i |e_i|, k_i > 0, into the smooth margins c ∓ k_i e_i."""
+    absolute = sorted(margin.atoms(sp.Abs), key=sp.default_sort_key)
+    stand_ins = [sp.Dummy(real=True) for _ in absolute]
+    plain = margin.xreplace(dict(zip(absolute, stand_ins, strict=True)))
+    slopes = [sp.diff(plain, z) for z in stand_ins]
+    if not all(slope.is_number and slope.is_negative for slope in slopes):
+        return [margin]
+    signs = product((1, -1), repeat=len(absolute))
+    return [
+        plain.xreplace({z: s * a.args[0] for z, s, a in zip(stand_ins, row, absolute, strict=True)})
+        for row in signs
+    ]

@@ -1,0 +1,297 @@
+"""The question and its answer: :func:`bound` and the :class:`Bound` that it returns."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.bounds.guesses import built_in, recorded
+from undertow.bounds.mesh import hermite
+from undertow.bounds.programme import Programme, Solution
+from undertow.errors import InfeasibleError, InvalidInputError, MissingExtraError
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.objective import Objective
+from undertow.rollout import Trajectory
+
+__all__ = ["Bound", "bound"]
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """An optimal-control bound with the motion that attains it and how good it is.
+
+    Attributes
+    ----------
+    mechanism
+        The plant that moves.
+    cost
+        The least cost found, in the objective's unit.
+    time
+        Final time t_f, s.
+    status
+        ``"optimal"`` (IPOPT's tolerances met) or ``"acceptable"`` (its looser ones).
+    message
+        IPOPT's own words.
+    guess
+        The initial guess that led here.
+    t
+        Nodes and midpoints of the mesh in turn, (2N+1,), s; nodes have even indices.
+    x
+        States there, (2N+1, 2n), SI units.
+    u
+        Inputs there, (2N+1, m); linear between nodes.
+    defect
+        Distance from the equations of motion *between* the nodes: the largest
+        ∫|ẋ̃ − f(x̃, u)| dt over an interval and a state, over 1 + max |x_i|.  Computed from
+        the mechanism itself by Gauss quadrature, not from the programme's own constraints.
+    violation
+        Largest violation of any constraint of the programme.
+    stationarity
+        Largest entry of the gradient of the Lagrangian, over max(1, max |∇ cost|).
+    change
+        Relative change in cost at the last mesh refinement: an estimate of the
+        discretisation error.
+    iterations
+        IPOPT's iterations in all, failed guesses and coarser meshes included.
+    seconds
+        Wall time in all, s.
+    """
+
+    mechanism: Mechanism
+    cost: float
+    time: float
+    status: Literal["optimal", "acceptable"]
+    message: str
+    guess: str
+    t: FloatArray
+    x: FloatArray
+    u: FloatArray
+    defect: float
+    violation: float
+    stationarity: float
+    change: float
+    iterations: int
+    seconds: float
+
+    @property
+    def intervals(self) -> int:
+        """Number of intervals N of the final mesh."""
+        return len(self.t) // 2
+
+    def input(self, t: ArrayLike) -> FloatArray:
+        """Return u at the times t: (…) to (…, m); piecewise linear, held after the end."""
+        times = np.asarray(t, dtype=float)
+        return np.stack(
+            [np.interp(times, self.t[::2], column[::2]) for column in self.u.T], axis=-1
+        )
+
+    def state(self, t: ArrayLike) -> FloatArray:
+        """Return x at the times t: (…) to (…, 2n); cubic between nodes, held after the end."""
+        if len(self.t) == 1:
+            return np.broadcast_to(self.x[0], (*np.shape(t), self.x.shape[1])).copy()
+        return np.asarray(self._spline(np.clip(t, self.t[0], self.t[-1])))
+
+    @cached_property
+    def _spline(self) -> Any:
+        return hermite(self.mechanism, self.t[::2], self.x[::2], self.u[::2])
+
+
+def bound(
+    mechanism: Mechanism,
+    objective: Objective,
+    x0: ArrayLike,
+    *,
+    horizon: float | None = None,
+    intervals: int = 100,
+    guess: Trajectory | Sequence[Trajectory] | None = None,
+    swing: bool = False,
+) -> Bound:
+    """Return the optimal-control bound on an objective from a state.
+
+    Parameters
+    ----------
+    mechanism
+        The model, with its input limits; any n and m.
+    objective
+        Stage cost Φ, terminal radius ν and path constraints, which hold at nodes and
+        midpoints.
+    x0
+        Initial state (q, q̇), (2n,), SI units.
+    horizon
+        Final time, or the longest one, s; the objective's by default.
+    intervals
+        Intervals of the first mesh; it is refined where the motion needs it.
+    guess
+        Recorded motions to start from besides the built-in guesses, e.g. a simulated
+        closed loop.
+    swing
+        Also start from motions that let each unactuated angle fall to its far side and
+        swing back.
+
+    Returns
+    -------
+    Bound
+        The cheapest motion found from all guesses.
+
+    Raises
+    ------
+    InvalidInputError
+        For a state, horizon, mesh or guess that cannot be used.
+    MissingExtraError
+        When CasADi is not installed.
+    InfeasibleError
+        When no guess led to an admissible motion.  That proves nothing: other guesses may.
+
+    Notes
+    -----
+    *Final time.*  Where rest at the target costs nothing, Φ(0, 0) = 0 (minimum energy), the
+    final time is fixed to the horizon.  The rollouts count cost only until the terminal set
+    is reached; a motion that reaches it at t₁ < horizon is a candidate here once it is held
+    inside until the horizon.  So the fixed-time problem relaxes theirs but for the cost of
+    that holding, at most about ν² λ_max(P) with P of the linear-quadratic regulator of least
+    effort (rotary pendulum: 5e-4 V² s with d_e = 0.025, 1.2e-3 with 0.073).  Where rest
+    costs something (minimum time: Φ = 1), t_f ≤ horizon is free.
+
+    *Basins.*  The built-in guesses go straight to the target.  A mechanism may have other,
+    far cheaper ways: a rotary pendulum at 41° that is let fall, swings through the bottom
+    and comes up again needs about a twentieth of the energy, and even a little less time
+    (``swing=True`` finds that).  No stable sliding surface can do so, since (37) confines it
+    to less than a right angle; to bound *its* cost, ask the same of every input:
+    ``constraints=state_box(phi=math.pi / 2)``.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    >>> found = bound(rig, ut.MinimumTime(), rig.state(phi=ut.deg(41)))
+    >>> round(found.cost, 2)
+    0.51
+    """
+    began = time.perf_counter()
+    start, longest = _check(mechanism, objective, x0, horizon, intervals)
+    given = recorded(mechanism, guess)
+    if float(np.linalg.norm(start)) <= objective.terminal_radius:
+        return _at_target(mechanism, start, began)
+    programme = Programme(_casadi(), mechanism, objective, start, longest)
+    candidates: list[Solution] = []
+    failures: list[str] = []
+    iterations = 0
+    for first in (*given, *built_in(mechanism, start, programme.scale, longest, swing)):
+        tried = programme.first(first, intervals)
+        iterations += tried.iterations
+        if tried.status is None:
+            failures.append(f"{first.name}: {tried.message}")
+        else:
+            candidates.append(tried)
+    best: Solution | None = None
+    for candidate in sorted(candidates, key=lambda c: c.cost):
+        if best is not None and best.cost <= candidate.cost:
+            break
+        refined = programme.refine(candidate)
+        iterations += refined.iterations
+        if refined.status is None:
+            failures.append(f"{candidate.name}: {refined.message}")
+        elif best is None or refined.cost < best.cost:
+            best = refined
+    if best is None or best.status is None:
+        raise InfeasibleError(
+            f"no optimal control found for '{mechanism.name}', {objective.name}",
+            value="; ".join(failures),
+            limit=f"a motion from x0 to ‖x‖ ≤ {objective.terminal_radius:g} "
+            f"within {longest:g} s and the input limits",
+            remedy="Pass guess= a motion that arrives, try swing=True, or relax the limits",
+        )
+    return Bound(
+        mechanism=mechanism,
+        cost=best.cost,
+        time=best.time,
+        status=best.status,
+        message=best.message,
+        guess=best.name,
+        t=best.times,
+        x=best.x,
+        u=best.u,
+        defect=best.defect,
+        violation=best.violation,
+        stationarity=best.stationarity,
+        change=best.change,
+        iterations=iterations,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _check(
+    mechanism: Mechanism,
+    objective: Objective,
+    x0: ArrayLike,
+    horizon: float | None,
+    intervals: int,
+) -> tuple[FloatArray, float]:
+    """Refuse what cannot be solved before any long work; return the state and the horizon."""
+    start = mechanism.check_state(x0)
+    if start.ndim != 1:
+        raise InvalidInputError(
+            "initial state", value=f"shape {start.shape}", limit=f"({2 * mechanism.n},), one state"
+        )
+    for coordinate, value in zip(mechanism.coordinates, start, strict=False):
+        if not coordinate.low <= value <= coordinate.high:
+            raise InvalidInputError(
+                f"initial {coordinate.name} of '{mechanism.name}'",
+                value=f"{value:g} {coordinate.unit}",
+                limit=f"in its range [{coordinate.low:g}, {coordinate.high:g}]",
+            )
+    longest = objective.horizon if horizon is None else float(horizon)
+    if not (math.isfinite(longest) and longest > 0):
+        raise InvalidInputError("horizon of the bound", value=longest, limit="finite and > 0 s")
+    if intervals < 10:
+        raise InvalidInputError("intervals of the first mesh", value=intervals, limit="≥ 10")
+    values = mechanism.substitution | dict(zip(mechanism.x, start.tolist(), strict=True))
+    for constraint, margin in zip(
+        objective.constraints, objective.path_margins(mechanism), strict=True
+    ):
+        at_start = margin.subs(values)
+        if at_start.is_number and float(at_start) < 0:
+            raise InvalidInputError(
+                f"initial state breaks '{constraint.name}'",
+                value=f"margin {float(at_start):g}",
+                limit="≥ 0",
+                remedy="Start inside the constraints",
+            )
+    return start, longest
+
+
+def _at_target(mechanism: Mechanism, start: FloatArray, began: float) -> Bound:
+    return Bound(
+        mechanism=mechanism,
+        cost=0.0,
+        time=0.0,
+        status="optimal",
+        message="the initial state is inside the terminal set",
+        guess="none needed",
+        t=np.zeros(1),
+        x=start[None],
+        u=np.zeros((1, mechanism.m)),
+        defect=0.0,
+        violation=0.0,
+        stationarity=0.0,
+        change=0.0,
+        iterations=0,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _casadi() -> Any:
+    try:
+        import casadi
+    except ImportError as error:
+        raise MissingExtraError(
+            "optimal-control bounds need CasADi", remedy="pip install 'undertow[bounds]'"
+        ) from error
+    return casadi

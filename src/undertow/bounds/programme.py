@@ -1,0 +1,340 @@
+"""The nonlinear programme: separated Hermite-Simpson collocation, solved by IPOPT."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import scipy.interpolate
+import sympy as sp
+
+from undertow.bounds.expressions import smooth, translate
+from undertow.bounds.guesses import Guess, time_scale
+from undertow.bounds.mesh import adapted_mesh, defects, first_mesh
+from undertow.codegen import Tape
+from undertow.errors import InvalidInputError
+from undertow.mechanism import TIME, FloatArray, Mechanism
+from undertow.objective import Objective
+
+__all__ = ["Programme", "Solution"]
+
+#: Largest defect (see ``Bound.defect``) that a result may have: coarse meshes let a
+#: programme "move" in ways that the mechanism cannot.
+DEFECT = 1e-3
+
+#: Relative change in cost below which the mesh is not refined further.
+SETTLED = 5e-4
+
+#: Refinements after the first mesh; the number of intervals grows by GROWTH each time.
+REFINEMENTS = 6
+GROWTH = 1.4
+
+#: IPOPT's iterations per solve.  Problems that have a solution need 15 to 60, few 150.
+ITERATIONS = 200
+
+#: Iterations for trying whether a motion can be run twice as fast: mostly 10 to 45.
+HASTE = 60
+
+#: Mean of (u_i/u_max,i)² below which a motion could clearly be run faster.
+IDLE = 0.05
+
+_STATUS: dict[str, Literal["optimal", "acceptable"]] = {
+    "Solve_Succeeded": "optimal",
+    "Solved_To_Acceptable_Level": "acceptable",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A solved programme: nodes and midpoints in turn, as in ``Bound``."""
+
+    name: str
+    status: Literal["optimal", "acceptable"] | None
+    message: str
+    cost: float
+    times: FloatArray
+    x: FloatArray
+    u: FloatArray
+    violation: float
+    stationarity: float
+    iterations: int
+    defect: float = math.inf
+    change: float = math.inf
+
+    @property
+    def time(self) -> float:
+        """Final time, s."""
+        return float(self.times[-1])
+
+    @property
+    def mesh(self) -> FloatArray:
+        """The nodes, scaled to [0, 1]."""
+        return self.times[::2] / self.time
+
+    @property
+    def nodes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times (N+1,), states (N+1, 2n) and inputs (N+1, m) at the nodes."""
+        return self.times[::2], self.x[::2], self.u[::2]
+
+    def as_guess(self, pace: float = 1.0) -> Guess:
+        """Return the motion, run ``pace`` times as fast, as a guess for another programme."""
+        n = self.x.shape[1] // 2
+        times = self.times / pace
+        faster = np.concatenate([self.x[:, :n], self.x[:, n:] * pace], axis=1)
+        x = scipy.interpolate.make_interp_spline(times, faster, k=1)
+        u = scipy.interpolate.make_interp_spline(times, self.u, k=1)
+        return Guess(self.name, self.time / pace, x, u)
+
+
+class _Transcription(NamedTuple):
+    """A programme in CasADi's symbols: equations = 0, inequalities ≥ 0."""
+
+    unknowns: Any
+    cost: Any
+    equations: Any
+    inequalities: Any
+
+
+class Programme:
+    """The nonlinear programme of one problem, on any mesh."""
+
+    def __init__(
+        self, ca: Any, mechanism: Mechanism, objective: Objective, x0: FloatArray, longest: float
+    ) -> None:
+        self.ca, self.mechanism, self.x0, self.longest = ca, mechanism, x0, longest
+        self.radius = objective.terminal_radius
+        stage = objective.stage_cost(mechanism)
+        _check_impulses(mechanism, stage)
+        at_rest = stage.subs(
+            mechanism.substitution | dict.fromkeys((*mechanism.x, *mechanism.u), 0)
+        )
+        self.free_time = float(at_rest) > 1e-12
+        self.scale = time_scale(mechanism, longest)
+        limits = np.where(np.isfinite(mechanism.input_limits), mechanism.input_limits, 1.0)
+        # ∫ effort dt weighs every input by its limit: 1 is all inputs at their limits.
+        effort = sum(((u / limit) ** 2 for u, limit in zip(mechanism.u, limits, strict=True)))
+        margins = [w for m in objective.path_margins(mechanism) for w in smooth(m)]
+        self.cost = self._dynamics(stage, margins)
+        self.effort = self._dynamics(sp.sympify(effort) / mechanism.m, margins)
+
+    def _dynamics(self, stage: sp.Expr, margins: Sequence[sp.Expr]) -> Any:
+        """Return the CasADi function (t, x, u) -> (ẋ, Φ, margins)."""
+        ca, mechanism = self.ca, self.mechanism
+        tape = Tape()
+        outputs = mechanism.partition(tape).accelerations(sp.Matrix(mechanism.u))
+        outputs += tape.let_all([stage, *margins])
+        t = ca.SX.sym("t")
+        x, u = ca.SX.sym("x", 2 * mechanism.n), ca.SX.sym("u", mechanism.m)
+        known: dict[sp.Basic, Any] = {TIME: t, **mechanism.substitution}
+        known |= zip(mechanism.x, ca.vertsplit(x), strict=True)
+        known |= zip(mechanism.u, ca.vertsplit(u), strict=True)
+        for line in tape.live(outputs):
+            known[line.symbol] = translate(ca, line.expression, known)
+        values = [translate(ca, output, known) for output in outputs]
+        n = mechanism.n
+        rates = ca.vertcat(x[n:], *values[:n])
+        return ca.Function("dynamics", [t, x, u], [rates, values[n], ca.vertcat(*values[n + 1 :])])
+
+    def _interval(self, dynamics: Any) -> Any:
+        """One interval: its defects (4n), its cost, and the margins at its midpoint and end."""
+        ca, n, m = self.ca, 2 * self.mechanism.n, self.mechanism.m
+        t, h = ca.SX.sym("t"), ca.SX.sym("h")
+        a, c, b = (ca.SX.sym(name, n) for name in ("x_start", "x_middle", "x_end"))
+        u_a, u_b = (ca.SX.sym(name, m) for name in ("u_start", "u_end"))
+        rate_a, cost_a, _ = dynamics(t, a, u_a)
+        rate_c, cost_c, margin_c = dynamics(t + h / 2, c, (u_a + u_b) / 2)
+        rate_b, cost_b, margin_b = dynamics(t + h, b, u_b)
+        simpson = b - a - h / 6 * (rate_a + 4 * rate_c + rate_b)
+        hermite = c - (a + b) / 2 - h / 8 * (rate_a - rate_b)
+        cost = h / 6 * (cost_a + 4 * cost_c + cost_b)
+        outputs = [ca.vertcat(hermite, simpson), cost, ca.vertcat(margin_c, margin_b)]
+        return ca.Function("interval", [t, h, a, c, b, u_a, u_b], outputs)
+
+    def _transcribe(self, mesh: FloatArray, dynamics: Any) -> _Transcription:
+        """Write the programme on a mesh in [0, 1]; the final time is its last unknown."""
+        ca, n, m, count = self.ca, 2 * self.mechanism.n, self.mechanism.m, len(mesh) - 1
+        x, c = ca.MX.sym("x", n, count + 1), ca.MX.sym("c", n, count)
+        u, end = ca.MX.sym("u", m, count + 1), ca.MX.sym("t_f")
+        defects, costs, margins = self._interval(dynamics).map(count)(
+            ca.DM(mesh[:-1]).T * end,
+            ca.DM(np.diff(mesh)).T * end,
+            x[:, :-1],
+            c,
+            x[:, 1:],
+            u[:, :-1],
+            u[:, 1:],
+        )
+        at_start = dynamics(0.0, x[:, 0], u[:, 0])[2]
+        reach = 1 - ca.sumsqr(x[:, -1]) / self.radius**2  # of order 1, as the tolerances expect
+        return _Transcription(
+            unknowns=ca.vertcat(ca.vec(x), ca.vec(c), ca.vec(u), end),
+            cost=ca.sum2(costs),
+            equations=ca.vec(defects),
+            inequalities=ca.vertcat(reach, at_start, ca.vec(margins)),
+        )
+
+    def solve(
+        self,
+        mesh: FloatArray,
+        guess: Guess,
+        dynamics: Any,
+        *,
+        fixed: float | None,
+        patience: int = ITERATIONS,
+    ) -> Solution:
+        """Solve on a mesh in [0, 1], at a fixed final time or a free one."""
+        ca, n, m, count = self.ca, 2 * self.mechanism.n, self.mechanism.m, len(mesh) - 1
+        written = self._transcribe(mesh, dynamics)
+        constraints = ca.vertcat(written.equations, written.inequalities)
+        equal, unequal = written.equations.numel(), written.inequalities.numel()
+
+        limits = self.mechanism.input_limits
+        shortest, longest = (1e-3 * guess.time, self.longest) if fixed is None else (fixed, fixed)
+        end = min(max(guess.time, shortest), longest)
+        wide = np.concatenate([np.full(2 * n * count, np.inf), np.tile(limits, count + 1)])
+        lower = np.concatenate([self.x0, -wide, [shortest]])
+        upper = np.concatenate([self.x0, wide, [longest]])
+
+        middles = (mesh[:-1] + mesh[1:]) / 2
+        first = [guess.x(mesh * end), guess.x(middles * end), guess.u(mesh * end)]
+        first[0][0], first[2] = self.x0, np.clip(first[2], -limits, limits)
+        solver = ca.nlpsol(
+            "bound",
+            "ipopt",
+            {"x": written.unknowns, "f": written.cost, "g": constraints},
+            {
+                "print_time": False,
+                "show_eval_warnings": False,
+                "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": patience},
+            },
+        )
+        found = solver(
+            x0=np.concatenate([*(part.ravel() for part in first), [end]]),
+            lbx=lower,
+            ubx=upper,
+            lbg=np.zeros(equal + unequal),
+            ubg=np.concatenate([np.zeros(equal), np.full(unequal, np.inf)]),
+        )
+        statistics = solver.stats()
+        report = str(statistics["return_status"])
+        solution, residual = (np.array(found[key]).ravel() for key in ("x", "g"))
+        broken = (
+            np.abs(residual[:equal]).max(),
+            -residual[equal:].min(),
+            (lower - solution).max(),
+            (solution - upper).max(),
+        )
+        nodes, centres, controls, last = np.split(
+            solution, np.cumsum([n * (count + 1), n * count, m * (count + 1)])
+        )
+        u = controls.reshape(-1, m)
+        return Solution(
+            name=guess.name,
+            status=_STATUS.get(report),
+            message=report.replace("_", " ").lower(),
+            cost=float(found["f"]),
+            times=_weave(mesh, middles) * float(last[0]),
+            x=_weave(nodes.reshape(-1, n), centres.reshape(-1, n)),
+            u=_weave(u, (u[:-1] + u[1:]) / 2),
+            violation=max(0.0, *(float(b) for b in broken)),
+            stationarity=self._stationarity(written, constraints, found),
+            iterations=int(statistics["iter_count"]),
+        )
+
+    def _stationarity(self, written: _Transcription, constraints: Any, found: Any) -> float:
+        """Largest entry of the gradient of the Lagrangian, relative to the cost's own."""
+        ca = self.ca
+        multipliers = ca.MX.sym("multipliers", constraints.numel())
+        lagrangian = written.cost + ca.dot(multipliers, constraints)
+        gradients = ca.Function(
+            "gradients",
+            [written.unknowns, multipliers],
+            [ca.gradient(f, written.unknowns) for f in (lagrangian, written.cost)],
+        )
+        slope, steepness = gradients(found["x"], found["lam_g"])
+        largest = np.abs(np.array(slope + found["lam_x"])).max()
+        return float(largest / max(1.0, np.abs(np.array(steepness)).max()))
+
+    def first(self, guess: Guess, count: int) -> Solution:
+        """Solve on the first mesh.
+
+        A free final time collapses when it starts far from its optimum.  So the motion of
+        least effort at a fixed time comes first; the time is halved while the inputs have
+        much to spare, and only then released.
+        """
+        if not self.free_time:
+            mesh = first_mesh(count, self.scale / self.longest)
+            return self.solve(mesh, guess, self.cost, fixed=self.longest)
+        spent = 0
+        mesh = np.linspace(0.0, 1.0, count + 1)
+        durations = {min(guess.time, 2.0 * self.scale), guess.time, 3.0 * guess.time}
+        for duration in sorted({min(d, self.longest) for d in durations}):
+            tried = self.solve(mesh, guess, self.effort, fixed=duration)
+            spent += tried.iterations
+            shorter = tried
+            while shorter.status is not None and shorter.cost < IDLE * shorter.time:
+                tried = shorter
+                shorter = self.solve(
+                    mesh,
+                    tried.as_guess(pace=2.0),
+                    self.effort,
+                    fixed=tried.time / 2.0,
+                    patience=HASTE,
+                )
+                spent += shorter.iterations
+            if shorter.status is not None:
+                tried = shorter
+            if tried.status is not None:
+                tried = self.solve(mesh, tried.as_guess(), self.cost, fixed=None)
+                spent += tried.iterations
+            if tried.status is not None:
+                break
+        return replace(tried, iterations=spent)
+
+    def refine(self, solution: Solution) -> Solution:
+        """Adapt and refine the mesh until cost and defects have settled."""
+        spent = 0
+        errors = defects(self.mechanism, *solution.nodes)
+        for _ in range(REFINEMENTS):
+            count = math.ceil(GROWTH * (len(solution.mesh) - 1))
+            mesh = adapted_mesh(solution.mesh, errors, solution.u[::2], count)
+            fixed = None if self.free_time else self.longest
+            finer = self.solve(mesh, solution.as_guess(), self.cost, fixed=fixed)
+            spent += finer.iterations
+            if finer.status is None:
+                return replace(finer, iterations=spent)
+            errors = defects(self.mechanism, *finer.nodes)
+            solution = replace(
+                finer,
+                defect=float(errors.max()),
+                change=abs(finer.cost - solution.cost) / max(abs(finer.cost), 1e-12),
+            )
+            if solution.defect <= DEFECT and solution.change <= SETTLED:
+                break
+        solution = replace(solution, iterations=spent)
+        if solution.defect > DEFECT:
+            message = f"not resolved by {len(solution.mesh) - 1} intervals, {solution.defect:.1e}"
+            return replace(solution, status=None, message=message)
+        return solution
+
+
+def _check_impulses(mechanism: Mechanism, stage: sp.Expr) -> None:
+    """Refuse an input that is neither limited nor paid for: its optimum is an impulse."""
+    for given in mechanism.inputs:
+        if math.isinf(given.limit) and given.symbol not in stage.free_symbols:
+            raise InvalidInputError(
+                f"input '{given.name}' of '{mechanism.name}' has no cost",
+                value="no limit",
+                limit="finite",
+                remedy="Give it one with mechanism.with_input_limit(…)",
+            )
+
+
+def _weave(nodes: FloatArray, middles: FloatArray) -> FloatArray:
+    """Return nodes and midpoints in turn."""
+    out = np.empty((len(nodes) + len(middles), *nodes.shape[1:]))
+    out[::2], out[1::2] = nodes, middles
+    return out
