@@ -67,7 +67,7 @@ def _progress() -> Iterator[Callable[[str, float], None]]:
         def tell(what: str, _fraction: float) -> None:
             if what not in told:
                 told.append(what)
-                console.print(f"… {what}", soft_wrap=True, markup=False)
+                _say(console, f"… {what}")
 
         yield tell
         return
@@ -77,11 +77,15 @@ def _progress() -> Iterator[Callable[[str, float], None]]:
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
 
 
-def _write(console: Console, out: Path, files: Mapping[str, bytes]) -> None:
+def _write(out: Path, files: Mapping[str, bytes]) -> str:
+    """Write results and return the sentence that says where they went."""
     earlier = results.write_files(out, files)
-    if earlier is not None:
-        console.print(f"Earlier results moved to {earlier}/", soft_wrap=True, markup=False)
-    console.print(f"Written to {out}/: {', '.join(files)}", soft_wrap=True, markup=False)
+    moved = "" if earlier is None else f"Earlier results moved to {earlier}/\n"
+    return f"{moved}Written to {out}/: {', '.join(files)}"
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, markup=False)
 
 
 def _version(asked: bool) -> None:
@@ -142,11 +146,11 @@ def reproduce(
     effort = paper.Effort.quick() if quick else paper.Effort()
     with _progress() as progress:
         result = paper.reproduce(seed=seed, effort=effort, progress=progress)
+    # First the files: a pipe that breaks while the report is printed must not lose them.
+    written = _write(out, paper.files(result))
     console = _console()
     console.print(paper.report(result))
-    console.print()
-    _write(console, out, paper.files(result))
-    console.print(f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
+    _say(console, f"\n{written}\nTook {time.perf_counter() - began:.0f} s, seed {seed}.")
 
 
 @app.command(
@@ -225,7 +229,8 @@ def simulate(
     console = _console()
     console.print(report.motion_report(belief, goal, x0, motion, surfaces[0], run))
     if out is not None:
-        _write(console, out, report.motion_files(request, motion, motion.total, surfaces))
+        files = report.motion_files(request, motion, motion.total, surfaces)
+        _say(console, _write(out, files))
     if motion.event.name != "REACHED":
         raise typer.Exit(1)
 
@@ -262,7 +267,7 @@ def optimise(
     console = _console()
     console.print(report.proposal_report(belief, goal, x0, proposal))
     if out is not None:
-        _write(console, out, report.proposal_files(request, proposal))
+        _say(console, _write(out, report.proposal_files(request, proposal)))
 
 
 def main() -> None:
