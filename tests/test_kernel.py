@@ -253,3 +253,30 @@ def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
             if line.strip() and len(line) - len(line.lstrip()) <= depth:
                 break
             assert not line.strip().startswith(("if ", "for ", "while ", "break", "continue"))
+
+
+@pytest.mark.parametrize(
+    ("parameter", "coordinate"), [("d_1", "b"), ("h", "W"), ("v0", "step"), ("limit_0", "noise")]
+)
+def test_names_of_users_meet_no_variable_of_the_kernel(parameter: str, coordinate: str) -> None:
+    """A mechanism may call its parameters and coordinates what the kernel calls its own."""
+
+    def cost(parameter: str, coordinate: str) -> float:
+        mass = ut.Parameter(parameter, 0.125, "kg", low=0)
+        arm, rod = ut.Coordinate("arm"), ut.Coordinate(coordinate)
+        w, p, p_dot, m = arm.velocity, rod.symbol, rod.velocity, mass.symbol
+        mechanism = ut.Mechanism.from_energies(
+            "names",
+            [arm, rod],
+            [ut.Input("torque", "N m", 15.0)],
+            kinetic=(0.0036 + 0.046 * m) * w**2 / 2
+            - 0.0045 * sp.cos(p) * w * p_dot
+            + 0.0047 * p_dot**2 / 2,
+            potential=0.2 * sp.cos(p),
+            parameters=(mass,),
+        )
+        surface = ut.first_surface(mechanism)
+        loop = ut.ClosedLoop(mechanism)
+        return loop.simulate(mechanism.state(**{coordinate: 0.4}), surface, duration=0.5).total
+
+    assert cost(parameter, coordinate) == pytest.approx(cost("mass", "phi"), rel=1e-12)

@@ -2,8 +2,9 @@
 
 from math import radians as deg
 
-from undertow import mechanisms
+from undertow import mechanisms, modelling
 from undertow.cascade import Cascade, Run
+from undertow.check import MechanismReport, check_mechanism
 from undertow.decision import Freedom
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
@@ -23,6 +24,7 @@ __all__ = [
     "Freedom",
     "Input",
     "Mechanism",
+    "MechanismReport",
     "MinimumEnergy",
     "MinimumTime",
     "Objective",
@@ -35,10 +37,12 @@ __all__ = [
     "SlidingModeLaw",
     "Surface",
     "Trajectory",
+    "check_mechanism",
     "check_surface",
     "deg",
     "first_surface",
     "mechanisms",
+    "modelling",
     "placed_surface",
     "state_box",
     "surface_margins",

@@ -303,6 +303,14 @@ class Mechanism:
                 limit="unique among coordinates, inputs, parameters and the time t",
                 remedy="Rename one of them",
             )
+        private = sorted(name for name in names if name.startswith("_"))
+        if private:
+            raise ModelError(
+                f"a name of '{self.name}' starts with an underscore",
+                value=", ".join(private),
+                limit="a letter first",
+                remedy="Rename it: such names are kept for generated code",
+            )
         for what, matrix, allowed in (
             ("mass_matrix", self.mass_matrix, {*self.q, *self.parameter_symbols}),
             ("input_matrix", self.input_matrix, {*self.parameter_symbols}),

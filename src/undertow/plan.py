@@ -58,6 +58,7 @@ class Plan:
                 "times of a plan",
                 value=list(self.times),
                 limit=f"{len(self.surfaces)} rising times from 0, one for each surface",
+                remedy="Give each surface the time at which it takes over",
             )
         if not rising or not np.isfinite(self.times).all():
             raise InvalidInputError(
@@ -68,6 +69,7 @@ class Plan:
                 "reaching laws of a plan",
                 value=len(self.reaching),
                 limit=f"{len(self.surfaces)}, one for each surface",
+                remedy="Leave reaching out to use the closed loop's law throughout",
             )
 
     @classmethod

@@ -413,8 +413,16 @@ class ClosedLoop:
             Do not roll out surfaces that are unstable at the target (``UNSTABLE``); for
             loops with a linear model, see :attr:`linear_end`.
         """
+        self._check_duration(duration)
         plans = _plans(surfaces)
         if plans:
+            if reaching is not None or tuple(switch_times) != (0.0,):
+                raise InvalidInputError(
+                    "batch of surfaces or plans",
+                    value="reaching= or switch_times= besides",
+                    limit="plans alone, or vectors with both",
+                    remedy="Put times and reaching laws into undertow.Plan",
+                )
             switch_times, vectors, reaching = Plan.align(plans, self.reaching)
         else:
             vectors = np.asarray(surfaces, dtype=float)
@@ -481,6 +489,9 @@ class ClosedLoop:
             Measurement noise added to the state that the law sees, (samples, 2n), SI
             units; for a sampled inner loop only.
         """
+        self._check_duration(duration)
+        if every < 1:
+            raise InvalidInputError("every", value=every, limit="≥ 1", remedy="Record each step: 1")
         plan = Plan.of(surfaces, switch_times)
         for surface in plan.surfaces:
             check_surface_shape(self.mechanism, surface)
@@ -513,6 +524,15 @@ class ClosedLoop:
             noise=noise,
         )
         return self._trajectory(batch, record[0], start, every)
+
+    def _check_duration(self, duration: float | None) -> None:
+        if duration is not None and not (math.isfinite(duration) and duration >= 0):
+            raise InvalidInputError(
+                "duration of a rollout",
+                value=f"{duration} s",
+                limit="finite and ≥ 0",
+                remedy="Leave it out for the objective's horizon",
+            )
 
     def _trajectory(self, batch: Batch, record: FloatArray, start: float, every: int) -> Trajectory:
         n, m = self.mechanism.n, self.mechanism.m
@@ -559,13 +579,13 @@ def lay_loop(
     belief_parameters: tuple[sp.Symbol, ...] = ()
     if plant is not None:
         belief_parameters = tuple(
-            sp.Symbol(f"belief_{s}", real=True) for s in belief.parameter_symbols
+            sp.Symbol(f"_belief_{s}", real=True) for s in belief.parameter_symbols
         )
         rename |= dict(zip(belief.parameter_symbols, belief_parameters, strict=True))
     symbols = LawSymbols.of(belief.n, belief.m)
     law = lay_law(belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds)
-    applied = tuple(sp.Symbol(f"applied_{i}", real=True) for i in range(truth.m))
-    limits = tuple(sp.Symbol(f"limit_{i}", real=True) for i in range(truth.m))
+    applied = tuple(sp.Symbol(f"_applied_{i}", real=True) for i in range(truth.m))
+    limits = tuple(sp.Symbol(f"_limit_{i}", real=True) for i in range(truth.m))
     inputs = dict(zip(truth.u, applied, strict=True))
     qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
     stage, *path = tape.let_all(

@@ -234,13 +234,13 @@ class LawSymbols(NamedTuple):
         """Return the symbols for n coordinates and m inputs."""
 
         def row(stem: str, count: int) -> tuple[sp.Symbol, ...]:
-            return tuple(sp.Symbol(f"{stem}_{i}", real=True) for i in range(count))
+            return tuple(sp.Symbol(f"_{stem}_{i}", real=True) for i in range(count))
 
         return cls(
             row("surface", 2 * m * n),
             row("eta", m),
             row("layer", m),
-            sp.Symbol("gamma_target", real=True),
+            sp.Symbol("_gamma_target", real=True),
         )
 
 

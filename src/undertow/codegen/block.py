@@ -92,6 +92,7 @@ class _Writer:
     def __init__(self, program: LoopProgram) -> None:
         self.program = program
         self.emit = Emitter(program.tape)
+        self.time = self.emit.text(program.time)
         self.hoisted = _hoist(program)
         self.rows = _Rows(program, self.hoisted.lane)
         self.constant = {*self.hoisted.call, *self.hoisted.lane}
@@ -106,9 +107,12 @@ class _Writer:
         """Everything that depends on parameters alone."""
         program = self.program
         return [
-            *(f"{s} = plant[{j}]" for j, s in enumerate(program.plant_parameters)),
-            *(f"{s} = belief[{j}]" for j, s in enumerate(program.belief_parameters)),
-            *(f"{s} = limits[{j}]" for j, s in enumerate(program.limits)),
+            *(f"{self.emit.text(s)} = plant[{j}]" for j, s in enumerate(program.plant_parameters)),
+            *(
+                f"{self.emit.text(s)} = belief[{j}]"
+                for j, s in enumerate(program.belief_parameters)
+            ),
+            *(f"{self.emit.text(s)} = limits[{j}]" for j, s in enumerate(program.limits)),
             *self.emit.lines(self.hoisted.call, set())[0],
         ]
 
@@ -135,9 +139,9 @@ class _Writer:
         lines, needs = self.emit.lines(self.hoisted.lane, set(self.hoisted.call))
         return [
             *(f"{row} = lanes[b + i, segment, {j}]" for j, row in enumerate(r.lane.values())),
-            *(f"{s} = {row}" for s, row in r.lane.items() if s in needs),
+            *(f"{self.emit.text(s)} = {row}" for s, row in r.lane.items() if s in needs),
             *lines,
-            *(f"{row} = {s}" for s, row in r.kept.items()),
+            *(f"{row} = {self.emit.text(s)}" for s, row in r.kept.items()),
         ]
 
     def load_tail(self) -> list[str]:
@@ -158,8 +162,8 @@ class _Writer:
         state = zip(self.program.state, source, strict=True)
         constants = (self.rows.lane | self.rows.kept).items()
         return [
-            *(f"{s} = {row}" for s, row in state if s in needs),
-            *(f"{s} = {row}" for s, row in constants if s in needs),
+            *(f"{self.emit.text(s)} = {row}" for s, row in state if s in needs),
+            *(f"{self.emit.text(s)} = {row}" for s, row in constants if s in needs),
         ]
 
     def _law(self, source: Sequence[str], more: Sequence[sp.Expr]) -> list[str]:
@@ -167,7 +171,7 @@ class _Writer:
         demand = self.program.demand
         code, needs = self.emit.lines([*demand, *more], self.constant)
         clip = [
-            f"u_{j} = max(-limit_{j}, min(limit_{j}, {self.emit.text(d)}))"
+            f"u_{j} = max(-_limit_{j}, min(_limit_{j}, {self.emit.text(d)}))"
             for j, d in enumerate(demand)
         ]
         return [*self._load(needs, source), *code, *clip]
@@ -209,7 +213,9 @@ class _Writer:
         r, program, text = self.rows, self.program, self.emit.text
         outputs = [*self.rates, *program.path]
         if sampled:
-            law = [f"{a} = {row}" for a, row in zip(program.applied, r.u, strict=True)]
+            law = [
+                f"{self.emit.text(a)} = {row}" for a, row in zip(program.applied, r.u, strict=True)
+            ]
             known: set[sp.Symbol] = set()
         else:
             law = [*self._law(r.x, self.monitored), *self._store_law(), *self._apply()]
@@ -233,7 +239,9 @@ class _Writer:
         """Runge-Kutta stages two to four; ``weight`` and ``reach`` tell them apart."""
         r, program, text = self.rows, self.program, self.emit.text
         if sampled:
-            law = [f"{a} = {row}" for a, row in zip(program.applied, r.u, strict=True)]
+            law = [
+                f"{self.emit.text(a)} = {row}" for a, row in zip(program.applied, r.u, strict=True)
+            ]
             known: set[sp.Symbol] = set()
         else:
             law = [*self._law(r.stage_x, []), *self._apply()]
@@ -253,7 +261,7 @@ class _Writer:
         ]
 
     def _apply(self) -> list[str]:
-        return [f"{a} = u_{j}" for j, a in enumerate(self.program.applied)]
+        return [f"{self.emit.text(a)} = u_{j}" for j, a in enumerate(self.program.applied)]
 
     # -- events ----------------------------------------------------------------------------
 
@@ -268,7 +276,7 @@ class _Writer:
                 for low, now in zip(r.smallest, r.margins, strict=True)
             ),
             "broken = active > 0.0 and not (worst >= 0.0)",
-            f"{r.end} = t if broken else {r.end}",
+            f"{r.end} = {self.time} if broken else {r.end}",
             f"{r.code} = (3.0 if not ({r.singular} >= 0.0) else 2.0) if broken else {r.code}",
             f"{r.active} = 0.0 if broken else active",
         ]
@@ -299,7 +307,7 @@ class _Writer:
             f"worst = max({r.recent}, {r.earlier})",
             f"allowed = {r.rate} * (tail * (level + counted * {r.cost}) + slack)",
             f"calm = {r.active} > 0.0 and worst <= allowed",
-            *(f"calm = calm and abs({row}) <= 0.5 * limit_{j}" for j, row in enumerate(r.u)),
+            *(f"calm = calm and abs({row}) <= 0.5 * _limit_{j}" for j, row in enumerate(r.u)),
             f"{r.code} = -1.0 if calm else {r.code}",
             f"{r.active} = 0.0 if calm else {r.active}",
         ]
@@ -325,9 +333,13 @@ class _Writer:
             "part = (before - terminal) / span if span > 0.0 else 1.0",
             "part = max(0.0, min(1.0, part)) if reached else 1.0",
             "lost = not (radius < escape)",
-            *(f"{x} = n_{j} if active > 0.0 else {x}" for j, x in enumerate(r.x)),
+            *(
+                f"m_{j} = {x} + part * (n_{j} - {x}) if reached else n_{j}"
+                for j, x in enumerate(r.x)
+            ),
+            *(f"{x} = m_{j} if active > 0.0 else {x}" for j, x in enumerate(r.x)),
             f"{r.cost} = {r.cost} + part * (c_new - {r.cost}) if active > 0.0 else {r.cost}",
-            f"{r.end} = t + part * h if active > 0.0 else {r.end}",
+            f"{r.end} = {self.time} + part * h if active > 0.0 else {r.end}",
             f"costly = {r.cost} > cap",
             "code = 4.0 if lost else (1.0 if reached else (5.0 if costly else 0.0))",
             f"{r.code} = code if active > 0.0 else {r.code}",
@@ -394,7 +406,7 @@ def rollout(
         if tail > 0.0:
 {_lanes(w.load_tail(), 3)}
         for step in range(steps):
-            t = start + step * h
+            {w.time} = start + step * h
             if segment < switch.shape[0] and step == switch[segment]:
 {_lanes(w.load_surface(), 4)}
                 segment += 1
@@ -410,9 +422,9 @@ def rollout(
             for rk in range(3):
                 weight = 1.0 if rk == 2 else 2.0
                 reach = half if rk == 0 else h
-                t = start + (step + (1.0 if rk == 2 else 0.5)) * h
+                {w.time} = start + (step + (1.0 if rk == 2 else 0.5)) * h
 {_lanes(w.later_stage(sampled=sampled), 4)}
-            t = start + step * h
+            {w.time} = start + step * h
 {_lanes(w.advance(), 3)}
             if step % 8 == 0:
                 alive = 0.0

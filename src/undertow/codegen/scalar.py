@@ -17,7 +17,7 @@ from undertow.codegen.tape import Tape
 
 __all__ = ["SINCOS", "Emitter"]
 
-#: Template of one sine-cosine evaluation: ``sin_{i}`` and ``cos_{i}`` of ``{arg}``.
+#: Template of one sine-cosine evaluation: ``_sin_{i}`` and ``_cos_{i}`` of ``{arg}``.
 SINCOS = """
 k_{i} = np.floor({arg} * 0.6366197723675814 + 0.5)
 r_{i} = ({arg} - k_{i} * 1.5707963267341256) - k_{i} * 6.077100506506192e-11
@@ -27,8 +27,8 @@ pc_{i} = 1.0 - 0.5 * z_{i} + z_{i} * z_{i} * (0.0416666666666666 + z_{i} * (-0.0
 h_{i} = np.floor(k_{i} * 0.5)
 o_{i} = k_{i} - 2.0 * h_{i}
 g_{i} = 1.0 - 2.0 * (h_{i} - 2.0 * np.floor(h_{i} * 0.5))
-sin_{i} = g_{i} * (ps_{i} if o_{i} == 0.0 else pc_{i})
-cos_{i} = g_{i} * (1.0 - 2.0 * o_{i}) * (pc_{i} if o_{i} == 0.0 else ps_{i})
+_sin_{i} = g_{i} * (ps_{i} if o_{i} == 0.0 else pc_{i})
+_cos_{i} = g_{i} * (1.0 - 2.0 * o_{i}) * (pc_{i} if o_{i} == 0.0 else ps_{i})
 """.strip()  # noqa: E501
 
 
@@ -46,6 +46,10 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
             power = " * ".join([text] * abs(int(exponent)))
             return f"({power})" if int(exponent) > 0 else f"(1.0 / ({power}))"
         return f"math.pow({self._print(base)}, {self._print(exponent)})"
+
+    def _print_Symbol(self, expr: sp.Symbol) -> str:
+        # Names from outside end in an underscore, so that none can meet a generated one.
+        return str(expr.name) if expr.name.startswith("_") else f"{expr.name}_"
 
     def _print_Integer(self, expr: sp.Integer) -> str:
         return f"{int(expr)}.0"
@@ -110,7 +114,7 @@ class Emitter:
                         argument = f"angle_{index}"
                     code += SINCOS.format(i=index, arg=argument).splitlines()
                 name = "sin" if isinstance(call, sp.sin) else "cos"
-                expression = expression.xreplace({call: sp.Symbol(f"{name}_{index}", real=True)})
+                expression = expression.xreplace({call: sp.Symbol(f"_{name}_{index}", real=True)})
             code.append(f"{line.symbol} = {self.text(expression)}")
         return code, {s for s in needed if isinstance(s, sp.Symbol)}
 

@@ -46,7 +46,7 @@ class Tape:
         """Lay several expressions at once, sharing their common subexpressions."""
         replacements, reduced = sp.cse(
             [sp.sympify(e) for e in expressions],
-            symbols=sp.numbered_symbols("cse_", real=True),
+            symbols=sp.numbered_symbols("_cse_", real=True),
             order="canonical",
         )
         local: dict[sp.Symbol, sp.Expr] = {}
@@ -58,7 +58,7 @@ class Tape:
         if expression.is_Atom:
             return expression
         if expression not in self._known:
-            symbol = sp.Symbol(f"v{len(self.assignments)}", real=True)
+            symbol = sp.Symbol(f"_v{len(self.assignments)}", real=True)
             self.assignments.append(Assignment(symbol, expression))
             self._known[expression] = symbol
         return self._known[expression]
