@@ -16,7 +16,6 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
 import sympy as sp
 from numpy.typing import ArrayLike
 
@@ -369,6 +368,8 @@ def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
             value=list(poles),
             limit=f"{free} numbers with negative real part",
         )
+    import scipy.signal  # slow to import, and needed here alone
+
     A, T = _regular_form(mechanism)
     try:
         with warnings.catch_warnings():
