@@ -4,6 +4,8 @@ Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when fi
 """
 
 from undertow.certify.reaching import DisturbanceBound, ReachingCertificate, reaching
+from undertow.certify.region import LyapunovFunction, SurfaceMotion, verify_region
+from undertow.certify.region_search import ProvedRegion, prove_region
 from undertow.certify.surface import (
     CriticalMode,
     closed_forms,
@@ -17,12 +19,17 @@ from undertow.certify.verdict import Verdict
 __all__ = [
     "CriticalMode",
     "DisturbanceBound",
+    "LyapunovFunction",
+    "ProvedRegion",
     "ReachingCertificate",
+    "SurfaceMotion",
     "Verdict",
     "closed_forms",
     "critical_mode",
     "hurwitz",
     "nonsingular",
+    "prove_region",
     "reaching",
     "singular_distance",
+    "verify_region",
 ]

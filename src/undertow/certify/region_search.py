@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -29,6 +30,7 @@ from undertow.errors import InfeasibleError, UnstableSurfaceError
 __all__ = ["ProvedRegion", "prove_region", "search_region"]
 
 FloatArray = NDArray[np.float64]
+Start = Literal["far", "round"]
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class _Basis:
 
 
 def _quadratic(
-    motion: SurfaceMotion, direction: FloatArray, rng: np.random.Generator
+    motion: SurfaceMotion, direction: FloatArray, rng: np.random.Generator, start: Start
 ) -> FloatArray:
     """T with V = |T⁻¹y|² whose set {V ≤ 1} reaches far along the direction."""
     A = _jacobian(motion)
@@ -120,6 +122,9 @@ def _quadratic(
     base = scipy.linalg.solve_continuous_lyapunov(A.T, -np.eye(size))
     units = 1 / np.sqrt(np.diag(base))
     rays = _rays(rng, 800, size)
+    if start == "round":
+        T = np.linalg.inv(np.linalg.cholesky(base * np.outer(units, units)).T) * units[:, None]
+        return np.asarray(T * math.sqrt(_quadratic_level(motion, T, rays)))
     best, chosen, root = -1.0, np.eye(size), np.eye(size)
     width = 0.8
     # A (1+1) evolution strategy over the square root of Q, with the 1/5 success rule.
@@ -181,6 +186,7 @@ def search_region(
     degrees: Sequence[int] = (4, 6),
     seconds: float = 60.0,
     seed: int = 0,
+    start: Start = "far",
     samples: int = 5000,
     progress: Callable[[str], None] | None = None,
 ) -> LyapunovFunction:
@@ -194,6 +200,9 @@ def search_region(
         Even degrees of V, tried one after the other, each starting from the last.
     seconds
         Budget, shared by the degrees.
+    start
+        The quadratic V to begin with: ``"far"`` reaches far along the direction and grows
+        little; ``"round"`` starts closer and often grows further.
     progress
         Called with a line of text after each step.
 
@@ -204,7 +213,7 @@ def search_region(
     """
     rng = np.random.default_rng(seed)
     way = np.asarray(direction, dtype=float)
-    T = _quadratic(motion, way, rng)
+    T = _quadratic(motion, way, rng, start)
     # The quadratic's unit ball is made the start; a little inside, so t > 0 is possible.
     coefficients = None
     basis = _Basis(motion, T, 2)
@@ -410,7 +419,7 @@ def prove_region(
     Returns
     -------
     ProvedRegion
-        Its set is shrunk by 1 % steps where the largest one found cannot be proved.
+        The larger of two searches with different starts; a set that cannot be proved is shrunk.
 
     Raises
     ------
@@ -419,18 +428,32 @@ def prove_region(
     UnstableSurfaceError
         When the surface is not locally stable.
     """
-    V = search_region(
-        motion, direction, degrees=degrees, seconds=seconds, seed=seed, progress=progress
-    )
     way = np.asarray(direction, dtype=float)
-    verdict = None
-    for factor in (1.001, 1.01, 1.03, 1.1, 1.3, 2.0):
-        candidate = V.times(factor)
-        verdict = verify_region(motion, candidate)
-        if progress is not None:
-            progress(f"level 1/{factor}: {verdict}, {verdict.details.get('boxes')} boxes")
-        if verdict:
-            return ProvedRegion(motion, candidate, verdict, extent(candidate, way) * (1 - 1e-9))
+    best, verdict = None, None
+    starts: tuple[Start, ...] = ("far", "round")
+    for start in starts:
+        V = search_region(
+            motion,
+            direction,
+            degrees=degrees,
+            seconds=0.5 * seconds,
+            seed=seed,
+            start=start,
+            progress=progress,
+        )
+        for factor in (1.001, 1.01, 1.03, 1.06, 1.1, 1.3, 2.0):
+            candidate = V.times(factor)
+            reach = extent(candidate, way) * (1 - 1e-9)
+            if best is not None and reach <= best.extent:
+                break
+            verdict = verify_region(motion, candidate)
+            if progress is not None:
+                progress(f"level 1/{factor}: {verdict}, {verdict.details.get('boxes')} boxes")
+            if verdict:
+                best = ProvedRegion(motion, candidate, verdict, reach)
+                break
+    if best is not None:
+        return best
     raise InfeasibleError(
         f"region of attraction of {motion.surface}",
         value=str(verdict),
