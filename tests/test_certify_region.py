@@ -16,6 +16,7 @@ from undertow.certify.region import (
 )
 from undertow.certify.region_search import prove_region, search_region
 from undertow.errors import InvalidInputError, UnstableSurfaceError
+from undertow.mechanism import TIME
 from undertow.sliding import SlidingModeLaw
 from undertow.stability import sliding_matrix
 
@@ -185,6 +186,13 @@ def test_a_dead_actuated_coordinate_is_refused() -> None:
     """λ_a = 0: w does not exist and θ would not converge."""
     with pytest.raises(InvalidInputError, match="λ_a"):
         SurfaceMotion(RIG, ut.Surface(-1, 0.0, 5, 10))
+
+
+def test_a_time_dependent_force_is_refused() -> None:
+    """A proof for the autonomous motion says nothing about a driven one."""
+    plant = RIG.disturbed({"phi": 0.01 * sp.sin(TIME)})
+    with pytest.raises(InvalidInputError, match="time"):
+        SurfaceMotion(plant, MOTION.surface)
 
 
 def test_the_linear_program_reaches_a_known_optimum() -> None:

@@ -102,7 +102,7 @@ class SurfaceMotion:
     Raises
     ------
     InvalidInputError
-        For a surface of another size, or with a singular λ_a.
+        For a surface of another size, with a singular λ_a, or a force that depends on time.
     """
 
     mechanism: Mechanism
@@ -112,6 +112,13 @@ class SurfaceMotion:
     def __post_init__(self) -> None:
         """Check sizes and that w exists."""
         check_surface_shape(self.mechanism, self.surface)
+        if TIME in self.mechanism.force.free_symbols:
+            raise InvalidInputError(
+                f"force of '{self.mechanism.name}'",
+                value="depends on time",
+                limit="autonomous",
+                remedy="Prove the region for the undisturbed mechanism",
+            )
         if abs(np.linalg.det(self.surface.lambda_a)) < 1e-12:
             raise InvalidInputError(
                 "surface for a region of attraction",
@@ -148,7 +155,7 @@ class SurfaceMotion:
         q_a = tape.matrix(w - ratio * q_u)
         v_a = tape.matrix(-inverse * (_exact(surface.lambda_a) * w + _exact(surface.alpha_u) * v_u))
         w_dot = tape.matrix(v_a + ratio * v_u)
-        rename = dict(zip(mechanism.x, [*q_a, *q_u, *v_a, *v_u], strict=True)) | {TIME: 0}
+        rename = dict(zip(mechanism.x, [*q_a, *q_u, *v_a, *v_u], strict=True))
         rows = [*mechanism.mass_matrix[m:, :], *mechanism.force[m:, :]]
         atoms = tape.let_all([e.xreplace(rename) for e in rows])
         M = sp.Matrix(free, mechanism.n, atoms[: free * mechanism.n])
@@ -199,7 +206,7 @@ class SurfaceMotion:
     @cached_property
     def at_rest(self) -> bool:
         """Whether f_u(0, 0) = 0 for all parameter values, decided symbolically."""
-        origin = dict.fromkeys(self.mechanism.x, 0) | {TIME: 0}
+        origin = dict.fromkeys(self.mechanism.x, 0)
         rest = self.mechanism.force[self.mechanism.m :, :].subs(origin)
         return all(sp.simplify(e) == 0 for e in rest)
 
