@@ -88,24 +88,16 @@ def test_no_worse_than_the_one_time_optimum(run: ut.Run, cascade: ut.Cascade) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("objective", "at_most", "spread"),
-    [(ut.MinimumEnergy(), 11.9, 0.01), (ut.MinimumTime(), 1.42, 0.05)],
+    ("objective", "at_most"), [(ut.MinimumEnergy(), 11.9), (ut.MinimumTime(), 1.42)]
 )
-def test_cascades_at_41_degrees(
-    rig: ut.Mechanism, objective: ut.Objective, at_most: float, spread: float
-) -> None:
-    """Energy ≤ 11.9 V² s and time ≤ 1.42 s at 41°, d_e = 0.025, from three seeds.
-
-    They agree within 1 % in energy.  Minimum time is re-planned greedily, and equally good
-    surfaces lead to different places: the seeds agree in the first optimum (0.1 %), but not
-    after that.
-    """
+def test_cascades_at_41_degrees(rig: ut.Mechanism, objective: ut.Objective, at_most: float) -> None:
+    """Energy ≤ 11.9 V² s and time ≤ 1.42 s at 41°, d_e = 0.025; three seeds within 1 %."""
     runs = [ut.Cascade(rig, objective, seed=seed).simulate(phi=ut.deg(41)) for seed in range(3)]
     costs = np.array([run.cost for run in runs])
     firsts = np.array([run.updates[0].predicted for run in runs])
     assert all(run.reached for run in runs)
     assert costs.max() <= at_most
-    assert np.ptp(costs) <= spread * costs.min()
+    assert np.ptp(costs) <= 0.01 * costs.min()
     assert np.ptp(firsts) <= 0.01 * firsts.min()
     assert min(float(run.descent.min()) for run in runs) >= -1e-9 * at_most
 

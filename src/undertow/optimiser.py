@@ -147,12 +147,17 @@ class Optimiser:
         self.decision = Decision(self.loop, self.first, self.freedom)
 
     @property
+    def counts_time(self) -> bool:
+        """Whether the cost is the time of arrival, a discontinuous function of the plan."""
+        end = self.loop.linear_end
+        if end is None or end.stage is None:
+            return False
+        return end.stage.rest > 0 and not end.counts_cost
+
+    @property
     def shoots(self) -> bool:
         """Whether this is a minimum-time task with enough parameters to aim with."""
-        end = self.loop.linear_end
-        counts_time = end is not None and end.stage is not None and end.stage.rest > 0
-        enough = self.decision.size >= 2 * self.loop.mechanism.n
-        return counts_time and enough and end is not None and not end.counts_cost
+        return self.counts_time and self.decision.size >= 2 * self.loop.mechanism.n
 
     def _budget(self, warm: bool) -> Budget:
         given = self.warm if warm else self.cold
@@ -324,7 +329,8 @@ class _Task:
             self.cost,
             evaluations=min(evaluations, self.left),
             tolerance=tolerance,
-            resolution=self.resolution,
+            # Times of arrival improve in jumps: a pause is no sign that the search is done.
+            resolution=0.0 if self.owner.counts_time else self.resolution,
             stop=self.late,
         )
         return search.converged

@@ -17,10 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import sympy as sp
 
+from undertow.codegen.machine import numba
 from undertow.mechanism import FloatArray, Mechanism, numbers
 from undertow.objective import Objective
 from undertow.stability import linearise

@@ -411,8 +411,7 @@ def rollout(
 {_lanes(w.load_surface(), 4)}
                 segment += 1
 {sampling}\
-{_lanes(w.first_stage(sampled=sampled), 3)}
-{_lanes(w.watch(), 3)}
+{_lanes([*w.first_stage(sampled=sampled), *w.watch()], 3)}
             if every > 0 and step % every == 0:
 {_lanes(w.record(), 4)}
             if tail > 0.0 and step % 16 == 0 and segment == switch.shape[0]:

@@ -15,6 +15,8 @@ import tempfile
 from pathlib import Path
 from types import ModuleType
 
+from undertow.codegen.machine import numba
+
 __all__ = ["cache_folder", "load_module"]
 
 
@@ -32,8 +34,6 @@ def load_module(name: str, source: str) -> ModuleType:
 
     The file appears whole or not at all, so several processes may ask at once.
     """
-    import numba
-
     versions = f"{numba.__version__} {sys.version} {platform.machine()}"
     digest = hashlib.sha256((versions + source).encode()).hexdigest()[:16]
     module_name = f"{name}_{digest}"

@@ -35,7 +35,8 @@ TITLES = {
 CAPTION = (
     "paper: the printed total. printed: the printed surfaces in our simulation. "
     "ours: our base is the surface that the quadratic design gives, our one-time and cascade "
-    "are our own optima. bound: the best of all controls, by collocation (no proof)."
+    "are our own optima. bound: the least cost of any control that keeps the pendulum above the "
+    "horizontal, by collocation (no proof)."
 )
 
 
