@@ -214,6 +214,7 @@ class MinimumEnergy(Objective):
 
     The paper's Φ = u² is zero wherever u = 0 and so breaks (27)-(28): Theorem 1 does not
     cover it.  With ``state_weight`` > 0, Φ = uᵀu + w xᵀx, and the theorem applies.
+    ``unit`` is that of voltage inputs; pass another one for forces or torques.
     """
 
     name: str = "energy"
