@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Self, cast
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError, ModelError
+from undertow.lagrange import derived
 
 __all__ = ["TIME", "Coordinate", "Input", "Mechanism", "Parameter", "Partition"]
 
@@ -392,33 +393,16 @@ class Mechanism:
         ModelError
             When T is not a quadratic form in the velocities, or as for the class.
         """
-        q = sp.Matrix([c.symbol for c in coordinates])
-        qd = sp.Matrix([c.velocity for c in coordinates])
-        kinetic = sp.sympify(kinetic)
-        mass = sp.hessian(kinetic, list(qd)).applyfunc(_tidy)
-        at_rest = dict.fromkeys(qd, 0)
-        if (
-            mass.free_symbols & set(qd)
-            or sp.simplify(sp.Matrix([kinetic]).jacobian(qd).subs(at_rest)) != sp.zeros(1, len(qd))
-            or sp.simplify(kinetic.subs(at_rest)) != 0
-        ):
-            raise ModelError(
-                f"kinetic energy of '{name}'",
-                limit="a quadratic form in the velocities",
-                remedy="Move velocity-free terms to the potential; gyroscopic terms to force",
-            )
-        momentum = mass * qd
-        coriolis = momentum.jacobian(q) * qd - sp.Matrix([kinetic]).jacobian(q).T
-        conservative = sp.Matrix([sp.sympify(potential)]).jacobian(q).T
-        damping = sp.Matrix([sp.sympify(dissipation)]).jacobian(qd).T
-        force = (-coriolis - conservative - damping).applyfunc(_tidy)
+        T, V, D = sp.sympify(kinetic), sp.sympify(potential), sp.sympify(dissipation)
+        q, qd = [c.symbol for c in coordinates], [c.velocity for c in coordinates]
+        mass, force = derived(name, q, qd, T, V, D)
         return cls(
             name,
             tuple(coordinates),
             tuple(inputs),
-            sp.ImmutableDenseMatrix(mass),
-            sp.ImmutableDenseMatrix(force),
-            potential=sp.sympify(potential),
+            mass,
+            force,
+            potential=V,
             **rest,
         )
 
@@ -430,6 +414,8 @@ class Mechanism:
         InvalidInputError
             For an unknown name or a value outside the parameter's bounds.
         """
+        if not values:
+            return self
         known = {p.name: p for p in self.parameters}
         for name in values:
             if name not in known:
@@ -541,20 +527,27 @@ class Mechanism:
         return np.array([i.limit for i in self.inputs], dtype=float)
 
     @cached_property
-    def fingerprint(self) -> str:
-        """Hash of everything that defines the equations and their numbers."""
+    def structure(self) -> str:
+        """Hash of everything that generated code depends on: equations and names, no values."""
         text = "\n".join(
             [
                 sp.srepr(self.mass_matrix),
                 sp.srepr(self.force),
                 sp.srepr(self.input_matrix),
-                repr([(p.name, p.value) for p in self.parameters]),
-                repr([(i.name, i.limit) for i in self.inputs]),
+                repr([p.name for p in self.parameters]),
+                repr([i.name for i in self.inputs]),
                 repr(self.state_names),
                 repr(self.disturbance_bounds),
             ]
         )
         return hashlib.sha256(text.encode()).hexdigest()
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of everything that defines the equations and their numbers."""
+        limits = [i.limit for i in self.inputs]
+        values = [p.value for p in self.parameters]
+        return hashlib.sha256(f"{self.structure} {values} {limits}".encode()).hexdigest()
 
     def state(self, **values: float) -> FloatArray:
         """Return the state with the named entries set and all others zero, SI units.
@@ -629,23 +622,23 @@ class Mechanism:
 
     # -- numbers ------------------------------------------------------------------------
 
-    @cached_property
-    def _functions(self) -> dict[str, Callable[..., list[Any]]]:
-        state = [TIME, *self.x, *self.parameter_symbols]
-        tape = Tape()
-        forward = self.partition(tape).accelerations(sp.Matrix(self.u))
-        dynamics = compile_numpy(tape, [TIME, *self.x, *self.u, *self.parameter_symbols], forward)
-        tape = Tape()
-        mass = compile_numpy(tape, state, tape.let_all(list(self.mass_matrix)))
-        tape = Tape()
-        force = compile_numpy(tape, state, tape.let_all(list(self.force)))
-        return {"dynamics": dynamics, "mass": mass, "force": force}
-
     def _evaluate(self, which: str, t: float, x: FloatArray, *more: object) -> FloatArray:
         columns = [x[..., i] for i in range(x.shape[-1])]
-        values = self._functions[which](t, *columns, *more, *self.parameter_values)
+        values = self.function(which)(t, *columns, *more, *self.parameter_values)
         shape = np.broadcast_shapes(x.shape[:-1], *(np.shape(v) for v in values))
         return np.stack([np.broadcast_to(v, shape) for v in values], axis=-1).astype(float)
+
+    def function(self, which: str) -> Callable[..., list[Any]]:
+        """Return ``"dynamics"``, ``"mass"`` or ``"force"`` compiled to NumPy.
+
+        A function of t, x, (with ``"dynamics"``) u and the parameters, one argument each, that
+        returns the entries of q̈, M or f.
+        """
+        states = (TIME, *self.x)
+        if which == "dynamics":
+            return _compiled_dynamics(self)
+        matrix = self.mass_matrix if which == "mass" else self.force
+        return _compiled(matrix, (*states, *self.parameter_symbols))
 
     def M(self, q: ArrayLike) -> FloatArray:
         """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like."""
@@ -710,6 +703,18 @@ def numbers(matrix: Any) -> FloatArray:
     return np.array(matrix, dtype=np.float64)
 
 
-def _tidy(expression: sp.Expr) -> sp.Expr:
-    """Write trigonometry in the sines and cosines of single angles, expanded."""
-    return sp.expand_trig(sp.expand(expression))
+@lru_cache(maxsize=256)
+def _compiled(
+    matrix: sp.ImmutableDenseMatrix, arguments: tuple[sp.Symbol, ...]
+) -> Callable[..., list[Any]]:
+    """Return the entries of a matrix as a NumPy function; shared by equal mechanisms."""
+    tape = Tape()
+    return compile_numpy(tape, arguments, tape.let_all(list(matrix)))
+
+
+@lru_cache(maxsize=64)
+def _compiled_dynamics(mechanism: Mechanism) -> Callable[..., list[Any]]:
+    tape = Tape()
+    forward = mechanism.partition(tape).accelerations(sp.Matrix(mechanism.u))
+    arguments = [TIME, *mechanism.x, *mechanism.u, *mechanism.parameter_symbols]
+    return compile_numpy(tape, arguments, forward)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.codegen.block import LANES, LoopProgram, block_source
-from undertow.codegen.store import load_module
+from undertow.codegen.store import content_key, load_module, recall, remember
 from undertow.codegen.tape import Tape
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, FloatArray, Mechanism
@@ -38,6 +39,9 @@ from undertow.sliding import (
 from undertow.tail import LinearEnd, Prepared
 
 __all__ = ["Batch", "ClosedLoop", "Event", "Trajectory"]
+
+#: Longest rollout, in steps.
+MOST_STEPS = 10_000_000
 
 #: Stands in for linear ends that are not there.
 _NOTHING = np.zeros((1, 1, 1))
@@ -208,10 +212,24 @@ class ClosedLoop:
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
+        for name, low in (("escape", 0.0), ("tail", 0.0)):
+            value = getattr(self, name)
+            if not value >= low:
+                raise InvalidInputError(
+                    f"{name} of a closed loop",
+                    value=value,
+                    limit="a number ≥ 0",
+                    remedy="Leave it out for the usual value",
+                )
         if not (math.isfinite(self.step) and self.step > 0):
             raise InvalidInputError("rollout step", value=self.step, limit="finite and > 0 s")
-        if self.hold < 0:
-            raise InvalidInputError("rollout hold", value=self.hold, limit="≥ 0 steps")
+        if self.hold < 0 or self.hold != int(self.hold):
+            raise InvalidInputError(
+                "rollout hold",
+                value=self.hold,
+                limit="a whole number ≥ 0 of steps",
+                remedy="0 is the continuous law",
+            )
         vector = self.reaching.vector(self.mechanism.m)
         if self.reaching.switching != "sign":
             eta, layer = np.split(vector, 2)
@@ -324,7 +342,8 @@ class ClosedLoop:
         states = np.empty((padded, 2 * n))
         states[:count] = x0
         states[count:] = states[count - 1]
-        steps = round((self.objective.horizon if duration is None else duration) / self.step)
+        steps = self._steps(self.objective.horizon if duration is None else duration)
+        self._check_gains(lanes, live := np.ones(padded), stable_only)
         record = np.zeros((padded, -(-steps // every), 2 * n + 2 * m + 2) if every else (0, 0, 0))
         w = len(self.objective.constraints)
         out = np.empty((padded, 6 + w + 2 * n))
@@ -333,7 +352,8 @@ class ClosedLoop:
         hands_over = self._hands_over and not every
         prepared = self._prepare(lanes[:, -1]) if hands_over or stable_only else None
         end = self.linear_end
-        live = prepared.stable if prepared is not None and stable_only else np.ones(padded)
+        if prepared is not None and stable_only:
+            live *= prepared.stable
         self._kernel(
             states,
             live,
@@ -440,7 +460,35 @@ class ClosedLoop:
             )
         if vectors.shape[0] == 0:
             raise InvalidInputError("batch of rollouts", value="no surface", limit="at least one")
+        if not np.isfinite(vectors).all():
+            raise InvalidInputError(
+                "surface vectors of a batch",
+                value="NaN or infinity",
+                limit="finite numbers",
+                remedy="An earlier computation went wrong: look at where they come from",
+            )
+        if reaching is not None and not (np.asarray(reaching) > 0).all():
+            raise InvalidInputError(
+                "reaching gains of a batch",
+                value=float(np.min(reaching)),
+                limit="> 0",
+                remedy="η and ε are positive",
+            )
+        if not (terminal is None or terminal >= 0) or not cap > 0 or not slack >= 0:
+            raise InvalidInputError(
+                "terminal, cap and slack of a batch",
+                value=(terminal, cap, slack),
+                limit="terminal ≥ 0, cap > 0, slack ≥ 0",
+                remedy="Leave them out for the usual values",
+            )
         count = max(states.shape[0], vectors.shape[0])
+        if states.ndim != 2 or {states.shape[0], vectors.shape[0]} - {1, count}:
+            raise InvalidInputError(
+                "batch of rollouts",
+                value=f"{states.shape[:-1]} states and {vectors.shape[0]} surfaces",
+                limit="equal numbers, or one of either",
+                remedy="Repeat the states or the surfaces",
+            )
         states = np.broadcast_to(states, (count, states.shape[1]))
         vectors = np.broadcast_to(vectors, (count, *vectors.shape[1:]))
         return self._run(
@@ -512,6 +560,13 @@ class ClosedLoop:
                 )
             noise = np.repeat(self.mechanism.check_state(noise)[:, None, :], LANES, axis=1)
         x0 = self.mechanism.check_state(x0)
+        if x0.ndim != 1:
+            raise InvalidInputError(
+                "initial state of a simulation",
+                value=f"shape {x0.shape}",
+                limit=f"({2 * self.mechanism.n},)",
+                remedy="ClosedLoop.batch takes many starts",
+            )
         batch, record = self._run(
             x0[None],
             plan.vectors[None],
@@ -524,6 +579,39 @@ class ClosedLoop:
             noise=noise,
         )
         return self._trajectory(batch, record[0], start, every)
+
+    def _steps(self, duration: float) -> int:
+        """Return the number of steps of a rollout, refusing what memory or patience forbid."""
+        steps = round(duration / self.step)
+        if steps > MOST_STEPS or (steps < 1 and duration > 0):
+            raise InvalidInputError(
+                "length of a rollout",
+                value=f"{duration:g} s",
+                limit=f"{self.step:g} s to {MOST_STEPS * self.step:g} s, 1 to {MOST_STEPS} steps",
+                remedy="Change the horizon, or the step",
+            )
+        return steps
+
+    def _check_gains(self, lanes: FloatArray, live: FloatArray, stable_only: bool) -> None:
+        """Refuse gains (13) that this step cannot follow, or switch their lanes off."""
+        if not any(self.mechanism.disturbance_bounds) or self.reaching.switching == "sign":
+            return
+        n, m = self.mechanism.n, self.mechanism.m
+        flat = lanes.reshape(-1, lanes.shape[-1])
+        surfaces, eta, layer = np.split(flat[:, :-1], [2 * m * n, 2 * m * n + m], axis=1)
+        gains = gains_at_target(self.mechanism, surfaces, eta)
+        rate = (gains / layer).max(axis=1).reshape(lanes.shape[:2]).max(axis=1)
+        period = self.step * max(1, self.hold)
+        fast = rate * period >= 2.0
+        if stable_only:
+            live[fast] = 0.0
+        elif fast.any():
+            raise InvalidInputError(
+                "step for the gains (13) that the disturbance bounds ask for",
+                value=f"{period:g} s at k/ε = {rate.max():.4g} 1/s",
+                limit=f"below 2 ε/k = {2 / rate.max():.3g} s",
+                remedy="Use a shorter step, a thicker boundary layer or smaller bounds",
+            )
 
     def _check_duration(self, duration: float | None) -> None:
         if duration is not None and not (math.isfinite(duration) and duration >= 0):
@@ -614,6 +702,21 @@ def lay_loop(
     )
 
 
+#: The files that write kernels: a kept source is theirs no more once one of them changes.
+GENERATOR = tuple(
+    str(Path(__file__).parent / name)
+    for name in (
+        "rollout.py",
+        "mechanism.py",
+        "objective.py",
+        "sliding.py",
+        "codegen/block.py",
+        "codegen/scalar.py",
+        "codegen/tape.py",
+    )
+)
+
+
 @lru_cache(maxsize=64)
 def _compile(
     belief: Mechanism,
@@ -622,10 +725,21 @@ def _compile(
     switching: Switching,
     sampled: bool,
 ) -> Any:
-    program = lay_loop(belief, plant, objective, switching)
-    source = block_source(
-        program,
-        sampled=sampled,
-        header=f"Closed loop of {belief.name}, {objective.name}; generated, do not edit.",
+    truth = belief if plant is None else plant
+    key = content_key(
+        belief.structure,
+        "the belief" if plant is None else plant.structure,
+        sp.srepr([objective.stage_cost(truth), *objective.path_margins(truth)]),
+        repr((belief.name, objective.name, objective.hard_input, switching, sampled, LANES)),
+        sources=GENERATOR,
     )
+    source = recall("loop", key)
+    if source is None:
+        program = lay_loop(belief, plant, objective, switching)
+        source = block_source(
+            program,
+            sampled=sampled,
+            header=f"Closed loop of {belief.name}, {objective.name}; generated, do not edit.",
+        )
+        remember("loop", key, source)
     return load_module(f"loop_{belief.name}", source).rollout

@@ -78,11 +78,8 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     ModelError
         When the target is no equilibrium for u = 0.
     """
-    values = mechanism.substitution | {TIME: 0}
-    origin = dict.fromkeys(mechanism.x, 0)
-    force = sp.Matrix(mechanism.force).subs(values)
-    rest = numbers(force.subs(origin)).ravel()
     n = mechanism.n
+    rest, jacobian = _force_at_target(mechanism)
     if np.abs(rest[mechanism.m :]).max() > 1e-9:
         raise ModelError(
             f"target of '{mechanism.name}'",
@@ -90,13 +87,42 @@ def linearise(mechanism: Mechanism) -> Linearisation:
             limit="an equilibrium, f_u = 0",
             remedy="Shift the coordinates so that x = 0 is the equilibrium to be stabilised",
         )
-    jacobian = numbers(force.jacobian(list(mechanism.x)).subs(origin))
     return Linearisation(
         M=mechanism.M(np.zeros(n)),
         F=jacobian[:, :n],
         D=jacobian[:, n:],
-        B=numbers(mechanism.input_matrix.subs(values)),
+        B=numbers(mechanism.input_matrix.subs(mechanism.substitution)),
     )
+
+
+#: Functions that NumPy continues analytically to complex arguments.
+_ANALYTIC = (
+    sp.sin, sp.cos, sp.tan, sp.exp, sp.log, sp.sinh, sp.cosh, sp.tanh, sp.atan, sp.asinh,
+)  # fmt: skip
+
+
+def _force_at_target(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
+    """Return f, (n,), and ∂f/∂x, (n, 2n), at x = 0 and t = 0.
+
+    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives,
+    which know what becomes of |x| and √x² at zero.
+    """
+    force, size = mechanism.force, 2 * mechanism.n
+    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(sp.Function)) and all(
+        power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*mechanism.x)
+    )
+    if analytic:
+        step = 1e-200  # its square is nothing: what is flat to first order comes out as zero
+        x = np.vstack([np.zeros(size), 1j * step * np.eye(size)])
+        with np.errstate(all="ignore"):
+            entries = mechanism.function("force")(0.0, *x.T, *mechanism.parameter_values)
+        values = np.stack([np.broadcast_to(e, size + 1) for e in entries])
+        if np.isfinite(values).all():
+            return values[:, 0].real, values[:, 1:].imag / step
+    at_target = dict.fromkeys(mechanism.x, 0)
+    numeric = sp.Matrix(force).subs(mechanism.substitution | {TIME: 0})
+    jacobian = numeric.jacobian(list(mechanism.x)).subs(at_target)
+    return numbers(numeric.subs(at_target)).ravel(), numbers(jacobian)
 
 
 def controllability(mechanism: Mechanism) -> float:
