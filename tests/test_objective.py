@@ -60,7 +60,7 @@ def test_the_users_own_stage_cost_and_constraint_are_compiled_in(
     """Any Φ(x, u) and w(x, u) ≤ 0 in names of states, inputs and parameters, (21) and (25)."""
     objective = ut.Objective(
         "own",
-        lambda v: 2 * v.voltage**2 + v.m * v.phi_dot**2 + (v.x.T * v.x)[0],
+        lambda v: 2 * v.voltage**2 + v.m * v.phi_dot**2 + (v.states.T * v.states)[0],
         constraints=(ut.Constraint("sum", lambda v: v.voltage + 10 * v.phi - 60),),
     )
     theta, phi, w, p = rig.x
@@ -93,8 +93,8 @@ def test_names_are_states_inputs_and_parameters_and_nothing_else(rig: ut.Mechani
     v = Names(rig)
     assert (v.theta, v.phi_dot, v.voltage) == (rig.x[0], rig.x[3], rig.u[0])
     assert v.r_o == sp.Symbol("r_o", real=True)
-    assert list(v.x) == list(rig.x)
-    assert list(v.u) == list(rig.u)
+    assert list(v.states) == list(rig.x)
+    assert list(v.inputs) == list(rig.u)
     with pytest.raises(AttributeError, match=r"psi.*theta.*voltage"):
         _ = v.psi
 
@@ -121,7 +121,7 @@ REFUSALS: dict[str, tuple[Callable[[ut.Mechanism], object], str]] = {
         r"stage cost of 'odd'.*k\*phi.*states and inputs",
     ),
     "more than one expression": (
-        lambda rig: ut.Objective("odd", lambda v: v.x).stage_cost(rig),
+        lambda rig: ut.Objective("odd", lambda v: v.states).stage_cost(rig),
         r"stage cost of 'odd'.*one expression",
     ),
     "cost that can be negative": (

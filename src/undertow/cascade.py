@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from undertow.decision import Freedom
 from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.mechanism import TIME, FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Objective
 from undertow.optimiser import INADMISSIBLE, Budget, Optimiser, Proposal
 from undertow.plan import Plan
@@ -168,14 +168,15 @@ class Run:
         """Slack of Lemma 3 at each decision, J̃_k − spent − J̃_{k+1}, in units of cost.
 
         Never negative, to integration tolerance, where belief and truth agree; for
-        minimum time it is t_{f,k} − Δt − t_{f,k+1}.
+        minimum time it is t_{f,k} − Δt − t_{f,k+1}.  NaN where one of the predictions is
+        infinite: a disturbed plant may leave what the belief can bring home.
         """
-        return np.array(
-            [
-                before.predicted - after.spent - after.predicted
-                for before, after in zip(self.updates, self.updates[1:], strict=False)
-            ]
-        )
+        predicted = np.array([update.predicted for update in self.updates])
+        spent = np.array([update.spent for update in self.updates])
+        finite = np.isfinite(predicted)
+        known = finite[1:] & finite[:-1]
+        predicted = np.where(finite, predicted, 0.0)
+        return np.where(known, predicted[:-1] - spent[1:] - predicted[1:], np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +243,26 @@ class Cascade:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the period and the first surface before any work starts."""
+        """Check all settings before any work starts."""
+        if TIME in self.mechanism.force.free_symbols:
+            raise InvalidInputError(
+                f"belief '{self.mechanism.name}' of a cascade",
+                value="a force that depends on the time t",
+                limit="autonomous",
+                remedy="Predictions have no clock: give disturbances to plant= alone",
+            )
+        if not (math.isfinite(self.resolution) and self.resolution >= 0):
+            raise InvalidInputError(
+                "resolution of the cascade",
+                value=self.resolution,
+                limit="finite and ≥ 0",
+                remedy="1e-4 is a ten-thousandth of the first cost",
+            )
+        if self.seed < 0:
+            raise InvalidInputError(
+                "seed", value=self.seed, limit="≥ 0", remedy="Any whole number from 0 will do"
+            )
+        assert self.loop is not None  # built here, so that its checks run first
         stride = self.step * max(1, self.hold)
         count = self.period / stride
         if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
@@ -352,6 +372,27 @@ class Cascade:
         plan = proposal.plan if admission.accepted else old
         return replace(state, plan=plan, predicted=admission.cost), admission
 
+    def _start_state(self, x0: ArrayLike | None, names: dict[str, float]) -> FloatArray:
+        """Return the initial state that was given one way or the other."""
+        if x0 is None:
+            return self.mechanism.state(**(names or self.mechanism.start))
+        if names:
+            raise InvalidInputError(
+                "initial state",
+                value=f"x0 and {', '.join(names)}",
+                limit="x0 or names, not both",
+                remedy="Leave one of them out",
+            )
+        x = self.mechanism.check_state(x0)
+        if x.ndim != 1:
+            raise InvalidInputError(
+                "initial state",
+                value=f"shape {x.shape}",
+                limit=f"({2 * self.mechanism.n},)",
+                remedy="A run has one start; ClosedLoop.batch takes many",
+            )
+        return x
+
     # -- simulation -----------------------------------------------------------------------
 
     def simulate(
@@ -369,6 +410,7 @@ class Cascade:
         ----------
         x0
             Initial state, (2n,); or give its non-zero entries by name (``phi=0.7``).
+            With neither, the mechanism's usual ``start``.
         plant
             The truth; the belief by default.
         duration
@@ -383,8 +425,15 @@ class Cascade:
         InvalidInputError
             For an unknown state name or a state that is not finite.
         """
-        x = self.mechanism.state(**state) if x0 is None else self.mechanism.check_state(x0)
+        x = self._start_state(x0, state)
         total = self.objective.horizon if duration is None else duration
+        if not (math.isfinite(total) and total > 0):
+            raise InvalidInputError(
+                "duration of a run",
+                value=f"{total} s",
+                limit="finite and > 0",
+                remedy="Leave it out for the objective's horizon",
+            )
         truth = replace(self.loop, plant=plant)
         memory, proposal = self.start(x)
         admission = Admission(True, "first optimum", memory.predicted)

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 from undertow import inputs, results
 from undertow.cascade import Cascade
-from undertow.errors import UndertowError
+from undertow.errors import InvalidInputError, UndertowError
 from undertow.optimiser import Budget, Optimiser
 from undertow.rollout import ClosedLoop
 from undertow.stability import check_surface, first_surface
@@ -169,12 +169,12 @@ def simulate(
     start: Start = None,
     objective: Goal = "energy",
     control: Annotated[
-        Literal["cascade", "one-time", "first"],
+        Literal["cascade", "one-time", "first"] | None,
         typer.Option(
-            help="cascade: re-optimised every period. one-time: optimised at the start. "
-            "first: the designed surface."
+            help="cascade, the default: re-optimised every period. one-time: optimised at the "
+            "start. first: the designed surface."
         ),
-    ] = "cascade",
+    ] = None,
     surface: Annotated[
         str | None,
         typer.Option(
@@ -208,10 +208,19 @@ def simulate(
     x0 = inputs.parse_start(belief, start or ())
     goal = inputs.objective_named(objective, belief, horizon)
     given = None if surface is None else inputs.parse_surface(belief, surface)
+    if given is not None and control is not None:
+        raise InvalidInputError(
+            "--surface with --control",
+            value=control,
+            limit="one of them",
+            remedy="A surface of your own is kept: leave --control out",
+        )
+    steering: str = control or ("cascade" if given is None else "given surface")
+    request["control"] = steering
     if out is not None:
         results.check_folder(out)
     run = None
-    if given is None and control == "cascade":
+    if steering == "cascade":
         cascade = Cascade(belief, goal, period=period, seed=seed)
         with _progress() as progress:
             run = cascade.simulate(
@@ -221,7 +230,7 @@ def simulate(
     else:
         if given is None:
             given = first_surface(belief)
-            if control == "one-time":
+            if steering == "one-time":
                 given = Optimiser(ClosedLoop(belief, goal), seed=seed).require(x0).surface or given
         check_surface(belief, given, x0)
         motion = ClosedLoop(belief, goal, plant=truth).simulate(x0, given)

@@ -110,7 +110,14 @@ class Coordinate:
     high: float = math.inf
 
     def __post_init__(self) -> None:
-        """Refuse an empty range of travel."""
+        """Refuse a name or unit of another kind, and an empty range of travel."""
+        if not self.name.isidentifier() or self.unit not in ("rad", "m"):
+            raise InvalidInputError(
+                "coordinate",
+                value=f"name {self.name!r}, unit {self.unit!r}",
+                limit="a Python identifier, in rad or m",
+                remedy="Scale other units to SI first",
+            )
         if not self.low < self.high:
             raise InvalidInputError(
                 f"range of coordinate '{self.name}'",
@@ -149,7 +156,14 @@ class Input:
     limit: float = math.inf
 
     def __post_init__(self) -> None:
-        """Refuse a limit that is not positive."""
+        """Refuse a name that is no identifier and a limit that is not positive."""
+        if not self.name.isidentifier():
+            raise InvalidInputError(
+                "input name",
+                value=repr(self.name),
+                limit="a Python identifier",
+                remedy="Use letters, digits and underscores",
+            )
         if not self.limit > 0:
             raise InvalidInputError(
                 f"limit of input '{self.name}'",

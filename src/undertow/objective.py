@@ -30,12 +30,12 @@ __all__ = [
 class Names:
     """The states, inputs and parameters of a mechanism as attributes: ``v.phi``, ``v.voltage``.
 
-    ``v.x`` and ``v.u`` are the column matrices of all states and all inputs.
+    ``v.states`` and ``v.inputs`` are the column matrices of all states and all inputs.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self.x = sp.Matrix(mechanism.x)
-        self.u = sp.Matrix(mechanism.u)
+        self.states = sp.Matrix(mechanism.x)
+        self.inputs = sp.Matrix(mechanism.u)
         self._symbols = {
             str(s): s for s in (*mechanism.x, *mechanism.u, *mechanism.parameter_symbols)
         }
@@ -218,7 +218,7 @@ class MinimumEnergy(Objective):
     """
 
     name: str = "energy"
-    stage: Formula = lambda v: (v.u.T * v.u)[0]
+    stage: Formula = lambda v: (v.inputs.T * v.inputs)[0]
     unit: str = "V² s"
     state_weight: float = 0.0
 
@@ -258,12 +258,3 @@ def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
     samples = rng.uniform(-1, 1, (256, len(symbols))) * reach
     with np.errstate(all="ignore"):
         return float(np.min(np.real_if_close(function(*samples.T))))
-
-
-def degrees(angle: float) -> float:
-    """Return an angle given in degrees as radians.
-
-    >>> round(degrees(180.0), 4)
-    3.1416
-    """
-    return float(np.deg2rad(angle))

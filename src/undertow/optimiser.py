@@ -25,7 +25,13 @@ from undertow.rollout import ClosedLoop, Event
 from undertow.search import CMAES, minimise
 from undertow.shooting import Shooting
 from undertow.sliding import Surface
-from undertow.stability import Margin, first_surface, stability_margin, surface_margins
+from undertow.stability import (
+    Margin,
+    check_surface,
+    first_surface,
+    stability_margin,
+    surface_margins,
+)
 
 __all__ = ["Budget", "Optimiser", "Proposal", "Status"]
 
@@ -58,11 +64,13 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Refuse budgets that allow nothing."""
-        if self.evaluations < 1 or not self.seconds > 0:
+        whole = isinstance(self.evaluations, int | np.integer) and self.evaluations >= 1
+        if not whole or not self.seconds > 0:
             raise InvalidInputError(
                 "budget of an optimisation",
                 value=f"{self.evaluations} evaluations, {self.seconds} s",
-                limit="at least 1 evaluation and more than 0 s",
+                limit="at least 1 evaluation, whole, and more than 0 s",
+                remedy="Budget(1024) is usual for a re-optimisation",
             )
 
 
@@ -89,8 +97,8 @@ class Proposal:
         Running number of the proposal.
     computed_for
         Time for which ``x`` was given, s.
-    message
-        What went wrong, in words.
+    message, remedy
+        What went wrong, and what could help, in words.
     """
 
     plan: Plan | None
@@ -103,6 +111,7 @@ class Proposal:
     sequence: int
     computed_for: float
     message: str = ""
+    remedy: str = ""
 
     @property
     def surface(self) -> Surface | None:
@@ -144,6 +153,14 @@ class Optimiser:
         """Design the first surface and the coordinates of the search around it."""
         if self.first is None:
             self.first = first_surface(self.loop.mechanism)
+        check_surface(self.loop.mechanism, self.first)
+        if self.population < 4:
+            raise InvalidInputError(
+                "population of the optimiser",
+                value=self.population,
+                limit="≥ 4",
+                remedy="32 fills two blocks of rollouts",
+            )
         self.decision = Decision(self.loop, self.first, self.freedom)
 
     @property
@@ -235,14 +252,13 @@ class Optimiser:
         """
         proposal = self.propose(x)
         if proposal.plan is None:
-            worst = min(proposal.margins, key=lambda m: m.value, default=None)
             raise InfeasibleError(
                 f"no admissible surface for '{self.loop.mechanism.name}' "
                 f"({self.loop.objective.name}) among {proposal.evaluations}",
                 value=proposal.message,
                 limit="every margin ≥ 0 and the terminal set reached within "
                 f"{self.loop.objective.horizon:g} s",
-                remedy=worst.remedy if worst else "Start closer to the target",
+                remedy=proposal.remedy,
             )
         return proposal
 
@@ -340,7 +356,9 @@ class _Task:
         owner, rng = self.owner, self.rng
         assert owner.first is not None
         anchor = self.decision.encode(Plan.of(owner.first))
-        total = min(self.budget.evaluations, 3072)
+        total = self.budget.evaluations
+        if owner.shoots:  # leave the rest to shooting
+            total = min(total, 3072)
         draws = max(owner.population, total // 6)
         draw = anchor + self.decision.steps(rng, np.ones(draws))
         z = np.vstack([anchor, *self._designs(16), draw])
@@ -350,7 +368,11 @@ class _Task:
         for start in starts:
             self._descend(start, 0.3, share, 3e-3)
         assert self.best is not None  # cost() has run at least once
-        return self._descend(self.decision.encode(self.best), 0.03, share, 1e-4)
+        converged = self._descend(self.decision.encode(self.best), 0.03, share, 1e-4)
+        while not owner.shoots and self.left >= owner.population and not self.late():
+            start = self.decision.encode(self.best) + self.decision.steps(rng, np.ones(1))[0]
+            self._descend(start, 0.3, self.left, 3e-3)
+        return converged
 
     def local_search(self, incumbent: Plan) -> bool:
         """Start from the incumbent: a wide look around, then descend from the best."""
@@ -363,7 +385,8 @@ class _Task:
         if wide < 1:
             return False
         self.cost(here + self.decision.steps(self.rng, np.geomspace(0.03, 1.0, wide)))
-        return self._descend(self.decision.encode(self.best), 0.1, min(self.left, 1024), 1e-3)
+        most = min(self.left, 1024) if self.owner.shoots else self.left
+        return self._descend(self.decision.encode(self.best), 0.1, most, 1e-3)
 
     def shoot(self) -> bool:
         """Shrink the time of arrival; starts are the best plan and random ones."""
@@ -424,9 +447,11 @@ class _Task:
         """Pack the best admissible plan with its margins."""
         found = self.best_cost < INADMISSIBLE
         margins: tuple[Margin, ...] = ()
-        message = ""
+        message = remedy = ""
         if self.best is not None:
-            margins, message = motion_margins(self.owner.loop, self.best, self.x, self.horizon)
+            margins, message, remedy = motion_margins(
+                self.owner.loop, self.best, self.x, self.horizon
+            )
         status: Status = "infeasible"
         if found:
             status = "converged" if converged else "budget spent"
@@ -441,18 +466,19 @@ class _Task:
             sequence,
             computed_for,
             "" if found else message,
+            "" if found else remedy,
         )
 
 
 def motion_margins(
     loop: ClosedLoop, plan: Plan, x: FloatArray, horizon: float
-) -> tuple[tuple[Margin, ...], str]:
-    """Return the margins of a plan and of its predicted motion, and how that ends."""
+) -> tuple[tuple[Margin, ...], str, str]:
+    """Return the margins of a plan and of its predicted motion, how it ends, and a remedy."""
     objective = loop.objective
     try:
         margins = list(surface_margins(loop.mechanism, plan.surfaces[-1]))
     except SingularSurfaceError as error:
-        return (), str(error)
+        return (), str(error), error.remedy
     batch = loop.batch(x, plan, duration=horizon)
     margins.append(
         Margin(
@@ -488,4 +514,9 @@ def motion_margins(
         Event.CONSTRAINT: f"breaks '{worst.name}' by {-worst.value:.3g} {worst.unit} "
         f"at {batch.time[0]:.3g} s",
     }[event]
-    return tuple(margins), f"the best candidate {ending}"
+    remedy = {
+        Event.HORIZON: "Lengthen the horizon, widen the terminal set, or spend a larger budget",
+        Event.COSTLY: "Spend a larger budget",
+        Event.CONSTRAINT: worst.remedy,
+    }.get(event, "Start closer to the target, or spend a larger budget")
+    return tuple(margins), f"the best candidate {ending}", remedy

@@ -51,7 +51,15 @@ class Plan:
     reaching: tuple[ReachingLaw, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check lengths and times."""
+        """Check lengths, times and shapes."""
+        shapes = {(s.n, s.m) for s in self.surfaces if isinstance(s, Surface)}
+        if len(shapes) > 1 or not all(isinstance(s, Surface) for s in self.surfaces):
+            raise InvalidInputError(
+                "surfaces of a plan",
+                value=[type(s).__name__ for s in self.surfaces],
+                limit="undertow.Surface, all with the same n and m",
+                remedy="Build each with undertow.Surface(alpha_a, lambda_a, alpha_u, lambda_u)",
+            )
         rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
         if not self.surfaces or len(self.times) != len(self.surfaces) or self.times[0] != 0:
             raise InvalidInputError(
@@ -75,10 +83,18 @@ class Plan:
     @classmethod
     def of(cls, what: Surface | Plan | Sequence[Surface], times: Iterable[float] = (0.0,)) -> Plan:
         """Return a plan made of a surface, of several with their times, or as it is."""
+        times = tuple(times)
         if isinstance(what, Plan):
+            if times != (0.0,):
+                raise InvalidInputError(
+                    "plan with times besides",
+                    value=list(times),
+                    limit="a plan alone",
+                    remedy="A plan has its own times: leave switch_times out",
+                )
             return what
         surfaces = (what,) if isinstance(what, Surface) else tuple(what)
-        return cls(surfaces, tuple(times))
+        return cls(surfaces, times)
 
     def _index(self, t: float) -> int:
         """Index of the surface in use at t; a nanosecond early counts as on time."""

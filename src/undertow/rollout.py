@@ -474,11 +474,11 @@ class ClosedLoop:
                 limit="> 0",
                 remedy="η and ε are positive",
             )
-        if not (terminal is None or terminal >= 0) or not cap > 0 or not slack >= 0:
+        if not (terminal is None or terminal >= 0) or not cap >= 0 or not slack >= 0:
             raise InvalidInputError(
                 "terminal, cap and slack of a batch",
                 value=(terminal, cap, slack),
-                limit="terminal ≥ 0, cap > 0, slack ≥ 0",
+                limit="all ≥ 0",
                 remedy="Leave them out for the usual values",
             )
         count = max(states.shape[0], vectors.shape[0])

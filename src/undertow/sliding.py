@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError, SingularSurfaceError
-from undertow.mechanism import FloatArray, Mechanism, Partition
+from undertow.mechanism import TIME, FloatArray, Mechanism, Partition
 
 __all__ = ["Control", "ReachingLaw", "SlidingModeLaw", "Surface", "Switching"]
 
@@ -391,6 +391,13 @@ class SlidingModeLaw:
 
     def __post_init__(self) -> None:
         """Check that surface and mechanism fit and that the law exists at the target."""
+        if TIME in self.mechanism.force.free_symbols:
+            raise InvalidInputError(
+                f"model '{self.mechanism.name}' of a sliding-mode law",
+                value="a force that depends on the time t",
+                limit="autonomous",
+                remedy="Derive the law from the undisturbed model; disturb the plant alone",
+            )
         check_surface_shape(self.mechanism, self.surface)
         if abs(self.gamma_target) < 1e-12:
             raise SingularSurfaceError(

@@ -287,7 +287,8 @@ def check_surface(mechanism: Mechanism, surface: Surface, x0: ArrayLike | None =
     Raises
     ------
     UnstableSurfaceError
-        (35), (36) or the exact stability condition fails.
+        The exact stability condition fails; the message names which of (35)-(36) is to
+        blame where the mechanism is of the paper's kind.
     SingularSurfaceError
         (37) fails at the target or at the initial state.
     """

@@ -270,12 +270,13 @@ class _Writer:
         r = self.rows
         return [
             f"active = {r.active}",
-            f"worst = {_nested('min', r.margins)}",
+            # Written so that a margin that is not a number counts as broken, and is kept.
+            "sound = " + " & ".join(f"({row} >= 0.0)" for row in r.margins),
             *(
-                f"{low} = min({low}, {now}) if active > 0.0 else {low}"
+                f"{low} = {now} if active > 0.0 and not ({now} >= {low}) else {low}"
                 for low, now in zip(r.smallest, r.margins, strict=True)
             ),
-            "broken = active > 0.0 and not (worst >= 0.0)",
+            "broken = active > 0.0 and not sound",
             f"{r.end} = {self.time} if broken else {r.end}",
             f"{r.code} = (3.0 if not ({r.singular} >= 0.0) else 2.0) if broken else {r.code}",
             f"{r.active} = 0.0 if broken else active",
@@ -443,14 +444,6 @@ def _lanes(lines: Iterable[str], depth: int) -> str:
 
 def _sum(terms: Iterable[str]) -> str:
     return " + ".join(terms)
-
-
-def _nested(name: str, terms: Sequence[str]) -> str:
-    """Return name(name(a, b), c): numba's min and max of two vectorise best."""
-    text = terms[0]
-    for term in terms[1:]:
-        text = f"{name}({text}, {term})"
-    return text
 
 
 def _entries(matrix: Sequence[Sequence[str]]) -> Iterable[tuple[int, int, str]]:
