@@ -1,0 +1,69 @@
+"""Commands about mechanisms: what there is, its formulas, a survey, moving pictures.
+
+Plain functions of plain arguments; :mod:`undertow.cli` gives them their options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from rich.table import Table
+from rich.text import Text
+
+from undertow import results
+from undertow.animation import Film, gif, still
+from undertow.derivation import derivation
+from undertow.mechanism import Mechanism
+from undertow.mechanisms import LIBRARY
+from undertow.plot import figure_bytes, style
+from undertow.rollout import Trajectory
+from undertow.survey import start_words
+
+__all__ = ["animation_files", "derivation_files", "mechanism_table"]
+
+
+def mechanism_table() -> Table:
+    """Return the mechanisms of the library with their coordinates, inputs and listed start."""
+    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
+    for head in ("mechanism", "n, m", "inputs", "start", "what it is"):
+        table.add_column(head, no_wrap=head != "what it is")
+    for build in LIBRARY.values():
+        m = build()
+        inputs = ", ".join(f"{i.name} ≤ {i.limit:g} {i.unit}" for i in m.inputs)
+        cells = (m.name, f"{m.n}, {m.m}", inputs, start_words(m), m.description)
+        table.add_row(*(Text(cell) for cell in cells))
+    return table
+
+
+def derivation_files(mechanism: Mechanism) -> dict[str, bytes]:
+    """Return a mechanism's formulas as ``<name>.txt`` and ``<name>.tex``."""
+    formulas = derivation(mechanism)
+    return {
+        f"{mechanism.name}.txt": formulas.text().encode(),
+        f"{mechanism.name}.tex": formulas.latex().encode(),
+    }
+
+
+def animation_files(
+    request: Mapping[str, object], motion: Trajectory, *, speed: float = 1.0, longest: float = 8.0
+) -> dict[str, bytes]:
+    """Return a motion as ``<name>.gif`` and ``<name>.png``, with ``<name>.json``."""
+    film = Film.of(motion, speed=speed, longest=longest)
+    with style():
+        figure = Figure(figsize=(4.5, 4.5))
+        still(figure.add_subplot(), film)
+        picture = figure_bytes(figure)
+    name = motion.mechanism.name
+    manifest = {
+        "what": "undertow animate",
+        "versions": results.versions(),
+        "request": {k: str(v) if isinstance(v, Path) else v for k, v in request.items()},
+        "frames": len(film.t),
+    }
+    return {
+        f"{name}.gif": gif(film),
+        f"{name}.png": picture,
+        f"{name}.json": results.to_json(manifest),
+    }

@@ -1,0 +1,614 @@
+"""The formulas of a mechanism, for reading: M, f, the law and the conditions on its surface.
+
+The same expressions that everything else is generated from, written with few symbols, as text
+or as LaTeX.  The law is shown as the linear equations that it solves, for any n and m:
+
+    M_auᵀ v + M_uu w = f_u,     α_a v + α_u w = −(λ_a q̇_a + λ_u q̇_u + K sw(s/ε)),
+    u = B⁻¹ (M_aa v + M_au w − f_a)
+
+with v = q̈_a and w = q̈_u: (1), (10) and (12) without a disturbance, equal to (5)-(9).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import sympy as sp
+from sympy.printing.latex import LatexPrinter
+from sympy.printing.str import StrPrinter
+from sympy.simplify.fu import TR10i
+
+from undertow.mechanism import Mechanism
+from undertow.stability import first_surface, linearise, sliding_matrix
+
+__all__ = ["Derivation", "Equation", "Section", "derivation"]
+
+#: The variable of characteristic polynomials, 1/s; s is taken by the surface.
+_s = sp.Symbol("sigma", real=True)
+
+
+@dataclass(frozen=True)
+class Equation:
+    """``left relation right``, SymPy on both sides."""
+
+    left: sp.Expr
+    right: sp.Expr
+    relation: str = "="
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, words in front of its equations, and the equations."""
+
+    title: str
+    words: str = ""
+    equations: tuple[Equation, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Derivation:
+    """The formulas of one mechanism, section by section.
+
+    Attributes
+    ----------
+    mechanism
+        Whose formulas they are.
+    sections
+        In the order of the theory.
+    """
+
+    mechanism: Mechanism
+    sections: tuple[Section, ...]
+
+    def __getitem__(self, title: str) -> Section:
+        """Return the section whose title starts so."""
+        return next(section for section in self.sections if section.title.startswith(title))
+
+    def text(self) -> str:
+        """Return everything as lines of plain text with mathematical signs."""
+        lines = [f"{self.mechanism.name}: {self.mechanism.description}"]
+        for section in self.sections:
+            lines += ["", section.title, "-" * len(section.title)]
+            if section.words:
+                lines.append(section.words)
+            lines += [
+                f"  {plain(e.left)} {_RELATIONS[e.relation]} {plain(e.right)}"
+                for e in section.equations
+            ]
+        return "\n".join(lines) + "\n"
+
+    def latex(self) -> str:
+        """Return a LaTeX document: amsmath, one ``align*`` for each section."""
+        lines = [
+            r"\documentclass{article}",
+            r"\usepackage{amsmath,amssymb}",
+            r"\usepackage[margin=2cm]{geometry}",
+            r"\allowdisplaybreaks",
+            r"\begin{document}",
+            rf"\section*{{{self.mechanism.name.replace('_', ' ')}}}",
+            _escaped(self.mechanism.description),
+        ]
+        for section in self.sections:
+            lines.append(rf"\subsection*{{{_escaped(section.title)}}}")
+            if section.words:
+                lines.append(_escaped(section.words))
+            if section.equations:
+                rows = [
+                    rf"{tex(e.left)} &{_TEX_RELATIONS[e.relation]} {tex(e.right)}"
+                    for e in section.equations
+                ]
+                lines += [r"\begin{align*}", " \\\\\n".join(rows), r"\end{align*}"]
+        return "\n".join([*lines, r"\end{document}"]) + "\n"
+
+
+_RELATIONS = {"=": "=", "!=": "≠", ">": ">", "<": "<", "<=": "≤"}
+_TEX_RELATIONS = {"=": "=", "!=": r"\neq", ">": ">", "<": "<", "<=": r"\leq"}
+
+
+# -- the symbols of the formulas -----------------------------------------------------------------
+
+
+def _symbol(name: str) -> sp.Symbol:
+    return sp.Symbol(name, real=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Symbols:
+    """Named entries in which law and conditions are written; indices count from 1."""
+
+    M: sp.Matrix
+    f: sp.Matrix
+    B: sp.Matrix
+    alpha_a: sp.Matrix
+    lambda_a: sp.Matrix
+    alpha_u: sp.Matrix
+    lambda_u: sp.Matrix
+    surface: sp.Matrix
+    eta: sp.Matrix
+    layer: sp.Matrix
+    v: sp.Matrix
+    w: sp.Matrix
+
+    @classmethod
+    def of(cls, mechanism: Mechanism) -> Symbols:
+        """Return the symbols; α_a = −I and zeros of M and B are written as such."""
+        n, m = mechanism.n, mechanism.m
+
+        def grid(stem: str, rows: int, columns: int) -> sp.Matrix:
+            if rows == 1:
+                return column(stem, columns).T
+            return sp.Matrix(rows, columns, lambda i, j: _symbol(f"{stem}_{i + 1}{j + 1}"))
+
+        def column(stem: str, count: int) -> sp.Matrix:
+            return sp.Matrix(
+                [_symbol(stem if count == 1 else f"{stem}_{i + 1}") for i in range(count)]
+            )
+
+        M, B = mechanism.mass_matrix, mechanism.input_matrix
+        return cls(
+            M=sp.Matrix(n, n, lambda i, j: _entry("M", min(i, j), max(i, j), M)),
+            f=sp.Matrix([_entry("f", i, None, mechanism.force) for i in range(n)]),
+            B=sp.Matrix(m, m, lambda i, j: _entry("B", i, j, B)),
+            alpha_a=-sp.eye(m),
+            lambda_a=grid("lambda_a", m, m),
+            alpha_u=grid("alpha_u", m, n - m),
+            lambda_u=grid("lambda_u", m, n - m),
+            surface=column("s", m),
+            eta=column("eta", m),
+            layer=column("epsilon", m),
+            v=sp.Matrix([_symbol(f"{c.name}_ddot") for c in mechanism.coordinates[:m]]),
+            w=sp.Matrix([_symbol(f"{c.name}_ddot") for c in mechanism.coordinates[m:]]),
+        )
+
+
+def _entry(stem: str, i: int, j: int | None, matrix: sp.Matrix) -> sp.Expr:
+    value = matrix[i] if j is None else matrix[i, j]
+    if value.is_number:
+        return value
+    return _symbol(f"{stem}_{i + 1}" if j is None else f"{stem}_{i + 1}{j + 1}")
+
+
+# -- the derivation ------------------------------------------------------------------------------
+
+
+def derivation(mechanism: Mechanism) -> Derivation:
+    """Return the formulas of a mechanism, in the order of the theory.
+
+    Parameters
+    ----------
+    mechanism
+        Any n and m.
+
+    Returns
+    -------
+    Derivation
+        Sections: coordinates, M, f, B, the surface (10), the law (5) with (12), when the law
+        exists (37), when the surface is stable ((35)-(36) and their general form), and a first
+        surface with the eigenvalues of its sliding dynamics.
+
+    Raises
+    ------
+    ModelError
+        When no surface can stabilise the mechanism.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> print(derivation(ut.mechanisms.rotary_pendulum())["Mass"].equations[1].right)
+    -l*m*r_o*cos(phi)
+    """
+    symbols = Symbols.of(mechanism)
+    return Derivation(
+        mechanism,
+        (
+            _coordinates(mechanism),
+            Section("Mass matrix M(q)", "M q̈ = f + (B u, 0), symmetric.", _mass(mechanism)),
+            Section("Forces f(q, q̇)", "", _force(mechanism)),
+            Section("Inputs B", "", _inputs(mechanism)),
+            _surface(mechanism, symbols),
+            _law(mechanism, symbols),
+            _existence(mechanism, symbols),
+            _stability(mechanism, symbols),
+            _example(mechanism),
+        ),
+    )
+
+
+def _coordinates(mechanism: Mechanism) -> Section:
+    m = mechanism.m
+    lines = [
+        f"  {plain(c.symbol)} ({c.unit}, {'actuated' if i < m else 'free'}): {c.description}"
+        for i, c in enumerate(mechanism.coordinates)
+    ]
+    lines += [f"  {plain(c.symbol)} ({c.unit}): input, |{c.name}| ≤ {c.limit:g}"
+              for c in mechanism.inputs]  # fmt: skip
+    lines += [
+        f"  {plain(p.symbol)} = {p.value:.6g} {p.unit}: {p.description}"
+        for p in mechanism.parameters
+    ]
+    return Section("Coordinates, inputs, parameters", "\n".join(lines))
+
+
+def _mass(mechanism: Mechanism) -> tuple[Equation, ...]:
+    n = mechanism.n
+    return tuple(
+        Equation(_symbol(f"M_{i + 1}{j + 1}"), readable(mechanism.mass_matrix[i, j]))
+        for i in range(n)
+        for j in range(i, n)
+    )
+
+
+def _force(mechanism: Mechanism) -> tuple[Equation, ...]:
+    rates = mechanism.x[mechanism.n :]
+    return tuple(
+        Equation(_symbol(f"f_{i + 1}"), readable(mechanism.force[i], rates))
+        for i in range(mechanism.n)
+    )
+
+
+def _inputs(mechanism: Mechanism) -> tuple[Equation, ...]:
+    m = mechanism.m
+    return tuple(
+        Equation(_symbol(f"B_{i + 1}{j + 1}"), readable(mechanism.input_matrix[i, j]))
+        for i in range(m)
+        for j in range(m)
+    )
+
+
+def _surface(mechanism: Mechanism, y: Symbols) -> Section:
+    n, m = mechanism.n, mechanism.m
+    q_a, q_u = sp.Matrix(mechanism.q[:m]), sp.Matrix(mechanism.q[m:])
+    qd_a, qd_u = sp.Matrix(mechanism.x[n : n + m]), sp.Matrix(mechanism.x[n + m :])
+    s = y.alpha_a * qd_a + y.lambda_a * q_a + y.alpha_u * qd_u + y.lambda_u * q_u
+    return Section(
+        "Sliding surface (10)",
+        "Normalised, α_a = −I.",
+        tuple(Equation(left, right) for left, right in zip(y.surface, s, strict=True)),
+    )
+
+
+def _law(mechanism: Mechanism, y: Symbols) -> Section:
+    """The law as the linear equations that it solves; explicit for n = 2, m = 1."""
+    n, m = mechanism.n, mechanism.m
+    qd_a, qd_u = sp.Matrix(mechanism.x[n : n + m]), sp.Matrix(mechanism.x[n + m :])
+    switch = sp.Matrix(
+        [
+            e * sp.Function("sat")(s / width)
+            for e, s, width in zip(y.eta, y.surface, y.layer, strict=True)
+        ]
+    )
+    reach = -(y.lambda_a * qd_a + y.lambda_u * qd_u + switch)
+    M_aa, M_au, M_uu = y.M[:m, :m], y.M[:m, m:], y.M[m:, m:]
+    free = [
+        Equation(left, right)
+        for left, right in zip(M_au.T * y.v + M_uu * y.w, y.f[m:, :], strict=True)
+    ]
+    sliding = [
+        Equation(left, right)
+        for left, right in zip(y.alpha_a * y.v + y.alpha_u * y.w, reach, strict=True)
+    ]
+    force = M_aa * y.v + M_au * y.w - y.f[:m, :]
+    inputs = [
+        Equation(left, right)
+        for left, right in zip(y.B * sp.Matrix(mechanism.u), force, strict=True)
+    ]
+    words = (
+        "Wanted accelerations from the free rows of (1) and from ṡ = −η sat(s/ε) (12); then the "
+        "input that makes them (5). Gains: η where no disturbance is declared, else (13)."
+    )
+    if (n, m) == (2, 1):
+        row = y.alpha_a[0] * y.M[1, 1] - y.alpha_u[0] * y.M[0, 1]
+        explicit = (y.M[1, 1] * reach[0] - y.alpha_u[0] * y.f[1]) / row
+        sliding.append(Equation(y.v[0], explicit))
+    return Section("Law (5), (12)", words, (*free, *sliding, *inputs))
+
+
+def _existence(mechanism: Mechanism, y: Symbols) -> Section:
+    """(37) as det E(q) ≠ 0 with E = M_uu + M_auᵀ α_u, for α_a = −I."""
+    m, n = mechanism.m, mechanism.n
+    M = sp.Matrix(mechanism.mass_matrix)
+    E = M[m:, m:] + M[:m, m:].T * y.alpha_u
+    words = (
+        "The law exists where det E(q) ≠ 0, E = M_uu − M_auᵀ α_a⁻¹ α_u, equivalent to "
+        "det(α_a − α_u M_uu⁻¹ M_auᵀ) ≠ 0; det E must keep its sign along the motion."
+    )
+    if n - m == 1:
+        return Section("Existence of the law (37)", words, (Equation(readable(E[0]), 0, "!="),))
+    entries = tuple(
+        Equation(_symbol(f"E_{i + 1}{j + 1}"), readable(E[i, j]))
+        for i in range(n - m)
+        for j in range(n - m)
+    )
+    names = sp.Matrix(n - m, n - m, lambda i, j: _symbol(f"E_{i + 1}{j + 1}"))
+    whole = Equation(names.det(method="berkowitz").expand(), sp.Integer(0), "!=")
+    return Section("Existence of the law (37)", words, (*entries, whole))
+
+
+def polynomial_matrix(mechanism: Mechanism, *, symbolic: bool) -> sp.Matrix:
+    """Return P(σ) whose determinant's roots are the eigenvalues of the sliding dynamics.
+
+    ``P = [[α_a σ + λ_a, α_u σ + λ_u], [M_auᵀ σ² − D_a σ − F_a, M_uu σ² − D_u σ − F_u]]`` at
+    the target, with the linearisation's numbers or in the mechanism's parameters.
+    """
+    n, m = mechanism.n, mechanism.m
+    y = Symbols.of(mechanism)
+    if symbolic:
+        at_target = dict.fromkeys(mechanism.x, 0)
+        M = mechanism.mass_matrix.subs(at_target)
+        slope = mechanism.force.jacobian(list(mechanism.x)).subs(at_target)
+        F, D = slope[:, :n], slope[:, n:]
+    else:
+        lin = linearise(mechanism)
+        M, F, D = (sp.Matrix(a) for a in (lin.M, lin.F, lin.D))
+    top = sp.Matrix.hstack(y.alpha_a * _s + y.lambda_a, y.alpha_u * _s + y.lambda_u)
+    return sp.Matrix.vstack(top, (M * _s**2 - D * _s - F)[m:, :])
+
+
+def _stability(mechanism: Mechanism, y: Symbols) -> Section:
+    n, m = mechanism.n, mechanism.m
+    degree = 2 * n - m
+    title = "Stability on the surface (35)-(36)"
+    general = (
+        "Exponentially stable on the surface, near the target, exactly where all roots of "
+        f"det P(σ) have negative real parts; degree {degree}."
+    )
+    if m > 1:
+        P = polynomial_matrix(mechanism, symbolic=False).applyfunc(rounded)
+        entries = tuple(
+            Equation(_symbol(f"P_{i + 1}{j + 1}"), P[i, j]) for i in range(n) for j in range(n)
+        )
+        return Section(title, general, entries)
+    symbolic = n == 2
+    P = polynomial_matrix(mechanism, symbolic=symbolic)
+    polynomial = sp.Poly(P.det(method="berkowitz").expand(), _s)
+    coefficients = [polynomial.coeff_monomial(_s**k) for k in range(degree + 1)]
+    sign = _leading_sign(mechanism, y, coefficients)
+    names = [_symbol(f"p_{k}") for k in range(degree + 1)]
+    shown = [
+        Equation(a, readable(sign * c) if symbolic else rounded(sign * c))
+        for a, c in zip(reversed(names), reversed(coefficients), strict=True)
+    ]
+    hurwitz = [Equation(a, sp.Integer(0), ">") for a in reversed(names)]
+    hurwitz += [
+        Equation(minor, sp.Integer(0), ">") for minor in hurwitz_minors(names) if minor.is_Add
+    ]
+    words = (
+        f"{general} With det P = ±(p_{degree} σ^{degree} + … + p_0): where all p_k have one sign "
+        "(that of a first surface is written as positive) and Hurwitz's minors are positive:"
+    )
+    return Section(title, words, (*shown, *hurwitz))
+
+
+def _leading_sign(mechanism: Mechanism, y: Symbols, coefficients: Sequence[sp.Expr]) -> int:
+    """Sign of the leading coefficient of det P for the first surface, −1 or 1."""
+    surface = first_surface(mechanism).normalised()
+    values = mechanism.substitution
+    for name in ("lambda_a", "alpha_u", "lambda_u"):
+        numbers = getattr(surface, name).ravel().tolist()
+        values |= dict(zip(getattr(y, name), numbers, strict=True))
+    return 1 if float(coefficients[-1].subs(values)) > 0 else -1
+
+
+def hurwitz_minors(a: Sequence[sp.Expr]) -> list[sp.Expr]:
+    """Leading minors of Hurwitz's matrix that are needed besides all a_k > 0.
+
+    Liénard and Chipart: with all coefficients positive, every other minor suffices; those of
+    order N−1, N−3, … are returned, a_k the coefficient of s^k.
+    """
+    N = len(a) - 1
+    H = sp.Matrix(N, N, lambda i, j: a[N - 2 * (j + 1) + i + 1]
+                  if 0 <= N - 2 * (j + 1) + i + 1 <= N else 0)  # fmt: skip
+    return [H[:k, :k].det(method="berkowitz").expand() for k in range(N - 1, 1, -2)]
+
+
+def _example(mechanism: Mechanism) -> Section:
+    surface = first_surface(mechanism).normalised()
+    poles = np.linalg.eigvals(sliding_matrix(mechanism, surface))
+    ordered = sorted(poles, key=lambda p: (p.real, p.imag))
+    shown = ", ".join(
+        f"{p.real:.4g}" if abs(p.imag) < 1e-9 else f"{p.real:.4g}±{abs(p.imag):.4g}i"
+        for p in ordered
+        if p.imag > -1e-9
+    )
+    y = Symbols.of(mechanism)
+    pairs: list[Equation] = []
+    for name in ("lambda_a", "alpha_u", "lambda_u"):
+        pairs += [
+            Equation(symbol, rounded(sp.Float(value)))
+            for symbol, value in zip(
+                getattr(y, name), getattr(surface, name).ravel().tolist(), strict=True
+            )
+        ]
+    words = f"Quadratic design of Utkin and Young; eigenvalues of its sliding motion, 1/s: {shown}."
+    return Section("A first surface", words, tuple(pairs))
+
+
+# -- short forms ---------------------------------------------------------------------------------
+
+
+def readable(expression: sp.Expr | float, rates: Sequence[sp.Symbol] = ()) -> sp.Expr:
+    """Return an equal expression that is short to read.
+
+    Parameters
+    ----------
+    expression
+        A polynomial in ``rates`` with coefficients in sines and cosines.
+    rates
+        Velocities by whose monomials the terms are collected.
+    """
+    expression = sp.expand(sp.sympify(expression))
+    polynomial = sp.Poly(expression, *rates) if rates and expression.is_polynomial(*rates) else None
+    if polynomial is None:
+        return _shortest(expression)
+    return sp.Add(
+        *(
+            sp.Mul(_shortest(c), sp.Mul(*(r**k for r, k in zip(rates, powers, strict=True))))
+            for powers, c in polynomial.terms()
+        )
+    )
+
+
+@lru_cache(maxsize=4096)
+def _shortest(expression: sp.Expr) -> sp.Expr:
+    candidates = [expression]
+    for change in (TR10i, _angles):
+        candidates.append(change(candidates[-1]))
+    candidates += [sp.factor_terms(c) for c in candidates]
+    return min(candidates, key=lambda c: (sp.count_ops(c), len(str(c))))
+
+
+def _angles(expression: sp.Expr) -> sp.Expr:
+    """Collect terms by their trigonometric factors, then contract sums of angles."""
+    functions = sorted(expression.atoms(sp.sin, sp.cos), key=str)
+    products = sorted(
+        {
+            sp.Mul(*(a for a in sp.Mul.make_args(t) if a.has(*functions)))
+            for t in sp.Add.make_args(sp.expand(expression))
+            if functions and t.has(*functions)
+        },
+        key=str,
+    )
+    return TR10i(sp.collect(sp.expand(expression), products)) if products else expression
+
+
+def rounded(expression: sp.Expr, digits: int = 5) -> sp.Expr:
+    """Return an expression with its numbers rounded; those that round to whole ones are whole."""
+
+    def short(number: sp.Float) -> sp.Expr:
+        value = float(f"{float(number):.{digits}g}")
+        if abs(value) < 1e-12:
+            return sp.Integer(0)
+        return sp.Integer(int(value)) if value == int(value) else sp.Float(value, digits)
+
+    whole = sp.sympify(expression)
+    return whole.xreplace({f: short(f) for f in whole.atoms(sp.Float)})
+
+
+# -- printing ------------------------------------------------------------------------------------
+
+_GREEK = {
+    "alpha": "α", "beta": "β", "gamma": "γ", "epsilon": "ε", "eta": "η", "theta": "θ",
+    "lambda": "λ", "phi": "φ", "psi": "ψ", "sigma": "σ",
+}  # fmt: skip
+_DIGITS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+_POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_DOTS = {"dot": "\N{COMBINING DOT ABOVE}", "ddot": "\N{COMBINING DIAERESIS}"}
+
+
+def _parts(name: str) -> tuple[str, str, str]:
+    """Split ``phi_1_ddot`` into stem, index and dots."""
+    match = re.fullmatch(r"(.+?)_(d?dot)", name)
+    body, dots = (match[1], match[2]) if match else (name, "")
+    stem, _, index = body.partition("_")
+    return stem, index, dots
+
+
+def _plain_symbol(name: str) -> str:
+    stem, index, dots = _parts(name)
+    letter = _GREEK.get(stem, stem) + _DOTS.get(dots, "")
+    if not index:
+        return letter
+    pieces = [piece.translate(_DIGITS) for piece in index.split("_")]
+    return letter + ("" if index[0].isdigit() else "_") + "".join(pieces)
+
+
+def _tex_symbol(name: str) -> str:
+    stem, index, dots = _parts(name)
+    greek = {"phi": r"\varphi", "epsilon": r"\varepsilon"}
+    letter = greek.get(stem, rf"\{stem}" if stem in _GREEK else stem)
+    if len(stem) > 1 and stem not in _GREEK:
+        letter = rf"\mathrm{{{stem}}}"
+    if dots:
+        letter = rf"\{dots}{{{letter}}}"
+    if not index:
+        return letter
+    pieces = index.split("_")
+    return f"{letter}_{{{','.join(pieces)}}}"
+
+
+class _Plain(StrPrinter):  # type: ignore[misc]  # SymPy is untyped
+    """One line of text with Greek letters, dots and raised powers; a space multiplies."""
+
+    def _print_Symbol(self, expr: sp.Symbol) -> str:
+        return _plain_symbol(expr.name)
+
+    def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
+        base, exponent = expr.args
+        if exponent.is_Integer and exponent > 0:
+            text = self._print(base)
+            closed = base.is_Symbol or isinstance(base, sp.Function)
+            power = str(exponent).translate(_POWERS)
+            return f"{text}{power}" if closed else f"({text}){power}"
+        return str(super()._print_Pow(expr, rational))
+
+    def _print_Mul(self, expr: sp.Mul) -> str:
+        return re.sub(r"(?<!\*)\*(?!\*)", " ", super()._print_Mul(expr))
+
+
+class _Tex(LatexPrinter):  # type: ignore[misc]  # SymPy is untyped
+    """LaTeX with dots over velocities and roman words."""
+
+    def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
+        del style
+        return _tex_symbol(expr.name)
+
+
+def plain(expression: sp.Expr) -> str:
+    """Return an expression on one line of text.
+
+    >>> plain(sp.Symbol("phi_1_dot") ** 2 * sp.cos(sp.Symbol("phi_1")))
+    'φ̇₁² cos(φ₁)'
+    """
+    return str(_Plain().doprint(sp.sympify(expression))).replace("-", "−")
+
+
+def tex(expression: sp.Expr) -> str:
+    r"""Return an expression as LaTeX.
+
+    >>> tex(sp.Symbol("phi_dot") ** 2)
+    '\\dot{\\varphi}^{2}'
+    """
+    return str(_Tex({"fold_short_frac": True}).doprint(sp.sympify(expression)))
+
+
+#: Signs in words to LaTeX, after formulas.
+_SIGNS: Mapping[str, str] = {
+    "%": r"\%", "&": r"\&", "_": r"\_", "−": "$-$", "≠": r"$\neq$", "≤": r"$\leq$", "±": r"$\pm$",
+    "²": "$^2$", "·": r"$\cdot$", "Ω": r"$\Omega$", "…": r"\dots{}", "°": r"$^\circ$",
+    ">": "$>$", "<": "$<$", "|": "$|$",
+}  # fmt: skip
+
+#: A letter with dots, indices and powers, as words and :func:`plain` write it.
+_FORMULA = re.compile(
+    r"([A-Za-zα-ω]+)(\u0307|\u0308)?(_[A-Za-z0-9₀-₉]+|[₀-₉]+)?(⁻¹|ᵀ|\^\d)?(?![A-Za-z])"
+)
+_NORMAL = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
+
+
+def _escaped(words: str) -> str:
+    """Return words for LaTeX: formulas as mathematics, one line after the other."""
+
+    def formula(match: re.Match[str]) -> str:
+        letters, dot, index, power = match.groups()
+        greek = {v: k for k, v in _GREEK.items()}
+        if not (dot or index or power or letters in greek):
+            return match[0]
+        text = _tex_symbol(greek.get(letters, letters))
+        if dot:
+            text = rf"\{'dot' if dot == chr(0x307) else 'ddot'}{{{text}}}"
+        if index:
+            text += f"_{{{index.lstrip('_').translate(_NORMAL)}}}"
+        if power:
+            text += {"⁻¹": "^{-1}", "ᵀ": "^{T}"}.get(power, power)
+        return f"\0{text}\0"
+
+    pieces = _FORMULA.sub(formula, words.replace("ṡ", "s\u0307")).split("\0")
+    for index in range(0, len(pieces), 2):
+        for sign, replacement in _SIGNS.items():
+            pieces[index] = pieces[index].replace(sign, replacement)
+    text = "".join(f"${p}$" if i % 2 else p for i, p in enumerate(pieces))
+    return "\\\\\n".join(line.strip() for line in text.split("\n"))

@@ -1,0 +1,374 @@
+"""Every mechanism of the library brought to its target: cost, time, bound and gap in one table.
+
+Nothing is chosen by hand: first surface, optimisation and cascade are those of
+``undertow simulate NAME``, from the mechanism's listed start.  The bound is a local optimum of
+the same task over *all* inputs, see :mod:`undertow.bounds`; the gap is what the cascade spends
+beyond it.  Where the gap is large, :data:`TRIALS` look for its cause: each removes one
+restriction, and the table shows what is left of the gap without it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from rich.table import Table
+from rich.text import Text
+
+from undertow import results
+from undertow.bounds import bound
+from undertow.cascade import Cascade, Run
+from undertow.decision import Freedom
+from undertow.errors import InfeasibleError
+from undertow.inputs import mechanism_named, objective_named
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.mechanisms import LIBRARY
+from undertow.objective import Objective
+from undertow.optimiser import Budget
+from undertow.plan import Plan
+from undertow.plot import display
+from undertow.sliding import Surface
+
+__all__ = [
+    "TRIALS",
+    "Entry",
+    "Trial",
+    "files",
+    "markdown",
+    "median_gap",
+    "start_words",
+    "summary",
+    "survey",
+    "survey_one",
+    "table",
+]
+
+#: A gap beyond this asks for its cause.
+LARGE = 0.10
+
+#: Intervals of the bound's first mesh for each swing of the motion, and the most there may be.
+PER_CYCLE = 12
+MOST_INTERVALS = 400
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One restriction taken away from the one-time optimum.
+
+    Parameters
+    ----------
+    name
+        What is different, in words.
+    freedom
+        What may be chosen.
+    budget
+        What the optimisation may spend.
+    """
+
+    name: str
+    freedom: Freedom
+    budget: Budget
+
+
+#: Tried in this order where the gap is large.
+TRIALS = (
+    Trial("more evaluations (30 000)", Freedom(), Budget(30_000)),
+    Trial("reaching law free (10 000)", Freedom(reaching=True), Budget(10_000)),
+    Trial("both (60 000)", Freedom(reaching=True), Budget(60_000)),
+)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the survey.
+
+    Attributes
+    ----------
+    name, n, m, start, unit
+        The mechanism, its start in words, and the unit of cost.
+    first, one_time, cascade
+        Cost of the designed first surface, of the surface optimised once, and of the cascade;
+        ``inf`` where the target was not reached.
+    time
+        When the cascade reached ‖x‖ ≤ ν, s; ``inf`` where it did not.
+    radius
+        ‖x‖ at the end of the cascade's motion.
+    bound
+        Optimal-control bound, NaN where none was asked for or found.
+    deadline
+        Final time of the bound, s: the horizon, or the cascade's time of arrival where the
+        motion swings too often to be bounded over the horizon.
+    seconds
+        Wall time of all of it, s.
+    trials
+        Name of each trial made to its cost.
+    """
+
+    name: str
+    n: int
+    m: int
+    start: str
+    unit: str
+    first: float
+    one_time: float
+    cascade: float
+    time: float
+    radius: float
+    bound: float
+    deadline: float
+    seconds: float
+    trials: Mapping[str, float]
+
+    @property
+    def gap(self) -> float:
+        """What the cascade spends beyond the bound, relative; NaN without a bound."""
+        return self.cascade / self.bound - 1.0
+
+    def gap_of(self, cost: float) -> float:
+        """Return the relative gap of another cost to the same bound."""
+        return cost / self.bound - 1.0
+
+
+def survey(
+    names: Sequence[str] | None = None,
+    *,
+    goal: str = "energy",
+    horizon: float = 60.0,
+    seed: int = 0,
+    bounds: bool = True,
+    progress: Callable[[str, float], None] | None = None,
+) -> tuple[Entry, ...]:
+    """Bring every mechanism from its listed start to its target.
+
+    Parameters
+    ----------
+    names
+        Which; all of the library by default.
+    goal
+        ``"energy"`` or ``"time"``.
+    horizon
+        Longest motion, s.
+    seed
+        Seed of the optimisers.
+    bounds
+        Also the optimal-control bound (extra ``bounds``) and, where the gap is large, the
+        trials.
+    progress
+        Called with what is being done and the part that is done.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown mechanism or goal, before any work.
+    MissingExtraError
+        When bounds are asked for without CasADi.
+    """
+    chosen = [mechanism_named(name) for name in (LIBRARY if names is None else names)]
+    entries = []
+    for index, mechanism in enumerate(chosen):
+        if progress is not None:
+            progress(mechanism.name, index / len(chosen))
+        objective = objective_named(goal, mechanism, horizon)
+        entries.append(survey_one(mechanism, objective, seed=seed, bounds=bounds))
+    return tuple(entries)
+
+
+def survey_one(
+    mechanism: Mechanism, objective: Objective, *, seed: int = 0, bounds: bool = True
+) -> Entry:
+    """Bring one mechanism from its listed start to its target; the line of the survey."""
+    began = time.perf_counter()
+    x0 = mechanism.state(**mechanism.start)
+    cascade = Cascade(mechanism, objective, seed=seed)
+    loop = cascade.loop
+    proposal = cascade.optimiser.require(x0)
+    plan, first = proposal.plan, cascade.optimiser.first
+    assert plan is not None  # require() raises otherwise
+    assert first is not None  # designed when the optimiser was made
+    horizon = objective.horizon
+    candidates: list[Surface | Plan] = [first, plan]
+    costs = loop.batch(x0, candidates)
+    run = cascade.simulate(x0)
+    limit, deadline = math.nan, horizon
+    trials: dict[str, float] = {}
+    if bounds:
+        limit, deadline = _bound(mechanism, objective, x0, run)
+        if run.cost / limit - 1.0 > LARGE:
+            trials = _trials(mechanism, objective, x0, seed)
+    reached = [
+        float(cost) if ok else math.inf for cost, ok in zip(costs.cost, costs.reached, strict=True)
+    ]
+    return Entry(
+        name=mechanism.name,
+        n=mechanism.n,
+        m=mechanism.m,
+        start=start_words(mechanism),
+        unit=objective.unit,
+        first=reached[0],
+        one_time=reached[1],
+        cascade=run.cost if run.reached else math.inf,
+        time=run.time if run.reached and run.time <= horizon + 1e-9 else math.inf,
+        radius=float(math.hypot(*run.trajectory.x[-1])),
+        bound=limit,
+        deadline=deadline,
+        seconds=time.perf_counter() - began,
+        trials=trials,
+    )
+
+
+def _bound(
+    mechanism: Mechanism, objective: Objective, x0: FloatArray, run: Run
+) -> tuple[float, float]:
+    """Return the bound and its deadline, s.
+
+    A motion that swings too often for one mesh over the whole horizon is bounded at the
+    cascade's own time of arrival instead: no motion that takes as long spends less.
+    """
+    motion = run.trajectory
+    sampled = motion.x[:: max(1, len(motion.x) // 20_000), mechanism.n :]
+    turns = max(int((a[1:] * a[:-1] < 0).sum()) for a in sampled.T) / 2
+    deadline = objective.horizon
+    intervals = round(PER_CYCLE * turns * deadline / motion.duration)
+    if run.reached and intervals > MOST_INTERVALS:
+        deadline = motion.duration
+        intervals = round(PER_CYCLE * turns)
+    try:
+        found = bound(
+            mechanism,
+            objective,
+            x0,
+            horizon=deadline,
+            intervals=min(max(100, intervals), MOST_INTERVALS),
+            guess=motion,
+        )
+    except InfeasibleError:
+        return math.nan, deadline
+    return found.cost, deadline
+
+
+def _trials(
+    mechanism: Mechanism, objective: Objective, x0: FloatArray, seed: int
+) -> dict[str, float]:
+    costs = {}
+    for trial in TRIALS:
+        cascade = Cascade(mechanism, objective, freedom=trial.freedom, cold=trial.budget, seed=seed)
+        proposal = cascade.optimiser.propose(x0)
+        costs[trial.name] = math.inf
+        if proposal.plan is not None:
+            batch = cascade.loop.batch(x0, proposal.plan)
+            costs[trial.name] = float(batch.cost[0]) if batch.reached[0] else math.inf
+    return costs
+
+
+def start_words(mechanism: Mechanism) -> str:
+    """Return the listed start in words, angles in degrees."""
+    units = {c.name: c.unit for c in mechanism.coordinates}
+    words = []
+    for name, value in mechanism.start.items():
+        factor, unit = display(units[name.removesuffix("_dot")], name.endswith("_dot"))
+        words.append(f"{name} = {factor * value:.4g}{'' if unit.startswith('°') else ' '}{unit}")
+    return ", ".join(words)
+
+
+def median_gap(entries: Sequence[Entry]) -> float:
+    """Return the median of the gaps that are known; NaN where none is."""
+    gaps = [entry.gap for entry in entries if math.isfinite(entry.bound)]
+    return median(gaps) if gaps else math.nan
+
+
+# -- what is shown and kept ----------------------------------------------------------------------
+
+_HEAD = ("mechanism", "n, m", "start", "first", "one-time", "cascade", "bound", "gap", "time")
+
+
+def _cells(entry: Entry) -> tuple[str, ...]:
+    def cost(value: float) -> str:
+        return f"{value:.4g}" if math.isfinite(value) else "—"
+
+    gap = f"{100 * entry.gap:.1f} %" if math.isfinite(entry.gap) else "—"
+    when = f"{entry.time:.2f} s" if math.isfinite(entry.time) else "not reached"
+    limit = cost(entry.bound)
+    if entry.deadline == entry.time and math.isfinite(entry.bound):
+        limit += f" ({entry.deadline:.1f} s)"
+    costs = (entry.first, entry.one_time)
+    return (
+        entry.name,
+        f"{entry.n}, {entry.m}",
+        entry.start,
+        *(cost(value) for value in costs),
+        f"{cost(entry.cascade)} {entry.unit}",
+        limit,
+        gap,
+        when,
+    )
+
+
+def _trial_words(entry: Entry) -> str:
+    words = [f"{name}: {100 * entry.gap_of(cost):.1f} %" for name, cost in entry.trials.items()]
+    return f"{entry.name}, {100 * entry.gap:.1f} %: " + "; ".join(words)
+
+
+def table(entries: Sequence[Entry]) -> Table:
+    """Return the survey for the terminal, with the median gap and the trials below it."""
+    grid = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
+    for index, head in enumerate(_HEAD):
+        grid.add_column(head, justify="left" if index in (0, 1, 2) else "right", no_wrap=True)
+    for entry in entries:
+        grid.add_row(*(Text(cell) for cell in _cells(entry)))
+    return grid
+
+
+def summary(entries: Sequence[Entry]) -> list[str]:
+    """Return the sentences under the table: how many arrive, median gap, what larger gaps hold."""
+    arrived = sum(math.isfinite(entry.time) for entry in entries)
+    lines = [f"{arrived} of {len(entries)} reach the target."]
+    if math.isfinite(median_gap(entries)):
+        lines.append(f"Median gap of the cascade to the bound: {100 * median_gap(entries):.1f} %.")
+    if any(entry.trials for entry in entries):
+        lines.append("Gap of a one-time optimum where a restriction is taken away:")
+        lines += [f"  {_trial_words(entry)}" for entry in entries if entry.trials]
+    return lines
+
+
+def markdown(entries: Sequence[Entry]) -> str:
+    """Return the survey as a Markdown table, as it stands in the documentation."""
+    rows = [_HEAD, tuple("---" if i < 3 else "---:" for i in range(len(_HEAD)))]
+    rows += [_cells(entry) for entry in entries]
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines) + "\n\n" + "\n\n".join(summary(entries)) + "\n"
+
+
+def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, bytes]:
+    """Return ``survey.csv``, ``survey.md`` and ``manifest.json``."""
+
+    def cell(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    header = (
+        "mechanism", "n", "m", "start", "unit", "first", "one_time", "cascade", "bound",
+        "deadline_s", "gap", "time_s", "radius", "seconds", *(trial.name for trial in TRIALS),
+    )  # fmt: skip
+    rows = [
+        (
+            e.name, e.n, e.m, e.start, e.unit,
+            *map(cell, (e.first, e.one_time, e.cascade, e.bound, e.deadline, e.gap)),
+            *map(cell, (e.time, e.radius)),
+            round(e.seconds, 2),
+            *(cell(e.trials.get(trial.name, math.nan)) for trial in TRIALS),
+        )
+        for e in entries
+    ]  # fmt: skip
+    manifest = {
+        "what": "undertow survey",
+        "versions": results.versions(),
+        "request": dict(request),
+        "median_gap": cell(median_gap(entries)),
+    }
+    return {
+        "survey.csv": results.to_csv(header, rows),
+        "survey.md": markdown(entries).encode(),
+        "manifest.json": results.to_json(manifest),
+    }
