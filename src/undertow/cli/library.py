@@ -1,0 +1,139 @@
+"""The library of mechanisms: what there is, formulas, a survey, moving pictures."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from undertow import inputs, results
+from undertow.cli.terminal import (
+    Goal,
+    Horizon,
+    Name,
+    Seed,
+    Settings,
+    Start,
+    app,
+    examples,
+    progress_bar,
+    reports_errors,
+    say,
+    terminal,
+    write,
+)
+from undertow.optimiser import Optimiser
+from undertow.rollout import ClosedLoop
+
+__all__ = ["animate", "derive", "list_mechanisms", "survey"]
+
+
+@app.command(name="mechanisms", epilog=examples("undertow mechanisms"))
+@reports_errors
+def list_mechanisms() -> None:
+    """List the mechanisms of the library."""
+    from undertow import commands
+
+    console = terminal()
+    console.width = max(console.width, 150)  # rows may wrap, but no cell is cut
+    console.print(commands.mechanism_table(), crop=False, soft_wrap=True)
+
+
+@app.command(
+    epilog=examples(
+        "undertow derive rotary_pendulum",
+        "undertow derive gantry_crane --latex",
+        "undertow derive acrobot --out formulas",
+    )
+)
+@reports_errors
+def derive(
+    name: Name,
+    latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX document.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for NAME.txt and NAME.tex.")] = None,
+) -> None:
+    """Show M, f, the law and the surface conditions as formulas."""
+    from undertow import commands
+
+    mechanism = inputs.mechanism_named(name)
+    if out is not None:
+        results.check_folder(out)
+    files = commands.derivation_files(mechanism)
+    typer.echo(files[f"{name}.tex" if latex else f"{name}.txt"].decode(), nl=False)
+    if out is not None:
+        say(terminal(stderr=True), write(out, files))
+
+
+@app.command(
+    epilog=examples(
+        "undertow survey",
+        "undertow survey --out survey",
+        "undertow survey --only acrobot --only tora --no-bounds",
+    )
+)
+@reports_errors
+def survey(
+    only: Annotated[
+        list[str] | None, typer.Option(help="This mechanism alone. Repeatable.", metavar="NAME")
+    ] = None,
+    objective: Goal = "energy",
+    horizon: Horizon = 60.0,
+    bounds: Annotated[bool, typer.Option(help="Also the optimal-control bounds.")] = True,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for survey.csv and survey.md.")] = None,
+) -> None:
+    """Bring every mechanism to its target: cost, time, bound and gap of all in one table."""
+    from undertow import survey as study
+
+    request = {k: v for k, v in locals().items() if k not in ("study", "out")}
+    if out is not None:
+        results.check_folder(out)
+    began = time.perf_counter()
+    with progress_bar() as progress:
+        entries = study.survey(
+            only, goal=objective, horizon=horizon, seed=seed, bounds=bounds, progress=progress
+        )
+    console = terminal()
+    written = None if out is None else write(out, study.files(request, entries))
+    console.width = max(console.width, 150)
+    console.print(study.table(entries), crop=False, soft_wrap=True)
+    for line in study.summary(entries):
+        say(console, line)
+    if written is not None:
+        say(console, written)
+    say(console, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
+
+
+@app.command(
+    epilog=examples(
+        "undertow animate acrobot",
+        "undertow animate rotary_pendulum --start phi=40deg --speed 0.5 --out film",
+    )
+)
+@reports_errors
+def animate(
+    name: Name,
+    start: Start = None,
+    objective: Goal = "energy",
+    setting: Settings = None,
+    horizon: Horizon = 20.0,
+    speed: Annotated[float, typer.Option(help="Motion seconds in a second of film.")] = 1.0,
+    seed: Seed = 0,
+    out: Annotated[Path, typer.Option(help="Folder for NAME.gif and NAME.png.")] = Path("."),
+) -> None:
+    """Draw a mechanism on its way to the target, under a surface optimised at the start."""
+    from undertow import commands
+
+    request = {k: v for k, v in locals().items() if k not in ("commands", "out")}
+    belief = inputs.mechanism_named(name, setting or ())
+    x0 = inputs.parse_start(belief, start or ())
+    goal = inputs.objective_named(objective, belief, horizon)
+    results.check_folder(out)
+    loop = ClosedLoop(belief, goal)
+    plan = Optimiser(loop, seed=seed).require(x0).plan
+    assert plan is not None  # require() raises otherwise
+    motion = loop.simulate(x0, plan)
+    files = commands.animation_files(request, motion, speed=speed)
+    say(terminal(), write(out, files))
