@@ -1,0 +1,50 @@
+"""The compiled step equals the law, and never leaves its limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.errors import InvalidInputError
+from undertow.inner_loop import InnerLoop
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link"])
+def test_the_compiled_step_equals_the_law(name: str) -> None:
+    mechanism = ut.mechanisms.LIBRARY[name]()
+    surface = ut.first_surface(mechanism)
+    law, fast = ut.SlidingModeLaw(mechanism, surface), InnerLoop(mechanism, surface)
+    for x in np.random.default_rng(0).normal(0.0, 0.5, (200, 2 * mechanism.n)):
+        wanted = law(0.0, x)
+        fast(x)
+        np.testing.assert_allclose(fast.s, wanted.s, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(fast.demand, wanted.demand, rtol=1e-9)
+        np.testing.assert_allclose(fast.u, wanted.u, rtol=1e-9)
+        assert fast.margin[0] == pytest.approx(float(wanted.margin), rel=1e-9)
+
+
+def test_no_state_brings_the_input_past_its_limits_or_to_nan(
+    rig: ut.Mechanism, base: ut.Surface
+) -> None:
+    law = InnerLoop(rig, base)
+    for value in (math.nan, math.inf, -math.inf, 1e300):
+        for i in range(4):
+            x = np.zeros(4)
+            x[i] = value
+            assert abs(law(x)[0]) <= rig.inputs[0].limit
+
+
+def test_a_surface_is_exchanged_between_steps_or_refused(
+    rig: ut.Mechanism, base: ut.Surface, quick: ut.Surface
+) -> None:
+    law, x = InnerLoop(rig, base), rig.state(phi=0.05)
+    before = float(law(x)[0])
+    law.use(quick)
+    assert law(x)[0] == pytest.approx(float(ut.SlidingModeLaw(rig, quick)(0.0, x).u[0]))
+    assert law(x)[0] != before
+    with pytest.raises(InvalidInputError, match="surface for"):
+        law.use(ut.Surface(-np.eye(2), np.eye(2), np.ones((2, 1)), np.ones((2, 1))))
+    assert law.surface == quick
