@@ -46,6 +46,9 @@ MOST_STEPS = 10_000_000
 #: Stands in for linear ends that are not there.
 _NOTHING = np.zeros((1, 1, 1))
 
+#: Switch steps of a single surface.
+_AT_ONCE = np.zeros(1, dtype=np.int64)
+
 
 class Event(IntEnum):
     """Why a rollout ended."""
@@ -67,6 +70,8 @@ class Batch:
     ``radius`` the final ‖x‖₂; ``singular`` the smallest det Γ(q)/det Γ(0) met;
     ``input`` the smallest u_max − |demand| (only with a hard input limit);
     ``path`` (N, w) the smallest margins of the path constraints; ``x`` (N, 2n) final states.
+    ``closest``, ``closest_time`` and ``closest_x`` (N, 2n): the smallest ‖x‖₂ met, when and
+    where, if it was asked for.
     """
 
     cost: FloatArray
@@ -76,6 +81,9 @@ class Batch:
     singular: FloatArray
     input: FloatArray
     path: FloatArray
+    closest: FloatArray
+    closest_time: FloatArray
+    closest_x: FloatArray
     x: FloatArray
 
     @property
@@ -262,11 +270,16 @@ class ClosedLoop:
         )
 
     @cached_property
-    def _numbers(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Plant parameters, belief parameters, input limits, X at the target."""
+    def _numbers(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Plant parameters, belief parameters, input limits, X at the target, η and ε."""
         belief, truth = self.mechanism, self.truth
-        at_target = coupling(belief, np.zeros(belief.n))
-        return truth.parameter_values, belief.parameter_values, truth.input_limits, at_target
+        return (
+            truth.parameter_values,
+            belief.parameter_values,
+            truth.input_limits,
+            coupling(belief, np.zeros(belief.n)),
+            self.reaching.vector(belief.m),
+        )
 
     @cached_property
     def linear_end(self) -> LinearEnd | None:
@@ -303,6 +316,8 @@ class ClosedLoop:
 
     def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:
         """Return the steps at which surfaces take over; the kernel meets them one by one."""
+        if len(switch_times) == 1 and switch_times[0] == 0:
+            return _AT_ONCE
         steps = np.array([round(t / self.step) for t in switch_times], dtype=np.int64)
         if steps[0] != 0 or not (np.diff(steps) > 0).all():
             raise InvalidInputError(
@@ -326,17 +341,19 @@ class ClosedLoop:
         cap: float = math.inf,
         slack: float = 0.0,
         stable_only: bool = False,
+        seek: bool = False,
         every: int = 0,
         noise: FloatArray | None = None,
     ) -> tuple[Batch, FloatArray]:
-        """Call the kernel on states (N, 2n) and surfaces (N, S, 2mn)."""
+        """Call the kernel on states (N, 2n) and surfaces (N, S, 2mn), or one of either."""
         n, m = self.mechanism.n, self.mechanism.m
-        plant, belief, limits, at_target = self._numbers
-        count, segments, width = surfaces.shape
+        plant, belief, limits, at_target, law = self._numbers
+        count = max(len(x0), len(surfaces))
+        segments, width = surfaces.shape[1:]
         padded = -(-count // LANES) * LANES
         lanes = np.empty((padded, segments, width + 2 * m + 1))
         lanes[:count, :, :width] = surfaces
-        lanes[:count, :, width:-1] = self.reaching.vector(m) if reaching is None else reaching
+        lanes[:count, :, width:-1] = law if reaching is None else reaching
         lanes[:count, :, -1] = gamma_determinant(at_target, surfaces)
         lanes[count:] = lanes[count - 1]
         states = np.empty((padded, 2 * n))
@@ -346,7 +363,7 @@ class ClosedLoop:
         self._check_gains(lanes, live := np.ones(padded), stable_only)
         record = np.zeros((padded, -(-steps // every), 2 * n + 2 * m + 2) if every else (0, 0, 0))
         w = len(self.objective.constraints)
-        out = np.empty((padded, 6 + w + 2 * n))
+        out = np.empty((padded, 8 + w + 4 * n))
         # A sampled kernel reads the noise of every lane.
         quiet = np.zeros((1, padded, 2 * n)) if self.hold else _NOTHING
         hands_over = self._hands_over and not every
@@ -370,6 +387,7 @@ class ClosedLoop:
             self.objective.terminal_radius if terminal is None else terminal,
             self.escape,
             cap,
+            1.0 if seek else 0.0,
             self.tail if hands_over else 0.0,
             1.0 if end is not None and end.counts_cost else 0.0,
             slack,
@@ -391,7 +409,10 @@ class ClosedLoop:
             singular=out[:, 4],
             input=out[:, 5],
             path=out[:, 6 : 6 + w],
-            x=out[:, 6 + w :],
+            closest=out[:, 6 + w],
+            closest_time=out[:, 7 + w] - start,
+            closest_x=out[:, 8 + w : 8 + w + 2 * n],
+            x=out[:, 8 + w + 2 * n :],
         )
         return batch, record
 
@@ -407,6 +428,7 @@ class ClosedLoop:
         cap: float = math.inf,
         slack: float = 0.0,
         stable_only: bool = False,
+        seek: bool = False,
     ) -> Batch:
         """Roll out a batch: many surfaces or plans, many initial states, or both.
 
@@ -432,6 +454,8 @@ class ClosedLoop:
         stable_only
             Do not roll out surfaces that are unstable at the target (``UNSTABLE``); for
             loops with a linear model, see :attr:`linear_end`.
+        seek
+            Also find where the motion comes closest to the target.
         """
         self._check_duration(duration)
         plans = _plans(surfaces)
@@ -489,8 +513,6 @@ class ClosedLoop:
                 limit="equal numbers, or one of either",
                 remedy="Repeat the states or the surfaces",
             )
-        states = np.broadcast_to(states, (count, states.shape[1]))
-        vectors = np.broadcast_to(vectors, (count, *vectors.shape[1:]))
         return self._run(
             states,
             vectors,
@@ -501,6 +523,7 @@ class ClosedLoop:
             cap=cap,
             slack=slack,
             stable_only=stable_only,
+            seek=seek,
         )[0]
 
     def simulate(

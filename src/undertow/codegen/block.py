@@ -25,6 +25,10 @@ __all__ = ["LANES", "LoopProgram", "block_source"]
 #: Closed loops in one block: two AVX-512 registers or four AVX2 registers of float64.
 LANES = 16
 
+#: The residual of the linear end is looked at in these intervals, s; the largest of the last
+#: four to eight counts.
+WATCH = 0.032
+
 
 @dataclass(frozen=True)
 class LoopProgram:
@@ -74,6 +78,8 @@ class _Rows:
         self.value = [self._take(nx) for _ in range(nx)]
         self.rate, self.recent, self.earlier = self._take(3)
         self.active, self.end, self.code, self.radius = self._take(4)
+        self.near, self.near_time = self._take(2)
+        self.near_x = self._take(nx)
 
     def _take(self, rows: int) -> list[str]:
         start = self.count
@@ -127,6 +133,9 @@ class _Writer:
             f"{r.radius} = radius",
             f"{r.code} = 1.0 if radius <= terminal else (0.0 if live[b + i] > 0.0 else 6.0)",
             f"{r.active} = 1.0 if {r.code} == 0.0 else 0.0",
+            f"{r.near} = radius",
+            f"{r.near_time} = start",
+            *(f"{near} = {x}" for near, x in zip(r.near_x, r.x, strict=True)),
             *(f"{row} = math.inf" for row in r.smallest),
             *(f"{row} = 0.0" for row in [*r.u, *r.s, *r.path]),
             f"{r.singular} = 1.0",
@@ -317,9 +326,27 @@ class _Writer:
         """Start a new window of residuals."""
         return [f"{self.rows.earlier} = {self.rows.recent}", f"{self.rows.recent} = 0.0"]
 
+    def approach(self) -> list[str]:
+        """Keep the point of the motion that is closest to the target, on the chord of a step."""
+        r = self.rows
+        nx = len(r.x)
+        return [
+            *(f"m_{j} = sixth * {slope}" for j, slope in enumerate(r.slope)),
+            "chord = " + _sum(f"m_{j} * m_{j}" for j in range(nx)),
+            "slant = -(" + _sum(f"{x} * m_{j}" for j, x in enumerate(r.x)) + ")",
+            "part = max(0.0, min(1.0, slant / chord)) if chord > 0.0 else 0.0",
+            *(f"m_{j} = {x} + part * m_{j}" for j, x in enumerate(r.x)),
+            "near = math.sqrt(" + _sum(f"m_{j} * m_{j}" for j in range(nx)) + ")",
+            f"nearer = {r.active} > 0.0 and near < {r.near}",
+            f"{r.near} = near if nearer else {r.near}",
+            f"{r.near_time} = {self.time} + part * h if nearer else {r.near_time}",
+            *(f"{row} = m_{j} if nearer else {row}" for j, row in enumerate(r.near_x)),
+        ]
+
     def advance(self) -> list[str]:
         """Complete the step; stop lanes that reach the terminal set, are lost or too costly."""
         r = self.rows
+        nx = len(r.x)
         return [
             f"active = {r.active}",
             *(
@@ -327,15 +354,22 @@ class _Writer:
                 for j, (x, d) in enumerate(zip(r.x, r.slope, strict=True))
             ),
             f"c_new = {r.cost} + sixth * {r.cost_slope}",
-            "radius = math.sqrt(" + _sum(f"n_{j} * n_{j}" for j in range(len(r.x))) + ")",
+            *(f"m_{j} = n_{j} - {x}" for j, x in enumerate(r.x)),
+            "outer = " + _sum(f"n_{j} * n_{j}" for j in range(nx)),
+            "radius = math.sqrt(outer)",
             f"before = {r.radius}",
-            "reached = radius <= terminal",
-            "span = before - radius",
-            "part = (before - terminal) / span if span > 0.0 else 1.0",
+            # Where the chord of the step enters the terminal ball, if it does: the smaller
+            # root of |x + part (n - x)|² = terminal².
+            "chord = " + _sum(f"m_{j} * m_{j}" for j in range(nx)),
+            "slant = -(" + _sum(f"{x} * m_{j}" for j, x in enumerate(r.x)) + ")",
+            "depth = slant * slant - chord * (before * before - terminal * terminal)",
+            "passed = (slant > 0.0) & (depth >= 0.0) & (slant <= chord)",
+            "reached = (radius <= terminal) | passed",
+            "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
             "part = max(0.0, min(1.0, part)) if reached else 1.0",
             "lost = not (radius < escape)",
             *(
-                f"m_{j} = {x} + part * (n_{j} - {x}) if reached else n_{j}"
+                f"m_{j} = {x} + part * m_{j} if reached else n_{j}"
                 for j, x in enumerate(r.x)
             ),
             *(f"{x} = m_{j} if active > 0.0 else {x}" for j, x in enumerate(r.x)),
@@ -344,6 +378,7 @@ class _Writer:
             f"costly = {r.cost} > cap",
             "code = 4.0 if lost else (1.0 if reached else (5.0 if costly else 0.0))",
             f"{r.code} = code if active > 0.0 else {r.code}",
+            "radius = min(radius, terminal) if reached else radius",
             f"{r.radius} = radius if active > 0.0 else before",
             f"{r.active} = 0.0 if (lost or reached or costly) else active",
         ]
@@ -355,10 +390,13 @@ class _Writer:
         return [f"record[b + i, step // every, {j}] = {row}" for j, row in enumerate(columns)]
 
     def collect(self) -> list[str]:
-        """One line of results: cost, end, code, radius, smallest margins, final x."""
+        """One line of results: cost, end, code, radius, closest, margins, final x."""
         r = self.rows
-        columns = [r.cost, r.end, r.code, r.radius, *r.smallest, *r.x]
-        return [f"out[b + i, {j}] = {row}" for j, row in enumerate(columns)]
+        columns = [r.cost, r.end, r.code, r.radius, *r.smallest]
+        return [
+            f"out[b + i, {j}] = {row}"
+            for j, row in enumerate([*columns, r.near, r.near_time, *r.near_x, *r.x])
+        ]
 
 
 def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
@@ -395,12 +433,13 @@ import numpy as np
 )
 def rollout(
     x0, live, lanes, switch, plant, belief, limits, noise,
-    start, h, steps, hold, terminal, escape, cap, tail, counted, slack,
+    start, h, steps, hold, terminal, escape, cap, seek, tail, counted, slack,
     linear, value, rate, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
     W = np.empty({w.rows.count * LANES})
     half, sixth = 0.5 * h, h / 6.0
+    stride = max(1, round({WATCH} / h))
     for b in range(0, x0.shape[0], {LANES}):
         segment = 0
 {_lanes(w.reset(), 2)}
@@ -415,9 +454,9 @@ def rollout(
 {_lanes([*w.first_stage(sampled=sampled), *w.watch()], 3)}
             if every > 0 and step % every == 0:
 {_lanes(w.record(), 4)}
-            if tail > 0.0 and step % 16 == 0 and segment == switch.shape[0]:
+            if tail > 0.0 and step % stride == 0 and segment == switch.shape[0]:
 {_lanes(w.hand_over(), 4)}
-                if step % 128 == 0:
+                if step % (4 * stride) == 0:
 {_lanes(w.forget(), 5)}
             for rk in range(3):
                 weight = 1.0 if rk == 2 else 2.0
@@ -425,6 +464,8 @@ def rollout(
                 {w.time} = start + (step + (1.0 if rk == 2 else 0.5)) * h
 {_lanes(w.later_stage(sampled=sampled), 4)}
             {w.time} = start + step * h
+            if seek > 0.0:
+{_lanes(w.approach(), 4)}
 {_lanes(w.advance(), 3)}
             if step % 8 == 0:
                 alive = 0.0
