@@ -8,10 +8,12 @@ rate η/ε, kept between 1/s and what the integration step can bear.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from undertow.codegen.machine import numba
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
@@ -75,6 +77,7 @@ class Decision:
         largest = scale[m * m :].max()
         self._width = 0.1 * np.maximum(scale, 0.05 * largest)[self._free]
         self._base = -np.eye(m).ravel()
+        self._places = np.flatnonzero(self._free)
         # Runge-Kutta is stable up to a rate of 2.8/step; the law is resolved up to 0.8/step.
         self._fastest = 0.8 / (loop.step * max(1, loop.hold))
 
@@ -118,16 +121,10 @@ class Decision:
     def decode(self, z: FloatArray) -> tuple[FloatArray, FloatArray | None]:
         """Return surface vectors (N, S, 2mn) and gains (N, S, 2m) of coordinates (N, d)."""
         rows = z.reshape(len(z), self.segments, -1)
-        vectors = np.zeros((len(z), self.segments, 2 * self.m * self.n))
-        vectors[..., : self.m**2] = self._base
-        entries = self._width * np.sinh(np.clip(rows[..., : self._entries], -15.0, 15.0))
-        vectors[..., self._free] = entries
-        if not self.freedom.reaching:
-            return vectors, None
-        log_eta, logit = np.split(rows[..., self._entries :], 2, axis=-1)
-        eta = np.exp(np.clip(log_eta, -5.0, 10.0))
-        rate = 1.0 + (self._fastest - 1.0) / (1.0 + np.exp(-np.clip(logit, -14.0, 14.0)))
-        return vectors, np.concatenate([eta, eta / rate], axis=-1)
+        vectors = np.empty((len(z), self.segments, 2 * self.m * self.n))
+        gains = np.empty((len(z), self.segments, 2 * self.m * self.freedom.reaching))
+        _decode(rows, self._base, self._places, self._width, self._fastest, vectors, gains)
+        return vectors, gains if self.freedom.reaching else None
 
     def plan(self, vectors: FloatArray, gains: FloatArray | None) -> Plan:
         """Return the plan of one decoded row: (S, 2mn) and (S, 2m)."""
@@ -139,3 +136,21 @@ class Decision:
                 ReachingLaw(tuple(row[: self.m]), tuple(row[self.m :]), switching) for row in gains
             )
         return Plan(surfaces, self.freedom.times, laws)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _decode(rows, base, places, width, fastest, vectors, gains):  # type: ignore[no-untyped-def]
+    m = gains.shape[2] // 2
+    for k in range(rows.shape[0]):
+        for segment in range(rows.shape[1]):
+            row, vector = rows[k, segment], vectors[k, segment]
+            vector[:] = 0.0
+            vector[: len(base)] = base
+            for j in range(len(places)):
+                vector[places[j]] = width[j] * math.sinh(max(-15.0, min(15.0, row[j])))
+            for j in range(m):
+                eta = math.exp(max(-5.0, min(10.0, row[len(places) + j])))
+                logit = max(-14.0, min(14.0, row[len(places) + m + j]))
+                rate = 1.0 + (fastest - 1.0) / (1.0 + math.exp(-logit))
+                gains[k, segment, j] = eta
+                gains[k, segment, m + j] = eta / rate

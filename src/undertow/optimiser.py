@@ -15,8 +15,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from undertow.codegen.block import LANES
+from undertow.codegen.machine import numba
 from undertow.decision import Decision, Freedom
 from undertow.errors import InfeasibleError, InvalidInputError, SingularSurfaceError, UndertowError
 from undertow.mechanism import FloatArray
@@ -32,6 +34,7 @@ from undertow.stability import (
     stability_margin,
     surface_margins,
 )
+from undertow.trust_region import TrustRegion
 
 __all__ = ["Budget", "Optimiser", "Proposal", "Status"]
 
@@ -42,6 +45,24 @@ INADMISSIBLE = 1e8
 
 #: Rollouts are given up when their cost exceeds the best one so far by this factor.
 HOPELESS = 3.0
+
+#: The same in a search for an earlier arrival, where all that counts is near the best one.
+NEARLY = 1.1
+
+#: What a closest approach of twice the terminal radius costs, as a part of the best time.
+MISS_PRICE = 0.1
+
+#: What a radius e times the terminal one at the deadline costs, as a part of the cost.
+LATE_PRICE = 0.3
+
+#: Improvements below this part of the cost do not keep a model search going.
+WORTHWHILE = 1e-3
+
+#: Largest number of coordinates for a model search: its model has 55 terms then.
+MODEL_SIZE = 9
+
+#: Widest spread of a first population along a ridge.
+FAR = 0.25
 
 #: Stands for a final state of a motion that broke off.
 MISSED = 1e3
@@ -90,7 +111,9 @@ class Proposal:
     incumbent_cost
         Predicted cost of keeping the old surface; ``inf`` at the first optimisation.
     margins
-        Signed margins of the surface and of its predicted motion, ≥ 0 is satisfied.
+        Signed margins of the surface and of its predicted motion, ≥ 0 is satisfied.  A
+        re-optimisation that found a plan leaves them out: its gate judges for itself, and
+        :func:`motion_margins` tells them.
     evaluations, seconds
         What it took.
     sequence
@@ -182,7 +205,9 @@ class Optimiser:
             return given
         if self.shoots:
             return Budget(40_000 if warm else 160_000)
-        return Budget(1024 if warm else 3072)
+        if warm:
+            return Budget(576 if self.counts_time else 1024)
+        return Budget(3072)
 
     @property
     def _promptness(self) -> float:
@@ -234,6 +259,7 @@ class Optimiser:
             began,
             np.random.default_rng([self.seed, sequence]),
         )
+        task.warm = incumbent is not None
         if incumbent is None:
             converged = task.global_search()
         else:
@@ -279,9 +305,11 @@ class _Task:
         self.owner, self.x, self.horizon = owner, x, horizon
         self.budget, self.resolution, self.began, self.rng = budget, resolution, began, rng
         self.decision = owner.decision
+        self.warm = False
         self.evaluations = 0
         self.best_cost = math.inf
-        self.best: Plan | None = None
+        self.best_z: FloatArray | None = None
+        self._best: Plan | None = None
         self.incumbent_cost = math.inf
         self._last = began
         self._pace = 0.0
@@ -301,40 +329,87 @@ class _Task:
 
     # -- evaluation ------------------------------------------------------------------------
 
-    def cost(self, z: FloatArray) -> FloatArray:
-        """Score coordinates (N, d), keeping the best: unstable 1e10, inadmissible 1e9 up."""
+    def cost(self, z: FloatArray, incumbent: Plan | None = None) -> FloatArray:
+        """Score coordinates (N, d), keeping the best plan; the incumbent goes in place of z[0].
+
+        What is returned guides a search: admissible plans at their cost; unstable ones at
+        1e10, others at 1e9 up, see ``Batch.score``; those that just miss the terminal set or
+        the deadline a little above what they would cost without the miss, which keeps the
+        score continuous where the best plans lie.
+        """
         vectors, gains = self.decision.decode(z)
-        scores = self._score(vectors, gains, self.owner.freedom.times)
+        if incumbent is not None:
+            vectors[0] = incumbent.vectors
+            if gains is not None:
+                gains[0] = incumbent.gains(self.owner.loop.reaching)
+        scores, guide = self._score(vectors, gains, self.owner.freedom.times)
+        if incumbent is not None:
+            self._adopt(incumbent, z[0].copy(), float(scores[0]))
         best = int(np.argmin(scores))
         if scores[best] < self.best_cost:
-            self.best_cost = float(scores[best])
-            self.best = self.decision.plan(vectors[best], None if gains is None else gains[best])
-        return scores
+            self.best_cost, self.best_z = float(scores[best]), z[best].copy()
+            self._best = None
+        return guide
+
+    def _adopt(self, incumbent: Plan, here: FloatArray, score: float) -> None:
+        self._best, self.best_z = incumbent, here
+        self.best_cost, self.incumbent_cost = score, score
+
+    @property
+    def best(self) -> Plan | None:
+        """The best plan so far."""
+        if self._best is None and self.best_z is not None:
+            vectors, gains = self.decision.decode(self.best_z[None])
+            self._best = self.decision.plan(vectors[0], None if gains is None else gains[0])
+        return self._best
 
     def _score(
         self, vectors: FloatArray, gains: FloatArray | None, times: Sequence[float]
-    ) -> FloatArray:
-        loop = self.owner.loop
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return scores, below ``INADMISSIBLE`` only where admissible, and the guide."""
+        loop, known = self.owner.loop, self.best_cost < INADMISSIBLE
         self.evaluations += len(vectors)
+        seek = self.owner.counts_time and known
         cap = math.inf
-        if self.best_cost < INADMISSIBLE:
-            cap = HOPELESS * self.best_cost + self.resolution
-        scores = np.full(len(vectors), 1e10)
-        stable = np.full(len(vectors), True)
+        if known:
+            cap = (NEARLY if seek else HOPELESS) * self.best_cost + self.resolution
         if loop.linear_end is None:
             stable = stability_margin(loop.mechanism, vectors[:, -1]) > 0
+            if not stable.all():
+                return self._stable_only(vectors, gains, times, stable)
+        batch = loop.batch(
+            self.x,
+            vectors,
+            reaching=gains,
+            switch_times=times,
+            duration=self.horizon,
+            cap=cap,
+            slack=self.resolution,
+            stable_only=True,
+            seek=seek,
+        )
+        scores = batch.score(self.horizon)
+        guide = scores.copy()
+        _guide(
+            batch.event, batch.cost, batch.radius, batch.closest, batch.closest_time,
+            loop.objective.terminal_radius, self.best_cost if seek else 0.0, guide,
+        )  # fmt: skip
+        return scores, guide
+
+    def _stable_only(
+        self,
+        vectors: FloatArray,
+        gains: FloatArray | None,
+        times: Sequence[float],
+        stable: NDArray[np.bool_],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Score the stable ones alone, where the rollout cannot tell them by itself."""
+        scores, guide = np.full(len(vectors), 1e10), np.full(len(vectors), 1e10)
+        self.evaluations -= int(stable.sum())
         if stable.any():
-            scores[stable] = loop.batch(
-                self.x,
-                vectors[stable],
-                reaching=None if gains is None else gains[stable],
-                switch_times=times,
-                duration=self.horizon,
-                cap=cap,
-                slack=self.resolution,
-                stable_only=True,
-            ).score(self.horizon)
-        return scores
+            some = None if gains is None else gains[stable]
+            scores[stable], guide[stable] = self._score(vectors[stable], some, times)
+        return scores, guide
 
     # -- search ----------------------------------------------------------------------------
 
@@ -367,26 +442,101 @@ class _Task:
         share = (total - len(z)) // 4
         for start in starts:
             self._descend(start, 0.3, share, 3e-3)
-        assert self.best is not None  # cost() has run at least once
-        converged = self._descend(self.decision.encode(self.best), 0.03, share, 1e-4)
+        converged = self._descend(self._centre(), 0.03, share, 1e-4)
         while not owner.shoots and self.left >= owner.population and not self.late():
-            start = self.decision.encode(self.best) + self.decision.steps(rng, np.ones(1))[0]
+            start = self._centre() + self.decision.steps(rng, np.ones(1))[0]
             self._descend(start, 0.3, self.left, 3e-3)
         return converged
 
     def local_search(self, incumbent: Plan) -> bool:
-        """Start from the incumbent: a wide look around, then descend from the best."""
-        law = self.owner.loop.reaching
-        gains = None if incumbent.reaching is None else incumbent.gains(law)[None]
-        score = float(self._score(incumbent.vectors[None], gains, incumbent.times)[0])
-        self.best, self.best_cost, self.incumbent_cost = incumbent, score, score
+        """Start from the incumbent; look further away where that gains nothing."""
         here = self.decision.encode(incumbent)
-        wide = min(self.left, self.owner.population)
-        if wide < 1:
-            return False
-        self.cost(here + self.decision.steps(self.rng, np.geomspace(0.03, 1.0, wide)))
+        known = self._know(incumbent, here)
+        if self.owner.counts_time:
+            if known is not None:
+                self.cost(here[None], known)
+            return self._along_the_ridge(here)
+        if here.size > MODEL_SIZE:
+            self._look_around(here)
+            return self._descend(self._centre(), 0.1, self.left, 1e-3)
+        search = TrustRegion(here, 0.1, LANES, self.rng)
+        self._run(search, known)
+        while self.left >= LANES and not self.late():
+            before = self.best_cost
+            self._look_around(here)
+            if not self.best_cost < (1.0 - WORTHWHILE) * before - self.resolution:
+                return True
+            search = TrustRegion(self._centre(), 0.1, LANES, self.rng)
+            self._run(search, None)
+        return search.converged
+
+    def _centre(self) -> FloatArray:
+        """Coordinates of the best plan so far."""
+        assert self.best_z is not None  # cost() has run before
+        return self.best_z
+
+    def _know(self, incumbent: Plan, here: FloatArray) -> Plan | None:
+        """Score an incumbent that the coordinates cannot express; return one that they can."""
+        freedom, law = self.owner.freedom, self.owner.loop.reaching
+        plain = freedom.reaching or incumbent.reaching is None
+        if plain and incumbent.times == freedom.times:
+            return incumbent
+        gains = None if incumbent.reaching is None else incumbent.gains(law)[None]
+        scores, _ = self._score(incumbent.vectors[None], gains, incumbent.times)
+        self._adopt(incumbent, here, float(scores[0]))
+        return None
+
+    def _run(self, search: TrustRegion, incumbent: Plan | None) -> None:
+        """Run a model search; its first candidate may stand for the incumbent."""
+        first = [incumbent]
+        minimise(
+            search,
+            lambda z: self.cost(z, first.pop() if first else None),
+            evaluations=self.left,
+            tolerance=1e-4,
+            resolution=self.resolution,
+            relative=WORTHWHILE,
+            patience=2,
+            stop=self.late,
+        )
+
+    def _along_the_ridge(self, here: FloatArray) -> bool:
+        """Search for an earlier arrival along the thin set of plans that arrive directly.
+
+        Across that set the closest approach moves away from 0 at once, along it hardly: the
+        first population is shaped by ∂(closest state)/∂z.
+        """
         most = min(self.left, 1024) if self.owner.shoots else self.left
-        return self._descend(self.decision.encode(self.best), 0.1, most, 1e-3)
+        if not self.best_cost < INADMISSIBLE:
+            self._look_around(here)
+            return self._descend(self._centre(), 0.1, most, 1e-3)
+        d, loop = here.size, self.owner.loop
+        vectors, gains = self.decision.decode(here + 1e-4 * np.vstack([np.eye(d), -np.eye(d)]))
+        self.evaluations += len(vectors)
+        near = loop.batch(
+            self.x,
+            vectors,
+            reaching=gains,
+            switch_times=self.owner.freedom.times,
+            duration=1.05 * self.best_cost,
+            terminal=0.0,
+            seek=True,
+        ).closest_x
+        slope = (near[:d] - near[d:]) / 2e-4
+        if not np.isfinite(slope).all():
+            return self._descend(here, 0.1, most, 1e-3)
+        across, steepness, _ = np.linalg.svd(slope)
+        spread = np.full(d, FAR)
+        tight = loop.objective.terminal_radius / np.maximum(steepness, 1e-12)
+        spread[: len(tight)] = np.minimum(tight, FAR)
+        search = CMAES(here, 1.0, LANES, self.rng, (across * spread**2) @ across.T)
+        minimise(search, self.cost, evaluations=most, tolerance=1e-4, stop=self.late)
+        return search.converged
+
+    def _look_around(self, here: FloatArray) -> None:
+        wide = min(self.left, self.owner.population)
+        if wide > 0:
+            self.cost(here + self.decision.steps(self.rng, np.geomspace(0.03, 1.0, wide)))
 
     def shoot(self) -> bool:
         """Shrink the time of arrival; starts are the best plan and random ones."""
@@ -394,8 +544,7 @@ class _Task:
         aim = Shooting(self._miss, 0.9 * loop.objective.terminal_radius, loop.step, self._exhausted)
         while not self._exhausted():
             known = self.best_cost if self.best_cost < INADMISSIBLE else self.horizon
-            assert self.best is not None  # a search has run before
-            start = self._start(self.decision.encode(self.best), known, rng)
+            start = self._start(self._centre(), known, rng)
             z = aim.correct(*start, 20)
             if z is not None:
                 shortest, _ = aim.kick(*aim.shrink(z, start[1]), rng, 20)
@@ -448,7 +597,7 @@ class _Task:
         found = self.best_cost < INADMISSIBLE
         margins: tuple[Margin, ...] = ()
         message = remedy = ""
-        if self.best is not None:
+        if self.best is not None and not (found and self.warm):
             margins, message, remedy = motion_margins(
                 self.owner.loop, self.best, self.x, self.horizon
             )
@@ -468,6 +617,24 @@ class _Task:
             "" if found else message,
             "" if found else remedy,
         )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _guide(  # type: ignore[no-untyped-def]
+    event, cost, radius, closest, closest_time, terminal, best, guide
+):
+    """Continue the score of admissible motions to those that miss by a little.
+
+    With the ``best`` time of arrival, to motions given up for costing more (event 5), by
+    their closest approach; else to those that are late (event 0).
+    """
+    for i in range(len(guide)):
+        if best > 0.0 and event[i] == 5:
+            miss = max(closest[i] / terminal - 1.0, 0.0)
+            guide[i] = closest_time[i] + MISS_PRICE * best * miss
+        elif best == 0.0 and event[i] == 0 and radius[i] < 100.0 * terminal:
+            lateness = math.log(max(radius[i] / terminal, 1.0))
+            guide[i] = cost[i] * (1.0 + LATE_PRICE * lateness)
 
 
 def motion_margins(

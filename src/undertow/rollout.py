@@ -19,6 +19,7 @@ import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.codegen.block import LANES, LoopProgram, block_source
+from undertow.codegen.machine import numba
 from undertow.codegen.store import content_key, load_module, recall, remember
 from undertow.codegen.tape import Tape
 from undertow.errors import InvalidInputError
@@ -97,12 +98,23 @@ class Batch:
         The penalty falls with survival time and then with the final distance, so that a
         search can climb out of a region without admissible surfaces.
         """
-        distance = np.tanh(np.nan_to_num(self.radius, nan=1e9))
-        penalty = 1e9 * (3.0 - self.time / horizon)
-        late = 1e9 * (1.0 + distance)
-        scores = np.where(self.event == Event.HORIZON, late, penalty)
-        scores = np.where(self.event == Event.UNSTABLE, 1e10, scores)
-        return np.where(self.reached, self.cost, scores)
+        scores = np.empty(len(self.cost))
+        _score(self.cost, self.time, self.event, self.radius, horizon, scores)
+        return scores
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _score(cost, time, event, radius, horizon, scores):  # type: ignore[no-untyped-def]
+    for i in range(len(scores)):
+        if event[i] == 1:  # reached
+            scores[i] = cost[i]
+        elif event[i] == 0:  # horizon
+            near = math.tanh(radius[i]) if math.isfinite(radius[i]) else 1.0
+            scores[i] = 1e9 * (1.0 + near)
+        elif event[i] == 6:  # unstable
+            scores[i] = 1e10
+        else:
+            scores[i] = 1e9 * (3.0 - time[i] / horizon)
 
 
 @dataclass(frozen=True, eq=False)

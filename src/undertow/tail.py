@@ -186,9 +186,7 @@ def _close(  # type: ignore[no-untyped-def]
                 drive[i, n + j] -= k * p[i * m + j] + p[lambda_a + i * m + j]
             for f in range(free):
                 drive[i, m + f] -= k * p[lambda_u + i * free + f]
-                drive[i, n + m + f] -= (
-                    k * p[alpha_u + i * free + f] + p[lambda_u + i * free + f]
-                )
+                drive[i, n + m + f] -= k * p[alpha_u + i * free + f] + p[lambda_u + i * free + f]
         _solve(gamma, drive)
         for j in range(N):
             for i in range(m):
@@ -216,8 +214,8 @@ def _close(  # type: ignore[no-untyped-def]
                 value = xx[i, j]
                 for k in range(m):
                     value += xu[i, k] * K[k, j] + xu[j, k] * K[k, i]
-                    for l in range(m):
-                        value += K[k, i] * uu[k, l] * K[l, j]
+                    for j2 in range(m):
+                        value += K[k, i] * uu[k, j2] * K[j2, j]
                 Q[lane, i, j] = value
 
 

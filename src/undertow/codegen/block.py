@@ -368,10 +368,7 @@ class _Writer:
             "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
             "part = max(0.0, min(1.0, part)) if reached else 1.0",
             "lost = not (radius < escape)",
-            *(
-                f"m_{j} = {x} + part * m_{j} if reached else n_{j}"
-                for j, x in enumerate(r.x)
-            ),
+            *(f"m_{j} = {x} + part * m_{j} if reached else n_{j}" for j, x in enumerate(r.x)),
             *(f"{x} = m_{j} if active > 0.0 else {x}" for j, x in enumerate(r.x)),
             f"{r.cost} = {r.cost} + part * (c_new - {r.cost}) if active > 0.0 else {r.cost}",
             f"{r.end} = {self.time} + part * h if active > 0.0 else {r.end}",
