@@ -1,5 +1,19 @@
 """Rigs, plants to meet: the ideal model, a realistic bench, MuJoCo, hardware of one's own."""
 
+from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Push, Timing
 from undertow.rig.interface import Measurement, Rig
+from undertow.rig.simulated import IdealRig, RealisticRig
 
-__all__ = ["Measurement", "Rig"]
+__all__ = [
+    "Amplifier",
+    "Backlash",
+    "Bench",
+    "Encoder",
+    "Friction",
+    "IdealRig",
+    "Measurement",
+    "Push",
+    "RealisticRig",
+    "Rig",
+    "Timing",
+]
