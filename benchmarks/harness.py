@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-__all__ = ["clock", "command_line", "need", "percentiles", "progress", "race", "table"]
+__all__ = ["Clock", "clock", "command_line", "need", "percentiles", "progress", "race", "table"]
 
 Clock = Callable[[], float]
 Item = TypeVar("Item")
