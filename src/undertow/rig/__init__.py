@@ -2,6 +2,7 @@
 
 from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Push, Timing
 from undertow.rig.interface import Measurement, Rig
+from undertow.rig.presets import plausible_rig, srv02_rig
 from undertow.rig.simulated import IdealRig, RealisticRig
 
 __all__ = [
@@ -16,4 +17,6 @@ __all__ = [
     "RealisticRig",
     "Rig",
     "Timing",
+    "plausible_rig",
+    "srv02_rig",
 ]

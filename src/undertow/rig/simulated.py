@@ -11,6 +11,7 @@ from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Timing
 from undertow.rig.interface import Measurement
+from undertow.rig.parts import measure
 from undertow.rig.stepping import stepping
 
 __all__ = ["IdealRig", "RealisticRig"]
@@ -76,9 +77,7 @@ class RealisticRig:
         self._t, self._lateness, self._samples = 0.0, 0.0, 0
         self._row = _BLOCK
         self._q = np.zeros(n)
-        self._module.measure(
-            0, self._past, 0, self._encoder, self._phase, self._draw()[1:], self._q
-        )
+        measure(0, self._past, 0, self._encoder, self._phase, self._draw()[1:], self._q)
 
     def _tables(self) -> None:
         """Lay the bench out in arrays, in the order of coordinates and inputs."""

@@ -29,35 +29,6 @@ __all__ = ["dynamics_source", "stepping"]
 
 _BODY = f"""
 {COMPILED}
-def motor(j, h, u, held, delay, amplifier, gap, gain, drive, applied):
-    # Amplifier and transmission: what reaches the joints in this step.
-    for i in range(u.shape[0]):
-        held[j % held.shape[0], i] = u[i]
-        wanted = held[(j - delay) % held.shape[0], i] if j >= delay else 0.0
-        limit, resolution, dead_band, rest = amplifier[i]
-        if abs(wanted) <= dead_band:
-            wanted = 0.0
-        if resolution > 0.0:
-            wanted = math.floor(wanted / resolution + 0.5) * resolution
-        wanted = max(-limit, min(limit, wanted))
-        part = 1.0 if rest == 0.0 else 1.0 - math.exp(-h / rest)
-        drive[0, i] += part * (wanted - drive[0, i])
-        applied[i] = drive[0, i]
-        play, inertia = gap[i]
-        if play > 0.0:
-            force = gain[i] * drive[0, i]
-            side = 0.5 * play
-            if not ((drive[1, i] >= side and force >= 0.0)
-                    or (drive[1, i] <= -side and force <= 0.0)):
-                drive[2, i] += h * force / inertia
-                drive[1, i] += h * drive[2, i]
-                applied[i] = 0.0
-            if abs(drive[1, i]) >= side:
-                drive[1, i] = max(-side, min(side, drive[1, i]))
-                drive[2, i] = 0.0
-
-
-{COMPILED}
 def smooth(t, h, x, u, viscous, parameters, work):
     # Runge-Kutta's step of the smooth dynamics, in place.
     n = x.shape[0] // 2
@@ -81,85 +52,38 @@ def smooth(t, h, x, u, viscous, parameters, work):
 
 
 {COMPILED}
-def dry(h, x, before, friction, stops, mobility_, impulse, hits):
-    # Friction and end stops, as impulses.
-    n = x.shape[0] // 2
-    rough = False
-    for i in range(n):
-        impulse[i] = 0.0
-        rough = rough or friction[i, 1] > 0.0
-    if rough:
-        for sweep in range(30):
-            largest = 0.0
-            for i in range(n):
-                coulomb, breakaway, speed = friction[i, 0], friction[i, 1], friction[i, 2]
-                if breakaway > 0.0:
-                    ratio = before[i] / speed
-                    level = h * (coulomb + (breakaway - coulomb) * math.exp(-ratio * ratio))
-                    new = impulse[i] - x[n + i] / mobility_[i * n + i]
-                    new = max(-level, min(level, new))
-                    change = new - impulse[i]
-                    impulse[i] = new
-                    for k in range(n):
-                        x[n + k] += mobility_[k * n + i] * change
-                        x[k] += 0.5 * h * mobility_[k * n + i] * change
-                    largest = max(largest, abs(change) / level)
-            if largest < 1e-12:
-                break
-    for i in range(n):
-        outside = x[i] > stops[i, 1] or x[i] < stops[i, 0]
-        if outside:
-            x[i] = max(stops[i, 0], min(stops[i, 1], x[i]))
-            outwards = x[n + i] > 0.0 if x[i] == stops[i, 1] else x[n + i] < 0.0
-            if outwards:
-                hits[0] += 1
-                knock = -x[n + i] / mobility_[i * n + i]
-                for k in range(n):
-                    x[n + k] += mobility_[k * n + i] * knock
-
-
-{COMPILED}
-def measure(index, past, delay, encoder, phase, noise, q):
-    # Old positions, disturbed, counted.
-    for i in range(q.shape[0]):
-        value = past[max(0, index - delay) % past.shape[0], i] + encoder[i, 1] * noise[i]
-        resolution = encoder[i, 0]
-        if resolution > 0.0:
-            value = (math.floor(value / resolution + phase[i]) - phase[i] + 0.5) * resolution
-        q[i] = value
-
-
-{COMPILED}
 def advance(
     t, length, counts, x, u, drive, held, past, delays, parameters, friction, stops, amplifier,
     gap, encoder, phase, pushes, noise, q, applied, work,
 ):
-    # One period: ``counts`` holds the index of the step, steps per period, hits of stops.
+    # One period: ``counts`` holds the index of the step, steps per period, stops run into.
     n = x.shape[0] // 2
     h = length / counts[1]
-    mobility_, before, impulse, viscous, gain = work[3], work[4], work[5], work[6], work[7]
+    W, before, impulse, viscous, gain = work[3], work[4], work[5], work[6], work[7]
     gains(parameters, gain)
+    rough, bounded = False, False
     for i in range(n):
         viscous[i] = friction[i, 3]
-    needed = False
-    for i in range(n):
-        needed = needed or friction[i, 1] > 0.0 or stops[i, 1] < math.inf or stops[i, 0] > -math.inf
+        rough = rough or friction[i, 1] > 0.0
+        bounded = bounded or stops[i, 1] < math.inf or stops[i, 0] > -math.inf
     for _ in range(counts[1]):
         j = counts[0]
-        motor(j, h, u, held, delays[0], amplifier, gap, gain, drive, applied)
+        transmit(j, h, u, held, delays[0], amplifier, gap, gain, drive, applied)
         for k in range(pushes.shape[0]):
             if t <= pushes[k, 0] < t + h:
-                mobility(x, parameters, mobility_)
+                mobility(x, parameters, W)
                 for i in range(n):
                     for l in range(n):
-                        x[n + i] += mobility_[i * n + l] * pushes[k, 1 + l]
-        for i in range(n):
-            before[i] = x[n + i]
-        if needed:
-            mobility(x, parameters, mobility_)
+                        x[n + i] += W[i * n + l] * pushes[k, 1 + l]
+        for i in range(2 * n):
+            before[i] = x[i]
+        if rough or bounded:
+            mobility(x, parameters, W)
         smooth(t, h, x, applied, viscous, parameters, work)
-        if needed:
-            dry(h, x, before, friction, stops, mobility_, impulse, counts[2:])
+        if rough:
+            dry_friction(h, x, before, friction, W, impulse)
+        if bounded:
+            counts[2] += end_stops(x, stops, W)
         t += h
         counts[0] = j + 1
         for i in range(n):
@@ -206,6 +130,7 @@ _GENERATOR = tuple(
     str(Path(__file__).parent.parent / name)
     for name in (
         "rig/stepping.py",
+        "rig/parts.py",
         "mechanism.py",
         "codegen/function.py",
         "codegen/scalar.py",
@@ -220,7 +145,9 @@ def stepping(mechanism: Mechanism) -> Any:
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
     source = recall("rig", key)
     if source is None:
-        header = f'"""Rig of {mechanism.name}; generated, do not edit."""\n\n'
-        source = f"{header}{PREAMBLE}\n\n{dynamics_source(mechanism)}\n{_BODY}"
+        # numba's cache does not notice that an imported function has changed: the key does.
+        header = f'"""Rig of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
+        parts = "from undertow.rig.parts import dry_friction, end_stops, measure, transmit\n"
+        source = f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
         remember("rig", key, source)
     return load_module(f"rig_{mechanism.name}", source)
