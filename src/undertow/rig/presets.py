@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanism import Mechanism
+from undertow.mechanism import Mechanism, Parameter
 from undertow.mechanisms import rotary_pendulum
 from undertow.rig.bench import Amplifier, Bench, Encoder, Friction, Timing
 
@@ -87,7 +87,13 @@ def plausible_rig(mechanism: Mechanism) -> Bench:
             if math.isfinite(i.limit)
         },
         timing=Timing(0.001, 1e-4, 0.5e-3, 0.5e-3, source=CHOSEN),
-        tolerance={p.name: 0.03 for p in mechanism.parameters if p.name != "g" and p.value},
+        tolerance={p.name: _spread(p) for p in mechanism.parameters if p.name != "g" and p.value},
         hand={c.name: math.radians(0.5) for c in mechanism.coordinates if c.unit == "rad"},
         source=CHOSEN,
     )
+
+
+def _spread(parameter: Parameter) -> float:
+    """Return 3 %, or what room the parameter's bounds leave: no efficiency exceeds 1."""
+    room = min(parameter.high - parameter.value, parameter.value - parameter.low)
+    return min(0.03, 0.99 * room / abs(parameter.value))
