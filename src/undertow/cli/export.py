@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,9 +24,9 @@ from undertow.cli.terminal import (
     write,
 )
 from undertow.errors import InvalidInputError
-from undertow.export import EmbeddedController, FilteredDerivative, SuperTwisting, files
+from undertow.export import DerivativeStep, EmbeddedController, SuperTwistingStep, files
 from undertow.export.host import Build
-from undertow.mechanism import Mechanism
+from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms import LIBRARY
 from undertow.optimiser import Optimiser
 from undertow.rollout import ClosedLoop
@@ -33,6 +34,9 @@ from undertow.sliding import ReachingLaw
 from undertow.stability import check_surface, first_surface
 
 __all__ = ["export_c"]
+
+#: Length of a run on a rig, s.
+SECONDS = 10.0
 
 export = typer.Typer(no_args_is_help=True, help="Write the controller in another language.")
 app.add_typer(export, name="export")
@@ -44,7 +48,7 @@ app.add_typer(export, name="export")
         "undertow export c rotary_pendulum --out firmware",
         "undertow export c cart_pendulum --control one-time --start phi=20deg --real float "
         "--velocity super-twisting --slew 400 --out firmware",
-        "undertow export c gantry_crane --check",
+        "undertow export c gantry_crane --check --rigs 3",
         "undertow export c --all --report",
     ),
 )
@@ -67,6 +71,14 @@ def export_c(
             help="Table of agreement with Python, instructions of a step and size.",
         ),
     ] = False,
+    rigs: Annotated[
+        int,
+        typer.Option(
+            "--rigs",
+            help="Also run it on so many realistic rigs, as a process of its own over a pipe.",
+            min=0,
+        ),
+    ] = 0,
     control: Annotated[
         Literal["first", "one-time"] | None,
         typer.Option(help="first, the default: the designed surface. one-time: optimised."),
@@ -87,7 +99,7 @@ def export_c(
         Literal["derivative", "super-twisting"],
         typer.Option(help="Where velocities come from when positions alone are measured."),
     ] = "derivative",
-    time_constant: Annotated[float, typer.Option(help="Of the filtered derivative, s.")] = 0.005,
+    time_constant: Annotated[float, typer.Option(help="Of the filtered derivative, s.")] = 0.01,
     slew: Annotated[
         float | None,
         typer.Option(help="Largest rate of an input, its unit per second. Default: no limit."),
@@ -110,17 +122,17 @@ def export_c(
             limit="one of them",
             remedy="Write for instance: undertow export c rotary_pendulum --out firmware",
         )
-    if out is None and not (check or report):
+    if out is None and not (check or report or rigs):
         raise InvalidInputError(
             "what to do with the C",
-            value="neither --out nor --check nor --report",
+            value="none of --out, --check, --rigs, --report",
             limit="one of them at least",
             remedy="Write for instance --out firmware",
         )
     if out is not None:
         results.check_folder(out)
     differentiator = (
-        SuperTwisting() if velocity == "super-twisting" else FilteredDerivative(time_constant)
+        SuperTwistingStep() if velocity == "super-twisting" else DerivativeStep(time_constant)
     )
 
     def controller(belief: Mechanism) -> EmbeddedController:
@@ -170,6 +182,18 @@ def export_c(
                 passed, said = Build(one, Path(folder), compiler).self_test()
             good &= passed
             say(console, said)
+    if rigs:
+        for one in chosen:
+            x0 = inputs.parse_start(one.mechanism, start or ())
+            with progress_bar() as progress:
+                held = on_rigs(one, x0, rigs, compiler, progress)
+            good &= held == rigs
+            words = ", ".join(start or ()) or "its usual start"
+            say(
+                console,
+                f"{one.mechanism.name}: held on {held} of {rigs} realistic rigs, seeds 0 to "
+                f"{rigs - 1}, from {words}, as a process over a pipe, positions alone measured.",
+            )
     if report:
         with progress_bar() as progress:
             entries = measure(chosen, states=states, compiler=compiler, progress=progress)
@@ -184,6 +208,28 @@ def export_c(
         say(console, write(out, written))
     if not good:
         raise typer.Exit(1)
+
+
+def on_rigs(
+    one: EmbeddedController,
+    x0: FloatArray,
+    rigs: int,
+    compiler: str,
+    progress: Callable[[str, float], None],
+) -> int:
+    """Return on how many realistic rigs the exported controller holds the mechanism."""
+    from undertow.export.loop import bench_of, run_on_rig
+    from undertow.rig import RealisticRig
+
+    bench = bench_of(one.mechanism).with_timing(period=one.period)
+    held = 0
+    with tempfile.TemporaryDirectory(prefix="undertow-") as folder:
+        build = Build(one, Path(folder), compiler)
+        for seed in range(rigs):
+            progress(f"rigs of {one.mechanism.name}", seed / rigs)
+            with build.start() as process:
+                held += run_on_rig(process, RealisticRig(bench, x0, seed), SECONDS).held
+    return held
 
 
 def notes(one: EmbeddedController, states: int, compiler: str) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ import sympy as sp
 from undertow.codegen.c99 import C99Emitter, Real, literal
 from undertow.codegen.tape import Tape
 from undertow.errors import InvalidInputError
-from undertow.export.differentiators import Differentiator, FilteredDerivative, StepSymbols
+from undertow.export.differentiators import DerivativeStep, DifferentiatorStep, StepSymbols
 from undertow.export.twin import LARGEST
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plan import Plan
@@ -79,7 +79,7 @@ class EmbeddedController:
     surface: Surface | Plan
     reaching: ReachingLaw = ReachingLaw()
     period: float = 0.001
-    differentiator: Differentiator = FilteredDerivative()
+    differentiator: DifferentiatorStep = DerivativeStep()
     slew: float | tuple[float, ...] | None = None
     missed: int = 5
     rows: int = 0
@@ -155,7 +155,8 @@ class EmbeddedController:
                     remedy="Use a shorter period, a thicker boundary layer or smaller gains",
                 )
         self.starts(self.plan)
-        self.slew_rates  # noqa: B018  # checked before anything is written
+        self.slew_rates  # noqa: B018  # refuses what cannot be used
+        self.differentiator.gains(self.mechanism.n)
 
     @cached_property
     def laws(self) -> tuple[SlidingModeLaw, ...]:
@@ -327,7 +328,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     shared = common(controller)
     plan = plan_text(controller, controller.plan)
     code = _lay(controller)
-    gains = controller.differentiator.gains(mechanism, controller.period)
+    gains = controller.differentiator.gains(mechanism.n)
     used = "\n".join(code.values())
     always = ("ut_max", "ut_min")
     sharp = controller.reaching.switching == "sign"

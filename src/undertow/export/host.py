@@ -5,6 +5,7 @@ What is needed: a C compiler; for counts also ``valgrind``, ``size`` and ``nm``.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 import subprocess
@@ -313,11 +314,11 @@ class HostProcess:
 
     def close(self) -> None:
         """End the process."""
-        if self._process.stdin is not None:
-            self._process.stdin.close()
+        for stream in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):  # what it can no longer read
+                if stream is not None:
+                    stream.close()
         self._process.wait(timeout=10)
-        if self._process.stdout is not None:
-            self._process.stdout.close()
 
     def __enter__(self) -> Self:
         """Use it in a ``with`` block."""

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.codegen import Tape, compile_numpy
-from undertow.export.differentiators import StepSymbols
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
+from undertow.rig import Measurement
 from undertow.sliding import Control, SlidingModeLaw
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ class Verdict(IntEnum):
 
 
 class Twin:
-    """The exported controller, in double precision, by the library's own law.
+    """The exported controller, in double precision, by the library's own law and estimator.
 
     Parameters
     ----------
@@ -58,13 +57,9 @@ class Twin:
         mechanism = controller.mechanism
         self._n, self._limit = mechanism.n, mechanism.input_limits
         self._slew = controller.slew_rates * controller.period
-        self._gains = controller.differentiator.gains(mechanism, controller.period)
-        tape, symbols = Tape(), StepSymbols.new()
-        memory = controller.differentiator.lay(tape, symbols)
-        self._differentiate = compile_numpy(tape, symbols, memory)
+        self._estimator = controller.differentiator.estimator(mechanism, controller.period)
         self.x = np.zeros(2 * self._n)
         self.u = np.zeros(mechanism.m)
-        self._memory = np.zeros((2, self._n))
         self._missed, self._running = 0, False
         self._use(controller.plan)
         self._offered: Plan | None = None
@@ -96,16 +91,14 @@ class Twin:
     def step(self, q: ArrayLike) -> tuple[FloatArray, Status]:
         """One period from measured positions, (n,): the inputs, (m,), and the status."""
         at = np.array(q, dtype=float)
-        velocity = self.x[self._n :].copy()
-        status = self._repair(at, velocity)
+        status = self._repair(at, self.x[self._n :].copy())
         if status & Status.LOST:
             self._running = False
         else:
             if not self._running:
-                self._memory = np.stack([at, np.zeros(self._n)])
-            stepped = self._differentiate(self._gains, at, *self._memory, self.controller.period)
-            self._memory = np.stack(stepped)
-            self.x = np.concatenate([at, self._memory[1]])
+                self._estimator.reset(np.concatenate([at, np.zeros(self._n)]))
+            # One instant for all, so that the estimator takes its usual period.
+            self.x = self._estimator.estimate(Measurement(0.0, at), self.u).copy()
             self._running = True
         return self._control(status)
 

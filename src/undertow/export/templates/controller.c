@@ -74,14 +74,6 @@ void ut_law(const ut_row *row, const ut_real x[UT_X], ut_output *out)
 
 /* -- the fast side ---------------------------------------------------------------------------- */
 
-void ut_init(ut_controller *c)
-{
-    static const ut_controller blank;
-    *c = blank;
-    (void)ut_offer(c, &ut_built_in);
-    c->taken = c->offered;
-}
-
 static int ut_sound(ut_real value)
 {
     return value > -UT_LARGEST && value < UT_LARGEST;
@@ -165,7 +157,7 @@ int ut_step(ut_controller *c, const ut_real q[UT_N], ut_real u[UT_M])
                 c->filter[i][1] = 0;
             }
             ut_differentiate(ut_gain[i], at[i], c->filter[i]);
-            c->x[i] = at[i];
+            c->x[i] = c->filter[i][0];
             c->x[UT_N + i] = c->filter[i][1];
         }
         c->running = 1;
@@ -256,4 +248,12 @@ int ut_offer(ut_controller *c, const ut_plan *plan)
     UT_BARRIER();
     c->offered = free_slot;
     return UT_ACCEPTED;
+}
+
+void ut_init(ut_controller *c)
+{
+    static const ut_controller blank;
+    *c = blank;
+    (void)ut_offer(c, &ut_built_in);
+    c->taken = c->offered;
 }
