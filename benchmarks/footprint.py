@@ -47,7 +47,7 @@ def peak(code: str) -> float:
 
 def main() -> int:
     """Measure and print."""
-    options = command_line(__doc__).parse_args()
+    options = command_line(__doc__, clocks=False).parse_args()
     jobs = dict(list(JOBS.items())[:3]) if options.quick else JOBS
     rows = []
     for name, code in progress(list(jobs.items()), "jobs"):

@@ -29,7 +29,9 @@ Clock = Callable[[], float]
 Item = TypeVar("Item")
 
 
-def command_line(description: str | None, *examples: str) -> argparse.ArgumentParser:
+def command_line(
+    description: str | None, *examples: str, clocks: bool = True
+) -> argparse.ArgumentParser:
     """Return a parser with ``--quick`` and ``--clock``; the module's words are its help.
 
     Parameters
@@ -38,6 +40,8 @@ def command_line(description: str | None, *examples: str) -> argparse.ArgumentPa
         The docstring of the benchmark.
     *examples
         Further argument lists, shown as examples besides the bare command and ``--quick``.
+    clocks
+        Whether the benchmark lets its clock be chosen.
     """
     script = Path(sys.argv[0])
     command = f"python {script.parent.name}/{script.name}"
@@ -48,13 +52,14 @@ def command_line(description: str | None, *examples: str) -> argparse.ArgumentPa
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--quick", action="store_true", help="less of everything: does it run?")
-    parser.add_argument(
-        "--clock",
-        choices=("wall", "cpu"),
-        default="wall",
-        help="wall: what a user waits for (default); cpu: processor time of this process, "
-        "for a machine that others use as well",
-    )
+    if clocks:
+        parser.add_argument(
+            "--clock",
+            choices=("wall", "cpu"),
+            default="wall",
+            help="wall: what a user waits for (default); cpu: processor time of this process, "
+            "for a machine that others use as well",
+        )
     return parser
 
 
