@@ -227,8 +227,8 @@ def verify_ellipsoid(
         raise InvalidInputError("radius of a terminal set", value=found.radius, limit="> 0")
     program = ClosedLoopProgram.of(mechanism, reaching.switching)
     claim = (
-        f"every motion of the full closed loop from {{|W x| ≤ {found.radius:.4g}}} converges to 0 "
-        "without leaving the layer, the input limits or the law's domain"
+        "every motion of the full closed loop from {|W x| ≤ ρ}, which holds the ball "
+        f"‖x‖ ≤ {found.ball:.3g}, converges inside the layer and the input limits"
     )
     method = "interval Jacobian over the ellipsoid's box, diagonal dominance, float64 outward"
     if not program.at_rest:
