@@ -2,6 +2,7 @@
 
 from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Push, Timing
 from undertow.rig.interface import Measurement, Rig
+from undertow.rig.mujoco_rig import MuJoCoRig
 from undertow.rig.presets import plausible_rig, srv02_rig
 from undertow.rig.simulated import IdealRig, RealisticRig
 
@@ -13,6 +14,7 @@ __all__ = [
     "Friction",
     "IdealRig",
     "Measurement",
+    "MuJoCoRig",
     "Push",
     "RealisticRig",
     "Rig",

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from undertow.estimators import Controller, Estimator, KalmanFilter, Record, drive
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import Objective
+from undertow.objective import Objective, state_box
 from undertow.rig import Bench, Encoder, RealisticRig
 from undertow.rollout import Event, Trajectory
 
@@ -20,10 +20,12 @@ __all__ = [
     "Outcome",
     "Spread",
     "balanced",
+    "bench_objective",
     "estimator_for",
     "motion",
     "spread",
     "trial",
+    "undisturbed",
 ]
 
 #: Belief and estimated start, (2n,), to a controller for one run.
@@ -46,6 +48,8 @@ class Outcome:
         Of the rig.
     balanced
         Whether every coordinate was home for the last second.
+    caught
+        Whether the free coordinates were, wherever the driven ones had got to.
     settled
         Time after which every coordinate stayed home, s; infinite if one did not.
     cost
@@ -60,6 +64,7 @@ class Outcome:
 
     seed: int
     balanced: bool
+    caught: bool
     settled: float
     cost: float
     effort: float
@@ -134,10 +139,12 @@ def trial(
     estimator = estimator_for(belief, bench) if estimator is None else estimator
     estimator.reset(seen)
     record = drive(rig, estimator, make(seen), seconds)
-    settled = _settled(belief, record)
+    settled = _settled(belief, record, 0)
+    last = record.t[-1] - LAST
     return Outcome(
         seed=seed,
-        balanced=settled <= record.t[-1] - LAST,
+        balanced=settled <= last,
+        caught=_settled(belief, record, belief.m) <= last,
         settled=settled,
         cost=math.nan if objective is None else _cost(belief, objective, record),
         effort=record.effort,
@@ -151,10 +158,10 @@ def balanced(outcomes: Sequence[Outcome]) -> int:
     return sum(outcome.balanced for outcome in outcomes)
 
 
-def _settled(mechanism: Mechanism, record: Record) -> float:
-    """Return when the last coordinate came home for good, s."""
+def _settled(mechanism: Mechanism, record: Record, first: int) -> float:
+    """Return when the last of the coordinates from ``first`` on came home for good, s."""
     home = np.where(np.arange(mechanism.n) < mechanism.m, HOME_DRIVEN, HOME_FREE)
-    at_home = np.abs(record.truth[:, : mechanism.n]) <= home
+    at_home = np.abs(record.truth[:, first : mechanism.n]) <= home[first:]
     away = np.logical_not(np.asarray(at_home).all(axis=1))
     if away[-1]:
         return math.inf
@@ -214,6 +221,30 @@ def motion(mechanism: Mechanism, record: Record, every: int = 5) -> Trajectory:
         nothing,
         np.ones(count),
         Event.HORIZON,
+    )
+
+
+def bench_objective(mechanism: Mechanism) -> Objective:
+    """Return an objective that suits a bench: Σ (u_i/u_max,i)² + 0.01 xᵀx, within the ranges.
+
+    The same for every mechanism.  The weight of the state makes Theorem 1 hold, and brings
+    the driven coordinates home; finite ranges of travel are kept to 95 %.
+    """
+    limits = [float(v) if math.isfinite(v) else 1.0 for v in mechanism.input_limits]
+    ranges = {
+        c.name: 0.95 * min(-c.low, c.high)
+        for c in mechanism.coordinates
+        if math.isfinite(min(-c.low, c.high)) and min(-c.low, c.high) > 0
+    }
+    return Objective(
+        "effort and error",
+        lambda v: (
+            sum((u / limit) ** 2 for u, limit in zip(v.inputs, limits, strict=True))
+            + 0.01 * (v.states.T * v.states)[0]
+        ),
+        "s",
+        terminal_radius=0.02,
+        constraints=state_box(**ranges),
     )
 
 
