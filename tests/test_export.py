@@ -496,6 +496,25 @@ def test_two_controllers_link_into_one_program(tmp_path: Path) -> None:
     assert not re.search(r"\but_", names)
 
 
+def test_the_example_of_the_page_compiles(tmp_path: Path) -> None:
+    """``docs/embedded.md`` shows C that fits the header, and commands that exist."""
+    page = (Path(__file__).parent.parent / "docs" / "embedded.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    Build(exported(), tmp_path)
+    needs = (
+        "#include <math.h>\nextern double read_arm(void), read_pendulum(void);\n"
+        "extern void write_voltage(double u), brake(void), start_timer(void), reply(int verdict);\n"
+        "extern int receive(void *plan);\nvoid timer_interrupt(void);\n"
+    )
+    (tmp_path / "example.c").write_text(needs + code)
+    done = gcc(tmp_path, *FLAGS, *STRICT, "-c", "example.c")
+    assert done.returncode == 0, done.stderr
+    code_of_help, shown, _ = invoke("--help")
+    assert code_of_help == 0
+    wanted = set(re.findall(r"--[a-z][a-z-]+", page)) - {"--version"}
+    assert wanted <= set(re.findall(r"--[a-z-]+", shown))
+
+
 def test_bad_requests_are_refused_with_value_and_limit() -> None:
     """Nothing is written for a controller that could not run."""
     rig = LIBRARY["rotary_pendulum"]()
