@@ -146,7 +146,7 @@ class ShootingMPC:
         The controller's belief.
     goal
         ``"energy"``: ∫ uᵀu dt + xᵀPx at the end of 5 s, P from the Riccati equation.
-        ``"time"``: the least T with ‖x(T)‖ ≤ 0.7 ν, in 30 equal intervals.
+        ``"time"``: the least T with ‖x(T)‖ ≤ ν/2, in 30 equal intervals.
     radius
         ν of the terminal set.
     tolerance
@@ -183,9 +183,9 @@ class ShootingMPC:
         width = n + timed  # the final time is one more state, which does not change
         z, u, h = ca.SX.sym("z", width), ca.SX.sym("u", m), ca.SX.sym("h")
         span = h * z[n] if timed else h
-        end, substeps = z[:n], 1 if timed else 2
-        for _ in range(substeps):
-            end = runge_kutta(lambda y: f(y, u), end, span / substeps)
+        end = z[:n]
+        for _ in range(2):
+            end = runge_kutta(lambda y: f(y, u), end, span / 2)
         move = ca.Function("move", [z, u, h], [ca.vertcat(end, z[n:])])
         Z = [ca.MX.sym(f"z{k}", width) for k in range(count + 1)]
         U = [ca.MX.sym(f"u{k}", m) for k in range(count)]
@@ -201,7 +201,7 @@ class ShootingMPC:
                 constraints.append(Z[0][:n] - start)
                 equal += [True] * n
         if timed:
-            constraints.append(1 - ca.sumsqr(Z[-1][:n]) / (0.7 * self.radius) ** 2)
+            constraints.append(1 - ca.sumsqr(Z[-1][:n]) / (0.5 * self.radius) ** 2)
             equal.append(False)
             cost = haste * Z[-1][n] + (1 - haste) * effort
         else:
@@ -212,6 +212,7 @@ class ShootingMPC:
         options = {
             "print_time": False,
             "error_on_fail": False,
+            "show_eval_warnings": False,
             "expand": True,
             "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 100},
         }
@@ -233,7 +234,7 @@ class ShootingMPC:
         n, m, count = states.shape[1], inputs.shape[1], len(self.grid)
         timed = self.goal == "time"
         states = np.column_stack([states, np.full(count + 1, T)]) if timed else states
-        low, high = (0.3 * T, 3.0 * T) if free else (T, T)
+        low, high = (0.05 * T, 3.0 * T) if free else (T, T)
         infinite = np.full(n, np.inf)
         box = np.concatenate([infinite, [high]]) if timed else infinite
         floor = np.concatenate([-infinite, [low]]) if timed else -infinite
@@ -273,13 +274,20 @@ class ShootingMPC:
         return None
 
     def plan(self, t: float, x: FloatArray) -> bool:
-        """Plan from x, warm-started with what is left of the last plan; False: none found."""
+        """Plan from x, warm-started with what is left of the last plan.
+
+        False: none found; the last plan stays in use while it covers the next period.
+        """
         began = time.perf_counter()
         self.iterations.append(0)
         found = None
         if self._plan is not None:
-            found = self._solve(x, self._shifted(t - self._since), True)
-        if found is None:
+            guess = self._shifted(t - self._since)
+            found = self._solve(x, guess, True)
+            if found is None and self.goal == "time":  # with a little more time, and then less
+                slow = self._solve(x, (*guess[:2], 1.1 * guess[2]), False)
+                found = None if slow is None else self._solve(x, slow, True)
+        if found is None and self._left(t) < self.PERIOD:
             found = self._cold(x)
         self.seconds.append(time.perf_counter() - began)
         if found is None:
@@ -303,8 +311,11 @@ class ShootingMPC:
         return moved, inputs[index], rest
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
-        """Return the input at t: planned afresh every 0.1 s; past its end, linear feedback."""
-        if self._due(t):
+        """Return the input at t: planned afresh every 0.1 s; past its end, linear feedback.
+
+        A plan that has less than a fifth of a period to go is carried out.
+        """
+        if self._due(t) and not 0.0 < self._left(t) < self.PERIOD / 5:
             self.plan(t, x)
         if self._plan is not None:
             _, inputs, T = self._plan
@@ -318,6 +329,10 @@ class ShootingMPC:
                 spent = np.stack([np.interp(ends, nodes, column) for column in area.T])
                 return np.asarray(np.diff(spent, axis=1)[:, 0] / Plant.STEP)
         return np.asarray(-self.K @ x)
+
+    def _left(self, t: float) -> float:
+        """Time until the end of the plan, s; 0 without one."""
+        return 0.0 if self._plan is None else self._since + self._times(self._plan[2])[-1] - t
 
     def _due(self, t: float) -> bool:
         return abs(t / self.PERIOD - round(t / self.PERIOD)) < 1e-6
