@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow check clean
+.PHONY: help setup demo test slow check bench clean
 
 help: ## list the targets
 	@echo "Undertow: make <target>    (PYTHON=$(PYTHON), WORKERS=$(WORKERS))"
@@ -33,6 +33,9 @@ check: $(STAMP) ## formatting, lint, types, direction of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 
+bench: $(STAMP) ## all benchmarks, with a summary (docs/benchmarks.md says what they mean)
+	$(BIN)/python benchmarks
+
 clean: ## remove .venv, caches and results/
 	rm -rf $(VENV) results dist build
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
@@ -51,5 +54,5 @@ $(STAMP): pyproject.toml constraints.txt
 	@"$(PYTHON)" -m venv --clear $(VENV) || { \
 	    echo "error: '$(PYTHON) -m venv' failed; some systems package it apart (python3-venv)."; \
 	    exit 1; } >&2
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bounds,certify,mujoco,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bounds,certify,compare,mujoco,dev]'
 	@touch $@

@@ -17,10 +17,9 @@ from undertow.derivation import (
     Derivation,
     derivation,
     hurwitz_minors,
-    plain,
     polynomial_matrix,
-    tex,
 )
+from undertow.formulas import plain, tex
 from undertow.mechanisms import LIBRARY
 from undertow.sliding import singularity
 from undertow.stability import sliding_matrix, stability_margin

@@ -252,3 +252,13 @@ def test_without_damping_energy_is_kept(name: str) -> None:
         k3 = rate(x + h / 2 * k2)
         x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3))
     assert float(mechanism.energy(x)) == pytest.approx(float(mechanism.energy(x0)), abs=1e-8)
+
+
+def test_reaction_wheel_has_the_inertia_about_the_pivot_that_its_source_prints() -> None:
+    """Claim: J_p + m_p l_p² + m_r l_r² = 4.572e-3 kg m² as printed; with J_p = 2.333e-4, which
+    copies of the table have, it would not be."""
+    printed = 4.572e-3
+    v = {p.name: p.value for p in library("reaction_wheel_pendulum").parameters}
+    shift = v["m_p"] * v["l_p"] ** 2 + v["m_r"] * v["l_r"] ** 2
+    assert round(v["J_p"] + shift, 6) == printed
+    assert round(2.333e-4 + shift, 6) != printed

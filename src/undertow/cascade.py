@@ -24,6 +24,7 @@ from undertow.plan import Plan
 from undertow.rollout import ClosedLoop, Event, Trajectory
 from undertow.sliding import Control, ReachingLaw, SlidingModeLaw, Surface
 from undertow.stability import check_surface, stability_margin
+from undertow.verdict import Verdict
 
 __all__ = ["Admission", "Cascade", "CascadeState", "Gate", "Run", "Update", "cost_gate"]
 
@@ -32,12 +33,14 @@ __all__ = ["Admission", "Cascade", "CascadeState", "Gate", "Run", "Update", "cos
 class Admission:
     """The gate's decision on a proposal: accepted or not, and why.
 
-    ``cost`` is the predicted cost of the surface that stays in use, new or old.
+    ``cost`` is the predicted cost of the plan that stays in use, new or old; ``verdict`` what is
+    known of that plan at the present state, where the gate gives one.
     """
 
     accepted: bool
     reason: str
     cost: float
+    verdict: Verdict | None = None
 
 
 #: Relative tolerance of the linear tail in the optimiser's rollouts.
@@ -162,6 +165,11 @@ class Run:
     def surfaces(self) -> tuple[Surface, ...]:
         """The surface in use after each decision."""
         return tuple(update.surface for update in self.updates)
+
+    @property
+    def verdicts(self) -> tuple[Verdict | None, ...]:
+        """What is known of the plan in use, at each decision."""
+        return tuple(update.admission.verdict for update in self.updates)
 
     @property
     def descent(self) -> FloatArray:
@@ -311,6 +319,16 @@ class Cascade:
             proposal, plan, cost = self._global(exact, x)
         return CascadeState(plan, 0, cost, cost), proposal
 
+    def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
+        """Put the first plan before the gate: there is no other, so it is used all the same.
+
+        The admission says what the gate would have said; ``accepted`` is always true.
+        """
+        current = self.mechanism.check_state(x)
+        asked = self.gate(self.loop, state.plan, state.plan, current, horizon)
+        reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
+        return Admission(True, reason, state.predicted, asked.verdict)
+
     def _global(self, optimiser: Optimiser, x: ArrayLike) -> tuple[Proposal, Plan, float]:
         """Return a global optimum, its plan and its cost integrated to the end."""
         proposal = optimiser.require(x)
@@ -365,9 +383,10 @@ class Cascade:
         old = state.at(t)
         state = replace(state, plan=old, since=t, sequence=proposal.sequence)
         if proposal.plan is None:
-            cost = self._exact_cost(old, current, span)
+            kept = self.gate(self.loop, old, old, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}"
-            return replace(state, predicted=cost), Admission(False, reason, cost)
+            admission = replace(kept, accepted=False, reason=reason)
+            return replace(state, predicted=kept.cost), admission
         admission = self.gate(self.loop, old, proposal.plan, current, span)
         plan = proposal.plan if admission.accepted else old
         return replace(state, plan=plan, predicted=admission.cost), admission
@@ -436,7 +455,7 @@ class Cascade:
             )
         truth = replace(self.loop, plant=plant)
         memory, proposal = self.start(x)
-        admission = Admission(True, "first optimum", memory.predicted)
+        admission = self.first_admission(memory, x, total)
         updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
         pieces: list[Trajectory] = []
         for k in range(math.ceil(total / self.period - 1e-9)):

@@ -11,17 +11,13 @@ with v = q̈_a and w = q̈_u: (1), (10) and (12) without a disturbance, equal to
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import sympy as sp
-from sympy.printing.latex import LatexPrinter
-from sympy.printing.str import StrPrinter
-from sympy.simplify.fu import TR10i
 
+from undertow.formulas import plain, readable, rounded, tex, tex_words
 from undertow.mechanism import Mechanism
 from undertow.stability import first_surface, linearise, sliding_matrix
 
@@ -90,12 +86,12 @@ class Derivation:
             r"\allowdisplaybreaks",
             r"\begin{document}",
             rf"\section*{{{self.mechanism.name.replace('_', ' ')}}}",
-            _escaped(self.mechanism.description),
+            tex_words(self.mechanism.description),
         ]
         for section in self.sections:
-            lines.append(rf"\subsection*{{{_escaped(section.title)}}}")
+            lines.append(rf"\subsection*{{{tex_words(section.title)}}}")
             if section.words:
-                lines.append(_escaped(section.words))
+                lines.append(tex_words(section.words))
             if section.equations:
                 rows = [
                     rf"{tex(e.left)} &{_TEX_RELATIONS[e.relation]} {tex(e.right)}"
@@ -224,10 +220,10 @@ def _coordinates(mechanism: Mechanism) -> Section:
         f"  {plain(c.symbol)} ({c.unit}, {'actuated' if i < m else 'free'}): {c.description}"
         for i, c in enumerate(mechanism.coordinates)
     ]
-    lines += [f"  {plain(c.symbol)} ({c.unit}): input, |{c.name}| ≤ {c.limit:g}"
+    lines += [f"  {plain(c.symbol)} ({c.unit}): input, |{plain(c.symbol)}| ≤ {c.limit:g}"
               for c in mechanism.inputs]  # fmt: skip
     lines += [
-        f"  {plain(p.symbol)} = {p.value:.6g} {p.unit}: {p.description}"
+        f"  {plain(p.symbol)} = {f'{p.value:.6g} {p.unit}'.strip()}: {p.description}"
         for p in mechanism.parameters
     ]
     return Section("Coordinates, inputs, parameters", "\n".join(lines))
@@ -376,8 +372,9 @@ def _stability(mechanism: Mechanism, y: Symbols) -> Section:
     hurwitz += [
         Equation(minor, sp.Integer(0), ">") for minor in hurwitz_minors(names) if minor.is_Add
     ]
+    leading = plain(names[-1] * _s**degree)
     words = (
-        f"{general} With det P = ±(p_{degree} σ^{degree} + … + p_0): where all p_k have one sign "
+        f"{general} With det P = ±({leading} + … + p₀): where all p_k have one sign "
         "(that of a first surface is written as positive) and Hurwitz's minors are positive:"
     )
     return Section(title, words, (*shown, *hurwitz))
@@ -413,7 +410,7 @@ def _example(mechanism: Mechanism) -> Section:
         f"{p.real:.4g}" if abs(p.imag) < 1e-9 else f"{p.real:.4g}±{abs(p.imag):.4g}i"
         for p in ordered
         if p.imag > -1e-9
-    )
+    ).replace("-", "−")
     y = Symbols.of(mechanism)
     pairs: list[Equation] = []
     for name in ("lambda_a", "alpha_u", "lambda_u"):
@@ -425,190 +422,3 @@ def _example(mechanism: Mechanism) -> Section:
         ]
     words = f"Quadratic design of Utkin and Young; eigenvalues of its sliding motion, 1/s: {shown}."
     return Section("A first surface", words, tuple(pairs))
-
-
-# -- short forms ---------------------------------------------------------------------------------
-
-
-def readable(expression: sp.Expr | float, rates: Sequence[sp.Symbol] = ()) -> sp.Expr:
-    """Return an equal expression that is short to read.
-
-    Parameters
-    ----------
-    expression
-        A polynomial in ``rates`` with coefficients in sines and cosines.
-    rates
-        Velocities by whose monomials the terms are collected.
-    """
-    expression = sp.expand(sp.sympify(expression))
-    polynomial = sp.Poly(expression, *rates) if rates and expression.is_polynomial(*rates) else None
-    if polynomial is None:
-        return _shortest(expression)
-    return sp.Add(
-        *(
-            sp.Mul(_shortest(c), sp.Mul(*(r**k for r, k in zip(rates, powers, strict=True))))
-            for powers, c in polynomial.terms()
-        )
-    )
-
-
-@lru_cache(maxsize=4096)
-def _shortest(expression: sp.Expr) -> sp.Expr:
-    candidates = [expression]
-    for change in (TR10i, _angles):
-        candidates.append(change(candidates[-1]))
-    candidates += [sp.factor_terms(c) for c in candidates]
-    return min(candidates, key=lambda c: (sp.count_ops(c), len(str(c))))
-
-
-def _angles(expression: sp.Expr) -> sp.Expr:
-    """Collect terms by their trigonometric factors, then contract sums of angles."""
-    functions = sorted(expression.atoms(sp.sin, sp.cos), key=str)
-    products = sorted(
-        {
-            sp.Mul(*(a for a in sp.Mul.make_args(t) if a.has(*functions)))
-            for t in sp.Add.make_args(sp.expand(expression))
-            if functions and t.has(*functions)
-        },
-        key=str,
-    )
-    return TR10i(sp.collect(sp.expand(expression), products)) if products else expression
-
-
-def rounded(expression: sp.Expr, digits: int = 5) -> sp.Expr:
-    """Return an expression with its numbers rounded; those that round to whole ones are whole."""
-
-    def short(number: sp.Float) -> sp.Expr:
-        value = float(f"{float(number):.{digits}g}")
-        if abs(value) < 1e-12:
-            return sp.Integer(0)
-        return sp.Integer(int(value)) if value == int(value) else sp.Float(value, digits)
-
-    whole = sp.sympify(expression)
-    return whole.xreplace({f: short(f) for f in whole.atoms(sp.Float)})
-
-
-# -- printing ------------------------------------------------------------------------------------
-
-_GREEK = {
-    "alpha": "α", "beta": "β", "gamma": "γ", "epsilon": "ε", "eta": "η", "theta": "θ",
-    "lambda": "λ", "phi": "φ", "psi": "ψ", "sigma": "σ",
-}  # fmt: skip
-_DIGITS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
-_POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_DOTS = {"dot": "\N{COMBINING DOT ABOVE}", "ddot": "\N{COMBINING DIAERESIS}"}
-
-
-def _parts(name: str) -> tuple[str, str, str]:
-    """Split ``phi_1_ddot`` into stem, index and dots."""
-    match = re.fullmatch(r"(.+?)_(d?dot)", name)
-    body, dots = (match[1], match[2]) if match else (name, "")
-    stem, _, index = body.partition("_")
-    return stem, index, dots
-
-
-def _plain_symbol(name: str) -> str:
-    stem, index, dots = _parts(name)
-    letter = _GREEK.get(stem, stem) + _DOTS.get(dots, "")
-    if not index:
-        return letter
-    pieces = [piece.translate(_DIGITS) for piece in index.split("_")]
-    return letter + ("" if index[0].isdigit() else "_") + "".join(pieces)
-
-
-def _tex_symbol(name: str) -> str:
-    stem, index, dots = _parts(name)
-    greek = {"phi": r"\varphi", "epsilon": r"\varepsilon"}
-    letter = greek.get(stem, rf"\{stem}" if stem in _GREEK else stem)
-    if len(stem) > 1 and stem not in _GREEK:
-        letter = rf"\mathrm{{{stem}}}"
-    if dots:
-        letter = rf"\{dots}{{{letter}}}"
-    if not index:
-        return letter
-    pieces = index.split("_")
-    return f"{letter}_{{{','.join(pieces)}}}"
-
-
-class _Plain(StrPrinter):  # type: ignore[misc]  # SymPy is untyped
-    """One line of text with Greek letters, dots and raised powers; a space multiplies."""
-
-    def _print_Symbol(self, expr: sp.Symbol) -> str:
-        return _plain_symbol(expr.name)
-
-    def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
-        base, exponent = expr.args
-        if exponent.is_Integer and exponent > 0:
-            text = self._print(base)
-            closed = base.is_Symbol or isinstance(base, sp.Function)
-            power = str(exponent).translate(_POWERS)
-            return f"{text}{power}" if closed else f"({text}){power}"
-        return str(super()._print_Pow(expr, rational))
-
-    def _print_Mul(self, expr: sp.Mul) -> str:
-        return re.sub(r"(?<!\*)\*(?!\*)", " ", super()._print_Mul(expr))
-
-
-class _Tex(LatexPrinter):  # type: ignore[misc]  # SymPy is untyped
-    """LaTeX with dots over velocities and roman words."""
-
-    def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
-        del style
-        return _tex_symbol(expr.name)
-
-
-def plain(expression: sp.Expr) -> str:
-    """Return an expression on one line of text.
-
-    >>> plain(sp.Symbol("phi_1_dot") ** 2 * sp.cos(sp.Symbol("phi_1")))
-    'φ̇₁² cos(φ₁)'
-    """
-    return str(_Plain().doprint(sp.sympify(expression))).replace("-", "−")
-
-
-def tex(expression: sp.Expr) -> str:
-    r"""Return an expression as LaTeX.
-
-    >>> tex(sp.Symbol("phi_dot") ** 2)
-    '\\dot{\\varphi}^{2}'
-    """
-    return str(_Tex({"fold_short_frac": True}).doprint(sp.sympify(expression)))
-
-
-#: Signs in words to LaTeX, after formulas.
-_SIGNS: Mapping[str, str] = {
-    "%": r"\%", "&": r"\&", "_": r"\_", "−": "$-$", "≠": r"$\neq$", "≤": r"$\leq$", "±": r"$\pm$",
-    "²": "$^2$", "·": r"$\cdot$", "Ω": r"$\Omega$", "…": r"\dots{}", "°": r"$^\circ$",
-    ">": "$>$", "<": "$<$", "|": "$|$",
-}  # fmt: skip
-
-#: A letter with dots, indices and powers, as words and :func:`plain` write it.
-_FORMULA = re.compile(
-    r"([A-Za-zα-ω]+)(\u0307|\u0308)?(_[A-Za-z0-9₀-₉]+|[₀-₉]+)?(⁻¹|ᵀ|\^\d)?(?![A-Za-z])"
-)
-_NORMAL = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
-
-
-def _escaped(words: str) -> str:
-    """Return words for LaTeX: formulas as mathematics, one line after the other."""
-
-    def formula(match: re.Match[str]) -> str:
-        letters, dot, index, power = match.groups()
-        greek = {v: k for k, v in _GREEK.items()}
-        if not (dot or index or power or letters in greek):
-            return match[0]
-        text = _tex_symbol(greek.get(letters, letters))
-        if dot:
-            text = rf"\{'dot' if dot == chr(0x307) else 'ddot'}{{{text}}}"
-        if index:
-            text += f"_{{{index.lstrip('_').translate(_NORMAL)}}}"
-        if power:
-            text += {"⁻¹": "^{-1}", "ᵀ": "^{T}"}.get(power, power)
-        return f"\0{text}\0"
-
-    pieces = _FORMULA.sub(formula, words.replace("ṡ", "s\u0307")).split("\0")
-    for index in range(0, len(pieces), 2):
-        for sign, replacement in _SIGNS.items():
-            pieces[index] = pieces[index].replace(sign, replacement)
-    text = "".join(f"${p}$" if i % 2 else p for i, p in enumerate(pieces))
-    return "\\\\\n".join(line.strip() for line in text.split("\n"))

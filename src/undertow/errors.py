@@ -8,6 +8,7 @@ from __future__ import annotations
 
 __all__ = [
     "ArtefactError",
+    "CertificateError",
     "InfeasibleError",
     "InvalidInputError",
     "MissingExtraError",
@@ -67,6 +68,10 @@ class SingularSurfaceError(UndertowError, ValueError):
 
 class InfeasibleError(UndertowError):
     """No admissible surface was found for the task."""
+
+
+class CertificateError(UndertowError):
+    """A certificate that says nothing: damaged, of another model, or of an unknown version."""
 
 
 class MissingExtraError(UndertowError, ImportError):

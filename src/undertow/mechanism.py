@@ -8,7 +8,6 @@ from the expressions kept here.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,194 +16,28 @@ from typing import Any, Self, cast
 
 import numpy as np
 import sympy as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError, ModelError
 from undertow.lagrange import derived
+from undertow.partition import Partition, compiled
+from undertow.quantities import TIME, Coordinate, FloatArray, Input, Parameter, numbers
+from undertow.validity import check_definite, check_names, check_symbols, check_symmetric
 
-__all__ = ["TIME", "Coordinate", "Input", "Mechanism", "Parameter", "Partition"]
-
-FloatArray = NDArray[np.float64]
+__all__ = [
+    "TIME",
+    "Coordinate",
+    "FloatArray",
+    "Input",
+    "Mechanism",
+    "Parameter",
+    "Partition",
+    "numbers",
+]
 
 #: Stands for the identity of the right size until ``__post_init__`` knows m.
 _IDENTITY = cast(sp.ImmutableDenseMatrix, None)
-
-#: The symbol of time in disturbances, s.
-TIME = sp.Symbol("t", real=True)
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A physical parameter: a number with its unit, its bounds and where it comes from.
-
-    Parameters
-    ----------
-    name
-        Identifier; also the name of the SymPy symbol.
-    value
-        The value, in ``unit``.
-    unit
-        SI unit, as text ("kg m²").
-    description
-        What it is, in words.
-    low, high
-        The open interval of values that make physical sense.
-    source
-        Where the number was found.
-    """
-
-    name: str
-    value: float
-    unit: str
-    description: str = ""
-    low: float = -math.inf
-    high: float = math.inf
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        """Refuse a value that is not finite or not inside its interval."""
-        if not self.name.isidentifier():
-            raise InvalidInputError(
-                "parameter name",
-                value=repr(self.name),
-                limit="a Python identifier",
-                remedy="Use letters, digits and underscores, a letter first",
-            )
-        if not math.isfinite(self.value) or not self.low < self.value < self.high:
-            interval = f"finite and inside ({self.low:g}, {self.high:g}) {self.unit}".rstrip()
-            raise InvalidInputError(
-                f"parameter '{self.name}'" + f" ({self.description})" * bool(self.description),
-                value=f"{self.value:g}",
-                limit=interval,
-                remedy="Give a value inside the interval",
-            )
-
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The SymPy symbol that stands for this parameter."""
-        return sp.Symbol(self.name, real=True)
-
-
-@dataclass(frozen=True)
-class Coordinate:
-    """A generalised coordinate; its velocity is named ``<name>_dot``.
-
-    Parameters
-    ----------
-    name
-        Identifier, e.g. ``"phi"``.
-    unit
-        ``"rad"`` or ``"m"``.
-    description
-        What it measures, with the sense that counts as positive.
-    low, high
-        Range of travel, in ``unit``; infinite where nothing stops the joint.  Data for
-        constraints, checks and pictures: the equations know no end stop.
-    """
-
-    name: str
-    unit: str = "rad"
-    description: str = ""
-    low: float = -math.inf
-    high: float = math.inf
-
-    def __post_init__(self) -> None:
-        """Refuse a name or unit of another kind, and an empty range of travel."""
-        if not self.name.isidentifier() or self.unit not in ("rad", "m"):
-            raise InvalidInputError(
-                "coordinate",
-                value=f"name {self.name!r}, unit {self.unit!r}",
-                limit="a Python identifier, in rad or m",
-                remedy="Scale other units to SI first",
-            )
-        if not self.low < self.high:
-            raise InvalidInputError(
-                f"range of coordinate '{self.name}'",
-                value=f"[{self.low:g}, {self.high:g}] {self.unit}",
-                limit="low < high",
-                remedy="Give the lower end first",
-            )
-
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The SymPy symbol of the coordinate."""
-        return sp.Symbol(self.name, real=True)
-
-    @property
-    def velocity(self) -> sp.Symbol:
-        """The SymPy symbol of its time derivative."""
-        return sp.Symbol(f"{self.name}_dot", real=True)
-
-
-@dataclass(frozen=True)
-class Input:
-    """An actuator input u_i with its symmetric limit ``|u_i| ≤ limit``, (38).
-
-    Parameters
-    ----------
-    name
-        Identifier, e.g. ``"voltage"``.
-    unit
-        SI unit, e.g. ``"V"`` or ``"N m"``.
-    limit
-        Largest magnitude that the actuator can deliver; ``inf`` for none.
-    """
-
-    name: str
-    unit: str
-    limit: float = math.inf
-
-    def __post_init__(self) -> None:
-        """Refuse a name that is no identifier and a limit that is not positive."""
-        if not self.name.isidentifier():
-            raise InvalidInputError(
-                "input name",
-                value=repr(self.name),
-                limit="a Python identifier",
-                remedy="Use letters, digits and underscores",
-            )
-        if not self.limit > 0:
-            raise InvalidInputError(
-                f"limit of input '{self.name}'",
-                value=f"{self.limit:g} {self.unit}",
-                limit="positive",
-                remedy="Give the largest magnitude that the actuator can deliver",
-            )
-
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The SymPy symbol of the input."""
-        return sp.Symbol(self.name, real=True)
-
-
-@dataclass(frozen=True, eq=False)
-class Partition:
-    """The blocks of (1) on a tape, with ``M_uu`` eliminated once for all later use.
-
-    ``X = M_uu⁻¹ M_auᵀ``, ``y = M_uu⁻¹ f_u``, ``S = M_aa − M_au X`` (2) and
-    ``h = f_a − M_au y``, so that ``S q̈_a = h + B u`` (4) and ``q̈_u = y − X q̈_a`` (3).
-    """
-
-    tape: Tape
-    M_aa: sp.Matrix
-    M_au: sp.Matrix
-    M_uu: sp.Matrix
-    f_a: sp.Matrix
-    f_u: sp.Matrix
-    B: sp.Matrix
-    X: sp.Matrix
-    y: sp.Matrix
-    S: sp.Matrix
-    h: sp.Matrix
-
-    def accelerations(self, u: sp.Matrix) -> list[sp.Expr]:
-        """Return q̈ = (q̈_a, q̈_u) for the inputs u, equations (3)-(4), as tape atoms."""
-        tape = self.tape
-        force = tape.matrix(self.h + self.B * u)
-        qdd_a = tape.cholesky(self.S).solve(force)
-        qdd_u = tape.matrix(self.y - self.X * qdd_a)
-        return [*qdd_a, *qdd_u]
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,73 +132,21 @@ class Mechanism:
                 remedy="Give bounds on |g_i|, 0 where nothing disturbs",
             )
         object.__setattr__(self, "disturbance_bounds", bounds)
-        self._check_names()
-        self._check_inertia()
+        self._check()
         self.state(**self.start)
 
-    def _check_names(self) -> None:
-        names = [
-            *self.state_names,
-            *(i.name for i in self.inputs),
-            *(p.name for p in self.parameters),
-            TIME.name,
-        ]
-        repeated = sorted({name for name in names if names.count(name) > 1})
-        if repeated:
-            raise ModelError(
-                f"a name of '{self.name}' is used twice",
-                value=", ".join(repeated),
-                limit="unique among coordinates, inputs, parameters and the time t",
-                remedy="Rename one of them",
-            )
-        private = sorted(name for name in names if name.startswith("_"))
-        if private:
-            raise ModelError(
-                f"a name of '{self.name}' starts with an underscore",
-                value=", ".join(private),
-                limit="a letter first",
-                remedy="Rename it: such names are kept for generated code",
-            )
-        for what, matrix, allowed in (
-            ("mass_matrix", self.mass_matrix, {*self.q, *self.parameter_symbols}),
-            ("input_matrix", self.input_matrix, {*self.parameter_symbols}),
-            ("force", self.force, {*self.x, *self.parameter_symbols, TIME}),
+    def _check(self) -> None:
+        states, parameters = {*self.x}, {*self.parameter_symbols}
+        channels = [i.name for i in self.inputs]
+        check_names(self.name, [*self.state_names, *channels, *(p.name for p in self.parameters)])
+        for what, allowed in (
+            ("mass_matrix", {*self.q} | parameters),
+            ("input_matrix", parameters),
+            ("force", states | parameters | {TIME}),
         ):
-            unknown = sorted(str(s) for s in matrix.free_symbols - allowed)
-            if unknown:
-                raise ModelError(
-                    f"{what} of '{self.name}' has unknown symbols",
-                    value=", ".join(unknown),
-                    limit=f"among {', '.join(sorted(str(s) for s in allowed))}",
-                    remedy="Declare them as parameters, or as coordinates, with real symbols",
-                )
-        skew = self.mass_matrix - self.mass_matrix.T
-        for j, i in itertools.combinations(range(self.n), 2):
-            if skew[i, j] != 0 and sp.simplify(skew[i, j]) != 0:
-                raise ModelError(
-                    f"mass_matrix of '{self.name}'",
-                    value=f"{self.mass_matrix[j, i]} at [{j}, {i}] and "
-                    f"{self.mass_matrix[i, j]} at [{i}, {j}]",
-                    limit="symmetric",
-                    remedy="Derive M from the kinetic energy: Mechanism.from_energies",
-                )
-
-    def _check_inertia(self) -> None:
-        rng = np.random.default_rng(0)
-        spread = np.array([math.pi if c.unit == "rad" else 1.0 for c in self.coordinates])
-        for trial in range(16):
-            q = trial * rng.uniform(-spread, spread) / 15
-            smallest = float(np.linalg.eigvalsh(self.M(q))[0])
-            if not smallest > 0:
-                where = ", ".join(
-                    f"{c.name} = {v:.3g} {c.unit}" for c, v in zip(self.coordinates, q, strict=True)
-                )
-                raise ModelError(
-                    f"mass_matrix of '{self.name}' at {where}",
-                    value=f"smallest eigenvalue {smallest:.3g}",
-                    limit="positive",
-                    remedy="Check masses, lengths and inertias: a massless link has no M > 0",
-                )
+            check_symbols(f"{what} of '{self.name}'", getattr(self, what), allowed)
+        check_symmetric(f"mass_matrix of '{self.name}'", self.mass_matrix)
+        check_definite(f"mass_matrix of '{self.name}'", self.coordinates, self.M)
         gain = numbers(self.input_matrix.subs(self.substitution))
         if not abs(np.linalg.det(gain)) > 0:
             raise ModelError(
@@ -616,23 +397,10 @@ class Mechanism:
 
         ``rename`` replaces symbols first: a controller's belief keeps its own parameters.
         """
-        n, m = self.n, self.m
-        raw = [*self.mass_matrix, *self.force, *self.input_matrix]
+        entries = [list(m) for m in (self.mass_matrix, self.force, self.input_matrix)]
         if rename:
-            raw = [e.xreplace(dict(rename)) for e in raw]
-        atoms = tape.let_all(raw)
-        M = sp.Matrix(n, n, atoms[: n * n])
-        M = sp.Matrix(n, n, lambda i, j: M[min(i, j), max(i, j)])
-        f = sp.Matrix(atoms[n * n : n * n + n])
-        B = sp.Matrix(m, m, atoms[n * n + n :])
-        M_aa, M_au, M_uu = M[:m, :m], M[:m, m:], M[m:, m:]
-        f_a, f_u = f[:m, :], f[m:, :]
-        factor = tape.cholesky(M_uu)
-        X, y = factor.solve(M_au.T), factor.solve(f_u)
-        S = tape.matrix(M_aa - M_au * X)
-        S = sp.Matrix(m, m, lambda i, j: S[min(i, j), max(i, j)])
-        h = tape.matrix(f_a - M_au * y)
-        return Partition(tape, M_aa, M_au, M_uu, f_a, f_u, B, X, y, S, h)
+            entries = [[e.xreplace(dict(rename)) for e in part] for part in entries]
+        return Partition.of(tape, *entries)
 
     # -- numbers ------------------------------------------------------------------------
 
@@ -652,7 +420,7 @@ class Mechanism:
         if which == "dynamics":
             return _compiled_dynamics(self)
         matrix = self.mass_matrix if which == "mass" else self.force
-        return _compiled(matrix, (*states, *self.parameter_symbols))
+        return compiled(matrix, (*states, *self.parameter_symbols))
 
     def M(self, q: ArrayLike) -> FloatArray:
         """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like."""
@@ -710,20 +478,6 @@ class Mechanism:
         )
         (value,) = potential(*np.moveaxis(q, -1, 0), *self.parameter_values)
         return np.asarray(kinetic + value)
-
-
-def numbers(matrix: Any) -> FloatArray:
-    """Return a SymPy matrix without symbols as a float array."""
-    return np.array(matrix, dtype=np.float64)
-
-
-@lru_cache(maxsize=256)
-def _compiled(
-    matrix: sp.ImmutableDenseMatrix, arguments: tuple[sp.Symbol, ...]
-) -> Callable[..., list[Any]]:
-    """Return the entries of a matrix as a NumPy function; shared by equal mechanisms."""
-    tape = Tape()
-    return compile_numpy(tape, arguments, tape.let_all(list(matrix)))
 
 
 @lru_cache(maxsize=64)

@@ -744,6 +744,8 @@ GENERATOR = tuple(
         "rollout.py",
         "mechanism.py",
         "objective.py",
+        "partition.py",
+        "quantities.py",
         "sliding.py",
         "codegen/block.py",
         "codegen/scalar.py",

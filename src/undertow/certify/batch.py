@@ -93,6 +93,14 @@ class Interval:
         """Show the endpoints."""
         return f"Interval({self.lo!r}, {self.hi!r})"
 
+    def __getitem__(self, index: Any) -> Interval:
+        """Return a part of the batch, indexed like an array."""
+        return Interval(self.lo[index], self.hi[index])
+
+    def reshape(self, *shape: int) -> Interval:
+        """Return the batch in another shape, like an array."""
+        return Interval(self.lo.reshape(shape), self.hi.reshape(shape))
+
     @staticmethod
     def of(value: Any) -> Interval:
         """Return an interval for a number: floats and small integers are exact."""

@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from undertow import results
-from undertow.cli import control, library, paper
+from undertow.cli import certify, control, export, library, paper, rig
 from undertow.cli.terminal import app
 
-__all__ = ["app", "control", "library", "main", "paper"]
+__all__ = ["app", "certify", "control", "export", "library", "main", "paper", "rig"]
 
 
 def _version(asked: bool) -> None:

@@ -27,7 +27,7 @@ COMPILED = (
 def function_source(
     name: str,
     tape: Tape,
-    inputs: Mapping[str, Sequence[sp.Symbol]],
+    inputs: Mapping[str, Sequence[sp.Symbol] | sp.Symbol],
     outputs: Mapping[str, Sequence[sp.Expr]],
 ) -> str:
     """Return the source of ``name(*inputs, *outputs)``, compiled by numba when it is imported.
@@ -39,8 +39,8 @@ def function_source(
     tape
         Where the expressions were laid.
     inputs
-        Argument name to the symbols that its entries stand for, in order.  An argument
-        without symbols may be ``None`` in a call.
+        Argument name to the symbols that its entries stand for, in order, or to the one
+        symbol that it stands for as a number.
     outputs
         Argument name to the expressions that fill its entries, in order: one-dimensional
         float arrays, written last, so that an output may be the same array as an input.
@@ -49,9 +49,9 @@ def function_source(
     wanted = [expression for group in outputs.values() for expression in group]
     code, needs = emit.lines(wanted, set())
     loads = [
-        f"{emit.text(symbol)} = {argument}[{j}]"
+        f"{emit.text(symbol)} = {place}"
         for argument, symbols in inputs.items()
-        for j, symbol in enumerate(symbols)
+        for symbol, place in _places(argument, symbols)
         if symbol in needs
     ]
     stores = [
@@ -62,3 +62,10 @@ def function_source(
     body = "\n".join([*loads, *code, *stores])
     arguments = ", ".join([*inputs, *outputs])
     return f"{COMPILED}\ndef {name}({arguments}):\n{textwrap.indent(body, '    ')}\n"
+
+
+def _places(argument: str, symbols: Sequence[sp.Symbol] | sp.Symbol) -> list[tuple[sp.Symbol, str]]:
+    """Return the symbols of an argument, each with where it is found."""
+    if isinstance(symbols, sp.Symbol):
+        return [(symbols, argument)]
+    return [(symbol, f"{argument}[{j}]") for j, symbol in enumerate(symbols)]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import sympy as sp
+from sympy.printing.codeprinter import CodePrinter
 from sympy.printing.pycode import PythonCodePrinter
 
 from undertow.codegen.tape import Tape
@@ -81,11 +82,14 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
 
 
 class Emitter:
-    """Prints tape lines with one sine-cosine evaluation per distinct angle."""
+    """Prints tape lines with one sine-cosine evaluation per distinct angle.
 
-    def __init__(self, tape: Tape) -> None:
+    A printer for another language overrides :meth:`assign` and :meth:`sincos`.
+    """
+
+    def __init__(self, tape: Tape, printer: CodePrinter | None = None) -> None:
         self.tape = tape
-        self.printer = _Printer({"fully_qualified_modules": True})
+        self.printer = printer or _Printer({"fully_qualified_modules": True})
         self.angles: dict[sp.Expr, int] = {}
 
     def lines(
@@ -99,6 +103,7 @@ class Emitter:
             if line.symbol in needed and line.symbol not in given:
                 kept.append(line)
                 needed |= line.expression.free_symbols
+        wanted = {call for line in kept for call in line.expression.atoms(sp.sin, sp.cos)}
         code: list[str] = []
         done: set[sp.Expr] = set()
         for line in reversed(kept):
@@ -108,15 +113,26 @@ class Emitter:
                 index = self.angles.setdefault(angle, len(self.angles))
                 if angle not in done:
                     done.add(angle)
-                    argument = self.printer.doprint(angle)
+                    argument = self.text(angle)
                     if not angle.is_Symbol:
-                        code.append(f"angle_{index} = {argument}")
+                        code.append(self.assign(f"angle_{index}", argument))
                         argument = f"angle_{index}"
-                    code += SINCOS.format(i=index, arg=argument).splitlines()
+                    code += self.sincos(
+                        index, argument, sp.sin(angle) in wanted, sp.cos(angle) in wanted
+                    )
                 name = "sin" if isinstance(call, sp.sin) else "cos"
                 expression = expression.xreplace({call: sp.Symbol(f"_{name}_{index}", real=True)})
-            code.append(f"{line.symbol} = {self.text(expression)}")
+            code.append(self.assign(str(line.symbol), self.text(expression)))
         return code, {s for s in needed if isinstance(s, sp.Symbol)}
+
+    def assign(self, name: str, text: str) -> str:
+        """Return the line that gives a new name to a value."""
+        return f"{name} = {text}"
+
+    def sincos(self, index: int, argument: str, sine: bool, cosine: bool) -> list[str]:
+        """Return the lines that define ``_sin_{index}`` and ``_cos_{index}``, as asked for."""
+        del sine, cosine  # the polynomials come together; what is not used is dropped later
+        return SINCOS.format(i=index, arg=argument).splitlines()
 
     def text(self, expression: sp.Expr) -> str:
         """Print one expression."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
-from undertow.mechanisms.chain import chain_energies
+from undertow.mechanism import Mechanism, Parameter
+from undertow.mechanisms.chain import two_link
 
 __all__ = ["acrobot"]
 
@@ -50,22 +50,11 @@ def acrobot(**values: float) -> Mechanism:
         Parameter("b_2", 0.1, "N m s/rad", "damping of the elbow", -1e-12, math.inf, DRAKE),
         Parameter("g", 9.81, "m/s²", "gravity", 0, math.inf, "standard"),
     )
-    m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g = (p.symbol for p in parameters)
-    elbow = Coordinate("q_2", "rad", "angle of link 2 against link 1")
-    shoulder = Coordinate("q_1", "rad", "lean of link 1 from the upright")
-    angles = [shoulder.symbol, shoulder.symbol + elbow.symbol]
-    rates = [shoulder.velocity, shoulder.velocity + elbow.velocity]
-    kinetic, potential = chain_energies(
-        angles, rates, [m_1, m_2], [J_1, J_2], [a_1, a_2], [l_1, l_1], g
-    )
-    return Mechanism.from_energies(
+    return two_link(
         "acrobot",
-        [elbow, shoulder],
-        [Input("torque", "N m", 30.0)],
-        kinetic=kinetic,
-        potential=potential,
-        dissipation=b_1 * shoulder.velocity**2 / 2 + b_2 * elbow.velocity**2 / 2,
-        parameters=parameters,
+        "elbow",
+        30.0,
+        parameters,
         start={"q_1": math.radians(3), "q_2": math.radians(-3)},
         description="two links, the motor at the elbow, balanced upright (limit chosen)",
         source=SPONG,

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
+from typing import Any, Literal
 
 import sympy as sp
 
-__all__ = ["chain_energies"]
+from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
+
+__all__ = ["chain_energies", "two_link"]
 
 
 def chain_energies(
@@ -57,3 +60,52 @@ def chain_energies(
         )
         potential += m * gravity * sum(arms[j] * sp.cos(angles[j]) for j in reach)
     return kinetic, potential
+
+
+def two_link(
+    name: str,
+    motor: Literal["shoulder", "elbow"],
+    limit: float,
+    parameters: Sequence[Parameter],
+    **rest: Any,
+) -> Mechanism:
+    """Return two links on a fixed shoulder, upright at the target, with one motor.
+
+    Link 1 leans by q_1 from the upright, link 2 by q_2 against link 1.
+
+    Parameters
+    ----------
+    name
+        Of the mechanism.
+    motor
+        The joint that is turned, whose angle is the actuated coordinate.
+    limit
+        Of its torque, N m.
+    parameters
+        ``m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g``: masses, length of link 1, joint to
+        centre of mass, inertias about the centre, damping of the joints, gravity.
+    **rest
+        Further fields of :class:`undertow.Mechanism`.
+    """
+    v = {p.name: p.symbol for p in parameters}
+    shoulder = Coordinate("q_1", "rad", "lean of link 1 from the upright")
+    elbow = Coordinate("q_2", "rad", "angle of link 2 against link 1")
+    kinetic, potential = chain_energies(
+        [shoulder.symbol, shoulder.symbol + elbow.symbol],
+        [shoulder.velocity, shoulder.velocity + elbow.velocity],
+        [v["m_1"], v["m_2"]],
+        [v["J_1"], v["J_2"]],
+        [v["a_1"], v["a_2"]],
+        [v["l_1"], v["l_1"]],
+        v["g"],
+    )
+    return Mechanism.from_energies(
+        name,
+        [shoulder, elbow] if motor == "shoulder" else [elbow, shoulder],
+        [Input("torque", "N m", limit)],
+        kinetic=kinetic,
+        potential=potential,
+        dissipation=v["b_1"] * shoulder.velocity**2 / 2 + v["b_2"] * elbow.velocity**2 / 2,
+        parameters=tuple(parameters),
+        **rest,
+    )

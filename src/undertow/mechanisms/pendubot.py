@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
-from undertow.mechanisms.chain import chain_energies
+from undertow.mechanism import Mechanism, Parameter
+from undertow.mechanisms.chain import two_link
 
 __all__ = ["pendubot"]
 
-PILCO = "Deisenroth, McHutchon, Hall, Rasmussen, PILCO code documentation v0.9, scenario Pendubot"
+PILCO = (
+    "Deisenroth, McHutchon, Hall, Rasmussen, PILCO code v0.9, dynamics_pendubot.m and its scenario"
+)
 
 
 def pendubot(**values: float) -> Mechanism:
@@ -39,31 +41,20 @@ def pendubot(**values: float) -> Mechanism:
     parameters = (
         Parameter("m_1", 0.5, "kg", "mass of link 1", 0, math.inf, PILCO),
         Parameter("m_2", 0.5, "kg", "mass of link 2", 0, math.inf, PILCO),
-        Parameter("l_1", 0.6, "m", "length of link 1", 0, math.inf, PILCO),
-        Parameter("a_1", 0.3, "m", "joint to centre of link 1", 0, math.inf, rod),
-        Parameter("a_2", 0.3, "m", "joint to centre of link 2", 0, math.inf, rod),
-        Parameter("J_1", 0.015, "kg m²", "link 1 about its centre", 0, math.inf, rod),
-        Parameter("J_2", 0.015, "kg m²", "link 2 about its centre", 0, math.inf, rod),
+        Parameter("l_1", 0.5, "m", "length of link 1", 0, math.inf, PILCO),
+        Parameter("a_1", 0.25, "m", "joint to centre of link 1", 0, math.inf, rod),
+        Parameter("a_2", 0.25, "m", "joint to centre of link 2", 0, math.inf, rod),
+        Parameter("J_1", 1 / 96, "kg m²", "link 1 about its centre", 0, math.inf, rod),
+        Parameter("J_2", 1 / 96, "kg m²", "link 2 about its centre", 0, math.inf, rod),
         Parameter("b_1", 0.01, "N m s/rad", "damping of joint 1", -1e-12, math.inf, "chosen"),
         Parameter("b_2", 0.01, "N m s/rad", "damping of joint 2", -1e-12, math.inf, "chosen"),
         Parameter("g", 9.82, "m/s²", "gravity", 0, math.inf, PILCO),
     )
-    m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g = (p.symbol for p in parameters)
-    first = Coordinate("q_1", "rad", "lean of link 1 from the upright")
-    second = Coordinate("q_2", "rad", "angle of link 2 against link 1")
-    angles = [first.symbol, first.symbol + second.symbol]
-    rates = [first.velocity, first.velocity + second.velocity]
-    kinetic, potential = chain_energies(
-        angles, rates, [m_1, m_2], [J_1, J_2], [a_1, a_2], [l_1, l_1], g
-    )
-    return Mechanism.from_energies(
+    return two_link(
         "pendubot",
-        [first, second],
-        [Input("torque", "N m", 3.5)],
-        kinetic=kinetic,
-        potential=potential,
-        dissipation=b_1 * first.velocity**2 / 2 + b_2 * second.velocity**2 / 2,
-        parameters=parameters,
+        "shoulder",
+        3.5,
+        parameters,
         start={"q_1": math.radians(5), "q_2": math.radians(-5)},
         description="two links, the motor at the shoulder, balanced upright",
         source=PILCO,

@@ -5,6 +5,10 @@ torque acts on ψ alone.  Energies:
 
     T = ½ (J_p + m_p l_p² + m_r l_r²) φ̇² + ½ J_r (φ̇ + ψ̇)²,
     V = (m_p l_p + m_r l_r) g cos φ
+
+Erratum: copies of the book's table are in circulation with J_p = 2.333e-4 kg m².  The same table
+has the inertia about the pivot, J = J_p + m_p l_p² + m_r l_r² = 4.572e-3 kg m², which gives
+2.233e-4, the value taken here; with the other, J would be 4.582e-3.
 """
 
 from __future__ import annotations

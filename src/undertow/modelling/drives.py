@@ -202,7 +202,7 @@ def _parameters(prefix: str, motor: DCMotor) -> dict[str, Parameter]:
     )
     return {
         key: Parameter(
-            f"{prefix}_{key}", value, unit, f"{what} of {prefix}", low, high, motor.source
+            f"{prefix}_{key}", value, unit, f"{what}, motor of {prefix}", low, high, motor.source
         )
         for key, value, unit, what, low, high in rows
     }

@@ -1,5 +1,24 @@
 """Rigs, plants to meet: the ideal model, a realistic bench, MuJoCo, hardware of one's own."""
 
+from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Push, Timing
 from undertow.rig.interface import Measurement, Rig
+from undertow.rig.mujoco_rig import MuJoCoRig
+from undertow.rig.presets import plausible_rig, srv02_rig
+from undertow.rig.simulated import IdealRig, RealisticRig
 
-__all__ = ["Measurement", "Rig"]
+__all__ = [
+    "Amplifier",
+    "Backlash",
+    "Bench",
+    "Encoder",
+    "Friction",
+    "IdealRig",
+    "Measurement",
+    "MuJoCoRig",
+    "Push",
+    "RealisticRig",
+    "Rig",
+    "Timing",
+    "plausible_rig",
+    "srv02_rig",
+]

@@ -1,0 +1,433 @@
+"""The controllers that Undertow is compared with, each written as well as we can.
+
+* :func:`riccati` and :meth:`Plant.regulated`: linear-quadratic feedback, clipped, evaluated
+  continuously.
+* :class:`ShootingMPC`: nonlinear model predictive control by multiple shooting in CasADi, solved
+  with exact derivatives and warm-started with the shifted plan.
+* :class:`DoMPC`: the same tasks in do-mpc, by collocation, solved by IPOPT.
+
+All of them take the equations of motion from the same mechanism.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy.linalg
+import sympy as sp
+
+import undertow as ut
+from harness import need
+from undertow.bounds.expressions import translate
+from undertow.codegen import Tape
+from undertow.mechanism import TIME, FloatArray
+from undertow.stability import linearise
+
+__all__ = ["DoMPC", "Outcome", "Plant", "ShootingMPC", "riccati"]
+
+#: Weight of ‖x‖² beside u² that stands for minimum energy: the infinite-horizon problem without
+#: any has no optimum where a mode neither grows nor decays.
+SLOW = 1e-2
+
+
+def rates(ca: Any, mechanism: ut.Mechanism, x: Any, u: Any) -> Any:
+    """Return ẋ = (q̇, M⁻¹(f + B u)) in CasADi's symbols."""
+    tape = Tape()
+    outputs = mechanism.partition(tape).accelerations(sp.Matrix(mechanism.u))
+    known: dict[sp.Basic, Any] = {TIME: 0.0, **mechanism.substitution}
+    known |= zip(mechanism.x, ca.vertsplit(x), strict=True)
+    known |= zip(mechanism.u, ca.vertsplit(u), strict=True)
+    for line in tape.live(outputs):
+        known[line.symbol] = translate(ca, line.expression, known)
+    return ca.vertcat(x[mechanism.n :], *(translate(ca, o, known) for o in outputs))
+
+
+def dynamics(ca: Any, mechanism: ut.Mechanism) -> Any:
+    """Return the CasADi function (x, u) -> ẋ."""
+    x, u = ca.SX.sym("x", 2 * mechanism.n), ca.SX.sym("u", mechanism.m)
+    return ca.Function("rates", [x, u], [rates(ca, mechanism, x, u)])
+
+
+def runge_kutta(f: Callable[[Any], Any], z: Any, h: Any) -> Any:
+    """One classical Runge-Kutta step of ż = f(z)."""
+    k1 = f(z)
+    k2 = f(z + h / 2 * k1)
+    k3 = f(z + h / 2 * k2)
+    k4 = f(z + h * k3)
+    return z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def riccati(mechanism: ut.Mechanism, weight: float) -> tuple[FloatArray, FloatArray]:
+    """Return P and K of the regulator that minimises ∫ uᵀu + weight·xᵀx dt, u = −K x."""
+    lin = linearise(mechanism)
+    B = lin.input
+    Q, R = weight * np.eye(2 * mechanism.n), np.eye(mechanism.m)
+    P = np.asarray(scipy.linalg.solve_continuous_are(lin.A, B, Q, R), dtype=float)
+    return P, B.T @ P
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A closed-loop run until ‖x‖ ≤ ν: energy ∫uᵀu dt, time, and where it stood at the end."""
+
+    energy: float
+    time: float
+    radius: float
+    reached: bool
+
+
+Control = Callable[[float, FloatArray], FloatArray]
+
+#: ‖x‖ from which on a run is given up.
+LOST = 1e3
+
+
+class Plant:
+    """The truth: Runge-Kutta steps of 2 ms, until the terminal set or the horizon."""
+
+    STEP = 0.002
+
+    def __init__(self, mechanism: ut.Mechanism, radius: float, horizon: float) -> None:
+        self.ca = need("casadi", "compare")
+        self.mechanism, self.radius, self.horizon = mechanism, radius, horizon
+        self.limits = mechanism.input_limits
+        ca, n, m = self.ca, 2 * mechanism.n, mechanism.m
+        self._rates = dynamics(ca, mechanism)
+        x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+        held = runge_kutta(lambda y: self._rates(y, u), x, self.STEP)
+        self._held = ca.Function("held", [x, u], [held])
+        z, K = ca.SX.sym("z", n + 1), ca.SX.sym("K", m, n)
+
+        def regulated(y: Any) -> Any:
+            u = ca.fmax(-self.limits, ca.fmin(self.limits, -K @ y[:n]))
+            return ca.vertcat(self._rates(y[:n], u), ca.sumsqr(u))
+
+        step = ca.Function("regulated", [z, K], [runge_kutta(regulated, z, self.STEP)])
+        self._regulated = step.mapaccum(500)
+
+    def held(self, x0: FloatArray, control: Control) -> Outcome:
+        """Apply ``control(t, x)``, held for each step."""
+        x, energy, radius = np.array(x0), 0.0, math.inf
+        steps = round(self.horizon / self.STEP)
+        for k in range(steps):
+            u = np.clip(control(k * self.STEP, x), -self.limits, self.limits)
+            x = np.array(self._held(x, u)).ravel()
+            energy += float(u @ u) * self.STEP
+            radius = float(np.linalg.norm(x))
+            if radius <= self.radius or not radius < LOST:
+                break
+        return Outcome(energy, (k + 1) * self.STEP, radius, radius <= self.radius)
+
+    def regulated(self, x0: FloatArray, K: FloatArray) -> Outcome:
+        """Apply u = −K x, clipped, at every stage of every step."""
+        n, state, t, radius = 2 * self.mechanism.n, np.append(x0, 0.0), 0.0, math.inf
+        while t < self.horizon - 1e-9:
+            path = np.array(self._regulated(state, np.tile(K, 500))).T
+            distance = np.linalg.norm(path[:, :n], axis=1)
+            inside = np.flatnonzero(distance <= self.radius)
+            last = int(inside[0]) if inside.size else len(path) - 1
+            t, state, radius = t + (last + 1) * self.STEP, path[last], float(distance[last])
+            if inside.size or not radius < LOST:
+                break
+        return Outcome(float(state[n]), t, radius, radius <= self.radius)
+
+
+class ShootingMPC:
+    """Multiple shooting with inputs held on the intervals of a grid; re-planned every 0.1 s.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's belief.
+    goal
+        ``"energy"``: ∫ uᵀu dt + xᵀPx at the end of 5 s, P from the Riccati equation.
+        ``"time"``: the least T with ‖x(T)‖ ≤ ν/2, in 30 equal intervals.
+    radius
+        ν of the terminal set.
+    tolerance
+        IPOPT's.
+    """
+
+    PERIOD = 0.1
+    #: Energy: short intervals first, because the next 0.1 s are what is applied.
+    GRID = np.repeat([0.02, 0.05, 0.1, 0.2, 0.3], [5, 8, 10, 10, 5])
+    EQUAL = np.full(30, 1 / 30)
+
+    def __init__(
+        self,
+        mechanism: ut.Mechanism,
+        goal: Literal["energy", "time"],
+        radius: float = 0.01,
+        tolerance: float = 1e-4,
+    ) -> None:
+        self.ca = need("casadi", "compare")
+        self.mechanism, self.goal, self.radius = mechanism, goal, radius
+        self.limits = mechanism.input_limits
+        self.P, self.K = riccati(mechanism, SLOW if goal == "energy" else 1.0)
+        self.grid = self.GRID if goal == "energy" else self.EQUAL
+        self.seconds: list[float] = []
+        self.iterations: list[int] = []
+        self.failures = 0
+        self._build(tolerance)
+        self.forget()
+
+    def _build(self, tolerance: float) -> None:
+        ca, n, m = self.ca, 2 * self.mechanism.n, self.mechanism.m
+        f = dynamics(ca, self.mechanism)
+        count, timed = len(self.grid), self.goal == "time"
+        width = n + timed  # the final time is one more state, which does not change
+        z, u, h = ca.SX.sym("z", width), ca.SX.sym("u", m), ca.SX.sym("h")
+        span = h * z[n] if timed else h
+        end = z[:n]
+        for _ in range(2):
+            end = runge_kutta(lambda y: f(y, u), end, span / 2)
+        move = ca.Function("move", [z, u, h], [ca.vertcat(end, z[n:])])
+        Z = [ca.MX.sym(f"z{k}", width) for k in range(count + 1)]
+        U = [ca.MX.sym(f"u{k}", m) for k in range(count)]
+        start, haste = ca.MX.sym("start", n), ca.MX.sym("haste")
+        constraints: list[Any] = []
+        equal: list[bool] = []
+        effort: Any = 0
+        for k, length in enumerate(self.grid):
+            constraints.append(Z[k + 1] - move(Z[k], U[k], length))
+            equal += [True] * width
+            effort += length * ca.sumsqr(U[k] / (self.limits if timed else 1.0))
+            if k == 0:
+                constraints.append(Z[0][:n] - start)
+                equal += [True] * n
+        if timed:
+            constraints.append(1 - ca.sumsqr(Z[-1][:n]) / (0.5 * self.radius) ** 2)
+            equal.append(False)
+            cost = haste * Z[-1][n] + (1 - haste) * effort
+        else:
+            cost = effort + ca.bilin(self.P, Z[-1], Z[-1])
+        self._lower = np.zeros(len(equal))
+        self._upper = np.where(equal, 0.0, np.inf)
+        unknowns = ca.vertcat(*(part for pair in zip(Z, U, strict=False) for part in pair), Z[-1])
+        options = {
+            "print_time": False,
+            "error_on_fail": False,
+            "show_eval_warnings": False,
+            "expand": True,
+            "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 100},
+        }
+        programme = {"x": unknowns, "f": cost, "g": ca.vertcat(*constraints),
+                     "p": ca.vertcat(start, haste)}  # fmt: skip
+        self._solver = ca.nlpsol("mpc", "ipopt", programme, options)
+
+    # -- a plan: states (N+1, 2n) and inputs (N, m) on the grid, and its length ------------------
+
+    def forget(self) -> None:
+        """Drop the plan: the next one is found from cold."""
+        self._plan: tuple[FloatArray, FloatArray, float] | None = None
+        self._since = 0.0
+
+    def _solve(
+        self, x: FloatArray, guess: tuple[FloatArray, FloatArray, float], free: bool
+    ) -> tuple[FloatArray, FloatArray, float] | None:
+        states, inputs, T = guess
+        n, m, count = states.shape[1], inputs.shape[1], len(self.grid)
+        timed = self.goal == "time"
+        states = np.column_stack([states, np.full(count + 1, T)]) if timed else states
+        low, high = (0.05 * T, 3.0 * T) if free else (T, T)
+        infinite = np.full(n, np.inf)
+        box = np.concatenate([infinite, [high]]) if timed else infinite
+        floor = np.concatenate([-infinite, [low]]) if timed else -infinite
+        rows = np.hstack([states[:-1], inputs]).ravel()
+        repeated = np.tile(np.concatenate([box, self.limits]), count)
+        lowest = np.tile(np.concatenate([floor, -self.limits]), count)
+        found = self._solver(
+            x0=np.concatenate([rows, states[-1]]),
+            p=np.concatenate([x, [1.0 if free else 0.0]]),
+            lbx=np.concatenate([lowest, floor]),
+            ubx=np.concatenate([repeated, box]),
+            lbg=self._lower,
+            ubg=self._upper,
+        )
+        statistics = self._solver.stats()
+        self.iterations[-1] += int(statistics["iter_count"])
+        self.cost = float(found["f"])
+        if not statistics["success"]:
+            return None
+        values = np.array(found["x"]).ravel()
+        width = n + timed
+        body = values[:-width].reshape(count, width + m)
+        ends = np.vstack([body[:, :width], values[-width:]])
+        return ends[:, :n], body[:, width:], float(ends[-1, n]) if timed else T
+
+    def _cold(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
+        count = len(self.grid)
+        fade = 1 - np.concatenate([[0.0], np.cumsum(self.grid)]) / self.grid.sum()
+        inputs = np.zeros((count, self.mechanism.m))
+        if self.goal == "energy":
+            return self._solve(x, (x * fade[:, None] ** 4, inputs, 0.0), True)
+        for T in (0.5, 1.0, 2.0, 4.0):  # least effort at a fixed time first, then the time is free
+            slow = self._solve(x, (x * fade[:, None], inputs, T), False)
+            quick = None if slow is None else self._solve(x, slow, True)
+            if quick is not None:
+                return quick
+        return None
+
+    def plan(self, t: float, x: FloatArray) -> bool:
+        """Plan from x, warm-started with what is left of the last plan.
+
+        False: none found; the last plan stays in use while it covers the next period.
+        """
+        began = time.perf_counter()
+        self.iterations.append(0)
+        found = None
+        if self._plan is not None:
+            guess = self._shifted(t - self._since)
+            found = self._solve(x, guess, True)
+            if found is None and self.goal == "time":  # with a little more time, and then less
+                slow = self._solve(x, (*guess[:2], 1.1 * guess[2]), False)
+                found = None if slow is None else self._solve(x, slow, True)
+        if found is None and self._left(t) < self.PERIOD:
+            found = self._cold(x)
+        self.seconds.append(time.perf_counter() - began)
+        if found is None:
+            self.failures += 1
+            return False
+        self._plan, self._since = found, t
+        return True
+
+    def _times(self, T: float) -> FloatArray:
+        nodes = np.concatenate([[0.0], np.cumsum(self.grid)])
+        return nodes * T if self.goal == "time" else nodes
+
+    def _shifted(self, by: float) -> tuple[FloatArray, FloatArray, float]:
+        assert self._plan is not None
+        states, inputs, T = self._plan
+        nodes, rest = self._times(T), max(T - by, 0.02)
+        later = self._times(rest) + by
+        moved = np.column_stack([np.interp(later, nodes, column) for column in states.T])
+        middles = (later[:-1] + later[1:]) / 2
+        index = np.clip(np.searchsorted(nodes, middles, side="right") - 1, 0, len(inputs) - 1)
+        return moved, inputs[index], rest
+
+    def __call__(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at t: planned afresh every 0.1 s; past its end, linear feedback.
+
+        A plan that has less than a fifth of a period to go is carried out.
+        """
+        if self._due(t) and not 0.0 < self._left(t) < self.PERIOD / 5:
+            self.plan(t, x)
+        if self._plan is not None:
+            _, inputs, T = self._plan
+            nodes = self._times(T)
+            since = t - self._since
+            if since < nodes[-1] - 1e-9:
+                # The mean over one step of the plant: switches fall between its steps.
+                area = np.vstack([np.zeros(inputs.shape[1]), np.cumsum(
+                    np.diff(nodes)[:, None] * inputs, axis=0)])  # fmt: skip
+                ends = [since, since + Plant.STEP]
+                spent = np.stack([np.interp(ends, nodes, column) for column in area.T])
+                return np.asarray(np.diff(spent, axis=1)[:, 0] / Plant.STEP)
+        return np.asarray(-self.K @ x)
+
+    def _left(self, t: float) -> float:
+        """Time until the end of the plan, s; 0 without one."""
+        return 0.0 if self._plan is None else self._since + self._times(self._plan[2])[-1] - t
+
+    def _due(self, t: float) -> bool:
+        return abs(t / self.PERIOD - round(t / self.PERIOD)) < 1e-6
+
+
+class DoMPC:
+    """The same tasks in do-mpc: N intervals, Radau collocation, IPOPT.
+
+    ``"energy"``: N = 25 intervals of 0.1 s, ∫ uᵀu dt + xᵀPx at their end.
+    ``"time"``: N = 25 intervals whose lengths are inputs too; least sum, in a box inside the
+    terminal set at the end.
+    """
+
+    INTERVALS, PERIOD = 25, 0.1
+
+    def __init__(
+        self,
+        mechanism: ut.Mechanism,
+        goal: Literal["energy", "time"],
+        radius: float = 0.01,
+        tolerance: float = 1e-4,
+    ) -> None:
+        self.ca, do_mpc = need("casadi", "compare"), need("do_mpc", "compare")
+        if hasattr(self.ca.GlobalOptions, "setNumpyMode"):
+            self.ca.GlobalOptions.setNumpyMode(-1)  # what do-mpc was written for
+        self.mechanism, self.goal = mechanism, goal
+        self.seconds: list[float] = []
+        self.iterations: list[int] = []
+        self.failures = 0
+        ca, n, m, timed = self.ca, 2 * mechanism.n, mechanism.m, goal == "time"
+        model = do_mpc.model.Model("continuous", "SX")
+        x, u = model.set_variable("_x", "x", (n, 1)), model.set_variable("_u", "u", (m, 1))
+        pace = model.set_variable("_u", "pace") if timed else 1.0
+        model.set_rhs("x", pace * rates(ca, mechanism, x, u))
+        model.setup()
+        mpc = do_mpc.controller.MPC(model)
+        mpc.settings.n_horizon = self.INTERVALS
+        mpc.settings.t_step = 1 / self.INTERVALS if timed else self.PERIOD
+        mpc.settings.store_full_solution = False
+        mpc.settings.collocation_deg = 3
+        mpc.settings.supress_ipopt_output()
+        mpc.settings.nlpsol_opts.update({"ipopt.tol": tolerance, "ipopt.max_iter": 200})
+        limits = mechanism.input_limits[:, None]
+        mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = -limits, limits
+        if timed:
+            mpc.set_objective(lterm=model.u["pace"] / self.INTERVALS, mterm=ca.DM(0))
+            mpc.bounds["lower", "_u", "pace"], mpc.bounds["upper", "_u", "pace"] = 0.02, 10.0
+            inside = np.full((n, 1), 0.99 * radius / math.sqrt(n))
+            mpc.terminal_bounds["lower", "x"] = -inside
+            mpc.terminal_bounds["upper", "x"] = inside
+            mpc.set_rterm(u=0.0, pace=0.0)
+        else:
+            P, _ = riccati(mechanism, SLOW)
+            X, U = model.x["x"], model.u["u"]
+            mpc.set_objective(lterm=self.PERIOD * ca.sumsqr(U), mterm=ca.bilin(P, X, X))
+            mpc.set_rterm(u=0.0)
+        mpc.setup()
+        self.mpc = mpc
+        self.forget()
+
+    def forget(self) -> None:
+        """Start from cold: the present state, repeated, and no input."""
+        self.mpc.reset_history()
+        self._cold = True
+
+    @property
+    def cost(self) -> float:
+        """The objective of the last plan."""
+        plan, count = self.mpc.opt_x_num, self.INTERVALS
+        inputs = np.array([np.array(plan["_u", k, 0]).ravel() for k in range(count)])
+        if self.goal == "time":
+            return float(inputs[:, -1].mean())
+        end = np.array(plan["_x", count, 0, -1]).ravel()
+        P, _ = riccati(self.mechanism, SLOW)
+        return float(self.PERIOD * np.sum(inputs**2) + end @ P @ end)
+
+    def plan(self, _t: float, x: FloatArray) -> bool:
+        """Plan from x; False when IPOPT failed."""
+        began = time.perf_counter()
+        state = np.asarray(x)[:, None]
+        if self._cold:
+            self.mpc.x0 = state
+            if self.goal == "time":
+                self.mpc.u0["pace"] = 1.0
+            self.mpc.set_initial_guess()
+            self._cold = False
+        self.u = np.asarray(self.mpc.make_step(state)).ravel()[: self.mechanism.m]
+        self.seconds.append(time.perf_counter() - began)
+        self.iterations.append(int(self.mpc.solver_stats["iter_count"]))
+        success = bool(self.mpc.solver_stats["success"])
+        self.failures += not success
+        return success
+
+    def __call__(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at t, planned afresh every 0.1 s and held."""
+        if abs(t / self.PERIOD - round(t / self.PERIOD)) < 1e-6:
+            self.plan(t, x)
+        return np.asarray(self.u)

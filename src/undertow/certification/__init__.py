@@ -1,0 +1,31 @@
+"""What `undertow certify` and `undertow verify` do: claims composed, shown, drawn, written."""
+
+from undertow.certification.figure import region_figure
+from undertow.certification.report import (
+    appendix_report,
+    certificate_files,
+    run_report,
+    subject_report,
+    verification_report,
+)
+from undertow.certification.subjects import (
+    Certified,
+    certify_appendix,
+    certify_run,
+    certify_surface,
+    mechanism_from_file,
+)
+
+__all__ = [
+    "Certified",
+    "appendix_report",
+    "certificate_files",
+    "certify_appendix",
+    "certify_run",
+    "certify_surface",
+    "mechanism_from_file",
+    "region_figure",
+    "run_report",
+    "subject_report",
+    "verification_report",
+]

@@ -1,0 +1,185 @@
+"""The proved region on the surface inside the simulated one, with motions."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from undertow.certify.motion import SurfaceMotion
+from undertow.certify.region_search import ProvedRegion
+from undertow.mechanism import FloatArray
+from undertow.plot import COLOURS, display, style
+
+__all__ = ["region_figure", "simulated"]
+
+#: Points a side of the picture of the simulated region.
+GRID = 141
+
+
+def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> FloatArray:
+    """Whether motions on the surface from points (B, N) enter the proved set, by simulation.
+
+    A motion that has not within ``limit`` seconds, or meets the singularity, does not.
+    """
+    motion, V = region.motion, region.function
+    home = np.zeros(len(y), dtype=bool)
+    side = np.sign(float(motion.determinant(np.zeros(motion.size))))
+    alive = np.arange(len(y))
+    state = y.copy()
+    step = 0.01 / max(1.0, float(np.abs(np.linalg.eigvals(motion.jacobian)).max()) / 20.0)
+    with np.errstate(all="ignore"):
+        for k in range(int(limit / step)):
+            if k % 4 == 0:
+                inside = V(state) < 1.0
+                home[alive[inside]] = True
+                sound = side * motion.determinant(state) > 0
+                sound &= np.isfinite(state).all(axis=1) & (np.abs(state[:, 0]) < 1e3)
+                keep = ~inside & sound
+                alive, state = alive[keep], state[keep]
+                if not len(alive):
+                    break
+            # Shorter steps near the singularity; motions need not keep the same time.
+            ratio = motion.determinant(state) / motion.determinant(np.zeros(motion.size))
+            state = _step(motion, state, step * np.clip(ratio, 0.05, 1.0)[:, None])
+    return home
+
+
+def _step(motion: object, y: FloatArray, h: float | FloatArray) -> FloatArray:
+    assert isinstance(motion, SurfaceMotion)
+    a = motion(y)
+    b = motion(y + 0.5 * h * a)
+    c = motion(y + 0.5 * h * b)
+    d = motion(y + h * c)
+    return np.asarray(y + h / 6 * (a + 2 * b + 2 * c + d))
+
+
+def region_figure(region: ProvedRegion, title: str) -> Figure:
+    """Draw two slices through the proved region, the simulated one, and motions.
+
+    Left: the first unactuated coordinate and its velocity; right: the same coordinate and the
+    slow coordinate w = q_a + λ_a⁻¹ λ_u q_u; all others zero.  The motions start on the edge of
+    the proved set in the slice, leave the slice, and are seen from the side.
+
+    Parameters
+    ----------
+    region
+        Proved, on the surface of a mechanism.
+    title
+        Of the figure.
+    """
+    motion = region.motion
+    assert isinstance(motion, SurfaceMotion)
+    free = motion.mechanism.n - motion.mechanism.m
+    with style():
+        figure = Figure(figsize=(8.6, 4.3), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        _slice(left, region, free)
+        _slice(right, region, 2 * free)
+        handles = [
+            Patch(color=to_rgba(COLOURS["sky"], 0.28), label="simulated: enters the proved set"),
+            Patch(color=to_rgba(COLOURS["blue"], 0.55), label="proved region of attraction"),
+            Line2D([], [], color=COLOURS["vermilion"], lw=0.9, label="motions on the surface"),
+            Line2D([], [], color=COLOURS["black"], lw=1, ls=(0, (4, 2)), label="law singular (37)"),
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+        figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _slice(axes: Axes, region: ProvedRegion, other: int) -> None:
+    """Draw the plane of coordinates 0 and ``other``."""
+    motion, V = region.motion, region.function
+    assert isinstance(motion, SurfaceMotion)
+    wide, high = _extents(region, other)
+    a, b = np.linspace(-wide, wide, GRID), np.linspace(-high, high, GRID)
+    points = np.zeros((GRID, GRID, motion.size))
+    points[..., 0], points[..., other] = np.meshgrid(a, b)
+    with np.errstate(all="ignore"):
+        proved = V(points)
+    home = simulated(region, points.reshape(-1, motion.size)).reshape(GRID, GRID)
+    (fa, ua), (fb, ub) = _units(motion, 0), _units(motion, other)
+    axes.contourf(
+        fa * a, fb * b, home.astype(float), [0.5, 1.5], colors=[to_rgba(COLOURS["sky"], 0.28)]
+    )
+    inside = np.where(np.isfinite(proved), proved, 2.0)
+    axes.contourf(fa * a, fb * b, inside, [-1.0, 1.0], colors=[to_rgba(COLOURS["blue"], 0.55)])
+    axes.contour(fa * a, fb * b, inside, [1.0], colors=COLOURS["blue"], linewidths=1.2)
+    edge = _edge(region, other)
+    path = [edge]
+    for _ in range(4000):
+        path.append(_step(motion, path[-1], 0.005))
+    lines = np.array(path)
+    for k in range(lines.shape[1]):
+        axes.plot(fa * lines[:, k, 0], fb * lines[:, k, other], color=COLOURS["vermilion"], lw=0.8)
+    axes.plot(fa * edge[:, 0], fb * edge[:, other], ".", color=COLOURS["vermilion"], ms=4, zorder=3)
+    axes.plot(0, 0, "+", color=COLOURS["black"], ms=7, zorder=4)
+    side = np.sign(float(motion.determinant(np.zeros(motion.size))))
+    ratio = side * motion.determinant(points)
+    if (ratio <= 0).any():
+        axes.contour(
+            fa * a, fb * b, ratio, [0.0], colors=COLOURS["black"], linewidths=1.0, linestyles="--"
+        )
+    axes.set_xlim(-fa * wide, fa * wide)
+    axes.set_ylim(-fb * high, fb * high)
+    axes.set_xlabel(ua)
+    axes.set_ylabel(ub)
+
+
+def _extents(region: ProvedRegion, other: int) -> tuple[float, float]:
+    """Half-sides of the picture: what is proved, with room around."""
+    edge = _edge(region, other, 64)
+    reach = np.abs(edge).max(axis=0)
+    motion = region.motion
+    far = np.linspace(0.0, 4.0 * reach[0], 2001)
+    points = np.zeros((len(far), motion.size))
+    points[:, 0] = far
+    side = np.sign(float(motion.determinant(np.zeros(motion.size))))
+    singular = far[side * motion.determinant(points) <= 0]
+    wide = 1.15 * singular[0] if len(singular) else 2.5 * reach[0]
+    return max(float(wide), 1.2 * float(reach[0])), 3.2 * float(reach[other])
+
+
+def _edge(region: ProvedRegion, other: int, count: int = 14) -> FloatArray:
+    """Points just inside V = 1 in the slice, in directions spread evenly, (count, N)."""
+    motion, V = region.motion, region.function
+    size = np.array([_first(region, 0), _first(region, other)])
+    angles = 2 * np.pi * (np.arange(count) + 0.5) / count
+    rays = np.zeros((count, motion.size))
+    rays[:, 0], rays[:, other] = size[0] * np.cos(angles), size[1] * np.sin(angles)
+    parts = np.linspace(0.0, 3.0, 1201)
+    with np.errstate(all="ignore"):
+        above = ~(V(parts[:, None, None] * rays) < 1.0)
+    first = np.maximum(above.argmax(axis=0) - 1, 0)
+    return np.asarray(0.999 * parts[first][:, None] * rays)
+
+
+def _first(region: ProvedRegion, axis: int) -> float:
+    """Where the proved set ends along an axis."""
+    from undertow.certify.lyapunov import extent
+
+    way = np.zeros(region.motion.size)
+    way[axis] = 1.0
+    found = extent(region.function, way)
+    return found if np.isfinite(found) else 1.0
+
+
+def _units(motion: SurfaceMotion, index: int) -> tuple[float, str]:
+    """Return the factor to display units and the label of a coordinate of y."""
+    mechanism = motion.mechanism
+    m, free = mechanism.m, mechanism.n - mechanism.m
+    names = {"phi": "φ", "theta": "θ"}
+    if index < 2 * free:
+        coordinate = mechanism.coordinates[m + index % free]
+        factor, unit = display(coordinate.unit, index >= free)
+        stem = names.get(coordinate.name, coordinate.name)
+        if index >= free:
+            stem = f"{stem}\N{COMBINING DOT ABOVE}" if len(stem) == 1 else f"d{stem}/dt"
+        return factor, f"{stem} ({unit})"
+    coordinate = mechanism.coordinates[index - 2 * free]
+    factor, unit = display(coordinate.unit)
+    stem = names.get(coordinate.name, coordinate.name)
+    return factor, f"w = {stem} + λₐ⁻¹λᵤ q ({unit})"

@@ -1,0 +1,401 @@
+"""Terminal sets of the whole loop: invariant, unsaturated, every motion from them converges.
+
+With y = (q, p) = T x the set is {W ≤ 1}, W = max(‖x‖, |s_i|/σ_i): an ellipsoid in the slow
+coordinates and a thin box in s.  W decreases strictly, but at 0, if for all 0 < ‖x‖ ≤ 1:
+
+1. d/dt ‖x‖² < 0 for all |s_i| ≤ σ_i ‖x‖ (there ‖x‖ is the larger part of W);
+2. |u_i| ≤ u_max for |s_i| ≤ σ_i, so the clip is not met and ṡ_i = −k_i sat(s_i/ε_i) + D_i, with
+   D = 0 where the law knows the plant; then |s_i| decreases by itself;
+3. else |D_i| < k_i sat(σ_i ‖x‖/ε_i) − … for |s_i| = σ_i r ≥ σ_i ‖x‖.
+
+A continuous positive definite W on a compact set that decreases strictly along every motion but
+0 proves convergence (a limit set would be invariant with W constant).  The set is convex and the
+coordinates exist all over it, so it lies in the non-singular set.
+
+The check is branch and bound over x in outward-rounded arithmetic with mean-value forms; near 0
+all three conditions are homogeneous and are decided on matrices (exactly, by rationals).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from undertow.certify.batch import Interval
+from undertow.certify.loop import LoopMotion
+from undertow.certify.tube import matmul
+from undertow.certify.verdict import Verdict
+from undertow.errors import InvalidInputError
+
+__all__ = ["TerminalSet", "exact_inverse", "verify_terminal"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalSet:
+    """{‖T⁻¹(q, p)‖ ≤ 1, |s_i| ≤ σ_i}.
+
+    Parameters
+    ----------
+    scale
+        T, (2n − m, 2n − m), invertible.
+    widths
+        σ, (m,), > 0, in units of s.
+
+    Raises
+    ------
+    InvalidInputError
+        For a singular or not finite T, or widths that are not positive.
+    """
+
+    scale: FloatArray
+    widths: FloatArray
+
+    def __init__(self, scale: ArrayLike, widths: ArrayLike) -> None:
+        T = np.array(scale, dtype=float)
+        sigma = np.atleast_1d(np.array(widths, dtype=float))
+        if T.ndim != 2 or T.shape[0] != T.shape[1] or not np.isfinite(T).all():
+            raise InvalidInputError(
+                "scale of a terminal set", value=T.shape, limit="square, finite"
+            )
+        if not (np.isfinite(sigma).all() and (sigma > 0).all()):
+            raise InvalidInputError(
+                "widths of a terminal set", value=widths, limit="finite and > 0"
+            )
+        if abs(np.linalg.det(T)) < 1e-300:
+            raise InvalidInputError("scale of a terminal set", value="singular", limit="invertible")
+        object.__setattr__(self, "scale", T)
+        object.__setattr__(self, "widths", sigma)
+
+    def value(self, z: ArrayLike) -> FloatArray:
+        """Return W at points z = (q, p, s), (…, N), in float64: ≤ 1 inside."""
+        points = np.asarray(z, dtype=float)
+        size = len(self.scale)
+        x = points[..., :size] @ np.linalg.inv(self.scale).T
+        part = np.abs(points[..., size:]) / self.widths
+        return np.asarray(np.maximum(np.linalg.norm(x, axis=-1), part.max(axis=-1)))
+
+    def times(self, factor: float) -> Self:
+        """Return the set grown by a factor in all coordinates."""
+        return type(self)(self.scale * factor, self.widths * factor)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers."""
+        return {"scale": self.scale.tolist(), "widths": self.widths.tolist()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Rebuild from :meth:`to_dict`."""
+        return cls(data["scale"], data["widths"])
+
+
+def exact_inverse(T: FloatArray) -> Interval:
+    """Enclose T⁻¹ of a float matrix by exact elimination over the rationals.
+
+    Raises
+    ------
+    InvalidInputError
+        For a singular matrix.
+    """
+    size = len(T)
+    rows = [
+        [Fraction(float(v)) for v in row] + [Fraction(int(i == j)) for j in range(size)]
+        for i, row in enumerate(T)
+    ]
+    for k in range(size):
+        pivot = max(range(k, size), key=lambda i: abs(rows[i][k]))
+        if rows[pivot][k] == 0:
+            raise InvalidInputError("matrix", value="singular", limit="invertible")
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [v / rows[k][k] for v in rows[k]]
+        for i in range(size):
+            if i != k and rows[i][k]:
+                rows[i] = [a - rows[i][k] * b for a, b in zip(rows[i], rows[k], strict=True)]
+    near = np.array([[float(v) for v in row[size:]] for row in rows])
+    return Interval(np.nextafter(near, -np.inf), np.nextafter(near, np.inf))
+
+
+def _positive_definite(rows: list[list[Fraction]]) -> bool:
+    """Decide by exact elimination whether a symmetric rational matrix is positive definite."""
+    a = [list(row) for row in rows]
+    for k in range(len(a)):
+        if a[k][k] <= 0:
+            return False
+        for i in range(k + 1, len(a)):
+            factor = a[i][k] / a[k][k]
+            a[i] = [x - factor * y for x, y in zip(a[i], a[k], strict=True)]
+    return True
+
+
+def _negative_by(matrix: Interval, slack: float) -> bool:
+    """Whether xᵀMx ≤ −slack ‖x‖² for every M in an interval matrix (N, N)."""
+    if not (np.isfinite(matrix.lo).all() and np.isfinite(matrix.hi).all()):
+        return False
+    middle = 0.5 * (matrix.lo + matrix.hi)
+    middle = 0.5 * (middle + middle.T)
+    symmetric = 0.5 * (matrix + Interval(matrix.lo.T, matrix.hi.T))
+    away = symmetric - Interval(middle)
+    # ‖N‖₂ ≤ ‖N‖_∞ for symmetric N.
+    radius = np.maximum(np.abs(away.lo), np.abs(away.hi))
+    worst = max(math.fsum(row) for row in radius) * (1 + 1e-12)
+    shift = Fraction(worst) + Fraction(slack)
+    size = len(middle)
+    return _positive_definite(
+        [
+            [-Fraction(middle[i, j]) - (shift if i == j else 0) for j in range(size)]
+            for i in range(size)
+        ]
+    )
+
+
+class _Enclosures:
+    """The three conditions over boxes of x."""
+
+    def __init__(self, motion: LoopMotion, terminal: TerminalSet) -> None:
+        self.motion, self.terminal = motion, terminal
+        self.m, self.slow = motion.mechanism.m, motion.slow
+        self.T = Interval(terminal.scale)
+        self.inverse = exact_inverse(terminal.scale)
+        self.limit = motion.mechanism.input_limits
+        eta, layer = motion.gains
+        sigma = terminal.widths
+        # k sat(σ r/ε) ≥ r · stiff for r ≤ 1, by concavity.
+        self.stiff = Interval(eta) * (Interval(sigma) / Interval(layer)).min(1.0)
+
+    def z(self, x: Interval, width: float) -> Interval:
+        """Boxes of z that hold T x and |s| ≤ σ width."""
+        y = matmul(self.T[:, :, None], x[:, None])[:, 0]
+        s = np.repeat(width * self.terminal.widths[:, None], x.lo.shape[1], axis=1)
+        return Interval(np.concatenate([y.lo, -s]), np.concatenate([y.hi, s]))
+
+    def slopes(self, x: Interval) -> tuple[Interval, ...]:
+        """Slopes over {x in the box, |s| ≤ σ}, in (x, s, parameters), and rates."""
+        rates = self.motion.over(self.z(x, 1.0))
+        turn = self.T[:, :, None]
+        inverse = self.inverse[:, :, None]
+        slow, end = self.slow, self.motion.size
+
+        def in_x(slope: Interval) -> Interval:
+            """Columns (y, s, p) to (x, σ-scaled s, ρ-scaled p)."""
+            first = matmul(slope[:, :slow], turn)
+            second = slope[:, slow:end] * Interval(self.terminal.widths)[None, :, None]
+            third = slope[:, end:] * Interval(self.motion.radii)[None, :, None]
+            return Interval(
+                np.concatenate([first.lo, second.lo, third.lo], axis=1),
+                np.concatenate([first.hi, second.hi, third.hi], axis=1),
+            )
+
+        x_slope = in_x(matmul(inverse, rates.slope[:slow]))
+        x_rate = matmul(inverse, rates.rate[:slow, None])[:, 0]
+        return x_rate, x_slope, rates.demand, in_x(rates.demand_slope), in_x(rates.push_slope)
+
+    def over(self, low: FloatArray, high: FloatArray) -> tuple[Any, ...]:
+        """Return (‖x‖² lower bound, decided, V̇ upper bound, |u| excess, split weights)."""
+        middle = 0.5 * (low + high)
+        x, centre = Interval(low, high), Interval(middle)
+        away = x - centre
+        square = _total(x**2)
+        radius = np.sqrt(np.minimum(np.nextafter(_total(x**2).hi, np.inf), 1.0)) * (1 + 1e-15)
+        floor = np.maximum(np.sqrt(np.maximum(square.lo, 0.0)) * (1 - 1e-15), 0.0)
+        rate, slope, u, u_slope, push = self.slopes(x)
+        here = self.motion.over(self.z(centre, 0.0), middle=True)
+        rate_c = matmul(self.inverse[:, :, None], here.rate[: self.slow, None])[:, 0]
+        slow, m = self.slow, self.m
+        unit = Interval(-radius, radius)
+        one = Interval(-1.0, 1.0)
+        k = len(self.motion.radii)
+        # Rates over the box by the mean value form, then V̇/2 = x·ẋ by another.
+        moved = [away[i] for i in range(slow)] + [unit] * m + [one] * k
+        better = rate_c
+        for j, part in enumerate(moved):
+            better = better + slope[:, j] * part
+        rate = rate.intersect(better)
+        natural = _total_of(x[i] * rate[i] for i in range(slow))
+        mean = _total_of(centre[i] * rate_c[i] for i in range(slow))
+        weights = []
+        for j in range(slow):
+            gradient = rate[j] + _total_of(x[i] * slope[i, j] for i in range(slow))
+            part = gradient * away[j]
+            mean = mean + part
+            weights.append(np.broadcast_to(part.hi - part.lo, radius.shape))
+        for j in range(slow, slow + m + k):
+            mean = mean + _total_of(x[i] * slope[i, j] for i in range(slow)) * moved[j]
+        decrease = natural.intersect(mean).hi
+        demand = here.demand
+        for j, part in enumerate(moved):
+            demand = demand + u_slope[:, j] * (one if slow <= j < slow + m else part)
+        demand = demand.intersect(u)
+        over = np.maximum(np.abs(demand.lo), np.abs(demand.hi)) - self.limit[:, None]
+        return (
+            square.lo,
+            decrease,
+            over.max(axis=0),
+            self._spare(push, here, moved, floor),
+            np.array(weights),
+        )
+
+    def _spare(
+        self, push: Interval, here: Any, moved: list[Interval], floor: FloatArray
+    ) -> FloatArray:
+        """Lower bound of (stiff − Σ|∂D/∂s|σ)‖x‖ − |D(x, 0)|; ∞ where D is 0."""
+        if not len(self.motion.radii):
+            return np.full(floor.shape, np.inf)
+        slow, m = self.slow, self.m
+        value = here.push
+        for j, part in enumerate(moved):
+            if not slow <= j < slow + m:
+                value = value + push[:, j] * part
+        rest = self.stiff[:, None]
+        for j in range(slow, slow + m):
+            rest = rest - abs(push[:, j])
+        spare = rest * Interval(floor) - abs(value)
+        return np.where(rest.lo > 0, spare.lo, -np.inf).min(axis=0)
+
+    def core(self, half: float) -> bool:
+        """Whether all conditions but 2 hold in the cube |x_i| ≤ half, by homogeneity."""
+        ones = np.full((self.slow, 1), half)
+        _, slope, _, _, push = self.slopes(Interval(-ones, ones))
+        slow, m = self.slow, self.m
+        # d/dt ½‖x‖² ≤ xᵀMx + ‖x‖ Σ_j ‖column_j‖ |s_j|/σ_j, |s_j|/σ_j ≤ ‖x‖.
+        drag = Interval(0.0)
+        for j in range(slow, slow + m):
+            drag = drag + _total(slope[:, j] ** 2).sqrt()
+        slack = float(drag.hi.max())
+        if not math.isfinite(slack) or not _negative_by(slope[:, :slow, 0], slack):
+            return False
+        if not len(self.motion.radii):
+            return True
+        for i in range(m):
+            gain = _total(push[i, :slow] ** 2).sqrt()
+            rest = self.stiff[i] - gain
+            for j in range(slow, slow + m):
+                rest = rest - abs(push[i, j])
+            if not bool((rest.lo > 0).all()):
+                return False
+        return True
+
+
+def _total(v: Interval) -> Interval:
+    return _total_of(v[i] for i in range(len(v.lo)))
+
+
+def _total_of(parts: Any) -> Interval:
+    total = Interval(0.0)
+    for part in parts:
+        total = total + part
+    return total
+
+
+def verify_terminal(
+    motion: LoopMotion,
+    terminal: TerminalSet,
+    *,
+    max_boxes: int = 4_000_000,
+    max_seconds: float = 600.0,
+    chunk: int = 4096,
+) -> Verdict:
+    """Decide whether a set is invariant, unsaturated and attracted to the target.
+
+    Parameters
+    ----------
+    motion
+        The loop, with its uncertain parameters.
+    terminal
+        The set.
+    max_boxes, max_seconds
+        Effort before giving up.
+
+    Returns
+    -------
+    Verdict
+        ``proved``; ``refuted``: at the witness, inside the set, the demand exceeds the limit
+        or ‖x‖ grows, proved in intervals; ``undecided``: where it got stuck.
+
+    Raises
+    ------
+    InvalidInputError
+        When the set has another size than the loop.
+    """
+    started = time.process_time()
+    claim = "{W ≤ 1} is invariant, non-singular, within the input limits, and converges"
+    method = "branch and bound, outward-rounded float64 intervals, mean-value form"
+    size, m = motion.slow, motion.mechanism.m
+    if terminal.scale.shape != (size, size) or terminal.widths.shape != (m,):
+        raise InvalidInputError(
+            "terminal set",
+            value=f"{terminal.scale.shape}, {terminal.widths.shape}",
+            limit=f"({size}, {size}) and ({m},) for '{motion.mechanism.name}'",
+        )
+    if not motion.at_rest:
+        return Verdict(claim, "undecided", method="f(0, 0) = 0 cannot be shown symbolically")
+    checker = _Enclosures(motion, terminal)
+    half = 0.5
+    while not checker.core(half):
+        half /= 1.6
+        if half < 1e-4:
+            return Verdict(claim, "undecided", method="no decrease near 0, as far as seen")
+
+    count = 0
+
+    def finish(kind: Any, point: FloatArray | None, why: str = "") -> Verdict:
+        witness: dict[str, float] = {}
+        if point is not None:
+            z = [*(terminal.scale @ point).tolist(), *([0.0] * m)]
+            witness = dict(zip(motion.names, z, strict=True))
+        details = {"boxes": count, "seconds": time.process_time() - started, "core": half}
+        return Verdict(claim, kind, witness=witness, method=method + why, details=details)
+
+    low, high = -np.ones((size, 1)), np.ones((size, 1))
+    if motion.odd:
+        low[-1] = 0.0
+    while low.shape[1]:
+        a, b = low[:, -chunk:], high[:, -chunk:]
+        low, high = low[:, :-chunk], high[:, :-chunk]
+        count += a.shape[1]
+        square, decrease, over, spare, weights = checker.over(a, b)
+        near = ((np.abs(a) <= half) & (np.abs(b) <= half)).all(axis=0)
+        moving = near | ((decrease < 0) & (spare > 0))
+        done = (square > 1.0) | (moving & (over <= 0))
+        if done.all():
+            continue
+        a, b, weights, near = a[:, ~done], b[:, ~done], weights[:, ~done], near[~done]
+        tiny = (b - a).max(axis=0) < 1e-6
+        spent = count > max_boxes or time.process_time() - started > max_seconds
+        index = np.flatnonzero(tiny)[:64] if tiny.any() else np.arange(min(64, a.shape[1]))
+        wrong = _wrong(checker, 0.5 * (a[:, index] + b[:, index]))
+        if wrong is not None:
+            return finish("refuted", wrong)
+        if tiny.any() or spent:
+            where = 0.5 * (a[:, index[0]] + b[:, index[0]])
+            return finish("undecided", where, ", effort ran out" if spent else ", stuck")
+        width = b - a
+        weight = np.where(np.isfinite(weights).all(axis=0) & ~near, weights, width)
+        weight = np.where(width > 0.02 * width.max(axis=0), weight, 0.0)
+        axis, columns = np.argmax(weight, axis=0), np.arange(a.shape[1])
+        cut = 0.5 * (a[axis, columns] + b[axis, columns])
+        left, right = b.copy(), a.copy()
+        left[axis, columns] = cut
+        right[axis, columns] = cut
+        low = np.concatenate([low, a, right], axis=1)
+        high = np.concatenate([high, left, b], axis=1)
+    return finish("proved", None)
+
+
+def _wrong(checker: _Enclosures, points: FloatArray) -> FloatArray | None:
+    """Return a point inside the set, s = 0, where a condition fails, proved in intervals."""
+    x = Interval(points)
+    here = checker.motion.over(checker.z(x, 0.0), middle=True)
+    rate = matmul(checker.inverse[:, :, None], here.rate[: checker.slow, None])[:, 0]
+    grows = _total_of(x[i] * rate[i] for i in range(checker.slow)).lo > 0
+    limit = checker.limit[:, None]
+    clips = ((here.demand.lo > limit) | (here.demand.hi < -limit)).any(axis=0)
+    bad = (_total(x**2).hi <= 1.0) & (grows | clips) & (np.abs(points) > 1e-9).any(axis=0)
+    return points[:, np.flatnonzero(bad)[0]] if bad.any() else None

@@ -1,0 +1,205 @@
+"""Proofs: certify a surface, a run or the paper's cases; verify a certificate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from undertow import inputs, results
+from undertow.cascade import Cascade
+from undertow.cli.terminal import (
+    Goal,
+    Horizon,
+    Seed,
+    Settings,
+    Start,
+    app,
+    examples,
+    progress_bar,
+    reports_errors,
+    say,
+    terminal,
+    write,
+)
+from undertow.errors import InvalidInputError
+from undertow.mechanism import Mechanism
+from undertow.stability import first_surface
+
+__all__ = ["certify", "verify"]
+
+
+def _mechanism(name: str, settings: list[str] | None) -> Mechanism:
+    """Return a mechanism of the library, or one's own from ``FILE.py:NAME``."""
+    if ".py:" not in name:
+        return inputs.mechanism_named(name, settings or ())
+    from undertow.certification import mechanism_from_file
+
+    mechanism = mechanism_from_file(name)
+    return mechanism.with_parameters(**inputs.parse_values(settings)) if settings else mechanism
+
+
+@app.command(
+    epilog=examples(
+        "undertow certify rotary_pendulum --surface 'lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1'",
+        "undertow certify cart_pendulum --seconds 30 --out proof",
+        "undertow certify rotary_pendulum --run --start phi=40deg --set d_e=0.025 --out proof",
+        "undertow certify --appendix",
+        "undertow certify model.py:make",
+    )
+)
+@reports_errors
+def certify(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME."),
+    ] = None,
+    surface: Annotated[
+        str | None,
+        typer.Option(
+            help="The surface: 'lambda_a=-0.5 alpha_u=5 lambda_u=10'. Default: the designed one.",
+            metavar="BLOCKS",
+        ),
+    ] = None,
+    start: Start = None,
+    setting: Settings = None,
+    run: Annotated[
+        bool, typer.Option("--run", help="Simulate a cascade and certify what it applied.")
+    ] = False,
+    appendix: Annotated[
+        bool, typer.Option("--appendix", help="The paper's five cases instead.")
+    ] = False,
+    objective: Goal = "energy",
+    horizon: Horizon = 60.0,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Search for each region on the surface, s; 0 leaves it out."),
+    ] = None,
+    seed: Seed = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for certificate.json and the figures.")
+    ] = None,
+) -> None:
+    """Prove what can be proved: stability, domain, disturbances, terminal sets, regions.
+
+    Exit status 0 when local stability at least is proved for every surface, else 1.
+    """
+    from undertow import certification
+    from undertow.certify.gate import certified_gate
+    from undertow.plot import figure_bytes
+
+    if appendix == (name is not None):
+        raise InvalidInputError(
+            "undertow certify",
+            value=f"{name or 'no mechanism'}{' and --appendix' if appendix else ''}",
+            limit="a mechanism, or --appendix",
+        )
+    if run and surface is not None:
+        raise InvalidInputError(
+            "--surface with --run", value=surface, limit="one of them: a run has its own surfaces"
+        )
+    if seconds is not None and not 0 <= seconds < 1e5:
+        raise InvalidInputError("--seconds", value=seconds, limit="in [0, 100000)")
+    if out is not None:
+        results.check_folder(out)
+    console = terminal()
+    console.width = max(console.width, 140)
+    mechanism = _mechanism(name or "rotary_pendulum", setting)
+    report: Any
+    figures: dict[str, bytes] = {}
+    with progress_bar() as progress:
+        if appendix:
+            cases = certification.certify_appendix(
+                mechanism, seconds=seconds or 0.0, progress=progress
+            )
+            certified, report = cases, certification.appendix_report(cases)
+        elif run:
+            x0 = inputs.parse_start(mechanism, start or ())
+            goal = inputs.objective_named(objective, mechanism, horizon)
+            cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed)
+            motion = cascade.simulate(x0, progress=lambda t, end: progress("cascade", t / end))
+            certified = certification.certify_run(mechanism, motion, progress=progress)
+            report = certification.run_report(motion)
+        else:
+            x0 = inputs.parse_start(mechanism, start or ())
+            given = (
+                first_surface(mechanism)
+                if surface is None
+                else inputs.parse_surface(mechanism, surface)
+            )
+            one = certification.certify_surface(
+                mechanism, given, x0, seconds=60.0 if seconds is None else seconds,
+                progress=progress,
+            )  # fmt: skip
+            certified, report = (one,), certification.subject_report(mechanism, one)
+        if out is not None:
+            for index, item in enumerate(certified):
+                if item.region is not None:
+                    progress("figure", 0.95)
+                    title = f"{mechanism.name}: {item.title.removeprefix('Surface')}"
+                    figure = certification.region_figure(item.region, title)
+                    key = "region.png" if len(certified) == 1 else f"region_{index + 1}.png"
+                    figures[key] = figure_bytes(figure)
+    written = None
+    if out is not None:
+        written = write(out, certification.certificate_files(mechanism, certified, figures))
+    console.print(report)
+    if written is not None:
+        say(console, written)
+    proved = [{c.kind for c in item.subject.claims} for item in certified]
+    if not all("stability" in kinds for kinds in proved):
+        raise typer.Exit(1)
+
+
+@app.command(
+    epilog=examples(
+        "undertow verify proof/certificate.json",
+        "undertow verify proof/certificate.json --mechanism model.py:make",
+        "undertow verify proof/certificate.json --set m=0.125",
+    )
+)
+@reports_errors
+def verify(
+    file: Annotated[Path, typer.Argument(help="A certificate of undertow certify.")],
+    mechanism: Annotated[
+        str | None,
+        typer.Option(
+            help="The mechanism it is about: a library name, or FILE.py:NAME for your own, whose "
+            "parameters must then be the certificate's. Default: the library's of that name.",
+            metavar="MECHANISM",
+        ),
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="A parameter of yours, SI units, that must be the certificate's. Repeatable.",
+            metavar="NAME=VALUE",
+        ),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Effort for each claim, s.")] = 600.0,
+) -> None:
+    """Check a certificate again, from the file and the mechanism alone.
+
+    Exit status 0 when every claim is proved again; 1 when one is not, or the file is damaged or
+    about another model.
+    """
+    from undertow import certification
+    from undertow.certify.certificate import read_certificate
+    from undertow.certify.verify import check_settings
+    from undertow.certify.verify import verify as decide
+
+    certificate = read_certificate(file)
+    check_settings(certificate, inputs.parse_values(setting or ()))
+    model = _mechanism(mechanism or certificate.name, None)
+    own = mechanism is not None and ".py:" in mechanism
+    console = terminal()
+    console.width = max(console.width, 120)
+    with progress_bar() as progress:
+        checked = decide(
+            certificate, model, own_parameters=own, max_seconds=seconds, progress=progress
+        )
+    console.print(certification.verification_report(certificate, checked))
+    if not all(item.verdict for item in checked):
+        raise typer.Exit(1)

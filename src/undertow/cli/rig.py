@@ -1,0 +1,160 @@
+"""A controller on a rig: run it against the clock, replay its log, drill its faults."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from undertow import inputs, results
+from undertow.cli.terminal import (
+    Goal,
+    Name,
+    Seed,
+    Settings,
+    Start,
+    app,
+    examples,
+    progress_bar,
+    reports_errors,
+    say,
+    terminal,
+    write,
+)
+
+__all__ = ["replay", "run"]
+
+
+@app.command(
+    epilog=examples(
+        "undertow run rotary_pendulum --seconds 60 --lead 0.04",
+        "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
+        "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
+    )
+)
+@reports_errors
+def run(
+    name: Name,
+    start: Start = None,
+    seconds: Annotated[float, typer.Option(help="Length of the run, s.", min=0.001)] = 10.0,
+    rig: Annotated[
+        Literal["ideal", "realistic"],
+        typer.Option(help="The simulated plant: its model, or a bench with all its flaws."),
+    ] = "ideal",
+    objective: Goal = "energy",
+    setting: Settings = None,
+    period: Annotated[float, typer.Option(help="Period of the fast loop, s.")] = 0.001,
+    lead: Annotated[
+        float,
+        typer.Option(help="From a request to the use of its answer, s: short keeps it busy."),
+    ] = 0.1,
+    worker: Annotated[
+        Literal["process", "thread"], typer.Option(help="Where the optimiser runs.")
+    ] = "process",
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="In simulated time: as fast as it goes.")
+    ] = False,
+    log: Annotated[
+        Path | None, typer.Option(help="File for the log, an SQLite database.", metavar="FILE")
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """Run the two-rate controller on a simulated rig, against the clock, and time every step."""
+    from undertow.runtime import Recipe
+    from undertow.runtime import Settings as Patience
+    from undertow.runtime.session import session
+    from undertow.runtime.tables import run_table
+
+    belief = inputs.mechanism_named(name, setting or ())
+    recipe = Recipe(
+        mechanism=name,
+        parameters=inputs.parse_values(setting or ()),
+        start=tuple(inputs.parse_start(belief, start or ()).tolist()),
+        objective=objective,
+        rig=rig,
+        seed=seed,
+        period=period,
+        seconds=float("inf") if simulated else 0.3 * lead,
+        settings=Patience(lead=lead),
+    )
+    console = terminal()
+    with ExitStack() as stack:
+        with progress_bar() as progress:
+            ready = session(
+                recipe,
+                log=log,
+                simulated=simulated,
+                processes=3 if worker == "process" else 0,
+                progress=progress,
+            )
+            runtime = stack.enter_context(ready)
+        stack.enter_context(_seconds_on_terminal(seconds))
+        report = runtime.run(seconds)
+    what = "simulated time" if simulated else f"optimiser in another {worker}"
+    say(console, f"{name} on the {rig} rig, {1 / period:g} Hz, {what}")
+    unit = ", ".join(sorted({i.unit for i in belief.inputs}))
+    console.print(run_table(report, period, unit, simulated=simulated))
+    if log is not None:
+        say(console, f"Log written to {log}")
+    if not report.stopped_by.startswith("operator"):
+        raise typer.Exit(1)
+
+
+@contextmanager
+def _seconds_on_terminal(seconds: float) -> Iterator[None]:
+    """Count the seconds on a terminal; a progress bar would cost the fast loop time."""
+    over, began = threading.Event(), time.monotonic()
+
+    def count() -> None:
+        while not over.wait(1.0):
+            sys.stderr.write(f"\r… running, {time.monotonic() - began:.0f} of {seconds:g} s ")
+
+    thread = threading.Thread(target=count, daemon=True)
+    if sys.stderr.isatty():
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        if sys.stderr.isatty():
+            sys.stderr.write("\r\033[K")
+
+
+@app.command(epilog=examples("undertow replay run.db", "undertow replay run.db --out figures"))
+@reports_errors
+def replay(
+    log: Annotated[Path, typer.Argument(help="Log of a run.", metavar="FILE")],
+    decisions: Annotated[
+        bool, typer.Option(help="Also let the gate judge the recorded answers again.")
+    ] = True,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for motion.png, latency.png, chatter.png.")
+    ] = None,
+) -> None:
+    """Replay a log through the same build: the same outputs, bit for bit, or say where not."""
+    from undertow import runtime
+    from undertow.runtime import figures
+    from undertow.runtime.tables import replay_table
+
+    if out is not None:
+        results.check_folder(out)
+    with progress_bar() as progress:
+        progress("replaying", 0.0)
+        result = runtime.replay(log, decisions=decisions)
+    console = terminal()
+    console.print(replay_table(result))
+    if out is not None:
+        pictures = {
+            "motion.png": figures.motion_figure(result.recording),
+            "latency.png": figures.latency_figure(result.recording),
+            "chatter.png": figures.chatter_figure(result.recording),
+        }
+        say(console, write(out, pictures))
+    if not result.identical:
+        raise typer.Exit(1)

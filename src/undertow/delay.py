@@ -1,0 +1,143 @@
+"""How much delay a surface can bear: the linear loop at the target, sampled and late.
+
+Inside the boundary layer the law is smooth; at the target it is a state feedback u = k x.
+Held from sample to sample and applied d samples late it closes a discrete loop whose
+spectral radius says whether it is stable.  A surface can be excellent on the model and yet
+bear no delay: near-singular ones (37) have the largest gains.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import scipy.linalg
+
+from undertow.cascade import Admission, Gate, cost_gate
+from undertow.errors import InvalidInputError
+from undertow.inner_loop import InnerLoop
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.optimiser import INADMISSIBLE
+from undertow.plan import Plan
+from undertow.rollout import ClosedLoop
+from undertow.sliding import ReachingLaw, Surface
+from undertow.stability import linearise
+
+__all__ = ["delay_gate", "delay_margin", "feedback"]
+
+
+def feedback(law: InnerLoop) -> FloatArray:
+    """Return k, (m, 2n), with u = k x near the target, inside the boundary layer."""
+    size = 2 * law.mechanism.n
+    columns = []
+    for i in range(size):
+        x = np.zeros(size)
+        x[i] = 1e-6
+        law(x)
+        ahead = law.demand.copy()
+        law(-x)
+        columns.append((ahead - law.demand) / 2e-6)
+    return np.column_stack(columns)
+
+
+@lru_cache(maxsize=32)
+def _sampled(mechanism: Mechanism, period: float) -> tuple[FloatArray, FloatArray]:
+    """Return the linear model at the target with its input held for a period."""
+    lin = linearise(mechanism)
+    A, B = lin.A, lin.input
+    size = A.shape[0] + B.shape[1]
+    whole = np.zeros((size, size))
+    whole[: len(A)] = np.hstack([A, B])
+    held = scipy.linalg.expm(whole * period)
+    return held[: len(A), : len(A)], held[: len(A), len(A) :]
+
+
+def _stable(A: FloatArray, B: FloatArray, k: FloatArray, late: int) -> bool:
+    """Whether u = k x, applied ``late`` samples after x, holds the sampled system."""
+    size, m = B.shape
+    loop = np.zeros((size + late * m, size + late * m))
+    loop[:size, :size] = A
+    if late == 0:
+        loop[:size, :size] += B @ k
+    else:
+        loop[:size, size : size + m] = B
+        shift = (late - 1) * m
+        loop[size : size + shift, size + m :] = np.eye(shift)
+        loop[size + shift :, :size] = k
+    return bool(np.abs(np.linalg.eigvals(loop)).max() < 1.0)
+
+
+def delay_margin(
+    mechanism: Mechanism,
+    surface: Surface,
+    reaching: ReachingLaw | None = None,
+    *,
+    period: float = 0.001,
+    longest: float = 0.05,
+) -> float:
+    """Return the longest delay, s, in whole periods, that the loop at the target bears.
+
+    Parameters
+    ----------
+    mechanism
+        The model.
+    surface, reaching
+        The law; the paper's gains by default.
+    period
+        Sampling period, s.
+    longest
+        Where to stop looking, s.
+
+    Returns
+    -------
+    float
+        Stable up to and including this delay; −period where the sampled loop is unstable
+        without any.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> round(delay_margin(rig, ut.first_surface(rig)), 3)
+    0.007
+    """
+    if not (0 < period < math.inf and 0 <= longest <= 1000 * period):
+        raise InvalidInputError(
+            "period and longest delay",
+            value=(period, longest),
+            limit="0 < period, 0 ≤ longest ≤ 1000 periods",
+        )
+    A, B = _sampled(mechanism, period)
+    k = feedback(InnerLoop(mechanism, surface, reaching or ReachingLaw()))
+    late = 0
+    while late * period <= longest and _stable(A, B, k, late):
+        late += 1
+    return (late - 1) * period
+
+
+def delay_gate(least: float, period: float = 0.001) -> Gate:
+    """Return a gate that, besides the cost, asks every surface to bear a delay.
+
+    Parameters
+    ----------
+    least
+        Smallest :func:`delay_margin` that is admitted, s: three times what is known of the
+        delays leaves room for what is not.
+    period
+        Sampling period of the inner loop, s.
+    """
+
+    def gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
+        laws = new.reaching or (loop.reaching,) * len(new.surfaces)
+        if new is not old and new != old:
+            for surface, law in zip(new.surfaces, laws, strict=True):
+                margin = delay_margin(loop.mechanism, surface, law, period=period, longest=least)
+                if margin < least - 1e-9:
+                    score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
+                    cost = score if score < INADMISSIBLE else math.inf
+                    reason = f"bears {1e3 * margin:.3g} ms of delay, wanted {1e3 * least:.3g} ms"
+                    return Admission(False, reason, cost)
+        return cost_gate(loop, old, new, x, horizon)
+
+    return gate

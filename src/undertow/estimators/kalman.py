@@ -1,0 +1,246 @@
+"""An extended Kalman filter on the mechanism's own model, compiled for it.
+
+The mean moves by a Runge-Kutta step of the model; the covariance by the step's Jacobian,
+``I + hA + ½h²A²`` with A from differences of the compiled dynamics; positions come in one
+by one, so that nothing is inverted and a missing one is left out.  Optionally a matched
+disturbance d, in the units of the inputs, is estimated with the state as a random walk:
+a disturbance observer, whose estimate the controller can take off its output.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.codegen.function import COMPILED, PREAMBLE
+from undertow.codegen.store import content_key, load_module, recall, remember
+from undertow.errors import InvalidInputError
+from undertow.estimators.interface import positive
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.rig.interface import Measurement
+from undertow.rig.stepping import dynamics_source
+
+__all__ = ["KalmanFilter"]
+
+_BODY = f"""
+{COMPILED}
+def move(h, x, u, n, m, parameters, stage, total, qdd, viscous, driven):
+    # Runge-Kutta's step of the mean; x may end with the estimated disturbance.
+    for i in range(m):
+        driven[i] = u[i] + (x[2 * n + i] if x.shape[0] > 2 * n else 0.0)
+    for i in range(2 * n):
+        stage[i] = x[i]
+        total[i] = 0.0
+    for k in range(4):
+        reach = h if k == 2 else 0.5 * h
+        weight = 1.0 if k == 0 or k == 3 else 2.0
+        forward(0.0, stage, driven, viscous, parameters, qdd)
+        for i in range(n):
+            d, dd = stage[n + i], qdd[i]
+            total[i] += weight * d
+            total[n + i] += weight * dd
+            stage[i] = x[i] + reach * d
+            stage[n + i] = x[n + i] + reach * dd
+    for i in range(2 * n):
+        x[i] += h / 6.0 * total[i]
+
+
+{COMPILED}
+def jacobian(h, x, u, n, m, parameters, F, A, qdd, base, viscous, driven):
+    # I + hA + h²A²/2, A by differences of the accelerations.
+    size = x.shape[0]
+    for i in range(m):
+        driven[i] = u[i] + (x[2 * n + i] if size > 2 * n else 0.0)
+    forward(0.0, x, driven, viscous, parameters, base)
+    for i in range(size):
+        for j in range(size):
+            A[i, j] = 1.0 if i < n and j == n + i else 0.0
+    for j in range(size):
+        small = 1e-6
+        if j < 2 * n:
+            kept = x[j]
+            x[j] = kept + small
+            forward(0.0, x, driven, viscous, parameters, qdd)
+            x[j] = kept
+        else:
+            kept = driven[j - 2 * n]
+            driven[j - 2 * n] = kept + small
+            forward(0.0, x, driven, viscous, parameters, qdd)
+            driven[j - 2 * n] = kept
+        for i in range(n):
+            A[n + i, j] = (qdd[i] - base[i]) / small
+    for i in range(size):
+        for j in range(size):
+            total = 0.0
+            for k in range(2 * n):
+                total += A[i, k] * A[k, j]
+            F[i, j] = (1.0 if i == j else 0.0) + h * A[i, j] + 0.5 * h * h * total
+
+
+{COMPILED}
+def estimate(h, q, u, x, P, past, count, limits, parameters, noise, variance, out, F, A, work):
+    n, m = q.shape[0], u.shape[0]
+    lead = past.shape[0] - 1
+    stage, total, qdd, base, viscous, driven = (
+        work[0], work[1], work[2], work[3], work[4], work[5]
+    )
+    for i in range(m):
+        past[count[0] % (lead + 1), i] = max(-limits[i], min(limits[i], u[i]))
+    then = past[(count[0] + 1) % (lead + 1)]
+    jacobian(h, x, then, n, m, parameters, F, A, qdd, base, viscous, driven)
+    move(h, x, then, n, m, parameters, stage, total, qdd, viscous, driven)
+    carry(F, P, A, noise, h)
+    correct(x, P, q, variance, total)
+    count[0] += 1
+    for i in range(x.shape[0]):
+        out[i] = x[i]
+    for k in range(lead):
+        then = past[(count[0] + 1 + k) % (lead + 1)]
+        move(h, out, then, n, m, parameters, stage, total, qdd, viscous, driven)
+"""
+
+
+_GENERATOR = tuple(
+    str(Path(__file__).parent.parent / name)
+    for name in (
+        "estimators/kalman.py",
+        "estimators/covariance.py",
+        "rig/stepping.py",
+        "mechanism.py",
+        "codegen/function.py",
+        "codegen/scalar.py",
+        "codegen/tape.py",
+    )
+)
+
+
+@lru_cache(maxsize=64)
+def _module(mechanism: Mechanism) -> Any:
+    key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
+    source = recall("kalman", key)
+    if source is None:
+        # numba's cache does not notice that an imported function has changed: the key does.
+        header = f'"""Kalman filter of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
+        parts = "from undertow.estimators.covariance import carry, correct\n"
+        source = f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
+        remember("kalman", key, source)
+    return load_module(f"kalman_{mechanism.name}", source)
+
+
+class KalmanFilter:
+    """Extended Kalman filter on the mechanism's own model, positions measured only.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's belief.
+    period
+        Usual time between samples, s.
+    position_noise
+        Standard deviation of a position, rad or m, one or one per coordinate; an encoder of
+        resolution r has r/√12.
+    acceleration_noise
+        Density of what the model does not know of the accelerations, rad/s²/√Hz or
+        m/s²/√Hz, one or one per coordinate.
+    disturbance_drift
+        Density of the drift of a matched disturbance, in units of the input per √s; 0:
+        no disturbance is estimated.
+    delay
+        Known delay of measurement and input together, s, rounded to periods: the estimate is
+        for the moment when the answer to it acts.
+
+    Raises
+    ------
+    InvalidInputError
+        For noises that are not positive.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> KalmanFilter(rig, position_noise=4e-4).disturbance.tolist()
+    [0.0]
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        period: float = 0.001,
+        *,
+        position_noise: ArrayLike = 5e-4,
+        acceleration_noise: ArrayLike = 0.5,
+        disturbance_drift: float = 0.0,
+        delay: float = 0.0,
+    ) -> None:
+        n, m = mechanism.n, mechanism.m
+        if not (0 <= disturbance_drift < math.inf and 0 <= delay < math.inf):
+            raise InvalidInputError(
+                "disturbance_drift and delay of a Kalman filter",
+                value=(disturbance_drift, delay),
+                limit="finite and ≥ 0",
+                remedy="0 turns either off",
+            )
+        self.mechanism = mechanism
+        self.period = float(positive("period of an estimator", [period], 1)[0])
+        size = 2 * n + (m if disturbance_drift > 0 else 0)
+        self._variance = positive("position_noise", position_noise, n) ** 2
+        self._noise = np.zeros(size)
+        self._noise[n : 2 * n] = positive("acceleration_noise", acceleration_noise, n) ** 2
+        self._noise[2 * n :] = disturbance_drift**2
+        self._x, self._out = np.zeros(size), np.zeros(size)
+        self._P, self._F, self._A = (np.zeros((size, size)) for _ in range(3))
+        self._work = np.zeros((6, size))
+        self._past = np.zeros((round(delay / period) + 1, m))
+        self._count = np.zeros(1, dtype=np.int64)
+        self._limits = mechanism.input_limits
+        self._parameters = mechanism.parameter_values
+        self._estimate = _module(mechanism).estimate
+        self.reset(np.zeros(2 * n))
+
+    def reset(self, x0: ArrayLike, spread: float = 1.0) -> None:
+        """Start again from the state x0, (2n,), at rest as far as is known.
+
+        ``spread`` is the standard deviation of the velocities, rad/s or m/s; that of the
+        positions is a measurement's, and the disturbance may be a tenth of its limit.
+        """
+        n = self.mechanism.n
+        self._x[:] = 0.0
+        self._x[: 2 * n] = x0
+        self._P[:] = 0.0
+        variances = np.zeros(len(self._x))
+        variances[:n], variances[n : 2 * n] = self._variance, spread**2
+        if len(self._x) > 2 * n:
+            variances[2 * n :] = np.minimum(0.1 * self._limits, 1.0) ** 2
+        np.fill_diagonal(self._P, variances)
+        self._past[:], self._count[0], self._t = 0.0, 0, math.nan
+        self._out[:] = self._x
+
+    def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
+        """Return the state after a measurement, (2n,); see :class:`Estimator`."""
+        h = measurement.t - self._t
+        self._t = measurement.t
+        if not 0.0 < h < 100.0 * self.period:
+            h = self.period
+        self._estimate(
+            h, measurement.q, u, self._x, self._P, self._past, self._count, self._limits,
+            self._parameters, self._noise, self._variance, self._out, self._F, self._A, self._work,
+        )  # fmt: skip
+        return self._out[: 2 * self.mechanism.n]
+
+    @property
+    def disturbance(self) -> FloatArray:
+        """The estimated matched disturbance, in units of the inputs, (m,)."""
+        n, m = self.mechanism.n, self.mechanism.m
+        if len(self._x) == 2 * n:
+            return np.zeros(m)
+        return self._x[2 * n :].copy()
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the state (and of the disturbance) at the measurement."""
+        return self._P.copy()

@@ -1,0 +1,334 @@
+"""The exported C on this machine: built, tested, spoken to over a pipe, counted.
+
+What is needed: a C compiler; for counts also ``valgrind``, ``size`` and ``nm``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.errors import ArtefactError, MissingExtraError
+from undertow.export.controller import EmbeddedController, files
+from undertow.export.twin import Status, Verdict
+from undertow.export.vectors import random_states
+from undertow.mechanism import FloatArray
+from undertow.plan import Plan
+
+__all__ = ["FLAGS", "Agreement", "Build", "Footprint", "HostProcess", "tool", "version"]
+
+#: How the C is compiled: every warning is an error.
+FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2")
+
+
+def tool(name: str) -> str:
+    """Return the path of a program.
+
+    Raises
+    ------
+    MissingExtraError
+        When it is not installed.
+    """
+    path = shutil.which(name)
+    if path is None:
+        raise MissingExtraError(
+            f"program '{name}'",
+            value="not found",
+            limit="on the PATH",
+            remedy=f"Install {name} from the system's packages",
+        )
+    return path
+
+
+def version(compiler: str) -> str:
+    """Return the first line of what a compiler says of itself."""
+    return _run(tool(compiler), "--version", cwd=Path.cwd()).stdout.partition("\n")[0]
+
+
+def _run(*command: str, cwd: Path, text: str | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command, cwd=cwd, input=text, capture_output=True, text=True, check=False, timeout=600
+    )
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Largest differences between C and Python over random states, relative.
+
+    ``output`` and ``demand`` by max(|value|, the input's limit), ``s`` and ``margin`` by
+    max(|value|, 1).  A demand has 1/det Γ as a factor, and with it the rounding of sines and
+    cosines, which differs between libraries: where det Γ(q)/det Γ(0) is below 1 in magnitude,
+    its difference is multiplied by that.
+    """
+
+    states: int
+    output: float
+    demand: float
+    s: float
+    margin: float
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What a controller costs on this machine.
+
+    Attributes
+    ----------
+    instructions
+        Of one step from positions, math.h included: the mean over a run.
+    code, constants
+        Bytes of machine code and of constant data.
+    memory
+        Bytes of one controller's state.
+    stack
+        Bytes: all frames of the controller's functions together, so a bound on its depth but
+        for math.h's.
+    calls
+        Names that the object file asks of the standard library.
+    """
+
+    instructions: float
+    code: int
+    constants: int
+    memory: int
+    stack: int
+    calls: tuple[str, ...]
+
+
+class Build:
+    """A controller's C in a folder, compiled there.
+
+    Parameters
+    ----------
+    controller
+        What is exported.
+    folder
+        Where its files are, or are written to if they are not there.
+    compiler
+        A C compiler that takes GCC's options.
+
+    Raises
+    ------
+    MissingExtraError
+        When there is no such compiler.
+    ArtefactError
+        When the C does not compile, with the compiler's first complaint.
+    """
+
+    def __init__(self, controller: EmbeddedController, folder: Path, compiler: str = "gcc") -> None:
+        self.controller, self.folder = controller, folder
+        self.name = controller.mechanism.name
+        self._compiler = tool(compiler)
+        for name, content in files(controller).items():
+            if not (folder / name).exists():
+                (folder / name).write_bytes(content)
+
+    def compile(self, sources: Sequence[str], program: str, *more: str) -> Path:
+        """Compile files of the folder into a program."""
+        done = _run(self._compiler, *FLAGS, *sources, "-o", program, *more, "-lm", cwd=self.folder)
+        if done.returncode != 0:
+            first = next((line for line in done.stderr.splitlines() if "error" in line), "")
+            raise ArtefactError(
+                f"C of '{self.name}'",
+                value=first or done.stderr[-200:],
+                limit=f"accepted by {Path(self._compiler).name}",
+                remedy="Report it: generated code must compile",
+            )
+        return self.folder / program
+
+    def self_test(self) -> tuple[bool, str]:
+        """Build and run the test against the vectors: whether it passes, and what it says."""
+        program = self.compile([f"{self.name}.c", f"{self.name}_test.c"], f"{self.name}_test")
+        done = _run(str(program), cwd=self.folder)
+        return done.returncode == 0, done.stdout.strip()
+
+    def pipe(self) -> Path:
+        """Build the program that is spoken to over a pipe."""
+        return self.compile([f"{self.name}.c", f"{self.name}_pipe.c"], f"{self.name}_pipe")
+
+    def start(self) -> HostProcess:
+        """Start the controller as a process of its own."""
+        return HostProcess(self.controller, self.pipe())
+
+    def agreement(self, count: int = 100_000, seed: int = 0) -> Agreement:
+        """Compare the law with :class:`undertow.SlidingModeLaw` at random states."""
+        mechanism = self.controller.mechanism
+        states = random_states(mechanism, count, seed)
+        if self.controller.real == "float":
+            states = states.astype(np.float32).astype(float)
+        lines = "\n".join("l " + " ".join(map(repr, row)) for row in states.tolist())
+        done = _run(str(self.pipe()), cwd=self.folder, text=lines + "\n")
+        got = np.array([row.split() for row in done.stdout.splitlines()], dtype=float)
+        demand, s, margin = np.split(got, [mechanism.m, 2 * mechanism.m], axis=1)
+        said = self.controller.laws[0](0.0, states)
+        limit = mechanism.input_limits
+
+        def largest(
+            value: FloatArray,
+            expected: FloatArray,
+            scale: float | FloatArray,
+            weight: float | FloatArray = 1.0,
+        ) -> float:
+            error = np.abs(value - expected) / np.maximum(np.abs(expected), scale)
+            return float(np.max(error * weight))
+
+        return Agreement(
+            count,
+            largest(np.clip(demand, -limit, limit), said.u, limit),
+            largest(demand, said.demand, limit, np.minimum(1.0, np.abs(said.margin))[:, None]),
+            largest(s, said.s, 1.0),
+            largest(margin[:, 0], said.margin, 1.0),
+        )
+
+    def footprint(self, positions: FloatArray) -> Footprint:
+        """Count instructions, bytes and frames; positions (N, n) are what the steps see."""
+        source, unit = f"{self.name}.c", f"{self.name}.o"
+        self.compile([source], unit, "-c", "-fstack-usage")
+        columns = _run(tool("size"), unit, cwd=self.folder).stdout.splitlines()[1].split()
+        sections = _run(tool("size"), "-A", unit, cwd=self.folder).stdout
+        code = sum(int(n) for n in re.findall(r"^\.text\S*\s+(\d+)", sections, re.MULTILINE))
+        constants = sum(int(n) for n in re.findall(r"^\.rodata\S*\s+(\d+)", sections, re.MULTILINE))
+        assert code + constants <= int(columns[0]) + int(columns[1])
+        usage = [
+            line.split("\t") for line in (self.folder / f"{self.name}.su").read_text().splitlines()
+        ]
+        if any(kind != "static" for _, _, kind in usage):
+            raise ArtefactError(
+                f"stack of '{self.name}'",
+                value=[row[0] for row in usage if row[2] != "static"],
+                limit="bounded when compiled",
+                remedy="Report it: generated code must not grow its stack",
+            )
+        undefined = _run(tool("nm"), "-u", unit, cwd=self.folder).stdout.split()
+        with self.start() as process:
+            memory = process.memory
+        return Footprint(
+            self._instructions(positions),
+            code,
+            constants,
+            memory,
+            sum(int(size) for _, size, _ in usage),
+            tuple(sorted(name for name in undefined if name not in {"U", "_GLOBAL_OFFSET_TABLE_"})),
+        )
+
+    def _instructions(self, positions: FloatArray) -> float:
+        """Mean number of instructions of a step, by callgrind."""
+        text = "".join("q " + " ".join(map(repr, row)) + "\n" for row in positions.tolist())
+        step = f"{self.controller.prefix}_step"
+        done = _run(
+            tool("valgrind"),
+            "--tool=callgrind",
+            "--callgrind-out-file=/dev/null",
+            "--collect-atstart=no",
+            f"--toggle-collect={step}",
+            str(self.pipe()),
+            cwd=self.folder,
+            text=text,
+        )
+        found = re.search(r"Collected : (\d+)", done.stderr)
+        if found is None:
+            raise ArtefactError(
+                "instruction count",
+                value=done.stderr[-200:],
+                limit="a count by valgrind",
+                remedy="See whether valgrind runs here at all",
+            )
+        return int(found[1]) / len(positions)
+
+
+class HostProcess:
+    """The exported controller as a process of its own, spoken to over a pipe.
+
+    Parameters
+    ----------
+    controller
+        What was exported.
+    program
+        The built ``<name>_pipe``.
+    """
+
+    def __init__(self, controller: EmbeddedController, program: Path) -> None:
+        self.controller = controller
+        self._process = subprocess.Popen(
+            [str(program)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        )
+
+    def _ask(self, line: str) -> list[str]:
+        to, back = self._process.stdin, self._process.stdout
+        assert to is not None  # both were asked for
+        assert back is not None
+        try:
+            to.write(line + "\n")
+            to.flush()
+            answer = back.readline().split()
+        except OSError:
+            answer = []
+        if not answer or answer == ["?"]:
+            raise ArtefactError(
+                "exported controller's process",
+                value=f"no answer to '{line[:60]}'",
+                limit="one line for each line",
+                remedy="Start it anew",
+            )
+        return answer
+
+    def _period(self, letter: Literal["q", "x"], values: ArrayLike) -> tuple[FloatArray, Status]:
+        numbers = np.asarray(values, dtype=float).ravel().tolist()
+        status, *u = self._ask(" ".join([letter, *map(repr, numbers)]))
+        return np.array(u, dtype=float), Status(int(status))
+
+    def step(self, q: ArrayLike) -> tuple[FloatArray, Status]:
+        """One period from measured positions, (n,): the inputs, (m,), and the status."""
+        return self._period("q", q)
+
+    def step_state(self, x: ArrayLike) -> tuple[FloatArray, Status]:
+        """One period from a state that is measured whole, (2n,)."""
+        return self._period("x", x)
+
+    def offer(self, plan: Plan, number: int) -> Verdict:
+        """Offer another plan; it is in use from the next step on."""
+        m = self.controller.mechanism.m
+        words = ["p", str(number), str(len(plan.surfaces))]
+        for surface, start, t in zip(
+            plan.surfaces, self.controller.starts(plan), plan.times, strict=True
+        ):
+            law = plan.at(t)[1] or self.controller.reaching
+            numbers = [*surface.vector.tolist(), *law.vector(m).tolist()]
+            words += [str(start), *map(repr, numbers)]
+        return Verdict(int(self._ask(" ".join(words))[0]))
+
+    @property
+    def memory(self) -> int:
+        """Bytes of the controller's state."""
+        return int(self._ask("m")[0])
+
+    def close(self) -> None:
+        """End the process."""
+        for stream in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):  # what it can no longer read
+                if stream is not None:
+                    stream.close()
+        self._process.wait(timeout=10)
+
+    def __enter__(self) -> Self:
+        """Use it in a ``with`` block."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the process."""
+        self.close()

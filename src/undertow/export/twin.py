@@ -1,0 +1,146 @@
+"""The exported controller's step in Python: what its C must reproduce, period by period."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.mechanism import FloatArray
+from undertow.plan import Plan
+from undertow.rig import Measurement
+from undertow.sliding import Control, SlidingModeLaw
+
+if TYPE_CHECKING:
+    from undertow.export.controller import EmbeddedController
+
+__all__ = ["LARGEST", "Status", "Twin", "Verdict"]
+
+#: A measurement beyond is no number either.
+LARGEST = 1e9
+
+
+class Status(IntFlag):
+    """What happened in a period; the bits that the C returns."""
+
+    OK = 0
+    CLIPPED = 1
+    SLEWED = 2
+    BRIDGED = 4
+    LOST = 8
+    SINGULAR = 16
+    SWITCHED = 32
+
+
+class Verdict(IntEnum):
+    """Answer to an offered plan."""
+
+    ACCEPTED = 0
+    BUSY = 1
+    STALE = 2
+    INVALID = 3
+
+
+class Twin:
+    """The exported controller, in double precision, by the library's own law and estimator.
+
+    Parameters
+    ----------
+    controller
+        What was exported.
+    """
+
+    def __init__(self, controller: EmbeddedController) -> None:
+        self.controller = controller
+        mechanism = controller.mechanism
+        self._n, self._limit = mechanism.n, mechanism.input_limits
+        self._slew = controller.slew_rates * controller.period
+        self._estimator = controller.differentiator.estimator(mechanism, controller.period)
+        self.x = np.zeros(2 * self._n)
+        self.u = np.zeros(mechanism.m)
+        self._missed, self._running = 0, False
+        self._use(controller.plan)
+        self._offered: Plan | None = None
+        self._newest = controller.number
+
+    def _use(self, plan: Plan) -> None:
+        controller = self.controller
+        self._laws = [
+            SlidingModeLaw(controller.mechanism, surface, plan.at(t)[1] or controller.reaching)
+            for surface, t in zip(plan.surfaces, plan.times, strict=True)
+        ]
+        self._starts = controller.starts(plan)
+        self._row, self._clock = 0, 0
+
+    @property
+    def law(self) -> SlidingModeLaw:
+        """The law in use."""
+        return self._laws[self._row]
+
+    def offer(self, plan: Plan, number: int) -> Verdict:
+        """Offer another plan; it is in use from the next step on."""
+        if self._offered is not None:
+            return Verdict.BUSY
+        if number <= self._newest:
+            return Verdict.STALE
+        self._newest, self._offered = number, plan
+        return Verdict.ACCEPTED
+
+    def step(self, q: ArrayLike) -> tuple[FloatArray, Status]:
+        """One period from measured positions, (n,): the inputs, (m,), and the status."""
+        at = np.array(q, dtype=float)
+        status = self._repair(at, self.x[self._n :].copy())
+        if status & Status.LOST:
+            self._running = False
+        else:
+            if not self._running:
+                self._estimator.reset(np.concatenate([at, np.zeros(self._n)]))
+            # One instant for all, so that the estimator takes its usual period.
+            self.x = self._estimator.estimate(Measurement(0.0, at), self.u).copy()
+            self._running = True
+        return self._control(status)
+
+    def step_state(self, x: ArrayLike) -> tuple[FloatArray, Status]:
+        """One period from a state that is measured whole, (2n,)."""
+        at, velocity = np.split(np.array(x, dtype=float), 2)
+        status = self._repair(at, velocity)
+        self._running = not status & Status.LOST
+        if self._running:
+            self.x = np.concatenate([at, velocity])
+        return self._control(status)
+
+    def _repair(self, q: FloatArray, velocity: FloatArray) -> Status:
+        rate = ~(np.abs(velocity) < LARGEST)
+        velocity[rate] = self.x[self._n :][rate]
+        place = ~(np.abs(q) < LARGEST)
+        q[place] = (self.x[: self._n] + self.controller.period * self.x[self._n :])[place]
+        if not (rate.any() or place.any()):
+            self._missed = 0
+            return Status.OK
+        self._missed = min(self._missed + 1, self.controller.missed + 1)
+        bridged = self._running and self._missed <= self.controller.missed
+        return Status.BRIDGED if bridged else Status.LOST
+
+    def _control(self, status: Status) -> tuple[FloatArray, Status]:
+        if self._offered is not None:
+            self._use(self._offered)
+            self._offered = None
+            status |= Status.SWITCHED
+        if self._row + 1 < len(self._laws) and self._clock >= self._starts[self._row + 1]:
+            self._row += 1
+            status |= Status.SWITCHED
+        self._clock += 1
+        said: Control = self.law(0.0, self.x)
+        if not said.margin > 0:
+            status |= Status.SINGULAR
+        wanted = np.zeros_like(said.u) if status & Status.LOST else said.u
+        low = np.maximum(-self._limit, self.u - self._slew)
+        high = np.minimum(self._limit, self.u + self._slew)
+        self.u = np.clip(wanted, low, high)
+        if (said.u != said.demand).any():
+            status |= Status.CLIPPED
+        if (self.u != wanted).any():
+            status |= Status.SLEWED
+        return self.u.copy(), status

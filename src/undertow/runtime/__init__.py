@@ -1,0 +1,36 @@
+"""The runtime: the controller against the clock, its log and replay, and the fault drill."""
+
+from undertow.runtime.clock import SimulatedClock, WallClock
+from undertow.runtime.controller import Controller, Inputs
+from undertow.runtime.log import Columns, Log, Recording, read_log
+from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.modes import Command, Mode
+from undertow.runtime.recipe import Recipe
+from undertow.runtime.replay import Replay, about, replay, replay_controller
+from undertow.runtime.settings import Settings
+from undertow.runtime.slow import InlineWorker, Worker, background_worker, respond
+
+__all__ = [
+    "Columns",
+    "Command",
+    "Controller",
+    "InlineWorker",
+    "Inputs",
+    "Log",
+    "Mode",
+    "Recipe",
+    "Recording",
+    "Replay",
+    "Report",
+    "Runtime",
+    "Settings",
+    "SimulatedClock",
+    "WallClock",
+    "Worker",
+    "about",
+    "background_worker",
+    "read_log",
+    "replay",
+    "replay_controller",
+    "respond",
+]

@@ -1,0 +1,91 @@
+"""Time for the fast loop: the wall clock, or simulated time; and how long things took."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+__all__ = ["Clock", "Histogram", "SimulatedClock", "WallClock"]
+
+
+class Clock(Protocol):
+    """What the fast loop knows of time."""
+
+    simulated: bool
+
+    def now(self) -> float:
+        """Return the time, s, from an arbitrary origin."""
+        ...
+
+    def sleep_until(self, t: float) -> None:
+        """Return at the time t, s, or at once if it is past."""
+        ...
+
+
+class WallClock:
+    """The monotonic clock of the machine."""
+
+    simulated = False
+    now = staticmethod(time.perf_counter)
+
+    def sleep_until(self, t: float) -> None:
+        """Sleep; the operating system may wake us late, never early."""
+        rest = t - time.perf_counter()
+        if rest > 0:
+            time.sleep(rest)
+
+
+class SimulatedClock:
+    """Time that passes when the loop says so: runs are fast and repeatable."""
+
+    simulated = True
+
+    def __init__(self) -> None:
+        self.t = 0.0
+
+    def now(self) -> float:
+        """Return the simulated time, s."""
+        return self.t
+
+    def sleep_until(self, t: float) -> None:
+        """Let time pass."""
+        self.t = max(self.t, t)
+
+
+class Histogram:
+    """Durations counted in bins of 1 µs up to 20 ms; nothing is allocated by a count.
+
+    Attributes
+    ----------
+    longest
+        Longest duration, s.
+    """
+
+    BINS = 20_000
+
+    def __init__(self) -> None:
+        self.counts = np.zeros(self.BINS + 1, dtype=np.int64)
+        self.longest = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one duration, s."""
+        place = int(1e6 * seconds)
+        self.counts[place if 0 <= place < self.BINS else (0 if place < 0 else self.BINS)] += 1
+        self.longest = max(self.longest, seconds)
+
+    def quantile(self, fraction: float) -> float:
+        """Return the duration, s, that ``fraction`` of all do not exceed; NaN without any."""
+        total = int(self.counts.sum())
+        if total == 0:
+            return float("nan")
+        place = int(np.searchsorted(np.cumsum(self.counts), fraction * total))
+        return min((place + 1) * 1e-6, self.longest) if place < self.BINS else self.longest
+
+    def between(self, edges: Sequence[float]) -> list[int]:
+        """Return how many durations fall between each two edges, s."""
+        places = np.minimum(np.round(1e6 * np.asarray(edges)), self.BINS + 1).astype(int)
+        total = np.concatenate([[0], np.cumsum(self.counts)])
+        return [int(v) for v in np.diff(total[places])]

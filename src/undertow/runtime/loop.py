@@ -1,0 +1,297 @@
+"""The fast loop against the clock: read, think, write, log; and a watchdog beside it."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import sys
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from undertow.mechanism import FloatArray
+from undertow.rig.interface import Measurement, Rig
+from undertow.runtime.clock import Clock, Histogram, WallClock
+from undertow.runtime.controller import Controller, Inputs
+from undertow.runtime.encoding import answer_row
+from undertow.runtime.log import Log
+from undertow.runtime.modes import Command, Mode
+from undertow.runtime.slow import Worker
+
+__all__ = ["Report", "Runtime"]
+
+
+@dataclass(eq=False)
+class Report:
+    """What came of a run.
+
+    Attributes
+    ----------
+    steps, missed
+        Steps made, and steps whose output came after the end of their period.
+    skipped
+        Periods in which no step was made, because an earlier one took too long.
+    think, whole, late
+        Time of the fast step's own computation between reading and writing; from when the
+        step was due to when its output was written; and to when it began.
+    mode, stopped_by
+        State at the end, and why the run stopped, if it did.
+    entered
+        How often each state was entered.
+    answers
+        Verdicts on the answers of the slow loop, in a few words each, with their numbers.
+    events
+        Everything that happened: (t, what, text).
+    variation
+        Total variation of the inputs, Σ|u_k − u_{k−1}|, (m,).
+    """
+
+    steps: int = 0
+    missed: int = 0
+    skipped: int = 0
+    think: Histogram = field(default_factory=Histogram)
+    whole: Histogram = field(default_factory=Histogram)
+    late: Histogram = field(default_factory=Histogram)
+    mode: Mode = Mode.IDLE
+    stopped_by: str = ""
+    entered: Counter[str] = field(default_factory=Counter)
+    answers: Counter[str] = field(default_factory=Counter)
+    events: list[tuple[float, str, str]] = field(default_factory=list)
+    variation: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+class Runtime:
+    """Runs a controller on a rig.
+
+    Parameters
+    ----------
+    controller
+        The pure fast step.
+    rig
+        The plant.
+    worker
+        Who answers the requests of the fast step; closed by the caller.
+    clock
+        The wall clock by default.
+    log
+        Where everything goes; closed by the caller.
+
+    Attributes
+    ----------
+    command
+        The operator's wish: set it from anywhere; the next step takes it.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        rig: Rig,
+        worker: Worker,
+        *,
+        clock: Clock | None = None,
+        log: Log | None = None,
+    ) -> None:
+        self.controller, self.rig, self.worker = controller, rig, worker
+        self.clock = WallClock() if clock is None else clock
+        self.log = log
+        self.command = Command.NONE
+        self.report = Report(variation=np.zeros_like(controller.u))
+        self._silent = ""
+        self._failing = 0.0
+        self._beat = self.clock.now()
+
+    def stop(self) -> None:
+        """Ask for a safe stop, as an operator does."""
+        self.command = Command.STOP
+
+    def run(self, seconds: float) -> Report:
+        """Run from start to a safe stop; the operator's stop comes after ``seconds``.
+
+        The loop ends once a safe stop has brought the output to zero.
+        """
+        self.command = Command.START
+        with _quiet_interpreter(self.clock), self._watchdog():
+            try:
+                self._loop(seconds)
+            finally:
+                self._beat = float("inf")
+                with contextlib.suppress(Exception):  # a rig that failed may fail again
+                    self.rig.close()
+        report, controller = self.report, self.controller
+        report.mode, report.stopped_by = controller.mode, self._silent or controller.stopped_by
+        return report
+
+    def _loop(self, seconds: float) -> None:
+        clock, period, report = self.clock, self.controller.period, self.report
+        think, whole, late = report.think, report.whole, report.late
+        stall = self.controller.settings.stall
+        origin = clock.now()
+        k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
+        while not self._silent:
+            due = origin + slot * period
+            clock.sleep_until(due)
+            began = self._beat = clock.now()
+            t = began - origin
+            if began - due > stall:
+                alarm = f"no step for {1e3 * (began - due + period):.0f} ms"
+            command, self.command = self.command, Command.NONE
+            if t >= seconds and self.controller.mode != Mode.SAFE_STOP:
+                command = Command.STOP
+            measurement, alarm = self._read(alarm)
+            read = clock.now()
+            inputs = Inputs(t, measurement, self.worker.take(t), command, alarm)
+            u = self.controller.step(inputs)
+            thought = clock.now()
+            alarm = self._write(u)
+            written = clock.now()
+            self._after(k, inputs)
+            np.abs(u - before, out=before)
+            report.variation += before
+            before[:] = u
+            if self.log is not None:
+                self._record(self.log, k, began, due, (read, thought, written), inputs)
+            late.add(began - due)
+            think.add(thought - read)
+            whole.add(written - due)
+            k += 1
+            report.steps = k
+            if self.controller.mode == Mode.SAFE_STOP and not u.any():
+                break
+            slot += 1
+            over = (written - origin) / period - slot
+            if over > 0:
+                report.missed += 1
+                report.skipped += int(over)
+                slot += int(over)
+
+    def _read(self, alarm: str) -> tuple[Measurement | None, str]:
+        """Read the rig; a rig that fails gives nothing, and is a gap in the sensors."""
+        try:
+            return self.rig.read(), alarm
+        except Exception as error:
+            self._tell("rig", f"read: {type(error).__name__}: {error}")
+            return None, alarm
+
+    def _write(self, u: FloatArray) -> str:
+        """Write to the rig; one that keeps failing is an alarm for the next step."""
+        try:
+            self.rig.write(u)
+        except Exception as error:
+            self._failing += self.controller.period
+            what = f"write: {type(error).__name__}: {error}"
+            self._tell("rig", what)
+            return what if self._failing > self.controller.settings.patience else ""
+        self._failing = 0.0
+        return ""
+
+    def _tell(self, what: str, text: str) -> None:
+        events = self.report.events
+        if len(events) < 10_000:
+            events.append((self._beat, what, text))
+
+    def _after(self, k: int, inputs: Inputs) -> None:
+        """Hand requests to the slow loop, and keep what happened."""
+        controller, report, log = self.controller, self.report, self.log
+        if controller.gives_up and not self.worker.replace():
+            self._tell("optimiser", "nobody is left to take over: the last plan stays")
+        if controller.request is not None:
+            self.worker.ask(controller.request)
+        if log is not None:
+            if inputs.command:
+                log.event(k, inputs.t, "command", inputs.command.name)
+            if inputs.alarm:
+                log.event(k, inputs.t, "alarm", inputs.alarm)
+            if inputs.answer is not None:
+                log.answer(answer_row(k, inputs.answer))
+        for note in controller.notes:
+            self._tell(note.kind, note.text)
+            if note.kind == "state":
+                report.entered[controller.mode.name] += 1
+            else:
+                report.answers[note.text.split(": ", 1)[1].split(",")[0].split(" by ")[0]] += 1
+            if log is not None:
+                log.event(k, inputs.t, note.kind, note.text)
+
+    def _record(
+        self,
+        log: Log,
+        k: int,
+        began: float,
+        due: float,
+        stamps: tuple[float, float, float],
+        inputs: Inputs,
+    ) -> None:
+        row, at, controller = log.row, log.columns, self.controller
+        measurement = inputs.measurement
+        row[0], row[1], row[2] = k, inputs.t, began
+        row[3], row[4] = controller.mode, controller.memory.sequence
+        if measurement is None:
+            row[5] = row[at.q] = row[at.v] = np.nan
+        else:
+            row[5] = measurement.t
+            row[at.q] = measurement.q
+            row[at.v] = np.nan if measurement.v is None else measurement.v
+        row[at.x], row[at.s] = controller.x, controller.s
+        row[at.demand], row[at.u] = controller.demand, controller.u
+        read, thought, written = stamps
+        row[-5], row[-4] = controller.margin[0], 1e6 * (began - due)
+        row[-3], row[-2] = 1e6 * (read - began), 1e6 * (thought - read)
+        row[-1] = 1e6 * (written - thought)
+        log.commit_row()
+
+    @contextlib.contextmanager
+    def _watchdog(self) -> Iterator[None]:
+        """Watch the heart of the fast loop from another thread; let go of a rig that hangs."""
+        if self.clock.simulated:
+            yield
+            return
+        over, stall = threading.Event(), self.controller.settings.stall
+
+        def watch() -> None:
+            while not over.wait(0.25 * stall):
+                silence = self.clock.now() - self._beat
+                if silence > 2.0 * stall:
+                    self._silent = f"watchdog: the fast loop was silent for {1e3 * silence:.0f} ms"
+                    with contextlib.suppress(Exception):
+                        self.rig.close()
+                    return
+
+        thread = threading.Thread(target=watch, name="undertow watchdog", daemon=True)
+        self._beat = self.clock.now()
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+
+
+@contextlib.contextmanager
+def _quiet_interpreter(clock: Clock) -> Iterator[None]:
+    """Keep the interpreter from pausing the loop: old objects frozen, threads yield quickly.
+
+    The fast loop also asks for a real-time priority, where the system grants it.
+    """
+    if clock.simulated:
+        yield
+        return
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-4)
+    gc.collect()
+    gc.freeze()
+    policy = None
+    if hasattr(os, "sched_setscheduler"):
+        with contextlib.suppress(OSError):
+            policy = os.sched_getscheduler(0)
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    try:
+        yield
+    finally:
+        if policy is not None:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, policy, os.sched_param(0))
+        gc.unfreeze()
+        sys.setswitchinterval(interval)

@@ -1,0 +1,122 @@
+"""One run from its recipe: optimise, warm up, connect, run, close."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+from undertow.cascade import CascadeState
+from undertow.rig.interface import Rig
+from undertow.runtime.clock import SimulatedClock, WallClock
+from undertow.runtime.controller import Inputs
+from undertow.runtime.log import Columns, Log
+from undertow.runtime.loop import Runtime
+from undertow.runtime.modes import Command
+from undertow.runtime.recipe import Recipe
+from undertow.runtime.replay import about
+from undertow.runtime.slow import Answer, InlineWorker, Request, Worker, background_worker, respond
+
+__all__ = ["session", "warm_up"]
+
+
+@contextlib.contextmanager
+def session(
+    recipe: Recipe,
+    *,
+    log: Path | None = None,
+    simulated: bool = False,
+    processes: int = 3,
+    rig: Rig | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Iterator[Runtime]:
+    """Make a runtime ready from a recipe: first optimum, everything compiled and connected.
+
+    Parameters
+    ----------
+    recipe
+        What to run.
+    log
+        File for the log.
+    simulated
+        In simulated time, as fast as it goes; otherwise against the wall clock.
+    processes
+        For the optimiser, see :func:`undertow.runtime.background_worker`; 0: a thread.
+    rig
+        The plant; the recipe's simulated one by default.
+    progress
+        Called with (what, fraction) before each part.
+
+    Yields
+    ------
+    Runtime
+        Ready to run; log and worker are closed in the end.
+
+    Raises
+    ------
+    InfeasibleError
+        When the first optimisation finds no admissible surface.
+    ArtefactError
+        When the log cannot be written.
+    """
+
+    def tell(what: str, fraction: float) -> None:
+        if progress is not None:
+            progress(what, fraction)
+
+    def compute(request: Request) -> Answer:
+        return respond(recipe.cascade, request)
+
+    tell("first optimum", 0.1)
+    plant = recipe.make_rig() if rig is None else rig
+    memory, _ = recipe.cascade.start(recipe.x0)
+    tell("warming up", 0.6)
+    warm_up(recipe, memory)
+    compute(Request(0.0, recipe.x0, recipe.settings.lead, memory))
+    controller = recipe.make_controller(memory)
+    with contextlib.ExitStack() as stack:
+        # First the processes are forked, then threads begin.
+        worker: Worker = InlineWorker(compute)
+        if not simulated:
+            worker = background_worker(compute, processes=processes)
+        stack.callback(worker.close)
+        book = None
+        if log is not None:
+            meta = about(controller, recipe, simulated=simulated)
+            columns = Columns.of(recipe.belief)
+            book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
+        clock = SimulatedClock() if simulated else WallClock()
+        runtime = Runtime(controller, plant, worker, clock=clock, log=book)
+        stack.enter_context(_operator(runtime))
+        tell("ready", 1.0)
+        yield runtime
+
+
+def warm_up(recipe: Recipe, memory: CascadeState) -> None:
+    """Make some steps on a rig that is thrown away, so that everything is compiled."""
+    rig = recipe.make_rig()
+    controller = recipe.make_controller(memory)
+    for k in range(60):
+        command = Command.START if k == 0 else Command.NONE
+        rig.write(controller.step(Inputs(k * recipe.period, rig.read(), None, command)))
+
+
+@contextlib.contextmanager
+def _operator(runtime: Runtime) -> Iterator[None]:
+    """Let Ctrl-C and a polite kill ask for a safe stop."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        runtime.stop()
+
+    before = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

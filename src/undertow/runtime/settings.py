@@ -1,0 +1,95 @@
+"""What a run keeps to: limits of the output, patience with sensors, optimiser and clock."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+
+import numpy as np
+
+from undertow.errors import InvalidInputError
+from undertow.mechanism import FloatArray, Mechanism
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Limits and patience of the fast loop.
+
+    Parameters
+    ----------
+    output_limit
+        Largest |u|, in the input's unit; the mechanism's own limits apply besides.
+    slew_time
+        Shortest time in which an input may cross its whole range, s: the slew rate is
+        2 u_max / slew_time.  Inputs without a limit have none on their rate either.
+    lead
+        How far ahead proposals are computed, s: from a request to the use of its answer.
+    silence
+        An optimiser that has not answered for this long after its time is replaced, s.
+    surprise
+        A proposal is refused when, at its time of use, an entry of the state is off the
+        predicted one by more than this, in units of 1 + |entry|.
+    patience
+        Longest gap in a sensor that the model bridges, s.
+    jump
+        Largest believable difference between a position and its prediction, rad or m.
+    frozen
+        A reading that does not move while the model has moved by this, rad or m, is frozen.
+    settle
+        The sensors must have been sound for this long before the law takes over, s.
+    near
+        ‖(q_u, q̇_u)‖₂ of the unactuated coordinates within which the mechanism counts as
+        settled; beyond twice that it does not.
+    margin
+        det Γ(q)/det Γ(0) below which the law is taken to be lost, (37).
+    travel
+        Largest |q_i|, rad or m, besides the ranges of the coordinates.
+    stall
+        Longest gap between two steps, s; after a longer one the loop stops safely.
+    """
+
+    output_limit: float = math.inf
+    slew_time: float = 0.004
+    lead: float = 0.1
+    silence: float = 0.5
+    surprise: float = 0.5
+    patience: float = 0.02
+    jump: float = 0.05
+    frozen: float = 0.25
+    settle: float = 0.02
+    near: float = 0.2
+    margin: float = 0.02
+    travel: float = math.inf
+    stall: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse what is not positive."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not value > 0:
+                raise InvalidInputError(
+                    f"{item.name} of a run",
+                    value=value,
+                    limit="> 0",
+                    remedy="Leave it out for the usual value",
+                )
+
+    def limits(self, mechanism: Mechanism) -> FloatArray:
+        """Largest |u_i|, (m,)."""
+        return np.minimum(mechanism.input_limits, self.output_limit)
+
+    def slew(self, mechanism: Mechanism) -> FloatArray:
+        """Largest |du_i/dt|, (m,), in the input's unit per second."""
+        return 2.0 * self.limits(mechanism) / self.slew_time
+
+    def travels(self, mechanism: Mechanism) -> FloatArray:
+        """Lowest and highest positions, (n, 2), rad or m."""
+        low = [max(c.low, -self.travel) for c in mechanism.coordinates]
+        high = [min(c.high, self.travel) for c in mechanism.coordinates]
+        return np.column_stack([low, high])
+
+    def as_dict(self) -> dict[str, float]:
+        """All settings by name."""
+        return {name: float(value) for name, value in asdict(self).items()}

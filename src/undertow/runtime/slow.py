@@ -1,0 +1,315 @@
+"""The slow loop: one request of the fast loop to one answer, and who computes it where.
+
+A request is a state and the plan in use; the answer is computed for the state *predicted*
+for the time of use.  Everything here is a function of the request, so that a recorded
+answer can be judged again without a clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import math
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Protocol
+
+import numpy as np
+
+from undertow.cascade import Admission, Cascade, CascadeState
+from undertow.inner_loop import lane
+from undertow.mechanism import FloatArray
+from undertow.optimiser import Proposal
+from undertow.plan import Plan
+from undertow.sliding import SlidingModeLaw
+
+__all__ = [
+    "Answer",
+    "Compute",
+    "InlineWorker",
+    "Request",
+    "Worker",
+    "background_worker",
+    "judge",
+    "lanes_of",
+    "respond",
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Request:
+    """What the fast loop asks: re-optimise ``memory.plan`` from x at t for use at ``use``, s."""
+
+    t: float
+    x: FloatArray
+    use: float
+    memory: CascadeState
+
+    @property
+    def sequence(self) -> int:
+        """Number that the answer must carry."""
+        return self.memory.sequence + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What the slow loop says.
+
+    Attributes
+    ----------
+    sequence, use
+        Number and time of use, s, of the request.
+    x
+        State predicted for the time of use, (2n,).
+    proposal, admission
+        The optimiser's answer and the gate's decision.
+    before, memory
+        The cascade's memory as it was asked, and from the time of use on.
+    lanes
+        Numbers of the law for each surface of the plan, (S, 2mn + 2m + 1).
+    seconds
+        Time from request to answer, s.
+    """
+
+    sequence: int
+    use: float
+    x: FloatArray
+    proposal: Proposal
+    admission: Admission
+    before: CascadeState
+    memory: CascadeState
+    lanes: FloatArray
+    seconds: float
+
+
+Compute = Callable[[Request], Answer]
+
+
+def lanes_of(cascade: Cascade, plan: Plan) -> FloatArray:
+    """Return the numbers of the compiled law for each surface of a plan, (S, 2mn + 2m + 1).
+
+    Raises
+    ------
+    UndertowError
+        For a plan that does not fit the mechanism, or is singular at the target.
+    """
+    laws = plan.reaching or (cascade.reaching,) * len(plan.surfaces)
+    pairs = zip(plan.surfaces, laws, strict=True)
+    return np.stack([lane(SlidingModeLaw(cascade.mechanism, s, law)) for s, law in pairs])
+
+
+def respond(cascade: Cascade, request: Request) -> Answer:
+    """Predict, re-optimise, judge; never raises."""
+    began = time.perf_counter()
+    x = _predicted(cascade, request)
+    memory = request.memory
+    proposal = cascade.propose(memory, x, request.use)
+    after, admission, lanes = judge(cascade, memory, proposal, x, request.use)
+    return Answer(
+        request.sequence,
+        request.use,
+        x,
+        proposal,
+        admission,
+        memory,
+        after,
+        lanes,
+        time.perf_counter() - began,
+    )
+
+
+def judge(
+    cascade: Cascade, memory: CascadeState, proposal: Proposal, x: FloatArray, use: float
+) -> tuple[CascadeState, Admission, FloatArray]:
+    """Pass a proposal through the cascade's gate; whatever goes wrong refuses it."""
+    try:
+        after, admission = cascade.consider(memory, proposal, x)
+        return after, admission, lanes_of(cascade, after.plan)
+    except Exception as error:  # an optimiser's answer may be anything
+        reason = f"gate: {type(error).__name__}: {error}"
+        admission = Admission(False, reason, memory.predicted)
+        after = replace(memory, plan=memory.at(use), since=use, sequence=memory.sequence + 1)
+        return after, admission, lanes_of(cascade, after.plan)
+
+
+def _predicted(cascade: Cascade, request: Request) -> FloatArray:
+    plan, span = request.memory.at(request.t), request.use - request.t
+    try:
+        batch = cascade.loop.batch(request.x, plan, duration=span, terminal=0.0)
+        return np.asarray(batch.x[0])
+    except Exception:  # then the optimiser fails on it too, and says so
+        return np.full_like(request.x, math.nan)
+
+
+class Worker(Protocol):
+    """Who computes answers: the fast loop asks, and takes what is there, never waiting."""
+
+    def ask(self, request: Request) -> None:
+        """Hand over a request."""
+        ...
+
+    def take(self, t: float) -> Answer | None:
+        """Return the next answer that has arrived by the time t, s, if there is one."""
+        ...
+
+    def replace(self) -> bool:
+        """Give up on the present computation; whether there is someone to take over."""
+        ...
+
+    def close(self) -> None:
+        """Stop computing."""
+        ...
+
+
+class InlineWorker:
+    """Computes at once, and answers after a latency of simulated time.
+
+    Parameters
+    ----------
+    compute
+        Request to answer.
+    latency
+        Simulated time from request to answer, s.
+    """
+
+    def __init__(self, compute: Compute, latency: float = 0.05) -> None:
+        self.compute, self.latency = compute, latency
+        self.waiting: deque[tuple[float, Answer]] = deque()
+
+    def ask(self, request: Request) -> None:
+        """Compute the answer."""
+        self.waiting.append((request.t + self.latency, self.compute(request)))
+
+    def take(self, t: float) -> Answer | None:
+        """Return the answer once its latency has passed."""
+        if self.waiting and self.waiting[0][0] <= t + 1e-9:
+            return self.waiting.popleft()[1]
+        return None
+
+    def replace(self) -> bool:
+        """Forget what was asked."""
+        self.waiting.clear()
+        return True
+
+    def close(self) -> None:
+        """Nothing to stop."""
+
+
+class _Courier(threading.Thread):
+    """Carries requests to a computation and answers back, away from the fast loop."""
+
+    def __init__(self, compute: Compute) -> None:
+        super().__init__(name="undertow slow loop", daemon=True)
+        self.compute = compute
+        self.requests: SimpleQueue[Request | None] = SimpleQueue()
+        self.answers: deque[Answer] = deque()
+        self.start()
+
+    def run(self) -> None:
+        while (request := self.requests.get()) is not None:
+            try:
+                self.answers.append(self.compute(request))
+            except (EOFError, OSError):  # the process is gone; the fast loop meets silence
+                return
+
+
+class BackgroundWorker:
+    """Computes in another thread, which may in turn wait for another process."""
+
+    def __init__(self, computers: list[_Computer]) -> None:
+        self.computers = computers
+        self.courier = _Courier(computers[0].compute)
+
+    def ask(self, request: Request) -> None:
+        """Hand the request over; costs some microseconds."""
+        self.courier.requests.put(request)
+
+    def take(self, t: float) -> Answer | None:
+        """Return an answer that has arrived."""
+        return self.courier.answers.popleft() if self.courier.answers else None
+
+    def replace(self) -> bool:
+        """End the present computation and let the next computer take over."""
+        if len(self.computers) < 2:
+            return False
+        self.computers.pop(0).close()
+        self.courier.requests.put(None)
+        self.courier = _Courier(self.computers[0].compute)
+        return True
+
+    def close(self) -> None:
+        """End all computers."""
+        for computer in self.computers:
+            computer.close()
+        self.courier.requests.put(None)
+
+
+class _Computer:
+    """A thread's computation: nothing to end."""
+
+    def __init__(self, compute: Compute) -> None:
+        self.compute = compute
+
+    def close(self) -> None:
+        """A thread cannot be ended from outside; it is left behind."""
+
+
+class _Child(_Computer):
+    """A forked process: it has everything compiled already, and can be ended at any time."""
+
+    def __init__(self, compute: Compute) -> None:
+        context = multiprocessing.get_context("fork")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(
+            target=_serve, args=(compute, theirs, self.pipe), name="undertow slow loop", daemon=True
+        )
+        self.process.start()
+        theirs.close()
+        super().__init__(self._exchange)
+
+    def _exchange(self, request: Request) -> Answer:
+        self.pipe.send(request)
+        answer: Answer = self.pipe.recv()
+        return answer
+
+    def close(self) -> None:
+        """Kill the process, and do not wait for it."""
+        self.process.kill()
+        with contextlib.suppress(OSError):
+            self.pipe.close()
+
+
+def _serve(compute: Compute, pipe: Connection, theirs: Connection) -> None:
+    """Answer requests until the other end is gone."""
+    theirs.close()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the fast loop decides when to end
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with contextlib.suppress(OSError, AttributeError):  # Linux: do not outlive the fast loop
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            pipe.send(compute(pipe.recv()))
+
+
+def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWorker:
+    """Return a worker on another core: one process computes, the others stand by.
+
+    Parameters
+    ----------
+    compute
+        Request to answer; call it once before, so that everything is compiled.
+    processes
+        Processes to fork now, while the fast loop does not run yet: one to compute, the
+        rest to take over from one that hangs or dies.  0: a thread of this process.
+    """
+    if processes < 1 or not hasattr(os, "fork"):
+        return BackgroundWorker([_Computer(compute) for _ in range(max(1, processes))])
+    return BackgroundWorker([_Child(compute) for _ in range(processes)])

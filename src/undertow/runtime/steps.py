@@ -1,0 +1,22 @@
+"""The arithmetic of the fast loop that is the same for every mechanism, compiled."""
+
+from __future__ import annotations
+
+import math
+
+from undertow.codegen.machine import numba
+from undertow.mechanism import FloatArray
+
+__all__ = ["confine"]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def confine(wanted: FloatArray, u: FloatArray, limits: FloatArray, slew: FloatArray) -> None:
+    """Bring u, (m,), towards ``wanted`` within limits and within ``slew`` of where it was.
+
+    Whatever is no number counts as zero.
+    """
+    for i in range(u.shape[0]):
+        aim = wanted[i] if math.isfinite(wanted[i]) else 0.0
+        aim = max(u[i] - slew[i], min(u[i] + slew[i], aim))
+        u[i] = max(-limits[i], min(limits[i], aim)) + 0.0  # no −0: a log does not keep its sign

@@ -1,0 +1,1 @@
+"""Trials: controllers on realistic rigs, many seeds, in tables and figures."""

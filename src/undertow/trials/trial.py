@@ -1,0 +1,254 @@
+"""One controller on one rig, and the same over many seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.estimators import Controller, Estimator, KalmanFilter, Record, drive
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.objective import Objective, state_box
+from undertow.rig import Bench, Encoder, RealisticRig
+from undertow.rollout import Event, Trajectory
+
+__all__ = [
+    "MakeController",
+    "Outcome",
+    "Spread",
+    "balanced",
+    "bench_objective",
+    "estimator_for",
+    "motion",
+    "spread",
+    "trial",
+    "undisturbed",
+]
+
+#: Belief and estimated start, (2n,), to a controller for one run.
+MakeController = Callable[[FloatArray], Controller]
+
+#: Within these of the target a coordinate counts as home: free ones, driven ones (rad or m).
+HOME_FREE, HOME_DRIVEN = math.radians(2.0), math.radians(20.0)
+
+#: A run is balanced when everything is home for its last second, s.
+LAST = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of one run.
+
+    Attributes
+    ----------
+    seed
+        Of the rig.
+    balanced
+        Whether every coordinate was home for the last second.
+    caught
+        Whether the free coordinates were, wherever the driven ones had got to.
+    settled
+        Time after which every coordinate stayed home, s; infinite if one did not.
+    cost
+        Of the objective, along the true motion with the inputs written; NaN without one.
+    effort
+        ∫ uᵀu dt.
+    chatter
+        Total variation of the inputs per second, in their unit.
+    record
+        The run.
+    """
+
+    seed: int
+    balanced: bool
+    caught: bool
+    settled: float
+    cost: float
+    effort: float
+    chatter: float
+    record: Record
+
+
+def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -> KalmanFilter:
+    """Return the Kalman filter that knows the bench's encoders, period and delay.
+
+    Parameters
+    ----------
+    belief
+        The controller's model.
+    bench
+        Its encoders, sampling period and delays are known; nothing else is.
+    drift
+        Density of the matched disturbance's drift, input units per √s; by default a third
+        of the smallest input limit.  0 estimates none.
+    """
+    sigmas = []
+    for c in belief.coordinates:
+        encoder = bench.encoders.get(c.name, Encoder())
+        sigmas.append(max(math.hypot(encoder.resolution / math.sqrt(12), encoder.noise), 1e-6))
+    timing = bench.timing
+    if drift is None:
+        limit = float(np.min(belief.input_limits))
+        drift = limit / 3 if math.isfinite(limit) else 1.0
+    return KalmanFilter(
+        belief,
+        timing.period,
+        position_noise=sigmas,
+        disturbance_drift=drift,
+        delay=timing.input_delay + timing.measurement_delay,
+    )
+
+
+def trial(
+    belief: Mechanism,
+    bench: Bench,
+    make: MakeController,
+    x0: ArrayLike,
+    seconds: float,
+    seed: int,
+    *,
+    objective: Objective | None = None,
+    estimator: Estimator | None = None,
+) -> Outcome:
+    """Run a controller on a rig, once.
+
+    Parameters
+    ----------
+    belief
+        The controller's model.
+    bench
+        The truth.
+    make
+        Returns the controller, told where the sensors say that the mechanism is held.
+    x0
+        Where the hand means to let go, (2n,).
+    seconds
+        Length of the run, s.
+    seed
+        Of the rig.
+    objective
+        What the cost is counted by.
+    estimator
+        By default :func:`estimator_for` the bench.
+    """
+    rig = RealisticRig(bench, x0, seed)
+    seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
+    estimator = estimator_for(belief, bench) if estimator is None else estimator
+    estimator.reset(seen)
+    record = drive(rig, estimator, make(seen), seconds)
+    settled = _settled(belief, record, 0)
+    last = record.t[-1] - LAST
+    return Outcome(
+        seed=seed,
+        balanced=settled <= last,
+        caught=_settled(belief, record, belief.m) <= last,
+        settled=settled,
+        cost=math.nan if objective is None else _cost(belief, objective, record),
+        effort=record.effort,
+        chatter=record.chatter / seconds,
+        record=record,
+    )
+
+
+def balanced(outcomes: Sequence[Outcome]) -> int:
+    """Count the runs that ended balanced."""
+    return sum(outcome.balanced for outcome in outcomes)
+
+
+def _settled(mechanism: Mechanism, record: Record, first: int) -> float:
+    """Return when the last of the coordinates from ``first`` on came home for good, s."""
+    home = np.where(np.arange(mechanism.n) < mechanism.m, HOME_DRIVEN, HOME_FREE)
+    at_home = np.abs(record.truth[:, first : mechanism.n]) <= home[first:]
+    away = np.logical_not(np.asarray(at_home).all(axis=1))
+    if away[-1]:
+        return math.inf
+    return float(record.t[np.flatnonzero(away)[-1] + 1]) if away.any() else 0.0
+
+
+def _cost(mechanism: Mechanism, objective: Objective, record: Record) -> float:
+    """Integrate the stage cost from sample to sample, until the terminal set is reached."""
+    import sympy as sp
+
+    stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
+    function = sp.lambdify([*mechanism.x, *mechanism.u], stage, "numpy")
+    radius = np.linalg.norm(record.truth, axis=1)
+    inside = np.flatnonzero(radius <= objective.terminal_radius)
+    end = int(inside[0]) if len(inside) else len(record.t)
+    if end == 0:
+        return 0.0
+    values = np.broadcast_to(function(*record.truth.T, *record.u.T), record.t.shape)
+    steps = np.diff(record.t, append=2 * record.t[-1] - record.t[-2])
+    return float((values * steps)[:end].sum())
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation of a number over the balanced runs."""
+
+    mean: float
+    deviation: float
+
+    def __str__(self) -> str:
+        """Show as mean ± deviation, to three digits of the mean."""
+        if not math.isfinite(self.mean):
+            return "—"
+        digits = max(0, 2 - math.floor(math.log10(max(abs(self.mean), 1e-9))))
+        return f"{self.mean:.{digits}f} ± {self.deviation:.{digits}f}"
+
+
+def spread(outcomes: Sequence[Outcome], what: str) -> Spread:
+    """Return mean and standard deviation of an attribute over the balanced runs."""
+    values = [float(getattr(o, what)) for o in outcomes if o.balanced]
+    if not values:
+        return Spread(math.nan, math.nan)
+    return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0)
+
+
+def motion(mechanism: Mechanism, record: Record, every: int = 5) -> Trajectory:
+    """Return the true motion of a record for plotting, every so many samples."""
+    rows = slice(None, None, every)
+    count, m = len(record.t[rows]), mechanism.m
+    nothing = np.zeros(count)
+    return Trajectory(
+        mechanism,
+        record.t[rows],
+        record.truth[rows],
+        record.u[rows],
+        np.zeros((count, m)),
+        nothing,
+        np.ones(count),
+        Event.HORIZON,
+    )
+
+
+def bench_objective(mechanism: Mechanism) -> Objective:
+    """Return an objective that suits a bench: Σ (u_i/u_max,i)² + 0.01 xᵀx, within the ranges.
+
+    The same for every mechanism.  The weight of the state makes Theorem 1 hold, and brings
+    the driven coordinates home; finite ranges of travel are kept to 95 %.
+    """
+    limits = [float(v) if math.isfinite(v) else 1.0 for v in mechanism.input_limits]
+    ranges = {
+        c.name: 0.95 * min(-c.low, c.high)
+        for c in mechanism.coordinates
+        if math.isfinite(min(-c.low, c.high)) and min(-c.low, c.high) > 0
+    }
+    return Objective(
+        "effort and error",
+        lambda v: (
+            sum((u / limit) ** 2 for u, limit in zip(v.inputs, limits, strict=True))
+            + 0.01 * (v.states.T * v.states)[0]
+        ),
+        "s",
+        terminal_radius=0.02,
+        constraints=state_box(**ranges),
+    )
+
+
+def undisturbed(mechanism: Mechanism, period: float = 0.001) -> Bench:
+    """Return the bench on which belief is truth: nothing but sampling at the same period."""
+    bench = Bench(mechanism)
+    return replace(bench, timing=replace(bench.timing, period=period))

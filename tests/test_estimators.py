@@ -1,0 +1,189 @@
+"""Estimators: exact where theory says so, quiet where it matters, robust to missing readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.errors import InvalidInputError
+from undertow.estimators import (
+    Estimator,
+    FilteredDerivative,
+    KalmanFilter,
+    Measured,
+    SuperTwisting,
+    drive,
+)
+from undertow.inner_loop import InnerLoop
+from undertow.rig import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
+
+PERIOD = 1e-3
+
+
+@pytest.fixture(scope="module")
+def arm() -> ut.Mechanism:
+    return ut.mechanisms.rotary_pendulum()
+
+
+def _follow(estimator: Estimator, q: Callable[[float], float], seconds: float) -> np.ndarray:
+    """Velocities that an estimator makes of q(t) for both coordinates, (N, 2)."""
+    estimator.reset([q(0.0), q(0.0), 0.0, 0.0])
+    out = []
+    for k in range(round(seconds / PERIOD)):
+        t = k * PERIOD
+        measured = Measurement(t, np.array([q(t), q(t)]))
+        out.append(estimator.estimate(measured, np.zeros(1))[2:].copy())
+    return np.array(out)
+
+
+def test_a_filtered_derivative_has_the_lag_of_its_time_constant(arm: ut.Mechanism) -> None:
+    tau, slope = 0.02, 3.0
+    v = _follow(FilteredDerivative(arm, time_constant=tau), lambda t: 0.5 * slope * t**2, 0.5)
+    t = PERIOD * (len(v) - 1)
+    np.testing.assert_allclose(v[-1], slope * (t - tau), rtol=1e-3)
+
+
+def test_super_twisting_is_exact_below_its_bound_and_not_above(arm: ut.Mechanism) -> None:
+    """Levant (1998): finite-time exact while |q̈| < L; here 40 rad/s² against 50 and 30."""
+    w = 4.0
+    q = lambda t: 2.5 * math.sin(w * t)  # noqa: E731
+    t = PERIOD * np.arange(2000)
+    true = 2.5 * w * np.cos(w * t)
+    within = np.abs(_follow(SuperTwisting(arm, acceleration=50.0), q, 2.0)[1000:, 0] - true[1000:])
+    beyond = np.abs(_follow(SuperTwisting(arm, acceleration=30.0), q, 2.0)[1000:, 0] - true[1000:])
+    assert within.max() < 2 * 40.0 * PERIOD
+    assert beyond.max() > 0.5
+
+
+def test_super_twisting_does_not_chatter_on_a_still_encoder(arm: ut.Mechanism) -> None:
+    v = _follow(SuperTwisting(arm, acceleration=500.0), lambda t: 0.3, 0.5)
+    assert not v.any()
+
+
+def test_the_kalman_filter_finds_the_state_of_its_own_model(arm: ut.Mechanism) -> None:
+    """From a wrong velocity, on exact positions, with inputs and no surprise."""
+    rig = IdealRig(arm, [0.1, 3.0, 0.5, -0.5])
+    kalman = KalmanFilter(arm, position_noise=1e-6, acceleration_noise=1e-3)
+    kalman.reset([0.1, 3.0, 0.0, 0.0])
+    record = drive(rig, kalman, lambda t, x: np.array([3.0 * math.sin(5 * t)]), 1.0)
+    assert np.abs(record.x - record.truth)[200:].max() < 1e-7
+
+
+def test_the_covariance_of_the_kalman_filter_is_honest(arm: ut.Mechanism) -> None:
+    """The errors that it makes have the variance it says: NEES within wide bounds."""
+    rng = np.random.default_rng(0)
+    noise, drift = 1e-3, 0.5
+    scores = []
+    for seed in range(10):
+        kalman = KalmanFilter(arm, position_noise=noise, acceleration_noise=drift)
+        kalman.reset([0.0, math.pi, 0.0, 0.0], spread=0.3)
+        x = np.array([0.0, math.pi, *rng.normal(0, 0.3, 2)])
+        for k in range(400):
+            u = np.array([2.0 * math.sin(0.02 * k + seed)])
+            y = x[:2] + noise * rng.standard_normal(2)
+            estimate = kalman.estimate(Measurement(k * PERIOD, y), u)
+            if k > 200 and k % 20 == 0:
+                error = estimate - x
+                scores.append(error @ np.linalg.solve(kalman.covariance, error))
+            rig = IdealRig(arm, x)
+            rig.write([2.0 * math.sin(0.02 * (k + 1) + seed)])
+            x = rig.truth
+            x[2:] += drift * math.sqrt(PERIOD) * rng.standard_normal(2)
+    assert 2.5 < np.mean(scores) < 6.0
+
+
+def test_a_matched_disturbance_is_found(arm: ut.Mechanism) -> None:
+    a_e = next(p.value for p in arm.parameters if p.name == "a_e")
+    truth = arm.disturbed({"theta": 0.7 * a_e})
+    rig = RealisticRig(Bench(truth), [0.0, math.pi, 0.0, 0.0])
+    kalman = KalmanFilter(arm, disturbance_drift=5.0)
+    kalman.reset([0.0, math.pi, 0.0, 0.0])
+    drive(rig, kalman, lambda t, x: np.zeros(1), 2.0)
+    assert kalman.disturbance[0] == pytest.approx(0.7, abs=0.05)
+
+
+def test_the_observer_lowers_the_gain_that_is_needed(arm: ut.Mechanism, base: ut.Surface) -> None:
+    """A constant matched force; with d̂ taken off, a quarter of η keeps |s| as small."""
+    a_e = next(p.value for p in arm.parameters if p.name == "a_e")
+    bench = Bench(arm.disturbed({"theta": 1.0 * a_e}))
+
+    def offset(eta: float, observe: bool) -> float:
+        kalman = KalmanFilter(arm, position_noise=1e-4, disturbance_drift=5.0)
+        x0 = arm.state(phi=0.05)
+        kalman.reset(x0)
+        law = InnerLoop(arm, base, ut.ReachingLaw(eta, 0.1))
+
+        def control(t: float, x: np.ndarray) -> np.ndarray:
+            return np.clip(law(x) - observe * kalman.disturbance, -15.0, 15.0)
+
+        record = drive(RealisticRig(bench, x0), kalman, control, 3.0)
+        return float(np.abs(base.s(record.truth[-500:])).max())
+
+    assert offset(5.0, True) < 0.5 * offset(20.0, False)
+    assert offset(5.0, False) > 2.0 * offset(20.0, False)
+
+
+def test_a_known_delay_is_predicted_over(arm: ut.Mechanism) -> None:
+    """With the delay known, the estimate is for when the input acts: hardly any error left."""
+    late = Timing(0.001, input_delay=0.003, measurement_delay=0.002)
+    errors = {}
+    for delay in (0.0, 0.005):
+        rig = RealisticRig(Bench(arm, timing=late), [0.0, 3.0, 0.0, 1.0])
+        kalman = KalmanFilter(arm, position_noise=1e-5, delay=delay)
+        kalman.reset([0.0, 3.0, 0.0, 1.0])
+        record = drive(rig, kalman, lambda t, x: np.array([4.0 * math.sin(9 * t)]), 1.0)
+        errors[delay] = np.abs(record.x[500:-3] - record.truth[503:]).max()
+    assert errors[0.005] < 0.05 * errors[0.0]
+
+
+@pytest.mark.parametrize("kind", [FilteredDerivative, SuperTwisting, KalmanFilter])
+def test_missing_readings_are_bridged(arm: ut.Mechanism, kind: type) -> None:
+    estimator = kind(arm)
+    estimator.reset([0.0, 0.0, 2.0, 2.0])
+    for k in range(20):
+        gone = 10 <= k < 15
+        q = np.array([math.nan if gone else 2.0 * (k + 1) * PERIOD, math.nan])
+        x = estimator.estimate(Measurement((k + 1) * PERIOD, q), np.zeros(1))
+        assert np.isfinite(x).all()
+        if gone:
+            assert x[0] == pytest.approx(2.0 * (k + 1) * PERIOD, abs=2e-3)
+
+
+def test_on_the_realistic_rig_the_model_is_worth_having(arm: ut.Mechanism) -> None:
+    """Velocity errors in closed loop: Kalman filter < filtered derivative, super-twisting."""
+    errors = {}
+    x0 = arm.state(phi=0.35)
+    for name, estimator in (
+        ("derivative", FilteredDerivative(arm, time_constant=0.005)),
+        ("twisting", SuperTwisting(arm, acceleration=100.0)),
+        ("kalman", KalmanFilter(arm)),
+    ):
+        estimator.reset(x0)
+        law = InnerLoop(arm, ut.first_surface(arm))
+        record = drive(RealisticRig(srv02_rig(), x0, 1), estimator, lambda t, x: law(x), 4.0)  # noqa: B023
+        assert abs(record.truth[-1, 1]) < 0.02
+        errors[name] = np.sqrt(np.mean((record.x - record.truth)[500:, 2:] ** 2))
+    assert errors["kalman"] < 0.7 * min(errors["derivative"], errors["twisting"])
+
+
+def test_measured_velocities_need_no_estimator(arm: ut.Mechanism) -> None:
+    rig = IdealRig(arm)
+    record = drive(rig, Measured(arm), lambda t, x: np.zeros(1), 0.1)
+    np.testing.assert_array_equal(record.x, record.truth)
+    with pytest.raises(InvalidInputError, match="positions only"):
+        Measured(arm).estimate(Measurement(0.0, np.zeros(2)), np.zeros(1))
+
+
+def test_senseless_settings_are_refused(arm: ut.Mechanism) -> None:
+    for make in (
+        lambda: FilteredDerivative(arm, time_constant=0.0),
+        lambda: SuperTwisting(arm, acceleration=[1.0, 2.0, 3.0]),
+        lambda: KalmanFilter(arm, position_noise=-1.0),
+        lambda: KalmanFilter(arm, delay=-1.0),
+    ):
+        with pytest.raises(InvalidInputError):
+            make()

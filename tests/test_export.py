@@ -1,0 +1,669 @@
+"""The exported C: compiles without a warning, equals the Python, never leaves its limits."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow.cli import app
+from undertow.codegen import Tape
+from undertow.codegen.c99 import C99Emitter, literal
+from undertow.errors import ArtefactError, InvalidInputError, MissingExtraError, ModelError
+from undertow.export import (
+    Build,
+    DerivativeStep,
+    EmbeddedController,
+    Status,
+    SuperTwistingStep,
+    Twin,
+    Verdict,
+    files,
+)
+from undertow.export.host import FLAGS, tool
+from undertow.export.loop import run_on_rig
+from undertow.export.vectors import run_positions
+from undertow.mechanisms import LIBRARY
+from undertow.plan import Plan
+from undertow.rig import RealisticRig, srv02_rig
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+
+#: Beyond the export's own flags: what embedded projects ask for.
+STRICT = (
+    "-Wconversion",
+    "-Wshadow",
+    "-Wdouble-promotion",
+    "-Wstrict-prototypes",
+    "-Wmissing-prototypes",
+    "-Wcast-qual",
+    "-Wvla",
+)
+M = "two_motor_three_link"
+
+
+@lru_cache(maxsize=16)
+def exported(name: str = "rotary_pendulum", **options: object) -> EmbeddedController:
+    mechanism = LIBRARY[name]()
+    surface = ut.first_surface(mechanism)
+    return EmbeddedController(mechanism, surface, **options)  # type: ignore[arg-type]
+
+
+def three_rows(mechanism: ut.Mechanism, scale: float = 1.0) -> Plan:
+    s = ut.first_surface(mechanism)
+    surfaces = [
+        ut.Surface(s.alpha_a, k * scale * s.lambda_a, s.alpha_u, k * scale * s.lambda_u)
+        for k in (1.0, 1.1, 1.2)
+    ]
+    return Plan(tuple(surfaces), (0.0, 0.05, 0.12))
+
+
+def gcc(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["gcc", *words], cwd=folder, capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+# -- it compiles, and is what Python computes ----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "real", "differentiator"),
+    [
+        ("rotary_pendulum", "double", DerivativeStep()),
+        ("rotary_pendulum", "float", SuperTwistingStep()),
+        (M, "double", SuperTwistingStep((300.0, 200.0, 100.0))),
+        (M, "float", DerivativeStep(0.004)),
+    ],
+)
+def test_strict_c99_without_a_warning_and_its_own_test_passes(
+    name: str, real: str, differentiator: object, tmp_path: Path
+) -> None:
+    """Law, limits, estimator, table, lost sensors: the vectors of Python's law and estimator.
+
+    Run under the compiler's sanitisers, so nothing undefined happens on the way.
+    """
+    controller = exported(name, real=real, differentiator=differentiator, slew=500.0)
+    build = Build(controller, tmp_path)
+    build.compile(
+        [f"{name}.c", f"{name}_test.c"], "strict", *STRICT, "-fsanitize=undefined,address"
+    )
+    done = subprocess.run([tmp_path / "strict"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert not done.stderr
+    passed, said = build.self_test()
+    assert passed
+    assert " 0 failed" in said
+
+
+def test_the_test_can_fail(tmp_path: Path) -> None:
+    """A parameter that is 1 % off is found by the vectors."""
+    controller = exported()
+    for name, content in files(controller).items():
+        text = content.decode().replace("UT_PARAMETER_m 0.125", "UT_PARAMETER_m 0.12625")
+        (tmp_path / name).write_text(text)
+    passed, said = Build(controller, tmp_path).self_test()
+    assert not passed
+    assert " 0 failed" not in said
+
+
+def test_agrees_with_python_at_1e5_random_states(tmp_path: Path) -> None:
+    """Show 6: relative difference ≤ 1e-12 in double precision."""
+    agreement = Build(exported(), tmp_path).agreement(100_000)
+    assert agreement.states == 100_000
+    assert max(agreement.output, agreement.demand, agreement.s, agreement.margin) <= 1e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("name", list(LIBRARY))
+def test_every_mechanism_of_the_library(name: str, real: str, tmp_path: Path) -> None:
+    """Show 6 for all: own test, agreement over 1e5 states, nothing asked of the library but maths.
+
+    Single precision: a millionth of the margin-weighted demand's scale is 10 of its roundings.
+    """
+    controller = exported(name, real=real)
+    build = Build(controller, tmp_path)
+    assert build.self_test()[0]
+    near = build.agreement(100_000)
+    if real == "double":
+        assert max(near.output, near.demand, near.s, near.margin) <= 1e-12
+    positions = run_positions(controller)
+    footprint = build.footprint(positions[np.isfinite(positions).all(axis=1)])
+    assert set(footprint.calls) <= {"sincos", "sincosf", "sin", "cos", "sinf", "cosf", "memcpy"}
+    assert 100 < footprint.instructions < 5000
+
+
+def test_disturbance_bounds_and_other_switching_functions_are_exported(tmp_path: Path) -> None:
+    """The gains (13) from bounds, and the other switching functions."""
+    rig = LIBRARY[M]().with_disturbance_bounds(0.3, 0.2, 0.1)
+    for switching in ("tanh", "sign"):
+        folder = tmp_path / switching
+        folder.mkdir()
+        law = ut.ReachingLaw((15.0, 20.0), (0.4, 0.5), switching)
+        controller = EmbeddedController(rig, ut.first_surface(rig), law)
+        build = Build(controller, folder)
+        assert build.self_test()[0]
+        assert build.agreement(2000).demand <= 1e-12
+
+
+# -- no heap, no unbounded loop, no recursion ----------------------------------------------------
+
+LOOP = re.compile(r"for \(int (\w) = 0; \1 < (\w+); \1\+\+\) \{")
+
+
+def unbounded(source: str) -> list[str]:
+    """Return what could keep C from ending: loops without a constant bound, calls upwards."""
+    text = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+    found = re.findall(r"\b(while|do|goto|longjmp|setjmp|switch)\b", text)
+    heads = re.findall(r"\bfor \(.*", text)
+    constants = {"UT_N", "UT_M", "UT_X", "UT_SURFACE", "UT_ROWS"}
+    for head in heads:
+        match = LOOP.match(head)
+        if match is None or match[2] not in constants:
+            found.append(head)
+    counters = re.findall(
+        r"\b([ik]) (?:=|\+=|-=) |(?:--|\+\+)([ik])\b", text.replace("int ", "int")
+    )
+    found += [a or b for a, b in counters]
+    defined: list[str] = []
+    for head, body in re.findall(
+        r"^(?:static )?[a-z_]+ (?:\*)?(ut_\w+)\([^;{]*\)\n\{(.*?)^\}",
+        text,
+        re.DOTALL | re.MULTILINE,
+    ):
+        found += [
+            f"{head} calls {f}" for f in re.findall(r"\b(ut_\w+)\(", body) if f not in defined
+        ]
+        defined.append(head)
+    return found
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", M])
+def test_no_unbounded_loop_and_no_recursion(name: str) -> None:
+    """Every loop counts to a constant; every function calls only those defined above it."""
+    source = files(exported(name))[f"{name}.c"].decode()
+    assert len(LOOP.findall(source)) >= 10
+    assert unbounded(source) == []
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        "    while (1) {\n    }\n",
+        "    for (int i = 0; i < c->row; i++) {\n    }\n",
+        "    i = 0;\n",
+        "    (void)ut_step_state(c, q, u);\n",
+    ],
+)
+def test_the_search_for_unbounded_loops_finds_them(planted: str) -> None:
+    """The check above fails where it should."""
+    source = files(exported())["rotary_pendulum.c"].decode()
+    head = "int ut_step(ut_controller *c, const ut_real q[UT_N], ut_real u[UT_M])\n{\n"
+    assert head in source
+    assert unbounded(source.replace(head, head + planted)) != []
+
+
+def test_no_heap_and_a_bounded_stack(tmp_path: Path) -> None:
+    """The object file asks for nothing but maths, and its frames are static."""
+    build = Build(exported(M), tmp_path)
+    build.compile([f"{M}.c"], "unit.o", "-c", "-fstack-usage")
+    undefined = subprocess.run(
+        ["nm", "-u", "unit.o"], cwd=tmp_path, capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert set(undefined) - {"U", "_GLOBAL_OFFSET_TABLE_"} <= {"sincos", "sin", "cos", "memcpy"}
+    usage = (tmp_path / "unit.su").read_text().split("\n")[:-1]
+    assert usage
+    assert all(line.endswith("\tstatic") for line in usage)
+
+
+def test_fast_math_is_refused(tmp_path: Path) -> None:
+    """-ffast-math would take the checks for NaN away."""
+    Build(exported(), tmp_path)
+    done = gcc(tmp_path, "-std=c99", "-ffast-math", "-c", "rotary_pendulum.c")
+    assert done.returncode != 0
+    assert "without -ffast-math" in done.stderr
+
+
+# -- never NaN, never past a limit ---------------------------------------------------------------
+
+
+def test_whatever_comes_in_the_output_is_a_number_within_limit_and_slew(tmp_path: Path) -> None:
+    """NaN, infinity, absurd numbers, in any order: |u| ≤ limit and |Δu| ≤ slew · T."""
+    controller = exported(M, slew=(3000.0, 5000.0))
+    limit = controller.mechanism.input_limits
+    step = controller.slew_rates * controller.period
+    value = st.one_of(
+        st.floats(allow_nan=True, allow_infinity=True), st.floats(-3, 3), st.just(math.nan)
+    )
+    measurement = st.tuples(st.booleans(), st.lists(value, min_size=6, max_size=6))
+    last = np.zeros(2)
+    with Build(controller, tmp_path).start() as process:
+
+        @settings(max_examples=60, deadline=None, database=None)
+        @given(st.lists(measurement, min_size=1, max_size=20))
+        def check(sequence: list[tuple[bool, list[float]]]) -> None:
+            nonlocal last
+            for positions_alone, x in sequence:
+                u, _ = process.step(x[:3]) if positions_alone else process.step_state(x)
+                assert (np.abs(u) <= limit).all()
+                assert (np.abs(u - last) <= step * (1 + 1e-12)).all()
+                last = u
+
+        check()
+
+
+def test_a_lost_sensor_is_bridged_then_the_output_goes_to_zero_then_it_starts_again(
+    tmp_path: Path,
+) -> None:
+    """The estimate is carried on for ``missed`` periods; after that the input is switched off."""
+    controller = exported(missed=4)
+    q = np.array([0.02, 0.1])
+    with Build(controller, tmp_path).start() as process:
+        before = [process.step(q) for _ in range(50)][-1]
+        lost = [process.step([0.02, math.nan]) for _ in range(8)]
+        after = process.step(q)
+    assert before[1] in (Status.OK, Status.CLIPPED)
+    assert all(s & Status.BRIDGED and u == before[0] for u, s in lost[:4])
+    assert all(s & Status.LOST and u == 0.0 for u, s in lost[4:])
+    assert not after[1] & (Status.LOST | Status.BRIDGED)
+    assert after[0] != 0.0
+
+
+def test_limits_are_rounded_towards_zero_in_single_precision() -> None:
+    """The literal of a limit is never above the limit."""
+    controller = exported(real="float")
+    for value in (0.1, 15.0, 0.3, 1 / 3, 7.7):
+        shown = np.float32(controller.limit(value).rstrip("f"))
+        assert float(shown) <= value
+        assert float(shown) > value * (1 - 1e-6)
+
+
+# -- plans ---------------------------------------------------------------------------------------
+
+
+def test_a_plan_takes_over_row_by_row_as_in_python(tmp_path: Path) -> None:
+    """A table of three surfaces built in, then another offered: equal outputs, equal switches."""
+    rig = LIBRARY[M]()
+    controller = EmbeddedController(rig, three_rows(rig))
+    later = three_rows(rig, 0.9)
+    rng = np.random.default_rng(0)
+    q = 0.05 * rng.standard_normal(3)
+    switched = []
+    with Build(controller, tmp_path).start() as process:
+        twin = Twin(controller)
+        for k in range(400):
+            if k == 200:
+                for side in (process, twin):
+                    assert side.offer(later, 2) is Verdict.ACCEPTED
+            q = q + 1e-4 * rng.standard_normal(3)
+            (u, said), (u_twin, said_twin) = process.step(q), twin.step(q)
+            assert said == said_twin
+            assert np.abs(u - u_twin).max() <= 1e-12 * rig.input_limits.max()
+            if said & Status.SWITCHED:
+                switched.append(k)
+    assert switched == [50, 120, 200, 250, 320]
+
+
+def test_offers_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+    """Stale, busy, singular, not finite, too fast for the period, too long, not rising."""
+    rig = LIBRARY["rotary_pendulum"]()
+    s = ut.first_surface(rig)
+    controller = replace(exported(), rows=2)
+    with Build(controller, tmp_path).start() as process:
+
+        def offer(*rows: str, number: int = 5, count: int | None = None) -> Verdict:
+            text = f"p {number} {len(rows) if count is None else count} {' '.join(rows)}"
+            return Verdict(int(process._ask(text)[0]))
+
+        def row(start: int = 0, eta: float = 20.0, layer: float = 0.1, **entries: float) -> str:
+            a_a, l_a, a_u, l_u = s.vector.tolist()
+            a_u, l_a = entries.get("alpha_u", a_u), entries.get("lambda_a", l_a)
+            return f"{start} {a_a!r} {l_a!r} {a_u!r} {l_u!r} {eta!r} {layer!r}"
+
+        singular = -1.0 / float(ut.sliding.coupling(rig, np.zeros(2))[0, 0])
+        assert offer(row(alpha_u=singular)) is Verdict.INVALID
+        assert offer(row(lambda_a=math.nan)) is Verdict.INVALID
+        assert offer(row(eta=0.0)) is Verdict.INVALID
+        assert offer(row(layer=-1.0)) is Verdict.INVALID
+        assert offer(row(eta=300.0)) is Verdict.INVALID  # 0.001 s ≥ 2 · 0.1 / 300
+        assert offer(row(start=1)) is Verdict.INVALID
+        assert offer(row(), row(start=0)) is Verdict.INVALID
+        assert offer(row(), row(start=9), count=3) is Verdict.INVALID
+        assert offer(count=0) is Verdict.INVALID
+        assert offer(row(), number=1) is Verdict.STALE
+        assert offer(row(), row(start=9), number=7) is Verdict.ACCEPTED
+        assert offer(row(), number=8) is Verdict.BUSY
+        process.step([0.0, 0.0])
+        assert offer(row(), number=7) is Verdict.STALE
+        assert offer(row(eta=199.0), number=8) is Verdict.ACCEPTED
+
+
+INTERRUPTED = r"""
+#include <signal.h>
+#include <stdio.h>
+#include <sys/time.h>
+#include "rotary_pendulum.h"
+
+/* The step runs in a signal handler, as in an interrupt; the main loop offers plans whose rows
+ * are all the same number, and the handler looks whether it ever sees two. */
+static ut_controller c;
+static volatile sig_atomic_t steps, torn, changes, offers_between;
+
+static void handler(int signum)
+{
+    static const ut_real q[UT_N] = {0.0, 0.01};
+    ut_real u[UT_M];
+    (void)signum;
+    if (ut_step(&c, q, u) & UT_SWITCHED) {
+        changes++;
+    }
+    const ut_plan *plan = &c.slot[c.taken];
+    for (int k = 0; k < UT_ROWS; k++) {
+        if (plan->row[k].surface[1] != plan->row[0].surface[1] ||
+            plan->row[k].eta[0] != -10 * plan->row[0].surface[1]) {
+            torn++;
+        }
+    }
+    steps++;
+}
+
+int main(void)
+{
+    static ut_plan plan;
+    struct itimerval every = {{0, 50}, {0, 50}};
+    unsigned long accepted = 0, busy = 0;
+    plan = ut_built_in;
+    for (int k = 0; k < UT_ROWS; k++) {
+        plan.row[k] = plan.row[0];
+        plan.start[k] = (unsigned long)k;
+        plan.row[k].eta[0] = -10 * plan.row[0].surface[1];
+    }
+    plan.count = UT_ROWS;
+    ut_init(&c);
+    plan.number = 2;
+    if (ut_offer(&c, &plan) != UT_ACCEPTED) {
+        return 2;
+    }
+    signal(SIGALRM, handler);
+    setitimer(ITIMER_REAL, &every, NULL);
+    for (unsigned long n = 3; accepted < 2000 && n < 2000000000UL; n++) {
+        const double size = 1 + (double)(n % 97) / 97;
+        for (int k = 0; k < UT_ROWS; k++) {
+            plan.row[k].surface[1] = -size;
+            plan.row[k].eta[0] = 10 * size;
+        }
+        plan.number = n;
+        const int verdict = ut_offer(&c, &plan);
+        accepted += verdict == UT_ACCEPTED;
+        busy += verdict == UT_BUSY;
+        if (verdict != UT_ACCEPTED && verdict != UT_BUSY) {
+            return 3;
+        }
+    }
+    printf("%lu %lu %d %d %d\n", accepted, busy, (int)steps, (int)changes, (int)torn);
+    return torn != 0;
+}
+"""
+
+
+def test_plans_are_exchanged_whole_under_interruption(tmp_path: Path) -> None:
+    """Steps interrupt the filling of a slot at any instant: never is a mixed plan in use."""
+    controller = replace(exported(), rows=16)
+    build = Build(controller, tmp_path)
+    (tmp_path / "interrupted.c").write_text(INTERRUPTED)
+    done = gcc(
+        tmp_path, "-std=gnu99", "-O2", "rotary_pendulum.c", "interrupted.c", "-lm", "-o", "run"
+    )
+    assert done.returncode == 0, done.stderr
+    ran = subprocess.run(
+        [build.folder / "run"], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert ran.returncode == 0, ran.stdout
+    accepted, busy, steps, changes, torn = map(int, ran.stdout.split())
+    assert accepted == 2000
+    assert busy > 0
+    assert steps > 1000
+    assert changes > 1000
+    assert torn == 0
+
+
+# -- in the loop ---------------------------------------------------------------------------------
+
+
+def test_a_process_over_a_pipe_balances_the_realistic_rig(tmp_path: Path) -> None:
+    """Show 6: the SRV02 bench from 35°, encoders, friction and delay, positions measured alone."""
+    controller = exported()
+    start = controller.mechanism.state(phi=math.radians(35))
+    rig = RealisticRig(srv02_rig(), start, seed=3)
+    with Build(controller, tmp_path).start() as process:
+        loop = run_on_rig(process, rig, 4.0)
+    assert loop.held
+    assert np.abs(rig.truth[1]) < 0.05
+    assert np.abs(loop.u).max() <= 15.0
+    assert abs(loop.q[0, 1]) > 0.5
+    # The same positions through the Python twin give the same outputs.
+    twin = Twin(controller)
+    for q, u in zip(loop.q[:500], loop.u[:500], strict=True):
+        assert np.abs(twin.step(q)[0] - u).max() <= 1e-12 * 15
+
+
+def test_without_control_the_rig_falls(tmp_path: Path) -> None:
+    """``held`` is no matter of course: on a rig whose input is cut the pendulum falls."""
+    controller = exported()
+    bench = srv02_rig()
+    dead = replace(bench, amplifiers={"voltage": ut.rig.Amplifier(1e-9)})
+    with Build(controller, tmp_path).start() as process:
+        assert not run_on_rig(process, RealisticRig(dead, seed=0), 2.0).held
+
+
+# -- names, refusals -----------------------------------------------------------------------------
+
+
+def test_two_controllers_link_into_one_program(tmp_path: Path) -> None:
+    """Prefixes keep their names apart, and C++ may include the headers."""
+    for name, prefix in (("rotary_pendulum", "one"), (M, "two")):
+        Build(exported(name, prefix=prefix), tmp_path)
+    (tmp_path / "main.c").write_text(
+        f'#include "rotary_pendulum.h"\n#include "{M}.h"\n'
+        "int main(void)\n{\n    static one_controller a;\n    static two_controller b;\n"
+        "    one_init(&a);\n    two_init(&b);\n    return ONE_N + TWO_N - 5;\n}\n"
+    )
+    sources = ["main.c", "rotary_pendulum.c", f"{M}.c"]
+    done = gcc(tmp_path, *FLAGS, *STRICT, *sources, "-lm", "-o", "both")
+    assert done.returncode == 0, done.stderr
+    assert subprocess.run([tmp_path / "both"], check=False).returncode == 0
+    names = subprocess.run(
+        ["nm", "-g", "--defined-only", "both"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert not re.search(r"\but_", names)
+
+
+def test_the_example_of_the_page_compiles(tmp_path: Path) -> None:
+    """``docs/embedded.md`` shows C that fits the header, and commands that exist."""
+    page = (Path(__file__).parent.parent / "docs" / "embedded.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    Build(exported(), tmp_path)
+    needs = (
+        "#include <math.h>\nextern double read_arm(void), read_pendulum(void);\n"
+        "extern void write_voltage(double u), brake(void), start_timer(void), reply(int verdict);\n"
+        "extern int receive(void *plan);\nvoid timer_interrupt(void);\n"
+    )
+    (tmp_path / "example.c").write_text(needs + code)
+    done = gcc(tmp_path, *FLAGS, *STRICT, "-c", "example.c")
+    assert done.returncode == 0, done.stderr
+    code_of_help, shown, _ = invoke("--help")
+    assert code_of_help == 0
+    wanted = set(re.findall(r"--[a-z][a-z-]+", page)) - {"--version"}
+    assert wanted <= set(re.findall(r"--[a-z-]+", shown))
+
+
+def test_bad_requests_are_refused_with_value_and_limit() -> None:
+    """Nothing is written for a controller that could not run."""
+    rig = LIBRARY["rotary_pendulum"]()
+    s = ut.first_surface(rig)
+    free = replace(rig, inputs=(ut.Input("voltage", "V"),))
+    requests: tuple[tuple[Callable[[], object], str], ...] = (
+        (lambda: EmbeddedController(free, s), "with_input_limit"),
+        (lambda: EmbeddedController(rig, s, period=0.02), "below 2 ε/k"),
+        (lambda: EmbeddedController(rig, s, period=math.nan), "0 to 1 s"),
+        (lambda: EmbeddedController(rig, s, slew=-1.0), "slew rate"),
+        (lambda: EmbeddedController(rig, s, prefix="2x"), "a C name"),
+        (lambda: EmbeddedController(rig, s, missed=-1), "0 or more"),
+        (lambda: EmbeddedController(rig, three_rows(rig), rows=2), "3 (those of the plan)"),
+        (lambda: EmbeddedController(rig, Plan((s, s), (0.0, 1e-4))), "apart"),
+        (lambda: EmbeddedController(rig, s, differentiator=DerivativeStep(0.0)), "> 0"),
+    )
+    for build, words in requests:
+        with pytest.raises(InvalidInputError, match=re.escape(words)):
+            build()
+
+
+def test_expressions_that_c_does_not_know_are_refused() -> None:
+    """A model with a function beyond math.h says so, and numbers beyond single precision."""
+    x = sp.Symbol("x", real=True)
+    tape = Tape()
+    with pytest.raises(ModelError, match=r"math\.h"):
+        C99Emitter(tape, {}).statements({"y": tape.let(sp.besselj(0, x))})
+    with pytest.raises(ModelError, match="single precision"):
+        literal(1e300, "float")
+    assert literal(1e-300, "float") == "1.1754944e-38f"
+
+
+def test_printed_expressions_are_those_of_numpy(tmp_path: Path) -> None:
+    """Powers, roots, signs, cases, constants: C and NumPy at the same numbers."""
+    x, y = sp.symbols("x y", real=True)
+    expressions = [
+        x**2 * y - y**-3,
+        sp.sqrt(1 + x**2) / sp.sqrt(2 + y**2),
+        (x**2 + 1) ** sp.Rational(1, 3),
+        sp.Max(x, y, sp.Rational(1, 3)) - sp.Min(x, -y),
+        sp.sign(x) * sp.Abs(y) + sp.pi * sp.E,
+        sp.Piecewise((x, x > y), (y**2, sp.And(x < 0, y > 0)), (sp.Float(0.5), True)),
+        sp.tanh(x) + sp.exp(-(y**2)) + sp.atan2(x, y) + sp.tan(x / 2),
+        sp.sin(x + y) * sp.cos(x + y) - sp.cos(3 * x),
+    ]
+    helpers = (
+        "static double ut_max(double a, double b) { return a > b ? a : b; }\n"
+        "static double ut_min(double a, double b) { return a < b ? a : b; }\n"
+        "static double ut_sign(double a) { return (a > 0) - (a < 0); }\n"
+    )
+    tape = Tape()
+    laid = tape.let_all(expressions)
+    body = C99Emitter(tape, {x: "v[0]", y: "v[1]"}).statements(
+        {f"out[{i}]": e for i, e in enumerate(laid)}
+    )
+    (tmp_path / "e.c").write_text(
+        "#include <math.h>\n#include <stdio.h>\ntypedef double ut_real;\n"
+        f"{helpers}int main(void)\n{{\n    double v[2], out[{len(laid)}];\n"
+        '    while (scanf("%lf %lf", v, v + 1) == 2) {\n'
+        f"{body}\n"
+        f"        for (int i = 0; i < {len(laid)}; i++)\n"
+        '            printf("%.17g ", out[i]);\n        printf("\\n");\n    }\n    return 0;\n}\n'
+    )
+    done = gcc(tmp_path, *FLAGS, "e.c", "-lm", "-o", "e")
+    assert done.returncode == 0, done.stderr
+    points = np.random.default_rng(0).uniform(-2, 2, (50, 2))
+    text = "\n".join(f"{a!r} {b!r}" for a, b in points.tolist())
+    ran = subprocess.run([tmp_path / "e"], input=text, capture_output=True, text=True, check=True)
+    got = np.array([line.split() for line in ran.stdout.splitlines()], dtype=float)
+    expected = [sp.lambdify((x, y), e, "numpy")(*points.T) for e in expressions]
+    assert np.allclose(got, np.array(expected).T, rtol=1e-13, atol=1e-14)
+
+
+def test_missing_tools_and_broken_c_are_said(tmp_path: Path) -> None:
+    """No compiler: what to install. C that does not compile: the first complaint."""
+    with pytest.raises(MissingExtraError, match="Install no-such-compiler"):
+        tool("no-such-compiler")
+    controller = exported()
+    for name, content in files(controller).items():
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "rotary_pendulum.c").write_text("int x = ;\n")
+    with pytest.raises(ArtefactError, match="expected expression"):
+        Build(controller, tmp_path).self_test()
+
+
+def test_a_process_that_ends_is_noticed(tmp_path: Path) -> None:
+    """No answer on the pipe is an error, not a wait."""
+    with Build(exported(), tmp_path).start() as process:
+        process._process.kill()
+        process._process.wait()
+        with pytest.raises(ArtefactError, match="no answer"):
+            process.step([0.0, 0.0])
+
+
+# -- the command line ----------------------------------------------------------------------------
+
+
+def invoke(*words: str) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, ["export", "c", *words], env={"COLUMNS": "120"})
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_command_writes_tests_and_says_so(tmp_path: Path) -> None:
+    """Files in the folder, its own test passed, ASCII alone; the same request, the same bytes."""
+    out = tmp_path / "firmware"
+    request = ("rotary_pendulum", "--velocity", "super-twisting", "--slew", "400", "--check")
+    code, said, _ = invoke(*request, "--out", str(out))
+    assert code == 0
+    assert "0 failed" in said
+    written = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert set(written) == {
+        "rotary_pendulum" + end for end in (".c", ".h", "_test.c", "_vectors.h", "_pipe.c")
+    }
+    assert all(content.isascii() for content in written.values())
+    header = written["rotary_pendulum.h"].decode()
+    assert "theta  rad  arm angle about the vertical" in header
+    assert "voltage, V, at most 15 V, 400 V/s" in header
+    invoke(*request, "--out", str(tmp_path / "again"))
+    assert written == {p.name: p.read_bytes() for p in (tmp_path / "again").iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ((), "neither a name nor --all"),
+        (("rotary_pendulum", "--all", "--check"), "a name and --all"),
+        (("rotary_pendulum",), "none of --out"),
+        (("rotary_pendulum", "--check", "--period", "0.05"), "below 2 ε/k"),
+        (("rotary_pendulum", "--check", "--compiler", "no-such-cc"), "Install no-such-cc"),
+        (("piano", "--check"), "'piano'"),
+    ],
+)
+def test_command_refuses(words: tuple[str, ...], part: str) -> None:
+    """One line, with value and limit."""
+    code, _, error = invoke(*words)
+    assert code in (1, 2)
+    assert error.startswith("error: ")
+    assert part in error
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("valgrind") is None, reason="needs valgrind")
+def test_report_counts_instructions_and_bytes(tmp_path: Path) -> None:
+    """``--report`` prints a row with agreement, instructions and sizes, and keeps it as CSV."""
+    code, said, _ = invoke(
+        "rotary_pendulum", "--report", "--states", "1000", "--out", str(tmp_path)
+    )
+    assert code == 0
+    assert "instr./step" in said
+    row = (tmp_path / "report.csv").read_text().splitlines()[1].split(",")
+    assert row[0] == "rotary_pendulum"
+    assert 200 < int(row[6]) < 1000
