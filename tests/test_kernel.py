@@ -24,8 +24,8 @@ from support import (
     runge_kutta,
 )
 from undertow.codegen import block, store
+from undertow.kernel import lay_loop
 from undertow.mechanism import TIME, FloatArray
-from undertow.rollout import lay_loop
 from undertow.sliding import Switching
 
 #: States to the values of all formulas there.
@@ -215,7 +215,7 @@ SOURCE_HASH = """
 import hashlib
 import undertow as ut
 from undertow.codegen import block
-from undertow.rollout import lay_loop
+from undertow.kernel import lay_loop
 rig = ut.mechanisms.rotary_pendulum()
 program = lay_loop(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")
 print(hashlib.sha256(block.block_source(program, sampled=False, header="").encode()).hexdigest())

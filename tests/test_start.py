@@ -14,7 +14,7 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow import lagrange, rollout, stability
+from undertow import kernel, lagrange, stability
 from undertow.codegen import block, store
 from undertow.mechanism import numbers
 from undertow.mechanisms import LIBRARY
@@ -25,9 +25,9 @@ from undertow.stability import linearise
 def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A cache folder of one's own, and nothing in memory."""
     monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path))
-    rollout._compile.cache_clear()
+    kernel.compile_loop.cache_clear()
     yield tmp_path
-    rollout._compile.cache_clear()
+    kernel.compile_loop.cache_clear()
 
 
 def derivations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -46,7 +46,7 @@ def derivations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def generations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the mechanisms whose loop is written afresh from now on."""
     names: list[str] = []
-    original = rollout.lay_loop
+    original = kernel.lay_loop
 
     def counted(belief: ut.Mechanism, *rest: Any) -> Any:
         names.append(belief.name)
@@ -55,15 +55,15 @@ def generations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def not_compiled(name: str, source: str) -> Any:
         return type("Module", (), {"rollout": staticmethod(lambda: source)})
 
-    monkeypatch.setattr(rollout, "lay_loop", counted)
-    monkeypatch.setattr(rollout, "load_module", not_compiled)
+    monkeypatch.setattr(kernel, "lay_loop", counted)
+    monkeypatch.setattr(kernel, "load_module", not_compiled)
     return names
 
 
 def source(*arguments: Any) -> str:
     """Source of a kernel as a new process would find or write it."""
-    rollout._compile.cache_clear()
-    return str(rollout._compile(*arguments)())
+    kernel.compile_loop.cache_clear()
+    return str(kernel.compile_loop(*arguments)())
 
 
 # -- equations -----------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ def test_a_changed_loop_never_finds_an_old_kernel(monkeypatch: pytest.MonkeyPatc
 
 def test_the_key_knows_every_file_that_writes_kernels() -> None:
     """Claim: each file of the package that runs while a loop is written is in its key."""
-    package = Path(rollout.__file__).parent
+    package = Path(kernel.__file__).parent
     met: set[str] = set()
 
     def note(frame: FrameType, _event: str, _argument: object) -> None:
@@ -203,12 +203,12 @@ def test_the_key_knows_every_file_that_writes_kernels() -> None:
     before = sys.getprofile()
     sys.setprofile(note)
     try:
-        program = rollout.lay_loop(rig, rig, goal, "saturation")
+        program = kernel.lay_loop(rig, rig, goal, "saturation")
         block.block_source(program, sampled=True, header="")
     finally:
         sys.setprofile(before)
     assert met
-    assert met <= set(rollout.GENERATOR)
+    assert met <= set(kernel.GENERATOR)
 
 
 # -- linearisation -------------------------------------------------------------------------------

@@ -46,6 +46,9 @@ class Admission:
 #: Relative tolerance of the linear tail in the optimiser's rollouts.
 TAIL = 5e-3
 
+#: Largest step times rate of the boundary layer in the optimiser's rollouts.
+RESOLVED = 1.0
+
 Gate = Callable[[ClosedLoop, Plan, Plan, FloatArray, float], Admission]
 
 
@@ -299,8 +302,20 @@ class Cascade:
 
     @cached_property
     def optimiser(self) -> Optimiser:
-        """The optimiser of the outer loop; its rollouts end in the exact linear tail."""
+        """The optimiser of the outer loop; its rollouts end in the exact linear tail.
+
+        Its steps are twice as long where that resolves the boundary layer: the gate integrates
+        what it finds again.  A time of arrival is a matter of milliseconds, and is not searched
+        for with longer steps than it is judged with.
+        """
         loop = replace(self.loop, tail=TAIL)
+        end = loop.linear_end
+        smooth = end is not None and end.counts_cost and not self.freedom.reaching
+        eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
+        slow = 2 * self.step * float((eta / layer).max()) <= RESOLVED
+        even = all(round(t / self.step) % 2 == 0 for t in self.freedom.times)
+        if smooth and slow and even and not any(self.mechanism.disturbance_bounds):
+            loop = replace(loop, step=2 * self.step)
         return Optimiser(loop, self.first, self.cold, self.warm, self.freedom, seed=self.seed)
 
     # -- the state machine ----------------------------------------------------------------

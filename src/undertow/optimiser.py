@@ -61,6 +61,9 @@ WORTHWHILE = 1e-3
 #: Largest number of coordinates for a model search: its model has 55 terms then.
 MODEL_SIZE = 9
 
+#: Generations without a gain that end a search along a ridge; it gains in jumps.
+PATIENCE = 12
+
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
 
@@ -305,6 +308,7 @@ class _Task:
         self.owner, self.x, self.horizon = owner, x, horizon
         self.budget, self.resolution, self.began, self.rng = budget, resolution, began, rng
         self.decision = owner.decision
+        self.probe = owner.loop.probe(x, owner.freedom.times, horizon)
         self.warm = False
         self.evaluations = 0
         self.best_cost = math.inf
@@ -377,17 +381,10 @@ class _Task:
             stable = stability_margin(loop.mechanism, vectors[:, -1]) > 0
             if not stable.all():
                 return self._stable_only(vectors, gains, times, stable)
-        batch = loop.batch(
-            self.x,
-            vectors,
-            reaching=gains,
-            switch_times=times,
-            duration=self.horizon,
-            cap=cap,
-            slack=self.resolution,
-            stable_only=True,
-            seek=seek,
-        )
+        probe = self.probe
+        if times != self.owner.freedom.times:
+            probe = loop.probe(self.x, times, self.horizon)
+        batch = probe(vectors, gains, cap=cap, slack=self.resolution, stable_only=True, seek=seek)
         scores = batch.score(self.horizon)
         guide = scores.copy()
         _guide(
@@ -461,7 +458,9 @@ class _Task:
             return self._descend(self._centre(), 0.1, self.left, 1e-3)
         search = TrustRegion(here, 0.1, LANES, self.rng)
         self._run(search, known)
-        while self.left >= LANES and not self.late():
+        # Where the incumbent stays the best, look further away, and go where that leads.
+        stagnant = not self.best_cost < (1.0 - WORTHWHILE) * self.incumbent_cost - self.resolution
+        while stagnant and self.left >= LANES and not self.late():
             before = self.best_cost
             self._look_around(here)
             if not self.best_cost < (1.0 - WORTHWHILE) * before - self.resolution:
@@ -530,13 +529,21 @@ class _Task:
         tight = loop.objective.terminal_radius / np.maximum(steepness, 1e-12)
         spread[: len(tight)] = np.minimum(tight, FAR)
         search = CMAES(here, 1.0, LANES, self.rng, (across * spread**2) @ across.T)
-        minimise(search, self.cost, evaluations=most, tolerance=1e-4, stop=self.late)
+        minimise(
+            search,
+            self.cost,
+            evaluations=most,
+            tolerance=1e-4,
+            relative=1e-6,
+            patience=PATIENCE,
+            stop=self.late,
+        )
         return search.converged
 
     def _look_around(self, here: FloatArray) -> None:
-        wide = min(self.left, self.owner.population)
+        wide = min(self.left, LANES)
         if wide > 0:
-            self.cost(here + self.decision.steps(self.rng, np.geomspace(0.03, 1.0, wide)))
+            self.cost(here + self.decision.steps(self.rng, np.geomspace(0.1, 1.0, wide)))
 
     def shoot(self) -> bool:
         """Shrink the time of arrival; starts are the best plan and random ones."""

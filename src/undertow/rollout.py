@@ -9,37 +9,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
-from functools import cached_property, lru_cache
-from pathlib import Path
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
-import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.codegen.block import LANES, LoopProgram, block_source
-from undertow.codegen.machine import numba
-from undertow.codegen.store import content_key, load_module, recall, remember
-from undertow.codegen.tape import Tape
+from undertow.codegen.block import LANES
 from undertow.errors import InvalidInputError
-from undertow.mechanism import TIME, FloatArray, Mechanism
+from undertow.kernel import compile_loop
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.motion import Batch, Event, Trajectory
 from undertow.objective import MinimumEnergy, Objective
 from undertow.plan import Plan
 from undertow.sliding import (
-    LawSymbols,
     ReachingLaw,
     Surface,
-    Switching,
     check_surface_shape,
     coupling,
     gains_at_target,
     gamma_determinant,
-    lay_law,
 )
 from undertow.tail import LinearEnd, Prepared
 
-__all__ = ["Batch", "ClosedLoop", "Event", "Trajectory"]
+__all__ = ["Batch", "ClosedLoop", "Event", "Probe", "Trajectory"]
 
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
@@ -51,137 +44,95 @@ _NOTHING = np.zeros((1, 1, 1))
 _AT_ONCE = np.zeros(1, dtype=np.int64)
 
 
-class Event(IntEnum):
-    """Why a rollout ended."""
+class _Numbers(NamedTuple):
+    """Plant and belief parameters, input limits, X at the target, η and ε of the loop."""
 
-    HORIZON = 0
-    REACHED = 1
-    CONSTRAINT = 2
-    SINGULAR = 3
-    DIVERGED = 4
-    COSTLY = 5
-    UNSTABLE = 6
+    plant: FloatArray
+    belief: FloatArray
+    limits: FloatArray
+    at_target: FloatArray
+    law: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """Results of N rollouts; arrays of length N.
+class _Room:
+    """What one call of the kernel reads and writes: whole blocks of lanes.
 
-    ``cost`` is ∫Φ dt until the end; ``time`` the end, s; ``event`` an :class:`Event`;
-    ``radius`` the final ‖x‖₂; ``singular`` the smallest det Γ(q)/det Γ(0) met;
-    ``input`` the smallest u_max − |demand| (only with a hard input limit);
-    ``path`` (N, w) the smallest margins of the path constraints; ``x`` (N, 2n) final states.
-    ``closest``, ``closest_time`` and ``closest_x`` (N, 2n): the smallest ‖x‖₂ met, when and
-    where, if it was asked for.
+    A lane is a row of ``lanes``: for each of S surfaces its vector, η and ε, and det Γ at the
+    target.
     """
 
-    cost: FloatArray
-    time: FloatArray
-    event: NDArray[np.int64]
-    radius: FloatArray
-    singular: FloatArray
-    input: FloatArray
-    path: FloatArray
-    closest: FloatArray
-    closest_time: FloatArray
-    closest_x: FloatArray
-    x: FloatArray
+    def __init__(self, loop: ClosedLoop, count: int, segments: int) -> None:
+        n, m = loop.mechanism.n, loop.mechanism.m
+        self.count, self.padded = count, -(-count // LANES) * LANES
+        self.at_target, self.width, self.paths = loop._numbers.at_target, 2 * m * n, 0
+        self.paths = len(loop.objective.constraints)
+        self.lanes = np.empty((self.padded, segments, self.width + 2 * m + 1))
+        self.states = np.empty((self.padded, 2 * n))
+        self.live = np.ones(self.padded)
+        self.out = np.empty((self.padded, 8 + self.paths + 4 * n))
+        # A sampled kernel reads the noise of every lane.
+        self.quiet = np.zeros((1, self.padded, 2 * n)) if loop.hold else _NOTHING
 
-    @property
-    def reached(self) -> NDArray[np.bool_]:
-        """Whether the terminal set was reached without breaking any constraint."""
-        return np.asarray(self.event == Event.REACHED)
+    def fill(self, states: FloatArray, surfaces: FloatArray, laws: FloatArray) -> None:
+        """Take states (…, 2n), surfaces (…, S, 2mn) and laws (…, S, 2m); the last fills up."""
+        lanes, count = self.lanes, self.count
+        lanes[:count, :, : self.width] = surfaces
+        lanes[:count, :, self.width : -1] = laws
+        lanes[:count, :, -1] = gamma_determinant(self.at_target, surfaces)
+        self.states[:count] = states
+        if self.padded > count:
+            lanes[count:] = lanes[count - 1]
+            self.states[count:] = self.states[count - 1]
 
-    def score(self, horizon: float) -> FloatArray:
-        """Return the cost where admissible, else a graded penalty above 1e9.
-
-        The penalty falls with survival time and then with the final distance, so that a
-        search can climb out of a region without admissible surfaces.
-        """
-        scores = np.empty(len(self.cost))
-        _score(self.cost, self.time, self.event, self.radius, horizon, scores)
-        return scores
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _score(cost, time, event, radius, horizon, scores):  # type: ignore[no-untyped-def]
-    for i in range(len(scores)):
-        if event[i] == 1:  # reached
-            scores[i] = cost[i]
-        elif event[i] == 0:  # horizon
-            near = math.tanh(radius[i]) if math.isfinite(radius[i]) else 1.0
-            scores[i] = 1e9 * (1.0 + near)
-        elif event[i] == 6:  # unstable
-            scores[i] = 1e10
-        else:
-            scores[i] = 1e9 * (3.0 - time[i] / horizon)
+    def batch(self, start: float) -> Batch:
+        """Return the results as named views."""
+        out, w, n = self.out[: self.count], self.paths, self.states.shape[1] // 2
+        return Batch(
+            cost=out[:, 0],
+            time=out[:, 1] - start,
+            event=out[:, 2].astype(np.int64),
+            radius=out[:, 3],
+            singular=out[:, 4],
+            input=out[:, 5],
+            path=out[:, 6 : 6 + w],
+            closest=out[:, 6 + w],
+            closest_time=out[:, 7 + w] - start,
+            closest_x=out[:, 8 + w : 8 + w + 2 * n],
+            x=out[:, 8 + w + 2 * n :],
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """One recorded motion.
+class Probe:
+    """Rollouts of many plans from one state, unchecked and in the same buffers: for searches.
 
-    Attributes
+    Parameters
     ----------
-    t
-        Times, (N,), s.
+    loop
+        The closed loop.
     x
-        States (q, q̇), (N, 2n), SI units.
-    u
-        Inputs after the actuator, (N, m).
-    s
-        Surface values, (N, m).
-    cost
-        Cost so far, (N,).
-    margin
-        det Γ(q)/det Γ(0), (N,): positive where the law exists.
-    event
-        Why it ended.
+        State, (2n,).
+    switches, steps
+        Switch times of the plans and length, in steps.
     """
 
-    mechanism: Mechanism
-    t: FloatArray
-    x: FloatArray
-    u: FloatArray
-    s: FloatArray
-    cost: FloatArray
-    margin: FloatArray
-    event: Event
+    def __init__(
+        self, loop: ClosedLoop, x: FloatArray, switches: NDArray[np.int64], steps: int
+    ) -> None:
+        self.loop, self.x, self.switches, self.steps = loop, x, switches, steps
+        self._rooms: dict[int, _Room] = {}
 
-    @property
-    def total(self) -> float:
-        """Total cost."""
-        return float(self.cost[-1])
+    def __call__(self, surfaces: FloatArray, laws: FloatArray | None, **options: Any) -> Batch:
+        """Roll out surfaces (N, S, 2mn) with reaching laws (N, S, 2m).
 
-    @property
-    def duration(self) -> float:
-        """Time at the end, s."""
-        return float(self.t[-1])
-
-    def __getitem__(self, name: str) -> FloatArray:
-        """Return the time series of a named state."""
-        if name not in self.mechanism.state_names:
-            raise InvalidInputError(
-                "state of a trajectory",
-                value=repr(name),
-                limit=f"one of {', '.join(self.mechanism.state_names)}",
-            )
-        return np.asarray(self.x[:, self.mechanism.state_names.index(name)])
-
-    @classmethod
-    def join(cls, pieces: Sequence[Trajectory]) -> Trajectory:
-        """Join consecutive pieces; costs add up, doubled end points are dropped."""
-        first, spent = pieces[0], 0.0
-        columns: dict[str, list[FloatArray]] = {k: [] for k in ("t", "x", "u", "s", "margin")}
-        costs = []
-        for index, piece in enumerate(pieces):
-            end = len(piece.t) if index == len(pieces) - 1 else -1
-            for key, parts in columns.items():
-                parts.append(getattr(piece, key)[:end])
-            costs.append(piece.cost[:end] + spent)
-            spent += piece.total
-        joined = {key: np.concatenate(parts) for key, parts in columns.items()}
-        return cls(first.mechanism, **joined, cost=np.concatenate(costs), event=pieces[-1].event)
+        What is returned is valid until the next call.  Options are those of
+        :meth:`ClosedLoop.batch`: ``terminal``, ``cap``, ``slack``, ``stable_only``, ``seek``.
+        """
+        count = len(surfaces)
+        room = self._rooms.get(count)
+        if room is None:
+            room = self._rooms[count] = _Room(self.loop, count, len(self.switches))
+        room.fill(self.x, surfaces, self.loop._numbers.law if laws is None else laws)
+        return self.loop._launch(room, self.switches, self.steps, **options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,15 +228,14 @@ class ClosedLoop:
 
     @cached_property
     def _kernel(self) -> Any:
-        return _compile(
+        return compile_loop(
             self.mechanism, self.plant, self.objective, self.reaching.switching, self.hold > 0
         )
 
     @cached_property
-    def _numbers(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Plant parameters, belief parameters, input limits, X at the target, η and ε."""
+    def _numbers(self) -> _Numbers:
         belief, truth = self.mechanism, self.truth
-        return (
+        return _Numbers(
             truth.parameter_values,
             belief.parameter_values,
             truth.input_limits,
@@ -349,49 +299,56 @@ class ClosedLoop:
         switch_times: Sequence[float] = (0.0,),
         duration: float | None = None,
         start: float = 0.0,
+        every: int = 0,
+        **options: Any,
+    ) -> tuple[Batch, FloatArray]:
+        """Roll out states (N, 2n) and surfaces (N, S, 2mn), or one of either, in new buffers."""
+        steps = self._steps(self.objective.horizon if duration is None else duration)
+        room = _Room(self, max(len(x0), len(surfaces)), surfaces.shape[1])
+        room.fill(x0, surfaces, self._numbers.law if reaching is None else reaching)
+        columns = 2 * self.mechanism.n + 2 * self.mechanism.m + 2
+        shape = (room.padded, -(-steps // every), columns) if every else (0, 0, 0)
+        record = np.zeros(shape)
+        switches = self._switch_steps(switch_times)
+        batch = self._launch(
+            room, switches, steps, start=start, every=every, record=record, **options
+        )
+        return batch, record
+
+    def _launch(
+        self,
+        room: _Room,
+        switches: NDArray[np.int64],
+        steps: int,
+        *,
+        start: float = 0.0,
         terminal: float | None = None,
         cap: float = math.inf,
         slack: float = 0.0,
         stable_only: bool = False,
         seek: bool = False,
         every: int = 0,
+        record: FloatArray = _NOTHING,
         noise: FloatArray | None = None,
-    ) -> tuple[Batch, FloatArray]:
-        """Call the kernel on states (N, 2n) and surfaces (N, S, 2mn), or one of either."""
-        n, m = self.mechanism.n, self.mechanism.m
-        plant, belief, limits, at_target, law = self._numbers
-        count = max(len(x0), len(surfaces))
-        segments, width = surfaces.shape[1:]
-        padded = -(-count // LANES) * LANES
-        lanes = np.empty((padded, segments, width + 2 * m + 1))
-        lanes[:count, :, :width] = surfaces
-        lanes[:count, :, width:-1] = law if reaching is None else reaching
-        lanes[:count, :, -1] = gamma_determinant(at_target, surfaces)
-        lanes[count:] = lanes[count - 1]
-        states = np.empty((padded, 2 * n))
-        states[:count] = x0
-        states[count:] = states[count - 1]
-        steps = self._steps(self.objective.horizon if duration is None else duration)
-        self._check_gains(lanes, live := np.ones(padded), stable_only)
-        record = np.zeros((padded, -(-steps // every), 2 * n + 2 * m + 2) if every else (0, 0, 0))
-        w = len(self.objective.constraints)
-        out = np.empty((padded, 8 + w + 4 * n))
-        # A sampled kernel reads the noise of every lane.
-        quiet = np.zeros((1, padded, 2 * n)) if self.hold else _NOTHING
+    ) -> Batch:
+        """Call the kernel on what the room holds; the results live there too."""
+        numbers = self._numbers
+        room.live.fill(1.0)
+        self._check_gains(room.lanes, room.live, stable_only)
         hands_over = self._hands_over and not every
-        prepared = self._prepare(lanes[:, -1]) if hands_over or stable_only else None
+        prepared = self._prepare(room.lanes[:, -1]) if hands_over or stable_only else None
         end = self.linear_end
         if prepared is not None and stable_only:
-            live *= prepared.stable
+            room.live *= prepared.stable
         self._kernel(
-            states,
-            live,
-            lanes,
-            self._switch_steps(switch_times),
-            plant,
-            belief,
-            limits,
-            quiet if noise is None else noise,
+            room.states,
+            room.live,
+            room.lanes,
+            switches,
+            numbers.plant,
+            numbers.belief,
+            numbers.limits,
+            room.quiet if noise is None else noise,
             start,
             self.step,
             steps,
@@ -408,25 +365,25 @@ class ClosedLoop:
             _NOTHING[0, 0] if prepared is None else prepared.rate,
             every,
             record,
-            out,
+            room.out,
         )  # fmt: skip
         if hands_over and end is not None and prepared is not None:
-            end.complete(prepared, out, start + steps * self.step)
-        out = out[:count]
-        batch = Batch(
-            cost=out[:, 0],
-            time=out[:, 1] - start,
-            event=out[:, 2].astype(np.int64),
-            radius=out[:, 3],
-            singular=out[:, 4],
-            input=out[:, 5],
-            path=out[:, 6 : 6 + w],
-            closest=out[:, 6 + w],
-            closest_time=out[:, 7 + w] - start,
-            closest_x=out[:, 8 + w : 8 + w + 2 * n],
-            x=out[:, 8 + w + 2 * n :],
-        )
-        return batch, record
+            end.complete(prepared, room.out, start + steps * self.step)
+        return room.batch(start)
+
+    def probe(self, x: FloatArray, times: Sequence[float] = (0.0,), horizon: float = 0.0) -> Probe:
+        """Return a function that rolls out plans from x, again and again, without checks.
+
+        Parameters
+        ----------
+        x
+            State, (2n,).
+        times
+            Switch times of the plans, s.
+        horizon
+            Length, s.
+        """
+        return Probe(self, x, self._switch_steps(times), self._steps(horizon))
 
     def batch(
         self,
@@ -685,98 +642,3 @@ def _plans(what: object) -> list[Plan]:
     if isinstance(what, Sequence) and all(isinstance(item, Surface | Plan) for item in what):
         return [Plan.of(item) for item in what]
     return []
-
-
-def lay_loop(
-    belief: Mechanism, plant: Mechanism | None, objective: Objective, switching: Switching
-) -> LoopProgram:
-    """Compose law, plant and objective on one tape.
-
-    With ``plant=None`` both share symbols, so everything they have in common is computed
-    once; otherwise the belief keeps its own parameter symbols.
-    """
-    tape = Tape()
-    truth = belief if plant is None else plant
-    x = truth.x
-    rename: dict[sp.Symbol, sp.Expr] = dict(zip(belief.x, x, strict=True))
-    belief_parameters: tuple[sp.Symbol, ...] = ()
-    if plant is not None:
-        belief_parameters = tuple(
-            sp.Symbol(f"_belief_{s}", real=True) for s in belief.parameter_symbols
-        )
-        rename |= dict(zip(belief.parameter_symbols, belief_parameters, strict=True))
-    symbols = LawSymbols.of(belief.n, belief.m)
-    law = lay_law(belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds)
-    applied = tuple(sp.Symbol(f"_applied_{i}", real=True) for i in range(truth.m))
-    limits = tuple(sp.Symbol(f"_limit_{i}", real=True) for i in range(truth.m))
-    inputs = dict(zip(truth.u, applied, strict=True))
-    qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
-    stage, *path = tape.let_all(
-        [e.xreplace(inputs) for e in (objective.stage_cost(truth), *objective.path_margins(truth))]
-    )
-    input_margin = None
-    if objective.hard_input:
-        margins = [limit - sp.Abs(d) for limit, d in zip(limits, law.u, strict=True)]
-        input_margin = tape.let(sp.Min(*margins))
-    return LoopProgram(
-        tape=tape,
-        time=TIME,
-        state=x,
-        applied=applied,
-        limits=limits,
-        plant_parameters=truth.parameter_symbols,
-        belief_parameters=belief_parameters,
-        lane_inputs=(*symbols.surface, *symbols.eta, *symbols.layer, symbols.gamma_target),
-        demand=tuple(law.u),
-        s=tuple(law.s),
-        singular=law.margin,
-        derivative=(*x[truth.n :], *qdd),
-        stage=stage,
-        path=tuple(path),
-        input_margin=input_margin,
-    )
-
-
-#: The files that write kernels: a kept source is theirs no more once one of them changes.
-GENERATOR = tuple(
-    str(Path(__file__).parent / name)
-    for name in (
-        "rollout.py",
-        "mechanism.py",
-        "objective.py",
-        "partition.py",
-        "quantities.py",
-        "sliding.py",
-        "codegen/block.py",
-        "codegen/scalar.py",
-        "codegen/tape.py",
-    )
-)
-
-
-@lru_cache(maxsize=64)
-def _compile(
-    belief: Mechanism,
-    plant: Mechanism | None,
-    objective: Objective,
-    switching: Switching,
-    sampled: bool,
-) -> Any:
-    truth = belief if plant is None else plant
-    key = content_key(
-        belief.structure,
-        "the belief" if plant is None else plant.structure,
-        sp.srepr([objective.stage_cost(truth), *objective.path_margins(truth)]),
-        repr((belief.name, objective.name, objective.hard_input, switching, sampled, LANES)),
-        sources=GENERATOR,
-    )
-    source = recall("loop", key)
-    if source is None:
-        program = lay_loop(belief, plant, objective, switching)
-        source = block_source(
-            program,
-            sampled=sampled,
-            header=f"Closed loop of {belief.name}, {objective.name}; generated, do not edit.",
-        )
-        remember("loop", key, source)
-    return load_module(f"loop_{belief.name}", source).rollout

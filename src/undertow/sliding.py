@@ -139,8 +139,10 @@ class Surface:
 
     def normalised(self) -> Self:
         """Return the same surface scaled to α_a = −I, the paper's normalisation."""
-        scale = -np.linalg.inv(self.alpha_a)
         m = self.m
+        if np.array_equal(self.alpha_a, -np.eye(m)):
+            return self
+        scale = -np.linalg.inv(self.alpha_a)
         return type(self)(
             -np.eye(m), scale @ self.lambda_a, scale @ self.alpha_u, scale @ self.lambda_u
         )
