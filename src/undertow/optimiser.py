@@ -8,6 +8,7 @@ left to :mod:`undertow.shooting` in the end.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -545,29 +546,43 @@ class _Task:
         if wide > 0:
             self.cost(here + self.decision.steps(self.rng, np.geomspace(0.1, 1.0, wide)))
 
-    def shoot(self) -> bool:
-        """Shrink the time of arrival; starts are the best plan and random ones."""
+    def shoot(self) -> Literal[False]:
+        """Shrink the time of arrival: from a fresh start, then from the best plan, and so on."""
         loop, rng = self.owner.loop, self.rng
         aim = Shooting(self._miss, 0.9 * loop.objective.terminal_radius, loop.step, self._exhausted)
-        while not self._exhausted():
-            known = self.best_cost if self.best_cost < INADMISSIBLE else self.horizon
-            start = self._start(self._centre(), known, rng)
-            z = aim.correct(*start, 20)
-            if z is not None:
-                shortest, _ = aim.kick(*aim.shrink(z, start[1]), rng, 20)
-                self.cost(shortest[None])
-        return False
+        for attempt in itertools.count():
+            if self._exhausted():
+                return False
+            shot = self._fresh(aim) if attempt % 4 == 0 else self._again(aim)
+            if shot is not None:
+                z, _ = aim.hop(*aim.shrink(*shot), lambda z: self._mutants(z, 256), rng, 15)
+                self.cost(z[None])
 
-    def _start(
-        self, best: FloatArray, known: float, rng: np.random.Generator
-    ) -> tuple[FloatArray, float]:
-        """Draw parameters around the best ones and a time at which they nearly arrive."""
-        step = self.owner.loop.step
-        T = max(1, round(known * rng.uniform(0.5, 1.0) / step)) * step
-        z = best + self.decision.steps(rng, 10 ** rng.uniform(-1.0, 0.2, 128))
-        miss = np.linalg.norm(self._miss(z, T), axis=1)
-        nearest = int(np.argmin(miss))
-        return z[nearest], T
+    def _fresh(self, aim: Shooting) -> tuple[FloatArray, float] | None:
+        """Return a shot from far and wide that arrives earlier than the best one."""
+        owner = self.owner
+        assert owner.first is not None
+        known = self.best_cost if self.best_cost < INADMISSIBLE else self.horizon
+        T = aim.on_grid(known * self.rng.uniform(0.5, 1.0))
+        anchors = np.stack([self.decision.encode(Plan.of(owner.first)), self._centre()])
+        spread = 10 ** self.rng.uniform(-0.5, 0.3, 512)
+        z = np.concatenate([a + self.decision.steps(self.rng, spread) for a in anchors])
+        return aim.nearest(z, T, 4)
+
+    def _again(self, aim: Shooting) -> tuple[FloatArray, float] | None:
+        """Return the best plan so far as a shot at its own time of arrival."""
+        if not self.best_cost < INADMISSIBLE:
+            return None
+        return aim.nearest(self._centre()[None], aim.on_grid(self.best_cost), 1)
+
+    def _mutants(self, z: FloatArray, count: int) -> FloatArray:
+        """Return copies of a plan in each of which one of its surfaces is drawn anew."""
+        rng, segments = self.rng, self.decision.segments
+        copies = np.repeat(z.reshape(1, segments, -1), count, axis=0)
+        size = 10 ** rng.uniform(-0.7, 0.5, (count, 1))
+        drawn = size * rng.standard_normal((count, copies.shape[2]))
+        copies[np.arange(count), rng.integers(segments, size=count)] += drawn
+        return copies.reshape(count, -1)
 
     def _exhausted(self) -> bool:
         return self.left < 4 * self.decision.size or self.late()

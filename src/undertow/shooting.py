@@ -3,8 +3,8 @@
 The first time at which a motion touches the terminal set is a discontinuous function of
 the parameters, and a population search gets stuck on its steps.  The state at a *fixed*
 time T is smooth.  So: find parameters with x(T) = 0 by Levenberg-Marquardt, shorten T,
-correct, and go on until no correction is found; then kick the parameters along the many
-directions that T leaves free, and try again.  A Jacobian is one batch of rollouts.
+correct, and go on until no correction is found; then change a part of the parameters, correct
+the rest, and try again.  A Jacobian is one batch of rollouts.
 """
 
 from __future__ import annotations
@@ -93,18 +93,41 @@ class Shooting:
                 z, T = corrected, shorter
         return z, T
 
-    def kick(
-        self, z: FloatArray, T: float, rng: np.random.Generator, count: int
+    def on_grid(self, T: float) -> float:
+        """Return the multiple of the grid that is nearest to T, at least one."""
+        return max(1, round(T / self.grid)) * self.grid
+
+    def nearest(
+        self, z: FloatArray, T: float, tries: int, iterations: int = 20
+    ) -> tuple[FloatArray, float] | None:
+        """Correct the candidates (N, d) that miss least at T, and return the first that hits."""
+        misses = np.linalg.norm(self.miss(z, T), axis=1)
+        for k in np.argsort(misses, kind="stable")[:tries]:
+            hit = self.correct(z[k], T, iterations)
+            if hit is not None:
+                return hit, T
+        return None
+
+    def hop(
+        self,
+        z: FloatArray,
+        T: float,
+        mutants: Callable[[FloatArray], FloatArray],
+        rng: np.random.Generator,
+        count: int,
     ) -> tuple[FloatArray, float]:
-        """Perturb, correct and shrink ``count`` times, keeping what is shorter."""
+        """Mutate, correct and shrink ``count`` times, keeping what is shorter.
+
+        Of the mutants (N, d) of z the one that misses least at a slightly shorter time is
+        corrected: most of them are far off, and one batch tells.
+        """
         for _ in range(count):
             if self.stop():
                 break
-            size = 0.3 * 10 ** rng.uniform(-1.0, 0.3)
-            kicked = self.correct(z + size * rng.standard_normal(z.size), T, 12)
-            if kicked is None:
+            shot = self.nearest(mutants(z), self.on_grid(T * rng.uniform(0.93, 1.0)), 1, 12)
+            if shot is None:
                 continue
-            shorter, earlier = self.shrink(kicked, T)
+            shorter, earlier = self.shrink(*shot)
             if earlier < T:
                 z, T = shorter, earlier
         return z, T
