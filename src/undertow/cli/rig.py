@@ -28,12 +28,12 @@ from undertow.cli.terminal import (
     write,
 )
 
-__all__ = ["replay", "run"]
+__all__ = ["drill", "replay", "run"]
 
 
 @app.command(
     epilog=examples(
-        "undertow run rotary_pendulum --seconds 60 --lead 0.04",
+        "undertow run rotary_pendulum --seconds 60 --lead 0.05",
         "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
         "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     )
@@ -157,4 +157,46 @@ def replay(
         }
         say(console, write(out, pictures))
     if not result.identical:
+        raise typer.Exit(1)
+
+
+@app.command(
+    epilog=examples(
+        "undertow drill",
+        "undertow drill --no-live --seed 3",
+        "undertow drill --kills 50",
+    )
+)
+@reports_errors
+def drill(
+    live: Annotated[
+        bool, typer.Option(help="Also the faults that need real time and processes.")
+    ] = True,
+    kills: Annotated[
+        int | None,
+        typer.Option(help="Instead: kill -9 so many runs at random moments, and replay.", min=1),
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """Put faults into runs on the realistic rig, one at a time, and say what happened."""
+    from undertow.runtime import tables
+    from undertow.runtime.drill import drill as simulated_drill
+    from undertow.runtime.drill_live import kill_drill, live_drill
+
+    console = terminal()
+    console.width = max(console.width, 140)  # rows may wrap, but no cell is cut
+    if kills is not None:
+        with progress_bar() as progress:
+            killed = kill_drill(kills, seed=seed, progress=progress)
+        console.print(tables.kill_table(killed), crop=False, soft_wrap=True)
+        if not all(one.passed for one in killed):
+            raise typer.Exit(1)
+        return
+    with progress_bar() as progress:
+        outcomes = simulated_drill(seed=seed, progress=progress)
+        lived = live_drill(progress) if live else ()
+    console.print(tables.drill_table(outcomes, lived), crop=False, soft_wrap=True)
+    passed = sum(o.passed for o in (*outcomes, *lived))
+    say(console, f"{passed} of {len(outcomes) + len(lived)} as they should be, seed {seed}")
+    if passed < len(outcomes) + len(lived):
         raise typer.Exit(1)

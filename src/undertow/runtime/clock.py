@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
 
-__all__ = ["Clock", "Histogram", "SimulatedClock", "WallClock"]
+__all__ = ["Clock", "Histogram", "SimulatedClock", "WallClock", "prompt"]
 
 
 class Clock(Protocol):
@@ -53,6 +55,23 @@ class SimulatedClock:
     def sleep_until(self, t: float) -> None:
         """Let time pass."""
         self.t = max(self.t, t)
+
+
+@contextlib.contextmanager
+def prompt() -> Iterator[bool]:
+    """Ask for a real-time priority for this thread; yields whether the system granted it."""
+    before: int | None = None
+    if hasattr(os, "sched_setscheduler"):
+        with contextlib.suppress(OSError):
+            policy = os.sched_getscheduler(0)
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            before = policy
+    try:
+        yield before is not None
+    finally:
+        if before is not None:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, before, os.sched_param(0))
 
 
 class Histogram:

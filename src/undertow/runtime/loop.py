@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import sys
 import threading
 from collections import Counter
@@ -15,7 +14,7 @@ import numpy as np
 
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
-from undertow.runtime.clock import Clock, Histogram, WallClock
+from undertow.runtime.clock import Clock, Histogram, WallClock, prompt
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import answer_row
 from undertow.runtime.log import Log
@@ -102,7 +101,7 @@ class Runtime:
         self.report = Report(variation=np.zeros_like(controller.u))
         self._silent = ""
         self._failing = 0.0
-        self._beat = self.clock.now()
+        self._beat = self._origin = self.clock.now()
 
     def stop(self) -> None:
         """Ask for a safe stop, as an operator does."""
@@ -129,15 +128,16 @@ class Runtime:
         clock, period, report = self.clock, self.controller.period, self.report
         think, whole, late = report.think, report.whole, report.late
         stall = self.controller.settings.stall
-        origin = clock.now()
+        origin = self._origin = clock.now()
         k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
         while not self._silent:
             due = origin + slot * period
             clock.sleep_until(due)
-            began = self._beat = clock.now()
+            last, began = self._beat, clock.now()
+            self._beat = began
             t = began - origin
-            if began - due > stall:
-                alarm = f"no step for {1e3 * (began - due + period):.0f} ms"
+            if k > 0 and began - last > stall:
+                alarm = f"no step for {1e3 * (began - last):.0f} ms"
             command, self.command = self.command, Command.NONE
             if t >= seconds and self.controller.mode != Mode.SAFE_STOP:
                 command = Command.STOP
@@ -191,7 +191,7 @@ class Runtime:
     def _tell(self, what: str, text: str) -> None:
         events = self.report.events
         if len(events) < 10_000:
-            events.append((self._beat, what, text))
+            events.append((self._beat - self._origin, what, text))
 
     def _after(self, k: int, inputs: Inputs) -> None:
         """Hand requests to the slow loop, and keep what happened."""
@@ -282,16 +282,9 @@ def _quiet_interpreter(clock: Clock) -> Iterator[None]:
     sys.setswitchinterval(1e-4)
     gc.collect()
     gc.freeze()
-    policy = None
-    if hasattr(os, "sched_setscheduler"):
-        with contextlib.suppress(OSError):
-            policy = os.sched_getscheduler(0)
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     try:
-        yield
+        with prompt():
+            yield
     finally:
-        if policy is not None:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(0, policy, os.sched_param(0))
         gc.unfreeze()
         sys.setswitchinterval(interval)

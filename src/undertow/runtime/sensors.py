@@ -2,7 +2,9 @@
 
 Each reading is compared with what the belief expects one period after the last estimate.
 A reading that stands still is compared with the model running freely from when it last
-moved: encoders repeat themselves, but not while the mechanism moves.
+moved: encoders repeat themselves, but not while the mechanism moves.  So that what sticks
+in its friction is not taken for a broken sensor, the free model feels only what an input
+exceeds a dead band by, and starts again, at rest, after a while.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ from undertow.runtime.settings import Settings
 
 __all__ = ["SensorWatch"]
 
+#: A model that has run freely for this long starts again, s.
+REST = 0.3
+
 _BODY = f"""
 {COMPILED}
 def roll(h, x, u, viscous, parameters, work):
@@ -40,13 +45,18 @@ def roll(h, x, u, viscous, parameters, work):
 
 
 {COMPILED}
-def believe(h, q, x, u, jump, frozen, expected, free, last, gaps, viscous, parameters, work):
+def believe(
+    h, q, x, u, band, jump, frozen, rest, expected, free, last, gaps, ages, felt, viscous,
+    parameters, work,
+):
     # What is not believable becomes NaN; returns how many are missing, the longest gap and
     # where, and which reading is frozen (-1: none).
     n = q.shape[0]
     for i in range(2 * n):
         expected[i] = x[i]
     roll(h, expected, u, viscous, parameters, work)
+    for i in range(u.shape[0]):
+        felt[i] = max(0.0, u[i] - band[i]) + min(0.0, u[i] + band[i])
     missing, worst, still = 0, 0, -1
     for i in range(n):
         if abs(q[i] - expected[i]) <= jump:
@@ -58,10 +68,18 @@ def believe(h, q, x, u, jump, frozen, expected, free, last, gaps, viscous, param
         if gaps[i] > gaps[worst]:
             worst = i
         if q[i] == last[i]:
-            roll(h, free[i], u, viscous, parameters, work)
+            roll(h, free[i], felt, viscous, parameters, work)
+            ages[i] += h
             if abs(free[i, i] - q[i]) > frozen:
                 still = i
+            if ages[i] > rest:
+                ages[i] = 0.0
+                for j in range(n):
+                    free[i, j] = x[j]
+                    free[i, n + j] = 0.0
+                free[i, i] = q[i]
         elif q[i] == q[i]:
+            ages[i] = 0.0
             for j in range(2 * n):
                 free[i, j] = x[j]
             free[i, i] = last[i] = q[i]
@@ -118,8 +136,12 @@ class SensorWatch:
         n = mechanism.n
         self._believe = _module(mechanism).believe
         self._q, self._last, self._gaps, self._nothing = (np.zeros(n) for _ in range(4))
-        self._expected, self._free = np.zeros(2 * n), np.zeros((n, 2 * n))
-        self._numbers = (np.zeros(n), mechanism.parameter_values, np.zeros((3, 2 * n)))
+        self._expected, self._free, self._ages = np.zeros(2 * n), np.zeros((n, 2 * n)), np.zeros(n)
+        limits = settings.limits(mechanism)
+        self._band = np.where(np.isfinite(limits), settings.dead_band * limits, 0.0)
+        self._numbers = (
+            np.zeros(mechanism.m), np.zeros(n), mechanism.parameter_values, np.zeros((3, 2 * n)),
+        )  # fmt: skip
         self._nothing[:] = math.nan
         low, high = settings.travels(mechanism).T
         self._low, self._high = low.tolist(), high.tolist()
@@ -130,7 +152,7 @@ class SensorWatch:
         """Start afresh: the next sound reading is the first."""
         self.missing, self.first, self._known = 0, False, False
         self._rig_time, self._time, self._waited = -math.inf, 0.0, 0.0
-        self._gaps[:] = 0.0
+        self._gaps[:] = self._ages[:] = 0.0
 
     def check(
         self, measurement: Measurement | None, x: FloatArray, u: FloatArray
@@ -170,8 +192,9 @@ class SensorWatch:
             return None, self._wait()
         settings = self.settings
         self.missing, worst, gap, still = self._believe(
-            self.period, self._q, x if not self.first else self._free[0], u, settings.jump,
-            settings.frozen, self._expected, self._free, self._last, self._gaps, *self._numbers,
+            self.period, self._q, self._free[0] if self.first else x, u, self._band, settings.jump,
+            settings.frozen, REST, self._expected, self._free, self._last, self._gaps, self._ages,
+            *self._numbers,
         )  # fmt: skip
         fault = ""
         if gap > settings.patience:

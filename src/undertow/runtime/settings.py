@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -37,6 +37,8 @@ class Settings:
         Largest believable difference between a position and its prediction, rad or m.
     frozen
         A reading that does not move while the model has moved by this, rad or m, is frozen.
+    dead_band
+        Part of the input's limit that friction may swallow without anything moving.
     settle
         The sensors must have been sound for this long before the law takes over, s.
     near
@@ -58,6 +60,7 @@ class Settings:
     patience: float = 0.02
     jump: float = 0.05
     frozen: float = 0.25
+    dead_band: float = 0.05
     settle: float = 0.02
     near: float = 0.2
     margin: float = 0.02
@@ -89,7 +92,3 @@ class Settings:
         low = [max(c.low, -self.travel) for c in mechanism.coordinates]
         high = [min(c.high, self.travel) for c in mechanism.coordinates]
         return np.column_stack([low, high])
-
-    def as_dict(self) -> dict[str, float]:
-        """All settings by name."""
-        return {name: float(value) for name, value in asdict(self).items()}
