@@ -44,7 +44,7 @@ def main() -> int:
         print(f"\n=== {name}", flush=True)
         command = [sys.executable, str(HERE / f"{name}.py")]
         command += ["--quick"] * options.quick
-        if name not in ("closed_loop", "footprint"):
+        if name != "footprint":
             command += ["--clock", options.clock]
         began, lines = time.perf_counter(), []
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
