@@ -196,7 +196,7 @@ def drill(
         outcomes = simulated_drill(seed=seed, progress=progress)
         lived = live_drill(progress) if live else ()
     console.print(tables.drill_table(outcomes, lived), crop=False, soft_wrap=True)
-    passed = sum(o.passed for o in (*outcomes, *lived))
-    say(console, f"{passed} of {len(outcomes) + len(lived)} as they should be, seed {seed}")
-    if passed < len(outcomes) + len(lived):
+    passed = [*(o.passed for o in outcomes), *(o.passed for o in lived)]
+    say(console, f"{sum(passed)} of {len(passed)} as they should be, seed {seed}")
+    if not all(passed):
         raise typer.Exit(1)

@@ -10,19 +10,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from undertow.cascade import CascadeState
+from undertow.estimators import Estimator
 from undertow.mechanism import FloatArray
 from undertow.rig import Push, RealisticRig
 from undertow.rig.interface import Measurement, Rig
 from undertow.runtime.cases import CASES, Case
 from undertow.runtime.clock import SimulatedClock
+from undertow.runtime.controller import Controller
 from undertow.runtime.faults import FaultyRig, FaultyWorker, Witness, spoil_optimiser
-from undertow.runtime.log import Columns, Log
+from undertow.runtime.log import Columns, Log, read_log
 from undertow.runtime.loop import Runtime
 from undertow.runtime.modes import Mode
 from undertow.runtime.recipe import Recipe
-from undertow.runtime.replay import about, replay
+from undertow.runtime.replay import about, replay_controller
 from undertow.runtime.slow import Answer, InlineWorker, Request, Worker, respond
 
 __all__ = ["Outcome", "drill", "drill_recipe", "run_case"]
@@ -93,14 +96,14 @@ class Outcome:
 class _SpoiltEstimator:
     """An estimator that goes wrong from some time on."""
 
-    def __init__(self, honest: object, spoil: Callable[[FloatArray], FloatArray], since: float):
+    def __init__(self, honest: Estimator, spoil: Callable[[FloatArray], FloatArray], since: float):
         self.honest, self.spoil, self.since = honest, spoil, since
 
-    def reset(self, x0: FloatArray) -> None:
-        self.honest.reset(x0)  # type: ignore[attr-defined]
+    def reset(self, x0: ArrayLike) -> None:
+        self.honest.reset(x0)
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
-        x: FloatArray = self.honest.estimate(measurement, u)  # type: ignore[attr-defined]
+        x = self.honest.estimate(measurement, u)
         return self.spoil(x) if measurement.t >= self.since else x
 
 
@@ -159,11 +162,16 @@ def run_case(
         hang=case.hang,
         clock=clock,
     )
-    controller = recipe.make_controller(memory)
-    if case.estimator is not None:
-        controller.estimator = _SpoiltEstimator(controller.estimator, case.estimator, since)
+
+    def make_controller() -> Controller:
+        controller = recipe.make_controller(memory)
+        if case.estimator is not None:
+            controller.estimator = _SpoiltEstimator(controller.estimator, case.estimator, since)
+        return controller
+
+    controller = make_controller()
     witness = Witness(rig, controller.limits, controller.slew)
-    meta = about(controller, None if case.estimator else recipe, drill=f"{case.part}: {case.name}")
+    meta = about(controller, recipe, drill=f"{case.part}: {case.name}")
     with Log(
         log,
         Columns.of(recipe.belief),
@@ -187,7 +195,7 @@ def run_case(
         witness.largest,
         report.mode == Mode.SAFE_STOP and not witness.last.any(),
         answers,
-        case.estimator is not None or not replay(log, decisions=False).differing,
+        not replay_controller(read_log(log), make_controller(), decisions=False).differing,
         f"log: {book.failure}" if book.failure else "",
     )
 

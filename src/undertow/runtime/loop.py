@@ -32,6 +32,8 @@ class Report:
     ----------
     steps, missed
         Steps made, and steps whose output came after the end of their period.
+    asleep
+        Missed steps that took less than a period, but were woken too late.
     skipped
         Periods in which no step was made, because an earlier one took too long.
     think, whole, late
@@ -51,6 +53,7 @@ class Report:
 
     steps: int = 0
     missed: int = 0
+    asleep: int = 0
     skipped: int = 0
     think: Histogram = field(default_factory=Histogram)
     whole: Histogram = field(default_factory=Histogram)
@@ -165,6 +168,7 @@ class Runtime:
             over = (written - origin) / period - slot
             if over > 0:
                 report.missed += 1
+                report.asleep += written - began < period
                 report.skipped += int(over)
                 slot += int(over)
 

@@ -73,7 +73,8 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         part = report.missed / max(1, report.steps)
         lines.add_row(
             f"missed deadlines of {1e3 * period:g} ms",
-            f"{report.missed:,} ({part:.3%}); {report.skipped:,} periods skipped",
+            f"{report.missed:,} ({part:.3%}), {report.asleep:,} of them woken too late by the "
+            f"system; {report.skipped:,} periods skipped",
         )
     path = " → ".join(
         text.split(":")[0].split(" → ")[-1] for _, what, text in report.events if what == "state"
