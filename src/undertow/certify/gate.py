@@ -225,7 +225,7 @@ def _region(case: _Case) -> Verdict | str:
 
 
 def _dual(case: _Case) -> Verdict | str:
-    if case.search is None and not case.known:
+    if not case.known and (case.search is None or not case.search.succeeds):
         return case.why_not or "the linear closed loop has no proved terminal set"
     x, t, span = case.x, 0.0, FIRST_LOOK
     margins = _Margins(case.policy)
@@ -306,7 +306,7 @@ def _local(case: _Case) -> Verdict | str:
     if not margin > 0:
         return f"unstable, margin {margin:.3g} 1/s"
     claim = "the closed loop is exponentially stable near the target"
-    if case.search is not None and case.search.largest(0) is not None:
+    if case.search is not None and case.search.succeeds:
         method = "a terminal ellipsoid is proved; the margin is the slowest eigenvalue in float64"
         return Verdict(claim, "proved", margin, "1/s", method=method)
     method = "float64 eigenvalues of the sliding dynamics, not proved"
