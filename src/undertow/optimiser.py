@@ -182,7 +182,11 @@ class Optimiser:
             return given
         if self.shoots:
             return Budget(40_000 if warm else 160_000)
-        return Budget(1024 if warm else 3072)
+        if warm:
+            return Budget(1024)
+        # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
+        n, m = self.loop.mechanism.n, self.loop.mechanism.m
+        return Budget(1024 * (2 * m * n - m * m) ** 2 // 3)
 
     @property
     def _promptness(self) -> float:
