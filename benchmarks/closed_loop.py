@@ -16,7 +16,7 @@ besides.  The *bound* is the least that any input could do on the plant itself, 
 and knows the plant; energy over 60 s, pendulums kept above the horizontal.  Both totals count
 until ‖x‖ ≤ 0.01.  No controller is charged for its computing time: inputs act at once; *plan*
 is what a (re-)planning took, for comparison with the period of 100 ms.  A run
-that does not arrive within 60 s *falls*, or *stays* at some ‖x‖.
+that does not arrive within 60 s (cascade and NMPC for time: 10 s) *falls*, or *stays* at some ‖x‖.
 """
 
 from __future__ import annotations
@@ -41,6 +41,9 @@ from undertow.mechanism import FloatArray, Parameter
 from undertow.stability import linearise
 
 HORIZON, RADIUS = 60.0, 0.01
+
+#: A controller that is to be quick is given up after this time, s.
+PATIENCE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,16 +178,17 @@ def controllers(
 ) -> dict[str, Callable[[], Result]]:
     """Return everything that can be run on a plant, by name."""
     truth = Plant(plant, RADIUS, HORIZON)
+    hasty = Plant(plant, RADIUS, PATIENCE)
     free = ut.Freedom(reaching=True)
 
     def predictive(mpc: ShootingMPC | DoMPC) -> Result:
-        return truth.held(scene.x0, mpc), mpc.seconds
+        return (truth if mpc.goal == "energy" else hasty).held(scene.x0, mpc), mpc.seconds
 
     def regulated(goal: str) -> Result:
         gains = tuned(scene)
         return (truth.regulated(scene.x0, gains[goal]) if gains else None), []
 
-    energy, time = ut.MinimumEnergy(), ut.MinimumTime()
+    energy, time = ut.MinimumEnergy(horizon=HORIZON), ut.MinimumTime(horizon=PATIENCE)
     everything: dict[str, Callable[[], Result]] = {
         "cascade, energy": lambda: cascade(scene, plant, energy, ut.Freedom(), now),
         "LQR clipped, energy": lambda: regulated("energy"),
