@@ -33,7 +33,7 @@ __all__ = ["drill", "replay", "run"]
 
 @app.command(
     epilog=examples(
-        "undertow run rotary_pendulum --seconds 60 --lead 0.05",
+        "undertow run rotary_pendulum --seconds 60 --lead 0.02",
         "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
         "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     )
@@ -52,7 +52,10 @@ def run(
     period: Annotated[float, typer.Option(help="Period of the fast loop, s.")] = 0.001,
     lead: Annotated[
         float,
-        typer.Option(help="From a request to the use of its answer, s: short keeps it busy."),
+        typer.Option(
+            help="Least time from a request to the use of its answer, s; grows where answers "
+            "come late. A short one keeps the optimiser busy."
+        ),
     ] = 0.1,
     worker: Annotated[
         Literal["process", "thread"], typer.Option(help="Where the optimiser runs.")
@@ -80,7 +83,7 @@ def run(
         rig=rig,
         seed=seed,
         period=period,
-        seconds=float("inf") if simulated else 0.3 * lead,
+        seconds=float("inf") if simulated else max(0.01, 0.3 * lead),
         settings=Patience(lead=lead),
     )
     console = terminal()

@@ -26,6 +26,10 @@ class Clock(Protocol):
         """Return at the time t, s, or at once if it is past."""
         ...
 
+    def spin_until(self, t: float) -> None:
+        """Like :meth:`sleep_until` for the last moments, without giving the processor away."""
+        ...
+
 
 class WallClock:
     """The monotonic clock of the machine."""
@@ -38,6 +42,11 @@ class WallClock:
         rest = t - time.perf_counter()
         if rest > 0:
             time.sleep(rest)
+
+    def spin_until(self, t: float) -> None:
+        """Wait without sleeping: no wake-up to be late for."""
+        while time.perf_counter() < t:
+            pass
 
 
 class SimulatedClock:
@@ -55,6 +64,8 @@ class SimulatedClock:
     def sleep_until(self, t: float) -> None:
         """Let time pass."""
         self.t = max(self.t, t)
+
+    spin_until = sleep_until
 
 
 @contextlib.contextmanager

@@ -90,7 +90,8 @@ class Outcome:
     def passed(self) -> bool:
         """Sound outputs, a safe end, an identical replay, and held where that is possible."""
         sound = not self.output_faults and self.ended_safely and self.replayed
-        return sound and (self.held or not self.case.holds)
+        stopped = not math.isnan(self.after)
+        return sound and (self.held or (stopped and not self.case.holds))
 
 
 class _SpoiltEstimator:

@@ -69,7 +69,9 @@ def motion_figure(recording: Recording) -> bytes:
         ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, ncols=4)
         ax.grid(alpha=0.3)
         _shade(ax, recording)
-    axes[0].set_title(f"{recording.meta['mechanism']}: {recording.path.name}", fontsize=10, loc="left")
+    axes[0].set_title(
+        f"{recording.meta['mechanism']}: {recording.path.name}", fontsize=10, loc="left"
+    )
     figure.legend(
         handles=[Patch(color=colour, label=mode.name.replace("_", " ").lower())
                  for mode, colour in STATES.items() if mode in recording["mode"]],

@@ -6,7 +6,7 @@ import contextlib
 import gc
 import sys
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -24,6 +24,10 @@ from undertow.runtime.slow import Worker
 __all__ = ["Report", "Runtime"]
 
 
+#: Time before a step is due at which the shadow rehearses, s.
+REHEARSAL = 1.5e-4
+
+
 @dataclass(eq=False)
 class Report:
     """What came of a run.
@@ -39,6 +43,8 @@ class Report:
     think, whole, late
         Time of the fast step's own computation between reading and writing; from when the
         step was due to when its output was written; and to when it began.
+    shadowed, disagreed
+        Steps that the shadow made again, and those in which its output was another.
     mode, stopped_by
         State at the end, and why the run stopped, if it did.
     entered
@@ -58,6 +64,8 @@ class Report:
     think: Histogram = field(default_factory=Histogram)
     whole: Histogram = field(default_factory=Histogram)
     late: Histogram = field(default_factory=Histogram)
+    shadowed: int = 0
+    disagreed: int = 0
     mode: Mode = Mode.IDLE
     stopped_by: str = ""
     entered: Counter[str] = field(default_factory=Counter)
@@ -81,6 +89,10 @@ class Runtime:
         The wall clock by default.
     log
         Where everything goes; closed by the caller.
+    shadow
+        A second controller, built as the first.  It makes every step again, one step behind,
+        in the last moments before the next one is due: that brings code and data back into
+        the processor's caches, and shows at once when the same inputs give other outputs.
 
     Attributes
     ----------
@@ -96,7 +108,10 @@ class Runtime:
         *,
         clock: Clock | None = None,
         log: Log | None = None,
+        shadow: Controller | None = None,
     ) -> None:
+        self.shadow = shadow
+        self._behind: deque[tuple[Inputs, FloatArray]] = deque(maxlen=1000)
         self.controller, self.rig, self.worker = controller, rig, worker
         self.clock = WallClock() if clock is None else clock
         self.log = log
@@ -135,7 +150,7 @@ class Runtime:
         k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
         while not self._silent:
             due = origin + slot * period
-            clock.sleep_until(due)
+            self._wait(due)
             last, began = self._beat, clock.now()
             self._beat = began
             t = began - origin
@@ -152,6 +167,8 @@ class Runtime:
             alarm = self._write(u)
             written = clock.now()
             self._after(k, inputs)
+            if self.shadow is not None:
+                self._behind.append((inputs, u.copy()))
             np.abs(u - before, out=before)
             report.variation += before
             before[:] = u
@@ -171,6 +188,19 @@ class Runtime:
                 report.asleep += written - began < period
                 report.skipped += int(over)
                 slot += int(over)
+
+    def _wait(self, due: float) -> None:
+        """Wait for the next step; shortly before, let the shadow make the last one again."""
+        shadow, clock, behind = self.shadow, self.clock, self._behind
+        if shadow is None:
+            clock.sleep_until(due)
+            return
+        clock.sleep_until(due - REHEARSAL)
+        while behind and clock.now() < due - 0.4 * REHEARSAL:
+            inputs, u = behind.popleft()
+            self.report.shadowed += 1
+            self.report.disagreed += not np.array_equal(shadow.step(inputs), u)
+        clock.spin_until(due)
 
     def _read(self, alarm: str) -> tuple[Measurement | None, str]:
         """Read the rig; a rig that fails gives nothing, and is a gap in the sensors."""

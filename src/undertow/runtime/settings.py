@@ -24,8 +24,10 @@ class Settings:
     slew_time
         Shortest time in which an input may cross its whole range, s: the slew rate is
         2 u_max / slew_time.  Inputs without a limit have none on their rate either.
-    lead
+    lead, longest_lead
         How far ahead proposals are computed, s: from a request to the use of its answer.
+        It starts at ``lead``, grows by half when an answer comes late, and shrinks by a tenth
+        when one comes in less than half of it.
     silence
         An optimiser that has not answered for this long after its time is replaced, s.
     surprise
@@ -55,6 +57,7 @@ class Settings:
     output_limit: float = math.inf
     slew_time: float = 0.004
     lead: float = 0.1
+    longest_lead: float = 0.5
     silence: float = 0.5
     surprise: float = 0.5
     patience: float = 0.02

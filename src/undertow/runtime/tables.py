@@ -76,6 +76,8 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
             f"{report.missed:,} ({part:.3%}), {report.asleep:,} of them woken too late by the "
             f"system; {report.skipped:,} periods skipped",
         )
+        same = "the same outputs" if not report.disagreed else f"{report.disagreed:,} other outputs"
+        lines.add_row("shadow", f"{report.shadowed:,} steps made again, {same}")
     path = " → ".join(
         text.split(":")[0].split(" → ")[-1] for _, what, text in report.events if what == "state"
     )
