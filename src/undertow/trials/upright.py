@@ -18,10 +18,22 @@ from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
 from undertow.trials.steering import CascadeSteering
 from undertow.trials.trial import Outcome, bench_objective, estimator_for, judge, trial
 
-__all__ = ["EngineResult", "SwingResult", "bench_of", "engine_trial", "swing_trials"]
+__all__ = [
+    "ENGINES",
+    "SWINGING",
+    "SWING_SECONDS",
+    "EngineResult",
+    "SwingResult",
+    "all_of",
+    "bench_of",
+    "engine_trial",
+    "swing_trials",
+]
 
 Progress = Callable[[str, float], None]
 
+#: Length of a swing-up run, s.
+SWING_SECONDS = 30.0
 #: Mechanisms of the library that a swing-up is shown for, and that MuJoCo stands in for.
 SWINGING = ("rotary_pendulum", "cart_pendulum", "pendubot")
 ENGINES = ("rotary_pendulum", "cart_pendulum", "double_pendulum_on_a_cart")
@@ -64,7 +76,7 @@ def swing_trials(
     *,
     bench: Bench | None = None,
     seeds: int = 20,
-    seconds: float = 30.0,
+    seconds: float = SWING_SECONDS,
     progress: Callable[[float], None] = lambda _: None,
 ) -> SwingResult:
     """Swing a mechanism up on realistic rigs, from hanging at rest, one for each seed.

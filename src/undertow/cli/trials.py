@@ -1,0 +1,82 @@
+"""Controllers on realistic rigs, many seeds: tables and figures."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from undertow import results
+from undertow.cli.terminal import (
+    app,
+    examples,
+    progress_bar,
+    reports_errors,
+    say,
+    terminal,
+    write,
+)
+
+__all__ = ["trials"]
+
+
+@app.command(
+    epilog=examples(
+        "undertow trials balance --out bench",
+        "undertow trials balance --quick",
+        "undertow trials swing-up",
+        "undertow trials mujoco",
+    )
+)
+@reports_errors
+def trials(
+    what: Annotated[
+        Literal["balance", "swing-up", "mujoco"],
+        typer.Argument(
+            help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
+            "rest to balanced. mujoco: MuJoCo as the truth, no retuning."
+        ),
+    ],
+    seeds: Annotated[int, typer.Option(help="Rigs, one for each seed.", min=1)] = 20,
+    angle: Annotated[
+        float, typer.Option(help="balance: start of the pendulum, degrees from the upright.")
+    ] = 35.0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A look: three rigs, no search for catch limits.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="balance: folder for balance.csv and the figures.")
+    ] = None,
+) -> None:
+    """Run controllers on realistic rigs, over and over, and print what came of it."""
+    from undertow.trials import balance as experiment
+    from undertow.trials import report, upright
+
+    if out is not None:
+        results.check_folder(out)
+    seeds = min(seeds, 3) if quick else seeds
+    console = terminal()
+    with progress_bar() as progress:
+        if what == "balance":
+            result = experiment.balance(
+                angle=math.radians(angle), seeds=seeds, limits=not quick, progress=progress
+            )
+            shown = report.balance_report(result)
+        elif what == "swing-up":
+            names = upright.SWINGING
+            found = []
+            for i, mechanism in enumerate(upright.all_of(names)):
+                progress(mechanism.name, i / len(names))
+                found.append(upright.swing_trials(mechanism, seeds=seeds))
+            shown = report.swing_report(found, upright.SWING_SECONDS)
+        else:
+            runs = []
+            for i, mechanism in enumerate(upright.all_of(upright.ENGINES)):
+                progress(mechanism.name, i / len(upright.ENGINES))
+                runs.append(upright.engine_trial(mechanism))
+            shown = report.engine_report(runs)
+    console.print(shown)
+    if out is not None and what == "balance":
+        say(console, write(out, report.balance_files(result)))
