@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -238,6 +239,15 @@ def test_the_refusal_keeps_the_old_plans_cost_and_verdict() -> None:
     assert admission.cost == pytest.approx(float(LOOP.batch(FAR, SLOW).time[0]))
     assert admission.verdict is not None
     assert admission.verdict.details["evidence"] == "dual"
+
+
+def test_a_gate_travels_to_another_process() -> None:
+    """The optimiser may run in a process of its own: what it decides there is the same."""
+    gate = certified_gate(Policy(("dual",), singular_margin=0.1), tail=5e-3)
+    there = pickle.loads(pickle.dumps(gate))
+    assert there == gate
+    question = (LOOP, Plan.of(SLOW), Plan.of(GOOD), FAR, 20.0)
+    assert there(*question) == gate(*question)
 
 
 def test_the_first_plan_is_used_and_judged() -> None:
