@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,13 @@ from undertow.certify.certificate import (
     function_data,
     read_certificate,
 )
+from undertow.certify.gate import Policy, assess
 from undertow.certify.lyapunov import LyapunovFunction
+from undertow.certify.sets import ProvedStarts, proved_sets
 from undertow.certify.verify import reaches, verify
 from undertow.cli import app
 from undertow.errors import ArtefactError, CertificateError, InvalidInputError
+from undertow.plan import Plan
 from undertow.verdict import Verdict
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
@@ -279,6 +283,27 @@ def test_a_parameter_changed_and_signed_again_meets_the_proof(written: bytes) ->
     broken = edited(written, lambda d: d["mechanism"]["parameters"].update(m=-1.0))
     with pytest.raises(CertificateError, match="parameters of a certificate"):
         verify(Certificate.from_bytes(broken), RIG)
+
+
+def test_a_verified_certificate_serves_the_gate(written: bytes) -> None:
+    """Its ellipsoid is evidence for its own surface, and only what was proved again counts."""
+    checked = verify(Certificate.from_bytes(edited(written, only("terminal ellipsoid"))), RIG)
+    sets = proved_sets(RIG, checked)
+    assert len(sets) == 1
+    x = 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
+    assert sets[0].contains(x)
+    assert not sets[0].contains(RIG.state(phi=0.3))
+    verdict = assess(ut.ClosedLoop(RIG), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    assert "proved before" in verdict.method
+    doubtful = [replace(item, verdict=Verdict("x", "undecided")) for item in checked]
+    assert proved_sets(RIG, doubtful) == ()
+
+
+def test_starts_at_rest_are_a_set() -> None:
+    starts = ProvedStarts(SURFACE, ut.ReachingLaw(), 1, 0.3)
+    assert starts.contains(RIG.state(phi=-0.3))
+    assert not starts.contains(RIG.state(phi=0.31))
+    assert not starts.contains(RIG.state(phi=0.1, phi_dot=1e-9))
 
 
 def test_only_proofs_become_claims() -> None:
