@@ -151,8 +151,8 @@ def judge(
     last = record.t[-1] - LAST
     return Outcome(
         seed=seed,
-        balanced=settled <= last,
-        caught=_settled(mechanism, record, mechanism.m) <= last,
+        balanced=bool(settled <= last),
+        caught=bool(_settled(mechanism, record, mechanism.m) <= last),
         settled=settled,
         cost=math.nan if objective is None else _cost(mechanism, objective, record),
         effort=record.effort,
