@@ -28,21 +28,24 @@ __all__ = ["trials"]
         "undertow trials balance --quick",
         "undertow trials swing-up",
         "undertow trials mujoco",
+        "undertow trials robustness --rigs 50",
     )
 )
 @reports_errors
 def trials(
     what: Annotated[
-        Literal["balance", "swing-up", "mujoco"],
+        Literal["balance", "swing-up", "mujoco", "robustness"],
         typer.Argument(
             help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
-            "rest to balanced. mujoco: MuJoCo as the truth, no retuning."
+            "rest to balanced. mujoco: MuJoCo as the truth, no retuning. "
+            "robustness: random rigs, and what breaks whom."
         ),
     ],
     seeds: Annotated[int, typer.Option(help="Rigs, one for each seed.", min=1)] = 20,
     angle: Annotated[
         float, typer.Option(help="balance: start of the pendulum, degrees from the upright.")
     ] = 35.0,
+    rigs: Annotated[int, typer.Option(help="robustness: random rigs.", min=1)] = 200,
     quick: Annotated[
         bool, typer.Option("--quick", help="A look: three rigs, no search for catch limits.")
     ] = False,
@@ -53,6 +56,7 @@ def trials(
     """Run controllers on realistic rigs, over and over, and print what came of it."""
     from undertow.trials import balance as experiment
     from undertow.trials import report, upright
+    from undertow.trials import robustness as stress
 
     if out is not None:
         results.check_folder(out)
@@ -71,6 +75,14 @@ def trials(
                 progress(mechanism.name, i / len(names))
                 found.append(upright.swing_trials(mechanism, seeds=seeds))
             shown = report.swing_report(found, upright.SWING_SECONDS)
+        elif what == "robustness":
+            shown = report.robustness_report(
+                stress.robustness(
+                    rigs=min(rigs, 10) if quick else rigs,
+                    seeds=0 if quick else 5,
+                    progress=progress,
+                )
+            )
         else:
             runs = []
             for i, mechanism in enumerate(upright.all_of(upright.ENGINES)):

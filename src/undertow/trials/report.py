@@ -18,6 +18,7 @@ from undertow import results
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
 from undertow.rollout import Trajectory
 from undertow.trials.balance import ENERGY_PRICE, ROWS, STATE_WEIGHT, BalanceResult
+from undertow.trials.robustness import FACTORS, RobustnessResult
 from undertow.trials.trial import balanced, motion, spread
 from undertow.trials.upright import EngineResult, SwingResult
 
@@ -27,6 +28,7 @@ __all__ = [
     "comparison_figure",
     "engine_report",
     "repeats_figure",
+    "robustness_report",
     "swing_report",
     "table",
 ]
@@ -237,3 +239,49 @@ def engine_report(found: Sequence[EngineResult]) -> RenderableType:
         ("", "balanced", "settled\ns", "positions at the end", "surfaces\nadmitted"),
         rows,
     )
+
+
+def robustness_report(result: RobustnessResult) -> RenderableType:
+    """Return the tables of :func:`undertow.trials.robustness.robustness` for the terminal."""
+    # Costs are compared where all of them balanced, or the weaker one would have easier rigs.
+    both = [all(o.balanced for o in runs) for runs in zip(*result.outcomes.values(), strict=True)]
+    rows = []
+    for name, runs in result.outcomes.items():
+        fair = [run for run, keep in zip(runs, both, strict=True) if keep]
+        rows.append(
+            (
+                name,
+                f"{balanced(runs)} of {len(runs)}",
+                f"{sum(run.caught for run in runs)}",
+                *(str(spread(fair, what)) for what in ("effort", "settled", "chatter")),
+            )
+        )
+    parts: list[RenderableType] = [
+        table(
+            "Random rigs: masses ±20 %, friction up to twice, delay up to 5 ms, a knock",
+            ("", "balanced", "caught", "∫u² dt\nV² s", "settled\ns", "chatter\nV/s"),
+            rows,
+            f"mean ± standard deviation over the {sum(both)} rigs that all of them balanced; "
+            "caught: the pendulum is up, wherever the arm is",
+        )
+    ]
+    if result.breaking:
+        names = list(result.outcomes)
+        lines = []
+        for factor, (_, _, unit, scale) in FACTORS.items():
+            cells = []
+            for name in names:
+                found = result.breaking[name, factor]
+                broken = "" if found.seed is None else f" (seed {found.seed})"
+                more = "≥ " if found.seed is None else ""
+                cells.append(f"{more}{scale * found.survived:.3g}{broken}")
+            lines.append((f"{factor}, {unit}", *cells))
+        parts.append(
+            table(
+                "Largest single change that is survived on every seed",
+                ("", *names),
+                lines,
+                "in brackets the first seed that a little more breaks",
+            )
+        )
+    return Group(*parts)
