@@ -50,8 +50,13 @@ _KINDS: tuple[Evidence, ...] = ("region", "dual", "sampled", "local")
 class ProvedSet(Protocol):
     """A proved region of attraction of a full closed loop, for one surface and reaching law."""
 
-    surface: Surface
-    reaching: ReachingLaw
+    @property
+    def surface(self) -> Surface:
+        """The surface it is for."""
+
+    @property
+    def reaching(self) -> ReachingLaw:
+        """Its reaching law."""
 
     def contains(self, x: FloatArray) -> bool:
         """Whether the state is inside for certain."""
