@@ -16,7 +16,7 @@ from undertow.delay import delay_gate
 from undertow.errors import InvalidInputError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import MinimumEnergy, MinimumTime, Objective
+from undertow.objective import MinimumEnergy, MinimumTime, Objective, state_box
 from undertow.optimiser import Budget
 from undertow.rig import Bench, IdealRig, RealisticRig, plausible_rig, srv02_rig
 from undertow.runtime.controller import Controller
@@ -99,11 +99,21 @@ class Recipe:
     @cached_property
     def cascade(self) -> Cascade:
         """Law, optimiser and gate."""
+        ends = {
+            c.name: 0.95 * min(-c.low, c.high)
+            for c in self.belief.coordinates
+            if math.isfinite(min(-c.low, c.high))
+        }
         goal: Objective = MinimumEnergy(
-            horizon=self.horizon, state_weight=STATE_WEIGHT, terminal_radius=TERMINAL
+            horizon=self.horizon,
+            state_weight=STATE_WEIGHT,
+            terminal_radius=TERMINAL,
+            constraints=state_box(**ends),
         )
         if self.objective == "time":
-            goal = MinimumTime(horizon=self.horizon, terminal_radius=TERMINAL)
+            goal = MinimumTime(
+                horizon=self.horizon, terminal_radius=TERMINAL, constraints=state_box(**ends)
+            )
         warm = Budget(self.evaluations, self.seconds)
         gate = delay_gate(BEARS * self.period, self.period)
         return Cascade(self.belief, goal, warm=warm, gate=gate, seed=self.seed)

@@ -65,7 +65,7 @@ def believe(
     missing, worst, still, moved = 0, 0, -1, False
     probing = quiet[0] >= {PROBE}
     for i in range(n):
-        if abs(q[i] - expected[i]) <= jump:
+        if abs(q[i] - expected[i]) <= jump + 2.0 * h * abs(expected[n + i]):
             gaps[i] = 0.0
         else:
             q[i] = math.nan

@@ -36,7 +36,8 @@ class Settings:
     patience
         Longest gap in a sensor that the model bridges, s.
     jump
-        Largest believable difference between a position and its prediction, rad or m.
+        Largest believable difference between a position and its prediction, rad or m, besides
+        two periods of motion at the present speed.
     frozen
         A reading that does not move while the model has moved by this, rad or m, is frozen.
     dead_band
