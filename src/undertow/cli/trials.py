@@ -34,11 +34,11 @@ __all__ = ["trials"]
 @reports_errors
 def trials(
     what: Annotated[
-        Literal["balance", "swing-up", "mujoco", "robustness"],
+        Literal["balance", "swing-up", "mujoco", "robustness", "estimators"],
         typer.Argument(
             help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
             "rest to balanced. mujoco: MuJoCo as the truth, no retuning. "
-            "robustness: random rigs, and what breaks whom."
+            "robustness: random rigs, and what breaks whom. estimators: the same law with each."
         ),
     ],
     seeds: Annotated[int, typer.Option(help="Rigs, one for each seed.", min=1)] = 20,
@@ -55,7 +55,7 @@ def trials(
 ) -> None:
     """Run controllers on realistic rigs, over and over, and print what came of it."""
     from undertow.trials import balance as experiment
-    from undertow.trials import report, upright
+    from undertow.trials import estimation, report, upright
     from undertow.trials import robustness as stress
 
     if out is not None:
@@ -75,6 +75,9 @@ def trials(
                 progress(mechanism.name, i / len(names))
                 found.append(upright.swing_trials(mechanism, seeds=seeds))
             shown = report.swing_report(found, upright.SWING_SECONDS)
+        elif what == "estimators":
+            progress("estimators", 0.0)
+            shown = report.estimator_report(estimation.compared(seeds=min(seeds, 5)))
         elif what == "robustness":
             shown = report.robustness_report(
                 stress.robustness(

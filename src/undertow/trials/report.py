@@ -18,6 +18,7 @@ from undertow import results
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
 from undertow.rollout import Trajectory
 from undertow.trials.balance import ENERGY_PRICE, ROWS, STATE_WEIGHT, BalanceResult
+from undertow.trials.estimation import EstimatorRow
 from undertow.trials.robustness import FACTORS, RobustnessResult
 from undertow.trials.trial import balanced, motion, spread
 from undertow.trials.upright import EngineResult, SwingResult
@@ -27,6 +28,7 @@ __all__ = [
     "balance_report",
     "comparison_figure",
     "engine_report",
+    "estimator_report",
     "repeats_figure",
     "robustness_report",
     "swing_report",
@@ -285,3 +287,36 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             )
         )
     return Group(*parts)
+
+
+def estimator_report(rows: Sequence[EstimatorRow]) -> RenderableType:
+    """Return the comparison of estimators for the terminal."""
+
+    def number(value: float, digits: int) -> str:
+        return f"{value:.{digits}f}" if np.isfinite(value) else "—"
+
+    return table(
+        "Estimators on the SRV02 bench, first surface, positions measured only",
+        (
+            "",
+            "balanced",
+            "θ̇ off by\nrad/s",
+            "φ̇ off by\nrad/s",
+            "∫u² dt\nV² s",
+            "chatter\nV/s",
+            "µs",
+        ),
+        [
+            (
+                row.name,
+                f"{row.balanced} of {row.seeds}",
+                *(number(v, 4) for v in row.errors),
+                number(row.effort, 2),
+                number(row.chatter, 0),
+                number(row.microseconds, 1),
+            )
+            for row in rows
+        ],
+        "off by: root mean square while balancing, against the present state, where a filter "
+        "that knows the delay is ahead of it; µs: processor time of one estimate",
+    )
