@@ -100,7 +100,7 @@ def certify_surface(
     loop
         Also prove how far off the target the full closed loop may start at rest: minutes.
     predict
-        Also predict the motion from the start (sampled).
+        Also predict the motion from the start, and from random ones up to it (sampled).
     progress
         Called with (what, part done).
 
@@ -145,6 +145,8 @@ def certify_surface(
             closed = ClosedLoop(mechanism, reaching=reaching_law)
             horizon = closed.objective.horizon
             remarks.append(assess(closed, Plan.of(surface), start, horizon, Policy()))
+            tell("random starts", 0.97)
+            remarks += _sampled(closed, surface, start)
     subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
     return Certified(title or str(surface), subject, region, time.perf_counter() - began)
 
@@ -262,6 +264,23 @@ def _loop(
         claim = "the full closed loop converges from rest"
         return {}, Verdict(claim, "undecided", method=str(error))
     return proved.claim.to_dict(), proved.verdict
+
+
+#: Random starts of the sampled verdict.
+TRIALS = 4000
+
+
+def _sampled(loop: ClosedLoop, surface: Surface, start: FloatArray) -> list[Verdict]:
+    """Whether starts at rest, up to the given one on either side, arrive."""
+    from undertow.certify.sampled import box_starts, sampled_region
+
+    box = _box(loop.mechanism, start)
+    if not box:
+        return []
+    ranges = ", ".join(f"|{name}| ≤ {high:.4g}" for name, (_, high) in box.items())
+    starts = box_starts(loop.mechanism, **box)
+    words = f"starts at rest with {ranges}"
+    return [sampled_region(loop, surface, starts, trials=TRIALS, what=words)]
 
 
 def certify_run(
