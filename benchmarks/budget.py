@@ -34,7 +34,8 @@ def situations(objective: ut.Objective, count: int) -> list[tuple[FloatArray, ut
     while len(found) < count:
         for update in run.updates:
             x = update.x * (1 + 0.05 * rng.standard_normal(update.x.size))
-            if exact.batch(x, update.surface).reached[0]:
+            motion = exact.batch(x, update.surface)
+            if motion.reached[0] and motion.time[0] < 0.99 * objective.horizon:
                 found.append((x, update.surface))
     return found[:count]
 

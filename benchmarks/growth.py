@@ -162,8 +162,10 @@ def populations(rounds: int, now: Clock) -> None:
 
 def main() -> int:
     """Print the three tables."""
-    options = command_line(__doc__, "--clock cpu").parse_args()
-    now, rounds = clock(options.clock), 5 if options.quick else 25
+    parser = command_line(__doc__, "--rounds 8 --clock cpu")
+    parser.add_argument("--rounds", type=int, help="rounds of each race (25; --quick: 5)")
+    options = parser.parse_args()
+    now, rounds = clock(options.clock), options.rounds or (5 if options.quick else 25)
     ratio = dimensions(rounds, now)
     horizons([5.0, 60.0] if options.quick else [2.0, 5.0, 10.0, 30.0, 60.0, 120.0], rounds, now)
     populations(rounds, now)

@@ -22,7 +22,7 @@ import scipy.linalg
 import sympy as sp
 
 import undertow as ut
-from harness import need
+from harness import Clock, need
 from undertow.bounds.expressions import translate
 from undertow.codegen import Tape
 from undertow.mechanism import TIME, FloatArray
@@ -151,6 +151,8 @@ class ShootingMPC:
         ν of the terminal set.
     tolerance
         IPOPT's.
+    now
+        Clock for the seconds of each planning.
     """
 
     PERIOD = 0.1
@@ -164,8 +166,9 @@ class ShootingMPC:
         goal: Literal["energy", "time"],
         radius: float = 0.01,
         tolerance: float = 1e-4,
+        now: Clock = time.perf_counter,
     ) -> None:
-        self.ca = need("casadi", "compare")
+        self.ca, self._now = need("casadi", "compare"), now
         self.mechanism, self.goal, self.radius = mechanism, goal, radius
         self.limits = mechanism.input_limits
         self.P, self.K = riccati(mechanism, SLOW if goal == "energy" else 1.0)
@@ -278,7 +281,7 @@ class ShootingMPC:
 
         False: none found; the last plan stays in use while it covers the next period.
         """
-        began = time.perf_counter()
+        began = self._now()
         self.iterations.append(0)
         found = None
         if self._plan is not None:
@@ -289,7 +292,7 @@ class ShootingMPC:
                 found = None if slow is None else self._solve(x, slow, True)
         if found is None and self._left(t) < self.PERIOD:
             found = self._cold(x)
-        self.seconds.append(time.perf_counter() - began)
+        self.seconds.append(self._now() - began)
         if found is None:
             self.failures += 1
             return False
@@ -354,8 +357,10 @@ class DoMPC:
         goal: Literal["energy", "time"],
         radius: float = 0.01,
         tolerance: float = 1e-4,
+        now: Clock = time.perf_counter,
     ) -> None:
         self.ca, do_mpc = need("casadi", "compare"), need("do_mpc", "compare")
+        self._now = now
         if hasattr(self.ca.GlobalOptions, "setNumpyMode"):
             self.ca.GlobalOptions.setNumpyMode(-1)  # what do-mpc was written for
         self.mechanism, self.goal = mechanism, goal
@@ -411,7 +416,7 @@ class DoMPC:
 
     def plan(self, _t: float, x: FloatArray) -> bool:
         """Plan from x; False when IPOPT failed."""
-        began = time.perf_counter()
+        began = self._now()
         state = np.asarray(x)[:, None]
         if self._cold:
             self.mpc.x0 = state
@@ -420,7 +425,7 @@ class DoMPC:
             self.mpc.set_initial_guess()
             self._cold = False
         self.u = np.asarray(self.mpc.make_step(state)).ravel()[: self.mechanism.m]
-        self.seconds.append(time.perf_counter() - began)
+        self.seconds.append(self._now() - began)
         self.iterations.append(int(self.mpc.solver_stats["iter_count"]))
         success = bool(self.mpc.solver_stats["success"])
         self.failures += not success

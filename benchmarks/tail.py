@@ -102,9 +102,10 @@ def main() -> int:
     """Compare and print errors and ratios."""
     parser = command_line(__doc__, "--count 5000")
     parser.add_argument("--count", type=int, help="motions (1000; --quick: 200)")
+    parser.add_argument("--rounds", type=int, help="rounds of the race (10; --quick: 3)")
     options = parser.parse_args()
     count, now = options.count or (200 if options.quick else 1000), clock(options.clock)
-    rounds = 3 if options.quick else 10
+    rounds = options.rounds or (3 if options.quick else 10)
     found = [compare(o, count, rounds, now) for o in (ut.MinimumEnergy(), ut.MinimumTime())]
     table(
         f"{count} random admissible motions: relative error of the cost; integration over tail",

@@ -48,13 +48,14 @@ def test_the_one_command_knows_every_benchmark() -> None:
     shown = run(str(FOLDER), "--help")
     assert shown.returncode == 0
     assert "examples:" in shown.stdout
-    assert all(name in shown.stdout for name in set(SCRIPTS) - HELPERS)
+    words = shown.stdout.replace(",", " ").split()
+    assert set(SCRIPTS) - HELPERS <= set(words)
 
 
 def test_an_unknown_benchmark_is_refused_with_the_known_ones() -> None:
     refused = run(str(FOLDER), "kernal")
     assert refused.returncode == 2
-    assert "no benchmark named kernal; there are kernel," in refused.stderr
+    assert "no benchmark named kernal; there are kernel" in refused.stderr
 
 
 def test_a_missing_extra_says_what_to_install(harness: ModuleType) -> None:
@@ -123,7 +124,7 @@ def test_predictive_control_of_least_time_is_near_the_bound(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(SCRIPTS) - HELPERS))
 def test_quick_run(name: str) -> None:
-    if name in ("kernel", "reoptimise", "closed_loop", "gap"):
+    if name in ("kernel", "reoptimise", "closed_loop", "gap", "searchers"):
         pytest.importorskip("casadi")
     finished = run(str(FOLDER / f"{name}.py"), "--quick")
     assert finished.returncode == 0, finished.stderr

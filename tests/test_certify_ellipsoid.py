@@ -110,6 +110,30 @@ def test_no_motion_leaves_a_proved_ellipsoid(case: str) -> None:
     assert level.max() < 0.2
 
 
+@pytest.mark.slow
+def test_a_hundred_thousand_motions_stay_and_converge() -> None:
+    """Twenty thousand starts all over each of the five cases' ellipsoids, none leaves."""
+    rng = np.random.default_rng(5)
+    loop = ut.ClosedLoop(RIG)
+    for surface in CASES.values():
+        found = largest(RIG, surface)
+        rays = rng.normal(size=(20_000, 4))
+        rays *= (
+            found.radius
+            * rng.random((20_000, 1)) ** 0.25
+            / np.linalg.norm(rays, axis=1, keepdims=True)
+        )
+        x = np.linalg.solve(found.W, rays.T).T
+        start = level = found.level(x)
+        assert 0.99 < level.max() <= 1
+        for seconds in (0.004, 0.01, 0.02, 0.04, 0.1, 0.3, 1.0, 4.0):
+            x = loop.batch(x, surface, duration=seconds, terminal=0.0).x
+            after = found.level(x)
+            assert (after < level).all()
+            level = after
+        assert (level < 0.9 * start).all()
+
+
 @pytest.mark.parametrize("name", SMALL)
 def test_other_mechanisms_have_terminal_ellipsoids(name: str) -> None:
     rig = ut.mechanisms.LIBRARY[name]()

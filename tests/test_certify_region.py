@@ -7,13 +7,12 @@ import pytest
 import sympy as sp
 
 import undertow as ut
+from undertow.certify.appendix import CASES, Constants
 from undertow.certify.linear_program import minimise_linear
-from undertow.certify.region import (
-    LyapunovFunction,
-    SurfaceMotion,
-    first_crossing,
-    verify_region,
-)
+from undertow.certify.lyapunov import LyapunovFunction, first_crossing
+from undertow.certify.motion import Motion, SurfaceMotion, VectorField
+from undertow.certify.region import verify_region
+from undertow.certify.region_chart import natural_stretch
 from undertow.certify.region_search import prove_region, search_region
 from undertow.errors import InvalidInputError, UnstableSurfaceError
 from undertow.mechanism import TIME
@@ -24,16 +23,17 @@ pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certi
 
 RIG = ut.mechanisms.rotary_pendulum()
 MOTION = SurfaceMotion(RIG, ut.Surface(-1, -1.59, 1.96, 12.1))
+CONSTANTS = Constants.of(RIG)
 SQUARES = np.array([[2, 0, 0], [0, 2, 0], [0, 0, 2]])
 
 
 @pytest.fixture(scope="module")
 def ellipsoid() -> LyapunovFunction:
     """The quadratic V that the search starts from, a little inside."""
-    return search_region(MOTION, (1, 0, 0), degrees=(2,), seconds=0.0).times(1.02)
+    return search_region(MOTION, (1, 0, 0), degrees=(2,), seconds=0.0, start="round").times(1.05)
 
 
-def steps(motion: SurfaceMotion, y: np.ndarray, seconds: float, h: float) -> np.ndarray:
+def steps(motion: Motion, y: np.ndarray, seconds: float, h: float) -> np.ndarray:
     """RK4 states (K, B, N) of a batch on the surface."""
     path = [y]
     for _ in range(round(seconds / h)):
@@ -49,10 +49,10 @@ def steps(motion: SurfaceMotion, y: np.ndarray, seconds: float, h: float) -> np.
 def inside(V: LyapunovFunction, count: int, seed: int) -> np.ndarray:
     """Points of {V ≤ 1}, half of them on its boundary."""
     rng = np.random.default_rng(seed)
-    rays = rng.normal(size=(count, 3))
+    rays = rng.normal(size=(count, V.exponents.shape[1]))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     part = np.where(rng.random(count) < 0.5, 0.9999, rng.random(count))
-    return np.asarray((rays * (first_crossing(V, rays) * part)[:, None]) @ V.scale.T)
+    return V.points(rays * (first_crossing(V, rays) * part)[:, None])
 
 
 def test_the_motion_is_the_mechanisms_on_its_surface() -> None:
@@ -116,6 +116,23 @@ def test_a_raised_level_is_refuted_with_a_witness(ellipsoid: LyapunovFunction) -
     assert ellipsoid(y + step) > ellipsoid(y - step)
 
 
+def test_stretched_coordinates_are_inverted_and_their_rates_are_derivatives() -> None:
+    """points(coordinates(y)) = y up to 95 % of the pole; ż by central differences."""
+    stretch = natural_stretch(MOTION, slow=True)
+    assert stretch is not None
+    S, pole = stretch
+    V = LyapunovFunction(np.diag([0.3, 2.0, 4.0]), SQUARES, np.ones(3), S, pole)
+    y = np.random.default_rng(1).uniform(-0.95, 0.95, (200, 3)) * [pole, 5.0, 5.0]
+    assert V.points(V.coordinates(y)) == pytest.approx(y, rel=1e-9, abs=1e-9)
+    y_dot = MOTION(y)
+    h = 1e-7
+    slope = (V.coordinates(y + h * y_dot) - V.coordinates(y - h * y_dot)) / (2 * h)
+    rates = V.coordinate_rates(y, y_dot)
+    assert slope == pytest.approx(rates, rel=1e-4, abs=1e-4 * np.abs(rates).max())
+    assert np.isinf(V([pole, 0.0, 0.0]))
+    assert pole == pytest.approx(CASES[3].reduced(CONSTANTS).limit, rel=1e-6)
+
+
 def test_a_level_set_that_crosses_the_singularity_is_not_proved() -> None:
     """Locally fine, but {V ≤ 1} reaches past arccos ε."""
     verdict = verify_region(
@@ -125,11 +142,14 @@ def test_a_level_set_that_crosses_the_singularity_is_not_proved() -> None:
 
 
 def test_an_unbounded_level_set_is_not_proved() -> None:
-    """V without w: {V ≤ 1} is a cylinder, and no box holds it."""
+    """V that falls again far along w, and V without w: no box holds {V ≤ 1}."""
+    falling = np.vstack([SQUARES, [0, 0, 4]])
+    V = LyapunovFunction(np.eye(3) * 0.1, falling, np.array([1.0, 1.0, 1.0, -0.5]))
+    verdict = verify_region(MOTION, V)
+    assert verdict.kind == "undecided"
+    assert "no box" in verdict.method or "boundary of the box" in verdict.method
     flat = LyapunovFunction(np.eye(3) * 0.1, SQUARES[:2], np.ones(2))
-    verdict = verify_region(MOTION, flat)
-    assert not verdict
-    assert "no box" in verdict.method
+    assert verify_region(MOTION, flat).kind == "undecided"
 
 
 def test_a_known_region_is_found_to_its_edge() -> None:
@@ -156,11 +176,61 @@ def test_a_known_region_is_found_to_its_edge() -> None:
     assert verify_region(motion, cylinder(1.02)).kind == "refuted"
 
 
+@pytest.mark.parametrize(("radius", "kind"), [(0.98, "proved"), (1.02, "refuted")])
+def test_a_plain_vector_field_with_a_known_region(radius: float, kind: str) -> None:
+    """ẋ = −x + x³ from its expression: V = (x/r)² serves iff r ≤ 1."""
+    x = sp.Symbol("x", real=True)
+    motion = VectorField((x,), (-x + x**3,))
+    V = LyapunovFunction(np.array([[radius]]), np.array([[2]]), np.ones(1))
+    verdict = verify_region(motion, V)
+    assert verdict.kind == kind
+    if kind == "refuted":
+        assert 1.0 < abs(verdict.witness["x"]) <= radius
+
+
+def test_the_reversed_van_der_pol_region_stays_inside_its_limit_cycle() -> None:
+    """ẋ = −y, ẏ = x − (1 − x²) y: proved, converging, and no larger than the true region."""
+    x, y = sp.symbols("x y", real=True)
+    motion = VectorField((x, y), (-y, x - (1 - x**2) * y))
+    found = prove_region(motion, (1, 0), degrees=(2, 4), seconds=60.0, goal=1.1)
+    path = steps(motion, inside(found.function, 2000, seed=5), seconds=12.0, h=0.02)
+    assert found.function(path).max() <= 1.0
+    assert found.function(path[-1]).max() < 1e-2
+    assert 1.0 < found.extent < 2.009  # where the limit cycle crosses y = 0
+
+
+def test_a_vector_field_must_be_closed_and_at_rest() -> None:
+    """A stray symbol is refused; a target that is no equilibrium is never proved."""
+    x, k = sp.symbols("x k", real=True)
+    with pytest.raises(InvalidInputError, match="k"):
+        VectorField((x,), (-k * x,))
+    V = LyapunovFunction(np.eye(1), np.array([[2]]), np.ones(1))
+    verdict = verify_region(VectorField((x,), (-x + sp.Rational(1, 100),)), V)
+    assert verdict.kind == "undecided"
+    assert "f(0) = 0" in verdict.method
+
+
+def test_a_repeated_zero_eigenvalue_is_never_proved() -> None:
+    """Without gravity or coupling q̈_u = 0: no search, and no function passes."""
+    a, b = ut.Coordinate("a"), ut.Coordinate("b")
+    mechanism = ut.Mechanism(
+        "free", (a, b), (ut.Input("u", "N m"),), sp.ImmutableDenseMatrix([[1, 0], [0, 1]]),
+        sp.ImmutableDenseMatrix([0, 0]),
+    )  # fmt: skip
+    motion = SurfaceMotion(mechanism, ut.Surface(1, 1, 0, 0))
+    assert np.sum(np.abs(np.linalg.eigvals(motion.jacobian)) < 1e-9) == 2
+    with pytest.raises(UnstableSurfaceError):
+        search_region(motion, (1, 0, 0), seconds=1.0)
+    verdict = verify_region(motion, LyapunovFunction(np.eye(3), SQUARES, np.ones(3)))
+    assert verdict.kind == "undecided"
+    assert "not negative definite" in verdict.method
+
+
 def test_another_plant_in_a_parameter_box(ellipsoid: LyapunovFunction) -> None:
     """±0.5 % in the mass's lever r_o is proved for a smaller set; ±30 % is not."""
     smaller = ellipsoid.times(1.5)
     assert verify_region(MOTION, smaller, parameters={"r_o": (0.2145, 0.2155)})
-    assert not verify_region(MOTION, smaller, parameters={"r_o": (0.15, 0.28)}, max_seconds=5)
+    assert not verify_region(MOTION, smaller, parameters={"r_o": (0.15, 0.28)}, max_boxes=20_000)
     with pytest.raises(InvalidInputError, match="parameter box"):
         verify_region(MOTION, smaller, parameters={"nothing": (0.0, 1.0)})
 

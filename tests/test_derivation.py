@@ -19,7 +19,7 @@ from undertow.derivation import (
     hurwitz_minors,
     polynomial_matrix,
 )
-from undertow.formulas import plain, tex
+from undertow.formulas import plain, readable, tex
 from undertow.mechanisms import LIBRARY
 from undertow.sliding import singularity
 from undertow.stability import sliding_matrix, stability_margin
@@ -180,6 +180,15 @@ def test_names_as_people_write_them() -> None:
     assert plain(v**2 * sp.cos(q)) == "φ̇₁² cos(θ_x)"
     assert tex(v**2) == r"\dot{\varphi}_{1}^{2}"
     assert tex(sp.Symbol("voltage")) == r"\mathrm{voltage}"
+    assert plain(sp.Symbol("tilt_dot")) == "tilt_dot"
+    assert plain(sp.Symbol("torque_k_t")) == "torque_k_t"
+
+
+def test_numbers_in_energies_are_shown_as_people_write_them() -> None:
+    """Claim: 1.0 and 4/3 as a decimal are written 1 and 4/3, and stay equal; 9.81 stays."""
+    h = sp.Symbol("h", real=True)
+    shown = readable(1.0 * h + 4.0 / 3.0 * h**2 + 9.81)
+    assert plain(shown) == "4 h²/3 + h + 9.81"
 
 
 def test_derive_on_the_command_line(tmp_path: object) -> None:

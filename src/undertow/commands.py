@@ -5,7 +5,7 @@ Plain functions of plain arguments; :mod:`undertow.cli` gives them their options
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -17,11 +17,16 @@ from undertow.animation import Film, gif, still
 from undertow.derivation import derivation
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import LIBRARY
+from undertow.objective import MinimumEnergy
+from undertow.optimiser import Optimiser
 from undertow.plot import figure_bytes, style
-from undertow.rollout import Trajectory
+from undertow.rollout import ClosedLoop, Trajectory
 from undertow.survey import start_words
 
-__all__ = ["animation_files", "derivation_files", "mechanism_table"]
+__all__ = ["animation_files", "derivation_files", "library_picture", "mechanism_table"]
+
+#: Mechanisms side by side in the picture of the library.
+COLUMNS = 5
 
 
 def mechanism_table() -> Table:
@@ -35,6 +40,24 @@ def mechanism_table() -> Table:
         cells = (m.name, f"{m.n}, {m.m}", inputs, start_words(m), m.description)
         table.add_row(*(Text(cell) for cell in cells))
     return table
+
+
+def library_picture(progress: Callable[[str, float], None] | None = None) -> bytes:
+    """Return a PNG of every mechanism on its way to the target, optimised once from its start."""
+    rows = -(-len(LIBRARY) // COLUMNS)
+    with style():
+        figure = Figure(figsize=(3 * COLUMNS, 2.9 * rows), layout="constrained")
+        for index, (name, build) in enumerate(LIBRARY.items()):
+            if progress is not None:
+                progress(name, index / len(LIBRARY))
+            mechanism = build()
+            loop = ClosedLoop(mechanism, MinimumEnergy())
+            x0 = mechanism.state(**mechanism.start)
+            plan = Optimiser(loop).require(x0).plan
+            assert plan is not None  # require() raises otherwise
+            film = Film.of(loop.simulate(x0, plan))
+            still(figure.add_subplot(rows, COLUMNS, index + 1), film)
+        return figure_bytes(figure)
 
 
 def derivation_files(mechanism: Mechanism) -> dict[str, bytes]:

@@ -1,14 +1,17 @@
-"""How much delay a surface can bear: the linear loop at the target, sampled and late.
+"""What a surface must bear before a bench may meet it: delay, and a weaker actuator.
 
 Inside the boundary layer the law is smooth; at the target it is a state feedback u = k x.
 Held from sample to sample and applied d samples late it closes a discrete loop whose
 spectral radius says whether it is stable.  A surface can be excellent on the model and yet
-bear no delay: near-singular ones (37) have the largest gains.
+bear no delay: near-singular ones (37) have the largest gains.  And far from the target the
+cheapest motion uses all of the actuator, so that a motor a little weaker than its data sheet
+loses it.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,11 +23,11 @@ from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.optimiser import INADMISSIBLE
 from undertow.plan import Plan
-from undertow.rollout import ClosedLoop
+from undertow.rollout import ClosedLoop, Event
 from undertow.sliding import ReachingLaw, Surface
 from undertow.stability import linearise
 
-__all__ = ["delay_gate", "delay_margin", "feedback"]
+__all__ = ["bench_gate", "delay_gate", "delay_margin", "feedback"]
 
 
 def feedback(law: InnerLoop) -> FloatArray:
@@ -139,5 +142,41 @@ def delay_gate(least: float, period: float = 0.001) -> Gate:
                     reason = f"bears {1e3 * margin:.3g} ms of delay, wanted {1e3 * least:.3g} ms"
                     return Admission(False, reason, cost)
         return cost_gate(loop, old, new, x, horizon)
+
+    return gate
+
+
+def bench_gate(
+    least: float, reserve: float = 0.15, *, period: float = 0.001, seconds: float = 4.0
+) -> Gate:
+    """Return a gate that asks for a delay margin and for a reserve of the actuator.
+
+    Parameters
+    ----------
+    least
+        Smallest :func:`delay_margin`, s.
+    reserve
+        Part of the inputs' limits that may be missing: a new plan must stay in the region
+        where its law exists, and not diverge, on a plant whose limits are lower by this.
+    period
+        Sampling period of the inner loop, s.
+    seconds
+        How far that is looked ahead.
+    """
+    late = delay_gate(least, period)
+
+    def gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
+        admission = late(loop, old, new, x, horizon)
+        if not admission.accepted or new == old:
+            return admission
+        limits = (1.0 - reserve) * loop.mechanism.input_limits
+        weak = replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail=0.0)
+        event = Event(int(weak.batch(x, new, duration=min(seconds, horizon)).event[0]))
+        if event in (Event.HORIZON, Event.REACHED):
+            return admission
+        score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
+        cost = score if score < INADMISSIBLE else math.inf
+        reason = f"with {100 * reserve:g} % less input: {event.name.lower()}"
+        return Admission(False, reason, cost)
 
     return gate

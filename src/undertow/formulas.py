@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from functools import lru_cache
 
 import sympy as sp
@@ -30,7 +31,7 @@ def readable(expression: sp.Expr | float, rates: Sequence[sp.Symbol] = ()) -> sp
     rates
         Velocities by whose monomials the terms are collected.
     """
-    expression = sp.expand(sp.sympify(expression))
+    expression = sp.expand(_with_fractions(sp.sympify(expression)))
     polynomial = sp.Poly(expression, *rates) if rates and expression.is_polynomial(*rates) else None
     if polynomial is None:
         return _shortest(expression)
@@ -40,6 +41,18 @@ def readable(expression: sp.Expr | float, rates: Sequence[sp.Symbol] = ()) -> sp
             for powers, c in polynomial.terms()
         )
     )
+
+
+def _with_fractions(expression: sp.Expr) -> sp.Expr:
+    """Write numbers that are small fractions as such: 1.0 is 1, 1.333… is 4/3; 9.81 stays."""
+
+    def fraction(number: sp.Float) -> sp.Expr:
+        value = float(number)
+        short = Fraction(value).limit_denominator(12)
+        near = abs(value - short) <= 4e-16 * abs(value)
+        return sp.Rational(short.numerator, short.denominator) if near else number
+
+    return expression.xreplace({f: fraction(f) for f in expression.atoms(sp.Float)})
 
 
 @lru_cache(maxsize=4096)
@@ -99,6 +112,8 @@ def _parts(name: str) -> tuple[str, str, str]:
 
 def _plain_symbol(name: str) -> str:
     stem, index, dots = _parts(name)
+    if len(stem) > 1 and stem not in _GREEK and dots:
+        return name  # a dot over the last letter of a word says nothing
     letter = _GREEK.get(stem, stem) + _DOTS.get(dots, "")
     if not index:
         return letter

@@ -211,7 +211,9 @@ class Optimiser:
             return Budget(40_000 if warm else 160_000)
         if warm:
             return Budget(576 if self.counts_time else 1024)
-        return Budget(3072)
+        # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
+        n, m = self.loop.mechanism.n, self.loop.mechanism.m
+        return Budget(1024 * (2 * m * n - m * m) ** 2 // 3)
 
     @property
     def _promptness(self) -> float:

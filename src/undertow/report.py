@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow import results
-from undertow.cascade import Run
+from undertow.cascade import Run, Update
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
@@ -102,6 +102,8 @@ def motion_report(
             ("last surface", _surface_words(run.surfaces[-1])),
             ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
         ]
+        if any(verdict is not None for verdict in run.verdicts):
+            rows.append(("evidence", _evidence(run)))
         if len(run.descent):
             rows.append(
                 ("Lemma 3", f"smallest slack {run.descent.min():.2e} {objective.unit} (≥ 0 wanted)")
@@ -122,8 +124,47 @@ def motion_report(
     return Group(_facts(rows), mark + Text(ended(motion, objective)))
 
 
+def _evidence(run: Run) -> str:
+    """Count what is known of the plan in use at each decision."""
+    kinds = [None if v is None else v.details.get("evidence") for v in run.verdicts]
+    words = {
+        "region": "in a proved set",
+        "dual": "predicted into a proved set",
+        "sampled": "sampled nearby",
+        "local": "stable near the target",
+        None: "without accepted evidence",
+    }
+    counts = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kinds.count(kind)]
+    return ", ".join(counts)
+
+
+def _decision(update: Update) -> dict[str, object]:
+    admission, verdict = update.admission, update.admission.verdict
+    return {
+        "t": update.t,
+        "admitted": admission.accepted,
+        "reason": admission.reason,
+        "surface": update.surface.vector.tolist(),
+        "predicted_cost": admission.cost if isfinite(admission.cost) else None,
+        "verdict": None
+        if verdict is None
+        else {
+            "kind": verdict.kind,
+            "evidence": verdict.details.get("evidence"),
+            "claim": verdict.claim,
+            "margin": verdict.margin if isfinite(verdict.margin) else None,
+            "unit": verdict.unit,
+            "method": verdict.method,
+        },
+    }
+
+
 def motion_files(
-    request: Mapping[str, object], motion: Trajectory, cost: float, surfaces: Sequence[Surface]
+    request: Mapping[str, object],
+    motion: Trajectory,
+    cost: float,
+    surfaces: Sequence[Surface],
+    run: Run | None = None,
 ) -> dict[str, bytes]:
     """Return a motion's files: ``motion.csv`` (SI units), ``motion.png``, ``manifest.json``.
 
@@ -137,6 +178,8 @@ def motion_files(
         Its total.
     surfaces
         The surfaces in use, in order.
+    run
+        The cascade's record: every decision with its verdict goes into the manifest.
     """
     mechanism = motion.mechanism
     header = [
@@ -158,6 +201,8 @@ def motion_files(
         "cost": cost,
         "surfaces": [surface.vector.tolist() for surface in surfaces],
     }
+    if run is not None:
+        facts["decisions"] = [_decision(update) for update in run.updates]
     return {
         "motion.csv": table,
         "motion.png": figure_bytes(motion_figure({"motion": motion})),

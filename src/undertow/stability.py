@@ -26,7 +26,13 @@ from undertow.errors import (
     UnstableSurfaceError,
 )
 from undertow.mechanism import TIME, FloatArray, Mechanism, numbers
-from undertow.sliding import Surface, check_surface_shape, singularity
+from undertow.sliding import (
+    Surface,
+    check_surface_shape,
+    coupling,
+    gamma_determinant,
+    singularity,
+)
 
 __all__ = [
     "Linearisation",
@@ -181,6 +187,12 @@ def sliding_matrix(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> Float
     return np.concatenate([top, acceleration], axis=-2)
 
 
+@lru_cache(maxsize=128)
+def _coupling_at_target(mechanism: Mechanism) -> FloatArray:
+    """Return X = M_uu⁻¹ M_auᵀ at the target, (n−m, m)."""
+    return coupling(mechanism, np.zeros(mechanism.n))
+
+
 def stability_margin(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> FloatArray:
     """Return −max Re eig of the sliding dynamics, 1/s, (…,); positive means stable.
 
@@ -188,7 +200,7 @@ def stability_margin(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> Flo
     at the target.
     """
     vectors = surfaces.vector if isinstance(surfaces, Surface) else np.asarray(surfaces, float)
-    gamma = singularity(mechanism, vectors, np.zeros(mechanism.n))
+    gamma = gamma_determinant(_coupling_at_target(mechanism), vectors)
     m = mechanism.m
     alpha_a = vectors[..., : m * m].reshape(*vectors.shape[:-1], m, m)
     sound = (np.abs(gamma) > 1e-9) & (np.abs(np.linalg.det(alpha_a)) > 1e-12)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 
@@ -31,6 +32,7 @@ from undertow.optimiser import Budget
 from undertow.plan import Plan
 from undertow.plot import display
 from undertow.sliding import Surface
+from undertow.stability import linearise
 
 __all__ = [
     "TRIALS",
@@ -49,9 +51,8 @@ __all__ = [
 #: A gap beyond this asks for its cause.
 LARGE = 0.10
 
-#: Intervals of the bound's first mesh for each swing of the motion, and the most there may be.
+#: Intervals of the bound's first mesh for each swing of the free motion.
 PER_CYCLE = 12
-MOST_INTERVALS = 400
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Trial:
 TRIALS = (
     Trial("more evaluations (30 000)", Freedom(), Budget(30_000)),
     Trial("reaching law free (10 000)", Freedom(reaching=True), Budget(10_000)),
-    Trial("both (60 000)", Freedom(reaching=True), Budget(60_000)),
+    Trial("both (40 000)", Freedom(reaching=True), Budget(40_000)),
 )
 
 
@@ -98,9 +99,6 @@ class Entry:
         ‖x‖ at the end of the cascade's motion.
     bound
         Optimal-control bound, NaN where none was asked for or found.
-    deadline
-        Final time of the bound, s: the horizon, or the cascade's time of arrival where the
-        motion swings too often to be bounded over the horizon.
     seconds
         Wall time of all of it, s.
     trials
@@ -118,7 +116,6 @@ class Entry:
     time: float
     radius: float
     bound: float
-    deadline: float
     seconds: float
     trials: Mapping[str, float]
 
@@ -188,14 +185,13 @@ def survey_one(
     plan, first = proposal.plan, cascade.optimiser.first
     assert plan is not None  # require() raises otherwise
     assert first is not None  # designed when the optimiser was made
-    horizon = objective.horizon
     candidates: list[Surface | Plan] = [first, plan]
     costs = loop.batch(x0, candidates)
     run = cascade.simulate(x0)
-    limit, deadline = math.nan, horizon
+    limit = math.nan
     trials: dict[str, float] = {}
     if bounds:
-        limit, deadline = _bound(mechanism, objective, x0, run)
+        limit = _bound(mechanism, objective, x0, run)
         if run.cost / limit - 1.0 > LARGE:
             trials = _trials(mechanism, objective, x0, seed)
     reached = [
@@ -210,43 +206,31 @@ def survey_one(
         first=reached[0],
         one_time=reached[1],
         cascade=run.cost if run.reached else math.inf,
-        time=run.time if run.reached and run.time <= horizon + 1e-9 else math.inf,
+        time=run.time if run.reached else math.inf,
         radius=float(math.hypot(*run.trajectory.x[-1])),
         bound=limit,
-        deadline=deadline,
         seconds=time.perf_counter() - began,
         trials=trials,
     )
 
 
-def _bound(
-    mechanism: Mechanism, objective: Objective, x0: FloatArray, run: Run
-) -> tuple[float, float]:
-    """Return the bound and its deadline, s.
-
-    A motion that swings too often for one mesh over the whole horizon is bounded at the
-    cascade's own time of arrival instead: no motion that takes as long spends less.
-    """
-    motion = run.trajectory
-    sampled = motion.x[:: max(1, len(motion.x) // 20_000), mechanism.n :]
-    turns = max(int((a[1:] * a[:-1] < 0).sum()) for a in sampled.T) / 2
-    deadline = objective.horizon
-    intervals = round(PER_CYCLE * turns * deadline / motion.duration)
-    if run.reached and intervals > MOST_INTERVALS:
-        deadline = motion.duration
-        intervals = round(PER_CYCLE * turns)
+def _bound(mechanism: Mechanism, objective: Objective, x0: FloatArray, run: Run) -> float:
+    """Return the bound, NaN where none was found; the cascade's own motion is one guess."""
+    intervals = max(100, round(PER_CYCLE * _cycles(mechanism, objective.horizon)))
     try:
-        found = bound(
-            mechanism,
-            objective,
-            x0,
-            horizon=deadline,
-            intervals=min(max(100, intervals), MOST_INTERVALS),
-            guess=motion,
-        )
+        found = bound(mechanism, objective, x0, intervals=intervals, guess=run.trajectory)
     except InfeasibleError:
-        return math.nan, deadline
-    return found.cost, deadline
+        return math.nan
+    return found.cost
+
+
+def _cycles(mechanism: Mechanism, horizon: float) -> float:
+    """How often the mechanism swings by itself, near the target, before it rests or time is up."""
+    modes = np.linalg.eigvals(linearise(mechanism).A)
+    swings = [
+        p.imag / math.tau * min(horizon, 5.0 / max(abs(p.real), 1e-12)) for p in modes if p.imag > 0
+    ]
+    return float(sum(swings))
 
 
 def _trials(
@@ -290,9 +274,6 @@ def _cells(entry: Entry) -> tuple[str, ...]:
 
     gap = f"{100 * entry.gap:.1f} %" if math.isfinite(entry.gap) else "—"
     when = f"{entry.time:.2f} s" if math.isfinite(entry.time) else "not reached"
-    limit = cost(entry.bound)
-    if entry.deadline == entry.time and math.isfinite(entry.bound):
-        limit += f" ({entry.deadline:.1f} s)"
     costs = (entry.first, entry.one_time)
     return (
         entry.name,
@@ -300,7 +281,7 @@ def _cells(entry: Entry) -> tuple[str, ...]:
         entry.start,
         *(cost(value) for value in costs),
         f"{cost(entry.cascade)} {entry.unit}",
-        limit,
+        cost(entry.bound),
         gap,
         when,
     )
@@ -349,12 +330,12 @@ def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, 
 
     header = (
         "mechanism", "n", "m", "start", "unit", "first", "one_time", "cascade", "bound",
-        "deadline_s", "gap", "time_s", "radius", "seconds", *(trial.name for trial in TRIALS),
+        "gap", "time_s", "radius", "seconds", *(trial.name for trial in TRIALS),
     )  # fmt: skip
     rows = [
         (
             e.name, e.n, e.m, e.start, e.unit,
-            *map(cell, (e.first, e.one_time, e.cascade, e.bound, e.deadline, e.gap)),
+            *map(cell, (e.first, e.one_time, e.cascade, e.bound, e.gap)),
             *map(cell, (e.time, e.radius)),
             round(e.seconds, 2),
             *(cell(e.trials.get(trial.name, math.nan)) for trial in TRIALS),

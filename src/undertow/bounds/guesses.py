@@ -15,7 +15,7 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.rollout import Trajectory
 from undertow.stability import linearise
 
-__all__ = ["Guess", "built_in", "recorded", "time_scale"]
+__all__ = ["Guess", "built_in", "recorded", "rests", "time_scale"]
 
 
 class Guess(NamedTuple):
@@ -36,6 +36,11 @@ def time_scale(mechanism: Mechanism, longest: float) -> float:
     lin, m = linearise(mechanism), mechanism.m
     rates = np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(lin.M[m:, m:], lin.F[m:, m:]))))
     return 10.0 / max(float(rates.min()), 10.0 / longest)
+
+
+def rests(mechanism: Mechanism) -> bool:
+    """Whether the target is stable without input: motions there may take all the time."""
+    return bool(np.linalg.eigvals(linearise(mechanism).A).real.max() <= 1e-9)
 
 
 def recorded(mechanism: Mechanism, guess: Trajectory | Sequence[Trajectory] | None) -> list[Guess]:
@@ -73,7 +78,7 @@ def _sampled(name: str, t: FloatArray, x: FloatArray, u: FloatArray) -> Guess:
 def built_in(
     mechanism: Mechanism, x0: FloatArray, scale: float, longest: float, swing: bool
 ) -> Iterator[Guess]:
-    """Yield the built-in guesses: decay, saturated linear-quadratic feedback, swings."""
+    """Yield the built-in guesses: decay, saturated linear-quadratic feedback, coasting, swings."""
     m = mechanism.m
 
     def decay(t: FloatArray) -> FloatArray:
@@ -83,6 +88,9 @@ def built_in(
     feedback = _regulated(mechanism, x0, scale, longest)
     if feedback is not None:
         yield feedback
+    coasting = _coasting(mechanism, x0, longest)
+    if coasting is not None:
+        yield coasting
     if swing:
         yield from _swings(mechanism, x0, scale, longest)
 
@@ -115,6 +123,26 @@ def _regulated(mechanism: Mechanism, x0: FloatArray, scale: float, longest: floa
     if not run.success or run.t[-1] < span or np.linalg.norm(x[-1]) > np.linalg.norm(x0):
         return None
     return _sampled("linear-quadratic feedback", run.t, x, control(x))
+
+
+def _coasting(mechanism: Mechanism, x0: FloatArray, longest: float) -> Guess | None:
+    """Let go: the motion without input, ``None`` where the target itself is not stable."""
+    if not rests(mechanism):
+        return None
+    nothing = np.zeros(mechanism.m)
+
+    def rate(_t: float, x: FloatArray) -> FloatArray:
+        return np.concatenate([x[mechanism.n :], mechanism.accelerations(0.0, x, nothing)])
+
+    run = scipy.integrate.solve_ivp(
+        rate, (0.0, longest), x0, rtol=1e-8, atol=1e-10, dense_output=True
+    )
+    motion = run.sol
+    if not run.success or motion is None:
+        return None
+    return Guess(
+        "coasting", longest, lambda t: motion(t).T, lambda t: np.zeros((len(t), mechanism.m))
+    )
 
 
 def _swings(mechanism: Mechanism, x0: FloatArray, scale: float, longest: float) -> Iterator[Guess]:

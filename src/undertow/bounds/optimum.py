@@ -180,6 +180,7 @@ def bound(
     if float(np.linalg.norm(start)) <= objective.terminal_radius:
         return _at_target(mechanism, start, began)
     programme = Programme(_casadi(), mechanism, objective, start, longest)
+    programme.unit = min([1.0, *(c for c in map(programme.spent, given) if c > 0)])
     candidates: list[Solution] = []
     failures: list[str] = []
     iterations = 0

@@ -12,7 +12,7 @@ import scipy.interpolate
 import sympy as sp
 
 from undertow.bounds.expressions import smooth, translate
-from undertow.bounds.guesses import Guess, time_scale
+from undertow.bounds.guesses import Guess, rests, time_scale
 from undertow.bounds.mesh import adapted_mesh, defects, first_mesh
 from undertow.codegen import Tape
 from undertow.errors import InvalidInputError
@@ -118,6 +118,8 @@ class Programme:
         effort = sum(((u / limit) ** 2 for u, limit in zip(mechanism.u, limits, strict=True)))
         margins = [w for m in objective.path_margins(mechanism) for w in smooth(m)]
         self.cost = self._dynamics(stage, margins)
+        #: The cost that IPOPT's tolerances, which are absolute, take for one.
+        self.unit = 1.0
         self.effort = self._dynamics(sp.sympify(effort) / mechanism.m, margins)
 
     def _dynamics(self, stage: sp.Expr, margins: Sequence[sp.Expr]) -> Any:
@@ -208,7 +210,13 @@ class Programme:
             {
                 "print_time": False,
                 "show_eval_warnings": False,
-                "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": patience},
+                "ipopt": {
+                    "print_level": 0,
+                    "sb": "yes",
+                    "tol": 1e-8,
+                    "max_iter": patience,
+                    "obj_scaling_factor": 1.0 / self.unit if dynamics is self.cost else 1.0,
+                },
             },
         )
         found = solver(
@@ -258,6 +266,12 @@ class Programme:
         largest = np.abs(np.array(slope + found["lam_x"])).max()
         return float(largest / max(1.0, np.abs(np.array(steepness)).max()))
 
+    def spent(self, guess: Guess, samples: int = 400) -> float:
+        """Return the cost of a guess as it stands, by the trapezoidal rule."""
+        t = np.linspace(0.0, guess.time, samples)
+        rows = (t[None], guess.x(t).T, guess.u(t).T)
+        return float(np.trapezoid(np.array(self.cost.map(samples)(*rows)[1]).ravel(), t))
+
     def first(self, guess: Guess, count: int) -> Solution:
         """Solve on the first mesh.
 
@@ -266,7 +280,8 @@ class Programme:
         much to spare, and only then released.
         """
         if not self.free_time:
-            mesh = first_mesh(count, self.scale / self.longest)
+            even = rests(self.mechanism)
+            mesh = first_mesh(count, 1.0 if even else self.scale / self.longest)
             return self.solve(mesh, guess, self.cost, fixed=self.longest)
         spent = 0
         mesh = np.linspace(0.0, 1.0, count + 1)

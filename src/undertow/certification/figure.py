@@ -17,7 +17,7 @@ from undertow.plot import COLOURS, display, style
 __all__ = ["region_figure", "simulated"]
 
 #: Points a side of the picture of the simulated region.
-GRID = 141
+GRID = 101
 
 
 def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> FloatArray:
@@ -27,24 +27,24 @@ def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> Fl
     """
     motion, V = region.motion, region.function
     home = np.zeros(len(y), dtype=bool)
-    side = np.sign(float(motion.determinant(np.zeros(motion.size))))
+    at_target = motion.determinant(np.zeros(motion.size))
     alive = np.arange(len(y))
     state = y.copy()
-    step = 0.01 / max(1.0, float(np.abs(np.linalg.eigvals(motion.jacobian)).max()) / 20.0)
+    fastest = float(np.abs(np.linalg.eigvals(motion.jacobian)).max())
+    step = 0.01 / max(1.0, fastest / 20.0)
     with np.errstate(all="ignore"):
-        for k in range(int(limit / step)):
-            if k % 4 == 0:
-                inside = V(state) < 1.0
-                home[alive[inside]] = True
-                sound = side * motion.determinant(state) > 0
-                sound &= np.isfinite(state).all(axis=1) & (np.abs(state[:, 0]) < 1e3)
-                keep = ~inside & sound
-                alive, state = alive[keep], state[keep]
-                if not len(alive):
-                    break
-            # Shorter steps near the singularity; motions need not keep the same time.
-            ratio = motion.determinant(state) / motion.determinant(np.zeros(motion.size))
-            state = _step(motion, state, step * np.clip(ratio, 0.05, 1.0)[:, None])
+        for _ in range(int(limit / step)):
+            inside = V(state) < 1.0
+            home[alive[inside]] = True
+            ratio = motion.determinant(state) / at_target
+            sound = (ratio > 0) & np.isfinite(state).all(axis=1) & (np.abs(state[:, 0]) < 1e3)
+            keep = ~inside & sound
+            alive, state, ratio = alive[keep], state[keep], ratio[keep]
+            if not len(alive):
+                break
+            # Shorter steps near the singularity and at speed; motions need not keep the same time.
+            hurry = np.clip(ratio, 0.01, 1.0) / (1.0 + 0.3 * np.abs(state).max(axis=1))
+            state = _step(motion, state, step * hurry[:, None])
     return home
 
 
@@ -100,7 +100,12 @@ def _slice(axes: Axes, region: ProvedRegion, other: int) -> None:
     points[..., 0], points[..., other] = np.meshgrid(a, b)
     with np.errstate(all="ignore"):
         proved = V(points)
-    home = simulated(region, points.reshape(-1, motion.size)).reshape(GRID, GRID)
+    flat = points.reshape(-1, motion.size)
+    if motion.odd:  # the picture is the same turned by half a turn
+        part = simulated(region, flat[: len(flat) // 2 + 1])
+        home = np.concatenate([part, part[:-1][::-1]]).reshape(GRID, GRID)
+    else:
+        home = simulated(region, flat).reshape(GRID, GRID)
     (fa, ua), (fb, ub) = _units(motion, 0), _units(motion, other)
     axes.contourf(
         fa * a, fb * b, home.astype(float), [0.5, 1.5], colors=[to_rgba(COLOURS["sky"], 0.28)]

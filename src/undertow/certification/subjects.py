@@ -78,6 +78,7 @@ def certify_surface(
     reaching_law: ReachingLaw = ReachingLaw(),
     title: str = "",
     seconds: float = 60.0,
+    loop: bool = False,
     predict: bool = True,
     progress: Progress | None = None,
 ) -> Certified:
@@ -96,8 +97,10 @@ def certify_surface(
         For tables; the surface itself by default.
     seconds
         Effort for the region on the surface; 0 leaves it out.
+    loop
+        Also prove how far off the target the full closed loop may start at rest: minutes.
     predict
-        Also predict the motion from the start (sampled).
+        Also predict the motion from the start, and from random ones up to it (sampled).
     progress
         Called with (what, part done).
 
@@ -134,11 +137,16 @@ def certify_surface(
             tell("region on the surface", 0.1)
             region, data, verdict = _region(mechanism, surface, start, seconds)
             keep("surface region", data, verdict)
+        if loop:
+            tell("the whole closed loop", 0.5)
+            keep("closed loop", *_loop(mechanism, surface, reaching_law, start))
         if predict and start.any():
             tell("prediction", 0.95)
-            loop = ClosedLoop(mechanism, reaching=reaching_law)
-            policy = Policy(("region", "dual"))
-            remarks.append(assess(loop, Plan.of(surface), start, loop.objective.horizon, policy))
+            closed = ClosedLoop(mechanism, reaching=reaching_law)
+            horizon = closed.objective.horizon
+            remarks.append(assess(closed, Plan.of(surface), start, horizon, Policy()))
+            tell("random starts", 0.97)
+            remarks += _sampled(closed, surface, start)
     subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
     return Certified(title or str(surface), subject, region, time.perf_counter() - began)
 
@@ -239,6 +247,40 @@ def _region(
         proved.verdict.details,
     )
     return proved, data, verdict
+
+
+def _loop(
+    mechanism: Mechanism, surface: Surface, law: ReachingLaw, start: FloatArray
+) -> tuple[Mapping[str, object], Verdict]:
+    from undertow.certify.loop_search import prove_loop
+
+    free = mechanism.coordinates[mechanism.m :]
+    away = np.abs(start[mechanism.m : mechanism.n])
+    index = int(np.argmax(away))
+    reach = float(away[index]) or (1.0 if free[index].unit == "rad" else 0.5)
+    try:
+        proved = prove_loop(mechanism, surface, law, coordinate=free[index].name, reach=reach)
+    except UndertowError as error:
+        claim = "the full closed loop converges from rest"
+        return {}, Verdict(claim, "undecided", method=str(error))
+    return proved.claim.to_dict(), proved.verdict
+
+
+#: Random starts of the sampled verdict.
+TRIALS = 4000
+
+
+def _sampled(loop: ClosedLoop, surface: Surface, start: FloatArray) -> list[Verdict]:
+    """Whether starts at rest, up to the given one on either side, arrive."""
+    from undertow.certify.sampled import box_starts, sampled_region
+
+    box = _box(loop.mechanism, start)
+    if not box:
+        return []
+    ranges = ", ".join(f"|{name}| ≤ {high:.4g}" for name, (_, high) in box.items())
+    starts = box_starts(loop.mechanism, **box)
+    words = f"starts at rest with {ranges}"
+    return [sampled_region(loop, surface, starts, trials=TRIALS, what=words)]
 
 
 def certify_run(

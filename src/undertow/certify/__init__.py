@@ -3,6 +3,9 @@
 Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when first used.
 """
 
+from undertow.certify.certificate import Certificate, Claim, Subject, read_certificate
+from undertow.certify.ellipsoid import TerminalEllipsoid, verify_ellipsoid
+from undertow.certify.gate import Policy, assess, certified_gate
 from undertow.certify.reaching import DisturbanceBound, ReachingCertificate, reaching
 from undertow.certify.region import LyapunovFunction, SurfaceMotion, verify_region
 from undertow.certify.region_search import ProvedRegion, prove_region
@@ -17,19 +20,28 @@ from undertow.certify.surface import (
 from undertow.certify.verdict import Verdict
 
 __all__ = [
+    "Certificate",
+    "Claim",
     "CriticalMode",
     "DisturbanceBound",
     "LyapunovFunction",
+    "Policy",
     "ProvedRegion",
     "ReachingCertificate",
+    "Subject",
     "SurfaceMotion",
+    "TerminalEllipsoid",
     "Verdict",
+    "assess",
+    "certified_gate",
     "closed_forms",
     "critical_mode",
     "hurwitz",
     "nonsingular",
     "prove_region",
     "reaching",
+    "read_certificate",
     "singular_distance",
+    "verify_ellipsoid",
     "verify_region",
 ]

@@ -7,7 +7,7 @@ Nothing here proves anything: every set that is returned is one that the kernel 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,6 +81,8 @@ class EllipsoidSearch:
         state = np.asarray(x, dtype=float)
         if not np.any(state):
             return self.largest()
+        if (np.abs(self.C @ state) > self.layer).any():
+            return None  # an ellipsoid around 0 that holds the state leaves the layer
         z = self.T_inverse @ state
         square = np.zeros(self.modes[-1] + 1)
         np.add.at(square, self.modes, z * z)
@@ -116,6 +118,11 @@ class EllipsoidSearch:
             if not best > before:
                 step *= 0.5
         return None
+
+    @cached_property
+    def succeeds(self) -> bool:
+        """Whether some ellipsoid is proved at all, however small."""
+        return self.largest(0) is not None
 
     def largest(self, rounds: int = 3) -> TerminalEllipsoid | None:
         """Return the proved terminal set with the largest ball that a short search finds.

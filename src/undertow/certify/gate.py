@@ -38,7 +38,7 @@ from undertow.sliding import ReachingLaw, Surface
 from undertow.stability import stability_margin
 from undertow.verdict import Verdict
 
-__all__ = ["Evidence", "Policy", "ProvedSet", "assess", "certified_gate"]
+__all__ = ["CertifiedGate", "Evidence", "Policy", "ProvedSet", "assess", "certified_gate"]
 
 Evidence = Literal["region", "dual", "sampled", "local"]
 #: When a prediction is first looked at, s; then after half the time again, and so on.
@@ -50,8 +50,13 @@ _KINDS: tuple[Evidence, ...] = ("region", "dual", "sampled", "local")
 class ProvedSet(Protocol):
     """A proved region of attraction of a full closed loop, for one surface and reaching law."""
 
-    surface: Surface
-    reaching: ReachingLaw
+    @property
+    def surface(self) -> Surface:
+        """The surface it is for."""
+
+    @property
+    def reaching(self) -> ReachingLaw:
+        """Its reaching law."""
 
     def contains(self, x: FloatArray) -> bool:
         """Whether the state is inside for certain."""
@@ -225,7 +230,7 @@ def _region(case: _Case) -> Verdict | str:
 
 
 def _dual(case: _Case) -> Verdict | str:
-    if case.search is None and not case.known:
+    if not case.known and (case.search is None or not case.search.succeeds):
         return case.why_not or "the linear closed loop has no proved terminal set"
     x, t, span = case.x, 0.0, FIRST_LOOK
     margins = _Margins(case.policy)
@@ -306,7 +311,7 @@ def _local(case: _Case) -> Verdict | str:
     if not margin > 0:
         return f"unstable, margin {margin:.3g} 1/s"
     claim = "the closed loop is exponentially stable near the target"
-    if case.search is not None and case.search.largest(0) is not None:
+    if case.search is not None and case.search.succeeds:
         method = "a terminal ellipsoid is proved; the margin is the slowest eigenvalue in float64"
         return Verdict(claim, "proved", margin, "1/s", method=method)
     method = "float64 eigenvalues of the sliding dynamics, not proved"
@@ -318,13 +323,43 @@ def _with_tail(loop: ClosedLoop, tail: float) -> ClosedLoop:
     return replace(loop, tail=tail)
 
 
+@dataclass(frozen=True)
+class CertifiedGate:
+    """The gate that :func:`certified_gate` returns; a plain record, so it can be pickled."""
+
+    policy: Policy
+    sets: tuple[ProvedSet, ...]
+    base: Gate
+    tail: float
+
+    def __call__(
+        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float
+    ) -> Admission:
+        """Decide on a plan, as :func:`undertow.cascade.cost_gate` does."""
+        judged = _with_tail(loop, self.tail) if self.tail else loop
+
+        def verdict(plan: Plan) -> Verdict:
+            return assess(loop, plan, x, horizon, self.policy, self.sets)
+
+        first = self.base(judged, old, new, x, horizon)
+        if not first.accepted:
+            return replace(first, verdict=verdict(old))
+        answer = verdict(new)
+        if answer.details["evidence"] is not None:
+            reason = f"{first.reason}; {answer.details['evidence']}: {answer.claim}"
+            return Admission(True, reason, first.cost, answer)
+        cost = self.base(judged, old, old, x, horizon).cost
+        reason = f"no accepted evidence from here ({answer.method})"
+        return Admission(False, reason, cost, verdict(old))
+
+
 def certified_gate(
     policy: Policy = Policy(),
     *,
     sets: Iterable[ProvedSet] = (),
     base: Gate = cost_gate,
     tail: float = 0.0,
-) -> Gate:
+) -> CertifiedGate:
     """Return a gate that admits a plan only with accepted evidence for the present state.
 
     Parameters
@@ -341,7 +376,7 @@ def certified_gate(
 
     Returns
     -------
-    Gate
+    CertifiedGate
         For ``Cascade(gate=…)``.  The admission's verdict is that of the plan which stays in use.
 
     Examples
@@ -351,22 +386,4 @@ def certified_gate(
     >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
     >>> cascade = ut.Cascade(rig, ut.MinimumTime(), gate=certified_gate(Policy(("dual",))))
     """
-    known = tuple(sets)
-
-    def gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
-        first = base(_with_tail(loop, tail) if tail else loop, old, new, x, horizon)
-
-        def verdict(plan: Plan) -> Verdict:
-            return assess(loop, plan, x, horizon, policy, known)
-
-        if not first.accepted:
-            return replace(first, verdict=verdict(old))
-        answer = verdict(new)
-        if answer.details["evidence"] is not None:
-            reason = f"{first.reason}; {answer.details['evidence']}: {answer.claim}"
-            return Admission(True, reason, first.cost, answer)
-        cost = base(loop, old, old, x, horizon).cost
-        reason = f"no accepted evidence from here ({answer.method})"
-        return Admission(False, reason, cost, verdict(old))
-
-    return gate
+    return CertifiedGate(policy, tuple(sets), base, tail)

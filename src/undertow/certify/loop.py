@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from undertow.certify.batch import Interval, IntervalArithmetic
 from undertow.certify.interval import OutwardFunction, compile_outward, derivative_tape
-from undertow.certify.tube import bracket, matmul
+from undertow.certify.tube import Paths, bracket, matmul
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
@@ -52,7 +52,8 @@ class LoopRates(NamedTuple):
 
     ``rate`` (N, L) encloses ż, ``slope`` (N, N + k, L) its generalised derivatives in z and in
     the k uncertain parameters, ``demand`` (m, L) the unclipped input, and ``push`` (m, L) what
-    clip and ignorance add to ṡ = −K sat(s/ε) + push.
+    clip and ignorance add to ṡ = −K sat(s/ε) + push.  ``kinked`` (L,) marks boxes in which an
+    input may be on either side of its limit.
     """
 
     rate: Interval
@@ -61,6 +62,7 @@ class LoopRates(NamedTuple):
     demand_slope: Interval
     push: Interval
     push_slope: Interval
+    kinked: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,10 +250,15 @@ class LoopMotion:
         s_dot = -eta * switch + np.einsum("...ij,...j->...i", W, excess)
         return np.concatenate([np.stack(values[:n_slow], axis=-1), s_dot], axis=-1), u
 
-    def over(self, z: Interval, *, middle: bool = False) -> LoopRates:
+    def over(self, z: Interval, *, middle: bool = False, paths: Paths | None = None) -> LoopRates:
         """Enclose ż, its slopes and the demand over boxes z, (N, L).
 
-        With ``middle`` for the uncertain parameters' middle values alone.
+        Parameters
+        ----------
+        middle
+            For the uncertain parameters' middle values alone.
+        paths
+            What is known of the points in the boxes besides.
         """
         program, m, slow = self._program, self.mechanism.m, self.slow
         eta, layer = self.gains
@@ -272,6 +279,10 @@ class LoopMotion:
         gap = get.block(m)
         gap_slope = get.block(m, columns + m)
         u_slope, gap_slope = (_through_switch(k, bend, columns, slow) for k in (u_slope, gap_slope))
+        if not middle:
+            # Mean value forms: the natural ones lose much to cancellation.
+            known = _Known.of(z, self.radii) if paths is None else paths
+            rate, u, gap = self._sharpen(known, (rate, slope), (u, u_slope), (gap, gap_slope))
         # ṡ = −K sat + W (excess + gap): the clip's excess, and what the law does not know.
         excess, kink = _excess(u, self.mechanism.input_limits)
         total = excess + gap
@@ -287,8 +298,57 @@ class LoopMotion:
             decay.hi[i, slow + i] = -(hold[i] * bend[i]).lo
         s_rate = push - hold * _rows(switch)
         return LoopRates(
-            _below(rate, s_rate), _below(slope, push_slope + decay), u, u_slope, push, push_slope
+            _below(rate, s_rate),
+            _below(slope, push_slope + decay),
+            u,
+            u_slope,
+            push,
+            push_slope,
+            (kink.lo != kink.hi).any(axis=0),
         )
+
+    def _sharpen(self, known: Paths, *pairs: tuple[Interval, Interval]) -> tuple[Interval, ...]:
+        """Meet enclosures over boxes with values at a middle plus slopes times the way from it."""
+        slow, middle = self.slow, Interval(known.middle)
+        rows = [middle[i] for i in range(self.size)]
+        layer = self.gains[1]
+        switch = [_saturation(rows[slow + i], float(e))[0] for i, e in enumerate(layer)]
+        flat = self._program.points(*rows, *switch, *self._parameters(True))
+        get = _Reader(flat, known.middle.shape[1])
+        return tuple(
+            value.intersect(get.block(len(value.lo)) + known.way(slope)) for value, slope in pairs
+        )
+
+    def bend(self, z: Interval, rate: Interval) -> Interval:
+        """Enclose d/dt of the slow rows of the slopes, (2n − m, N + k, L).
+
+        Over boxes z (N, L) for velocities ż in ``rate`` (N, L).  The slow rows do not hold
+        the input, so they are smooth where sat and clip have their corners.
+        """
+        lanes = z.lo.shape[1]
+        rows = [z[i] for i in range(self.size)]
+        speeds = [rate[i] for i in range(self.size)]
+        flat = self._program.second(*rows, *speeds, *self._parameters(False))
+        return _Reader(flat, lanes).block(self.slow, self.size + len(self.radii))
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Points of boxes: middle + away, parameters p̂ + unknown."""
+
+    middle: FloatArray
+    away: Interval
+
+    @classmethod
+    def of(cls, z: Interval, radii: FloatArray) -> _Known:
+        middle = 0.5 * (z.lo + z.hi)
+        off = z - Interval(middle)
+        unknown = np.repeat(radii[:, None], middle.shape[1], axis=1)
+        low, high = np.concatenate([off.lo, -unknown]), np.concatenate([off.hi, unknown])
+        return cls(middle, Interval(low, high))
+
+    def way(self, slope: Interval) -> Interval:
+        return matmul(slope, self.away[:, None])[:, 0]
 
 
 class _Program:
@@ -325,6 +385,21 @@ class _Program:
             *slow, *slopes(slow, state_like), *u, *slopes(u, with_switch),
             *W, *slopes(list(W), state_like), *gap, *slopes(gap, with_switch),
         ]  # fmt: skip
+        self.points: OutwardFunction = compile_outward(
+            tape, inputs, [*slow, *u, *gap], IntervalArithmetic()
+        )
+        speeds = [sp.Symbol(f"dz_{i}", real=True) for i in range(2 * n)]
+        first = slopes(slow, self.z)
+        change = tape.let_all(
+            sum(d * v for d, v in zip(first[i * 2 * n : (i + 1) * 2 * n], speeds, strict=True))
+            for i in range(len(slow))
+        )
+        self.second: OutwardFunction = compile_outward(
+            tape,
+            [*self.z, *speeds, *mechanism.parameter_symbols],
+            slopes(change, state_like),
+            IntervalArithmetic(),
+        )
         self.boxes: OutwardFunction = compile_outward(tape, inputs, outputs, IntervalArithmetic())
 
 

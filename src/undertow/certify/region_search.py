@@ -1,12 +1,12 @@
-"""The search for Lyapunov functions on the surface: samples, a linear program, counterexamples.
+"""The search for Lyapunov functions: samples, a linear program, counterexamples.
 
 Nothing here proves anything: what is found goes to :func:`undertow.certify.region.verify_region`.
 
-A function V, an even polynomial, is linear in its coefficients, and so are its demands at
-sampled points: V̇ ≤ −t·|x|² inside a star-shaped candidate set, V ≥ 1 on the set's boundary,
-V ≤ 1 on the way to a target point.  The linear program maximises t; points where fresh
-samples disagree are added, and the candidate grows step by step from the quadratic V of the
-linearisation.
+A function V, an even polynomial in z, is linear in its coefficients, and so are its demands
+at sampled points: V̇ ≤ −t·(|z|² + |z||ż|/ω) inside a star-shaped candidate set, V ≥ 1 on the
+set's boundary, V ≤ 1 on the way to a target point.  The linear program maximises t; points
+where fresh samples disagree are added, and the candidate grows step by step from the
+quadratic V of the linearisation.
 """
 
 from __future__ import annotations
@@ -14,33 +14,40 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.certify.linear_program import minimise_linear
-from undertow.certify.region import LyapunovFunction, SurfaceMotion, first_crossing, verify_region
+from undertow.certify.lyapunov import LyapunovFunction, extent, first_crossing
+from undertow.certify.motion import Motion, SurfaceMotion
+from undertow.certify.region import verify_region
+from undertow.certify.region_chart import natural_stretch
 from undertow.certify.verdict import Verdict
 from undertow.errors import InfeasibleError, UnstableSurfaceError
 
 __all__ = ["ProvedRegion", "prove_region", "search_region"]
 
 FloatArray = NDArray[np.float64]
+Progress = Callable[[str], None]
 Start = Literal["far", "round"]
+
+#: The candidate keeps det f / det f(0) above this, and |y_0| below this part of the pole.
+CLEARANCE, POLE_PART = 0.01, 0.985
 
 
 @dataclass(frozen=True)
 class ProvedRegion:
-    """A proved region of attraction on the surface.
+    """A proved region of attraction.
 
     Parameters
     ----------
     motion
-        The sliding dynamics, in y = (q_u, q̇_u, w).
+        The motion, on a surface in y = (q_u, q̇_u, w).
     function
         V; the set is the component of {V ≤ 1} that contains 0.
     verdict
@@ -49,121 +56,263 @@ class ProvedRegion:
         How far along the asked direction the set is proved to reach.
     """
 
-    motion: SurfaceMotion
+    motion: Motion
     function: LyapunovFunction
     verdict: Verdict
     extent: float
 
 
 class _Basis:
-    """Monomials of x = T⁻¹ y and their rates along the motion."""
+    """Monomials of z and their rates along the motion."""
 
-    def __init__(self, motion: SurfaceMotion, T: FloatArray, degree: int) -> None:
-        self.motion, self.T, self.T_inverse = motion, T, np.linalg.inv(T)
-        size = motion.size
-        self.exponents = np.array(
-            [
-                e
-                for total in range(2, degree + 1, 2)
-                for e in itertools.product(range(total, -1, -1), repeat=size)
-                if sum(e) == total
-            ]
-        )
+    def __init__(self, motion: Motion, chart: LyapunovFunction, degree: int) -> None:
+        self.motion, self.chart = motion, chart
+        self.size = motion.size
+        self.exponents = _even_exponents(self.size, degree)
 
-    def values(self, x: FloatArray) -> FloatArray:
-        """Monomials, (B, N) to (B, K)."""
+    def _table(self, z: FloatArray) -> FloatArray:
         top = int(self.exponents.max())
-        powers = [np.ones_like(x)]
-        for _ in range(top):
-            powers.append(powers[-1] * x)
-        table = np.array(powers)  # (power, B, N)
-        out = np.ones((len(x), len(self.exponents)))
-        for j in range(x.shape[1]):
+        return np.array([z**k for k in range(top + 1)])  # (power, B, N)
+
+    def values(self, z: FloatArray) -> FloatArray:
+        """Monomials, (B, N) to (B, K)."""
+        table = self._table(z)
+        out = np.ones((len(z), len(self.exponents)))
+        for j in range(self.size):
             out *= table[self.exponents[:, j], :, j].T
         return out
 
-    def rates(self, x: FloatArray) -> FloatArray:
-        """Their time derivatives, (B, K)."""
-        x_dot = self.motion(x @ self.T.T) @ self.T_inverse.T
-        top = int(self.exponents.max())
-        powers = [np.ones_like(x)]
-        for _ in range(top):
-            powers.append(powers[-1] * x)
-        table = np.array(powers)
-        out = np.zeros((len(x), len(self.exponents)))
-        for j in range(x.shape[1]):
+    def flow(self, z: FloatArray) -> FloatArray:
+        """ż, (B, N)."""
+        y = self.chart.points(z)
+        return self.chart.coordinate_rates(y, self.motion(y))
+
+    def rates(self, z: FloatArray, z_dot: FloatArray) -> FloatArray:
+        """Time derivatives of the monomials, (B, K)."""
+        table = self._table(z)
+        out = np.zeros((len(z), len(self.exponents)))
+        for j in range(self.size):
             lowered = self.exponents.copy()
             lowered[:, j] = np.maximum(lowered[:, j] - 1, 0)
-            term = self.exponents[:, j] * x_dot[:, j : j + 1]
-            for k in range(x.shape[1]):
+            term = self.exponents[:, j] * z_dot[:, j : j + 1]
+            for k in range(self.size):
                 term = term * table[lowered[:, k], :, k].T
             out += term
         return out
 
     def function(self, coefficients: FloatArray) -> LyapunovFunction:
-        return LyapunovFunction(self.T, self.exponents, coefficients)
+        """The polynomial with these coefficients."""
+        return self.chart.replaced(coefficients, self.exponents)
 
 
-def _quadratic(
-    motion: SurfaceMotion, direction: FloatArray, rng: np.random.Generator, start: Start
-) -> FloatArray:
-    """T with V = |T⁻¹y|² whose set {V ≤ 1} reaches far along the direction."""
-    A = _jacobian(motion)
-    rate = -np.linalg.eigvals(A).real.max()
+def _even_exponents(size: int, degree: int) -> NDArray[np.int64]:
+    return np.array(
+        [
+            e
+            for total in range(2, degree + 1, 2)
+            for e in itertools.product(range(total, -1, -1), repeat=size)
+            if sum(e) == total
+        ]
+    )
+
+
+def _rays(rng: np.random.Generator, count: int, size: int) -> FloatArray:
+    return _unit(rng.normal(size=(count, size)))
+
+
+def _unit(z: FloatArray) -> FloatArray:
+    return np.asarray(z / np.linalg.norm(z, axis=1, keepdims=True))
+
+
+def _on_axis(coordinates: LyapunovFunction, way: FloatArray, length: float) -> FloatArray:
+    """Points of z on the way, as far as |z| = length or the pole's part, (10, N)."""
+    top = POLE_PART * coordinates.pole / abs(way[0]) if way[0] else np.inf
+    low, high = 0.0, min(top, 1.0)
+    while high < top and np.linalg.norm(coordinates.coordinates(high * way)) < length:
+        high = min(2 * high, top)
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        short = np.linalg.norm(coordinates.coordinates(middle * way)) < length
+        low, high = (middle, high) if short else (low, middle)
+    return coordinates.coordinates(np.linspace(0.1, 1.0, 10)[:, None] * (low * way))
+
+
+class _Candidate:
+    """A star-shaped set in z: V's, grown, cut before the singularity and the pole."""
+
+    def __init__(self, basis: _Basis, rng: np.random.Generator) -> None:
+        self.basis, self.rng, self.size = basis, rng, basis.size
+        self.reference = float(basis.motion.determinant(np.zeros(self.size)))
+        self.omega = float(np.linalg.norm(_linear(basis.motion, basis.chart), 2))
+
+    def shell(self, V: LyapunovFunction, rays: FloatArray, growth: float) -> FloatArray:
+        """Boundary points along rays."""
+        radius = first_crossing(V, rays)
+        radius = np.minimum(np.where(np.isfinite(radius), radius, 50.0) * (1 + growth), 50.0)
+        out = np.ones(len(radius), dtype=bool)
+        for _ in range(300):
+            y = self.basis.chart.points(radius[out, None] * rays[out])
+            bad = self.basis.motion.determinant(y) / self.reference < CLEARANCE
+            bad |= np.abs(y[:, 0]) > POLE_PART * self.basis.chart.pole
+            out[out] = bad
+            if not bad.any():
+                break
+            radius[out] *= 0.95
+        return np.asarray(radius[:, None] * rays)
+
+    def inside(self, V: LyapunovFunction, z: FloatArray, growth: float) -> NDArray[np.bool_]:
+        """Whether points lie in the candidate."""
+        limit = np.linalg.norm(self.shell(V, _unit(z), growth), axis=1)
+        return np.asarray(np.linalg.norm(z, axis=1) <= limit)
+
+    def around(self, V: LyapunovFunction, shell: FloatArray, growth: float) -> FloatArray:
+        """Points outside the candidate but in the box that the checker will take."""
+        y = self.basis.chart.points(shell)
+        B = np.linalg.cholesky(np.cov(y.T, bias=True).reshape(self.size, self.size))
+        reach = 1.08 * np.abs(np.linalg.solve(B, y.T)).max(axis=1)
+        points = (reach * self.rng.uniform(-1, 1, (len(shell), self.size))) @ B.T
+        points = points[np.abs(points[:, 0]) < 0.998 * self.basis.chart.pole]
+        z = self.basis.chart.coordinates(points)
+        near = np.linalg.norm(z, axis=1) < 3 * np.linalg.norm(shell, axis=1).max()
+        return np.asarray(z[near & ~self.inside(V, z, growth)])
+
+    def decrease(self, z: FloatArray) -> FloatArray:
+        """Rows of V̇ + t·(|z|² + |z||ż|/ω) ≤ 0, over that weight."""
+        z_dot = self.basis.flow(z)
+        length = np.linalg.norm(z, axis=1)
+        weight = length * (length + np.linalg.norm(z_dot, axis=1) / self.omega)
+        return np.hstack([self.basis.rates(z, z_dot) / weight[:, None], np.ones((len(z), 1))])
+
+    def score(self, z: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """V̇ over the weight."""
+        return np.asarray(self.decrease(z)[:, :-1] @ coefficients)
+
+    def boundary(self, z: FloatArray) -> FloatArray:
+        """Rows of −V ≤ −(more than 1)."""
+        return np.hstack([-self.basis.values(z), np.zeros((len(z), 1))])
+
+    def near_zero(self, coefficients: FloatArray) -> FloatArray:
+        """The worst directions of the quadratic part of V̇: exact, where samples miss."""
+        A = _linear(self.basis.motion, self.basis.chart)
+        P = np.zeros((self.size, self.size))
+        for e, c in zip(self.basis.exponents, coefficients, strict=True):
+            if e.sum() == 2:
+                i, j = np.repeat(np.arange(self.size), e)
+                P[i, j] += 0.5 * c
+                P[j, i] += 0.5 * c
+        return np.asarray(1e-3 * np.linalg.eigh(A.T @ P + P @ A)[1].T)
+
+    def counterexamples(
+        self, V: LyapunovFunction, row: FloatArray, growth: float, t: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Fresh points (local ascent included) where decrease or boundary fail."""
+        shell = self.shell(V, _rays(self.rng, 12000, self.size), growth)
+        inner = shell * self.rng.random((len(shell), 1)) ** (1 / 2)
+        score = self.score(inner, row)
+        for width in (0.05, 0.02, 0.005):
+            worst = inner[np.argsort(score)[-150:]]
+            near = np.repeat(worst, 8, axis=0)
+            near = near * (1 + width * self.rng.normal(size=near.shape))
+            near = near + width * self.rng.normal(size=near.shape) * np.linalg.norm(
+                near, axis=1, keepdims=True
+            )
+            near = near[self.inside(V, near, growth)]
+            inner = np.vstack([inner, near])
+            score = np.concatenate([score, self.score(near, row)])
+        bad = inner[score > -0.3 * t]
+        # A random part of the offenders: the worst ones crowd together.
+        bad = bad[self.rng.permutation(len(bad))[:300]]
+        core = self.near_zero(row)
+        score = self.score(core, row)
+        shell = np.vstack([shell, self.around(V, shell, growth)])
+        edge = shell[self.basis.values(shell) @ row < 1.0]
+        edge = edge[self.rng.permutation(len(edge))[:300]]
+        return np.vstack([bad, core[score > -0.3 * t]]), edge
+
+
+def _linear(motion: Motion, chart: LyapunovFunction) -> FloatArray:
+    """The linearisation in z."""
+    return np.asarray(np.linalg.solve(chart.scale, motion.jacobian @ chart.scale))
+
+
+# -- the start: a quadratic V -----------------------------------------------------------------
+
+
+def _slowest(motion: Motion) -> float:
+    rate = float(-np.linalg.eigvals(motion.jacobian).real.max())
     if not rate > 0:
         raise UnstableSurfaceError(
-            f"region of attraction of {motion.surface}",
+            f"region of attraction of {getattr(motion, 'surface', motion.names)}",
             value=f"slowest rate {rate:.4g} 1/s",
             limit="> 0",
             remedy="Start from undertow.first_surface(mechanism)",
         )
-    size = motion.size
+    return rate
+
+
+def _quadratic(
+    motion: Motion,
+    stretch: tuple[FloatArray, float] | None,
+    way: FloatArray,
+    rng: np.random.Generator,
+    start: Start,
+) -> LyapunovFunction:
+    """V = |z|², whose set {V ≤ 1} reaches far along the direction."""
+    _slowest(motion)
+    A, size = motion.jacobian, motion.size
+    squares = 2 * np.eye(size, dtype=np.int64)
+    S, pole = stretch if stretch is not None else (None, np.inf)
     # Units in which the linear motion is about round.
     base = scipy.linalg.solve_continuous_lyapunov(A.T, -np.eye(size))
     units = 1 / np.sqrt(np.diag(base))
-    rays = _rays(rng, 800, size)
+    rays = _rays(rng, 500, size)
+
+    def largest(T: FloatArray, stretched: bool) -> LyapunovFunction:
+        """V = |z|², as large as samples allow; the search itself goes without the stretch."""
+        bend = (S, pole) if stretched else (None, np.inf)
+        r = _quadratic_radius(motion, LyapunovFunction(T, squares, np.ones(size), *bend), rays)
+        return LyapunovFunction(r * T, squares, np.ones(size), *bend)
+
     if start == "round":
-        T = np.linalg.inv(np.linalg.cholesky(base * np.outer(units, units)).T) * units[:, None]
-        return np.asarray(T * math.sqrt(_quadratic_level(motion, T, rays)))
-    best, chosen, root = -1.0, np.eye(size), np.eye(size)
-    width = 0.8
+        return largest(_root(base), stretched=True)
+    best, root, width = -1.0, np.eye(size), 0.8
+    chosen: LyapunovFunction | None = None
     # A (1+1) evolution strategy over the square root of Q, with the 1/5 success rule.
-    for trial in range(240):
+    for k in range(240):
         change = width * rng.normal(size=(size, size))
         attempt = (
             np.diag(np.exp(rng.normal(size=size)))
-            if trial < 40
+            if k < 40
             else scipy.linalg.expm(0.5 * (change + change.T)) @ root
         )
         Q = (attempt.T @ attempt + 1e-6 * np.eye(size)) / np.outer(units, units)
-        P = scipy.linalg.solve_continuous_lyapunov(A.T, -Q)
-        try:
-            T = np.linalg.inv(np.linalg.cholesky(0.5 * (P + P.T)).T)
-        except np.linalg.LinAlgError:
-            continue
-        level = _quadratic_level(motion, T, rays)
-        reach = math.sqrt(level / float(direction @ P @ direction))
-        if trial >= 40:
+        V = largest(_root(scipy.linalg.solve_continuous_lyapunov(A.T, -Q)), stretched=False)
+        reach = 1 / float(np.linalg.norm(np.linalg.solve(V.scale, way)))
+        if k >= 40:
             width *= 1.25 if reach > best else 0.94
         if reach > best:
-            best, chosen, root = reach, T * math.sqrt(level), attempt
-    return chosen
+            best, chosen, root = reach, V, attempt
+    assert chosen is not None
+    return largest(chosen.scale, stretched=True)
 
 
-def _jacobian(motion: SurfaceMotion, h: float = 1e-6) -> FloatArray:
-    steps = h * np.eye(motion.size)
-    return np.asarray((motion(steps) - motion(-steps)).T / (2 * h))
+def _root(P: NDArray[Any]) -> FloatArray:
+    """T with P = (T Tᵀ)⁻¹, lower triangular."""
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(0.5 * (P + P.T))))
 
 
-def _quadratic_level(motion: SurfaceMotion, T: FloatArray, rays: FloatArray) -> float:
-    """Largest r² with V̇ < 0 at samples of |T⁻¹y| ≤ r, inside the non-singular set."""
-    inverse = np.linalg.inv(T)
-    sign = float(np.sign(motion.determinant(np.zeros(motion.size))))
+def _quadratic_radius(motion: Motion, V: LyapunovFunction, rays: FloatArray) -> float:
+    """Largest r with V̇ < 0 at samples of |z| ≤ r, inside the non-singular set."""
+    reference = float(motion.determinant(np.zeros(motion.size)))
 
     def holds(r: float) -> bool:
-        y = (r * rays) @ T.T
-        rate = np.sum(rays * (motion(y) @ inverse.T), axis=1)
-        return bool((rate < 0).all() and (motion.determinant(y) * sign > 0).all())
+        y = V.points(r * rays)
+        rate = np.sum(rays * V.coordinate_rates(y, motion(y)), axis=1)
+        return bool(
+            (rate < 0).all()
+            and (motion.determinant(y) / reference > CLEARANCE).all()
+            and (np.abs(y[:, 0]) < POLE_PART * V.pole).all()
+        )
 
     r = 1.0
     while not holds(r) and r > 1e-9:
@@ -171,38 +320,47 @@ def _quadratic_level(motion: SurfaceMotion, T: FloatArray, rays: FloatArray) -> 
     grow = r * 1.1
     while holds(grow) and grow < 1e9:
         r, grow = grow, grow * 1.1
-    return r * r
+    return r
 
 
-def _rays(rng: np.random.Generator, count: int, size: int) -> FloatArray:
-    rays = rng.normal(size=(count, size))
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+# -- growing ------------------------------------------------------------------------------------
 
 
 def search_region(
-    motion: SurfaceMotion,
+    motion: Motion,
     direction: ArrayLike,
     *,
-    degrees: Sequence[int] = (4, 6),
+    degrees: Sequence[int] = (2, 4, 6),
     seconds: float = 60.0,
     seed: int = 0,
     start: Start = "far",
+    goal: float = math.inf,
     samples: int = 5000,
-    progress: Callable[[str], None] | None = None,
+    slow: bool = False,
+    progress: Progress | None = None,
 ) -> LyapunovFunction:
     """Find V whose set {V ≤ 1} reaches far along a direction of y, by sampling.
 
     Parameters
     ----------
+    motion
+        The sliding dynamics, or any vector field.
     direction
-        In y = (q_u, q̇_u, w), (N,): e.g. (1, 0, 0) for the pendulum's angle at rest.
+        In y, (N,); on a surface y = (q_u, q̇_u, w), so (1, 0, 0) is an angle at rest.
     degrees
         Even degrees of V, tried one after the other, each starting from the last.
     seconds
-        Budget, shared by the degrees.
+        Budget of process time, shared by the degrees.
     start
         The quadratic V to begin with: ``"far"`` reaches far along the direction and grows
         little; ``"round"`` starts closer and often grows further.
+    goal
+        Stop when the set reaches so far along the direction.
+    samples
+        Points of each linear program, before counterexamples.
+    slow
+        On a surface with one unactuated coordinate: whether the third of the coordinates of
+        :mod:`undertow.certify.region_chart` is η, not w.
     progress
         Called with a line of text after each step.
 
@@ -213,213 +371,130 @@ def search_region(
     """
     rng = np.random.default_rng(seed)
     way = np.asarray(direction, dtype=float)
-    T = _quadratic(motion, way, rng, start)
-    # The quadratic's unit ball is made the start; a little inside, so t > 0 is possible.
-    coefficients = None
-    basis = _Basis(motion, T, 2)
-    previous = basis.function((basis.exponents == 2).any(axis=1).astype(float) * 1.02)
+    stretch = None
+    if isinstance(motion, SurfaceMotion):
+        stretch = natural_stretch(motion, slow=slow)
+    # The quadratic's set is made the unit ball; a little inside, so that t > 0 is possible.
+    V = _quadratic(motion, stretch, way, rng, start).times(1.02)
     for k, degree in enumerate(degrees):
-        basis = _Basis(motion, T, degree)
-        coefficients = _lift(previous, basis)
         share = seconds * (k + 1) / sum(range(1, len(degrees) + 1))
-        previous = _grow(basis, coefficients, way, rng, share, samples, progress)
-    return previous
-
-
-def _lift(V: LyapunovFunction, basis: _Basis) -> FloatArray:
-    """The same function in a larger basis."""
-    known = {tuple(e): c for e, c in zip(V.exponents.tolist(), V.coefficients, strict=True)}
-    return np.array([known.get(tuple(e), 0.0) for e in basis.exponents.tolist()])
-
-
-def extent(V: LyapunovFunction, direction: FloatArray) -> float:
-    """Return r with V(r·direction) = 1, the first such, in float64."""
-    ray = np.asarray(np.linalg.solve(V.scale, direction), dtype=np.float64)
-    length = float(np.linalg.norm(ray))
-    unit: FloatArray = (ray / length)[None, :]
-    return float(first_crossing(V, unit)[0]) / length
-
-
-class _Grower:
-    """The linear program's rows around one candidate."""
-
-    def __init__(self, basis: _Basis, rng: np.random.Generator) -> None:
-        self.basis, self.rng = basis, rng
-        self.size = basis.motion.size
-        self.sign = float(np.sign(basis.motion.determinant(np.zeros(self.size))))
-        self.reference = abs(float(basis.motion.determinant(np.zeros(self.size))))
-
-    def shell(self, V: LyapunovFunction, rays: FloatArray, growth: float) -> FloatArray:
-        """Boundary points of the candidate: V's set, grown, cut before the singularity."""
-        radius = first_crossing(V, rays)
-        radius = np.minimum(np.where(np.isfinite(radius), radius, 20.0) * (1 + growth), 20.0)
-        for _ in range(200):
-            y = (radius[:, None] * rays) @ self.basis.T.T
-            bad = self.basis.motion.determinant(y) * self.sign < 0.005 * self.reference
-            if not bad.any():
-                break
-            radius = np.where(bad, 0.97 * radius, radius)
-        return np.asarray(radius[:, None] * rays)
-
-    def around(self, V: LyapunovFunction, shell: FloatArray, growth: float) -> FloatArray:
-        """Points outside the candidate but in the box that the checker will take."""
-        box = 1.1 * np.abs(shell).max(axis=0)
-        x = box * self.rng.uniform(-1, 1, (len(shell), self.size))
-        limit = np.linalg.norm(self.shell(V, _unit(x), growth), axis=1)
-        return np.asarray(x[np.linalg.norm(x, axis=1) > limit])
-
-    def decrease(self, x: FloatArray) -> FloatArray:
-        """Rows of V̇/|x|² + t ≤ 0."""
-        rows = self.basis.rates(x) / np.sum(x * x, axis=1)[:, None]
-        return np.hstack([rows, np.ones((len(x), 1))])
-
-    def boundary(self, x: FloatArray) -> FloatArray:
-        """Rows of −V ≤ −(more than 1)."""
-        return np.hstack([-self.basis.values(x), np.zeros((len(x), 1))])
-
-    def near_zero(self, coefficients: FloatArray) -> FloatArray:
-        """The worst directions of the quadratic part of V̇: exact, where samples miss."""
-        h = 1e-4
-        steps = h * np.eye(self.size)
-        rows = np.zeros((self.size, self.size))
-
-        def rate(x: FloatArray) -> FloatArray:
-            return np.asarray(self.basis.rates(x) @ coefficients) / h**2
-
-        single = rate(steps)
-        for i, j in itertools.product(range(self.size), repeat=2):
-            both = rate((steps[i] + steps[j])[None, :])[0]
-            rows[i, j] = 0.5 * (both - single[i] - single[j])
-        _, vectors = np.linalg.eigh(0.5 * (rows + rows.T))
-        return 1e-3 * vectors.T
-
-    def counterexamples(
-        self, V: LyapunovFunction, row: FloatArray, growth: float, t: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Fresh points (local ascent included) where decrease or boundary fail."""
-        rays = _rays(self.rng, 15000, self.size)
-        shell = self.shell(V, rays, growth)
-        inner = shell * self.rng.random((len(shell), 1)) ** (1 / 2)
-        score = self.basis.rates(inner) @ row / np.sum(inner**2, axis=1)
-        for width in (0.05, 0.02, 0.005):
-            worst = inner[np.argsort(score)[-150:]]
-            near = np.repeat(worst, 8, axis=0)
-            near = near * (1 + width * self.rng.normal(size=near.shape))
-            near = near + width * self.rng.normal(size=near.shape) * np.linalg.norm(
-                near, axis=1, keepdims=True
-            )
-            limit = np.linalg.norm(self.shell(V, _unit(near), growth), axis=1)
-            near = near[np.linalg.norm(near, axis=1) <= limit]
-            inner = np.vstack([inner, near])
-            score = np.concatenate([score, self.basis.rates(near) @ row / np.sum(near**2, axis=1)])
-        bad = inner[score > -0.3 * t]
-        # A random part of the offenders: the worst ones crowd together.
-        bad = bad[self.rng.permutation(len(bad))[:300]]
-        core = self.near_zero(row)
-        score = self.basis.rates(core) @ row / np.sum(core**2, axis=1)
-        shell = np.vstack([shell, self.around(V, shell, growth)])
-        edge = shell[self.basis.values(shell) @ row < 1.0]
-        return np.vstack([bad, core[score > -0.3 * t]]), edge[:300]
-
-
-def _unit(x: FloatArray) -> FloatArray:
-    return np.asarray(x / np.linalg.norm(x, axis=1, keepdims=True))
+        V = _grow(_Basis(motion, V, degree), V, way, rng, share, goal, samples, progress)
+        if extent(V, way) >= goal:
+            break
+    return V
 
 
 def _grow(
     basis: _Basis,
-    coefficients: FloatArray,
+    V: LyapunovFunction,
     way: FloatArray,
     rng: np.random.Generator,
     seconds: float,
+    goal: float,
     samples: int,
-    progress: Callable[[str], None] | None,
+    progress: Progress | None,
 ) -> LyapunovFunction:
-    started = time.monotonic()
-    grower = _Grower(basis, rng)
-    rate = -np.linalg.eigvals(_jacobian(basis.motion)).real.max()
-    V = basis.function(coefficients)
+    started = time.process_time()
+    candidate = _Candidate(basis, rng)
+    rate = _slowest(basis.motion)
     growth, step = 0.06, 0.04
-    while growth > 0.004 and time.monotonic() - started < seconds:
+    while growth > 0.004 and time.process_time() - started < seconds:
         reach = extent(V, way)
-        # On the samples of the boundary; between them V must still be ≥ 1.
-        edge_value = 1 + 0.25 * growth
-        shell = grower.shell(V, _rays(rng, samples, basis.motion.size), growth)
-        inner = np.vstack(
-            [
-                shell * rng.random((len(shell), 1)) ** 0.5,
-                0.999 * shell,
-                1e-3 * _rays(rng, samples // 4, basis.motion.size),
-            ]
-        )
-        beyond = grower.around(V, shell, growth)[::2]
-        targets = np.linspace(0.1, 1.0, 10)[:, None] * (reach * (1 + step) * way)
-        on_way = basis.values(targets @ basis.T_inverse.T)
-        rows = [
-            grower.decrease(inner),
-            grower.boundary(np.vstack([shell[::2], beyond])),
-            -grower.boundary(shell[::2]),
-            np.hstack([on_way, np.zeros((10, 1))]),
-            np.eye(1, len(coefficients) + 1, len(coefficients)),
-        ]
-        count = len(shell[::2])
-        right = np.concatenate(
-            [
-                np.zeros(len(inner)),
-                np.full(count + len(beyond), -edge_value),
-                np.full(count, 1.8),
-                np.linspace(0.1, 1.0, 10),
-                [0.5 * rate],
-            ]
-        )
-        A = np.vstack(rows)
-        goal = np.zeros(A.shape[1])
-        goal[-1] = -1.0
-        accepted = None
-        for _ in range(7):
-            x = minimise_linear(goal, A, right)
-            if x is None or x[-1] < 1e-3 * rate:
-                break
-            inside, edge = grower.counterexamples(V, x[:-1], growth, x[-1])
-            if not len(inside) and not len(edge):
-                accepted = x
-                break
-            A = np.vstack([A, grower.decrease(inside), grower.boundary(edge)])
-            right = np.concatenate([right, np.zeros(len(inside)), np.full(len(edge), -edge_value)])
-        candidate = None if accepted is None else basis.function(accepted[:-1])
-        if candidate is not None and extent(candidate, way) > reach * 1.0005:
-            V = candidate
+        if reach >= goal:
+            break
+        accepted = _step(candidate, V, way, growth, step, reach, rate, samples)
+        if accepted is not None and extent(basis.function(accepted[:-1]), way) > reach * 1.0005:
+            V = basis.function(accepted[:-1])
             growth, step = min(1.2 * growth, 0.15), min(1.2 * step, 0.1)
-            if progress is not None and accepted is not None:
+            if progress is not None:
                 progress(
                     f"degree {basis.exponents.sum(axis=1).max()}: reach {extent(V, way):.4f}, "
-                    f"decay {accepted[-1] / rate:.3f}, {time.monotonic() - started:.0f} s"
+                    f"decay {accepted[-1] / rate:.3f}, {time.process_time() - started:.0f} s"
                 )
         else:
             growth, step = growth / 1.5, step / 1.5
     return V
 
 
+def _step(
+    candidate: _Candidate,
+    V: LyapunovFunction,
+    way: FloatArray,
+    growth: float,
+    step: float,
+    reach: float,
+    rate: float,
+    samples: int,
+) -> FloatArray | None:
+    """Coefficients and t on V's set, grown; None where fresh samples keep disagreeing."""
+    basis, rng = candidate.basis, candidate.rng
+    # On the samples of the boundary; between them V must still be ≥ 1.
+    edge_value = 1 + 0.25 * growth
+    shell = candidate.shell(V, _rays(rng, samples, basis.size), growth)
+    inner = np.vstack(
+        [
+            shell * rng.random((len(shell), 1)) ** 0.5,
+            0.999 * shell,
+            1e-3 * _rays(rng, samples // 4, basis.size),
+        ]
+    )
+    outer = np.vstack([shell[::2], candidate.around(V, shell, growth)[::2]])
+    length = float(np.linalg.norm(V.coordinates(reach * way)))
+    on_way = basis.values(_on_axis(V, way, (1 + step) * length))
+    columns = len(basis.exponents) + 1
+    fixed = np.vstack(
+        [
+            -candidate.boundary(shell[::2]),
+            np.hstack([on_way, np.zeros((10, 1))]),
+            np.eye(1, columns, columns - 1),
+        ]
+    )
+    limits = np.concatenate(
+        [np.full(len(shell[::2]), 1.8), np.linspace(0.1, 1.0, 10), [0.5 * rate]]
+    )
+    edge = candidate.boundary(outer)
+    decrease = candidate.decrease(inner)
+    goal = np.zeros(columns)
+    goal[-1] = -1.0
+    for _ in range(8):
+        A = np.vstack([decrease, edge, fixed])
+        right = np.concatenate([np.zeros(len(decrease)), np.full(len(edge), -edge_value), limits])
+        x = minimise_linear(goal, A, right)
+        if x is None or x[-1] < 1e-3 * rate:
+            return None
+        more, out = candidate.counterexamples(V, x[:-1], growth, x[-1])
+        if not len(more) and not len(out):
+            return x
+        decrease = np.vstack([decrease, candidate.decrease(more)])
+        edge = np.vstack([edge, candidate.boundary(out)])
+    return None
+
+
 def prove_region(
-    motion: SurfaceMotion,
+    motion: Motion,
     direction: ArrayLike,
     *,
-    degrees: Sequence[int] = (4, 6),
+    degrees: Sequence[int] = (2, 4, 6),
     seconds: float = 60.0,
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    goal: float = math.inf,
+    parameters: Mapping[str, tuple[float, float]] | None = None,
+    progress: Progress | None = None,
 ) -> ProvedRegion:
-    """Search for a region of attraction on the surface and prove it.
+    """Search for a region of attraction and prove it.
 
     Parameters
     ----------
-    motion, direction, degrees, seconds, seed, progress
-        As for :func:`search_region`.
+    motion, direction, degrees, seconds, seed, goal, progress
+        As for :func:`search_region`; ``seconds``, of process time, are shared by three
+        searches with different starts and coordinates, which end when one meets the goal.
+    parameters
+        Intervals of uncertain parameters, as for :func:`undertow.certify.verify_region`.
 
     Returns
     -------
     ProvedRegion
-        The larger of two searches with different starts; a set that cannot be proved is shrunk.
+        The largest set found that could be proved; one that cannot be is shrunk.
 
     Raises
     ------
@@ -429,24 +504,31 @@ def prove_region(
         When the surface is not locally stable.
     """
     way = np.asarray(direction, dtype=float)
-    best, verdict = None, None
-    starts: tuple[Start, ...] = ("far", "round")
-    for start in starts:
+    attempts: list[tuple[Start, bool]] = [("far", False), ("far", True), ("round", False)]
+    found = []
+    for start, slow in attempts:
         V = search_region(
             motion,
             direction,
             degrees=degrees,
-            seconds=0.5 * seconds,
+            seconds=seconds / len(attempts),
             seed=seed,
             start=start,
+            slow=slow,
+            goal=goal,
             progress=progress,
         )
+        found.append(V)
+        if extent(V, way) >= goal:
+            break
+    best, verdict = None, None
+    for V in sorted(found, key=lambda V: -extent(V, way)):
         for factor in (1.001, 1.01, 1.03, 1.06, 1.1, 1.3, 2.0):
             candidate = V.times(factor)
             reach = extent(candidate, way) * (1 - 1e-9)
             if best is not None and reach <= best.extent:
                 break
-            verdict = verify_region(motion, candidate)
+            verdict = verify_region(motion, candidate, parameters=parameters)
             if progress is not None:
                 progress(f"level 1/{factor}: {verdict}, {verdict.details.get('boxes')} boxes")
             if verdict:
@@ -455,7 +537,7 @@ def prove_region(
     if best is not None:
         return best
     raise InfeasibleError(
-        f"region of attraction of {motion.surface}",
+        f"region of attraction of {getattr(motion, 'surface', motion.names)}",
         value=str(verdict),
         limit="a proved sublevel set",
         remedy="Give the search more seconds or another degree",

@@ -13,9 +13,12 @@ One step h, for a right-hand side f that need only be Lipschitz:
    weight h^k/k!, so e(h) ∈ Φ e(0) + Ψ δp with Φ ∈ Σ h^k/k! J^k: no smoothness is needed, and
    a fast linear mode is resolved by the series, not by small steps.
 3. Likewise m(h) ∈ m + Σ_{k≥1} h^k/k! J^{k−1} f(m).
+4. The first R rows of f are smooth and dA/dt lies in G over Y.  There A(t) ∈ J₀ + t G with J₀
+   the slopes over X alone, so the first term of Φ is h J₀ + h²/2 G, and the second term of 3.
+   is h²/2 (J(m) + h/3 G) f(m): the slopes between m and m(t) change at half the rate of those
+   at m(t).  This wins an order in h.
 
-Everything is outward-rounded.  The error of 3. is of third order in h where f is smooth, times
-the second derivative of f.
+Everything is outward-rounded.
 """
 
 from __future__ import annotations
@@ -48,6 +51,48 @@ class Rates(Protocol):
     def slope(self) -> Interval:
         """Generalised derivatives in z and in k parameters, (N, N + k, L)."""
 
+    @property
+    def kinked(self) -> Mask:
+        """Boxes, (L,), for which it pays to say more of the points in them."""
+
+
+class Paths(Protocol):
+    """Points of boxes z and parameters, written around a middle."""
+
+    @property
+    def middle(self) -> FloatArray:
+        """The middle, (N, L); parameters p̂."""
+
+    def way(self, slope: Interval) -> Interval:
+        """Enclose slope · (z − middle, p − p̂) over the points, (I, N + k, L) to (I, L)."""
+
+
+@dataclass(frozen=True)
+class _Motions:
+    """Points of motions from m + C ξ + B r with ż in F, up to time h: a convex set."""
+
+    tubes: Tubes
+    rate: Interval
+    span: Interval
+
+    @property
+    def middle(self) -> FloatArray:
+        return self.tubes.middle
+
+    def way(self, slope: Interval) -> Interval:
+        tubes, k = self.tubes, len(self.tubes.field.radii)
+        size = len(tubes.middle)
+        first = slope[:, :size]
+        spread = matmul(first, Interval(tubes.spread))
+        if k:
+            own = spread[:, -k:] + slope[:, size:] * Interval(tubes.field.radii[None, :, None])
+            spread = _beside(spread[:, :-k], own)
+        return (
+            _spread(spread)
+            + matmul(matmul(first, Interval(tubes.basis)), tubes.rest[:, None])[:, 0]
+            + self.span * matmul(first, self.rate[:, None])[:, 0]
+        )
+
 
 class Field(Protocol):
     """A right-hand side with slopes, and with k parameters p̂ + ρ ξ, ξ ∈ [−1, 1]."""
@@ -56,8 +101,14 @@ class Field(Protocol):
     def radii(self) -> FloatArray:
         """ρ, (k,)."""
 
-    def over(self, z: Interval, *, middle: bool = False) -> Rates:
-        """Enclose rates and slopes over boxes; with ``middle`` for ξ = 0 alone."""
+    def over(self, z: Interval, *, middle: bool = False, paths: Paths | None = None) -> Rates:
+        """Enclose rates and slopes over boxes.
+
+        With ``middle`` for ξ = 0 alone; ``paths`` says more of the points in the boxes.
+        """
+
+    def bend(self, z: Interval, rate: Interval) -> Interval:
+        """Enclose d/dt of the slopes of the R smooth rows, (R, N + k, L), for ż in ``rate``."""
 
 
 def matmul(a: Interval, b: Interval) -> Interval:
@@ -83,6 +134,18 @@ def _row_sum(a: FloatArray) -> FloatArray:
     for k in range(1, a.shape[1]):
         total = np.nextafter(total + a[:, k], np.inf)
     return np.asarray(total.max(axis=0))
+
+
+def _below(upper: Interval, lower: Interval) -> Interval:
+    """Stack two blocks of rows."""
+    return Interval(np.concatenate([upper.lo, lower.lo]), np.concatenate([upper.hi, lower.hi]))
+
+
+def _beside(left: Interval, right: Interval) -> Interval:
+    """Put two blocks of columns beside each other."""
+    return Interval(
+        np.concatenate([left.lo, right.lo], axis=1), np.concatenate([left.hi, right.hi], axis=1)
+    )
 
 
 def _size(a: Interval) -> FloatArray:
@@ -164,19 +227,25 @@ class Tubes:
         numpy.ndarray
             Which sets moved; the others found no such box, and their numbers mean nothing.
         """
-        step = Interval(h)
-        outer, rates, good = self._enclose(h)
+        step, third = Interval(h), 1 / Interval(3.0)
+        begin, outer, rates, good = self._enclose(h)
         size = len(self.middle)
-        J = rates.slope
+        here = self.field.over(Interval(self.middle), middle=True)
+        G = self.field.bend(outer, rates.rate)
+        smooth = len(G.lo)
+        kinked = rates.slope[smooth:]
+        drawn = begin.slope[:smooth] + Interval(0.0, h) * G
+        J = _below(rates.slope[:smooth].intersect(drawn), kinked)
         J_z = J[:, :size]
-        here = self.field.over(Interval(self.middle), middle=True).rate
-        # Σ h^k/k! J^k for [Φ Ψ], and Σ h^k/k! J^(k−1) for the middle.
-        term, move = J * step, (here * step)[:, None]
-        flow, drift = term, move
+        mean = _below(begin.slope[:smooth] + 0.5 * step * G, kinked)
+        along = _below(here.slope[:smooth] + third * step * G, kinked)[:, :size]
+        # Ordered integrals of A…A for [Φ Ψ], and of A…A f(m) for the middle.
+        flow, drift = mean * step, (here.rate * step)[:, None]
+        term, move = J * step, drift
         for k in range(2, TERMS + 1):
             part = step * (1 / Interval(float(k)))
             term = matmul(J_z, term) * part
-            move = matmul(J_z, move) * part
+            move = matmul(along if k == 2 else J_z, move) * part
             flow, drift = flow + term, drift + move
         # The tail of both series in the maximum norm, Σ_{k≥1} (h‖J‖)^k ≤ h‖J‖/(1 − h‖J‖).
         ratio = step * Interval(_row_sum(_size(J_z))) * (1 / Interval(float(TERMS + 1)))
@@ -188,11 +257,12 @@ class Tubes:
         Phi = flow[:, :size] + Interval(np.eye(size)[:, :, None])
         return self._assemble(Phi, flow[:, size:], drift[:, 0]), outer, rates, good
 
-    def _enclose(self, h: float) -> tuple[Interval, Rates, Mask]:
-        """Find boxes that hold the motions over a step."""
+    def _enclose(self, h: float) -> tuple[Rates, Interval, Rates, Mask]:
+        """Find boxes that hold the motions over a step; the field at its begin and over it."""
         start = self.hull
         span = Interval(0.0, h)
-        guess = start + span * self.field.over(start).rate
+        begin = self.field.over(start)
+        guess = start + span * begin.rate
         outer = rates = None
         good = np.zeros(start.lo.shape[1], dtype=bool)
         for _ in range(12):
@@ -206,7 +276,9 @@ class Tubes:
                 break
         assert outer is not None
         assert rates is not None
-        return outer, rates, good
+        if rates.kinked.any():
+            rates = self.field.over(outer, paths=_Motions(self, rates.rate, span))
+        return begin, outer, rates, good
 
     def _assemble(self, Phi: Interval, Psi: Interval, drift: Interval) -> Tubes:
         k = len(self.field.radii)
@@ -215,11 +287,7 @@ class Tubes:
         carried = matmul(Phi, Interval(self.spread))
         if k:
             own = Psi * Interval(self.field.radii[None, :, None])
-            columns = carried.lo.shape[1]
-            carried = Interval(
-                np.concatenate([carried.lo[:, : columns - k], (carried[:, -k:] + own).lo], axis=1),
-                np.concatenate([carried.hi[:, : columns - k], (carried[:, -k:] + own).hi], axis=1),
-            )
+            carried = _beside(carried[:, :-k], carried[:, -k:] + own)
         spread = 0.5 * (carried.lo + carried.hi)
         lost = (target - Interval(middle)) + _spread(carried - Interval(spread))
         turned = matmul(Phi, Interval(self.basis))

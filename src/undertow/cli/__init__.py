@@ -7,10 +7,21 @@ from typing import Annotated
 import typer
 
 from undertow import results
-from undertow.cli import certify, control, export, library, paper, rig
+from undertow.cli import bench, certify, control, export, library, paper, rig, trials
 from undertow.cli.terminal import app
 
-__all__ = ["app", "certify", "control", "export", "library", "main", "paper", "rig"]
+__all__ = [
+    "app",
+    "bench",
+    "certify",
+    "control",
+    "export",
+    "library",
+    "main",
+    "paper",
+    "rig",
+    "trials",
+]
 
 
 def _version(asked: bool) -> None:

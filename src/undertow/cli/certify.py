@@ -45,6 +45,7 @@ def _mechanism(name: str, settings: list[str] | None) -> Mechanism:
         "undertow certify rotary_pendulum --surface 'lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1'",
         "undertow certify cart_pendulum --seconds 30 --out proof",
         "undertow certify rotary_pendulum --run --start phi=40deg --set d_e=0.025 --out proof",
+        "undertow certify rotary_pendulum --loop --seconds 0 --start phi=20deg",
         "undertow certify --appendix",
         "undertow certify model.py:make",
     )
@@ -76,6 +77,14 @@ def certify(
         float | None,
         typer.Option(help="Search for each region on the surface, s; 0 leaves it out."),
     ] = None,
+    loop: Annotated[
+        bool,
+        typer.Option(
+            "--loop",
+            help="Also prove from how far the full closed loop, at rest, converges: up to the "
+            "start, or where the proof ends. Takes minutes.",
+        ),
+    ] = False,
     seed: Seed = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for certificate.json and the figures.")
@@ -130,7 +139,7 @@ def certify(
             )
             one = certification.certify_surface(
                 mechanism, given, x0, seconds=60.0 if seconds is None else seconds,
-                progress=progress,
+                loop=loop, progress=progress,
             )  # fmt: skip
             certified, report = (one,), certification.subject_report(mechanism, one)
         if out is not None:

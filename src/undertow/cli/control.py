@@ -73,6 +73,15 @@ def simulate(
     ] = None,
     horizon: Horizon = 60.0,
     period: Annotated[float, typer.Option(help="Time between re-optimisations, s.")] = 0.1,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Evidence that a new surface of the cascade needs at the present state: it is in "
+            "a proved region; its predicted motion enters one (dual mode); states nearby arrive; "
+            "or stability near the target. Repeatable. Default: region, dual or local.",
+            metavar="region|dual|sampled|local",
+        ),
+    ] = None,
     seed: Seed = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for motion.csv, motion.png and manifest.json.")
@@ -100,7 +109,11 @@ def simulate(
         results.check_folder(out)
     run = None
     if steering == "cascade":
-        cascade = Cascade(belief, goal, period=period, seed=seed)
+        from undertow.certify.gate import Policy, certified_gate
+
+        accepted: Any = tuple(accept or ("region", "dual", "local"))
+        gate = certified_gate(Policy(accepted))
+        cascade = Cascade(belief, goal, period=period, gate=gate, seed=seed)
         with progress_bar() as progress:
             run = cascade.simulate(
                 x0, plant=truth, progress=lambda t, end: progress("cascade", t / end)
@@ -117,7 +130,7 @@ def simulate(
     console = terminal()
     console.print(report.motion_report(belief, goal, x0, motion, surfaces[0], run))
     if out is not None:
-        files = report.motion_files(request, motion, motion.total, surfaces)
+        files = report.motion_files(request, motion, motion.total, surfaces, run)
         say(console, write(out, files))
     if motion.event.name != "REACHED":
         raise typer.Exit(1)

@@ -218,10 +218,11 @@ def on_rigs(
     progress: Callable[[str, float], None],
 ) -> int:
     """Return on how many realistic rigs the exported controller holds the mechanism."""
-    from undertow.export.loop import bench_of, run_on_rig
+    from undertow.export.loop import run_on_rig
     from undertow.rig import RealisticRig
+    from undertow.rig.presets import bench_for
 
-    bench = bench_of(one.mechanism).with_timing(period=one.period)
+    bench = bench_for(one.mechanism).with_timing(period=one.period)
     held = 0
     with tempfile.TemporaryDirectory(prefix="undertow-") as folder:
         build = Build(one, Path(folder), compiler)

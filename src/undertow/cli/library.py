@@ -30,15 +30,26 @@ from undertow.rollout import ClosedLoop
 __all__ = ["animate", "derive", "list_mechanisms", "survey"]
 
 
-@app.command(name="mechanisms", epilog=examples("undertow mechanisms"))
+@app.command(
+    name="mechanisms", epilog=examples("undertow mechanisms", "undertow mechanisms --out pictures")
+)
 @reports_errors
-def list_mechanisms() -> None:
-    """List the mechanisms of the library."""
+def list_mechanisms(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for mechanisms.png: all on their way to the target.")
+    ] = None,
+) -> None:
+    """List the mechanisms of the library; with --out also draw them."""
     from undertow import commands
 
     console = terminal()
     console.width = max(console.width, 150)  # rows may wrap, but no cell is cut
     console.print(commands.mechanism_table(), crop=False, soft_wrap=True)
+    if out is not None:
+        results.check_folder(out)
+        with progress_bar() as progress:
+            picture = commands.library_picture(progress)
+        say(console, write(out, {"mechanisms.png": picture}))
 
 
 @app.command(

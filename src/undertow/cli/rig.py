@@ -28,12 +28,12 @@ from undertow.cli.terminal import (
     write,
 )
 
-__all__ = ["replay", "run"]
+__all__ = ["drill", "replay", "run"]
 
 
 @app.command(
     epilog=examples(
-        "undertow run rotary_pendulum --seconds 60 --lead 0.04",
+        "undertow run rotary_pendulum --seconds 60 --lead 0.02",
         "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
         "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     )
@@ -52,7 +52,10 @@ def run(
     period: Annotated[float, typer.Option(help="Period of the fast loop, s.")] = 0.001,
     lead: Annotated[
         float,
-        typer.Option(help="From a request to the use of its answer, s: short keeps it busy."),
+        typer.Option(
+            help="Least time from a request to the use of its answer, s; grows where answers "
+            "come late. A short one keeps the optimiser busy."
+        ),
     ] = 0.1,
     worker: Annotated[
         Literal["process", "thread"], typer.Option(help="Where the optimiser runs.")
@@ -80,7 +83,7 @@ def run(
         rig=rig,
         seed=seed,
         period=period,
-        seconds=float("inf") if simulated else 0.3 * lead,
+        seconds=float("inf") if simulated else max(0.01, 0.3 * lead),
         settings=Patience(lead=lead),
     )
     console = terminal()
@@ -157,4 +160,46 @@ def replay(
         }
         say(console, write(out, pictures))
     if not result.identical:
+        raise typer.Exit(1)
+
+
+@app.command(
+    epilog=examples(
+        "undertow drill",
+        "undertow drill --no-live --seed 3",
+        "undertow drill --kills 50",
+    )
+)
+@reports_errors
+def drill(
+    live: Annotated[
+        bool, typer.Option(help="Also the faults that need real time and processes.")
+    ] = True,
+    kills: Annotated[
+        int | None,
+        typer.Option(help="Instead: kill -9 so many runs at random moments, and replay.", min=1),
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """Put faults into runs on the realistic rig, one at a time, and say what happened."""
+    from undertow.runtime import tables
+    from undertow.runtime.drill import drill as simulated_drill
+    from undertow.runtime.drill_live import kill_drill, live_drill
+
+    console = terminal()
+    console.width = max(console.width, 140)  # rows may wrap, but no cell is cut
+    if kills is not None:
+        with progress_bar() as progress:
+            killed = kill_drill(kills, seed=seed, progress=progress)
+        console.print(tables.kill_table(killed), crop=False, soft_wrap=True)
+        if not all(one.passed for one in killed):
+            raise typer.Exit(1)
+        return
+    with progress_bar() as progress:
+        outcomes = simulated_drill(seed=seed, progress=progress)
+        lived = live_drill(progress) if live else ()
+    console.print(tables.drill_table(outcomes, lived), crop=False, soft_wrap=True)
+    passed = [*(o.passed for o in outcomes), *(o.passed for o in lived)]
+    say(console, f"{sum(passed)} of {len(passed)} as they should be, seed {seed}")
+    if not all(passed):
         raise typer.Exit(1)

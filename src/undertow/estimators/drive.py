@@ -53,6 +53,10 @@ class Record:
         """Total variation of the inputs, in their unit."""
         return float(np.abs(np.diff(self.u, axis=0)).sum())
 
+    def last(self) -> Record:
+        """Return the last sample alone: where many runs are kept."""
+        return Record(*(column[-1:] for column in (self.t, self.q, self.x, self.u, self.truth)))
+
 
 def drive(rig: Rig, estimator: Estimator, controller: Controller, seconds: float) -> Record:
     """Run a controller on a rig for some time, as fast as it goes.

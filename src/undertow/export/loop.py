@@ -8,10 +8,10 @@ import numpy as np
 
 from undertow.export.host import HostProcess
 from undertow.export.twin import Status
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.rig import Bench, Rig, plausible_rig, srv02_rig
+from undertow.mechanism import FloatArray
+from undertow.rig import Rig
 
-__all__ = ["HELD", "Loop", "bench_of", "run_on_rig"]
+__all__ = ["HELD", "Loop", "run_on_rig"]
 
 #: Distance of an unactuated coordinate from the target up to which it counts as held, rad or m.
 HELD = 0.1
@@ -37,13 +37,6 @@ class Loop:
     u: FloatArray
     status: tuple[Status, ...]
     held: bool
-
-
-def bench_of(mechanism: Mechanism) -> Bench:
-    """Return the bench with published numbers, else one of usual quality."""
-    published = srv02_rig()
-    same = published.mechanism.fingerprint == mechanism.fingerprint
-    return published if same else plausible_rig(mechanism)
 
 
 def run_on_rig(process: HostProcess, rig: Rig, seconds: float) -> Loop:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
 
-__all__ = ["Clock", "Histogram", "SimulatedClock", "WallClock"]
+__all__ = ["Clock", "Histogram", "SimulatedClock", "WallClock", "prompt"]
 
 
 class Clock(Protocol):
@@ -24,6 +26,10 @@ class Clock(Protocol):
         """Return at the time t, s, or at once if it is past."""
         ...
 
+    def spin_until(self, t: float) -> None:
+        """Like :meth:`sleep_until` for the last moments, without giving the processor away."""
+        ...
+
 
 class WallClock:
     """The monotonic clock of the machine."""
@@ -36,6 +42,11 @@ class WallClock:
         rest = t - time.perf_counter()
         if rest > 0:
             time.sleep(rest)
+
+    def spin_until(self, t: float) -> None:
+        """Wait without sleeping: no wake-up to be late for."""
+        while time.perf_counter() < t:
+            pass
 
 
 class SimulatedClock:
@@ -53,6 +64,25 @@ class SimulatedClock:
     def sleep_until(self, t: float) -> None:
         """Let time pass."""
         self.t = max(self.t, t)
+
+    spin_until = sleep_until
+
+
+@contextlib.contextmanager
+def prompt() -> Iterator[bool]:
+    """Ask for a real-time priority for this thread; yields whether the system granted it."""
+    before: int | None = None
+    if hasattr(os, "sched_setscheduler"):
+        with contextlib.suppress(OSError):
+            policy = os.sched_getscheduler(0)
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            before = policy
+    try:
+        yield before is not None
+    finally:
+        if before is not None:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, before, os.sched_param(0))
 
 
 class Histogram:

@@ -135,6 +135,7 @@ class Controller:
         self._asked: Request | None = None
         self._pending: Answer | None = None
         self._sound = 0.0
+        self._lead = settings.lead
 
     # -- one step --------------------------------------------------------------------------
 
@@ -175,7 +176,8 @@ class Controller:
         self._change(t, *successor(self.mode, signs))
         self._wanted[:] = self._zero
         if self.mode in (Mode.CATCH, Mode.BALANCE):
-            self._wanted[:] = self.demand
+            np.multiply(self.sensors.band, 2.0 * self.sensors.probe, out=self._wanted)
+            self._wanted += self.demand
             self._ask(t)
         elif self.mode == Mode.SWING_UP and self.swing_up is not None:
             self._wanted[:] = self.swing_up(t, self.x)
@@ -239,10 +241,17 @@ class Controller:
                 self.notes.append(Note("answer", f"{self._asked.sequence}: never came"))
                 self._number(self._asked.sequence)
                 self._asked, self.gives_up = None, True
+                self._plan_ahead(1.5)
             return
         if self._pending is None:
-            use = t + self.settings.lead
-            self._asked = self.request = Request(t, self.x.copy(), use, self.memory)
+            self._asked = self.request = Request(t, self.x.copy(), t + self._lead, self.memory)
+
+    def _plan_ahead(self, factor: float) -> None:
+        """Change how far ahead proposals are computed, in whole steps of the predictions."""
+        step, settings = self.cascade.step, self.settings
+        most = max(settings.lead, settings.longest_lead)
+        lead = max(settings.lead, min(most, factor * self._lead))
+        self._lead = math.ceil(lead / step - 1e-9) * step
 
     def _number(self, sequence: int) -> None:
         """Let the next request have a higher number."""
@@ -254,9 +263,13 @@ class Controller:
         if fault:
             self.notes.append(Note("answer", f"{answer.sequence}: refused, {fault}"))
             if self._asked is not None and answer.sequence == self._asked.sequence:
+                if t > self._asked.use:
+                    self._plan_ahead(1.5)
                 self._number(answer.sequence)
                 self._asked = None
         else:
+            if answer.use - t > 0.5 * self._lead:
+                self._plan_ahead(0.9)
             self._asked, self._pending = None, answer
 
     def _unfit(self, t: float, answer: Answer) -> str:

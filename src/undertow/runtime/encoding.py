@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -59,6 +59,13 @@ def memory_from(value: Mapping[str, Any]) -> CascadeState:
     return CascadeState(**{**value, "plan": _plan_from(value["plan"])})
 
 
+def _is_sound(plan: object) -> TypeGuard[Plan]:
+    """Whether it is a plan with numbers in it."""
+    if not isinstance(plan, Plan):
+        return False
+    return all(bool(np.isfinite(surface.vector).all()) for surface in plan.surfaces)
+
+
 def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
     """Return the line of the log for an answer that arrived in step k."""
     proposal, admission = answer.proposal, answer.admission
@@ -69,7 +76,7 @@ def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
         "after": memory_to(answer.memory),
         "lanes": answer.lanes.tolist(),
         # What an optimiser says may be anything: only what can be judged again is kept.
-        "plan": _plan_to(plan) if isinstance(plan, Plan) else None,
+        "plan": _plan_to(plan) if _is_sound(plan) else None,
         "number": proposal.sequence,
         "computed_for": proposal.computed_for,
         "message": proposal.message,

@@ -3,18 +3,41 @@
 from __future__ import annotations
 
 import io
+import itertools
+from typing import Any
 
 import numpy as np
 
 from undertow.mechanism import FloatArray
 from undertow.runtime.log import Recording
+from undertow.runtime.modes import Mode
 
 __all__ = ["chatter_figure", "latency_figure", "motion_figure"]
 
 
-def _png(figure: object) -> bytes:
+#: Colour of each state in the background.
+STATES = {
+    Mode.IDLE: "#f2f2f2",
+    Mode.BRING_UP: "#fde9b8",
+    Mode.SWING_UP: "#e3d4f2",
+    Mode.CATCH: "#d3e5f7",
+    Mode.BALANCE: "#d9f0d9",
+    Mode.SAFE_STOP: "#f7d0cc",
+}
+
+
+def _shade(ax: Any, recording: Recording) -> None:
+    """Colour the background by the state."""
+    t, modes = recording["t"], recording["mode"]
+    changes = [0, *(np.flatnonzero(np.diff(modes)) + 1), len(t) - 1]
+    for begin, end in itertools.pairwise(changes):
+        ax.axvspan(t[begin], t[end], color=STATES[Mode(int(modes[begin]))], lw=0, zorder=0)
+    ax.set_xlim(t[0], t[-1])
+
+
+def _png(figure: Any) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)  # type: ignore[attr-defined]
+    figure.savefig(buffer, format="png", dpi=130)
     return buffer.getvalue()
 
 
@@ -25,6 +48,7 @@ def _columns(recording: Recording, ending: str) -> list[str]:
 def motion_figure(recording: Recording) -> bytes:
     """Return a PNG of positions, inputs and surfaces over time, with the answers taken."""
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     t = recording["t"]
     positions = [name.removesuffix("_measured") for name in _columns(recording, "_measured")]
@@ -42,18 +66,17 @@ def motion_figure(recording: Recording) -> bytes:
         for name in names:
             ax.plot(t, recording[name], lw=0.9, label=name)
         ax.set_ylabel(label)
-        ax.legend(loc="upper right", frameon=False, ncols=4)
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, ncols=4)
         ax.grid(alpha=0.3)
-        for _, when, kind, text in recording.events:
-            if kind == "state":
-                ax.axvline(when, color="0.4", lw=0.8, ls=":")
-                if ax is axes[0]:
-                    mode = text.split(":")[0].split(" → ")[-1].replace("_", " ").lower()
-                    ax.annotate(
-                        mode, (when, 0.02), xycoords=("data", "axes fraction"), rotation=90,
-                        fontsize=7, color="0.3", ha="right",
-                    )  # fmt: skip
-    axes[0].set_title(f"{recording.meta['mechanism']}: {recording.path.name}", fontsize=10)
+        _shade(ax, recording)
+    axes[0].set_title(
+        f"{recording.meta['mechanism']}: {recording.path.name}", fontsize=10, loc="left"
+    )
+    figure.legend(
+        handles=[Patch(color=colour, label=mode.name.replace("_", " ").lower())
+                 for mode, colour in STATES.items() if mode in recording["mode"]],
+        loc="outside lower center", ncols=6, frameon=False, fontsize=9,
+    )  # fmt: skip
     axes[-1].set_xlabel("time, s")
     return _png(figure)
 

@@ -40,8 +40,8 @@ ANSWERS = {
 #: Rows that wait in memory at most.
 RING = 8192
 
-#: Time between transactions, s.
-FLUSH = 0.025
+#: Time between transactions, s; and rows, where no thread writes.
+FLUSH, BATCH = 0.025, 250
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,9 @@ class Log:
     meta
         What the run was: JSON values.
     threaded
-        Write in a thread, every 25 ms.  Otherwise write when the ring is half full, for
-        simulated time.
+        Write in a thread, every 25 ms.  Otherwise write every 250 rows, for simulated time.
+    most_bytes
+        Size that the file may grow to; the log ends there, and the run goes on.
 
     Attributes
     ----------
@@ -110,7 +111,13 @@ class Log:
     """
 
     def __init__(
-        self, path: Path, columns: Columns, meta: Mapping[str, Any], *, threaded: bool = True
+        self,
+        path: Path,
+        columns: Columns,
+        meta: Mapping[str, Any],
+        *,
+        threaded: bool = True,
+        most_bytes: int | None = None,
     ) -> None:
         self.path, self.columns = path, columns
         self.failure, self.dropped = "", 0
@@ -125,6 +132,9 @@ class Log:
             path.parent.mkdir(parents=True, exist_ok=True)
             _move_earlier(path)
             self._file = self._make(meta)
+            if most_bytes is not None:
+                (page,) = self._file.execute("PRAGMA page_size").fetchone()
+                self._file.execute(f"PRAGMA max_page_count={max(1, most_bytes // page)}")
         except (OSError, sqlite3.Error) as error:
             raise ArtefactError(
                 f"log '{path}'",
@@ -165,7 +175,7 @@ class Log:
             return
         self._ring[self._head % RING] = self.row
         self._head += 1
-        if self._thread is None and self._head - self._tail >= RING // 2:
+        if self._thread is None and self._head - self._tail >= BATCH:
             self.flush()
 
     def event(self, k: int, t: float, kind: str, text: str) -> None:

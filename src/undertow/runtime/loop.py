@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import sys
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
-from undertow.runtime.clock import Clock, Histogram, WallClock
+from undertow.runtime.clock import Clock, Histogram, WallClock, prompt
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import answer_row
 from undertow.runtime.log import Log
@@ -23,6 +22,10 @@ from undertow.runtime.modes import Command, Mode
 from undertow.runtime.slow import Worker
 
 __all__ = ["Report", "Runtime"]
+
+
+#: Time before a step is due at which the shadow rehearses, s.
+REHEARSAL = 1.5e-4
 
 
 @dataclass(eq=False)
@@ -33,11 +36,15 @@ class Report:
     ----------
     steps, missed
         Steps made, and steps whose output came after the end of their period.
+    asleep
+        Missed steps that took less than a period, but were woken too late.
     skipped
         Periods in which no step was made, because an earlier one took too long.
     think, whole, late
         Time of the fast step's own computation between reading and writing; from when the
         step was due to when its output was written; and to when it began.
+    shadowed, disagreed
+        Steps that the shadow made again, and those in which its output was another.
     mode, stopped_by
         State at the end, and why the run stopped, if it did.
     entered
@@ -52,10 +59,13 @@ class Report:
 
     steps: int = 0
     missed: int = 0
+    asleep: int = 0
     skipped: int = 0
     think: Histogram = field(default_factory=Histogram)
     whole: Histogram = field(default_factory=Histogram)
     late: Histogram = field(default_factory=Histogram)
+    shadowed: int = 0
+    disagreed: int = 0
     mode: Mode = Mode.IDLE
     stopped_by: str = ""
     entered: Counter[str] = field(default_factory=Counter)
@@ -79,6 +89,10 @@ class Runtime:
         The wall clock by default.
     log
         Where everything goes; closed by the caller.
+    shadow
+        A second controller, built as the first.  It makes every step again, one step behind,
+        in the last moments before the next one is due: that brings code and data back into
+        the processor's caches, and shows at once when the same inputs give other outputs.
 
     Attributes
     ----------
@@ -94,7 +108,10 @@ class Runtime:
         *,
         clock: Clock | None = None,
         log: Log | None = None,
+        shadow: Controller | None = None,
     ) -> None:
+        self.shadow = shadow
+        self._behind: deque[tuple[Inputs, FloatArray]] = deque(maxlen=1000)
         self.controller, self.rig, self.worker = controller, rig, worker
         self.clock = WallClock() if clock is None else clock
         self.log = log
@@ -102,7 +119,7 @@ class Runtime:
         self.report = Report(variation=np.zeros_like(controller.u))
         self._silent = ""
         self._failing = 0.0
-        self._beat = self.clock.now()
+        self._beat = self._origin = self.clock.now()
 
     def stop(self) -> None:
         """Ask for a safe stop, as an operator does."""
@@ -129,15 +146,16 @@ class Runtime:
         clock, period, report = self.clock, self.controller.period, self.report
         think, whole, late = report.think, report.whole, report.late
         stall = self.controller.settings.stall
-        origin = clock.now()
+        origin = self._origin = clock.now()
         k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
         while not self._silent:
             due = origin + slot * period
-            clock.sleep_until(due)
-            began = self._beat = clock.now()
+            self._wait(due)
+            last, began = self._beat, clock.now()
+            self._beat = began
             t = began - origin
-            if began - due > stall:
-                alarm = f"no step for {1e3 * (began - due + period):.0f} ms"
+            if k > 0 and began - last > stall:
+                alarm = f"no step for {1e3 * (began - last):.0f} ms"
             command, self.command = self.command, Command.NONE
             if t >= seconds and self.controller.mode != Mode.SAFE_STOP:
                 command = Command.STOP
@@ -149,6 +167,8 @@ class Runtime:
             alarm = self._write(u)
             written = clock.now()
             self._after(k, inputs)
+            if self.shadow is not None:
+                self._behind.append((inputs, u.copy()))
             np.abs(u - before, out=before)
             report.variation += before
             before[:] = u
@@ -165,8 +185,22 @@ class Runtime:
             over = (written - origin) / period - slot
             if over > 0:
                 report.missed += 1
+                report.asleep += written - began < period
                 report.skipped += int(over)
                 slot += int(over)
+
+    def _wait(self, due: float) -> None:
+        """Wait for the next step; shortly before, let the shadow make the last one again."""
+        shadow, clock, behind = self.shadow, self.clock, self._behind
+        if shadow is None:
+            clock.sleep_until(due)
+            return
+        clock.sleep_until(due - REHEARSAL)
+        while behind and clock.now() < due - 0.4 * REHEARSAL:
+            inputs, u = behind.popleft()
+            self.report.shadowed += 1
+            self.report.disagreed += not np.array_equal(shadow.step(inputs), u)
+        clock.spin_until(due)
 
     def _read(self, alarm: str) -> tuple[Measurement | None, str]:
         """Read the rig; a rig that fails gives nothing, and is a gap in the sensors."""
@@ -191,7 +225,7 @@ class Runtime:
     def _tell(self, what: str, text: str) -> None:
         events = self.report.events
         if len(events) < 10_000:
-            events.append((self._beat, what, text))
+            events.append((self._beat - self._origin, what, text))
 
     def _after(self, k: int, inputs: Inputs) -> None:
         """Hand requests to the slow loop, and keep what happened."""
@@ -282,16 +316,9 @@ def _quiet_interpreter(clock: Clock) -> Iterator[None]:
     sys.setswitchinterval(1e-4)
     gc.collect()
     gc.freeze()
-    policy = None
-    if hasattr(os, "sched_setscheduler"):
-        with contextlib.suppress(OSError):
-            policy = os.sched_getscheduler(0)
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     try:
-        yield
+        with prompt():
+            yield
     finally:
-        if policy is not None:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(0, policy, os.sched_param(0))
         gc.unfreeze()
         sys.setswitchinterval(interval)

@@ -12,16 +12,24 @@ import numpy as np
 
 from undertow import mechanisms
 from undertow.cascade import Cascade, CascadeState
+from undertow.delay import delay_gate
 from undertow.errors import InvalidInputError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import MinimumEnergy, MinimumTime, Objective
+from undertow.objective import MinimumEnergy, MinimumTime, Objective, state_box
 from undertow.optimiser import Budget
 from undertow.rig import Bench, IdealRig, RealisticRig, plausible_rig, srv02_rig
 from undertow.runtime.controller import Controller
 from undertow.runtime.settings import Settings
 
 __all__ = ["Recipe"]
+
+
+#: Weight of the state in minimum energy; radius of the ball in which a motion ends.
+STATE_WEIGHT, TERMINAL = 0.05, 0.05
+
+#: Periods of delay that an admitted surface must bear.
+BEARS = 6
 
 
 @dataclass(frozen=True)
@@ -91,11 +99,24 @@ class Recipe:
     @cached_property
     def cascade(self) -> Cascade:
         """Law, optimiser and gate."""
-        goal: Objective = MinimumEnergy(horizon=self.horizon)
+        ends = {
+            c.name: 0.95 * min(-c.low, c.high)
+            for c in self.belief.coordinates
+            if math.isfinite(min(-c.low, c.high))
+        }
+        goal: Objective = MinimumEnergy(
+            horizon=self.horizon,
+            state_weight=STATE_WEIGHT,
+            terminal_radius=TERMINAL,
+            constraints=state_box(**ends),
+        )
         if self.objective == "time":
-            goal = MinimumTime(horizon=self.horizon)
+            goal = MinimumTime(
+                horizon=self.horizon, terminal_radius=TERMINAL, constraints=state_box(**ends)
+            )
         warm = Budget(self.evaluations, self.seconds)
-        return Cascade(self.belief, goal, warm=warm, seed=self.seed)
+        gate = delay_gate(BEARS * self.period, self.period)
+        return Cascade(self.belief, goal, warm=warm, gate=gate, seed=self.seed)
 
     @cached_property
     def bench(self) -> Bench:
@@ -117,11 +138,12 @@ class Recipe:
         bench, names = self.bench, [c.name for c in self.belief.coordinates]
         counts = [bench.encoders[name].resolution for name in names]
         delay = bench.timing.input_delay + bench.timing.measurement_delay
+        limit = float(np.min(self.belief.input_limits))
         return KalmanFilter(
             self.belief,
             self.period,
             position_noise=np.array(counts) / math.sqrt(12),
-            acceleration_noise=5.0,
+            disturbance_drift=limit / 3 if math.isfinite(limit) else 1.0,
             delay=delay,
         )
 
@@ -137,7 +159,7 @@ class Recipe:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values from which :meth:`from_dict` makes the recipe again."""
-        return {**asdict(self), "settings": self.settings.as_dict()}
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:

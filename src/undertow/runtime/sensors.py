@@ -2,7 +2,11 @@
 
 Each reading is compared with what the belief expects one period after the last estimate.
 A reading that stands still is compared with the model running freely from when it last
-moved: encoders repeat themselves, but not while the mechanism moves.
+moved: encoders repeat themselves, but not while the mechanism moves.  So that what sticks
+in its friction is not taken for a broken sensor, the free model feels only what an input
+exceeds a dead band by, and starts again, at rest, after a while.  When no reading at all has
+moved for some time, the mechanism is either at rest or unseen: a small probe on the inputs
+tells which.
 """
 
 from __future__ import annotations
@@ -23,6 +27,12 @@ from undertow.runtime.settings import Settings
 
 __all__ = ["SensorWatch"]
 
+#: A model that has run freely for this long starts again, s.
+REST = 0.3
+
+#: When nothing has moved for this long a probe begins; it lasts so long, each side of it, s.
+PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
+
 _BODY = f"""
 {COMPILED}
 def roll(h, x, u, viscous, parameters, work):
@@ -40,16 +50,22 @@ def roll(h, x, u, viscous, parameters, work):
 
 
 {COMPILED}
-def believe(h, q, x, u, jump, frozen, expected, free, last, gaps, viscous, parameters, work):
+def believe(
+    h, q, x, u, band, jump, frozen, expected, free, last, gaps, ages, counts, quiet, felt,
+    viscous, parameters, work,
+):
     # What is not believable becomes NaN; returns how many are missing, the longest gap and
     # where, and which reading is frozen (-1: none).
     n = q.shape[0]
     for i in range(2 * n):
         expected[i] = x[i]
     roll(h, expected, u, viscous, parameters, work)
-    missing, worst, still = 0, 0, -1
+    for i in range(u.shape[0]):
+        felt[i] = max(0.0, u[i] - band[i]) + min(0.0, u[i] + band[i])
+    missing, worst, still, moved = 0, 0, -1, False
+    probing = quiet[0] >= {PROBE}
     for i in range(n):
-        if abs(q[i] - expected[i]) <= jump:
+        if abs(q[i] - expected[i]) <= jump + 2.0 * h * abs(expected[n + i]):
             gaps[i] = 0.0
         else:
             q[i] = math.nan
@@ -58,13 +74,26 @@ def believe(h, q, x, u, jump, frozen, expected, free, last, gaps, viscous, param
         if gaps[i] > gaps[worst]:
             worst = i
         if q[i] == last[i]:
-            roll(h, free[i], u, viscous, parameters, work)
+            roll(h, free[i], felt, viscous, parameters, work)
+            ages[i] += h
             if abs(free[i, i] - q[i]) > frozen:
                 still = i
+            if probing and i < u.shape[0] and abs(free[i, i] - q[i]) > 4.0 * counts[i]:
+                still = i
+            if ages[i] > {REST} or (quiet[0] < {PROBE} <= quiet[0] + h):
+                ages[i] = 0.0
+                for j in range(n):
+                    free[i, j] = x[j]
+                    free[i, n + j] = 0.0
+                free[i, i] = q[i]
         elif q[i] == q[i]:
+            moved = True
+            counts[i] = min(counts[i], abs(q[i] - last[i]))
+            ages[i] = 0.0
             for j in range(2 * n):
                 free[i, j] = x[j]
             free[i, i] = last[i] = q[i]
+    quiet[0] = 0.0 if moved or quiet[0] > {PROBE + PROBES} else quiet[0] + h
     return missing, worst, gaps[worst], still
 """
 
@@ -118,8 +147,13 @@ class SensorWatch:
         n = mechanism.n
         self._believe = _module(mechanism).believe
         self._q, self._last, self._gaps, self._nothing = (np.zeros(n) for _ in range(4))
-        self._expected, self._free = np.zeros(2 * n), np.zeros((n, 2 * n))
-        self._numbers = (np.zeros(n), mechanism.parameter_values, np.zeros((3, 2 * n)))
+        self._expected, self._free, self._ages = np.zeros(2 * n), np.zeros((n, 2 * n)), np.zeros(n)
+        self._quiet, self._counts = np.zeros(1), np.full(n, 0.01)
+        limits = settings.limits(mechanism)
+        self.band = np.where(np.isfinite(limits), settings.dead_band * limits, 0.0)
+        self._numbers = (
+            np.zeros(mechanism.m), np.zeros(n), mechanism.parameter_values, np.zeros((3, 2 * n)),
+        )  # fmt: skip
         self._nothing[:] = math.nan
         low, high = settings.travels(mechanism).T
         self._low, self._high = low.tolist(), high.tolist()
@@ -130,7 +164,15 @@ class SensorWatch:
         """Start afresh: the next sound reading is the first."""
         self.missing, self.first, self._known = 0, False, False
         self._rig_time, self._time, self._waited = -math.inf, 0.0, 0.0
-        self._gaps[:] = 0.0
+        self._gaps[:] = self._ages[:] = self._quiet[:] = 0.0
+
+    @property
+    def probe(self) -> float:
+        """−1, 0 or 1: what to add to the inputs, in units of twice their dead band."""
+        beyond = float(self._quiet[0]) - PROBE
+        if beyond < 0:
+            return 0.0
+        return 1.0 if int(beyond / SIDE) % 2 == 0 else -1.0
 
     def check(
         self, measurement: Measurement | None, x: FloatArray, u: FloatArray
@@ -170,8 +212,9 @@ class SensorWatch:
             return None, self._wait()
         settings = self.settings
         self.missing, worst, gap, still = self._believe(
-            self.period, self._q, x if not self.first else self._free[0], u, settings.jump,
-            settings.frozen, self._expected, self._free, self._last, self._gaps, *self._numbers,
+            self.period, self._q, self._free[0] if self.first else x, u, self.band, settings.jump,
+            settings.frozen, self._expected, self._free, self._last, self._gaps, self._ages,
+            self._counts, self._quiet, *self._numbers,
         )  # fmt: skip
         fault = ""
         if gap > settings.patience:

@@ -89,7 +89,8 @@ def session(
             columns = Columns.of(recipe.belief)
             book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
         clock = SimulatedClock() if simulated else WallClock()
-        runtime = Runtime(controller, plant, worker, clock=clock, log=book)
+        shadow = None if simulated else recipe.make_controller(memory)
+        runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=shadow)
         stack.enter_context(_operator(runtime))
         tell("ready", 1.0)
         yield runtime

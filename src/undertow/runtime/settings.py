@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -24,8 +24,10 @@ class Settings:
     slew_time
         Shortest time in which an input may cross its whole range, s: the slew rate is
         2 u_max / slew_time.  Inputs without a limit have none on their rate either.
-    lead
+    lead, longest_lead
         How far ahead proposals are computed, s: from a request to the use of its answer.
+        It starts at ``lead``, grows by half when an answer comes late, and shrinks by a tenth
+        when one comes in less than half of it.
     silence
         An optimiser that has not answered for this long after its time is replaced, s.
     surprise
@@ -34,9 +36,12 @@ class Settings:
     patience
         Longest gap in a sensor that the model bridges, s.
     jump
-        Largest believable difference between a position and its prediction, rad or m.
+        Largest believable difference between a position and its prediction, rad or m, besides
+        two periods of motion at the present speed.
     frozen
         A reading that does not move while the model has moved by this, rad or m, is frozen.
+    dead_band
+        Part of the input's limit that friction may swallow without anything moving.
     settle
         The sensors must have been sound for this long before the law takes over, s.
     near
@@ -53,11 +58,13 @@ class Settings:
     output_limit: float = math.inf
     slew_time: float = 0.004
     lead: float = 0.1
+    longest_lead: float = 0.5
     silence: float = 0.5
     surprise: float = 0.5
     patience: float = 0.02
     jump: float = 0.05
     frozen: float = 0.25
+    dead_band: float = 0.05
     settle: float = 0.02
     near: float = 0.2
     margin: float = 0.02
@@ -89,7 +96,3 @@ class Settings:
         low = [max(c.low, -self.travel) for c in mechanism.coordinates]
         high = [min(c.high, self.travel) for c in mechanism.coordinates]
         return np.column_stack([low, high])
-
-    def as_dict(self) -> dict[str, float]:
-        """All settings by name."""
-        return {name: float(value) for name, value in asdict(self).items()}

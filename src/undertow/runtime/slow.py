@@ -111,7 +111,12 @@ def respond(cascade: Cascade, request: Request) -> Answer:
     began = time.perf_counter()
     x = _predicted(cascade, request)
     memory = request.memory
-    proposal = cascade.propose(memory, x, request.use)
+    proposal: object = cascade.propose(memory, x, request.use)
+    if not isinstance(proposal, Proposal):
+        what = f"not a proposal but a {type(proposal).__name__}"
+        proposal = Proposal(
+            None, "failed", math.inf, math.inf, (), 0, 0.0, request.sequence, request.use, what
+        )
     after, admission, lanes = judge(cascade, memory, proposal, x, request.use)
     return Answer(
         request.sequence,
@@ -227,6 +232,11 @@ class BackgroundWorker:
     def __init__(self, computers: list[_Computer]) -> None:
         self.computers = computers
         self.courier = _Courier(computers[0].compute)
+
+    @property
+    def processes(self) -> list[int]:
+        """Process ids of the computers, the one that computes first."""
+        return [c.process.pid or 0 for c in self.computers if isinstance(c, _Child)]
 
     def ask(self, request: Request) -> None:
         """Hand the request over; costs some microseconds."""

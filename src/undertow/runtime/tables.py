@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
 from undertow.runtime.clock import Histogram
+from undertow.runtime.drill import Outcome
+from undertow.runtime.drill_live import Killed, LiveOutcome
 from undertow.runtime.loop import Report
 from undertow.runtime.modes import Mode
 from undertow.runtime.replay import Replay
 
-__all__ = ["replay_table", "run_table"]
+__all__ = ["drill_table", "kill_table", "replay_table", "run_table"]
 
 #: Edges of the histogram of response times, s.
 EDGES = (0.0, 50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, math.inf)
@@ -70,8 +73,11 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         part = report.missed / max(1, report.steps)
         lines.add_row(
             f"missed deadlines of {1e3 * period:g} ms",
-            f"{report.missed:,} ({part:.3%}); {report.skipped:,} periods skipped",
+            f"{report.missed:,} ({part:.3%}), {report.asleep:,} of them woken too late by the "
+            f"system; {report.skipped:,} periods skipped",
         )
+        same = "the same outputs" if not report.disagreed else f"{report.disagreed:,} other outputs"
+        lines.add_row("shadow", f"{report.shadowed:,} steps made again, {same}")
     path = " → ".join(
         text.split(":")[0].split(" → ")[-1] for _, what, text in report.events if what == "state"
     )
@@ -117,3 +123,59 @@ def replay_table(result: Replay) -> Table:
     for name, (then, now) in result.build.items():
         table.add_row("another build", f"{name} {then} then, {now} now")
     return table
+
+
+def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -> Table:
+    """Return what happened in the drill, a row a fault."""
+    table = Table("what fails", "how", "what happened", "largest |u|", "replay", "")
+    table.columns[0].no_wrap = table.columns[1].no_wrap = True
+    part = ""
+    for outcome in outcomes:
+        case = outcome.case
+        if case.part != part:
+            table.add_section()
+        table.add_row(
+            case.part if case.part != part else "",
+            case.name,
+            escape(outcome.happened),
+            f"{outcome.largest:.0%} of the limit",
+            "same bits" if outcome.replayed else "[red]differs[/red]",
+            _mark(outcome.passed),
+        )
+        part = case.part
+    table.add_section()
+    for one in live:
+        table.add_row(one.part, one.name, escape(one.happened), "", "", _mark(one.passed))
+    return table
+
+
+def kill_table(killed: Sequence[Killed]) -> Table:
+    """Return what was left of runs that were killed."""
+    table = Table(
+        "killed at, s", "steps in the log", "missing, ms", "replay", "output zero, ms", ""
+    )
+    for column in table.columns[:5]:
+        column.justify = "right"
+    for one in killed:
+        table.add_row(
+            f"{one.moment:.3f}",
+            f"{one.steps:,}",
+            f"{1e3 * one.missing:.0f}",
+            "same bits" if one.identical else "[red]differs[/red]",
+            f"{1e3 * one.to_zero:.0f}",
+            _mark(one.passed),
+        )
+    table.add_section()
+    table.add_row(
+        f"{len(killed)} runs",
+        "",
+        f"at most {1e3 * max(one.missing for one in killed):.0f}",
+        f"{sum(one.identical for one in killed)} same",
+        f"at most {1e3 * max(one.to_zero for one in killed):.0f}",
+        f"{sum(one.passed for one in killed)} of {len(killed)}",
+    )
+    return table
+
+
+def _mark(passed: bool) -> str:
+    return "[green]✓[/green]" if passed else "[red]✗[/red]"

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.cascade import Cascade
-from undertow.delay import delay_gate
+from undertow.delay import bench_gate
 from undertow.errors import InfeasibleError
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
@@ -36,8 +36,8 @@ BASE = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
 #: Weight of the state in minimum energy, V²; price of energy in minimum time, 1/V².
 STATE_WEIGHT, ENERGY_PRICE = 0.05, 0.01
 
-#: Delay that every admitted surface must bear, s.
-BEARS = 0.006
+#: What every admitted surface must bear: a delay, s, and so much less of the input.
+BEARS, RESERVE = 0.006, 0.15
 
 #: Radius of the ball in which the counting ends.
 TERMINAL = 0.05
@@ -96,7 +96,9 @@ def controllers(
     ``one-time`` is optimised once, from x0; ``cascade`` starts from there, and its
     re-optimisations may spend ``budget`` rollouts each.
     """
-    cascade = Cascade(belief, objective, warm=Budget(budget), gate=delay_gate(BEARS), seed=seed)
+    cascade = Cascade(
+        belief, objective, warm=Budget(budget), gate=bench_gate(BEARS, RESERVE), seed=seed
+    )
     start = cascade.start(x0)
     once = start[1].surface
     assert once is not None  # start() raises otherwise

@@ -22,6 +22,7 @@ __all__ = [
     "balanced",
     "bench_objective",
     "estimator_for",
+    "judge",
     "motion",
     "spread",
     "trial",
@@ -139,16 +140,23 @@ def trial(
     estimator = estimator_for(belief, bench) if estimator is None else estimator
     estimator.reset(seen)
     record = drive(rig, estimator, make(seen), seconds)
-    settled = _settled(belief, record, 0)
+    return judge(belief, record, seed, objective)
+
+
+def judge(
+    mechanism: Mechanism, record: Record, seed: int = 0, objective: Objective | None = None
+) -> Outcome:
+    """Return what came of a recorded run."""
+    settled = _settled(mechanism, record, 0)
     last = record.t[-1] - LAST
     return Outcome(
         seed=seed,
-        balanced=settled <= last,
-        caught=_settled(belief, record, belief.m) <= last,
+        balanced=bool(settled <= last),
+        caught=bool(_settled(mechanism, record, mechanism.m) <= last),
         settled=settled,
-        cost=math.nan if objective is None else _cost(belief, objective, record),
+        cost=math.nan if objective is None else _cost(mechanism, objective, record),
         effort=record.effort,
-        chatter=record.chatter / seconds,
+        chatter=record.chatter / float(record.t[-1]),
         record=record,
     )
 

@@ -1,0 +1,103 @@
+"""Starting: derivation and first compile with empty caches, then a second start.
+
+Each start is a process of its own with a cache folder of its own.  It imports the package, builds
+a mechanism from its energies and rolls its closed loop out once, which compiles the kernel.
+Printed side by side for the largest mechanisms (n = 4) and the paper's: seconds of the processor
+and of the clock, in all and for each part.  The clock counts what else the machine does; the
+processor's seconds do not.  The import of the libraries alone is the least that a start can take.
+
+    python benchmarks/start.py [--quick] [NAME ...]
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+NAMES = ("rotary_pendulum", "gantry_crane", "triple_pendulum_on_a_cart")
+
+LIBRARIES = "import numba, numpy, scipy.linalg, sympy"
+
+START = """
+import json, sys, time
+marks = [(0.0, float(sys.argv[2]))]
+def mark():
+    marks.append((time.process_time(), time.time()))
+mark()
+import undertow as ut
+mark()
+rig = ut.mechanisms.LIBRARY[sys.argv[1]]()
+mark()
+loop = ut.ClosedLoop(rig, ut.MinimumEnergy())
+loop.simulate(rig.state(**rig.start), ut.first_surface(rig), duration=0.1)
+mark()
+print(json.dumps(marks))
+"""
+
+PARTS = ("interpreter", "import", "mechanism", "kernel")
+
+#: Seconds of the processor and of the clock for each part.
+Parts = list[tuple[float, float]]
+
+
+def start(name: str, cache: str) -> Parts:
+    """Start one process and return what its parts took."""
+    environment = {**os.environ, "UNDERTOW_CACHE": cache}
+    answer = subprocess.run(
+        [sys.executable, "-c", START, name, repr(time.time())],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    marks = json.loads(answer.stdout)
+    return [(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(marks)]
+
+
+def libraries() -> tuple[float, float]:
+    """Return what importing the libraries alone takes."""
+    code = (
+        "import time; wall = time.perf_counter()\n"
+        f"{LIBRARIES}\n"
+        "print(time.process_time(), time.perf_counter() - wall)"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    processor, clock = map(float, answer.stdout.split())
+    return processor, clock
+
+
+def row(name: str, parts: Parts) -> None:
+    """Print a start: total and parts, processor beside clock."""
+    total = tuple(sum(column) for column in zip(*parts, strict=True))
+    cells = [f"{p:8.2f} {c:6.2f}" for p, c in (total, *parts)]
+    print(f"{name:40s}" + " ".join(cells), flush=True)
+
+
+def main() -> int:
+    """Run everything; ``--quick`` starts the paper's mechanism alone."""
+    words = sys.argv[1:]
+    names = [word for word in words if not word.startswith("-")]
+    chosen = names or (NAMES[:1] if "--quick" in words else NAMES)
+    heads = " ".join(f"{head:>15s}" for head in ("total", *PARTS))
+    print(f"{'s, processor and clock':40s}{heads}")
+    for name in chosen:
+        with tempfile.TemporaryDirectory() as folder:
+            cache = str(Path(folder) / "cache")
+            row(f"{name}, empty caches", start(name, cache))
+            again = [start(name, cache) for _ in range(3)]
+            row(f"{name}, second start", min(again, key=lambda parts: sum(p for p, _ in parts)))
+    processor, clock = min(libraries() for _ in range(3))
+    print(f"{'libraries alone':40s}{processor:8.2f} {clock:6.2f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,26 @@
+"""Bring-up of a rig: what is wired wrongly, how late it is, what its parameters are."""
+
+from undertow.bring_up.faults import Miswired, miswired
+from undertow.bring_up.identify import Estimate, Identification, identify
+from undertow.bring_up.motion import GuardError, Record, doublets, perform
+from undertow.bring_up.rest import rest_state
+from undertow.bring_up.wiring import Wiring, explain
+from undertow.bring_up.wizard import BringUp, Finding, bring_up
+
+__all__ = [
+    "BringUp",
+    "Estimate",
+    "Finding",
+    "GuardError",
+    "Identification",
+    "Miswired",
+    "Record",
+    "Wiring",
+    "bring_up",
+    "doublets",
+    "explain",
+    "identify",
+    "miswired",
+    "perform",
+    "rest_state",
+]

@@ -1,0 +1,124 @@
+"""What a bring-up found, for a terminal and for files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+from rich.text import Text
+
+from undertow import results
+from undertow.bring_up.identify import Identification
+from undertow.bring_up.wizard import BringUp
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.plot import figure_bytes, style
+
+__all__ = ["files", "findings_table", "parameter_table", "summary"]
+
+_STYLES = {"right": "green", "wrong": "bold red", "unclear": "yellow"}
+
+
+def findings_table(found: BringUp) -> Table:
+    """Return the checks as a table, but for parameters that are right."""
+    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
+    for head in ("check", "part", "measured", "expected", "verdict"):
+        table.add_column(head, no_wrap=True)
+    for f in found.findings:
+        if f.check != "parameter" or f.verdict != "right":
+            row = (f.check, f.part, f.measured, f.expected)
+            table.add_row(*map(Text, row), Text(f.verdict, style=_STYLES[f.verdict]))
+    return table
+
+
+def parameter_table(found: Identification) -> Table:
+    """Return the identified quantities with their 95 % intervals."""
+    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
+    heads = ("identified", "value", "95 % interval", "model", "unit", "what it is")
+    for head in heads:
+        right = head in ("value", "95 % interval", "model")
+        table.add_column(head, no_wrap=True, justify="right" if right else "left")
+    table.title = ""
+    for e in found.estimates.values():
+        digits = _digits(e.value, e.high - e.value)
+        interval = f"{e.low:.{digits}g} … {e.high:.{digits}g}"
+        nominal = f"{e.nominal:.4g}" if math.isfinite(e.nominal) else ""
+        row = (e.name, f"{e.value:.{digits}g}", interval, nominal, e.unit, e.description)
+        table.add_row(*map(Text, row))
+    return table
+
+
+def _digits(value: float, half: float) -> int:
+    """Digits that show an interval: two of its half-width, three to six in all."""
+    if not (half > 0 and value):
+        return 4
+    return int(min(6, max(3, math.floor(math.log10(abs(value) / half)) + 3)))
+
+
+def summary(found: BringUp) -> tuple[str, ...]:
+    """Return what is wrong and what to do, in lines."""
+    lines = [""]
+    identified = found.identification
+    if identified is not None and identified.held:
+        lines.append(
+            f"Held at the model's values, for the motion does not tell them apart: "
+            f"{', '.join(identified.held)}; what is identified is in proportion to them."
+        )
+    if not found.wrong:
+        lines.append("Nothing is wrong.")
+    lines += [f"Wrong: {f.check} of {f.part}: {f.measured}. {f.remedy}." for f in found.wrong]
+    return tuple(lines)
+
+
+def files(
+    request: Mapping[str, object], belief: Mechanism, rest: FloatArray, found: BringUp
+) -> dict[str, bytes]:
+    """Return ``findings.json`` and, where there was a motion, ``motion.csv`` and its picture."""
+    identified = found.identification
+    content: dict[str, object] = {
+        "what": "undertow bench",
+        "versions": results.versions(),
+        "request": dict(request),
+        "findings": [vars(f) for f in found.findings],
+        "identified": {}
+        if identified is None
+        else {
+            name: {"value": e.value, "low": e.low, "high": e.high, "unit": e.unit}
+            for name, e in identified.estimates.items()
+        },
+    }
+    written = {"findings.json": results.to_json(content)}
+    record = found.record
+    if record is not None and identified is not None:
+        names = [c.name for c in belief.coordinates]
+        head = ["t", *names, *(f"{n}_predicted" for n in names), *(i.name for i in belief.inputs)]
+        rows = np.column_stack([record.t, record.moved, identified.predicted, record.u])
+        written["motion.csv"] = results.to_csv(head, rows.tolist())
+        written["motion.png"] = _picture(belief, found)
+    return written
+
+
+def _picture(belief: Mechanism, found: BringUp) -> bytes:
+    record, identified = found.record, found.identification
+    assert record is not None  # the caller has looked
+    assert identified is not None
+    with style():
+        figure = Figure(figsize=(7.0, 1.9 * (belief.n + 1)), layout="constrained")
+        axes = figure.subplots(belief.n + 1, 1, sharex=True)
+        t = record.t - record.t[0]
+        for i, (axis, c) in enumerate(zip(axes, belief.coordinates, strict=False)):
+            factor, unit = (180 / np.pi, "°") if c.unit == "rad" else (1.0, "m")
+            axis.plot(t, factor * record.moved[:, i], lw=2.4, alpha=0.45, label="measured")
+            axis.plot(t, factor * identified.predicted[:, i], lw=1.0, label="identified model")
+            axis.set_ylabel(f"{c.name} ({unit})")
+        for j, channel in enumerate(belief.inputs):
+            axes[-1].step(t, record.u[:, j], where="post", lw=1.0, label=channel.name)
+        axes[0].legend(loc="upper right", ncols=2)
+        axes[-1].set_ylabel(f"input ({belief.inputs[0].unit})")
+        axes[-1].set_xlabel("time (s)")
+        if belief.m > 1:
+            axes[-1].legend(loc="upper right", ncols=belief.m)
+        figure.align_ylabels(axes)
+        return figure_bytes(figure)

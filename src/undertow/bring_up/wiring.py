@@ -1,0 +1,151 @@
+"""Signs and scales: what is wired the wrong way round, and the fewest faults that explain it.
+
+The response of coordinate j to input i, measured over predicted, is a number g_ij ≈ k_i c_j:
+k_i is the factor of the input, c_j that of the encoder, 1 for both where all is well.  A common
+factor of all inputs and encoders cannot be told apart; the explanation with the fewest faults
+is taken.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from undertow.mechanism import FloatArray
+from undertow.rig.interface import Measurement, Rig
+
+__all__ = ["Wiring", "explain", "known_factor"]
+
+#: A factor within this ratio of 1 is within the tolerance of parameters and friction.
+TOLERANCE = 1.45
+
+#: A response below this share of the predicted one is none.
+DEAD = 0.01
+
+#: Factors that come from a setting: name to number.
+KNOWN = {
+    "degrees for radians": 180 / np.pi,
+    "turns for radians": 1 / (2 * np.pi),
+    "a quadrature count of 4 for 1": 4.0,
+    "a quadrature count of 2 for 1": 2.0,
+    "a quadrature count of 1 for 2": 0.5,
+    "a quadrature count of 1 for 4": 0.25,
+    "radians for degrees": np.pi / 180,
+    "millimetres for metres": 1000.0,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Wiring:
+    """Factors between a rig and the model: 1 where all is well.
+
+    Attributes
+    ----------
+    inputs
+        Of each input, (m,); 0: it does nothing.
+    encoders
+        Of each encoder, (n,); 0: it never moves.
+    """
+
+    inputs: FloatArray
+    encoders: FloatArray
+
+    def corrected(self, rig: Rig) -> Corrected:
+        """Return the rig as it were with these factors undone."""
+        return Corrected(rig, self)
+
+
+@dataclass(eq=False)
+class Corrected:
+    """A rig behind a wiring that is undone in software: signs and scales as in the model."""
+
+    rig: Rig
+    wiring: Wiring
+    period: float = field(init=False)
+    _home: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        """Take the period over."""
+        self.period = self.rig.period
+
+    def _factors(self, values: FloatArray) -> FloatArray:
+        return np.where(np.abs(values) > 0, values, 1.0)
+
+    def read(self) -> Measurement:
+        """Return the measurement, relative to the first one, in the model's scale."""
+        measured = self.rig.read()
+        q = np.asarray(measured.q, dtype=float)
+        if self._home is None:
+            self._home = q.copy()
+        factors = self._factors(self.wiring.encoders)
+        v = None if measured.v is None else np.asarray(measured.v) / factors
+        return Measurement(measured.t, (q - self._home) / factors + self._home, v)
+
+    def write(self, u: FloatArray) -> None:
+        """Write the inputs in the rig's scale."""
+        self.rig.write(np.asarray(u) / self._factors(self.wiring.inputs))
+
+    def close(self) -> None:
+        """Let go of the rig."""
+        self.rig.close()
+
+
+def explain(gain: FloatArray, known: FloatArray) -> Wiring:
+    """Return the wiring with the fewest faults that explains measured gains.
+
+    Parameters
+    ----------
+    gain
+        g, (m, n): response of coordinate j to input i, measured over predicted; near 0 where
+        nothing moved that should have.
+    known
+        Whether the prediction is large enough to compare with, (m, n).
+
+    Returns
+    -------
+    Wiring
+        Factors within a ratio of 1.45 of ±1 are ±1.
+    """
+    m, n = gain.shape
+    dead = np.array([not (np.abs(gain[i][known[i]]) > DEAD).any() for i in range(m)])
+    live = known & ~dead[:, None]
+    choices = []
+    for i in range(m):
+        moved = [g for g in gain[i][live[i]].tolist() if abs(g) > DEAD]
+        choices.append([1.0] if dead[i] else [1.0, -1.0, *moved])
+    best: tuple[float, FloatArray, FloatArray] | None = None
+    for k in itertools.product(*choices):
+        encoders = np.ones(n)
+        misfit = 0.0
+        for j in range(n):
+            rows = np.flatnonzero(live[:, j])
+            if len(rows) == 0:
+                continue
+            ratios = gain[rows, j] / np.array(k)[rows]
+            c = float(np.median(ratios))
+            encoders[j] = _rounded(c) if abs(c) > DEAD else 0.0
+            misfit += float(np.abs(ratios - c).sum())
+        faults = sum(_rounded(v) != 1.0 for v in k) + int((encoders != 1.0).sum())
+        cost = faults + 0.5 * min(misfit, 1.8)
+        if best is None or cost < best[0] - 1e-9:
+            best = cost, np.array(k), encoders
+    assert best is not None  # there is one choice at least
+    inputs = np.array([_rounded(v) for v in best[1]])
+    inputs[dead] = 0.0
+    return Wiring(inputs, best[2])
+
+
+def _rounded(factor: float) -> float:
+    """Return ±1 for a factor within tolerance of it, else the factor."""
+    return math.copysign(1.0, factor) if 1 / TOLERANCE < abs(factor) < TOLERANCE else factor
+
+
+def known_factor(value: float) -> str:
+    """Return what a factor looks like, in words, where it is near a known one."""
+    for words, factor in KNOWN.items():
+        if factor / 1.2 < abs(value) < factor * 1.2:
+            return words
+    return ""

@@ -1,0 +1,78 @@
+"""Regions that a verified certificate proves, for the admission gate to use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from undertow.certify.certificate import ellipsoid_of
+from undertow.certify.ellipsoid import TerminalEllipsoid
+from undertow.certify.loop_claim import LoopClaim
+from undertow.certify.verify import Checked
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.sliding import ReachingLaw, Surface
+
+__all__ = ["ProvedEllipsoid", "ProvedStarts", "proved_sets"]
+
+
+@dataclass(frozen=True)
+class ProvedEllipsoid:
+    """A proved terminal ellipsoid of one closed loop."""
+
+    surface: Surface
+    reaching: ReachingLaw
+    ellipsoid: TerminalEllipsoid
+
+    def contains(self, x: FloatArray) -> bool:
+        """Whether the state is inside for certain."""
+        return self.ellipsoid.contains(x)
+
+
+@dataclass(frozen=True)
+class ProvedStarts:
+    """Starts at rest, one coordinate off the target by at most ``extent``, SI units."""
+
+    surface: Surface
+    reaching: ReachingLaw
+    index: int
+    extent: float
+
+    def contains(self, x: FloatArray) -> bool:
+        """Whether the state is one of them."""
+        state = np.asarray(x, dtype=float)
+        return bool(
+            abs(state[self.index]) <= self.extent and not np.delete(state, self.index).any()
+        )
+
+
+def proved_sets(
+    mechanism: Mechanism, checked: Iterable[Checked]
+) -> tuple[ProvedEllipsoid | ProvedStarts, ...]:
+    """Return the regions of the full closed loop that were proved again.
+
+    Parameters
+    ----------
+    mechanism
+        The one that they were checked for.
+    checked
+        From :func:`undertow.certify.verify.verify`; what was not proved is passed over.
+
+    Returns
+    -------
+    tuple
+        For ``certified_gate(sets=…)``.
+    """
+    names = [c.name for c in mechanism.coordinates]
+    found: list[ProvedEllipsoid | ProvedStarts] = []
+    for item in checked:
+        law = (item.subject.surface, item.subject.reaching)
+        if not item.verdict:
+            continue
+        if item.claim.kind == "terminal ellipsoid":
+            found.append(ProvedEllipsoid(*law, ellipsoid_of(item.claim.data)))
+        elif item.claim.kind == "closed loop":
+            claim = LoopClaim.from_dict(item.claim.data)
+            found.append(ProvedStarts(*law, names.index(claim.coordinate), claim.extent))
+    return tuple(found)

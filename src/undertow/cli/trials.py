@@ -1,0 +1,97 @@
+"""Controllers on realistic rigs, many seeds: tables and figures."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from undertow import results
+from undertow.cli.terminal import (
+    app,
+    examples,
+    progress_bar,
+    reports_errors,
+    say,
+    terminal,
+    write,
+)
+
+__all__ = ["trials"]
+
+
+@app.command(
+    epilog=examples(
+        "undertow trials balance --out bench",
+        "undertow trials balance --quick",
+        "undertow trials swing-up",
+        "undertow trials mujoco",
+        "undertow trials robustness --rigs 50",
+    )
+)
+@reports_errors
+def trials(
+    what: Annotated[
+        Literal["balance", "swing-up", "mujoco", "robustness", "estimators"],
+        typer.Argument(
+            help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
+            "rest to balanced. mujoco: MuJoCo as the truth, no retuning. "
+            "robustness: random rigs, and what breaks whom. estimators: the same law with each."
+        ),
+    ],
+    seeds: Annotated[int, typer.Option(help="Rigs, one for each seed.", min=1)] = 20,
+    angle: Annotated[
+        float, typer.Option(help="balance: start of the pendulum, degrees from the upright.")
+    ] = 35.0,
+    rigs: Annotated[int, typer.Option(help="robustness: random rigs.", min=1)] = 200,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A look: three rigs, no search for catch limits.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="balance: folder for balance.csv and the figures.")
+    ] = None,
+) -> None:
+    """Run controllers on realistic rigs, over and over, and print what came of it."""
+    from undertow.trials import balance as experiment
+    from undertow.trials import estimation, report, upright
+    from undertow.trials import robustness as stress
+
+    if out is not None:
+        results.check_folder(out)
+    seeds = min(seeds, 3) if quick else seeds
+    console = terminal()
+    with progress_bar() as progress:
+        if what == "balance":
+            result = experiment.balance(
+                angle=math.radians(angle), seeds=seeds, limits=not quick, progress=progress
+            )
+            shown = report.balance_report(result)
+        elif what == "swing-up":
+            names = upright.SWINGING
+            found = []
+            for i, mechanism in enumerate(upright.all_of(names)):
+                progress(mechanism.name, i / len(names))
+                found.append(upright.swing_trials(mechanism, seeds=seeds))
+            shown = report.swing_report(found, upright.SWING_SECONDS)
+        elif what == "estimators":
+            progress("estimators", 0.0)
+            shown = report.estimator_report(estimation.compared(seeds=min(seeds, 5)))
+        elif what == "robustness":
+            shown = report.robustness_report(
+                stress.robustness(
+                    rigs=min(rigs, 10) if quick else rigs,
+                    seeds=0 if quick else 5,
+                    progress=progress,
+                )
+            )
+        else:
+            runs = []
+            for i, mechanism in enumerate(upright.all_of(upright.ENGINES)):
+                progress(mechanism.name, i / len(upright.ENGINES))
+                runs.append(upright.engine_trial(mechanism))
+            shown = report.engine_report(runs)
+    console.print(shown)
+    if out is not None and what == "balance":
+        say(console, write(out, report.balance_files(result)))

@@ -1,0 +1,307 @@
+"""The list of the drill: what can go wrong, and whether the mechanism can still be held."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from undertow.mechanism import FloatArray
+from undertow.optimiser import Proposal
+from undertow.plan import Plan
+from undertow.rig.interface import Measurement
+from undertow.runtime.faults import Change, Drive, Hang, Sense, Spoil
+from undertow.runtime.slow import Answer
+from undertow.sliding import Surface
+
+__all__ = ["CASES", "Case"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault of the drill.
+
+    Parameters
+    ----------
+    part
+        What fails.
+    name
+        How.
+    holds
+        Whether the mechanism can still be held; otherwise the run must stop safely.
+    optimiser, answers, sensor, actuator, hang, estimator
+        What happens, at which seam.
+    latency
+        Of the optimiser, s.
+    push
+        Impulse on the last coordinate, N m s or N s.
+    operator, disk_full
+        The operator stops the run; the disk takes no more of the log.
+    """
+
+    part: str
+    name: str
+    holds: bool
+    optimiser: Spoil | None = None
+    answers: Callable[[], Change] | None = None
+    sensor: Callable[[], Sense] | None = None
+    actuator: Callable[[], Drive] | None = None
+    estimator: Callable[[FloatArray], FloatArray] | None = None
+    hang: Hang | None = None
+    latency: float = 0.05
+    push: float = 0.0
+    operator: bool = False
+    disk_full: bool = False
+
+
+# -- optimisers ------------------------------------------------------------------------------
+
+
+def _raises(_: Proposal) -> Proposal:
+    message = "the optimiser broke"
+    raise RuntimeError(message)
+
+
+def _with_surface(change: Callable[[Surface], Surface]) -> Spoil:
+    """Claim that a changed surface costs nothing."""
+
+    def spoil(proposal: Proposal) -> Proposal:
+        if proposal.plan is None:
+            return proposal
+        return replace(proposal, plan=Plan.of(change(proposal.plan.surfaces[0])), cost=0.0)
+
+    return spoil
+
+
+def _not_a_number(surface: Surface) -> Surface:
+    block = surface.lambda_u.copy()
+    spoilt = Surface(surface.alpha_a, surface.lambda_a, surface.alpha_u, surface.lambda_u)
+    object.__setattr__(spoilt, "lambda_u", block * math.nan)  # as a bit flip would
+    return spoilt
+
+
+def _scaled(alpha_a: float = 1, lambda_a: float = 1, alpha_u: float = 1) -> Spoil:
+    return _with_surface(
+        lambda s: Surface(
+            alpha_a * s.alpha_a, lambda_a * s.lambda_a, alpha_u * s.alpha_u, s.lambda_u
+        )
+    )
+
+
+def _wrong_shape(surface: Surface) -> Surface:
+    m, free = surface.m + 1, surface.n - surface.m
+    return Surface(-np.eye(m), -np.eye(m), np.ones((m, free)), np.ones((m, free)))
+
+
+def _nothing(proposal: Proposal) -> Proposal:
+    return replace(proposal, plan=None, status="infeasible", cost=math.inf, message="none found")
+
+
+def _text(_: Proposal) -> Any:
+    return "a surface, surely"
+
+
+# -- answers on their way ----------------------------------------------------------------------
+
+
+def _arrives(*delays: float, change: Callable[[Answer], Answer] = lambda a: a) -> Any:
+    """Each answer arrives, changed, after each of the delays, s."""
+    return lambda: lambda answer: [(delay, change(answer)) for delay in delays]
+
+
+def _old_first() -> Change:
+    """Before each answer the one before it arrives again."""
+    kept: list[Answer] = []
+
+    def change(answer: Answer) -> list[tuple[float, Answer]]:
+        kept.append(answer)
+        return [(0.001 * i, a) for i, a in enumerate(kept[-2:])]
+
+    return change
+
+
+# -- sensors -------------------------------------------------------------------------------------
+
+
+def _sensor(
+    change: Callable[[float, FloatArray], FloatArray], until: float = math.inf
+) -> Callable[[], Sense]:
+    """Change the positions of each measurement, for a while."""
+
+    def make() -> Sense:
+        def sense(t: float, m: Measurement) -> Measurement:
+            return replace(m, q=change(t, m.q.copy())) if t <= until else m
+
+        return sense
+
+    return make
+
+
+def _lost(channel: int | None = None) -> Callable[[float, FloatArray], FloatArray]:
+    def change(_: float, q: FloatArray) -> FloatArray:
+        q[slice(None) if channel is None else channel] = math.nan
+        return q
+
+    return change
+
+
+def _frozen(channel: int | None = None) -> Callable[[], Sense]:
+    def make() -> Sense:
+        kept: list[FloatArray] = []
+
+        def sense(_: float, m: Measurement) -> Measurement:
+            kept.append(m.q.copy()) if not kept else None
+            q = m.q.copy()
+            where = slice(None) if channel is None else channel
+            q[where] = kept[0][where]
+            return replace(m, q=q)
+
+        return sense
+
+    return make
+
+
+def _spikes(t: float, q: FloatArray) -> FloatArray:
+    if round(1000 * t) % 37 == 0:
+        q += 1.0
+    return q
+
+
+def _infinite(t: float, q: FloatArray) -> FloatArray:
+    if round(1000 * t) % 37 == 0:
+        q[:] = math.inf
+    return q
+
+
+def _flipped(_: float, q: FloatArray) -> FloatArray:
+    q[-1] = -q[-1]
+    return q
+
+
+def _offset(_: float, q: FloatArray) -> FloatArray:
+    q[-1] += 0.3
+    return q
+
+
+def _drift(t: float, q: FloatArray) -> FloatArray:
+    q[-1] += 2.0 * t
+    return q
+
+
+def _clock(shift: Callable[[float], float]) -> Callable[[], Sense]:
+    return lambda: lambda t, m: replace(m, t=m.t + shift(t))
+
+
+def _read_fails(until: float) -> Callable[[], Sense]:
+    def sense(t: float, m: Measurement) -> Measurement:
+        if t <= until:
+            message = "no answer from the card"
+            raise OSError(message)
+        return m
+
+    return lambda: sense
+
+
+# -- actuators -------------------------------------------------------------------------------------
+
+
+def _sticks() -> Drive:
+    kept: list[FloatArray] = []
+
+    def drive(_: float, u: FloatArray) -> FloatArray:
+        kept.append(u.copy()) if not kept else None
+        return kept[0]
+
+    return drive
+
+
+def _write_fails(until: float) -> Callable[[], Drive]:
+    def drive(t: float, u: FloatArray) -> FloatArray:
+        if t <= until:
+            message = "no answer from the card"
+            raise OSError(message)
+        return u
+
+    return lambda: drive
+
+
+def _estimator_raises(_: FloatArray) -> FloatArray:
+    message = "the estimator broke"
+    raise ZeroDivisionError(message)
+
+
+#: What can go wrong.
+CASES: tuple[Case, ...] = (
+    Case("nothing", "all is well", True),
+    Case("optimiser", "raises", True, optimiser=_raises),
+    Case("optimiser", "hangs for good", True, latency=math.inf),
+    Case("optimiser", "finds nothing", True, optimiser=_nothing),
+    Case("optimiser", "gives NaN", True, optimiser=_with_surface(_not_a_number)),
+    Case("optimiser", "gives an unstable surface", True, optimiser=_scaled(lambda_a=-1)),
+    Case("optimiser", "gives a singular surface", True, optimiser=_scaled(alpha_u=1e-3)),
+    Case("optimiser", "gives huge parameters", True, optimiser=_scaled(lambda_a=1e9)),
+    Case("optimiser", "gives the wrong shape", True, optimiser=_with_surface(_wrong_shape)),
+    Case("optimiser", "gives a text", True, optimiser=_text),
+    Case("answer", "late by 80 ms", True, answers=_arrives(0.08)),
+    Case("answer", "late by 3 s", True, answers=_arrives(3.0)),
+    Case("answer", "twice", True, answers=_arrives(0.0, 0.001)),
+    Case("answer", "out of order", True, answers=_old_first),
+    Case(
+        "answer", "numbered ahead", True,
+        answers=_arrives(0.0, change=lambda a: replace(a, sequence=a.sequence + 5)),
+    ),
+    Case(
+        "answer", "for another state", True,
+        answers=_arrives(0.0, change=lambda a: replace(a, x=a.x + 2.0)),
+    ),
+    Case(
+        "answer", "numbers turned to NaN", True,
+        answers=_arrives(0.0, change=lambda a: replace(a, lanes=a.lanes * math.nan)),
+    ),
+    Case(
+        "answer", "cut short", True,
+        answers=_arrives(0.0, change=lambda a: replace(a, lanes=a.lanes[:, 1:])),
+    ),
+    Case("sensor", "drops out for 10 ms", True, sensor=_sensor(_lost(), 0.01)),
+    Case("sensor", "one channel out for 10 ms", True, sensor=_sensor(_lost(-1), 0.01)),
+    Case("sensor", "lost for good", False, sensor=_sensor(_lost())),
+    Case("sensor", "one channel lost for good", False, sensor=_sensor(_lost(-1))),
+    Case("sensor", "all channels freeze", False, sensor=_frozen()),
+    Case("sensor", "one channel freezes", False, sensor=_frozen(-1)),
+    Case("sensor", "spikes of 1 rad", True, sensor=_sensor(_spikes)),
+    Case("sensor", "infinite now and then", True, sensor=_sensor(_infinite)),
+    Case("sensor", "sign swapped", False, sensor=_sensor(_flipped)),
+    Case("sensor", "jumps by 0.3 rad for good", False, sensor=_sensor(_offset)),
+    Case("sensor", "drifts by 2 rad/s", False, sensor=_sensor(_drift)),
+    Case("sensor", "clock goes back once", True, sensor=_clock(lambda _: -5.0)),
+    Case("sensor", "clock runs backwards", False, sensor=_clock(lambda t: -2.0 * t)),
+    Case("sensor", "clock stands still", False, sensor=_clock(lambda t: -t)),
+    Case(
+        "actuator", "gives 75 % of what is asked", True,
+        actuator=lambda: lambda _, u: 0.75 * u,
+    ),
+    Case(
+        # Below the gain margin of the surface: an unstable mechanism needs a least gain.
+        "actuator", "gives 40 % of what is asked", False,
+        actuator=lambda: lambda _, u: 0.4 * u,
+    ),
+    Case("actuator", "saturates at 3", True, actuator=lambda: lambda _, u: np.clip(u, -3, 3)),
+    Case("actuator", "dies", False, actuator=lambda: lambda _, u: 0.0 * u),
+    Case("actuator", "sign swapped", False, actuator=lambda: lambda _, u: -u),
+    Case("actuator", "sticks", False, actuator=_sticks),
+    Case("rig", "fails to read for 10 ms", True, sensor=_read_fails(0.01)),
+    Case("rig", "fails to read for good", False, sensor=_read_fails(math.inf)),
+    Case("rig", "fails to write for 10 ms", True, actuator=_write_fails(0.01)),
+    Case("rig", "fails to write for good", False, actuator=_write_fails(math.inf)),
+    Case("rig", "hangs for 0.3 s", False, hang=Hang(0.3)),
+    Case("rig", "is pushed", True, push=0.01),
+    Case("rig", "is knocked over", False, push=0.08),
+    Case("loop", "one step takes 10 ms", True, hang=Hang(0.01)),
+    Case("loop", "estimator raises", False, estimator=_estimator_raises),
+    Case("loop", "estimate is NaN", False, estimator=lambda x: x * math.nan),
+    Case("log", "disk full", True, disk_full=True),
+    Case("operator", "stops the run", False, operator=True),
+)  # fmt: skip

@@ -1,0 +1,253 @@
+"""The part of the drill that needs real time: processes that hang or die, calls that block."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import os
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from undertow.errors import ArtefactError
+from undertow.mechanism import FloatArray
+from undertow.rig.interface import Measurement, Rig
+from undertow.runtime.drill import drill_recipe
+from undertow.runtime.faults import Witness
+from undertow.runtime.keeper import KeptRig
+from undertow.runtime.log import read_log
+from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.recipe import Recipe
+from undertow.runtime.replay import replay
+from undertow.runtime.session import session
+from undertow.runtime.slow import BackgroundWorker
+
+__all__ = ["LIVE", "Killed", "LiveOutcome", "kill_drill", "kill_run", "live_drill"]
+
+
+@dataclass(frozen=True)
+class LiveOutcome:
+    """What happened in one run against the clock: what fails, how, what happened, verdict."""
+
+    part: str
+    name: str
+    happened: str
+    passed: bool
+
+
+class _Blocking:
+    """A rig whose read does not return for a while."""
+
+    def __init__(self, rig: Rig, since: float, seconds: float) -> None:
+        self.rig, self.period, self.seconds = rig, rig.period, seconds
+        self.left, self.let_go = round(since / rig.period), 0.0
+        self.blocked = 0.0
+
+    def read(self) -> Measurement:
+        self.left -= 1
+        if self.left == 0:
+            self.blocked = time.perf_counter()
+            time.sleep(self.seconds)
+        return self.rig.read()
+
+    def write(self, u: FloatArray) -> None:
+        self.rig.write(u)
+
+    def close(self) -> None:
+        self.let_go = self.let_go or time.perf_counter()
+        self.rig.close()
+
+
+def _children(runtime: Runtime) -> list[int]:
+    worker = runtime.worker
+    assert isinstance(worker, BackgroundWorker)
+    return worker.processes
+
+
+def _hurt_optimiser(number: signal.Signals) -> tuple[Report, Witness]:
+    """Send a signal to the process that optimises, half a second into a run."""
+    recipe = drill_recipe()
+    rig = recipe.make_rig()
+    limits = recipe.settings.limits(recipe.belief)
+    witness = Witness(rig, limits, recipe.settings.slew(recipe.belief) * recipe.period)
+    with session(recipe, rig=witness, processes=2) as runtime:
+        (victim, *_) = _children(runtime)
+        timer = threading.Timer(0.5, os.kill, (victim, number))
+        timer.start()
+        return runtime.run(2.5), witness
+
+
+def _optimiser(number: signal.Signals) -> LiveOutcome:
+    report, witness = _hurt_optimiser(number)
+    gave_up = report.answers["never came"]
+    later = [t for t, _, text in report.events if "applied" in text and t > 1.3]
+    held = report.stopped_by == "operator: stop" and not witness.faults
+    happened = (
+        f"{'held to the end' if held else report.stopped_by}; {gave_up} never came, the one "
+        f"standing by gave {len(later)} more"
+    )
+    name = "process killed" if number == signal.SIGKILL else "process stands still"
+    return LiveOutcome("optimiser", name, happened, held and gave_up == 1 and len(later) > 0)
+
+
+def _blocking_read() -> LiveOutcome:
+    recipe = drill_recipe()
+    rig = _Blocking(recipe.make_rig(), 0.5, 1.0)
+    with session(recipe, rig=rig, processes=1) as runtime:
+        report = runtime.run(2.0)
+    after = rig.let_go - rig.blocked
+    happened = f"{report.stopped_by}; the rig was let go of after {1e3 * after:.0f} ms"
+    return LiveOutcome("rig", "a read blocks for 1 s", happened, 0 < after < 0.5)
+
+
+def _unwritable_log() -> LiveOutcome:
+    recipe = drill_recipe()
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "file"
+        place.write_text("not a folder")
+        try:
+            with session(recipe, log=place / "run.db", simulated=True):
+                return LiveOutcome("log", "cannot be made", "the run began", False)
+        except ArtefactError as error:
+            return LiveOutcome("log", "cannot be made", f"refused before the run: {error}", True)
+
+
+@dataclass(frozen=True)
+class Killed:
+    """What was left of a run whose controller was killed.
+
+    Attributes
+    ----------
+    moment
+        When it was killed, s after its first step.
+    steps
+        Steps in the log.
+    missing
+        Time from the last step in the log to the kill, s.
+    identical
+        Whether the log's replay is identical, bit for bit.
+    to_zero
+        Time from the last output of the controller until the keeper had brought it to zero, s.
+    """
+
+    moment: float
+    steps: int
+    missing: float
+    identical: bool
+    to_zero: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether at most 0.1 s is missing, the replay identical, and the output at zero soon."""
+        return self.missing <= 0.1 and self.identical and self.to_zero <= 0.1
+
+
+def _victim(recipe: Recipe, log: Path, record: Path) -> None:
+    limits = recipe.settings.limits(recipe.belief)
+    slew = recipe.settings.slew(recipe.belief) * recipe.period
+    rig = KeptRig(recipe.make_rig, recipe.period, limits, slew, record=record)
+    with session(recipe, rig=rig, log=log, processes=1) as runtime:
+        runtime.run(60.0)
+
+
+def kill_run(recipe: Recipe, moment: float, folder: Path) -> Killed:
+    """Run a controller in a process of its own, its rig kept by another, and kill it.
+
+    Parameters
+    ----------
+    recipe
+        The run; compiled already, so that its process starts at once.
+    moment
+        When to kill it, s after its log has its first line.
+    folder
+        For the log and the keeper's record.
+    """
+    log, record = folder / "killed.db", folder / "keeper.json"
+    context = multiprocessing.get_context("fork")
+    victim = context.Process(target=_victim, args=(recipe, log, record))
+    victim.start()
+    assert victim.pid is not None  # it has just been started
+    first = _first_line(log)
+    time.sleep(max(0.0, first + moment - time.perf_counter()))
+    os.kill(victim.pid, signal.SIGKILL)
+    killed = time.perf_counter()
+    victim.join()
+    recording = read_log(log)
+    last = float(recording["clock"][-1])
+    deadline = time.perf_counter() + 5.0
+    while not record.exists() and time.perf_counter() < deadline:
+        time.sleep(0.01)
+    time.sleep(0.01)
+    facts = json.loads(record.read_text())
+    return Killed(
+        killed - float(recording["clock"][0]),
+        len(recording.steps),
+        killed - last,
+        replay(log).identical,
+        facts["zero"] - facts["heard"] if not any(facts["u"]) else float("inf"),
+    )
+
+
+def _first_line(log: Path, patience: float = 120.0) -> float:
+    """Wait until the log has its first step; return when that was made, s."""
+    deadline = time.perf_counter() + patience
+    while time.perf_counter() < deadline:
+        with contextlib.suppress(ArtefactError):
+            recording = read_log(log)
+            if len(recording.steps):
+                return float(recording["clock"][0])
+        time.sleep(0.02)
+    raise ArtefactError(f"log '{log}'", value="no step within two minutes")
+
+
+def _process_killed() -> LiveOutcome:
+    with tempfile.TemporaryDirectory() as folder:
+        killed = kill_run(drill_recipe(), 0.7, Path(folder))
+    happened = (
+        f"killed at {killed.moment:.2f} s: the keeper had the output at zero "
+        f"{1e3 * killed.to_zero:.0f} ms after the last one; the log misses "
+        f"{1e3 * killed.missing:.0f} ms; replay {'identical' if killed.identical else 'differs'}"
+    )
+    return LiveOutcome("process", "controller killed", happened, killed.passed)
+
+
+def kill_drill(
+    count: int, *, seed: int = 0, progress: Callable[[str, float], None] | None = None
+) -> tuple[Killed, ...]:
+    """Kill ``count`` runs at random moments of their first two seconds."""
+    recipe, rng = drill_recipe(seed), np.random.default_rng(seed)
+    recipe.cascade.start(recipe.x0)  # what the runs share is compiled once
+    killed = []
+    for number, moment in enumerate(rng.uniform(0.0, 2.0, count)):
+        if progress is not None:
+            progress(f"kill {number + 1} of {count}, at {moment:.2f} s", number / count)
+        with tempfile.TemporaryDirectory() as folder:
+            killed.append(kill_run(recipe, float(moment), Path(folder)))
+    return tuple(killed)
+
+
+#: The live part of the drill.
+LIVE: tuple[tuple[str, Callable[[], LiveOutcome]], ...] = (
+    ("optimiser: process killed", lambda: _optimiser(signal.SIGKILL)),
+    ("optimiser: process stands still", lambda: _optimiser(signal.SIGSTOP)),
+    ("rig: a read blocks", _blocking_read),
+    ("log: cannot be made", _unwritable_log),
+    ("process: controller killed", _process_killed),
+)
+
+
+def live_drill(progress: Callable[[str, float], None] | None = None) -> tuple[LiveOutcome, ...]:
+    """Run the live part of the drill."""
+    outcomes = []
+    for number, (name, run) in enumerate(LIVE):
+        if progress is not None:
+            progress(name, number / len(LIVE))
+        outcomes.append(run())
+    return tuple(outcomes)

@@ -1,0 +1,128 @@
+"""What people see of proofs: tables, pictures, the log of a run's decisions."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow import report
+from undertow.certification import (
+    appendix_report,
+    certify_appendix,
+    certify_run,
+    figure,
+    region_figure,
+    run_report,
+)
+from undertow.certify.gate import Policy, certified_gate
+from undertow.certify.lyapunov import LyapunovFunction
+from undertow.certify.motion import SurfaceMotion
+from undertow.certify.region_search import ProvedRegion
+from undertow.cli import app
+from undertow.verdict import Verdict
+
+pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+
+RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
+GOOD = ut.Surface(-1, -1.59, 1.96, 12.1)
+GOAL = ut.MinimumTime(horizon=20.0)
+
+
+def text(shown: Any) -> str:
+    console = Console(width=150, record=True, file=io.StringIO())
+    console.print(shown)
+    return console.export_text()
+
+
+@pytest.fixture(scope="module")
+def run() -> ut.Run:
+    """A short cascade whose gate asks for evidence."""
+    gate = certified_gate(Policy(("region", "dual")))
+    cascade = ut.Cascade(RIG, GOAL, gate=gate, first=GOOD, cold=ut.Budget(64), warm=ut.Budget(32))
+    return cascade.simulate(phi=0.2)
+
+
+def test_the_log_of_a_run_has_a_verdict_for_each_decision(run: ut.Run) -> None:
+    files = report.motion_files({}, run.trajectory, run.cost, run.surfaces, run)
+    decisions = json.loads(files["manifest.json"])["decisions"]
+    assert len(decisions) == len(run.updates)
+    for decision, update in zip(decisions, run.updates, strict=True):
+        assert decision["reason"] == update.admission.reason
+        assert decision["verdict"]["kind"] in ("proved", "sampled", "undecided")
+        assert decision["surface"] == update.surface.vector.tolist()
+    assert decisions[-1]["verdict"]["evidence"] in ("region", "dual")
+    start = RIG.state(phi=0.2)
+    shown = text(report.motion_report(RIG, GOAL, start, run.trajectory, run.surfaces[0], run))
+    assert "evidence" in shown
+    assert "predicted into a proved set" in shown
+
+
+def test_a_run_is_shown_decision_by_decision(run: ut.Run) -> None:
+    shown = text(run_report(run))
+    assert f"{len(run.updates)} decisions" in shown
+    assert "dual, sampled" in shown
+    assert "Lemma 3" in shown
+    bare = replace(run, updates=tuple(
+        replace(u, admission=replace(u.admission, verdict=None)) for u in run.updates
+    ))  # fmt: skip
+    assert "without accepted evidence" in text(run_report(bare))
+
+
+def test_each_surface_of_a_run_is_certified(run: ut.Run) -> None:
+    certified = certify_run(RIG, run)
+    assert [c.subject.surface for c in certified] == list(dict.fromkeys(run.surfaces))
+    for item in certified:
+        assert {"stability"} <= {claim.kind for claim in item.subject.claims}
+
+
+def test_the_papers_cases_at_once() -> None:
+    cases = certify_appendix(ut.mechanisms.rotary_pendulum())
+    shown = text(appendix_report(cases))
+    assert shown.count("proved,") == 10
+    assert "0.5481 1/s" in shown  # the rate of docs/appendix.md
+
+
+def region() -> ProvedRegion:
+    """A round set, small enough to be one of attraction."""
+    import scipy.linalg
+
+    motion = SurfaceMotion(RIG, GOOD)
+    P = scipy.linalg.solve_continuous_lyapunov(motion.jacobian.T, -np.diag([30.0, 0.3, 3.0]))
+    squares = np.array([[2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0], [0, 1, 1], [0, 0, 2]])
+    values = [P[0, 0], 2 * P[0, 1], 2 * P[0, 2], P[1, 1], 2 * P[1, 2], P[2, 2]]
+    V = LyapunovFunction(np.eye(3), squares, np.array(values) / 0.02)
+    return ProvedRegion(motion, V, Verdict("a region", "proved"), 0.02)
+
+
+def test_the_simulated_region_is_the_non_singular_strip() -> None:
+    """Between the singular angles, ±58.0°, all slow motions come home; beyond, none."""
+    angles = np.array([-1.1, -1.0, -0.5, 0.0, 0.5, 1.0, 1.1])
+    y = np.zeros((7, 3))
+    y[:, 0] = angles
+    home = figure.simulated(region(), y)
+    assert home.tolist() == [False, True, True, True, True, True, False]
+
+
+def test_the_picture_names_its_axes_in_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figure, "GRID", 9)
+    drawn = region_figure(region(), "a title")
+    left, right = drawn.axes
+    assert left.get_xlabel() == "φ (°)"
+    assert "°/s" in left.get_ylabel()
+    assert right.get_ylabel().startswith("w = θ")
+    assert len(drawn.legends) == 1
+
+
+def test_unknown_evidence_is_refused() -> None:
+    words = ["simulate", "rotary_pendulum", "--start", "phi=5deg", "--accept", "faith"]
+    answer = CliRunner().invoke(app, words)
+    assert answer.exit_code == 2
+    assert "faith" in answer.output

@@ -1,0 +1,438 @@
+"""Certificate files: proved again from the file alone; what is damaged or untrue is refused."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow.certification import certificate_files, certify_surface, mechanism_from_file
+from undertow.certify.certificate import (
+    LARGEST,
+    Certificate,
+    Claim,
+    Subject,
+    _checksum,
+    function_data,
+    read_certificate,
+)
+from undertow.certify.gate import Policy, assess
+from undertow.certify.lyapunov import LyapunovFunction
+from undertow.certify.sets import ProvedStarts, proved_sets
+from undertow.certify.verify import reaches, verify
+from undertow.cli import app
+from undertow.errors import ArtefactError, CertificateError, InvalidInputError
+from undertow.plan import Plan
+from undertow.verdict import Verdict
+
+pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+
+RIG = ut.mechanisms.rotary_pendulum()
+SURFACE = ut.Surface(-1, -1.59, 1.96, 12.1)
+#: V of the sliding dynamics, rounded, and a level at which it is proved in a second.
+P = np.array([[30.0, 3.0, -3.0], [3.0, 0.8, 0.4], [-3.0, 0.4, 3.0]])
+SQUARES = np.array([[2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0], [0, 1, 1], [0, 0, 2]])
+
+
+def quadratic(matrix: np.ndarray, level: float) -> LyapunovFunction:
+    values = [matrix[0, 0], 2 * matrix[0, 1], 2 * matrix[0, 2]]
+    values += [matrix[1, 1], 2 * matrix[1, 2], matrix[2, 2]]
+    return LyapunovFunction(np.eye(3), SQUARES, np.array(values) / level)
+
+
+def lyapunov_matrix() -> np.ndarray:
+    """P of the linear sliding dynamics in y = (φ, φ̇, w)."""
+    import scipy.linalg
+
+    from undertow.certify.motion import SurfaceMotion
+
+    A = SurfaceMotion(RIG, SURFACE).jacobian
+    return np.asarray(scipy.linalg.solve_continuous_lyapunov(A.T, -np.diag([30.0, 0.3, 3.0])))
+
+
+def region_claim(level: float, start: float) -> Claim:
+    data = {"function": function_data(quadratic(lyapunov_matrix(), level)), "start": [start, 0, 0]}
+    return Claim("surface region", data, Verdict("a region", "proved", start * (1 - 1e-12), "rad"))
+
+
+@pytest.fixture(scope="module")
+def written() -> bytes:
+    """A certificate with one claim of each kind that is quick."""
+    x0 = RIG.state(phi=0.5)
+    one = certify_surface(RIG, SURFACE, x0, seconds=0.0, predict=False)
+    claims = (*one.subject.claims, region_claim(0.02, 0.01))
+    remark = Verdict("the motion from 30° arrives", "sampled", 0.4)
+    subject = Subject(SURFACE, ut.ReachingLaw(), claims, (remark,))
+    return Certificate.of(RIG, [subject], {"undertow": "test", "sympy": sp.__version__}).to_bytes()
+
+
+Edit = Callable[[dict[str, Any]], Any]
+
+
+def edited(content: bytes, edit: Edit, *, signed: bool = True) -> bytes:
+    """The file after a change, with a checksum that fits again if ``signed``."""
+    document = json.loads(content)
+    edit(document)
+    if signed:
+        document["checksum"] = _checksum(document)
+    return json.dumps(document).encode()
+
+
+def claims_of(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
+    return [c for c in document["subjects"][0]["claims"] if c["kind"] == kind]
+
+
+def test_all_claims_are_proved_again(written: bytes) -> None:
+    certificate = Certificate.from_bytes(written)
+    assert certificate.to_bytes() == written
+    checked = verify(certificate, RIG)
+    kinds = {item.claim.kind for item in checked}
+    assert kinds >= {
+        "stability", "terminal ellipsoid", "nonsingular", "reaching", "surface region"
+    }  # fmt: skip
+    assert [item.verdict.kind for item in checked] == ["proved"] * len(checked)
+    assert len(certificate.subjects[0].remarks) == 1
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "cut off": lambda c: c[: len(c) // 2],
+    "a digit": lambda c: c.replace(b"12.1", b"12.2", 1),
+    "a word": lambda c: c.replace(b'"proved"', b'"PROVED"', 1),
+    "a parameter": lambda c: c.replace(b'"m": 0.125', b'"m": 0.126', 1),
+    "NaN": lambda c: c.replace(b"12.1", b"NaN", 1),
+    "infinity": lambda c: c.replace(b"12.1", b"1e999", 1),
+    "a repeated key": lambda c: c.replace(b'"version": 1', b'"version": 1, "version": 1', 1),
+    "no text": lambda c: b"\xff\xfe" + c,
+    "no object": lambda c: b"[1, 2]",
+    "nothing": lambda c: b"",
+    "endless nesting": lambda c: b"[" * 200_000,
+    "an endless number": lambda c: c.replace(b"12.1", b"9" * 5000, 1),
+    "too large": lambda c: b" " * (LARGEST + 1),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_or_edited_file_is_refused(written: bytes, name: str) -> None:
+    content = DAMAGES[name](written)
+    assert content != written
+    with pytest.raises(CertificateError, match="certificate"):
+        Certificate.from_bytes(content)
+
+
+FORGERIES: dict[str, tuple[Edit, str]] = {
+    "another format": (lambda d: d.update(format="proof"), "format"),
+    "a later version": (lambda d: d.update(version=2), "version 2"),
+    "an unknown claim": (lambda d: claims_of(d, "stability")[0].update(kind="magic"), "magic"),
+    "no claim": (lambda d: d["subjects"][0].update(claims=[]), "no claim"),
+    "a missing part": (lambda d: d["subjects"][0].pop("reaching"), "complete"),
+    "another shape": (
+        lambda d: d["subjects"][0]["surface"].update(alpha_u=[[1.0, 2.0]]), "shape"
+    ),
+    "a kind of verdict": (
+        lambda d: claims_of(d, "stability")[0]["verdict"].update(kind="certain"), "certain"
+    ),
+    "a negative layer": (lambda d: d["subjects"][0]["reaching"].update(layer=[-1.0]), "layer"),
+    "a huge exponent": (
+        lambda d: claims_of(d, "surface region")[0]["data"]["function"].update(
+            exponents=[[200, 0, 0]] * 6
+        ),
+        "24",
+    ),
+    "an ellipsoid of another size": (
+        lambda d: claims_of(d, "terminal ellipsoid")[0]["data"].update(W=[[1.0]]), "shape"
+    ),
+    "an unknown coordinate": (
+        lambda d: claims_of(d, "nonsingular")[0]["data"].update(region={"psi": [-1, 1]}), "psi"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_file_that_was_signed_again_but_means_nothing_is_refused(
+    written: bytes, name: str
+) -> None:
+    edit, words = FORGERIES[name]
+    with pytest.raises(CertificateError, match=words):
+        verify(Certificate.from_bytes(edited(written, edit)), RIG)
+
+
+def only(kind: str) -> Edit:
+    def keep(document: dict[str, Any]) -> None:
+        document["subjects"][0]["claims"] = claims_of(document, kind)
+
+    return keep
+
+
+def verdict_after(content: bytes, kind: str, edit: Edit) -> Verdict:
+    """The verdict on the first claim of a kind, after a change and with a fresh checksum."""
+
+    def both(document: dict[str, Any]) -> None:
+        only(kind)(document)
+        edit(document)
+
+    return verify(Certificate.from_bytes(edited(content, both)), RIG)[0].verdict
+
+
+def test_untrue_claims_meet_the_proof(written: bytes) -> None:
+    """A forger may sign what he likes; each trap fails as it should."""
+
+    def data(document: dict[str, Any]) -> dict[str, Any]:
+        found: dict[str, Any] = document["subjects"][0]["claims"][0]["data"]
+        return found
+
+    # A K that is too small for the stated disturbance.
+    weak = verdict_after(written, "reaching", lambda d: data(d).update(disturbance=[0.12, 0.0]))
+    assert weak.kind == "refuted"
+    # A box that holds a singular position.
+    wide = verdict_after(
+        written, "nonsingular", lambda d: data(d).update(region={"phi": [-1.1, 1.1]})
+    )
+    assert wide.kind == "refuted"
+    assert abs(wide.witness["phi"]) > 1.0
+
+    # A repeated zero eigenvalue, and an unstable surface.
+    def other(value: float) -> Edit:
+        return lambda d: d["subjects"][0]["surface"].update(lambda_a=[[value]])
+
+    for value in (0.0, 1.59):
+        assert verdict_after(written, "stability", other(value)).kind == "refuted"
+    # A terminal ellipsoid half as large again; a margin that is overstated.
+    larger = verdict_after(
+        written, "terminal ellipsoid", lambda d: data(d).update(radius=1.5 * data(d)["radius"])
+    )
+    assert larger.kind == "undecided"
+
+    def boast(document: dict[str, Any]) -> None:
+        document["subjects"][0]["claims"][0]["verdict"]["margin"] = 50.0
+
+    assert "states a margin of 50" in verdict_after(written, "stability", boast).method
+
+
+def test_untrue_regions_meet_the_proof(written: bytes) -> None:
+    """A level too high, across the singularity, or without bound; a start that is outside."""
+
+    def function(matrix: np.ndarray, level: float, start: float = 0.01) -> Verdict:
+        data = function_data(quadratic(matrix, level))
+
+        def edit(document: dict[str, Any]) -> None:
+            document["subjects"][0]["claims"][0]["data"] = {
+                "function": data, "start": [start, 0, 0]
+            }  # fmt: skip
+
+        return verdict_after(written, "surface region", edit)
+
+    good = lyapunov_matrix()
+    assert function(good, 0.02).kind == "proved"
+    high = function(good, 20.0)
+    assert high.kind == "refuted"
+    assert high.witness
+    assert function(np.diag([1.0, 1.0, 1.0]), 1.5).kind != "proved"  # beyond arccos ε
+    assert function(np.diag([1.0, 1.0, 0.0]), 0.01).kind == "undecided"
+    assert "start" in function(good, 0.02, start=0.5).method
+
+
+def test_reaching_a_point_is_proved_in_intervals() -> None:
+    V = quadratic(np.diag([4.0, 1.0, 1.0]), 1.0)
+    assert reaches(V, [0.4999, 0.0, 0.0])
+    assert not reaches(V, [0.5001, 0.0, 0.0])
+    assert not reaches(V, [0.1, 0.1])
+    # {V ≤ 1} again beyond a ridge is another component.
+    ridge = LyapunovFunction(np.eye(1), np.array([[2], [4], [6]]), np.array([4.0, -4.4, 1.21]))
+    assert float(ridge([1.35])) < 1 < float(ridge([0.7]))
+    assert not reaches(ridge, [1.35])
+
+
+def test_another_model_is_refused(written: bytes) -> None:
+    """Another mechanism, other equations under the same name, a parameter, an input limit."""
+    certificate = Certificate.from_bytes(written)
+    cart = ut.mechanisms.cart_pendulum()
+    with pytest.raises(CertificateError, match="another mechanism"):
+        verify(certificate, cart)
+    pushed = RIG.disturbed({"phi": sp.Rational(1, 1000) * RIG.x[1]})
+    with pytest.raises(CertificateError, match="equations"):
+        verify(certificate, pushed)
+    heavier = RIG.with_parameters(m=0.13)
+    with pytest.raises(CertificateError, match=r"parameter 'm'.*0\.13.*0\.125"):
+        verify(certificate, heavier, own_parameters=True)
+    with pytest.raises(CertificateError, match="input limits"):
+        verify(certificate, RIG.with_input_limit(10.0))
+    # By name alone the file's parameters count, and the proof is about them.
+    checked = verify(Certificate.from_bytes(edited(written, only("stability"))), heavier)
+    assert checked[0].verdict
+
+
+def test_a_parameter_changed_and_signed_again_meets_the_proof(written: bytes) -> None:
+    """With another length the old numbers are another claim: decided, not believed."""
+
+    def longer(document: dict[str, Any]) -> None:
+        only("stability")(document)
+        document["mechanism"]["parameters"]["l"] = 0.4
+
+    verdict = verify(Certificate.from_bytes(edited(written, longer)), RIG)[0].verdict
+    assert verdict.kind != "proved" or verdict.margin != pytest.approx(3.716, abs=1e-3)
+    broken = edited(written, lambda d: d["mechanism"]["parameters"].update(m=-1.0))
+    with pytest.raises(CertificateError, match="parameters of a certificate"):
+        verify(Certificate.from_bytes(broken), RIG)
+
+
+def test_a_verified_certificate_serves_the_gate(written: bytes) -> None:
+    """Its ellipsoid is evidence for its own surface, and only what was proved again counts."""
+    checked = verify(Certificate.from_bytes(edited(written, only("terminal ellipsoid"))), RIG)
+    sets = proved_sets(RIG, checked)
+    assert len(sets) == 1
+    x = 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
+    assert sets[0].contains(x)
+    assert not sets[0].contains(RIG.state(phi=0.3))
+    verdict = assess(ut.ClosedLoop(RIG), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    assert "proved before" in verdict.method
+    doubtful = [replace(item, verdict=Verdict("x", "undecided")) for item in checked]
+    assert proved_sets(RIG, doubtful) == ()
+
+
+def test_starts_at_rest_are_a_set() -> None:
+    starts = ProvedStarts(SURFACE, ut.ReachingLaw(), 1, 0.3)
+    assert starts.contains(RIG.state(phi=-0.3))
+    assert not starts.contains(RIG.state(phi=0.31))
+    assert not starts.contains(RIG.state(phi=0.1, phi_dot=1e-9))
+
+
+def test_only_proofs_become_claims() -> None:
+    claim = Claim("stability", {}, Verdict("x", "sampled", 1.0))
+    with pytest.raises(CertificateError, match="proved"):
+        Certificate.of(RIG, [Subject(SURFACE, ut.ReachingLaw(), (claim,))])
+
+
+def test_unreadable_and_huge_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="certificate"):
+        read_certificate(tmp_path / "nothing.json")
+    huge = tmp_path / "huge.json"
+    with huge.open("wb") as file:
+        file.truncate(LARGEST + 1)
+    with pytest.raises(CertificateError, match="at most"):
+        read_certificate(huge)
+
+
+# -- independence ------------------------------------------------------------------------------
+
+
+def imports_of(module: str) -> set[str]:
+    """Modules that a module's own text imports, wherever in it."""
+    spec = importlib.util.find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    found = set()
+    for node in ast.walk(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {node.module} | {n for n in names if _is_module(n)}
+    return found
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return name.startswith("undertow") and importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def test_the_verifier_shares_nothing_with_the_searches() -> None:
+    """All that it reaches: no search, no linear program, no semidefinite or other optimiser."""
+    todo, seen = ["undertow.certify.verify"], set[str]()
+    while todo:
+        module = todo.pop()
+        if module in seen:
+            continue
+        seen.add(module)
+        # Package files that only collect names are not what is used of a package.
+        if module.split(".")[0] == "undertow" and module not in (
+            "undertow", "undertow.certify", "undertow.modelling", "undertow.mechanisms"
+        ):  # fmt: skip
+            todo += imports_of(module)
+    ours = {name for name in seen if name.startswith("undertow")}
+    assert "undertow.certify.region" in ours
+    assert not [n for n in ours if "search" in n or "optimis" in n or "linear_program" in n]
+    foreign = seen - ours
+    assert not [n for n in foreign if n.split(".")[0] in ("clarabel", "cvxpy", "cmaes", "casadi")]
+    assert not [n for n in foreign if n.startswith(("scipy.optimize", "scipy.stats"))]
+
+
+# -- the command line --------------------------------------------------------------------------
+
+
+OWN = """
+import undertow as ut
+
+def make():
+    return ut.mechanisms.rotary_pendulum().with_parameters(m={m})
+
+number = 3
+"""
+
+
+def test_certify_and_verify_from_the_command_line(tmp_path: Path) -> None:
+    """0 for proved, 1 for a file that is not, 2 for a wrong request; own mechanisms too."""
+    run = CliRunner().invoke
+    out = tmp_path / "proof"
+    words = ["certify", "rotary_pendulum", "--start", "phi=20deg", "--seconds", "0"]
+    surface = ["--surface", "lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1"]
+    answer = run(app, [*words, *surface, "--out", str(out)])
+    assert answer.exit_code == 0, answer.output
+    assert "disturbance on theta" in answer.output
+    file = out / "certificate.json"
+    answer = run(app, ["verify", str(file)])
+    assert answer.exit_code == 0, answer.output
+    assert "claims proved again" in answer.output
+    assert run(app, ["verify", str(file), "--set", "m=0.125"]).exit_code == 0
+    changed = run(app, ["verify", str(file), "--set", "m=0.126"])
+    assert changed.exit_code == 1
+    assert "0.126" in changed.output
+    assert run(app, ["verify", str(file), "--mechanism", "cart_pendulum"]).exit_code == 1
+    for m, code in ((0.125, 0), (0.126, 1)):
+        (tmp_path / "model.py").write_text(OWN.format(m=m))
+        answer = run(app, ["verify", str(file), "--mechanism", f"{tmp_path}/model.py:make"])
+        assert answer.exit_code == code, answer.output
+    (out / "edited.json").write_bytes(file.read_bytes().replace(b"12.1", b"12.2", 1))
+    damaged = run(app, ["verify", str(out / "edited.json")])
+    assert damaged.exit_code == 1
+    assert "checksum" in damaged.output
+    unstable = ["--surface", "lambda_a=1.59 alpha_u=1.96 lambda_u=12.1"]
+    assert run(app, [*words, *unstable]).exit_code == 1
+    assert run(app, ["certify"]).exit_code == 2
+    assert run(app, ["certify", "rotary_pendulum", "--appendix"]).exit_code == 2
+
+
+def test_own_mechanisms_are_loaded_or_named(tmp_path: Path) -> None:
+    model = tmp_path / "model.py"
+    model.write_text(OWN.format(m=0.2))
+    assert mechanism_from_file(f"{model}:make").parameter_values[2] == 0.2
+    for text in ("model.py", f"{model}:number", f"{model}:absent"):
+        with pytest.raises(InvalidInputError):
+            mechanism_from_file(text)
+    model.write_text("1 / 0")
+    with pytest.raises(ArtefactError, match="ZeroDivisionError"):
+        mechanism_from_file(f"{model}:make")
+
+
+@pytest.mark.parametrize("name", ["cart_pendulum", "overhead_crane", "gantry_crane", "tora"])
+def test_other_mechanisms_get_certificates(name: str) -> None:
+    """Written, read, proved again: stability and a terminal set of the full loop, at least."""
+    rig = ut.mechanisms.LIBRARY[name]()
+    one = certify_surface(
+        rig, ut.first_surface(rig), rig.state(**rig.start), seconds=0.0, predict=False
+    )
+    content = certificate_files(rig, [one])["certificate.json"]
+    checked = verify(Certificate.from_bytes(content), ut.mechanisms.LIBRARY[name]())
+    assert {"stability", "terminal ellipsoid"} <= {item.claim.kind for item in checked}
+    assert all(item.verdict for item in checked)

@@ -1,0 +1,131 @@
+"""The drill: no fault brings the output past its limits or ends the loop without a safe stop."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.cascade import CascadeState
+from undertow.plan import Plan
+from undertow.rig import IdealRig
+from undertow.runtime import InlineWorker, Runtime, SimulatedClock, respond
+from undertow.runtime.cases import CASES, Case
+from undertow.runtime.drill import Outcome, drill, drill_recipe, run_case
+from undertow.runtime.drill_live import kill_drill, live_drill
+from undertow.runtime.faults import Witness
+from undertow.runtime.tables import drill_table
+
+RECIPE = replace(drill_recipe(), evaluations=32, horizon=10.0)
+MEMORY = CascadeState(Plan.of(ut.Surface(alpha_a=-1, lambda_a=-0.25, alpha_u=1.6, lambda_u=17.3)))
+
+
+def case(part: str, name: str) -> Case:
+    (found,) = [c for c in CASES if (c.part, c.name) == (part, name)]
+    return found
+
+
+def short(one: Case, folder: Path, seconds: float = 1.0) -> Outcome:
+    return run_case(one, RECIPE, MEMORY, folder / "log.db", since=0.3, seconds=seconds)
+
+
+QUICK = [
+    ("nothing", "all is well"),
+    ("optimiser", "raises"),
+    ("optimiser", "gives an unstable surface"),
+    ("answer", "twice"),
+    ("sensor", "one channel lost for good"),
+    ("sensor", "spikes of 1 rad"),
+    ("sensor", "sign swapped"),
+    ("sensor", "clock goes back once"),
+    ("actuator", "sign swapped"),
+    ("rig", "fails to write for good"),
+    ("rig", "hangs for 0.3 s"),
+    ("loop", "estimator raises"),
+    ("operator", "stops the run"),
+]
+
+
+@pytest.mark.parametrize(("part", "name"), QUICK)
+def test_a_fault_ends_as_it_should(part: str, name: str, tmp_path: Path) -> None:
+    """Sound outputs, a safe end, an identical replay, and held where that is possible."""
+    outcome = short(case(part, name), tmp_path, 1.5 if part == "actuator" else 1.0)
+    assert outcome.passed, outcome.happened
+    if not outcome.case.holds:
+        assert outcome.after <= 1.2
+
+
+def test_the_list_is_long_and_covers_every_part() -> None:
+    parts = Counter(c.part for c in CASES)
+    assert len(CASES) >= 25
+    assert set(parts) >= {
+        "optimiser", "answer", "sensor", "actuator", "rig", "loop", "log", "operator",
+    }  # fmt: skip
+    assert len({(c.part, c.name) for c in CASES}) == len(CASES)
+    assert any(c.holds for c in CASES)
+    assert any(not c.holds for c in CASES)
+
+
+def test_the_witness_sees_what_is_wrong() -> None:
+    """NaN, past the limits, too fast: none of them goes by, and sound outputs do."""
+    rig = IdealRig(RECIPE.belief)
+    for wrong, word in ((np.nan, "finite"), (16.0, "limits"), (9.0, "slew")):
+        witness = Witness(rig, np.array([15.0]), np.array([5.0]))
+        for sound in (4.0, 8.0, 3.5):
+            witness.write(np.array([sound]))
+        assert not witness.faults
+        try:
+            witness.write(np.array([wrong]))
+        except ut.errors.InvalidInputError:
+            assert np.isnan(wrong)  # no rig takes that
+        assert word in witness.faults[0]
+
+
+def test_an_outcome_with_one_bad_output_does_not_pass(tmp_path: Path) -> None:
+    """The verdict is no rubber stamp: each of its conditions can fail it."""
+    good = short(case("nothing", "all is well"), tmp_path, 0.6)
+    assert good.passed
+    for spoilt in (
+        replace(good, output_faults=("past its limits",)),
+        replace(good, ended_safely=False),
+        replace(good, replayed=False),
+        replace(good, held=False),
+    ):
+        assert not spoilt.passed
+    assert drill_table([good]).row_count == 1
+
+
+def test_the_drill_looks_at_the_slew_rate(tmp_path: Path) -> None:
+    """A tenth of the slew rate declared to the witness, and the same run is not sound."""
+    controller = RECIPE.make_controller(MEMORY)
+    witness = Witness(RECIPE.make_rig(), controller.limits, 0.1 * controller.slew)
+    worker = InlineWorker(lambda request: respond(RECIPE.cascade, request))
+    Runtime(controller, witness, worker, clock=SimulatedClock()).run(0.1)
+    assert any("slew" in fault for fault in witness.faults)
+
+
+# -- the whole of it --------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_whole_drill_passes(seed: int) -> None:
+    outcomes = drill(seed=seed)
+    assert [(o.case.name, o.happened) for o in outcomes if not o.passed] == []
+
+
+@pytest.mark.slow
+def test_the_live_part_of_the_drill_passes() -> None:
+    """Processes killed or stopped, a call that blocks, a log that cannot be made."""
+    assert [one for one in live_drill() if not one.passed] == []
+
+
+@pytest.mark.slow
+def test_fifty_runs_killed_at_random_moments() -> None:
+    """Every log opens, at most 0.1 s is missing, every replay is identical bit for bit."""
+    killed = kill_drill(50)
+    assert [one for one in killed if not one.passed] == []

@@ -1,0 +1,419 @@
+"""The fast loop: pure, always within limits, never stopped without a safe stop."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import undertow as ut
+from undertow.cascade import Admission, CascadeState
+from undertow.errors import InvalidInputError
+from undertow.plan import Plan
+from undertow.rig import IdealRig, Measurement, RealisticRig
+from undertow.runtime import (
+    Command,
+    Controller,
+    InlineWorker,
+    Inputs,
+    Mode,
+    Recipe,
+    Runtime,
+    Settings,
+    SimulatedClock,
+    background_worker,
+    respond,
+)
+from undertow.runtime.clock import Histogram
+from undertow.runtime.faults import Witness
+from undertow.runtime.keeper import KeptRig
+from undertow.runtime.modes import Signs, successor
+from undertow.runtime.slow import Answer, Request
+
+RECIPE = Recipe(parameters={"d_e": 0.025}, evaluations=64, start=(0.0, 0.3, 0.0, 0.0))
+
+
+@pytest.fixture
+def memory(quick: ut.Surface) -> CascadeState:
+    return CascadeState(Plan.of(quick))
+
+
+@pytest.fixture
+def controller(memory: CascadeState) -> Controller:
+    return RECIPE.make_controller(memory)
+
+
+def settled(controller: Controller, steps: int = 30) -> int:
+    """Bring the controller under its law on an ideal rig; return the number of steps made."""
+    rig = RECIPE.make_rig()
+    for k in range(steps):
+        command = Command.START if k == 0 else Command.NONE
+        rig.write(controller.step(Inputs(1e-3 * k, rig.read(), None, command)))
+    assert controller.mode == Mode.CATCH
+    return steps
+
+
+# -- states and guards -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [m for m in Mode if m not in (Mode.IDLE, Mode.SAFE_STOP)])
+def test_faults_and_the_operator_come_before_everything(mode: Mode) -> None:
+    for signs in (Signs(fault="broken", inside=True), Signs(command=Command.STOP, inside=True)):
+        assert successor(mode, signs)[0] == Mode.SAFE_STOP
+
+
+def test_nothing_but_the_operator_leads_out_of_a_safe_stop() -> None:
+    every = Signs(ready=True, inside=True, settled=True, swings=True)
+    assert successor(Mode.SAFE_STOP, every)[0] == Mode.SAFE_STOP
+    assert successor(Mode.SAFE_STOP, replace(every, command=Command.START))[0] == Mode.SAFE_STOP
+    assert successor(Mode.SAFE_STOP, replace(every, command=Command.RESET))[0] == Mode.IDLE
+    still = replace(every, command=Command.RESET, fault="still broken")
+    assert successor(Mode.SAFE_STOP, still)[0] == Mode.SAFE_STOP
+
+
+def test_the_law_takes_over_inside_its_region_alone_and_hands_back() -> None:
+    ready = Signs(ready=True, swings=True)
+    assert successor(Mode.BRING_UP, ready)[0] == Mode.SWING_UP
+    assert successor(Mode.BRING_UP, replace(ready, swings=False))[0] == Mode.BRING_UP
+    assert successor(Mode.SWING_UP, ready)[0] == Mode.SWING_UP
+    assert successor(Mode.SWING_UP, replace(ready, inside=True))[0] == Mode.CATCH
+    assert successor(Mode.CATCH, Signs(settled=True))[0] == Mode.BALANCE
+    for mode in (Mode.CATCH, Mode.BALANCE):
+        assert successor(mode, Signs(lost=True, swings=True))[0] == Mode.SWING_UP
+        assert successor(mode, Signs(lost=True))[0] == Mode.SAFE_STOP
+
+
+def test_swing_up_is_used_outside_the_region_and_within_limits(memory: CascadeState) -> None:
+    controller = Controller(
+        RECIPE.cascade,
+        memory,
+        RECIPE.make_estimator(),
+        period=1e-3,
+        swing_up=lambda t, x: np.array([1e3]),
+        region=lambda x: abs(x[1]) < 0.1,
+    )
+    rig = IdealRig(RECIPE.belief, RECIPE.belief.state(phi=3.0))
+    for k in range(60):
+        command = Command.START if k == 0 else Command.NONE
+        rig.write(controller.step(Inputs(1e-3 * k, rig.read(), None, command)))
+    assert controller.mode == Mode.SWING_UP
+    assert controller.u[0] == 15.0
+
+
+# -- the output ------------------------------------------------------------------------------
+
+
+@given(
+    readings=st.lists(
+        st.tuples(st.floats(width=64), st.floats(width=64), st.floats(width=64)),
+        min_size=1,
+        max_size=40,
+    ),
+    alarm=st.sampled_from(["", "", "", "the sky falls"]),
+)
+@settings(max_examples=50)
+def test_no_measurement_brings_the_output_past_limits_slew_or_to_nan(
+    readings: list[tuple[float, float, float]], alarm: str
+) -> None:
+    """Any numbers whatever, NaN and infinity among them, as positions and times."""
+    quick = ut.Surface(alpha_a=-1, lambda_a=-1.59, alpha_u=1.96, lambda_u=12.1)
+    controller = RECIPE.make_controller(CascadeState(Plan.of(quick)))
+    k = settled(controller)
+    before = controller.u.copy()
+    for i, (t, theta, phi) in enumerate(readings):
+        measurement = Measurement(t, np.array([theta, phi]))
+        u = controller.step(Inputs(1e-3 * (k + i), measurement, None, Command.NONE, alarm))
+        assert np.isfinite(u).all()
+        assert abs(u[0]) <= 15.0
+        assert abs(u[0] - before[0]) <= controller.slew[0] * (1 + 1e-12)
+        before = u.copy()
+
+
+def test_the_fast_step_is_the_law_of_the_cascade(
+    controller: Controller, memory: CascadeState
+) -> None:
+    """Away from limits the output is Cascade.control at the estimate."""
+    settled(controller, 400)
+    wanted = RECIPE.cascade.control(memory, 0.4, controller.x)
+    assert controller.u[0] == pytest.approx(float(wanted.u[0]), rel=1e-9)
+
+
+def test_a_safe_stop_brings_the_output_to_zero_within_the_slew_rate(
+    controller: Controller,
+) -> None:
+    k = settled(controller)
+    assert abs(controller.u[0]) > 1.0
+    outputs = [controller.u[0]]
+    while controller.u[0] != 0.0:
+        inputs = Inputs(1e-3 * k, None, None, Command.STOP)
+        outputs.append(controller.step(inputs)[0])
+        assert len(outputs) < 10
+    assert controller.mode == Mode.SAFE_STOP
+    assert np.abs(np.diff(outputs)).max() <= controller.slew[0]
+
+
+@pytest.mark.parametrize("name", ["lead", "patience", "stall", "slew_time"])
+def test_settings_refuse_what_is_not_positive(name: str) -> None:
+    with pytest.raises(InvalidInputError, match=name):
+        Settings(**{name: -1.0})
+
+
+# -- answers of the slow loop ------------------------------------------------------------------
+
+
+def asked(controller: Controller) -> tuple[Request, RealisticRig, int]:
+    """The first request of a run."""
+    rig = RECIPE.make_rig()
+    for k in range(100):
+        command = Command.START if k == 0 else Command.NONE
+        rig.write(controller.step(Inputs(1e-3 * k, rig.read(), None, command)))
+        if controller.request is not None:
+            return controller.request, rig, k + 1
+    raise AssertionError
+
+
+def answered(request: Request, surface: ut.Surface) -> Answer:
+    """An answer that changes the surface, admitted."""
+    plan = Plan.of(surface)
+    honest = respond(RECIPE.cascade, request)
+    after = replace(request.memory, plan=plan, since=request.use, sequence=request.sequence)
+    admission = Admission(True, "for the test", 1.0)
+    lanes = honest.lanes.copy()
+    lanes[0, : len(surface.vector)] = surface.vector
+    return replace(honest, admission=admission, memory=after, lanes=lanes)
+
+
+OTHER = ut.Surface(alpha_a=-1, lambda_a=-1.2, alpha_u=2.1, lambda_u=12.0)
+
+
+def test_an_answer_is_computed_for_the_predicted_state_and_used_at_its_time(
+    controller: Controller,
+) -> None:
+    """Belief = truth: at the time of use the state is the predicted one, and not before."""
+    request, rig, k = asked(controller)
+    answer = answered(request, OTHER)
+    ahead = RECIPE.cascade.loop.simulate(
+        request.x, request.memory.plan, duration=request.use - request.t, terminal=0.0
+    )
+    np.testing.assert_allclose(answer.x, ahead.x[-1], atol=1e-9)
+    before = controller.memory.surface
+    for i in range(k, k + 101):
+        given = answer if i == k else None
+        rig.write(controller.step(Inputs(1e-3 * i, rig.read(), given)))
+        used = controller.memory.surface == OTHER
+        assert used == (1e-3 * i >= request.use - 5e-4)
+        if not used:
+            assert controller.memory.surface == before
+    np.testing.assert_allclose(controller.x, answer.x, atol=0.03)
+    assert any("applied" in note.text for note in controller.notes) or used
+
+
+def given_to(controller: Controller, answer: Answer, t: float, rig: RealisticRig) -> str:
+    rig.write(controller.step(Inputs(t, rig.read(), answer)))
+    return "; ".join(note.text for note in controller.notes if note.kind == "answer")
+
+
+def test_answers_late_stale_twice_or_not_asked_for_are_refused(controller: Controller) -> None:
+    request, rig, k = asked(controller)
+    answer = answered(request, OTHER)
+    t = 1e-3 * k
+    assert "not asked for" in given_to(controller, replace(answer, sequence=9), t, rig)
+    assert "stale" in given_to(controller, replace(answer, sequence=0), t + 0.001, rig)
+    assert given_to(controller, answer, t + 0.002, rig) == ""  # kept for its time
+    assert "twice" in given_to(controller, answer, t + 0.003, rig)
+    assert controller.memory.surface != OTHER
+
+
+def test_a_late_answer_is_refused_and_the_next_one_has_a_higher_number(
+    controller: Controller,
+) -> None:
+    request, rig, k = asked(controller)
+    answer = answered(request, OTHER)
+    for i in range(k, k + 110):
+        rig.write(controller.step(Inputs(1e-3 * i, rig.read())))
+    assert "late by" in given_to(controller, answer, 1e-3 * (k + 110), rig)
+    assert controller.memory.surface != OTHER
+    assert controller.request is not None
+    assert controller.request.sequence > request.sequence
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda a: replace(a, lanes=a.lanes * math.nan),
+        lambda a: replace(a, lanes=a.lanes[:, 1:]),
+        lambda a: replace(a, lanes=np.vstack([a.lanes, a.lanes])),
+        lambda a: replace(a, use=a.use + 1.0),
+    ],
+)
+def test_an_answer_that_was_damaged_on_its_way_is_refused(controller: Controller, spoil) -> None:  # type: ignore[no-untyped-def]
+    request, rig, k = asked(controller)
+    said = given_to(controller, spoil(answered(request, OTHER)), 1e-3 * k, rig)
+    assert "refused" in said
+
+
+def test_an_answer_for_another_state_is_refused_at_its_time(controller: Controller) -> None:
+    request, rig, k = asked(controller)
+    answer = replace(answered(request, OTHER), x=np.full(4, 3.0))
+    texts = [given_to(controller, answer, 1e-3 * k, rig)]
+    for i in range(k + 1, k + 110):
+        rig.write(controller.step(Inputs(1e-3 * i, rig.read())))
+        texts += [note.text for note in controller.notes]
+    assert any("off its prediction" in text for text in texts)
+    assert controller.memory.surface != OTHER
+
+
+# -- deadlines, by a clock that is told to jump ---------------------------------------------------
+
+
+class Slow:
+    """A rig that costs time."""
+
+    def __init__(self, rig: RealisticRig, clock: SimulatedClock, cost: dict[int, float]) -> None:
+        self.rig, self.clock, self.cost, self.period = rig, clock, cost, rig.period
+        self.calls, self.closed = 0, False
+
+    def read(self) -> Measurement:
+        self.clock.t += self.cost.get(self.calls, 0.0)
+        self.calls += 1
+        return self.rig.read()
+
+    def write(self, u: np.ndarray) -> None:
+        self.rig.write(u)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def run_slow(controller: Controller, cost: dict[int, float], seconds: float = 0.2) -> Runtime:
+    clock = SimulatedClock()
+    rig = Slow(RECIPE.make_rig(), clock, cost)
+    worker = InlineWorker(lambda request: respond(RECIPE.cascade, request))
+    runtime = Runtime(controller, rig, worker, clock=clock)
+    runtime.run(seconds)
+    assert rig.closed
+    return runtime
+
+
+def test_deadlines_are_counted_and_missed_periods_skipped(controller: Controller) -> None:
+    """2.5 periods late: a miss, and two periods without a step; 0.5 late: a miss; else none."""
+    report = run_slow(controller, {50: 3.5e-3, 100: 0.5e-3, 150: 1.5e-3}).report
+    assert report.missed == 2
+    assert report.skipped == 2
+    assert report.steps == 200 - 2 + 1  # the last one stops
+    assert report.whole.longest == pytest.approx(3.5e-3)
+    assert sum(report.whole.between((0.0, 1e-3, math.inf))) == report.steps
+    assert report.stopped_by == "operator: stop"
+
+
+def test_a_stalled_loop_stops_safely(controller: Controller) -> None:
+    report = run_slow(controller, {50: 0.2}, 1.0).report
+    assert report.mode == Mode.SAFE_STOP
+    assert "no step for" in report.stopped_by
+
+
+def test_histogram_quantiles_are_right_to_a_microsecond() -> None:
+    histogram, rng = Histogram(), np.random.default_rng(0)
+    times = rng.exponential(100e-6, 5000)
+    for value in times:
+        histogram.add(value)
+    for fraction in (0.5, 0.99):
+        assert histogram.quantile(fraction) == pytest.approx(
+            float(np.quantile(times, fraction, method="inverted_cdf")), abs=2e-6
+        )
+    assert histogram.longest == times.max()
+    assert math.isnan(Histogram().quantile(0.5))
+
+
+# -- processes ------------------------------------------------------------------------------------
+
+
+def take(worker, seconds: float = 10.0):  # type: ignore[no-untyped-def]
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if (answer := worker.take(0.0)) is not None:
+            return answer
+        time.sleep(0.002)
+    return None
+
+
+def echo(request: Request) -> Answer:
+    """An answer without any work; hangs when asked from a negative time."""
+    if request.t < 0:
+        time.sleep(60.0)
+    return respond(RECIPE.cascade, request)
+
+
+@pytest.mark.parametrize("processes", [0, 2])
+def test_a_worker_in_the_background_gives_the_same_bits(
+    memory: CascadeState, processes: int
+) -> None:
+    request = Request(0.0, RECIPE.x0, 0.1, memory)
+    here = echo(request)
+    worker = background_worker(echo, processes=processes)
+    try:
+        worker.ask(request)
+        there = take(worker)
+    finally:
+        worker.close()
+    assert there is not None
+    assert there.proposal.plan == here.proposal.plan
+    np.testing.assert_array_equal(there.lanes, here.lanes)
+    np.testing.assert_array_equal(there.x, here.x)
+
+
+@pytest.mark.parametrize("how", ["hangs", "dies"])
+def test_another_process_takes_over_from_one_that_hangs_or_dies(
+    memory: CascadeState, how: str
+) -> None:
+    worker = background_worker(echo, processes=2)
+    try:
+        if how == "dies":
+            os.kill(worker.processes[0], signal.SIGKILL)
+        worker.ask(Request(-1.0 if how == "hangs" else 0.0, RECIPE.x0, 0.1, memory))
+        assert take(worker, 0.3) is None
+        assert worker.replace()
+        worker.ask(Request(0.0, RECIPE.x0, 0.1, memory))
+        assert take(worker) is not None
+        assert not worker.replace()  # nobody is left
+    finally:
+        worker.close()
+
+
+def test_a_keeper_brings_the_output_to_zero_when_its_controller_falls_silent(
+    tmp_path: Path,
+) -> None:
+    """Within the slew rate, and the rig goes on giving measurements."""
+    limits, slew = np.array([15.0]), np.array([7.5])
+
+    written = tmp_path / "written"
+    written.touch()
+
+    class Watched(Witness):
+        def write(self, u: np.ndarray) -> None:
+            super().write(u)
+            with written.open("a") as file:
+                file.write(f"{float(u[0])} {len(self.faults)}\n")
+
+    rig = KeptRig(lambda: Watched(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew)
+    try:
+        first = rig.read()
+        rig.write(np.array([5.0]))
+        deadline = time.monotonic() + 10.0
+        lines: list[str] = []
+        while time.monotonic() < deadline and not (len(lines) > 1 and lines[-1].startswith("0.0")):
+            time.sleep(0.01)
+            lines = written.read_text().splitlines()
+        assert [line.split() for line in lines] == [["5.0", "0"], ["0.0", "0"]]
+        assert rig.read().t == pytest.approx(first.t + 1e-3)
+    finally:
+        rig.close()
+    assert not rig.process.is_alive()

@@ -1,0 +1,94 @@
+"""Trials: the cascade balances realistic rigs, in simulated time, a period behind as in life."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.estimators import Record
+from undertow.inner_loop import InnerLoop
+from undertow.rig import srv02_rig
+from undertow.trials.balance import OBJECTIVES, controllers
+from undertow.trials.report import balance_files, balance_report
+from undertow.trials.steering import CascadeSteering, steady
+from undertow.trials.trial import judge, spread, trial, undisturbed
+
+
+@pytest.fixture(scope="module")
+def arm() -> ut.Mechanism:
+    return ut.mechanisms.rotary_pendulum()
+
+
+def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
+    """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
+    x0, goal = arm.state(phi=ut.deg(35)), OBJECTIVES["energy"]
+    made = controllers(arm, goal, x0, budget=128)
+    costs = {
+        row: trial(arm, undisturbed(arm), made[row], x0, 8.0, 0, objective=goal).cost
+        for row in ("one-time", "cascade")
+    }
+    assert costs["cascade"] < costs["one-time"] * 1.002
+
+
+def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism) -> None:
+    x0, goal = arm.state(phi=ut.deg(35)), OBJECTIVES["energy"]
+    made = controllers(arm, goal, x0, budget=128)
+    runs = {
+        row: [trial(arm, srv02_rig(), made[row], x0, 8.0, s, objective=goal) for s in range(3)]
+        for row in ("one-time", "cascade")
+    }
+    assert all(run.balanced for row in runs.values() for run in row)
+    assert spread(runs["cascade"], "cost").mean < spread(runs["one-time"], "cost").mean
+
+
+def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None:
+    x0 = arm.state(phi=0.4)
+    cascade = ut.Cascade(arm, OBJECTIVES["energy"], warm=ut.Budget(64), cold=ut.Budget(256))
+    start = cascade.start(x0)
+    records = [
+        trial(arm, srv02_rig(), lambda _: CascadeSteering(cascade, start), x0, 1.0, 7).record
+        for _ in range(2)
+    ]
+    assert np.array_equal(records[0].u, records[1].u)
+    assert np.array_equal(records[0].truth, records[1].truth)
+
+
+def test_a_run_is_balanced_only_if_it_stays_so(arm: ut.Mechanism) -> None:
+    t = np.arange(0.0, 4.0, 0.001)
+
+    def outcome(phi: np.ndarray) -> tuple[bool, float]:
+        truth = np.zeros((len(t), 4))
+        truth[:, 1] = phi
+        run = judge(arm, Record(t, truth[:, :2], truth, np.zeros((len(t), 1)), truth))
+        return run.balanced, run.settled
+
+    held, since = outcome(np.where(t < 1.0, 0.5, 0.0))
+    assert held
+    assert since == pytest.approx(1.0)
+    assert not outcome(np.where(t < 3.5, 0.5, 0.0))[0]
+    assert outcome(np.where(t > 3.9, 0.5, 0.0)) == (False, math.inf)
+    assert outcome(np.full(len(t), math.nan)) == (False, math.inf)
+
+
+def test_a_fixed_law_is_the_compiled_one(arm: ut.Mechanism, base: ut.Surface) -> None:
+    x = arm.state(phi=0.1)
+    assert steady(InnerLoop(arm, base))(0.0, x)[0] == InnerLoop(arm, base)(x)[0]
+
+
+@pytest.mark.slow
+def test_the_report_prints_what_was_run() -> None:
+    from rich.console import Console
+
+    from undertow.trials.balance import balance
+
+    result = balance(seeds=2, seconds=4.0, budget=64, limits=False)
+    console = Console(record=True, width=100)
+    console.print(balance_report(result))
+    text = console.export_text()
+    assert "of 2" in text
+    assert "φ(0) = 35°" in text
+    files = balance_files(result)
+    assert files["balance.csv"].decode().count("\n") == 1 + 2 * 3 * 2
