@@ -452,11 +452,14 @@ class _Task:
         """Start from the incumbent; look further away where that gains nothing."""
         here = self.decision.encode(incumbent)
         known = self._know(incumbent, here)
+        if known is not None and (self.owner.counts_time or self.left < 2 * LANES or self.late()):
+            self.cost(here[None], known)
+            known = None
         if self.owner.counts_time:
-            if known is not None:
-                self.cost(here[None], known)
             return self._along_the_ridge(here)
         if here.size > MODEL_SIZE:
+            if known is not None:
+                self.cost(here[None], known)
             self._look_around(here)
             return self._descend(self._centre(), 0.1, self.left, 1e-3)
         search = TrustRegion(here, 0.1, LANES, self.rng)
@@ -513,6 +516,8 @@ class _Task:
             self._look_around(here)
             return self._descend(self._centre(), 0.1, most, 1e-3)
         d, loop = here.size, self.owner.loop
+        if self.left < 2 * d + LANES or self.late():
+            return False
         vectors, gains = self.decision.decode(here + 1e-4 * np.vstack([np.eye(d), -np.eye(d)]))
         self.evaluations += len(vectors)
         near = loop.batch(
@@ -535,7 +540,7 @@ class _Task:
         minimise(
             search,
             self.cost,
-            evaluations=most,
+            evaluations=min(most, self.left),
             tolerance=1e-4,
             relative=1e-6,
             patience=PATIENCE,
