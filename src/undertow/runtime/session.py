@@ -31,6 +31,7 @@ def session(
     simulated: bool = False,
     processes: int = 3,
     rig: Rig | None = None,
+    shadow: bool = True,
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Runtime]:
     """Make a runtime ready from a recipe: first optimum, everything compiled and connected.
@@ -47,6 +48,8 @@ def session(
         For the optimiser, see :func:`undertow.runtime.background_worker`; 0: a thread.
     rig
         The plant; the recipe's simulated one by default.
+    shadow
+        Against the wall clock: make every step again, see :class:`undertow.runtime.Runtime`.
     progress
         Called with (what, fraction) before each part.
 
@@ -89,8 +92,8 @@ def session(
             columns = Columns.of(recipe.belief)
             book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
         clock = SimulatedClock() if simulated else WallClock()
-        shadow = None if simulated else recipe.make_controller(memory)
-        runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=shadow)
+        double = recipe.make_controller(memory) if shadow and not simulated else None
+        runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=double)
         stack.enter_context(_operator(runtime))
         tell("ready", 1.0)
         yield runtime
