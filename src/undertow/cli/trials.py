@@ -50,6 +50,9 @@ def trials(
         bool,
         typer.Option(help="robustness: also look for the largest single change that is survived."),
     ] = True,
+    limits: Annotated[
+        bool, typer.Option(help="balance: also search for the catch limits, which takes longest.")
+    ] = True,
     quick: Annotated[
         bool, typer.Option("--quick", help="A look: three rigs, no search for catch limits.")
     ] = False,
@@ -69,7 +72,10 @@ def trials(
     with progress_bar() as progress:
         if what == "balance":
             result = experiment.balance(
-                angle=math.radians(angle), seeds=seeds, limits=not quick, progress=progress
+                angle=math.radians(angle),
+                seeds=seeds,
+                limits=limits and not quick,
+                progress=progress,
             )
             shown = report.balance_report(result)
         elif what == "swing-up":
