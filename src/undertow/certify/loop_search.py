@@ -266,7 +266,7 @@ def prove_loop(
     law = ReachingLaw() if reaching is None else reaching
     motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}))
     terminal, reach = _terminal(motion, coordinate, reach, step, duration, trials, seed, progress)
-    pending = _boxes(reach, widest)
+    pending = _boxes(motion, coordinate, reach, widest)
     done: list[tuple[float, float]] = []
     horizon, barrier = 0.0, math.inf
     for level in range(splits + 1):
@@ -307,13 +307,25 @@ def prove_loop(
     return ProvedLoop(claim, verdict, time.process_time() - started)
 
 
-def _boxes(reach: float, widest: float | None) -> list[tuple[float, float]]:
-    """Neighbouring boxes of [0, reach], narrower where the motions are faster."""
+def _boxes(
+    motion: LoopMotion, coordinate: str, reach: float, widest: float | None
+) -> list[tuple[float, float]]:
+    """Neighbouring boxes of [0, reach], narrower where the motions are faster.
+
+    Around the edge of the layer they are a small part of it: a set that lies on both sides
+    of the corner of sat loses its contraction.
+    """
     first = reach / 200 if widest is None else widest
+    index = [c.name for c in motion.mechanism.coordinates].index(coordinate)
+    weights = np.abs(motion.surface.position_row[:, index])
+    layer = float(np.min(motion.gains[1] / np.maximum(weights, 1e-12)))
     edges = [0.0]
     while edges[-1] < reach:
         left = 1 - edges[-1] / reach
-        edges.append(min(edges[-1] + first * (0.4 + 0.6 * left), reach))
+        width = first * (0.4 + 0.6 * left)
+        if edges[-1] < 2 * layer:
+            width = min(width, 0.15 * layer)
+        edges.append(min(edges[-1] + width, reach))
     return list(itertools.pairwise(edges))
 
 
