@@ -12,13 +12,19 @@ from types import FrameType
 from undertow.cascade import CascadeState
 from undertow.rig.interface import Rig
 from undertow.runtime.clock import SimulatedClock, WallClock
-from undertow.runtime.controller import Inputs
 from undertow.runtime.log import Columns, Log
 from undertow.runtime.loop import Runtime
-from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
-from undertow.runtime.slow import Answer, InlineWorker, Request, Worker, background_worker, respond
+from undertow.runtime.slow import (
+    Answer,
+    Compute,
+    InlineWorker,
+    Request,
+    Worker,
+    background_worker,
+    respond,
+)
 
 __all__ = ["session", "warm_up"]
 
@@ -77,8 +83,7 @@ def session(
     plant = recipe.make_rig() if rig is None else rig
     memory, _ = recipe.cascade.start(recipe.x0)
     tell("warming up", 0.6)
-    warm_up(recipe, memory)
-    compute(Request(0.0, recipe.x0, recipe.settings.lead, memory))
+    warm_up(recipe, memory, compute)
     controller = recipe.make_controller(memory)
     with contextlib.ExitStack() as stack:
         # First the processes are forked, then threads begin.
@@ -99,13 +104,12 @@ def session(
         yield runtime
 
 
-def warm_up(recipe: Recipe, memory: CascadeState) -> None:
-    """Make some steps on a rig that is thrown away, so that everything is compiled."""
-    rig = recipe.make_rig()
-    controller = recipe.make_controller(memory)
-    for k in range(60):
-        command = Command.START if k == 0 else Command.NONE
-        rig.write(controller.step(Inputs(k * recipe.period, rig.read(), None, command)))
+def warm_up(recipe: Recipe, memory: CascadeState, compute: Compute) -> None:
+    """Make a short run in simulated time and throw it away, so that everything is compiled."""
+    controller, lead = recipe.make_controller(memory), recipe.settings.lead
+    worker = InlineWorker(compute, 0.5 * lead)
+    runtime = Runtime(controller, recipe.make_rig(), worker, clock=SimulatedClock())
+    runtime.run(min(recipe.settings.settle + 1.2 * lead, 1.0))
 
 
 @contextlib.contextmanager
