@@ -1,4 +1,4 @@
-"""The whole loop: enclosures hold, tubes contain, proofs are sound, and what is false is refused."""
+"""The whole loop: enclosures hold, tubes contain, proofs are sound, false claims are refused."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def test_the_coordinates_carry_the_plants_own_motion(
     near = z + np.random.default_rng(1).uniform(-1e-4, 1e-4, z.shape)
     there, u = motion(near)
     assert (boxes.rate.lo <= there.T).all()
-    assert (there.T <= boxes.rate.hi).all()
+    assert (boxes.rate.hi >= there.T).all()
     assert (boxes.demand.lo <= u.T).all()
-    assert (u.T <= boxes.demand.hi).all()
+    assert (boxes.demand.hi >= u.T).all()
 
 
 def test_slopes_hold_every_difference_quotient() -> None:
@@ -104,7 +104,7 @@ def test_tubes_hold_the_motions_from_their_starts() -> None:
         assert moved.all()
         hull = tubes.hull
         assert (hull.lo[:, lane] <= path[k].T + 1e-9).all()
-        assert (path[k].T <= hull.hi[:, lane] + 1e-9).all()
+        assert (hull.hi[:, lane] + 1e-9 >= path[k].T).all()
     assert (hull.hi - hull.lo).max() < 0.2
 
 
@@ -160,6 +160,7 @@ def test_a_claim_is_verified_from_its_numbers_alone(claim: LoopClaim) -> None:
     assert verdict.margin == claim.extent
 
 
+@pytest.mark.slow
 def test_what_does_not_follow_is_not_proved(claim: LoopClaim) -> None:
     """Too short a horizon, a start beyond the singularity, another gain, a grown set."""
     assert not verify_loop(RIG, SURFACE, LAW, replace(claim, horizon=0.01))

@@ -66,7 +66,7 @@ def report(
 def markdown(reports: Sequence[LoopReport]) -> str:
     """Return the table, angles in degrees."""
     lines = [
-        "| case | sampled limit | proved | share | peak demand | boxes | search and check | check |",
+        "| case | sampled limit | proved | share | peak demand | boxes | with search | check |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for r in reports:
