@@ -61,7 +61,7 @@ class KeptRig:
         )
         theirs.close()
         self._last: Measurement = self._pipe.recv()
-        self._asked = False
+        self._asked = 0
 
     def read(self) -> Measurement:
         """Return the measurement that the keeper took after the last output.
@@ -77,15 +77,15 @@ class KeptRig:
             if not self._pipe.poll(0.5 * self.period):
                 message = "the keeper does not answer"
                 raise TimeoutError(message)
-            self._last, self._asked = self._pipe.recv(), False
+            while self._asked and self._pipe.poll(0.0):  # late answers too: the newest counts
+                self._last = self._pipe.recv()
+                self._asked -= 1
         return self._last
 
     def write(self, u: FloatArray) -> None:
         """Hand the output to the keeper."""
-        while self._asked and self._pipe.poll(0.0):  # an answer that came too late
-            self._last, self._asked = self._pipe.recv(), False
         self._pipe.send(u)
-        self._asked = True
+        self._asked += 1
 
     def close(self) -> None:
         """Let the keeper bring the output to zero and let go."""
