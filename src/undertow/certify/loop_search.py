@@ -248,7 +248,7 @@ def prove_loop(
     uncertain
         Plant parameters known to lie in [low, high].
     widest
-        Widest box of starts, at the target; a 200th of the reach by default.
+        Widest box of starts, at the target; a 350th of the reach by default.
     splits
         How often a box whose tube fails is halved.
 
@@ -315,7 +315,7 @@ def _boxes(
     Around the edge of the layer they are a small part of it: a set that lies on both sides
     of the corner of sat loses its contraction.
     """
-    first = reach / 200 if widest is None else widest
+    first = reach / 350 if widest is None else widest
     index = [c.name for c in motion.mechanism.coordinates].index(coordinate)
     weights = np.abs(motion.surface.position_row[:, index])
     layer = float(np.min(motion.gains[1] / np.maximum(weights, 1e-12)))
