@@ -18,6 +18,7 @@ HERE = Path(__file__).parent
 #: Those that take ``--clock``, the quick ones first; any other file here is a benchmark too.
 CLOCKED = (
     "kernel", "budget", "tail", "growth", "searchers", "reoptimise", "closed_loop", "gap",
+    "admission",
 )  # fmt: skip
 OTHERS = sorted(
     path.stem

@@ -413,6 +413,39 @@ def test_certify_and_verify_from_the_command_line(tmp_path: Path) -> None:
     assert run(app, ["certify", "rotary_pendulum", "--appendix"]).exit_code == 2
 
 
+BAR = """
+import sympy as sp
+import undertow as ut
+
+x, tilt = ut.Coordinate("x", "m"), ut.Coordinate("tilt")
+v, w, a = x.velocity, tilt.velocity, tilt.symbol
+bar = ut.Mechanism.from_energies(
+    "sprung_bar", [x, tilt], [ut.Input("force", "N", 10.0)],
+    kinetic=1.1 * v**2 / 2 + 0.075 * sp.cos(a) * v * w + 0.0125 * w**2,
+    potential=0.73575 * sp.cos(a) + 0.1 * a**2, start={"tilt": 0.2},
+)
+"""
+
+
+def test_a_mechanism_of_ones_own_is_certified_and_verified(tmp_path: Path) -> None:
+    """Nothing of the library is needed: the file brings the model both times."""
+    run = CliRunner().invoke
+    model, out = tmp_path / "model.py", tmp_path / "proof"
+    model.write_text(BAR)
+    words = ["certify", f"{model}:bar", "--seconds", "0", "--out", str(out)]
+    answer = run(app, words)
+    assert answer.exit_code == 0, answer.output
+    file = str(out / "certificate.json")
+    assert run(app, ["verify", file, "--mechanism", f"{model}:bar"]).exit_code == 0
+    answer = run(app, ["verify", file])
+    assert answer.exit_code == 2
+    assert "--mechanism FILE.py:NAME" in " ".join(answer.output.split())
+    model.write_text(BAR.replace("0.1 * a**2", "0.2 * a**2"))
+    answer = run(app, ["verify", file, "--mechanism", f"{model}:bar"])
+    assert answer.exit_code == 1
+    assert "equations" in answer.output
+
+
 def test_own_mechanisms_are_loaded_or_named(tmp_path: Path) -> None:
     model = tmp_path / "model.py"
     model.write_text(OWN.format(m=0.2))

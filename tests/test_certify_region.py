@@ -282,3 +282,24 @@ def test_degree_four_reaches_further_than_the_ellipsoid(ellipsoid: LyapunovFunct
     assert found.verdict.kind == "proved"
     assert found.extent > float(start)
     assert found.function(np.array([found.extent, 0.0, 0.0])) <= 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [1, 4])
+def test_100000_motions_from_a_proved_set_stay_and_converge(case: int) -> None:
+    """Half of them start on the boundary; 5 % more is not proved, with a witness."""
+    motion = SurfaceMotion(RIG, CASES[case - 1].surface)
+    found = prove_region(motion, (1, 0, 0), degrees=(2, 4), seconds=90.0, goal=0.7)
+    V = found.function
+    rate = -np.linalg.eigvals(motion.jacobian).real.max()
+    for part in range(10):
+        y = inside(V, 10_000, seed=part)
+        highest = np.zeros(len(y))
+        for _ in range(int(7.0 / rate / 0.004)):  # e⁻⁷ of the slowest mode is left
+            y = steps(motion, y, seconds=0.004, h=0.004)[-1]
+            highest = np.maximum(highest, V(y))
+        assert highest.max() <= 1.0
+        assert V(y).max() < 1e-3
+    raised = verify_region(motion, V.times(1 / 1.05), max_seconds=120.0)
+    assert raised.kind in ("refuted", "undecided")
+    assert set(raised.witness) == {"phi", "phi_dot", "w_theta"}

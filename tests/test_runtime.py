@@ -241,8 +241,10 @@ def test_a_late_answer_is_refused_and_the_next_one_has_a_higher_number(
         rig.write(controller.step(Inputs(1e-3 * i, rig.read())))
     assert "late by" in given_to(controller, answer, 1e-3 * (k + 110), rig)
     assert controller.memory.surface != OTHER
+    rig.write(controller.step(Inputs(1e-3 * (k + 111), rig.read())))
     assert controller.request is not None
     assert controller.request.sequence > request.sequence
+    assert controller.request.use - controller.request.t > request.use - request.t
 
 
 @pytest.mark.parametrize(

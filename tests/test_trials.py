@@ -12,7 +12,9 @@ from undertow.estimators import Record
 from undertow.inner_loop import InnerLoop
 from undertow.rig import srv02_rig
 from undertow.trials.balance import OBJECTIVES, controllers
+from undertow.trials.nmpc import predictive
 from undertow.trials.report import balance_files, balance_report
+from undertow.trials.robustness import breaking_point, clipped_regulator, random_bench
 from undertow.trials.steering import CascadeSteering, steady
 from undertow.trials.trial import judge, spread, trial, undisturbed
 
@@ -92,3 +94,38 @@ def test_the_report_prints_what_was_run() -> None:
     assert "φ(0) = 35°" in text
     files = balance_files(result)
     assert files["balance.csv"].decode().count("\n") == 1 + 2 * 3 * 2
+
+
+def test_a_breaking_point_is_bracketed_with_the_seed_that_breaks_it() -> None:
+    limits = [0.8, 0.5, 0.9]
+    found = breaking_point(lambda value, seed: value <= limits[seed], 2.0, seeds=3, bisections=12)
+    assert found.survived <= 0.5 < found.broken
+    assert found.broken - found.survived < 1e-3
+    assert found.seed == 1
+    unbroken = breaking_point(lambda value, seed: True, 2.0, seeds=3)
+    assert (unbroken.survived, unbroken.seed) == (2.0, None)
+
+
+def test_random_benches_stay_within_what_is_declared() -> None:
+    bench = srv02_rig()
+    benches = [random_bench(bench, seed) for seed in range(60)]
+    delays = [b.timing.input_delay + b.timing.measurement_delay for b in benches]
+    frictions = [b.friction["theta"].coulomb for b in benches]
+    assert 0.004 < max(delays) <= 0.005
+    assert 0.05 < max(frictions) <= 0.06
+    assert all(b.friction["theta"].F_s >= b.friction["theta"].coulomb for b in benches)
+    assert random_bench(bench, 3) == benches[3]
+    assert all(b.tolerance["m"] == 0.2 for b in benches)
+
+
+def test_a_clipped_regulator_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
+    x0 = arm.state(phi=ut.deg(10))
+    assert trial(arm, undisturbed(arm), clipped_regulator(arm), x0, 6.0, 0).balanced
+
+
+def test_predictive_control_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
+    pytest.importorskip("casadi")
+    make = predictive(arm, OBJECTIVES["energy"])
+    run = trial(arm, undisturbed(arm), make, arm.state(phi=ut.deg(30)), 4.0, 0)
+    assert run.caught
+    assert np.abs(run.record.u).max() <= 15.0

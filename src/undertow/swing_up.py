@@ -489,7 +489,8 @@ class SwingUpAndCatch:
         if t - self._since > self.patience:
             self._since, self._choice = t, self._choice + 1
         offset = self.region.turns(x)
-        if t >= self._next and self.region.worth_asking(x - offset):
+        near = np.abs((x - offset)[m:n]).max() <= 0.8 * self.lost
+        if t >= self._next and near and self.region.worth_asking(x - offset):
             self._next = t + self.every
             surface = self.region.surface(x - offset)
             if surface is not None:

@@ -347,7 +347,10 @@ class _Fit:
             return self.residual(free, z)
 
         def jacobian(z: FloatArray) -> FloatArray:
-            return self.jacobian(free, z)
+            # Forward differences are enough to find the way.
+            base = self.residual(free, z)
+            steps = z + STEP * np.eye(len(z))
+            return np.array([(self.residual(free, a) - base) / STEP for a in steps]).T
 
         found = scipy.optimize.least_squares(
             residual,

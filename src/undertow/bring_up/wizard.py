@@ -23,8 +23,8 @@ __all__ = ["BringUp", "Finding", "bring_up"]
 SHARES = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5)
 
 #: Motion that is enough to compare, and the most that is allowed, rad and m.
-ENOUGH = {"rad": 0.2, "m": 0.02}
-MOST = {"rad": 2.0, "m": 0.3}
+ENOUGH = {"rad": 0.2, "m": 0.08}
+MOST = {"rad": 2.0, "m": 0.6}
 
 Verdict = Literal["right", "wrong", "unclear"]
 
@@ -86,6 +86,7 @@ def bring_up(
     *,
     delay: float | None = None,
     rest: FloatArray | None = None,
+    learn: bool = True,
     progress: Callable[[str, float], None] | None = None,
 ) -> BringUp:
     """Check a rig against its model by small safe motions from rest.
@@ -100,6 +101,8 @@ def bring_up(
         From a write to its effect in a reading, s, as it should be; ``None``: not compared.
     rest
         The state it rests in, (2n,); found from the model by default.
+    learn
+        Also a longer motion, from which delay, friction and parameters are identified.
     progress
         Told what is under way, and the fraction done.
 
@@ -118,6 +121,8 @@ def bring_up(
         return wizard.result()
     tell("slow ramps", 0.25)
     wizard.break_away()
+    if not learn:
+        return wizard.result()
     tell("a longer motion", 0.3)
     wizard.learn(delay, lambda what, part: tell(what, 0.35 + 0.65 * part))
     return wizard.result()
@@ -246,7 +251,9 @@ class _Wizard:
                 known[i] = size > 0.1 * self.enough
                 power = (predicted**2).sum(axis=0)
                 gain[i] = (moved * predicted).sum(axis=0) / np.maximum(power, 1e-300)
-                if (np.abs(moved).max(axis=0) > self.enough).any() or (size > self.guard).any():
+                if (np.abs(moved[:, : belief.m]).max(axis=0) > self.enough[: belief.m]).any() or (
+                    (size > self.guard).any()
+                ):
                     break
         self.wiring = explain(gain, known)
         self._tell(gain, known)
@@ -324,8 +331,10 @@ class _Wizard:
                 "breakaway", channel.name,
                 f"{up:.3g} one way, {down:.3g} {channel.unit} the other",
                 f"alike, below {0.25 * channel.limit:.3g} {channel.unit}",
-                verdict="right" if even and light else "wrong",
-                remedy="" if even and light else "Look for what rubs, or a cable that pulls",
+                verdict="wrong" if not light else "right" if even else "unclear",
+                remedy=""
+                if even and light
+                else "Look for what rubs, for a cable that pulls, or for a load that still swings",
             )  # fmt: skip
 
     def learn(self, delay: float | None, progress: Callable[[str, float], None]) -> None:
@@ -339,7 +348,7 @@ class _Wizard:
             level = factor * self.share[i] * channel.limit / max(1.0, abs(self.wiring.inputs[i]))
             parts.append(self._one(i, doublets(level, widths, 0.3, self.rig.period)))
         u = np.vstack(parts)
-        for _ in range(3):
+        for _ in range(6):
             self._settle()
             try:
                 self.record = perform(rig, u, self.guard)
@@ -371,13 +380,14 @@ class _Wizard:
             )  # fmt: skip
         for estimate in found.estimates.values():
             if math.isfinite(estimate.nominal) and estimate.nominal:
-                ratio = estimate.value / estimate.nominal
-                good = 0.75 < ratio < 1.33
+                low, high = 0.75 * estimate.nominal, 1.33 * estimate.nominal
+                good = low < estimate.value < high
+                apart = estimate.high < low or estimate.low > high
                 self._add(
                     "parameter", estimate.name,
                     f"{estimate.value:.4g} ± {estimate.high - estimate.value:.2g} {estimate.unit}",
                     f"{estimate.nominal:.4g} {estimate.unit}, within a third",
-                    verdict="right" if good else "wrong",
+                    verdict="right" if good else "wrong" if apart else "unclear",
                     remedy="" if good else "Weigh and measure it again, or take the identified one",
                 )  # fmt: skip
 

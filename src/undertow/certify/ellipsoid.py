@@ -25,7 +25,8 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.certify.program import Program, add, down, magnitude, mul, run, up
+from undertow.certify.outward import add, down, magnitude, mul, up
+from undertow.certify.program import Program, run
 from undertow.certify.verdict import Verdict
 from undertow.codegen import Tape
 from undertow.codegen.machine import numba

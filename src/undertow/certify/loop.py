@@ -292,10 +292,10 @@ class LoopMotion:
         for j in range(m):
             push_slope = push_slope + W_slope.reshape(m, m, columns, lanes)[:, j] * total[j]
         hold = Interval(eta[:, None])
-        decay = Interval(np.zeros((m, columns, lanes)))
+        decay = _zeros(m, columns, lanes)
         for i in range(m):
-            decay.lo[i, slow + i] = -(hold[i] * bend[i]).hi
-            decay.hi[i, slow + i] = -(hold[i] * bend[i]).lo
+            loss = -(hold[i] * bend[i])
+            decay.lo[i, slow + i], decay.hi[i, slow + i] = loss.lo, loss.hi
         s_rate = push - hold * _rows(switch)
         return LoopRates(
             _below(rate, s_rate),
@@ -492,6 +492,11 @@ class _Reader:
 def _below(upper: Interval, lower: Interval) -> Interval:
     """Stack two blocks of rows."""
     return Interval(np.concatenate([upper.lo, lower.lo]), np.concatenate([upper.hi, lower.hi]))
+
+
+def _zeros(*shape: int) -> Interval:
+    """Return zeros whose ends are arrays of their own, to be written to."""
+    return Interval(np.zeros(shape), np.zeros(shape))
 
 
 def _rows(parts: Sequence[Interval]) -> Interval:

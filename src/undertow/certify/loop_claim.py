@@ -15,16 +15,16 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from undertow.certify.batch import Interval
-from undertow.certify.loop import LoopMotion
+from undertow.certify.loop import LoopMotion, LoopRates
 from undertow.certify.loop_terminal import TerminalSet, exact_inverse, verify_terminal
 from undertow.certify.tube import Tubes, bracket
-from undertow.certify.verdict import Verdict
+from undertow.certify.verdict import Kind, Verdict
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
 from undertow.sliding import ReachingLaw, Surface
@@ -121,7 +121,7 @@ class TubeEnd(NamedTuple):
     steps: int
 
 
-def start_tubes(motion: LoopMotion, coordinate: str, edges: Sequence[float]) -> Tubes:
+def start_tubes(motion: LoopMotion, coordinate: str, edges: Sequence[float] | FloatArray) -> Tubes:
     """Return the sets of starts at rest between neighbouring edges.
 
     Raises
@@ -142,7 +142,7 @@ def start_tubes(motion: LoopMotion, coordinate: str, edges: Sequence[float]) -> 
     lanes, size, slow = len(middle), motion.size, motion.slow
     centre, spread = np.zeros((size, lanes)), np.zeros((size, 1, lanes))
     centre[index], spread[index, 0] = middle, radius
-    rest = Interval(np.zeros((size, lanes)))
+    rest = Interval(np.zeros((size, lanes)), np.zeros((size, lanes)))
     for i, weight in enumerate(motion.surface.position_row[:, index]):
         # s = λ q: what rounding loses goes to the remainder.
         one = Interval(float(weight))
@@ -180,7 +180,8 @@ def run_tubes(
     entered, peak = np.full(lanes, np.nan), np.zeros((lanes, m))
     active = np.arange(lanes)
     inverse = exact_inverse(terminal.scale)
-    rows = Interval(np.zeros((motion.size, motion.size)))
+    square = (motion.size, motion.size)
+    rows = Interval(np.zeros(square), np.zeros(square))
     rows.lo[: motion.slow, : motion.slow], rows.hi[: motion.slow, : motion.slow] = (
         inverse.lo, inverse.hi,
     )  # fmt: skip
@@ -193,7 +194,8 @@ def run_tubes(
             break
         tubes, _, rates, moved = tubes.advance(step)
         k += 1
-        demand = np.maximum(np.abs(rates.demand.lo), np.abs(rates.demand.hi)).T
+        u = cast(LoopRates, rates).demand
+        demand = np.maximum(np.abs(u.lo), np.abs(u.hi)).T
         peak[active] = np.maximum(peak[active], demand)
         inside = moved & _inside(tubes.image(rows), motion.slow, terminal.widths)
         entered[active[inside]] = k * step
@@ -266,7 +268,7 @@ def verify_loop(
         return Verdict(text, "undecided", unit=unit, method="the loop is not shown to be odd")
     end = verify_terminal(motion, claim.terminal, max_seconds=max_seconds)
     if not end:
-        kind = "refuted" if end.kind == "refuted" else "undecided"
+        kind: Kind = "refuted" if end.kind == "refuted" else "undecided"
         why = f"terminal set: {end.kind}, {end.method}"
         return Verdict(text, kind, unit=unit, witness=end.witness, method=why, details=end.details)
     left = max_seconds - (time.process_time() - started)

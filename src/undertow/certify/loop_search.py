@@ -228,7 +228,7 @@ def prove_loop(
     duration: float = 3.0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
     widest: float | None = None,
-    splits: int = 2,
+    splits: int = 1,
     trials: int = 150,
     seed: int = 0,
     progress: Progress = None,
@@ -248,7 +248,7 @@ def prove_loop(
     uncertain
         Plant parameters known to lie in [low, high].
     widest
-        Widest box of starts, at the target; a fiftieth of the reach by default.
+        Widest box of starts, at the target; a 350th of the reach by default.
     splits
         How often a box whose tube fails is halved.
 
@@ -266,7 +266,7 @@ def prove_loop(
     law = ReachingLaw() if reaching is None else reaching
     motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}))
     terminal, reach = _terminal(motion, coordinate, reach, step, duration, trials, seed, progress)
-    pending = _boxes(reach, widest)
+    pending = _boxes(motion, coordinate, reach, widest)
     done: list[tuple[float, float]] = []
     horizon, barrier = 0.0, math.inf
     for level in range(splits + 1):
@@ -283,7 +283,7 @@ def prove_loop(
             break
         pending = [h for a, b in failed for h in ((a, 0.5 * (a + b)), (0.5 * (a + b), b))]
         # Far above the first failure little is to be won: keep a window above it.
-        window = 0.1 * reach
+        window = 0.15 * reach
         pending = [p for p in pending if p[0] <= failed[0][0] + window]
         beyond = [p for p in failed if p[0] > failed[0][0] + window]
         barrier = min([barrier, *(a for a, _ in beyond)])
@@ -307,13 +307,25 @@ def prove_loop(
     return ProvedLoop(claim, verdict, time.process_time() - started)
 
 
-def _boxes(reach: float, widest: float | None) -> list[tuple[float, float]]:
-    """Neighbouring boxes of [0, reach], narrower where the motions are faster."""
-    first = reach / 50 if widest is None else widest
+def _boxes(
+    motion: LoopMotion, coordinate: str, reach: float, widest: float | None
+) -> list[tuple[float, float]]:
+    """Neighbouring boxes of [0, reach], narrower where the motions are faster.
+
+    Around the edge of the layer they are a small part of it: a set that lies on both sides
+    of the corner of sat loses its contraction.
+    """
+    first = reach / 350 if widest is None else widest
+    index = [c.name for c in motion.mechanism.coordinates].index(coordinate)
+    weights = np.abs(motion.surface.position_row[:, index])
+    layer = float(np.min(motion.gains[1] / np.maximum(weights, 1e-12)))
     edges = [0.0]
     while edges[-1] < reach:
         left = 1 - edges[-1] / reach
-        edges.append(min(edges[-1] + max(first * left**1.5, 0.05 * first), reach))
+        width = first * (0.4 + 0.6 * left)
+        if edges[-1] < 2 * layer:
+            width = min(width, 0.15 * layer)
+        edges.append(min(edges[-1] + width, reach))
     return list(itertools.pairwise(edges))
 
 
@@ -334,9 +346,9 @@ def _terminal(
     every = max(1, round(0.01 / step))
     path, times = follow(motion, motion.from_state(x), duration, step, every)
     slow = motion.slow
-    calm = (np.abs(path[..., slow:]) <= 1e-3 * motion.gains[1]).all(axis=(-1))
+    calm = np.all(np.abs(path[..., slow:]) <= 1e-3 * motion.gains[1], axis=-1)
     rates = np.linalg.eigvals(_jacobian(motion)[:slow, :slow])
-    alive = np.isfinite(path).all(axis=(0, 2)) & calm[-1]
+    alive = np.all(np.isfinite(path), axis=(0, 2)) & calm[-1]
     # The first start whose motion never settles ends the line.
     last = len(alive) if alive.all() else int(np.argmin(alive))
     if last == 0:
@@ -347,13 +359,13 @@ def _terminal(
             remedy="Take a longer duration or a smaller reach",
         )
     use = slice(max(1, last // 3), max(2, round(0.93 * last)))
-    begin = int(np.argmax(calm[:, use].all(axis=1)))
+    begin = int(np.argmax(np.all(calm[:, use], axis=1)))
     window = 4 / np.abs(rates).max()
     keep = (np.arange(len(times)) >= begin) & (times <= times[begin] + window)
     terminal = search_terminal(
         motion, path[keep][:, use], trials=trials, seed=seed, progress=progress
     )
-    enters = (terminal.value(path) <= 1).any(axis=0)
+    enters = np.any(terminal.value(path) <= 1, axis=0)
     far = len(enters) if enters.all() else int(np.argmin(enters))
     return terminal, float(x[min(far, 63), names.index(coordinate)])
 

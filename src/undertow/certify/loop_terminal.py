@@ -257,7 +257,7 @@ class _Enclosures:
         for j in range(slow, slow + m):
             rest = rest - abs(push[:, j])
         spare = rest * Interval(floor) - abs(value)
-        return np.where(rest.lo > 0, spare.lo, -np.inf).min(axis=0)
+        return np.asarray(np.min(np.where(rest.lo > 0, spare.lo, -np.inf), axis=0))
 
     def core(self, half: float) -> bool:
         """Whether all conditions but 2 hold in the cube |x_i| ≤ half, by homogeneity."""
@@ -361,7 +361,7 @@ def verify_terminal(
         low, high = low[:, :-chunk], high[:, :-chunk]
         count += a.shape[1]
         square, decrease, over, spare, weights = checker.over(a, b)
-        near = ((np.abs(a) <= half) & (np.abs(b) <= half)).all(axis=0)
+        near = np.all((np.abs(a) <= half) & (np.abs(b) <= half), axis=0)
         moving = near | ((decrease < 0) & (spare > 0))
         done = (square > 1.0) | (moving & (over <= 0))
         if done.all():
@@ -396,6 +396,7 @@ def _wrong(checker: _Enclosures, points: FloatArray) -> FloatArray | None:
     rate = matmul(checker.inverse[:, :, None], here.rate[: checker.slow, None])[:, 0]
     grows = _total_of(x[i] * rate[i] for i in range(checker.slow)).lo > 0
     limit = checker.limit[:, None]
-    clips = ((here.demand.lo > limit) | (here.demand.hi < -limit)).any(axis=0)
-    bad = (_total(x**2).hi <= 1.0) & (grows | clips) & (np.abs(points) > 1e-9).any(axis=0)
-    return points[:, np.flatnonzero(bad)[0]] if bad.any() else None
+    clips = np.any((here.demand.lo > limit) | (here.demand.hi < -limit), axis=0)
+    away = np.any(np.abs(points) > 1e-9, axis=0)
+    bad = np.flatnonzero((_total(x**2).hi <= 1.0) & (grows | clips) & away)
+    return np.asarray(points[:, bad[0]]) if len(bad) else None

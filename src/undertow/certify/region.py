@@ -68,6 +68,7 @@ class _Enclosures:
         self.point = self._compile(tape, inputs, [value, rate])
         self.box = self._compile(tape, inputs, [value, rate, *slope, *gradient])
         self._tape, self._inputs, self._gradient, self._x = tape, inputs, gradient, x
+        self._second: OutwardFunction | None = None
 
     def _compile(
         self, tape: Tape, inputs: Sequence[sp.Symbol], outputs: Sequence[sp.Expr]
@@ -78,9 +79,10 @@ class _Enclosures:
     def hessian(self, box: list[Interval]) -> list[list[Interval]]:
         """Interval Hessian of V̇ in x over a box."""
         size = len(self._x)
-        rows = [derivative_tape(self._tape, self._x, g) for g in self._gradient[:size]]
-        run = self._compile(self._tape, self._inputs, [e for row in rows for e in row])
-        flat = [Interval.of(v) for v in run(*box)]
+        if self._second is None:
+            rows = [derivative_tape(self._tape, self._x, g) for g in self._gradient[:size]]
+            self._second = self._compile(self._tape, self._inputs, [e for row in rows for e in row])
+        flat = [Interval.of(v) for v in self._second(*box)]
         return [flat[i * size : (i + 1) * size] for i in range(size)]
 
     def over(self, low: FloatArray, high: FloatArray) -> tuple[Interval, Interval, FloatArray]:
@@ -188,10 +190,15 @@ def verify_region(
     names = [p.name for p in motion.parameters if p.name in box_parameters]
     ends = np.array([box_parameters[k] for k in names], dtype=float).reshape(-1, 2).T
 
+    # The parameters in slices that cover their box: neighbours share their end.
+    cuts = [np.linspace(*box_parameters[k], 17 if len(names) == 1 else 5) for k in names]
+    slices = list(
+        itertools.product(*([Interval(a, b) for a, b in itertools.pairwise(c)] for c in cuts))
+    )
     core = 0.25 * reach
     for _ in range(24):
-        cube = [Interval(-c, c) for c in core] + [Interval(*box_parameters[k]) for k in names]
-        if _negative_definite(enclosures.hessian(cube)):
+        cube = [Interval(-c, c) for c in core]
+        if all(_negative_definite(enclosures.hessian([*cube, *part])) for part in slices):
             break
         core = core / 1.6
     else:

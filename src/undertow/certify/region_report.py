@@ -39,6 +39,8 @@ OTHERS: dict[str, tuple[float, str]] = {
     "cart_pendulum": (0.6, "m_p"),
     "overhead_crane": (1.0, "m_p"),
     "pendubot": (0.3, "b_2"),
+    "ball_and_beam": (0.2, "m_b"),
+    "reaction_wheel_pendulum": (0.5, "b_p"),
 }
 
 
@@ -92,12 +94,12 @@ HEAD = (
 def simulated_limit(motion: Motion, top: float, points: int = 100) -> float:
     """Return how far along y_0, at rest, simulated motions converge (a grid up to ``top``).
 
-    Runge-Kutta 4 with steps of 1/20 of the fastest linear time constant, until 1 % of the
-    slowest is left; a motion that passes a singularity does not count.
+    Runge-Kutta 4 with steps of 1/20 of the fastest linear time constant, 0.5 ms at most, for five
+    slowest time constants; a motion that passes a singularity does not count.
     """
     eigenvalues = np.linalg.eigvals(motion.jacobian)
     fast, slow = np.abs(eigenvalues).max(), -eigenvalues.real.max()
-    h = 0.05 / fast
+    h = min(0.05 / fast, 5e-4)
     start = np.zeros((points, motion.size))
     start[:, 0] = top * np.arange(1, points + 1) / points
     y, good = start.copy(), np.ones(points, dtype=bool)
@@ -111,8 +113,7 @@ def simulated_limit(motion: Motion, top: float, points: int = 100) -> float:
             y = y + h / 6 * (a + 2 * b + 2 * c + d)
             good &= motion.determinant(y) / reference > 0
             y[~good] = 0.0
-    norms = np.abs(y) / np.abs(y).max(initial=1e-300, axis=0)
-    good &= np.isfinite(y).all(axis=1) & (np.abs(y[:, 0]) < 0.2 * start[:, 0]) & (norms <= 1).all(1)
+    good &= np.isfinite(y).all(axis=1) & (np.abs(y[:, 0]) < 0.2 * start[:, 0])
     return float(start[good.argmin() - 1, 0]) if not good.all() else top
 
 
@@ -145,13 +146,19 @@ def _box(
 
 
 def report(
-    title: str, motion: SurfaceMotion, target: float, uncertain: str, *, boxes: bool = False
+    title: str,
+    motion: SurfaceMotion,
+    target: float,
+    uncertain: str,
+    *,
+    seconds: float = 100.0,
+    boxes: bool = False,
 ) -> Row:
     """Prove one row, with its parameter box if asked."""
     way = np.eye(motion.size)[0]
     free = motion.mechanism.coordinates[motion.mechanism.m]
     started = time.process_time()
-    region = prove_region(motion, way, seconds=120.0, degrees=(2, 4, 6), goal=1.02 * target)
+    region = prove_region(motion, way, seconds=seconds, degrees=(2, 4, 6), goal=1.12 * target)
     found = time.process_time()
     raised = verify_region(motion, region.function.times(1 / 1.05), max_seconds=120.0)
     top = singular_distance_on_axis(motion, math.pi if free.unit == "rad" else 10 * target)
@@ -172,10 +179,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", default=[], help="rows: 1 … 5, or mechanisms")
     parser.add_argument("--boxes", action="store_true", help="with a parameter ±5 %% as well")
+    parser.add_argument("--seconds", type=float, default=100.0, help="of each search")
     arguments = parser.parse_args()
     print(HEAD, flush=True)
     for row in motions(arguments.only):
-        print(report(*row, boxes=arguments.boxes).markdown(), flush=True)
+        line = report(*row, seconds=arguments.seconds, boxes=arguments.boxes)
+        print(line.markdown(), flush=True)
 
 
 if __name__ == "__main__":

@@ -504,7 +504,7 @@ def prove_region(
         When the surface is not locally stable.
     """
     way = np.asarray(direction, dtype=float)
-    attempts: list[tuple[Start, bool]] = [("far", False), ("far", True), ("round", False)]
+    attempts: list[tuple[Start, bool]] = [("round", False), ("far", False), ("far", True)]
     found = []
     for start, slow in attempts:
         V = search_region(
@@ -523,7 +523,7 @@ def prove_region(
             break
     best, verdict = None, None
     for V in sorted(found, key=lambda V: -extent(V, way)):
-        for factor in (1.001, 1.01, 1.03, 1.06, 1.1, 1.3, 2.0):
+        for factor in (1.001, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3, 1.45, 1.7, 2.0):
             candidate = V.times(factor)
             reach = extent(candidate, way) * (1 - 1e-9)
             if best is not None and reach <= best.extent:

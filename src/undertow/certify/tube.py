@@ -264,14 +264,14 @@ class Tubes:
         begin = self.field.over(start)
         guess = start + span * begin.rate
         outer = rates = None
-        good = np.zeros(start.lo.shape[1], dtype=bool)
+        good: Mask = np.zeros(start.lo.shape[1], dtype=bool)
         for _ in range(12):
             room = 0.05 * (guess.hi - guess.lo) + 1e-9
             outer = Interval(guess.lo - room, guess.hi + room)
             rates = self.field.over(outer)
             guess = start + span * rates.rate
             with np.errstate(invalid="ignore"):
-                good = ((guess.lo >= outer.lo) & (guess.hi <= outer.hi)).all(axis=0)
+                good = np.all((guess.lo >= outer.lo) & (guess.hi <= outer.hi), axis=0)
             if good.all():
                 break
         assert outer is not None

@@ -53,6 +53,9 @@ def bench(
             "simulated rig's own."
         ),
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Signs, scales and breakaway alone.")
+    ] = False,
     setting: Settings = None,
     seed: Seed = 0,
     out: Annotated[
@@ -84,6 +87,7 @@ def bench(
             belief,
             delay=expected,
             rest=rest,
+            learn=not quick,
             progress=progress,
         )
     console = terminal()

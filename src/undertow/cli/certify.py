@@ -25,6 +25,7 @@ from undertow.cli.terminal import (
 )
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
+from undertow.mechanisms import LIBRARY
 from undertow.stability import first_surface
 
 __all__ = ["certify", "verify"]
@@ -201,6 +202,12 @@ def verify(
 
     certificate = read_certificate(file)
     check_settings(certificate, inputs.parse_values(setting or ()))
+    if mechanism is None and certificate.name not in LIBRARY:
+        raise InvalidInputError(
+            "certificate of a mechanism that the library does not have",
+            value=certificate.name,
+            remedy="Name its file: --mechanism FILE.py:NAME",
+        )
     model = _mechanism(mechanism or certificate.name, None)
     own = mechanism is not None and ".py:" in mechanism
     console = terminal()

@@ -60,6 +60,9 @@ def run(
     worker: Annotated[
         Literal["process", "thread"], typer.Option(help="Where the optimiser runs.")
     ] = "process",
+    shadow: Annotated[
+        bool, typer.Option(help="Make every step again before the next: warm caches, a check.")
+    ] = True,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="In simulated time: as fast as it goes.")
     ] = False,
@@ -94,6 +97,7 @@ def run(
                 log=log,
                 simulated=simulated,
                 processes=3 if worker == "process" else 0,
+                shadow=shadow,
                 progress=progress,
             )
             runtime = stack.enter_context(ready)

@@ -46,6 +46,13 @@ def trials(
         float, typer.Option(help="balance: start of the pendulum, degrees from the upright.")
     ] = 35.0,
     rigs: Annotated[int, typer.Option(help="robustness: random rigs.", min=1)] = 200,
+    single: Annotated[
+        bool,
+        typer.Option(help="robustness: also look for the largest single change that is survived."),
+    ] = True,
+    limits: Annotated[
+        bool, typer.Option(help="balance: also search for the catch limits, which takes longest.")
+    ] = True,
     quick: Annotated[
         bool, typer.Option("--quick", help="A look: three rigs, no search for catch limits.")
     ] = False,
@@ -65,7 +72,10 @@ def trials(
     with progress_bar() as progress:
         if what == "balance":
             result = experiment.balance(
-                angle=math.radians(angle), seeds=seeds, limits=not quick, progress=progress
+                angle=math.radians(angle),
+                seeds=seeds,
+                limits=limits and not quick,
+                progress=progress,
             )
             shown = report.balance_report(result)
         elif what == "swing-up":
@@ -82,7 +92,7 @@ def trials(
             shown = report.robustness_report(
                 stress.robustness(
                     rigs=min(rigs, 10) if quick else rigs,
-                    seeds=0 if quick else 5,
+                    seeds=5 if single and not quick else 0,
                     progress=progress,
                 )
             )

@@ -22,7 +22,7 @@ from undertow.runtime.modes import Command, Mode, Signs, successor
 from undertow.runtime.sensors import SensorWatch
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import Answer, Request, lanes_of
-from undertow.runtime.steps import confine
+from undertow.runtime.steps import confine, off_by, sound
 
 __all__ = ["Controller", "Inputs", "Note"]
 
@@ -158,11 +158,14 @@ class Controller:
         fault = inputs.alarm or self._observe(inputs.measurement)
         np.take(self.x, self._of_u, out=self._swing)
         self._evaluate(t)
-        if inputs.answer is not None:
-            self._receive(t, inputs.answer)
+        free = True  # one thing a step: what is rare is also slow
         if self._pending is not None and t >= self._pending.use - 0.5 * self.period:
             self._use(self._pending)
             self._evaluate(t)
+            free = False
+        if inputs.answer is not None:
+            self._receive(t, inputs.answer)
+            free = False
         radius = math.sqrt(float(self.x @ self.x))
         margin = self.margin[0]
         signs.command, signs.fault = inputs.command, fault
@@ -178,7 +181,8 @@ class Controller:
         if self.mode in (Mode.CATCH, Mode.BALANCE):
             np.multiply(self.sensors.band, 2.0 * self.sensors.probe, out=self._wanted)
             self._wanted += self.demand
-            self._ask(t)
+            if free:
+                self._ask(t)
         elif self.mode == Mode.SWING_UP and self.swing_up is not None:
             self._wanted[:] = self.swing_up(t, self.x)
 
@@ -280,7 +284,7 @@ class Controller:
             return f"late by {1e3 * (t - self._asked.use):.1f} ms"
         lanes = answer.lanes
         plan = answer.memory.plan
-        if lanes.shape != (len(plan.times), self._lanes.shape[1]) or not np.isfinite(lanes).all():
+        if lanes.shape != (len(plan.times), self._lanes.shape[1]) or not sound(lanes):
             return "not a plan for this mechanism"
         if answer.use != self._asked.use or answer.memory.sequence != answer.sequence:
             return "not what was asked for"
@@ -289,7 +293,7 @@ class Controller:
     def _use(self, answer: Answer) -> None:
         """Put an answer to use at its time, if the state is the one it was made for."""
         self._pending = None
-        off = float(np.max(np.abs(self.x - answer.x) / (1.0 + np.abs(answer.x))))
+        off = off_by(self.x, answer.x)
         u, demand, s, margin = self._scratch
         self._law(self.x, answer.lanes[0], self._parameters, self._law_limits, u, demand, s, margin)
         if not answer.admission.accepted:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
 import os
 import signal
 import tempfile
@@ -24,6 +23,7 @@ from undertow.runtime.faults import Witness
 from undertow.runtime.keeper import KeptRig
 from undertow.runtime.log import read_log
 from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.processes import fork
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import replay
 from undertow.runtime.session import session
@@ -170,9 +170,7 @@ def kill_run(recipe: Recipe, moment: float, folder: Path) -> Killed:
         For the log and the keeper's record.
     """
     log, record = folder / "killed.db", folder / "keeper.json"
-    context = multiprocessing.get_context("fork")
-    victim = context.Process(target=_victim, args=(recipe, log, record))
-    victim.start()
+    victim = fork(_victim, (recipe, log, record), "undertow victim", daemon=False)
     assert victim.pid is not None  # it has just been started
     first = _first_line(log)
     time.sleep(max(0.0, first + moment - time.perf_counter()))

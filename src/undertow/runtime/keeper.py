@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
 import signal
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ import numpy as np
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
 from undertow.runtime.clock import prompt
+from undertow.runtime.processes import fork, pipe
 from undertow.runtime.steps import confine
 
 __all__ = ["KeptRig"]
@@ -51,18 +51,17 @@ class KeptRig:
         silence: float = 0.02,
         record: Path | None = None,
     ) -> None:
-        context = multiprocessing.get_context("fork")
         self.period = period
-        self._pipe, theirs = context.Pipe()
-        self.process = context.Process(
-            target=_keep,
-            args=(make, theirs, self._pipe, period, limits, slew, silence, record),
-            name="undertow keeper",
+        self._pipe, theirs = pipe()
+        self.process = fork(
+            _keep,
+            (make, theirs, self._pipe, period, limits, slew, silence, record),
+            "undertow keeper",
+            daemon=False,
         )
-        self.process.start()
         theirs.close()
         self._last: Measurement = self._pipe.recv()
-        self._asked = False
+        self._asked = 0
 
     def read(self) -> Measurement:
         """Return the measurement that the keeper took after the last output.
@@ -78,15 +77,15 @@ class KeptRig:
             if not self._pipe.poll(0.5 * self.period):
                 message = "the keeper does not answer"
                 raise TimeoutError(message)
-            self._last, self._asked = self._pipe.recv(), False
+            while self._asked and self._pipe.poll(0.0):  # late answers too: the newest counts
+                self._last = self._pipe.recv()
+                self._asked -= 1
         return self._last
 
     def write(self, u: FloatArray) -> None:
         """Hand the output to the keeper."""
-        while self._asked and self._pipe.poll(0.0):  # an answer that came too late
-            self._last, self._asked = self._pipe.recv(), False
         self._pipe.send(u)
-        self._asked = True
+        self._asked += 1
 
     def close(self) -> None:
         """Let the keeper bring the output to zero and let go."""
@@ -97,7 +96,7 @@ class KeptRig:
 
 def _keep(
     make: Callable[[], Rig],
-    pipe: Connection,
+    ours: Connection,
     theirs: Connection,
     period: float,
     limits: FloatArray,
@@ -110,14 +109,14 @@ def _keep(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with prompt():
-        facts = _hold(make(), pipe, period, limits, slew, silence)
+        facts = _hold(make(), ours, period, limits, slew, silence)
     if record is not None:
         record.write_text(json.dumps(facts))
 
 
 def _hold(
     rig: Rig,
-    pipe: Connection,
+    ours: Connection,
     period: float,
     limits: FloatArray,
     slew: FloatArray,
@@ -127,14 +126,14 @@ def _hold(
     heard = at_zero = time.perf_counter()
     gone = False
     with contextlib.suppress(OSError):
-        pipe.send(rig.read())
+        ours.send(rig.read())
     while not gone or u.any():
         wanted = None
         try:
             if gone:
                 time.sleep(period)
-            elif pipe.poll(period if u.any() else silence):
-                wanted = pipe.recv()
+            elif ours.poll(period if u.any() else silence):
+                wanted = ours.recv()
         except (EOFError, OSError):
             gone = True
         now = time.perf_counter()
@@ -151,6 +150,6 @@ def _hold(
             at_zero = time.perf_counter()
         if wanted is not None:
             with contextlib.suppress(OSError):
-                pipe.send(rig.read())
+                ours.send(rig.read())
     rig.close()
     return {"heard": heard, "zero": at_zero, "largest": largest, "u": u.tolist()}

@@ -12,13 +12,19 @@ from types import FrameType
 from undertow.cascade import CascadeState
 from undertow.rig.interface import Rig
 from undertow.runtime.clock import SimulatedClock, WallClock
-from undertow.runtime.controller import Inputs
 from undertow.runtime.log import Columns, Log
 from undertow.runtime.loop import Runtime
-from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
-from undertow.runtime.slow import Answer, InlineWorker, Request, Worker, background_worker, respond
+from undertow.runtime.slow import (
+    Answer,
+    Compute,
+    InlineWorker,
+    Request,
+    Worker,
+    background_worker,
+    respond,
+)
 
 __all__ = ["session", "warm_up"]
 
@@ -31,6 +37,7 @@ def session(
     simulated: bool = False,
     processes: int = 3,
     rig: Rig | None = None,
+    shadow: bool = True,
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Runtime]:
     """Make a runtime ready from a recipe: first optimum, everything compiled and connected.
@@ -47,6 +54,8 @@ def session(
         For the optimiser, see :func:`undertow.runtime.background_worker`; 0: a thread.
     rig
         The plant; the recipe's simulated one by default.
+    shadow
+        Against the wall clock: make every step again, see :class:`undertow.runtime.Runtime`.
     progress
         Called with (what, fraction) before each part.
 
@@ -74,8 +83,7 @@ def session(
     plant = recipe.make_rig() if rig is None else rig
     memory, _ = recipe.cascade.start(recipe.x0)
     tell("warming up", 0.6)
-    warm_up(recipe, memory)
-    compute(Request(0.0, recipe.x0, recipe.settings.lead, memory))
+    warm_up(recipe, memory, compute)
     controller = recipe.make_controller(memory)
     with contextlib.ExitStack() as stack:
         # First the processes are forked, then threads begin.
@@ -89,20 +97,19 @@ def session(
             columns = Columns.of(recipe.belief)
             book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
         clock = SimulatedClock() if simulated else WallClock()
-        shadow = None if simulated else recipe.make_controller(memory)
-        runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=shadow)
+        double = recipe.make_controller(memory) if shadow and not simulated else None
+        runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=double)
         stack.enter_context(_operator(runtime))
         tell("ready", 1.0)
         yield runtime
 
 
-def warm_up(recipe: Recipe, memory: CascadeState) -> None:
-    """Make some steps on a rig that is thrown away, so that everything is compiled."""
-    rig = recipe.make_rig()
-    controller = recipe.make_controller(memory)
-    for k in range(60):
-        command = Command.START if k == 0 else Command.NONE
-        rig.write(controller.step(Inputs(k * recipe.period, rig.read(), None, command)))
+def warm_up(recipe: Recipe, memory: CascadeState, compute: Compute) -> None:
+    """Make a short run in simulated time and throw it away, so that everything is compiled."""
+    controller, lead = recipe.make_controller(memory), recipe.settings.lead
+    worker = InlineWorker(compute, 0.5 * lead)
+    runtime = Runtime(controller, recipe.make_rig(), worker, clock=SimulatedClock())
+    runtime.run(min(recipe.settings.settle + 1.2 * lead, 1.0))
 
 
 @contextlib.contextmanager

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import math
-import multiprocessing
 import os
 import signal
 import threading
@@ -29,6 +28,7 @@ from undertow.inner_loop import lane
 from undertow.mechanism import FloatArray
 from undertow.optimiser import Proposal
 from undertow.plan import Plan
+from undertow.runtime.processes import fork, pipe
 from undertow.sliding import SlidingModeLaw
 
 __all__ = [
@@ -276,12 +276,8 @@ class _Child(_Computer):
     """A forked process: it has everything compiled already, and can be ended at any time."""
 
     def __init__(self, compute: Compute) -> None:
-        context = multiprocessing.get_context("fork")
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(
-            target=_serve, args=(compute, theirs, self.pipe), name="undertow slow loop", daemon=True
-        )
-        self.process.start()
+        self.pipe, theirs = pipe()
+        self.process = fork(_serve, (compute, theirs, self.pipe), "undertow slow loop")
         theirs.close()
         super().__init__(self._exchange)
 
@@ -297,7 +293,7 @@ class _Child(_Computer):
             self.pipe.close()
 
 
-def _serve(compute: Compute, pipe: Connection, theirs: Connection) -> None:
+def _serve(compute: Compute, ours: Connection, theirs: Connection) -> None:
     """Answer requests until the other end is gone."""
     theirs.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the fast loop decides when to end
@@ -306,7 +302,7 @@ def _serve(compute: Compute, pipe: Connection, theirs: Connection) -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
     with contextlib.suppress(EOFError, OSError):
         while True:
-            pipe.send(compute(pipe.recv()))
+            ours.send(compute(ours.recv()))
 
 
 def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWorker:

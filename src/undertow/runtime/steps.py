@@ -7,7 +7,7 @@ import math
 from undertow.codegen.machine import numba
 from undertow.mechanism import FloatArray
 
-__all__ = ["confine"]
+__all__ = ["confine", "off_by", "sound"]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -20,3 +20,23 @@ def confine(wanted: FloatArray, u: FloatArray, limits: FloatArray, slew: FloatAr
         aim = wanted[i] if math.isfinite(wanted[i]) else 0.0
         aim = max(u[i] - slew[i], min(u[i] + slew[i], aim))
         u[i] = max(-limits[i], min(limits[i], aim)) + 0.0  # no −0: a log does not keep its sign
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def off_by(x: FloatArray, expected: FloatArray) -> float:
+    """Return the largest |x_i − e_i| / (1 + |e_i|); infinite where that is no number."""
+    worst = 0.0
+    for i in range(x.shape[0]):
+        part = abs(x[i] - expected[i]) / (1.0 + abs(expected[i]))
+        if not part <= worst:
+            worst = part if part < math.inf else math.inf
+    return worst
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def sound(numbers: FloatArray) -> bool:
+    """Whether all numbers, (S, …), are finite, and so is their sum."""
+    size = 0.0
+    for value in numbers.flat:
+        size += abs(value)
+    return size < math.inf

@@ -77,7 +77,8 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
             f"system; {report.skipped:,} periods skipped",
         )
         same = "the same outputs" if not report.disagreed else f"{report.disagreed:,} other outputs"
-        lines.add_row("shadow", f"{report.shadowed:,} steps made again, {same}")
+        if report.shadowed:
+            lines.add_row("shadow", f"{report.shadowed:,} steps made again, {same}")
     path = " → ".join(
         text.split(":")[0].split(" → ")[-1] for _, what, text in report.events if what == "state"
     )

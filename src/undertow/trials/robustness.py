@@ -2,11 +2,12 @@
 
 Every rig is the SRV02 bench with masses within ±20 %, friction between nothing and twice as
 much, up to 5 ms of delay in all, and a knock on the pendulum on the way.  The controllers
-know the bench they were made for, and nothing of this.
+know the bench they were made for, and nothing of this.  NMPC joins where CasADi is installed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,10 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
+from undertow.errors import MissingExtraError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.rig import Bench, Friction, Push, srv02_rig
 from undertow.stability import linearise
 from undertow.trials.balance import OBJECTIVES, controllers
+from undertow.trials.nmpc import NMPC, predictive
 from undertow.trials.trial import MakeController, Outcome, estimator_for, trial
 
 __all__ = [
@@ -34,8 +37,6 @@ Progress = Callable[[str, float], None]
 
 #: Half-width of the masses; scale of friction; delay in all, s; impulse, N m s.
 MASSES, FRICTION, DELAY, IMPULSE = 0.20, 2.0, 0.005, 0.004
-
-CONTROLLERS = ("cascade", "fixed surface", "clipped LQR")
 
 
 def clipped_regulator(belief: Mechanism) -> MakeController:
@@ -191,6 +192,9 @@ def robustness(
         "fixed surface": made["one-time"],
         "clipped LQR": clipped_regulator(belief),
     }
+    with contextlib.suppress(MissingExtraError):  # then there is nothing to compare with
+        NMPC(belief, objective)
+        makers["NMPC, 10 Hz"] = predictive(belief, objective)
 
     def once(name: str, truth: Bench, seed: int) -> Outcome:
         known = estimator_for(belief, bench)
@@ -199,9 +203,9 @@ def robustness(
         )
 
     outcomes: dict[str, list[Outcome]] = {}
-    parts = len(CONTROLLERS) * (1 + (len(FACTORS) if seeds else 0))
+    parts = len(makers) * (1 + (len(FACTORS) if seeds else 0))
     done = 0
-    for name in CONTROLLERS:
+    for name in makers:
         runs = []
         for seed in range(rigs):
             progress(f"{rigs} random rigs, {name}", (done + seed / rigs) / parts)
@@ -211,7 +215,7 @@ def robustness(
         done += 1
     breaking: dict[tuple[str, str], Breaking] = {}
     for factor, (change, largest, _, _) in FACTORS.items() if seeds else ():
-        for name in CONTROLLERS:
+        for name in makers:
             progress(f"{factor}, {name}", done / parts)
 
             def survives(

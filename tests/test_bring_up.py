@@ -1,0 +1,249 @@
+"""The bring-up wizard: faults on an emulated rig are found, parameters with honest intervals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow.bring_up import (
+    BringUp,
+    GuardError,
+    bring_up,
+    doublets,
+    explain,
+    identify,
+    miswired,
+    perform,
+    rest_state,
+)
+from undertow.cli import app
+from undertow.errors import InfeasibleError, InvalidInputError
+from undertow.mechanisms import LIBRARY
+from undertow.rig import Bench, Encoder, Friction, IdealRig, RealisticRig, Timing, srv02_rig
+
+
+@lru_cache(maxsize=16)
+def wizard(*faults: str, seed: int = 0, learn: bool = True) -> BringUp:
+    """A bring-up of the realistic SRV02 rig with some faults."""
+    belief = ut.mechanisms.rotary_pendulum()
+    rest = rest_state(belief)
+    rig = miswired(RealisticRig(srv02_rig(), rest, seed), belief, faults)
+    return bring_up(rig, belief, delay=1.5e-3, rest=rest, learn=learn)
+
+
+def wrong(found: BringUp) -> set[tuple[str, str]]:
+    return {(f.check, f.part) for f in found.wrong}
+
+
+# -- rest ------------------------------------------------
+
+
+def test_mechanisms_rest_where_they_are_stable_or_say_that_they_do_not() -> None:
+    """A pendulum hangs, a crane hangs at its target, a ball does not stay on its beam."""
+    assert rest_state(LIBRARY["rotary_pendulum"]())[1] == np.pi
+    assert (rest_state(LIBRARY["overhead_crane"]()) == 0).all()
+    with pytest.raises(InfeasibleError, match="cannot be left alone"):
+        rest_state(LIBRARY["ball_and_beam"]())
+    for name in ("pendubot", "acrobot", "triple_pendulum_on_a_cart", "gantry_crane"):
+        mechanism = LIBRARY[name]()
+        x = rest_state(mechanism)
+        assert np.abs(mechanism.accelerations(0.0, x, np.zeros(mechanism.m))).max() < 1e-6
+
+
+# -- motions ------------------------------------------------
+
+
+def test_a_guard_stops_the_motion_and_leaves_the_input_at_zero() -> None:
+    """A coordinate that goes too far ends the motion, whatever was still to be written."""
+    belief = ut.mechanisms.rotary_pendulum()
+    rig = IdealRig(belief, rest_state(belief))
+    with pytest.raises(GuardError, match="coordinate 0"):
+        perform(rig, np.full((2000, 1), 5.0), [0.3, 3.0])
+    assert rig.applied[0] == 0.0
+    assert abs(rig.read().q[0]) < 0.4
+
+
+def test_doublets_have_no_mean() -> None:
+    """Pushes to and fro cancel, so that a joint comes back."""
+    u = doublets(2.0, [0.05, 0.1], 0.2, 0.001)
+    assert u.sum() == 0.0
+    assert set(u) == {0.0, 2.0, -2.0}
+
+
+# -- signs and scales ------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("inputs", "encoders"),
+    [
+        ([1, 1], [1, 1, 1]),
+        ([-1, 1], [1, 1, 1]),
+        ([1, 1], [1, -1, 1]),
+        ([1, -1], [1, 1, -1]),
+        ([1, 1], [4, 1, 1]),
+        ([1, 1], [1, 1, -57.3]),
+        ([0, 1], [1, 1, 1]),
+        ([1, 1], [1, 0, 1]),
+        ([2.5, 1], [1, -2, 1]),
+    ],
+)
+def test_the_fewest_faults_explain_the_gains(inputs: list[float], encoders: list[float]) -> None:
+    """From g = k cᵀ with a tenth of error the faults come back; dead parts too."""
+    rng = np.random.default_rng(0)
+    gain = np.outer(inputs, encoders) * (1 + 0.1 * rng.uniform(-1, 1, (2, 3)))
+    wiring = explain(gain, np.ones((2, 3), dtype=bool))
+    for found, made in ((wiring.inputs, inputs), (wiring.encoders, encoders)):
+        assert np.allclose(found, made, rtol=0.25)
+        ones = np.abs(made) == 1
+        assert (found[ones] == np.array(made)[ones]).all()
+
+
+@pytest.mark.parametrize(
+    ("fault", "found"),
+    [
+        ("voltage=-1", ("input sign", "voltage")),
+        ("theta=4", ("encoder scale", "theta")),
+        ("voltage=0", ("input", "voltage")),
+        ("phi=0", ("encoder", "phi")),
+    ],
+)
+def test_a_fault_on_the_realistic_rig_is_found_and_nothing_else(
+    fault: str, found: tuple[str, str]
+) -> None:
+    """Friction, encoders, delays, drawn parameters: the one fault, and no false alarm."""
+    assert wrong(wizard(fault, learn=False)) == {found}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("fault", "found"),
+    [
+        ((), set()),
+        (("voltage=-1",), {("input sign", "voltage")}),
+        (("theta=-1",), {("encoder sign", "theta")}),
+        (("phi=-1",), {("encoder sign", "phi")}),
+        (("theta=2",), {("encoder scale", "theta")}),
+        (("phi=0.25",), {("encoder scale", "phi")}),
+        (("phi=57.29578",), {("encoder scale", "phi")}),
+        (("delay=0.0015",), {("delay", "the loop")}),
+        (("theta=-1", "phi=2"), {("encoder sign", "theta"), ("encoder scale", "phi")}),
+    ],
+)
+def test_faults_on_other_rigs(
+    fault: tuple[str, ...], found: set[tuple[str, str]], seed: int
+) -> None:
+    """Nine wirings on three rigs with other parameters, zeros and noise."""
+    assert wrong(wizard(*fault, seed=seed)) == found
+
+
+@pytest.mark.slow
+def test_a_healthy_rig_is_called_healthy_and_its_delay_is_measured() -> None:
+    """No false alarm; the delay within a quarter of a millisecond; most parameters close."""
+    found = wizard()
+    assert found.wrong == ()
+    assert found.identification is not None
+    late = found.identification.estimates["delay"]
+    assert late.value == pytest.approx(1.55e-3, abs=0.25e-3)
+    assert (found.identification.explained > 0.999).all()
+    assert "m" in found.identification.held
+    truth = RealisticRig(srv02_rig(), seed=0).mechanism
+    scale = 0.125 / next(p.value for p in truth.parameters if p.name == "m")
+    for p in truth.parameters:
+        if p.name in ("I_e", "d_e", "a_e"):
+            estimate = found.identification.estimates[p.name]
+            assert estimate.value == pytest.approx(scale * p.value, rel=0.02)
+            nominal = next(q.value for q in ut.mechanisms.rotary_pendulum().parameters
+                           if q.name == p.name)  # fmt: skip
+            assert estimate.nominal == nominal
+
+
+# -- identification ------------------------------------------------
+
+
+def bench_in_the_class(seed: int) -> tuple[ut.Mechanism, RealisticRig, dict[str, float]]:
+    """A rig that the model class contains: counted and noisy positions, friction, other values."""
+    rng = np.random.default_rng([seed, 7])
+    belief = ut.mechanisms.rotary_pendulum()
+    truth = {"I_e": 0.0036, "d_e": 0.073, "a_e": 0.1285}
+    truth = {k: v * (1 + 0.1 * rng.uniform(-1, 1)) for k, v in truth.items()}
+    bench = Bench(
+        belief.with_parameters(**truth),
+        friction={"theta": Friction(0.03), "phi": Friction(0.0003)},
+        encoders=dict.fromkeys(("theta", "phi"), Encoder(2 * np.pi / 4096, noise=1e-3)),
+        timing=Timing(0.001, measurement_delay=0.002, steps=2),
+    )
+    rest = rest_state(belief)
+    known = truth | {"delay": 0.002, "friction_theta": 0.03, "l": 0.1675, "r_o": 0.215}
+    return belief, RealisticRig(bench, rest, seed), known
+
+
+def identified(seed: int) -> tuple[dict[str, tuple[float, float, float]], dict[str, float]]:
+    belief, rig, known = bench_in_the_class(seed)
+    u = doublets(2.5, [0.05, 0.1, 0.2, 0.1, 0.05, 0.2, 0.15], 0.3, 0.001)[:, None]
+    found = identify(belief, rest_state(belief), perform(rig, u, [3.0, 3.0]))
+    return {k: (e.low, e.value, e.high) for k, e in found.estimates.items()}, known
+
+
+def test_parameters_come_back_from_noisy_counts() -> None:
+    """Inertia, damping, motor constant, friction and delay, from a 10 % wrong guess."""
+    found, known = identified(0)
+    for name, value in known.items():
+        low, best, high = found[name]
+        assert best == pytest.approx(value, rel=0.05 if name == "delay" else 0.02), name
+        assert low < best < high
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
+    """95 % intervals over 24 rigs: of all quantities together, nine in ten cover at least."""
+    hits, total = 0, 0
+    for seed in range(24):
+        found, known = identified(seed)
+        for name, value in known.items():
+            if name in found:
+                low, _, high = found[name]
+                hits += low <= value <= high
+                total += 1
+    assert total > 120
+    assert 0.85 <= hits / total <= 1.0, f"{hits} of {total}"
+
+
+def test_a_motion_without_motion_is_refused() -> None:
+    """Nothing can be learnt from a rig that stood still."""
+    belief = ut.mechanisms.rotary_pendulum()
+    rig = IdealRig(belief, rest_state(belief))
+    record = perform(rig, np.zeros((100, 1)), [1.0, 1.0])
+    with pytest.raises(InvalidInputError, match="nothing moved"):
+        identify(belief, rest_state(belief), replace(record, q=np.zeros_like(record.q)))
+
+
+# -- the command ------------------------------------------------
+
+
+def test_command_says_what_is_wrong_and_keeps_it(tmp_path: Path) -> None:
+    """One fault, one line that names it and what to do; the files hold the same."""
+    words = ["bench", "rotary_pendulum", "--fault", "voltage=0", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 1
+    (line,) = [row for row in result.stdout.splitlines() if row.startswith("Wrong: ")]
+    assert "voltage" in line
+    assert "cable" in line
+    kept = json.loads((tmp_path / "findings.json").read_text())
+    assert [f["part"] for f in kept["findings"] if f["verdict"] == "wrong"] == ["voltage"]
+
+
+@pytest.mark.parametrize("fault", ["piano=2", "theta", "theta=x", "theta=nan"])
+def test_command_refuses_faults_that_are_none(fault: str) -> None:
+    """The parts that there are stand in the refusal."""
+    result = CliRunner().invoke(app, ["bench", "rotary_pendulum", "--fault", fault])
+    assert result.exit_code == 2
+    assert "voltage" in result.stderr
+    assert result.stderr.startswith("error: ")
