@@ -152,6 +152,7 @@ class Killed:
 def _victim(recipe: Recipe, log: Path, record: Path) -> None:
     limits = recipe.settings.limits(recipe.belief)
     slew = recipe.settings.slew(recipe.belief) * recipe.period
+    recipe.make_rig().write(np.zeros_like(limits))  # compiles what the keeper needs
     rig = KeptRig(recipe.make_rig, recipe.period, limits, slew, record=record)
     with session(recipe, rig=rig, log=log, processes=1) as runtime:
         runtime.run(60.0)

@@ -32,7 +32,7 @@ class KeptRig:
     Parameters
     ----------
     make
-        Makes the rig, in the keeper.
+        Makes the rig, in the keeper.  What it needs should be compiled already.
     limits, slew
         Largest |u|, and largest change in one period, (m,).
     silence
@@ -52,6 +52,7 @@ class KeptRig:
         record: Path | None = None,
     ) -> None:
         self.period = period
+        confine(np.zeros_like(limits), np.zeros_like(limits), limits, slew)  # compiled by now
         self._pipe, theirs = pipe()
         self.process = fork(
             _keep,
