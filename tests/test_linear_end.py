@@ -1,0 +1,100 @@
+"""The exact linear end of a closed loop, and what a rollout sees between its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import undertow as ut
+from undertow.codegen.block import LANES
+from undertow.mechanism import FloatArray
+from undertow.rollout import ClosedLoop
+from undertow.tail import LinearEnd, Prepared
+
+
+def _prepared(loop: ClosedLoop, spread: float) -> tuple[Prepared, LinearEnd]:
+    """Prepare the ends of a block of surfaces around the designed one."""
+    rig, rng = loop.mechanism, np.random.default_rng(3)
+    base = ut.first_surface(rig).normalised().vector
+    surfaces = base * np.exp(spread * rng.standard_normal((LANES, base.size)))
+    eta, layer = np.split(loop.reaching.vector(rig.m), 2)
+    end = loop.linear_end
+    assert end is not None
+    laws = [np.repeat(v[None], LANES, axis=0) for v in (eta, layer)]
+    return end.prepare(surfaces, *laws), end
+
+
+def _full(rows: FloatArray) -> FloatArray:
+    n = len(rows)
+    return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), rows])
+
+
+@pytest.mark.parametrize(
+    "build", [ut.mechanisms.rotary_pendulum, ut.mechanisms.double_pendulum_on_a_cart]
+)
+def test_linear_ends_agree_with_scipy(build: Callable[[], ut.Mechanism]) -> None:
+    """Lyapunov integrals, decay rates, stability and e^{At} of sixteen loops at once."""
+    prepared, _ = _prepared(ClosedLoop(build(), ut.MinimumTime(), tail=1e-3), 0.1)
+    stable = 0
+    for lane in range(LANES):
+        A = _full(prepared.A[lane])
+        slowest = -np.linalg.eigvals(A).real.max()
+        assert (slowest > 0) == (prepared.stable[lane] > 0)
+        if slowest < 0.05:
+            continue
+        stable += 1
+        P = scipy.linalg.solve_continuous_lyapunov(A.T, -np.eye(len(A)))
+        np.testing.assert_allclose(prepared.P[lane], P, rtol=1e-8, atol=1e-8 * np.abs(P).max())
+        assert prepared.rate[lane] == pytest.approx(slowest, rel=0.1)
+        power = prepared.powers[0, 5].reshape(len(A), len(A), LANES)[:, :, lane]
+        np.testing.assert_allclose(power, scipy.linalg.expm(0.16 * A), atol=1e-7)
+    assert stable >= LANES // 2
+
+
+def test_the_linear_end_agrees_with_integration(rig: ut.Mechanism) -> None:
+    """Cost to 0.1 %, time to 1 %, on random surfaces and states, in a fraction of the steps."""
+    rng = np.random.default_rng(5)
+    entries = np.array([-1.5, 1.7, 12.0]) * np.exp(0.5 * rng.standard_normal((200, 3)))
+    vectors = np.column_stack([-np.ones(200), entries])
+    states = rng.uniform([-1, -0.5, -1, -1], [1, 0.5, 1, 1], (200, 4))
+    exact = ClosedLoop(rig, ut.MinimumEnergy())
+    whole = exact.batch(states, vectors, stable_only=True)
+    ended = replace(exact, tail=5e-4).batch(states, vectors, stable_only=True)
+    both = whole.reached & ended.reached
+    assert both.sum() > 60
+    np.testing.assert_array_equal(whole.reached, ended.reached)
+    np.testing.assert_allclose(ended.cost[both], whole.cost[both], rtol=1e-3)
+
+
+def test_a_fast_pass_through_the_terminal_set_is_seen(rig: ut.Mechanism) -> None:
+    """The chord of a step counts: a pass between two samples is an arrival, whatever the step."""
+    surface = ut.Surface(-1, -3.6, 1.38, 9.07)
+    x = rig.state(phi=ut.deg(38))
+    near = ClosedLoop(rig, ut.MinimumTime()).batch(
+        x, surface, terminal=0.0, duration=3.0, seek=True
+    )
+    radius = 1.05 * float(near.closest[0])
+    for step in (0.002, 0.004):
+        loop = ClosedLoop(rig, ut.MinimumTime(terminal_radius=radius), step=step)
+        batch = loop.batch(x, surface, duration=3.0)
+        assert batch.reached[0]
+        assert batch.time[0] == pytest.approx(near.closest_time[0], abs=0.02)
+        assert np.linalg.norm(batch.x[0]) == pytest.approx(radius, rel=1e-6)
+
+
+def test_the_closest_approach_is_that_of_the_recorded_motion(rig: ut.Mechanism) -> None:
+    """Smallest ‖x‖, when and where: no larger than any sample, and on the motion."""
+    loop = ClosedLoop(rig, ut.MinimumTime())
+    surface = ut.Surface(-1, -3.6, 1.38, 9.07)
+    x = rig.state(phi=ut.deg(35))
+    batch = loop.batch(x, surface, terminal=0.0, duration=2.0, seek=True)
+    motion = loop.simulate(x, surface, terminal=0.0, duration=2.0)
+    radii = np.linalg.norm(motion.x, axis=1)
+    assert batch.closest[0] <= radii.min()
+    assert batch.closest[0] == pytest.approx(np.linalg.norm(batch.closest_x[0]))
+    place = [np.interp(batch.closest_time[0], motion.t, column) for column in motion.x.T]
+    np.testing.assert_allclose(batch.closest_x[0], place, atol=1e-9)

@@ -1,0 +1,84 @@
+"""The quadratic-model search: what it solves, and that it keeps the face of every search."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from undertow.errors import InvalidInputError
+from undertow.mechanism import FloatArray
+from undertow.search import CMAES, minimise
+from undertow.trust_region import TrustRegion
+
+
+def _bowl(x: FloatArray) -> FloatArray:
+    """A tilted quadratic, 1 at its minimum at (0.3, 0.3, …)."""
+    y = x - 0.3
+    turned = y @ np.tri(x.shape[1])
+    return np.asarray(1.0 + (turned * turned).sum(axis=1))
+
+
+def _bent(x: FloatArray) -> FloatArray:
+    """Smooth, but not quadratic."""
+    return np.asarray(_bowl(x) + 0.3 * np.sin(3.0 * x).sum(axis=1) ** 2)
+
+
+@pytest.mark.parametrize("d", [1, 3, 5, 7])
+def test_a_quadratic_takes_a_few_generations(d: int) -> None:
+    """The model is exact, so what limits it is the first step length."""
+    search = TrustRegion(np.zeros(d), 0.1, 16, np.random.default_rng(0))
+    minimise(search, _bowl, evaluations=400, tolerance=1e-12)
+    assert search.best_f == pytest.approx(1.0, abs=1e-3)
+
+
+def test_fewer_evaluations_than_a_covariance_takes() -> None:
+    """On a smooth function of three coordinates, at equal quality, over ten seeds."""
+
+    def spent(search: TrustRegion | CMAES) -> int:
+        used = 0
+        while search.best_f > 1.002 * best and used < 2000:
+            x = search.ask()
+            search.tell(x, _bent(x))
+            used += len(x)
+        return used
+
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 1.0, 61)] * 3), -1).reshape(-1, 3)
+    best = float(_bent(grid).min())
+    seeds = range(10)
+    model = [spent(TrustRegion(np.ones(3), 0.1, 16, np.random.default_rng(s))) for s in seeds]
+    covariance = [spent(CMAES(np.ones(3), 0.1, 16, np.random.default_rng(s))) for s in seeds]
+    assert np.median(model) <= np.median(covariance)
+
+
+def test_penalties_and_nan_stay_out_of_the_model() -> None:
+    """A wall through the region leaves the best admissible candidate, and never a NaN."""
+
+    def walled(x: FloatArray) -> FloatArray:
+        cost = np.where(x[:, 0] > 0.1, 1e9, _bowl(x))
+        return np.where(x[:, 1] > 0.9, np.nan, cost)
+
+    search = TrustRegion(np.zeros(3), 0.2, 16, np.random.default_rng(1))
+    minimise(search, walled, evaluations=320, tolerance=1e-12)
+    assert np.isfinite(search.best_f)
+    assert search.best_f < float(walled(np.zeros((1, 3)))[0])
+    assert search.best_x[0] <= 0.1
+
+
+def test_same_seed_same_bits() -> None:
+    """Nothing but the seed decides."""
+    runs = []
+    for _ in range(2):
+        search = TrustRegion(np.ones(4), 0.1, 16, np.random.default_rng(7))
+        minimise(search, _bent, evaluations=200)
+        runs.append(search.best_x)
+    np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize(
+    ("mean", "radius", "population"),
+    [([np.nan], 0.1, 16), ([0.0], 0.0, 16), ([0.0], np.inf, 16), ([0.0], 0.1, 3)],
+)
+def test_refuses_unusable_settings(mean: list[float], radius: float, population: int) -> None:
+    """As the other searches do."""
+    with pytest.raises(InvalidInputError, match="search"):
+        TrustRegion(np.array(mean), radius, population, np.random.default_rng(0))
