@@ -71,7 +71,7 @@ def test_same_seed_same_bits() -> None:
         search = TrustRegion(np.ones(4), 0.1, 16, np.random.default_rng(7))
         minimise(search, _bent, evaluations=200)
         runs.append(search.best_x)
-    np.testing.assert_array_equal(*runs)
+    np.testing.assert_array_equal(runs[0], runs[1])
 
 
 @pytest.mark.parametrize(

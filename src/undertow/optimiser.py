@@ -8,7 +8,6 @@ left to :mod:`undertow.shooting` in the end.
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -553,17 +552,18 @@ class _Task:
         if wide > 0:
             self.cost(here + self.decision.steps(self.rng, np.geomspace(0.1, 1.0, wide)))
 
-    def shoot(self) -> Literal[False]:
+    def shoot(self) -> bool:
         """Shrink the time of arrival: from a fresh start, then from the best plan, and so on."""
         loop, rng = self.owner.loop, self.rng
         aim = Shooting(self._miss, 0.9 * loop.objective.terminal_radius, loop.step, self._exhausted)
-        for attempt in itertools.count():
-            if self._exhausted():
-                return False
+        attempt = 0
+        while not self._exhausted():
             shot = self._fresh(aim) if attempt % 4 == 0 else self._again(aim)
             if shot is not None:
                 z, _ = aim.hop(*aim.shrink(*shot), lambda z: self._mutants(z, 256), rng, 15)
                 self.cost(z[None])
+            attempt += 1
+        return False
 
     def _fresh(self, aim: Shooting) -> tuple[FloatArray, float] | None:
         """Return a shot from far and wide that arrives earlier than the best one."""
