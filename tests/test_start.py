@@ -233,3 +233,18 @@ def test_what_is_not_analytic_is_differentiated_by_symbols() -> None:
     np.testing.assert_allclose(change, [[-3, 0], [0, 0]], atol=1e-15)
     np.testing.assert_allclose(linearise(drag).F - linearise(rig).F, [[0, 0], [0, -1]], atol=1e-12)
     assert stability.linearise(drag) is linearise(drag)
+
+
+def test_a_known_first_surface_is_not_designed_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The kept design has the same bits, and is another one's for other parameters or weights."""
+    monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path))
+    rig = ut.mechanisms.cart_pendulum()
+    designed = ut.first_surface(rig)
+    other = ut.first_surface(rig, rate=0.5)
+    monkeypatch.setattr(stability, "_regular_form", None)  # a second design would fail here
+    assert ut.first_surface(rig) == designed
+    assert ut.first_surface(rig, rate=0.5) == other != designed
+    with pytest.raises(TypeError):
+        ut.first_surface(rig.with_parameters(m_p=0.1234))

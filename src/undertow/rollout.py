@@ -253,13 +253,10 @@ class ClosedLoop:
     @cached_property
     def _hands_over(self) -> bool:
         """Whether rollouts may end in the linear model."""
+        if not self.tail > 0 or self.objective.constraints:
+            return False
         end = self.linear_end
-        return bool(
-            self.tail > 0
-            and end is not None
-            and end.stage is not None
-            and not self.objective.constraints
-        )
+        return end is not None and end.stage is not None
 
     def _prepare(self, lanes: FloatArray) -> Prepared | None:
         """Linearise the last surface of every lane, (N, 2mn + 2m + 1)."""
@@ -337,7 +334,7 @@ class ClosedLoop:
         self._check_gains(room.lanes, room.live, stable_only)
         hands_over = self._hands_over and not every
         prepared = self._prepare(room.lanes[:, -1]) if hands_over or stable_only else None
-        end = self.linear_end
+        end = self.linear_end if hands_over else None
         if prepared is not None and stable_only:
             room.live *= prepared.stable
         self._kernel(
@@ -367,7 +364,7 @@ class ClosedLoop:
             record,
             room.out,
         )  # fmt: skip
-        if hands_over and end is not None and prepared is not None:
+        if end is not None and prepared is not None:
             end.complete(prepared, room.out, start + steps * self.step)
         return room.batch(start)
 

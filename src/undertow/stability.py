@@ -9,16 +9,17 @@ damping the same condition reads (35)-(37) at the target.
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import scipy.linalg
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.codegen.store import content_key, recall, remember
 from undertow.errors import (
     InvalidInputError,
     ModelError,
@@ -360,6 +361,10 @@ def first_surface(
         When (A, B) is not controllable, with the Hautus distance.
     InvalidInputError
         For weights or a rate that cannot be used.
+
+    Notes
+    -----
+    A design is kept on disk beside the kernels, so that a second start need not repeat it.
     """
     n, m = mechanism.n, mechanism.m
     if weights is None:
@@ -371,6 +376,16 @@ def first_surface(
         )
     if not (np.isfinite(rate) and rate >= 0):
         raise InvalidInputError("convergence rate", value=rate, limit="finite and ≥ 0 1/s")
+    key = content_key(
+        mechanism.structure,
+        repr((mechanism.parameter_values.tolist(), diagonal.tolist(), float(rate))),
+        sources=(__file__,),
+    )
+    known = recall("surface", key)
+    if known is not None:
+        return Surface.from_vector(np.array(json.loads(known)), n, m)
+    import scipy.linalg  # slow to import: a known design does without
+
     A, T = _regular_form(mechanism)
     free = 2 * n - m
     Q = T @ np.diag(diagonal) @ T.T
@@ -385,7 +400,9 @@ def first_surface(
     except np.linalg.LinAlgError as error:
         raise _uncontrollable(mechanism) from error
     K = np.linalg.solve(Q[free:, free:], A[:free, free:].T @ P + Q[:free, free:].T)
-    return _surface_of(mechanism, np.hstack([K, np.eye(m)]) @ T)
+    surface = _surface_of(mechanism, np.hstack([K, np.eye(m)]) @ T)
+    remember("surface", key, json.dumps(surface.vector.tolist()))
+    return surface
 
 
 def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
