@@ -71,6 +71,11 @@ def main() -> int:
     met = True
     for objective in (ut.MinimumEnergy(), ut.MinimumTime()):
         asked = questions(objective, budget)
+        if not asked:
+            print(
+                f"minimum {objective.name}: no proposal to judge with {budget.evaluations} rollouts"
+            )
+            continue
         quick = replace(asked[0][0], tail=TAIL)
 
         def modes(loop: Any, old: Any, new: Any, x: Any, horizon: float) -> None:

@@ -53,7 +53,8 @@ def run(mechanism: ut.Mechanism, q: float) -> tuple[float, float]:
 
 def main() -> int:
     """Sweep the weights for each mechanism that is named."""
-    for name in sys.argv[1:] or ["tora"]:
+    names = [name for name in sys.argv[1:] if name != "--quick"]
+    for name in names or ["tora"]:
         mechanism = ut.mechanisms.LIBRARY[name]()
         (cost, arrival), q = min((run(mechanism, q), q) for q in WEIGHTS)
         print(f"{name}: {cost:.3g} with q = {q:.1e}, arrives at {arrival:.1f} s", flush=True)

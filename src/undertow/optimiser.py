@@ -55,6 +55,10 @@ MISS_PRICE = 0.1
 #: What a radius e times the terminal one at the deadline costs, as a part of the cost.
 LATE_PRICE = 0.3
 
+#: Late motions are worth this part of the best admissible cost or more: less would lead a search
+#: after motions that never arrive and cost next to nothing.
+LATE_WORTH = 0.97
+
 #: Improvements below this part of the cost do not keep a model search going.
 WORTHWHILE = 1e-3
 
@@ -217,7 +221,7 @@ class Optimiser:
     @property
     def _promptness(self) -> float:
         """Part of the horizon to plan for: the linear end may be late by its tolerance."""
-        return 1.0 - min(0.5 * self.loop.tail, 0.1)
+        return 1.0 - min(0.1 * self.loop.tail, 0.1)
 
     def propose(
         self,
@@ -391,7 +395,7 @@ class _Task:
         guide = scores.copy()
         _guide(
             batch.event, batch.cost, batch.radius, batch.closest, batch.closest_time,
-            loop.objective.terminal_radius, self.best_cost if seek else 0.0, guide,
+            loop.objective.terminal_radius, self.best_cost, seek, guide,
         )  # fmt: skip
         return scores, guide
 
@@ -463,6 +467,9 @@ class _Task:
             return self._descend(self._centre(), 0.1, self.left, 1e-3)
         search = TrustRegion(here, 0.1, LANES, self.rng)
         self._run(search, known)
+        if not self.best_cost < INADMISSIBLE:
+            self._look_around(here)
+            return self._descend(self._centre(), 0.3, self.left, 1e-3)
         # Where the incumbent stays the best, look further away, and go where that leads.
         stagnant = not self.best_cost < (1.0 - WORTHWHILE) * self.incumbent_cost - self.resolution
         while stagnant and self.left >= LANES and not self.late():
@@ -650,20 +657,22 @@ class _Task:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _guide(  # type: ignore[no-untyped-def]
-    event, cost, radius, closest, closest_time, terminal, best, guide
+    event, cost, radius, closest, closest_time, terminal, best, seek, guide
 ):
     """Continue the score of admissible motions to those that miss by a little.
 
-    With the ``best`` time of arrival, to motions given up for costing more (event 5), by
+    In a search for an earlier arrival, to motions given up for costing more (event 5), by
     their closest approach; else to those that are late (event 0).
     """
+    if best >= INADMISSIBLE:
+        return
     for i in range(len(guide)):
-        if best > 0.0 and event[i] == 5:
+        if seek and event[i] == 5:
             miss = max(closest[i] / terminal - 1.0, 0.0)
             guide[i] = closest_time[i] + MISS_PRICE * best * miss
-        elif best == 0.0 and event[i] == 0 and radius[i] < 100.0 * terminal:
+        elif not seek and event[i] == 0 and radius[i] < 100.0 * terminal:
             lateness = math.log(max(radius[i] / terminal, 1.0))
-            guide[i] = cost[i] * (1.0 + LATE_PRICE * lateness)
+            guide[i] = max(cost[i], LATE_WORTH * best) * (1.0 + LATE_PRICE * lateness)
 
 
 def motion_margins(
