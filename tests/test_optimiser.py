@@ -91,6 +91,19 @@ def test_budget_in_evaluations_is_kept(optimisers: dict[str, ut.Optimiser]) -> N
         assert proposal.surface is not None
 
 
+def test_from_the_edge_of_the_terminal_set_there_is_nothing_to_search(
+    optimisers: dict[str, ut.Optimiser],
+) -> None:
+    """A time of arrival below one step is an answer, and no rollout of no length is asked for."""
+    optimiser = optimisers["time"]
+    start = optimiser.loop.mechanism.state(phi=0.4)
+    motion = optimiser.loop.simulate(start, CASES["4 one-time, time"])
+    x = motion.x[-1] * (1 + 1e-9)
+    proposal = optimiser.propose(x, incumbent=CASES["4 one-time, time"])
+    assert proposal.status == "converged"
+    assert proposal.cost <= optimiser.loop.step
+
+
 def test_budget_in_seconds_still_answers(optimisers: dict[str, ut.Optimiser]) -> None:
     """With no time at all the incumbent, at least, comes back."""
     optimiser = optimisers["energy"]

@@ -55,10 +55,6 @@ MISS_PRICE = 0.1
 #: What a radius e times the terminal one at the deadline costs, as a part of the cost.
 LATE_PRICE = 0.3
 
-#: Late motions are worth this part of the best admissible cost or more: less would lead a search
-#: after motions that never arrive and cost next to nothing.
-LATE_WORTH = 0.97
-
 #: Improvements below this part of the cost do not keep a model search going.
 WORTHWHILE = 1e-3
 
@@ -221,7 +217,7 @@ class Optimiser:
     @property
     def _promptness(self) -> float:
         """Part of the horizon to plan for: the linear end may be late by its tolerance."""
-        return 1.0 - min(0.1 * self.loop.tail, 0.1)
+        return 1.0 - min(0.5 * self.loop.tail, 0.1)
 
     def propose(
         self,
@@ -522,6 +518,8 @@ class _Task:
             self._look_around(here)
             return self._descend(self._centre(), 0.1, most, 1e-3)
         d, loop = here.size, self.owner.loop
+        if self.best_cost <= loop.step:  # all but there
+            return True
         if self.left < 2 * d + LANES or self.late():
             return False
         vectors, gains = self.decision.decode(here + 1e-4 * np.vstack([np.eye(d), -np.eye(d)]))
@@ -662,7 +660,8 @@ def _guide(  # type: ignore[no-untyped-def]
     """Continue the score of admissible motions to those that miss by a little.
 
     In a search for an earlier arrival, to motions given up for costing more (event 5), by
-    their closest approach; else to those that are late (event 0).
+    their closest approach; else to those that are late (event 0), never below the best admissible
+    cost: late motions may cost next to nothing.
     """
     if best >= INADMISSIBLE:
         return
@@ -672,7 +671,7 @@ def _guide(  # type: ignore[no-untyped-def]
             guide[i] = closest_time[i] + MISS_PRICE * best * miss
         elif not seek and event[i] == 0 and radius[i] < 100.0 * terminal:
             lateness = math.log(max(radius[i] / terminal, 1.0))
-            guide[i] = max(cost[i], LATE_WORTH * best) * (1.0 + LATE_PRICE * lateness)
+            guide[i] = max(cost[i], best) * (1.0 + LATE_PRICE * lateness)
 
 
 def motion_margins(
