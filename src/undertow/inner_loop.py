@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from undertow.codegen.function import COMPILED, PREAMBLE, function_source
-from undertow.codegen.store import content_key, load_module, recall, remember
+from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.sliding import (
@@ -113,25 +112,15 @@ def step(x, lane, parameters, limits, u, demand, s, margin):
         u[i] = max(-limits[i], min(limits[i], demand[i]))
 """
 
-_GENERATOR = tuple(
-    str(Path(__file__).parent / name)
-    for name in (
-        "inner_loop.py",
-        "mechanism.py",
-        "sliding.py",
-        "codegen/function.py",
-        "codegen/scalar.py",
-        "codegen/tape.py",
-    )
-)
+_GENERATOR = generators("inner_loop.py", "sliding.py", "codegen/function.py")
 
 
 @lru_cache(maxsize=64)
 def law_module(mechanism: Mechanism, switching: Switching) -> Any:
     """Return the compiled module of a law: ``law`` and, with limits, ``step``."""
     key = content_key(mechanism.structure, mechanism.name, switching, sources=_GENERATOR)
-    source = recall("law", key)
-    if source is None:
+
+    def write() -> str:
         tape, symbols = Tape(), LawSymbols.of(mechanism.n, mechanism.m)
         law = lay_law(
             mechanism.partition(tape), mechanism.x, symbols, switching, mechanism.disturbance_bounds
@@ -147,6 +136,6 @@ def law_module(mechanism: Mechanism, switching: Switching) -> Any:
             {"demand": law.u, "s": law.s, "margin": [law.margin]},
         )
         header = f'"""Sliding-mode law of {mechanism.name}; generated, do not edit."""\n\n'
-        source = f"{header}{PREAMBLE}\n\n{body}\n{_CLIP}"
-        remember("law", key, source)
-    return load_module(f"law_{mechanism.name}", source)
+        return f"{header}{PREAMBLE}\n\n{body}\n{_CLIP}"
+
+    return generated("law", mechanism.name, key, write)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import sympy as sp
 
 from undertow.codegen.block import LANES, LoopProgram, block_source
-from undertow.codegen.store import content_key, load_module, recall, remember
+from undertow.codegen.store import content_key, generators, load_module, recall, remember
 from undertow.codegen.tape import Tape
 from undertow.mechanism import TIME, Mechanism
 from undertow.objective import Objective
@@ -69,20 +68,7 @@ def lay_loop(
 
 
 #: The files that write kernels: a kept source is theirs no more once one of them changes.
-GENERATOR = tuple(
-    str(Path(__file__).parent / name)
-    for name in (
-        "kernel.py",
-        "mechanism.py",
-        "objective.py",
-        "partition.py",
-        "quantities.py",
-        "sliding.py",
-        "codegen/block.py",
-        "codegen/scalar.py",
-        "codegen/tape.py",
-    )
-)
+GENERATOR = generators("kernel.py", "objective.py", "sliding.py", "codegen/block.py")
 
 
 @lru_cache(maxsize=64)

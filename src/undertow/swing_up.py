@@ -20,7 +20,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -28,7 +27,7 @@ import scipy.linalg
 import sympy as sp
 
 from undertow.codegen.function import COMPILED, PREAMBLE, function_source
-from undertow.codegen.store import content_key, load_module, recall, remember
+from undertow.codegen.store import content_key, generated, generators, recall, remember
 from undertow.codegen.tape import Tape
 from undertow.errors import InfeasibleError, InvalidInputError, ModelError, UndertowError
 from undertow.inner_loop import InnerLoop
@@ -110,24 +109,14 @@ def attempt(x0, gains, belief, plant, drag, limit, middle, stops, P, level, wrap
     return -nearest
 """  # noqa: E501
 
-_GENERATOR = tuple(
-    str(Path(__file__).parent / name)
-    for name in (
-        "swing_up.py",
-        "rig/stepping.py",
-        "mechanism.py",
-        "codegen/function.py",
-        "codegen/scalar.py",
-        "codegen/tape.py",
-    )
-)
+_GENERATOR = generators("swing_up.py", "rig/stepping.py", "codegen/function.py")
 
 
 @lru_cache(maxsize=32)
 def _module(mechanism: Mechanism) -> Any:
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
-    source = recall("swing", key)
-    if source is None:
+
+    def write() -> str:
         tape = Tape()
         part = mechanism.partition(tape)
         velocities = sp.Matrix(mechanism.x[mechanism.n :])
@@ -137,7 +126,7 @@ def _module(mechanism: Mechanism) -> Any:
         energies = tape.let_all([kinetic, kinetic + mechanism.potential - at_target])
         given = {"x": mechanism.x, "parameters": mechanism.parameter_symbols}
         blocks = [part.S[0, 0], part.h[0], part.B[0, 0]]
-        source = "\n\n".join(
+        return "\n\n".join(
             [
                 f'"""Swing-up of {mechanism.name}; generated, do not edit."""\n\n{PREAMBLE}',
                 dynamics_source(mechanism),
@@ -146,8 +135,8 @@ def _module(mechanism: Mechanism) -> Any:
                 _BODY,
             ]
         )
-        remember("swing", key, source)
-    return load_module(f"swing_{mechanism.name}", source)
+
+    return generated("swing", mechanism.name, key, write)
 
 
 def hanging(mechanism: Mechanism) -> FloatArray:

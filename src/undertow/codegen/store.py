@@ -13,7 +13,7 @@ import os
 import platform
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -23,7 +23,25 @@ import sympy as sp
 
 from undertow.codegen.machine import numba
 
-__all__ = ["cache_folder", "content_key", "load_module", "recall", "remember"]
+__all__ = [
+    "cache_folder",
+    "content_key",
+    "generated",
+    "generators",
+    "load_module",
+    "recall",
+    "remember",
+]
+
+#: Files of this package that every generated module depends on: they turn a mechanism into
+#: formulas, and formulas into code.
+FORMULAS = (
+    "mechanism.py",
+    "partition.py",
+    "quantities.py",
+    "codegen/scalar.py",
+    "codegen/tape.py",
+)
 
 
 def cache_folder() -> Path:
@@ -82,6 +100,34 @@ def remember(name: str, key: str, text: str) -> None:
     with contextlib.suppress(OSError):
         path = _writable_folder() / f"{name}_{key[:32]}.txt"
         _write(path, f"{_seal(key, text)}\n{text}")
+
+
+def generators(*names: str) -> tuple[str, ...]:
+    """Return the paths of files of this package, by name, and of ``FORMULAS``.
+
+    What they generate is theirs no more once one of them changes: for :func:`content_key`.
+    """
+    package = Path(__file__).parent.parent
+    return tuple(str(package / name) for name in (*names, *FORMULAS))
+
+
+def generated(kind: str, name: str, key: str, write: Callable[[], str]) -> ModuleType:
+    """Import a generated module, writing its source only where none is kept under the key.
+
+    Parameters
+    ----------
+    kind, name
+        What is generated, and for which mechanism: the module's name.
+    key
+        Everything that the source depends on, see :func:`content_key`.
+    write
+        Returns the source.
+    """
+    source = recall(kind, key)
+    if source is None:
+        source = write()
+        remember(kind, key, source)
+    return load_module(f"{kind}_{name}", source)
 
 
 def _seal(key: str, text: str) -> str:

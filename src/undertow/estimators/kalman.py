@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.codegen.function import COMPILED, PREAMBLE
-from undertow.codegen.store import content_key, load_module, recall, remember
+from undertow.codegen.store import content_key, generated, generators
 from undertow.errors import InvalidInputError
 from undertow.estimators.interface import positive
 from undertow.mechanism import FloatArray, Mechanism
@@ -105,31 +104,22 @@ def estimate(h, q, u, x, P, past, count, limits, parameters, noise, variance, ou
 """
 
 
-_GENERATOR = tuple(
-    str(Path(__file__).parent.parent / name)
-    for name in (
-        "estimators/kalman.py",
-        "estimators/covariance.py",
-        "rig/stepping.py",
-        "mechanism.py",
-        "codegen/function.py",
-        "codegen/scalar.py",
-        "codegen/tape.py",
-    )
+_GENERATOR = generators(
+    "estimators/kalman.py", "estimators/covariance.py", "rig/stepping.py", "codegen/function.py"
 )
 
 
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
-    source = recall("kalman", key)
-    if source is None:
+
+    def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
         header = f'"""Kalman filter of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
         parts = "from undertow.estimators.covariance import carry, correct\n"
-        source = f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
-        remember("kalman", key, source)
-    return load_module(f"kalman_{mechanism.name}", source)
+        return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
+
+    return generated("kalman", mechanism.name, key, write)
 
 
 class KalmanFilter:

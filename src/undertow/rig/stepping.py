@@ -15,13 +15,12 @@ q⁺ = q* + ½ h M⁻¹ p, so that what sticks does not creep.
 from __future__ import annotations
 
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import sympy as sp
 
 from undertow.codegen.function import COMPILED, PREAMBLE, function_source
-from undertow.codegen.store import content_key, load_module, recall, remember
+from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.mechanism import TIME, Mechanism
 
@@ -126,28 +125,18 @@ def dynamics_source(mechanism: Mechanism) -> str:
     )
 
 
-_GENERATOR = tuple(
-    str(Path(__file__).parent.parent / name)
-    for name in (
-        "rig/stepping.py",
-        "rig/parts.py",
-        "mechanism.py",
-        "codegen/function.py",
-        "codegen/scalar.py",
-        "codegen/tape.py",
-    )
-)
+_GENERATOR = generators("rig/stepping.py", "rig/parts.py", "codegen/function.py")
 
 
 @lru_cache(maxsize=64)
 def stepping(mechanism: Mechanism) -> Any:
     """Return the compiled module that advances a rig of this mechanism: ``advance``."""
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
-    source = recall("rig", key)
-    if source is None:
+
+    def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
         header = f'"""Rig of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
         parts = "from undertow.rig.parts import dry_friction, end_stops, measure, transmit\n"
-        source = f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
-        remember("rig", key, source)
-    return load_module(f"rig_{mechanism.name}", source)
+        return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
+
+    return generated("rig", mechanism.name, key, write)

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from undertow.codegen.function import COMPILED, PREAMBLE
-from undertow.codegen.store import content_key, load_module, recall, remember
+from undertow.codegen.store import content_key, generated, generators
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.rig.interface import Measurement
 from undertow.rig.stepping import dynamics_source
@@ -97,28 +96,18 @@ def believe(
     return missing, worst, gaps[worst], still
 """
 
-_GENERATOR = tuple(
-    str(Path(__file__).parent.parent / name)
-    for name in (
-        "runtime/sensors.py",
-        "rig/stepping.py",
-        "mechanism.py",
-        "codegen/function.py",
-        "codegen/scalar.py",
-        "codegen/tape.py",
-    )
-)
+_GENERATOR = generators("runtime/sensors.py", "rig/stepping.py", "codegen/function.py")
 
 
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
-    source = recall("watch", key)
-    if source is None:
+
+    def write() -> str:
         header = f'"""Sensor watch of {mechanism.name}; generated, do not edit."""\n\n'
-        source = f"{header}{PREAMBLE}\n\n{dynamics_source(mechanism)}\n{_BODY}"
-        remember("watch", key, source)
-    return load_module(f"watch_{mechanism.name}", source)
+        return f"{header}{PREAMBLE}\n\n{dynamics_source(mechanism)}\n{_BODY}"
+
+    return generated("watch", mechanism.name, key, write)
 
 
 class SensorWatch:
