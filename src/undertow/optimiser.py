@@ -64,8 +64,9 @@ MODEL_SIZE = 9
 #: Fruitless looks around that end a re-optimisation.
 LOOKS = 2
 
-#: Generations without such a gain that end a search along a ridge, where gains come in jumps.
-PATIENCE = 10
+#: Generations that end a search along a ridge, where gains come in jumps, unless together they
+#: gain this part of the time.
+PATIENCE, GAIN = 10, 3e-3
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
@@ -558,7 +559,7 @@ class _Task:
             self.cost,
             evaluations=min(most, self.left),
             tolerance=1e-4,
-            relative=WORTHWHILE,
+            relative=GAIN,
             patience=PATIENCE,
             stop=self.late,
         )
