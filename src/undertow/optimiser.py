@@ -211,7 +211,7 @@ class Optimiser:
         if given is not None:
             return given
         if self.shoots:
-            return Budget(40_000 if warm else 160_000)
+            return Budget(40_000 if warm else 400_000)
         if warm:
             return Budget(576 if self.counts_time else 1024)
         # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
