@@ -519,6 +519,8 @@ class _Task:
             patience=2,
             stop=self.late,
         )
+        if first and incumbent is not None:  # no time for a single generation
+            self.cost(search.mean[None], incumbent)
 
     def _along_the_ridge(self, here: FloatArray) -> bool:
         """Search for an earlier arrival along the thin set of plans that arrive directly.
