@@ -64,6 +64,9 @@ MODEL_SIZE = 9
 #: Fruitless looks around that end a re-optimisation.
 LOOKS = 2
 
+#: Time that packing an answer takes, s.
+ANSWERING = 1e-4
+
 #: Generations that end a search along a ridge, where gains come in jumps, unless together they
 #: gain this part of the time.
 PATIENCE, GAIN = 10, 3e-3
@@ -330,7 +333,7 @@ class _Task:
         """Whether another batch, taking as long as the last one, would overrun the time."""
         now = time.perf_counter()
         self._pace, self._last = now - self._last, now
-        return now - self.began + self._pace >= self.budget.seconds
+        return now - self.began + self._pace + ANSWERING >= self.budget.seconds
 
     @property
     def left(self) -> int:
