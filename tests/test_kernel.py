@@ -26,7 +26,7 @@ from support import (
     random_surface,
     runge_kutta,
 )
-from undertow.codegen import block, store
+from undertow.codegen import block, rows, store
 from undertow.kernel import lay_loop
 from undertow.mechanism import TIME, FloatArray
 from undertow.sliding import Switching
@@ -248,7 +248,7 @@ def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
         lay_loop(rig, None, ut.MinimumEnergy(), "saturation"), sampled=False, header=""
     )
     lines = source.splitlines()
-    heads = [i for i, line in enumerate(lines) if line.strip() == f"for i in range({block.LANES}):"]
+    heads = [i for i, line in enumerate(lines) if line.strip() == f"for i in range({rows.LANES}):"]
     assert len(heads) >= 6
     for head in heads:
         depth = len(lines[head]) - len(lines[head].lstrip())

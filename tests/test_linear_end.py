@@ -10,7 +10,7 @@ import pytest
 import scipy.linalg
 
 import undertow as ut
-from undertow.codegen.block import LANES
+from undertow.codegen.rows import LANES
 from undertow.mechanism import FloatArray
 from undertow.rollout import ClosedLoop
 from undertow.tail import LinearEnd, Prepared

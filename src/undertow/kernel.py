@@ -7,7 +7,8 @@ from typing import Any
 
 import sympy as sp
 
-from undertow.codegen.block import LANES, LoopProgram, block_source
+from undertow.codegen.block import block_source
+from undertow.codegen.rows import LANES, LoopProgram
 from undertow.codegen.store import content_key, generators, load_module, recall, remember
 from undertow.codegen.tape import Tape
 from undertow.mechanism import TIME, Mechanism
@@ -68,7 +69,14 @@ def lay_loop(
 
 
 #: The files that write kernels: a kept source is theirs no more once one of them changes.
-GENERATOR = generators("kernel.py", "objective.py", "sliding.py", "codegen/block.py")
+GENERATOR = generators(
+    "kernel.py",
+    "objective.py",
+    "sliding.py",
+    "codegen/block.py",
+    "codegen/rows.py",
+    "codegen/settle.py",
+)
 
 
 @lru_cache(maxsize=64)

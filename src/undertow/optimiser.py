@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.codegen.block import LANES
 from undertow.codegen.machine import numba
+from undertow.codegen.rows import LANES
 from undertow.decision import Decision, Freedom
 from undertow.errors import InfeasibleError, InvalidInputError, SingularSurfaceError, UndertowError
 from undertow.mechanism import FloatArray

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.codegen.block import LANES
+from undertow.codegen.rows import LANES
 from undertow.errors import InvalidInputError
 from undertow.kernel import compile_loop
 from undertow.mechanism import FloatArray, Mechanism
@@ -340,33 +340,45 @@ class ClosedLoop:
         end = self.linear_end if hands_over else None
         if prepared is not None and stable_only:
             live *= prepared.stable
-        self._kernel(
-            room.states,
-            live,
-            room.lanes,
-            switches,
-            numbers.plant,
-            numbers.belief,
-            numbers.limits,
-            room.quiet if noise is None else noise,
-            start,
-            self.step,
-            steps,
-            max(1, self.hold),
-            self.objective.terminal_radius if terminal is None else terminal,
-            self.escape,
-            cap,
-            1.0 if seek else 0.0,
-            self.tail if hands_over else 0.0,
-            1.0 if end is not None and end.counts_cost else 0.0,
-            slack,
-            _NOTHING if prepared is None else prepared.A,
-            _NOTHING if prepared is None else prepared.P,
-            _NOTHING[0, 0] if prepared is None else prepared.rate,
-            every,
-            record,
-            room.out,
-        )  # fmt: skip
+        tail = self.tail if hands_over else 0.0
+
+        def run(live: FloatArray, tail: float, out: FloatArray) -> None:
+            self._kernel(
+                room.states,
+                live,
+                room.lanes,
+                switches,
+                numbers.plant,
+                numbers.belief,
+                numbers.limits,
+                room.quiet if noise is None else noise,
+                start,
+                self.step,
+                steps,
+                max(1, self.hold),
+                self.objective.terminal_radius if terminal is None else terminal,
+                self.escape,
+                cap,
+                1.0 if seek else 0.0,
+                tail,
+                1.0 if end is not None and end.counts_cost else 0.0,
+                slack,
+                _NOTHING if prepared is None else prepared.A,
+                _NOTHING if prepared is None else prepared.P,
+                _NOTHING[0, 0] if prepared is None else prepared.rate,
+                _NOTHING if prepared is None else prepared.powers,
+                _NOTHING[None] if prepared is None else prepared.forced,
+                every,
+                record,
+                out,
+            )
+
+        run(live, tail, room.out)
+        again = room.out[:, 2] == -2.0
+        if again.any():  # these left the linear range after all: small steps to the end
+            whole = np.empty_like(room.out)
+            run(live * again, 0.0, whole)
+            room.out[again] = whole[again]
         if end is not None and prepared is not None:
             end.complete(prepared, room.out, start + steps * self.step)
         return room.batch(start)

@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 import sympy as sp
 
-from undertow.codegen.block import LANES
-from undertow.codegen.linear import LEVELS, linear_source
+from undertow.codegen.linear import LEVELS, SETTLING, linear_source
 from undertow.codegen.machine import numba
+from undertow.codegen.rows import LANES
 from undertow.codegen.store import load_module
 from undertow.mechanism import FloatArray, Mechanism, numbers
 from undertow.objective import Objective
@@ -76,8 +76,8 @@ class Prepared(NamedTuple):
 
     ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
     ``P`` (C, 2n, 2n); ``rate`` (C,), decay of the slowest
-    mode, 1/s; ``stable`` (C,), 1 or 0; ``powers`` of e^{At}, see
-    :mod:`undertow.codegen.linear`.
+    mode, 1/s; ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and
+    ``forced`` responses, see :mod:`undertow.codegen.linear`.
     """
 
     A: FloatArray
@@ -86,6 +86,7 @@ class Prepared(NamedTuple):
     rate: FloatArray
     stable: FloatArray
     powers: FloatArray
+    forced: FloatArray
 
 
 class LinearEnd:
@@ -134,6 +135,7 @@ class LinearEnd:
             np.empty(count),
             np.empty(count),
             np.empty((count // LANES, LEVELS, N * N * LANES)),
+            np.empty((count // LANES, SETTLING, 2, N * N * LANES)),
         )
 
     def prepare(self, lanes: FloatArray, gains: FloatArray | None, into: Prepared) -> None:
@@ -154,7 +156,9 @@ class LinearEnd:
             lanes, _SAME if gains is None else gains, self.X, self.Y, self.H, self.S,
             self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, into.A, into.Q,
         )  # fmt: skip
-        self._blocks.double(into.A, into.Q, into.P, into.rate, into.stable, into.powers)
+        self._blocks.double(
+            into.A, into.Q, into.P, into.rate, into.stable, into.powers, into.forced
+        )
 
     def complete(self, prepared: Prepared, out: FloatArray, horizon: float) -> None:
         """Add the linear ends to the kernel's results, (C, columns), in place.

@@ -17,79 +17,14 @@ from dataclasses import dataclass
 
 import sympy as sp
 
+from undertow.codegen.rows import LANES, LoopProgram, Rows
 from undertow.codegen.scalar import Emitter
-from undertow.codegen.tape import Tape
+from undertow.codegen.settle import MOST, begin_settling, choose_step, end_settling, settling_step
 
-__all__ = ["LANES", "LoopProgram", "block_source"]
+__all__ = ["block_source"]
 
-#: Closed loops in one block: two AVX-512 registers or four AVX2 registers of float64.
-LANES = 16
-
-#: The residual of the linear end is looked at in these intervals, s; the largest of the last
-#: four to eight counts.
+#: Whether a lane may hand over is looked at in these intervals, s.
 WATCH = 0.032
-
-
-@dataclass(frozen=True)
-class LoopProgram:
-    """A closed loop on a tape, ready for printing.
-
-    The control part maps (x, surface, gains) to ``demand``, ``s`` and ``margins``; the flow
-    part maps (t, x, ``applied``) to ``derivative``, ``stage`` and ``path``.  ``applied`` are
-    the symbols that stand for the inputs after the actuator.
-    """
-
-    tape: Tape
-    time: sp.Symbol
-    state: tuple[sp.Symbol, ...]
-    applied: tuple[sp.Symbol, ...]
-    limits: tuple[sp.Symbol, ...]
-    plant_parameters: tuple[sp.Symbol, ...]
-    belief_parameters: tuple[sp.Symbol, ...]
-    lane_inputs: tuple[sp.Symbol, ...]
-    demand: tuple[sp.Expr, ...]
-    s: tuple[sp.Expr, ...]
-    singular: sp.Expr
-    derivative: tuple[sp.Expr, ...]
-    stage: sp.Expr
-    path: tuple[sp.Expr, ...]
-    input_margin: sp.Expr | None
-
-
-class _Rows:
-    """The rows of the flat work array, by name; a row holds one value per lane.
-
-    Every attribute is the text of an element, ``W[offset + i]``, or a list of them.
-    """
-
-    def __init__(self, program: LoopProgram, kept: Sequence[sp.Symbol]) -> None:
-        self.count = 0
-        nx, m, nw = len(program.state), len(program.applied), len(program.path)
-        self.x, self.stage_x, self.slope = self._take(nx), self._take(nx), self._take(nx)
-        self.cost, self.cost_slope = self._take(2)
-        lane_inputs = program.lane_inputs
-        self.lane = dict(zip(lane_inputs, self._take(len(lane_inputs)), strict=True))
-        self.kept = dict(zip(kept, self._take(len(kept)), strict=True))
-        self.u, self.s = self._take(m), self._take(m)
-        self.singular, self.input = self._take(2)
-        self.path = self._take(nw)
-        self.smallest = self._take(2 + nw)
-        self.linear = [self._take(nx) for _ in range(nx // 2)]
-        self.value = [self._take(nx) for _ in range(nx)]
-        self.rate, self.recent, self.earlier = self._take(3)
-        self.active, self.end, self.code, self.radius = self._take(4)
-        self.near, self.near_time = self._take(2)
-        self.near_x = self._take(nx)
-
-    def _take(self, rows: int) -> list[str]:
-        start = self.count
-        self.count += rows
-        return [f"W[{(start + j) * LANES} + i]" for j in range(rows)]
-
-    @property
-    def margins(self) -> list[str]:
-        """Margins of the present step, in the order of ``smallest``."""
-        return [self.singular, self.input, *self.path]
 
 
 class _Writer:
@@ -100,7 +35,7 @@ class _Writer:
         self.emit = Emitter(program.tape)
         self.time = self.emit.text(program.time)
         self.hoisted = _hoist(program)
-        self.rows = _Rows(program, self.hoisted.lane)
+        self.rows = Rows(program, self.hoisted.lane)
         self.constant = {*self.hoisted.call, *self.hoisted.lane}
         self.rates = [*program.derivative, program.stage]
         self.monitored = [*program.s, program.singular]
@@ -160,8 +95,6 @@ class _Writer:
             *(f"{e} = linear[b + i, {j}, {k}]" for j, k, e in _entries(r.linear)),
             *(f"{e} = value[b + i, {j}, {k}]" for j, k, e in _entries(r.value)),
             f"{r.rate} = rate[b + i]",
-            f"{r.recent} = math.inf",
-            f"{r.earlier} = math.inf",
         ]
 
     # -- the law and the plant -----------------------------------------------------------
@@ -248,13 +181,13 @@ class _Writer:
         """Runge-Kutta stages two to four; ``weight`` and ``reach`` tell them apart."""
         r, program, text = self.rows, self.program, self.emit.text
         if sampled:
-            law = [
-                f"{self.emit.text(a)} = {row}" for a, row in zip(program.applied, r.u, strict=True)
+            held = zip(program.applied, r.u, strict=True)
+            evaluate = [
+                *(f"{text(a)} = {row}" for a, row in held),
+                *self._flow(r.stage_x, self.rates, set()),
             ]
-            known: set[sp.Symbol] = set()
         else:
-            law = [*self._law(r.stage_x, []), *self._apply()]
-            known = self._laid(program.demand)
+            evaluate = self._evaluate(r.stage_x)
         slopes = []
         for j, rate in enumerate(program.derivative):
             slopes += [
@@ -263,10 +196,18 @@ class _Writer:
                 f"{r.stage_x[j]} = {r.x[j]} + reach * d_{j}",
             ]
         return [
-            *law,
-            *self._flow(r.stage_x, self.rates, known),
+            *evaluate,
             *slopes,
             f"{r.cost_slope} = {r.cost_slope} + weight * ({text(program.stage)})",
+        ]
+
+    def _evaluate(self, source: Sequence[str]) -> list[str]:
+        """Evaluate the continuous law, and the rates of the plant under it."""
+        known = self._laid(self.program.demand)
+        return [
+            *self._law(source, []),
+            *self._apply(),
+            *self._flow(source, self.rates, known),
         ]
 
     def _apply(self) -> list[str]:
@@ -303,39 +244,28 @@ class _Writer:
         ]
 
     def hand_over(self) -> list[str]:
-        """Stop a lane (code −1) once its nonlinear residual no longer matters.
+        """Stop a lane (code −1) that is well inside its boundary layer and its input limits.
 
-        See :mod:`undertow.tail`.  The largest residual of the last window counts, since a
-        residual vanishes for a moment whenever an oscillation crosses zero.
+        The rest is left to :mod:`undertow.codegen.settle`.
         """
-        r = self.rows
-        nx, n = len(r.x), len(r.linear)
+        r, m = self.rows, len(self.rows.u)
+        layers = [r.lane[symbol] for symbol in self.program.lane_inputs[-1 - m : -1]]
         return [
-            *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
-            *(
-                f"p_{j} = " + _sum(f"{e} * x_{k}" for k, e in enumerate(r.value[j]))
-                for j in range(nx)
-            ),
-            *(
-                f"r_{j} = {r.slope[n + j]} - ("
-                + _sum(f"{e} * x_{k}" for k, e in enumerate(r.linear[j]))
-                + ")"
-                for j in range(n)
-            ),
-            "level = " + _sum(f"p_{j} * x_{j}" for j in range(nx)),
-            "residual = 2.0 * (" + _sum(f"abs(p_{n + j} * r_{j})" for j in range(n)) + ")",
-            f"{r.recent} = max({r.recent}, residual)",
-            f"worst = max({r.recent}, {r.earlier})",
-            f"allowed = {r.rate} * (tail * (level + counted * {r.cost}) + slack)",
-            f"calm = {r.active} > 0.0 and worst <= allowed",
-            *(f"calm = calm and abs({row}) <= 0.5 * _limit_{j}" for j, row in enumerate(r.u)),
-            f"{r.code} = -1.0 if calm else {r.code}",
-            f"{r.active} = 0.0 if calm else {r.active}",
+            f"calm = {r.active} > 0.0",
+            *(f"calm = calm & (abs({s}) <= 0.9 * {e})" for s, e in zip(r.s, layers, strict=True)),
+            *(f"calm = calm & (abs({row}) <= 0.5 * _limit_{j})" for j, row in enumerate(r.u)),
+            f"code, active = {r.code}, {r.active}",
+            f"{r.code} = -1.0 if calm else code",
+            f"{r.active} = 0.0 if calm else active",
         ]
 
-    def forget(self) -> list[str]:
-        """Start a new window of residuals."""
-        return [f"{self.rows.earlier} = {self.rows.recent}", f"{self.rows.recent} = 0.0"]
+    def settle(self) -> list[str]:
+        """One large step of the lanes that handed over."""
+        r, text = self.rows, self.emit.text
+        rates = [text(rate) for rate in self.program.derivative]
+        return settling_step(
+            r, self._evaluate(r.x), self._evaluate(r.stage_x), rates, text(self.program.stage)
+        )
 
     def approach(self) -> list[str]:
         """Keep the point of the motion that is closest to the target, on the chord of a step."""
@@ -428,6 +358,25 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
                 sample = min(step // hold, noise.shape[0] - 1)
 {_lanes(w.sample(), 4)}
 """
+    settling = (
+        ""
+        if sampled
+        else f"""\
+        if tail > 0.0:
+            block = b // {LANES}
+            until = start + steps * h
+{_lanes(begin_settling(w.rows), 3)}
+            for step in range({MOST}):
+                alive = 0.0
+                for i in range({LANES}):
+                    alive += {w.rows.active}
+                if alive == 0.0:
+                    break
+{textwrap.indent(choose_step(w.rows), " " * 16)}\
+{_lanes(w.settle(), 4)}
+{_lanes(end_settling(w.rows), 3)}
+"""
+    )
     return f'''"""{header}"""
 
 import math
@@ -442,7 +391,7 @@ import numpy as np
 def rollout(
     x0, live, lanes, switch, plant, belief, limits, noise,
     start, h, steps, hold, terminal, escape, cap, seek, tail, counted, slack,
-    linear, value, rate, every, record, out,
+    linear, value, rate, powers, forced, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
     W = np.empty({w.rows.count * LANES})
@@ -464,8 +413,6 @@ def rollout(
 {_lanes(w.record(), 4)}
             if tail > 0.0 and step % stride == 0 and segment == switch.shape[0]:
 {_lanes(w.hand_over(), 4)}
-                if step % (4 * stride) == 0:
-{_lanes(w.forget(), 5)}
             for rk in range(3):
                 weight = 1.0 if rk == 2 else 2.0
                 reach = half if rk == 0 else h
@@ -481,6 +428,7 @@ def rollout(
                     alive += {w.rows.active}
                 if alive == 0.0:
                     break
+{settling}\
 {_lanes(w.collect(), 2)}
 '''
 

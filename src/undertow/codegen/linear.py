@@ -8,9 +8,9 @@ given N, so that its innermost loop runs over the lanes alone.
 
 from __future__ import annotations
 
-from undertow.codegen.block import LANES
+from undertow.codegen.rows import LANES
 
-__all__ = ["LEVELS", "UNIT", "linear_source"]
+__all__ = ["LEVELS", "SETTLING", "UNIT", "linear_source"]
 
 #: Time of the first stored power e^{At}, s; level k stands for 2ᵏ units.
 UNIT = 0.005
@@ -18,14 +18,19 @@ UNIT = 0.005
 #: Stored powers: the last one is e^{A t} at 164 s.
 LEVELS = 16
 
+#: Of these the responses to a force are stored too: steps of up to 0.32 s.
+SETTLING = 7
+
 
 def linear_source(size: int) -> str:
     """Return the source of a module with functions ``double`` and ``arrive``.
 
-    ``double(A, Q, P, rate, stable, powers)`` takes A (C, n, N), the lower half of a system of
-    second order, and Q (C, N, N), or (1, N, N) for all; C is a multiple of the lanes.  It
+    ``double(A, Q, P, rate, stable, powers, forced)`` takes A (C, n, N), the lower half of a
+    system of second order, and Q (C, N, N), or (1, N, N) for all; C is a multiple of lanes.  It
     writes P (C, N, N), the decay ``rate`` (C,) of the slowest mode, 1/s, whether e^{At} decays
-    at all, ``stable`` (C,), and ``powers`` (C/16, LEVELS, N·N·16).
+    at all, ``stable`` (C,), ``powers`` (C/16, LEVELS, N·N·16), and ``forced``
+    (C/16, SETTLING, 2, N·N·16): the responses at t to a constant rate and to one that rises
+    from 0 to 1, ∫₀ᵗ e^{As} ds and ∫₀ᵗ e^{A(t−s)} s/t ds.
 
     ``arrive(powers, P, out, horizon, terminal, rest, counted)`` completes the lanes of ``out``
     with code −1.
@@ -82,10 +87,11 @@ def _turned(a, b, add, o):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def double(A, Q, P, rate, stable, powers):
+def double(A, Q, P, rate, stable, powers, forced):
     half = {N // 2}
-    W = np.zeros((9, {area}))
-    zero, one, scaled, E, X, T, U, V, Z = W[0], W[1], W[2], W[3], W[4], W[5], W[6], W[7], W[8]
+    W = np.zeros((12, {area}))
+    zero, one, scaled, E, X, T = W[0], W[1], W[2], W[3], W[4], W[5]
+    U, V, Z, F, G, Y = W[6], W[7], W[8], W[9], W[10], W[11]
     for r in range({N}):
         for i in range({LANES}):
             one[(r * {N} + r) * {LANES} + i] = 1.0
@@ -122,7 +128,13 @@ def double(A, Q, P, rate, stable, powers):
             scaled[e] *= t
             E[e] = one[e]
             X[e] = U[e]
+            F[e] = one[e]
+            G[e] = one[e]
         for k in range(10, 0, -1):
+            _product(scaled, F, one, 1.0 / (k + 1), T)
+            F, T = T, F
+            _product(scaled, G, one, 1.0 / (k + 2), T)
+            G, T = T, G
             _product(scaled, E, one, 1.0 / k, T)
             _product(X, scaled, zero, 1.0 / (k + 1), V)
             for r in range({N}):
@@ -133,6 +145,8 @@ def double(A, Q, P, rate, stable, powers):
             E, T = T, E
         for e in range({area}):
             X[e] *= t
+            F[e] *= t
+            G[e] *= 0.5 * t
         for level in range(-halvings, {LEVELS}):
             if level >= 0:
                 for i in range({LANES}):
@@ -148,6 +162,15 @@ def double(A, Q, P, rate, stable, powers):
                             rate[first + i] = 0.5 * math.log(before[i] / now[i]) / (0.5 * t)
                 for i in range({LANES}):
                     before[i] = now[i]
+            if 0 <= level < {SETTLING}:
+                forced[block, level, 0] = F
+                forced[block, level, 1] = G
+            if level + 1 < {SETTLING}:
+                _product(E, G, F, 1.0, T)
+                for e in range({area}):
+                    G[e] = 0.5 * (G[e] + T[e])
+                _product(E, F, F, 1.0, Y)
+                F, Y = Y, F
             if level + 1 < {LEVELS}:
                 _product(X, E, zero, 1.0, T)
                 _turned(E, T, X, Z)
