@@ -51,7 +51,6 @@ def test_linear_ends_agree_with_scipy(build: Callable[[], ut.Mechanism]) -> None
         stable += 1
         P = scipy.linalg.solve_continuous_lyapunov(A.T, -np.eye(len(A)))
         np.testing.assert_allclose(prepared.P[lane], P, rtol=1e-8, atol=1e-8 * np.abs(P).max())
-        assert prepared.rate[lane] == pytest.approx(slowest, rel=0.1)
         power = prepared.powers[0, 5].reshape(len(A), len(A), LANES)[:, :, lane]
         np.testing.assert_allclose(power, scipy.linalg.expm(0.16 * A), atol=1e-7)
     assert stable >= LANES // 2

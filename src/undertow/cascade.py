@@ -44,7 +44,7 @@ class Admission:
 
 
 #: Relative tolerance of the linear tail in the optimiser's rollouts.
-TAIL = 5e-3
+TAIL = 2e-3
 
 #: Largest step times rate of the boundary layer in the optimiser's rollouts.
 RESOLVED = 1.0

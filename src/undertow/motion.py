@@ -38,7 +38,8 @@ class Batch:
     ``input`` the smallest u_max − |demand| (only with a hard input limit);
     ``path`` (N, w) the smallest margins of the path constraints; ``x`` (N, 2n) final states.
     ``closest``, ``closest_time`` and ``closest_x`` (N, 2n): the smallest ‖x‖₂ met, when and
-    where, if it was asked for.
+    where, if it was asked for.  ``steps``: how many it took, small ones (four evaluations of
+    law and plant) and large ones (two) alike.
     """
 
     cost: FloatArray
@@ -52,6 +53,7 @@ class Batch:
     closest_time: FloatArray
     closest_x: FloatArray
     x: FloatArray
+    steps: FloatArray
 
     @property
     def reached(self) -> NDArray[np.bool_]:

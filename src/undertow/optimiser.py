@@ -401,7 +401,7 @@ class _Task:
         probe = self.probe
         if times != self.owner.freedom.times:
             probe = loop.probe(self.x, times, self.horizon)
-        batch = probe(vectors, gains, cap=cap, slack=self.resolution, stable_only=True, seek=seek)
+        batch = probe(vectors, gains, cap=cap, stable_only=True, seek=seek)
         scores = batch.score(self.horizon)
         guide = scores.copy()
         _guide(

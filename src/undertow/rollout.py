@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.codegen.rows import LANES
+from undertow.codegen.settle import UNSETTLED
 from undertow.errors import InvalidInputError
 from undertow.kernel import compile_loop
 from undertow.mechanism import FloatArray, Mechanism
@@ -70,7 +71,7 @@ class _Room:
         self.states = np.empty((self.padded, 2 * n))
         self.live = np.ones(self.padded)
         self.ends = None if loop.linear_end is None else loop.linear_end.room(self.padded)
-        self.out = np.empty((self.padded, 8 + w + 4 * n))
+        self.out = np.empty((self.padded, 9 + w + 4 * n))
         # A sampled kernel reads the noise of every lane.
         self.quiet = np.zeros((1, self.padded, 2 * n)) if loop.hold else _NOTHING
         out = self.out[:count]
@@ -85,7 +86,8 @@ class _Room:
             closest=out[:, 6 + w],
             closest_time=out[:, 7 + w],
             closest_x=out[:, 8 + w : 8 + w + 2 * n],
-            x=out[:, 8 + w + 2 * n :],
+            x=out[:, 8 + w + 2 * n : -1],
+            steps=out[:, -1],
         )
 
     def fill(self, states: FloatArray, surfaces: FloatArray, laws: FloatArray) -> None:
@@ -132,7 +134,7 @@ class Probe:
         """Roll out surfaces (N, S, 2mn) with reaching laws (N, S, 2m).
 
         What is returned is valid until the next call.  Options are those of
-        :meth:`ClosedLoop.batch`: ``terminal``, ``cap``, ``slack``, ``stable_only``, ``seek``.
+        :meth:`ClosedLoop.batch`: ``terminal``, ``cap``, ``stable_only``, ``seek``.
         """
         count = len(surfaces)
         room = self._rooms.get(count)
@@ -324,7 +326,6 @@ class ClosedLoop:
         start: float = 0.0,
         terminal: float | None = None,
         cap: float = math.inf,
-        slack: float = 0.0,
         stable_only: bool = False,
         seek: bool = False,
         every: int = 0,
@@ -335,18 +336,20 @@ class ClosedLoop:
         numbers, live = self._numbers, room.live
         live.fill(1.0)
         self._check_gains(room.lanes, live, stable_only)
-        hands_over = self._hands_over and not every
+        # Large steps see no closest approach, and leave nothing to record.
+        hands_over = self._hands_over and not every and not seek
         prepared = self._prepare(room) if hands_over or stable_only else None
         end = self.linear_end if hands_over else None
         if prepared is not None and stable_only:
             live *= prepared.stable
-        tail = self.tail if hands_over else 0.0
 
-        def run(live: FloatArray, tail: float, out: FloatArray) -> None:
+        def run(
+            states: FloatArray, live: FloatArray, lanes: FloatArray, tail: float, out: FloatArray
+        ) -> None:
             self._kernel(
-                room.states,
+                states,
                 live,
-                room.lanes,
+                lanes,
                 switches,
                 numbers.plant,
                 numbers.belief,
@@ -362,10 +365,8 @@ class ClosedLoop:
                 1.0 if seek else 0.0,
                 tail,
                 1.0 if end is not None and end.counts_cost else 0.0,
-                slack,
                 _NOTHING if prepared is None else prepared.A,
                 _NOTHING if prepared is None else prepared.P,
-                _NOTHING[0, 0] if prepared is None else prepared.rate,
                 _NOTHING if prepared is None else prepared.powers,
                 _NOTHING[None] if prepared is None else prepared.forced,
                 every,
@@ -373,14 +374,15 @@ class ClosedLoop:
                 out,
             )
 
-        run(live, tail, room.out)
-        again = room.out[:, 2] == -2.0
-        if again.any():  # these left the linear range after all: small steps to the end
-            whole = np.empty_like(room.out)
-            run(live * again, 0.0, whole)
-            room.out[again] = whole[again]
-        if end is not None and prepared is not None:
-            end.complete(prepared, room.out, start + steps * self.step)
+        run(room.states, live, room.lanes, self.tail if hands_over else 0.0, room.out)
+        if hands_over:
+            again = np.flatnonzero(room.out[:, 2] == UNSETTLED)
+            if len(again):  # too fast for large steps, or at a limit again: small steps to the end
+                rows = np.resize(again, -(-len(again) // LANES) * LANES)
+                out = np.empty((len(rows), room.out.shape[1]))
+                run(room.states[rows], live[rows], room.lanes[rows], 0.0, out)
+                out[: len(again), -1] += room.out[again, -1]
+                room.out[again] = out[: len(again)]
         return room.batch(start)
 
     def probe(self, x: FloatArray, times: Sequence[float] = (0.0,), horizon: float = 0.0) -> Probe:
@@ -407,7 +409,6 @@ class ClosedLoop:
         duration: float | None = None,
         terminal: float | None = None,
         cap: float = math.inf,
-        slack: float = 0.0,
         stable_only: bool = False,
         seek: bool = False,
     ) -> Batch:
@@ -430,8 +431,6 @@ class ClosedLoop:
             Terminal radius; the objective's by default; 0 never ends.
         cap
             Cost beyond which a rollout is given up (``COSTLY``).
-        slack
-            Absolute error in cost that the linear end may make besides its relative one.
         stable_only
             Do not roll out surfaces that are unstable at the target (``UNSTABLE``); for
             loops with a linear model, see :attr:`linear_end`.
@@ -479,11 +478,11 @@ class ClosedLoop:
                 limit="> 0",
                 remedy="η and ε are positive",
             )
-        if not (terminal is None or terminal >= 0) or not cap >= 0 or not slack >= 0:
+        if not (terminal is None or terminal >= 0) or not cap >= 0:
             raise InvalidInputError(
-                "terminal, cap and slack of a batch",
-                value=(terminal, cap, slack),
-                limit="all ≥ 0",
+                "terminal and cap of a batch",
+                value=(terminal, cap),
+                limit="both ≥ 0",
                 remedy="Leave them out for the usual values",
             )
         count = max(states.shape[0], vectors.shape[0])
@@ -502,7 +501,6 @@ class ClosedLoop:
             duration=duration,
             terminal=terminal,
             cap=cap,
-            slack=slack,
             stable_only=stable_only,
             seek=seek,
         )[0]

@@ -1,16 +1,12 @@
-"""The infinite horizon done exactly: the linear end of a closed loop.
+"""The infinite horizon done exactly: the linear model of a closed loop, and what goes with it.
 
 Inside the boundary layer, unsaturated and near the target, the closed loop is ẋ = A x and
-the stage cost is Φ₀ + xᵀQx to second order.  The rest of the cost and of the time then
-needs no integration: with AᵀP + PA = −Q,
+the stage cost is Φ₀ + xᵀQx to second order.  With AᵀP + PA = −Q,
 
-    ∫ xᵀQx dt from x to x_f  =  xᵀPx − x_fᵀPx_f,
+    ∫ xᵀQx dt from x to x_f  =  xᵀPx − x_fᵀPx_f.
 
-and x_f is where e^{At}x first enters the terminal set.  A rollout may hand over to this
-end as soon as the nonlinear residual r = ẋ − A x can no longer matter: V = xᵀPx changes by
-at most ∫ 2|Px|ᵀ|r| dt because of it, and |Px|ᵀ|r|, being of third order at least, decays
-faster than the slowest mode, e^{−σt}.  The hand-over asks for 2|Px|ᵀ|r| ≤ δ σ (V + cost so
-far), for the largest residual of the last tenths of a second.
+A rollout that has come into its boundary layer goes on from there in large steps that take A
+and P exactly, and what they leave over by quadrature: :mod:`undertow.codegen.settle`.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import sympy as sp
 
-from undertow.codegen.linear import LEVELS, SETTLING, linear_source
+from undertow.codegen.linear import SETTLING, linear_source
 from undertow.codegen.machine import numba
 from undertow.codegen.rows import LANES
 from undertow.codegen.store import load_module
@@ -75,15 +71,13 @@ class Prepared(NamedTuple):
     """Linear ends of C closed loops.
 
     ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
-    ``P`` (C, 2n, 2n); ``rate`` (C,), decay of the slowest
-    mode, 1/s; ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and
-    ``forced`` responses, see :mod:`undertow.codegen.linear`.
+    ``P`` (C, 2n, 2n); ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and ``forced`` responses,
+    see :mod:`undertow.codegen.linear`.
     """
 
     A: FloatArray
     Q: FloatArray
     P: FloatArray
-    rate: FloatArray
     stable: FloatArray
     powers: FloatArray
     forced: FloatArray
@@ -133,8 +127,7 @@ class LinearEnd:
             np.empty((count, N, N)) if self.counts_cost else np.eye(N)[None],
             np.empty((count, N, N)),
             np.empty(count),
-            np.empty(count),
-            np.empty((count // LANES, LEVELS, N * N * LANES)),
+            np.empty((count // LANES, SETTLING, N * N * LANES)),
             np.empty((count // LANES, SETTLING, 2, N * N * LANES)),
         )
 
@@ -156,21 +149,7 @@ class LinearEnd:
             lanes, _SAME if gains is None else gains, self.X, self.Y, self.H, self.S,
             self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, into.A, into.Q,
         )  # fmt: skip
-        self._blocks.double(
-            into.A, into.Q, into.P, into.rate, into.stable, into.powers, into.forced
-        )
-
-    def complete(self, prepared: Prepared, out: FloatArray, horizon: float) -> None:
-        """Add the linear ends to the kernel's results, (C, columns), in place.
-
-        Lanes that handed over (code −1) become reached (1), with the cost still to come
-        added and the time at which the terminal set is entered, or run into the
-        horizon (0).
-        """
-        self._blocks.arrive(
-            prepared.powers, prepared.P, out, horizon, self.objective.terminal_radius,
-            self._weights.rest, self.counts_cost,
-        )  # fmt: skip
+        self._blocks.double(into.A, into.Q, into.P, into.stable, into.powers, into.forced)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -75,6 +75,7 @@ class _Writer:
             *(f"{row} = 0.0" for row in [*r.u, *r.s, *r.path]),
             f"{r.singular} = 1.0",
             f"{r.input} = 1.0",
+            f"{r.steps} = -1.0",
         ]
 
     def load_surface(self) -> list[str]:
@@ -94,7 +95,6 @@ class _Writer:
         return [
             *(f"{e} = linear[b + i, {j}, {k}]" for j, k, e in _entries(r.linear)),
             *(f"{e} = value[b + i, {j}, {k}]" for j, k, e in _entries(r.value)),
-            f"{r.rate} = rate[b + i]",
         ]
 
     # -- the law and the plant -----------------------------------------------------------
@@ -328,12 +328,12 @@ class _Writer:
         return [f"record[b + i, step // every, {j}] = {row}" for j, row in enumerate(columns)]
 
     def collect(self) -> list[str]:
-        """One line of results: cost, end, code, radius, closest, margins, final x."""
+        """One line of results: cost, end, code, radius, closest, margins, final x, steps."""
         r = self.rows
-        columns = [r.cost, r.end, r.code, r.radius, *r.smallest]
+        steps = f"{r.steps} if {r.steps} >= 0.0 else ({r.end} - start) / h"
+        columns = [r.cost, r.end, r.code, r.radius, *r.smallest, r.near, r.near_time]
         return [
-            f"out[b + i, {j}] = {row}"
-            for j, row in enumerate([*columns, r.near, r.near_time, *r.near_x, *r.x])
+            f"out[b + i, {j}] = {row}" for j, row in enumerate([*columns, *r.near_x, *r.x, steps])
         ]
 
 
@@ -390,8 +390,8 @@ import numpy as np
 )
 def rollout(
     x0, live, lanes, switch, plant, belief, limits, noise,
-    start, h, steps, hold, terminal, escape, cap, seek, tail, counted, slack,
-    linear, value, rate, powers, forced, every, record, out,
+    start, h, steps, hold, terminal, escape, cap, seek, tail, counted,
+    linear, value, powers, forced, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
     W = np.empty({w.rows.count * LANES})

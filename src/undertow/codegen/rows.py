@@ -61,11 +61,11 @@ class Rows:
         self.smallest = self._take(2 + nw)
         self.linear = [self._take(nx) for _ in range(nx // 2)]
         self.value = [self._take(nx) for _ in range(nx)]
-        self.rate, self.recent, self.span, self.power, self.changed = self._take(5)
+        self.span, self.power, self.changed, self.begun, self.bend, self.ago = self._take(6)
         self.flow = [self._take(nx) for _ in range(nx)]
         self.force = [self._take(nx // 2) for _ in range(nx)]
         self.rise = [self._take(nx // 2) for _ in range(nx)]
-        self.active, self.end, self.code, self.radius = self._take(4)
+        self.active, self.end, self.code, self.radius, self.steps = self._take(5)
         self.near, self.near_time = self._take(2)
         self.near_x = self._take(nx)
 

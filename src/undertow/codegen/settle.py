@@ -8,11 +8,10 @@ exponential Runge-Kutta method of second order (ETD2RK; Cox and Matthews, J. Com
     a = e^{Ah} x + F(h) r(x),   x₊ = a + G(h) (r(a) − r(x)),
     F(h) = ∫₀ʰ e^{As} ds,       G(h) = ∫₀ʰ e^{A(h−s)} s/h ds.
 
-Each lane has a step of its own, a power of two of the unit, that keeps the last term small in
-the norm of V = xᵀPx.  With AᵀP + PA = −Q the cost is V(x) − V(x₊) + ∫ (Φ + V̇) dt, whose
-integrand is of fourth order: the trapezoidal rule does.  A lane is done when r can no longer
-matter: V changes by at most ∫ 2|Px|ᵀ|r| dt because of it, and |Px|ᵀ|r| decays faster than the
-slowest mode, e^{−σt}, so that 2|Px|ᵀ|r| ≤ δ σ V leaves a part δ.
+Each lane has a step of its own, a power of two of the unit: it keeps the last term small in the
+norm of V = xᵀPx, and cannot leap over the terminal set.  With AᵀP + PA = −Q the cost is
+V(x) − V(x₊) + ∫ (Φ + V̇) dt, whose integrand is of fourth order: three points do.
+Once r has died out the steps are as long as the terminal set is far.
 """
 
 from __future__ import annotations
@@ -22,14 +21,16 @@ from collections.abc import Iterable, Sequence
 from undertow.codegen.linear import SETTLING, UNIT
 from undertow.codegen.rows import LANES, Rows
 
-__all__ = ["MOST", "begin_settling", "choose_step", "end_settling", "settling_step"]
+__all__ = ["MOST", "UNSETTLED", "begin_settling", "choose_step", "end_settling", "settling_step"]
+
+#: Code of a lane that cannot be done in this way.
+UNSETTLED = -2.0
 
 #: Steps that a lane may take.
 MOST = 4000
 
-#: Largest correction in one step, and part of the cost that the rest may change, both as parts
-#: of the tolerance.
-CORRECTION, REST = 0.2, 0.2
+#: Largest correction in one step, as a part of the tolerance.
+CORRECTION = 0.2
 
 
 def _sum(terms: Iterable[str]) -> str:
@@ -54,11 +55,13 @@ def begin_settling(r: Rows) -> list[str]:
         *_level(r, [f"x_{j}" for j in range(len(r.x))]),
         f"begins = {r.code} == -1.0",
         f"{r.active} = 1.0 if begins else 0.0",
+        f"{r.begun} = {r.active}",
         f"{r.cost} = {r.cost} + counted * level if begins else {r.cost}",
         f"{r.span} = {UNIT}",
         f"{r.power} = 0.0",
+        f"{r.ago} = 0.0",
+        f"{r.steps} = ({r.end} - start) / h if begins else {r.steps}",
         f"{r.changed} = {r.active}",
-        f"{r.recent} = math.inf",
     ]
 
 
@@ -118,12 +121,12 @@ def settling_step(
         *(f"f_{j} = {rate}" for j, rate in enumerate(rates)),
         *_level(r, x),
         *(f"q_{j} = f_{n + j} - ({linear(j, 'x')})" for j in half),
-        "residual = 2.0 * (" + _sum(f"abs(p_{n + j} * q_{j})" for j in half) + ")",
         "bend = "
         + stage
         + " + 2.0 * counted * ("
         + _sum(f"p_{j} * f_{j}" for j in range(size))
         + ")",
+        "speed = math.sqrt(" + _sum(f"f_{j} * f_{j}" for j in range(size)) + ")",
         "free = " + " & ".join(f"(abs(u_{j}) < _limit_{j})" for j in range(len(r.u))),
         *(
             f"a_{j} = "
@@ -137,11 +140,11 @@ def settling_step(
         *(f"f_{j} = {rate}" for j, rate in enumerate(rates)),
         *(f"y_{j} = f_{n + j} - ({linear(j, 'a')}) - q_{j}" for j in half),
         *_level(r, [f"a_{j}" for j in range(size)]),
-        "bend = 0.5 * (bend + "
+        "late = "
         + stage
         + " + 2.0 * counted * ("
         + _sum(f"p_{j} * f_{j}" for j in range(size))
-        + "))",
+        + ")",
         "high = level",
         *(f"c_{j} = " + _sum(f"{e} * y_{k}" for k, e in enumerate(r.rise[j])) for j in range(size)),
         *_level(r, [f"c_{j}" for j in range(size)]),
@@ -149,43 +152,55 @@ def settling_step(
         *(f"a_{j} = a_{j} + c_{j}" for j in range(size)),
         "outer = math.sqrt(" + _sum(f"a_{j} * a_{j}" for j in range(size)) + ")",
         f"span, size, going = {r.span}, {r.power}, {r.active} > 0.0",
+        # The trapezoidal rule, less h³/12 times the second derivative over this step and the last.
+        f"last, ago = {r.bend}, {r.ago}",
+        "turn = (late - bend) / span - ((bend - last) / ago if ago > 0.0 else 0.0)",
+        "turn = 2.0 * turn / (span + ago) if ago > 0.0 else 0.0",
+        "mean = 0.5 * (bend + late) - span * span * turn / 12.0",
         "sound = free & (outer < escape) & ((size > 0.0) | (level <= 16.0 * small))",
-        "inside = outer < terminal",
-        "taken = going & sound & ((size <= 0.0) | ((level <= small) & (not inside)))",
-        # Where the chord of the radius meets that of the terminal set.
-        f"part = ({r.radius} - terminal) / ({r.radius} - outer) if inside else 1.0",
-        *(
-            f"{row} = x_{j} + part * (a_{j} - x_{j}) if taken else x_{j}"
-            for j, row in enumerate(r.x)
-        ),
-        f"cost = {r.cost} + part * span * bend if taken else {r.cost}",
+        f"before = {r.radius}",
+        # Where the chord of the step enters the terminal ball, if it does: the smaller root
+        # of |x + part (a - x)|² = terminal².
+        *(f"m_{j} = a_{j} - x_{j}" for j in range(size)),
+        "chord = " + _sum(f"m_{j} * m_{j}" for j in range(size)),
+        "slant = -(" + _sum(f"x_{j} * m_{j}" for j in range(size)) + ")",
+        "depth = slant * slant - chord * (before * before - terminal * terminal)",
+        "inside = (outer <= terminal) | ((slant > 0.0) & (depth >= 0.0) & (slant <= chord))",
+        "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
+        "part = max(0.0, min(1.0, part)) if inside else 1.0",
+        "far = before - terminal > span * speed",
+        "taken = going & sound & ((size <= 0.0) | ((level <= small) & far & (not inside)))",
+        *(f"{row} = x_{j} + part * m_{j} if taken else x_{j}" for j, row in enumerate(r.x)),
+        f"cost = {r.cost} + part * span * mean if taken else {r.cost}",
         f"end = {r.end} + part * span if taken else {r.end}",
-        f"radius = (terminal if inside else outer) if taken else {r.radius}",
-        "up = taken & (64.0 * level <= small) & (size < " + f"{SETTLING - 1}.0)",
+        "radius = (terminal if inside else outer) if taken else before",
+        "further = outer - terminal > 4.0 * span * speed",
+        f"up = taken & further & (64.0 * level <= small) & (size < {SETTLING - 1}.0)",
         "down = going & (not taken) & (size > 0.0)",
         f"{r.power} = size + (1.0 if up else (-1.0 if down else 0.0))",
         f"{r.span} = span * (2.0 if up else (0.5 if down else 1.0))",
         f"{r.changed} = 1.0 if up | down else 0.0",
-        f"recent = max(residual, 0.5 * {r.recent}) if taken else {r.recent}",
-        "total = cost if counted > 0.0 else high",
-        f"calm = recent <= {r.rate} * ({REST} * tail * total + slack)",
-        "near = (radius <= 1.5 * terminal) | calm | (end >= until)",
-        f"{r.recent} = recent",
+        f"{r.bend} = bend if taken else last",
+        f"{r.ago} = span if taken else ago",
+        f"{r.steps} = {r.steps} + (1.0 if going else 0.0)",
         f"{r.cost} = cost",
         f"{r.end} = end",
         f"{r.radius} = radius",
+        "there = taken & inside & (end <= until)",
+        "over = taken & (inside | (end >= until))",
         f"code = {r.code}",
-        f"{r.code} = -2.0 if going & (not sound) else code",
-        f"{r.active} = 1.0 if going & sound & (not (taken & near)) else 0.0",
+        "code = 1.0 if there else (0.0 if over else code)",
+        f"{r.code} = {UNSETTLED} if going & (not sound) else code",
+        f"{r.active} = 1.0 if going & sound & (not over) else 0.0",
     ]
 
 
 def end_settling(r: Rows) -> list[str]:
-    """Take V out of the costs again; lanes that are not done yet are not done by this way."""
+    """Take V out of the costs again; lanes that are not done cannot be done in this way."""
     return [
         *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
         *_level(r, [f"x_{j}" for j in range(len(r.x))]),
-        f"code, active = {r.code}, {r.active}",
-        f"{r.cost} = {r.cost} - counted * level if code == -1.0 else {r.cost}",
-        f"{r.code} = -2.0 if active > 0.0 else code",
+        f"begun, code, active = {r.begun} > 0.0, {r.code}, {r.active} > 0.0",
+        f"{r.cost} = {r.cost} - counted * level if begun else {r.cost}",
+        f"{r.code} = {UNSETTLED} if active else code",
     ]
