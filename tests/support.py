@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from functools import lru_cache
+from types import SimpleNamespace
 
 import numpy as np
 import sympy as sp
@@ -130,5 +131,5 @@ def observed_order(steps: FloatArray, errors: FloatArray) -> float:
 
 def interpreted(loop: ut.ClosedLoop) -> ut.ClosedLoop:
     """The loop with its generated kernel run by Python: no compilation, for short rollouts."""
-    vars(loop)["_kernel"] = loop._kernel.py_func
+    vars(loop)["_kernels"] = SimpleNamespace(rollout=loop._kernels.rollout.py_func)
     return loop

@@ -196,11 +196,13 @@ def test_a_folder_that_cannot_be_made_is_no_obstacle(
 
 
 def test_changed_numbers_need_no_new_kernel_and_changed_formulas_do(rig: ut.Mechanism) -> None:
-    kernel = ut.ClosedLoop(rig)._kernel
+    kernel = ut.ClosedLoop(rig)._kernels.rollout
     numbers = rig.with_parameters(d_e=0.05, m=0.2).with_input_limit(3.0)
-    assert ut.ClosedLoop(numbers)._kernel is kernel
-    assert ut.ClosedLoop(rig, step=0.001, reaching=ut.ReachingLaw(9.0, 0.3))._kernel is kernel
-    assert ut.ClosedLoop(rig, ut.MinimumEnergy(horizon=5.0))._kernel is kernel
+    assert ut.ClosedLoop(numbers)._kernels.rollout is kernel
+    assert (
+        ut.ClosedLoop(rig, step=0.001, reaching=ut.ReachingLaw(9.0, 0.3))._kernels.rollout is kernel
+    )
+    assert ut.ClosedLoop(rig, ut.MinimumEnergy(horizon=5.0))._kernels.rollout is kernel
     others = [
         ut.ClosedLoop(rig, ut.MinimumTime()),
         ut.ClosedLoop(rig, ut.MinimumEnergy(state_weight=0.1)),
@@ -210,7 +212,7 @@ def test_changed_numbers_need_no_new_kernel_and_changed_formulas_do(rig: ut.Mech
         ut.ClosedLoop(rig, plant=numbers),
         ut.ClosedLoop(rig.with_disturbance_bounds(0.1, 0.0)),
     ]
-    kernels = {loop._kernel for loop in others} | {kernel}
+    kernels = {loop._kernels.rollout for loop in others} | {kernel}
     assert len(kernels) == len(others) + 1
 
 
@@ -264,7 +266,7 @@ def test_lane_loops_are_compiled_to_vectors() -> None:
     rig = ut.mechanisms.rotary_pendulum()
     loop = ut.ClosedLoop(rig)
     loop.simulate(rig.state(phi=0.1), ut.first_surface(rig), duration=0.01)
-    cached = loop._kernel
+    cached = loop._kernels.rollout
     options = {k: cached.targetoptions[k] for k in ("nogil", "error_model", "fastmath")}
     kernel = numba.njit(**options)(cached.py_func)  # a cached one shows no assembly
     kernel.compile(next(iter(cached.signatures)))

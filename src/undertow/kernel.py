@@ -87,7 +87,11 @@ def compile_loop(
     switching: Switching,
     sampled: bool,
 ) -> Any:
-    """Return the kernel of a closed loop, from the cache where it is known."""
+    """Return the kernel of a closed loop, from the cache where it is known.
+
+    A module with the functions ``rollout`` and, for continuous loops, ``settle``; each is
+    compiled when it is first called.
+    """
     truth = belief if plant is None else plant
     key = content_key(
         belief.structure,
@@ -105,4 +109,4 @@ def compile_loop(
             header=f"Closed loop of {belief.name}, {objective.name}; generated, do not edit.",
         )
         remember("loop", key, source)
-    return load_module(f"loop_{belief.name}", source).rollout
+    return load_module(f"loop_{belief.name}", source)

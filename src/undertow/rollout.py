@@ -236,7 +236,7 @@ class ClosedLoop:
         return self.mechanism if self.plant is None else self.plant
 
     @cached_property
-    def _kernel(self) -> Any:
+    def _kernels(self) -> Any:
         return compile_loop(
             self.mechanism, self.plant, self.objective, self.reaching.switching, self.hold > 0
         )
@@ -343,10 +343,12 @@ class ClosedLoop:
         if prepared is not None and stable_only:
             live *= prepared.stable
 
+        end_radius = self.objective.terminal_radius if terminal is None else terminal
+
         def run(
-            states: FloatArray, live: FloatArray, lanes: FloatArray, tail: float, out: FloatArray
+            states: FloatArray, live: FloatArray, lanes: FloatArray, yields: bool, out: FloatArray
         ) -> None:
-            self._kernel(
+            self._kernels.rollout(
                 states,
                 live,
                 lanes,
@@ -359,30 +361,42 @@ class ClosedLoop:
                 self.step,
                 steps,
                 max(1, self.hold),
-                self.objective.terminal_radius if terminal is None else terminal,
+                end_radius,
                 self.escape,
                 cap,
                 1.0 if seek else 0.0,
-                tail,
-                1.0 if end is not None and end.counts_cost else 0.0,
-                _NOTHING if prepared is None else prepared.A,
-                _NOTHING if prepared is None else prepared.P,
-                _NOTHING if prepared is None else prepared.powers,
-                _NOTHING[None] if prepared is None else prepared.forced,
+                yields,
                 every,
                 record,
                 out,
             )
 
-        run(room.states, live, room.lanes, self.tail if hands_over else 0.0, room.out)
-        if hands_over:
-            again = np.flatnonzero(room.out[:, 2] == UNSETTLED)
+        out = room.out
+        run(room.states, live, room.lanes, hands_over, out)
+        if hands_over and prepared is not None and end is not None:
+            self._kernels.settle(
+                room.lanes,
+                numbers.plant,
+                numbers.belief,
+                numbers.limits,
+                start + steps * self.step,
+                end_radius,
+                self.escape,
+                self.tail,
+                1.0 if end.counts_cost else 0.0,
+                prepared.A,
+                prepared.P,
+                prepared.powers,
+                prepared.forced,
+                out,
+            )
+            again = np.flatnonzero(out[:, 2] == UNSETTLED)
             if len(again):  # too fast for large steps, or at a limit again: small steps to the end
                 rows = np.resize(again, -(-len(again) // LANES) * LANES)
-                out = np.empty((len(rows), room.out.shape[1]))
-                run(room.states[rows], live[rows], room.lanes[rows], 0.0, out)
-                out[: len(again), -1] += room.out[again, -1]
-                room.out[again] = out[: len(again)]
+                whole = np.empty((len(rows), out.shape[1]))
+                run(room.states[rows], live[rows], room.lanes[rows], False, whole)
+                whole[: len(again), -1] += out[again, -1]
+                out[again] = whole[: len(again)]
         return room.batch(start)
 
     def probe(self, x: FloatArray, times: Sequence[float] = (0.0,), horizon: float = 0.0) -> Probe:

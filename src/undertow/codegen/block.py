@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import sympy as sp
 
+from undertow.codegen import settle
 from undertow.codegen.rows import LANES, LoopProgram, Rows
 from undertow.codegen.scalar import Emitter
-from undertow.codegen.settle import MOST, begin_settling, choose_step, end_settling, settling_step
 
 __all__ = ["block_source"]
 
@@ -75,7 +75,6 @@ class _Writer:
             *(f"{row} = 0.0" for row in [*r.u, *r.s, *r.path]),
             f"{r.singular} = 1.0",
             f"{r.input} = 1.0",
-            f"{r.steps} = -1.0",
         ]
 
     def load_surface(self) -> list[str]:
@@ -87,14 +86,6 @@ class _Writer:
             *(f"{self.emit.text(s)} = {row}" for s, row in r.lane.items() if s in needs),
             *lines,
             *(f"{row} = {self.emit.text(s)}" for s, row in r.kept.items()),
-        ]
-
-    def load_tail(self) -> list[str]:
-        """The linear model of the last surface."""
-        r = self.rows
-        return [
-            *(f"{e} = linear[b + i, {j}, {k}]" for j, k, e in _entries(r.linear)),
-            *(f"{e} = value[b + i, {j}, {k}]" for j, k, e in _entries(r.value)),
         ]
 
     # -- the law and the plant -----------------------------------------------------------
@@ -255,17 +246,22 @@ class _Writer:
             *(f"calm = calm & (abs({s}) <= 0.9 * {e})" for s, e in zip(r.s, layers, strict=True)),
             *(f"calm = calm & (abs({row}) <= 0.5 * _limit_{j})" for j, row in enumerate(r.u)),
             f"code, active = {r.code}, {r.active}",
-            f"{r.code} = -1.0 if calm else code",
+            f"{r.code} = {settle.HANDED_OVER} if calm else code",
             f"{r.active} = 0.0 if calm else active",
         ]
 
-    def settle(self) -> list[str]:
-        """One large step of the lanes that handed over."""
+    def rates_at_stage(self) -> list[str]:
+        """Law and plant at the state of a stage: input, rates and stage cost into their rows."""
         r, text = self.rows, self.emit.text
-        rates = [text(rate) for rate in self.program.derivative]
-        return settling_step(
-            r, self._evaluate(r.x), self._evaluate(r.stage_x), rates, text(self.program.stage)
-        )
+        return [
+            *self._evaluate(r.stage_x),
+            *(f"{row} = u_{j}" for j, row in enumerate(r.u)),
+            *(
+                f"{row} = {text(rate)}"
+                for row, rate in zip(r.slope, self.program.derivative, strict=True)
+            ),
+            f"{r.cost_slope} = {text(self.program.stage)}",
+        ]
 
     def approach(self) -> list[str]:
         """Keep the point of the motion that is closest to the target, on the chord of a step."""
@@ -330,7 +326,7 @@ class _Writer:
     def collect(self) -> list[str]:
         """One line of results: cost, end, code, radius, closest, margins, final x, steps."""
         r = self.rows
-        steps = f"{r.steps} if {r.steps} >= 0.0 else ({r.end} - start) / h"
+        steps = f"({r.end} - start) / h"
         columns = [r.cost, r.end, r.code, r.radius, *r.smallest, r.near, r.near_time]
         return [
             f"out[b + i, {j}] = {row}" for j, row in enumerate([*columns, *r.near_x, *r.x, steps])
@@ -358,25 +354,6 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
                 sample = min(step // hold, noise.shape[0] - 1)
 {_lanes(w.sample(), 4)}
 """
-    settling = (
-        ""
-        if sampled
-        else f"""\
-        if tail > 0.0:
-            block = b // {LANES}
-            until = start + steps * h
-{_lanes(begin_settling(w.rows), 3)}
-            for step in range({MOST}):
-                alive = 0.0
-                for i in range({LANES}):
-                    alive += {w.rows.active}
-                if alive == 0.0:
-                    break
-{textwrap.indent(choose_step(w.rows), " " * 16)}\
-{_lanes(w.settle(), 4)}
-{_lanes(end_settling(w.rows), 3)}
-"""
-    )
     return f'''"""{header}"""
 
 import math
@@ -390,8 +367,7 @@ import numpy as np
 )
 def rollout(
     x0, live, lanes, switch, plant, belief, limits, noise,
-    start, h, steps, hold, terminal, escape, cap, seek, tail, counted,
-    linear, value, powers, forced, every, record, out,
+    start, h, steps, hold, terminal, escape, cap, seek, hands_over, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
     W = np.empty({w.rows.count * LANES})
@@ -400,8 +376,6 @@ def rollout(
     for b in range(0, x0.shape[0], {LANES}):
         segment = 0
 {_lanes(w.reset(), 2)}
-        if tail > 0.0:
-{_lanes(w.load_tail(), 3)}
         for step in range(steps):
             {w.time} = start + step * h
             if segment < switch.shape[0] and step == switch[segment]:
@@ -411,7 +385,7 @@ def rollout(
 {_lanes([*w.first_stage(sampled=sampled), *w.watch()], 3)}
             if every > 0 and step % every == 0:
 {_lanes(w.record(), 4)}
-            if tail > 0.0 and step % stride == 0 and segment == switch.shape[0]:
+            if hands_over and step % stride == 0 and segment == switch.shape[0]:
 {_lanes(w.hand_over(), 4)}
             for rk in range(3):
                 weight = 1.0 if rk == 2 else 2.0
@@ -428,9 +402,43 @@ def rollout(
                     alive += {w.rows.active}
                 if alive == 0.0:
                     break
-{settling}\
 {_lanes(w.collect(), 2)}
-'''
+{"" if sampled else _settling(w)}'''
+
+
+def _settling(w: _Writer) -> str:
+    """Return the function that ends rollouts in large steps, see :mod:`undertow.codegen.settle`."""
+    return f"""
+
+@numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
+)
+def settle(
+    lanes, plant, belief, limits, until, terminal, escape, tail, counted,
+    linear, value, powers, forced, out,
+):
+{textwrap.indent(chr(10).join(w.constants()), "    ")}
+    W = np.empty({w.rows.count * LANES})
+    {w.time} = 0.0
+    segment = lanes.shape[1] - 1
+    for b in range(0, out.shape[0], {LANES}):
+        block = b // {LANES}
+{_lanes(w.load_surface(), 2)}
+{_lanes(settle.begin(w.rows), 2)}
+        for step in range({settle.MOST}):
+            alive = 0.0
+            for i in range({LANES}):
+                alive += {w.rows.active}
+            if alive == 0.0:
+                break
+{textwrap.indent(settle.choose_step(w.rows), " " * 12)}\
+            for half in range(2):
+{_lanes(w.rates_at_stage(), 4)}
+                if half == 0:
+{_lanes(settle.first_half(w.rows), 5)}
+{_lanes(settle.second_half(w.rows), 3)}
+{_lanes(settle.finish(w.rows), 2)}
+"""
 
 
 def _lanes(lines: Iterable[str], depth: int) -> str:

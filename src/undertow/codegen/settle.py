@@ -21,10 +21,19 @@ from collections.abc import Iterable, Sequence
 from undertow.codegen.linear import SETTLING, UNIT
 from undertow.codegen.rows import LANES, Rows
 
-__all__ = ["MOST", "UNSETTLED", "begin_settling", "choose_step", "end_settling", "settling_step"]
+__all__ = [
+    "HANDED_OVER",
+    "MOST",
+    "UNSETTLED",
+    "begin",
+    "choose_step",
+    "finish",
+    "first_half",
+    "second_half",
+]
 
-#: Code of a lane that cannot be done in this way.
-UNSETTLED = -2.0
+#: Codes of a lane that waits for its large steps, and of one that cannot be done in this way.
+HANDED_OVER, UNSETTLED = -1.0, -2.0
 
 #: Steps that a lane may take.
 MOST = 4000
@@ -49,18 +58,32 @@ def _level(r: Rows, x: Sequence[str]) -> list[str]:
     ]
 
 
-def begin_settling(r: Rows) -> list[str]:
+def begin(r: Rows) -> list[str]:
     """Lanes that handed over begin with the smallest step; their costs include V."""
-    return [f"x_{j} = {row}" for j, row in enumerate(r.x)] + [
-        *_level(r, [f"x_{j}" for j in range(len(r.x))]),
-        f"begins = {r.code} == -1.0",
-        f"{r.active} = 1.0 if begins else 0.0",
-        f"{r.begun} = {r.active}",
-        f"{r.cost} = {r.cost} + counted * level if begins else {r.cost}",
+    size = len(r.x)
+    columns = {r.cost: "0", r.end: "1", r.code: "2", r.radius: "3", r.steps: "-1"}
+    return [
+        *(f"{row} = out[b + i, {column}]" for row, column in columns.items()),
+        *(f"x_{j} = out[b + i, out.shape[1] - {1 + size - j}]" for j in range(size)),
+        *(f"{row} = x_{j}" for j, row in enumerate(r.x)),
+        *(f"{row} = x_{j}" for j, row in enumerate(r.stage_x)),
+        *(
+            f"{e} = linear[b + i, {j}, {k}]"
+            for j, row in enumerate(r.linear)
+            for k, e in enumerate(row)
+        ),
+        *(
+            f"{e} = value[b + i, {j}, {k}]"
+            for j, row in enumerate(r.value)
+            for k, e in enumerate(row)
+        ),
+        *_level(r, [f"x_{j}" for j in range(size)]),
+        f"{r.active} = 1.0 if {r.code} == {HANDED_OVER} else 0.0",
+        f"{r.cost} = {r.cost} + counted * level",
         f"{r.span} = {UNIT}",
         f"{r.power} = 0.0",
         f"{r.ago} = 0.0",
-        f"{r.steps} = ({r.end} - start) / h if begins else {r.steps}",
+        f"{r.last} = 0.0",
         f"{r.changed} = {r.active}",
     ]
 
@@ -93,58 +116,49 @@ for lane in range({LANES}):
 """
 
 
-def settling_step(
-    r: Rows, at_x: Sequence[str], at_end: Sequence[str], rates: Sequence[str], stage: str
-) -> list[str]:
-    """One step of every lane that settles.
+def _bend(r: Rows) -> str:
+    """Φ + V̇, or Φ alone where the cost has no quadratic part, from p = P x and the rates."""
+    slope = _sum(f"p_{j} * {row}" for j, row in enumerate(r.slope))
+    return f"{r.cost_slope} + 2.0 * counted * ({slope})"
 
-    Parameters
-    ----------
-    r
-        Rows of the work array.
-    at_x, at_end
-        Lines that evaluate law and plant at ``r.x`` and at ``r.stage_x``.
-    rates, stage
-        What these lines call the time derivatives of the state and the stage cost.
-    """
-    size = len(r.x)
-    n = size // 2
-    x = [f"x_{j}" for j in range(size)]
-    half = range(n)
 
-    def linear(j: int, of: str) -> str:
-        return _sum(f"{e} * {of}_{k}" for k, e in enumerate(r.linear[j]))
+def _rest(r: Rows, j: int, x: str) -> str:
+    """The part of the j-th acceleration at a state x_0, x_1, … that A leaves over."""
+    n = len(r.linear)
+    return f"{r.slope[n + j]} - (" + _sum(f"{e} * {x}_{k}" for k, e in enumerate(r.linear[j])) + ")"
 
+
+def first_half(r: Rows) -> list[str]:
+    """From the rates at x to the state a."""
+    size, half = len(r.x), range(len(r.linear))
     return [
-        *at_x,
         *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
-        *(f"f_{j} = {rate}" for j, rate in enumerate(rates)),
-        *_level(r, x),
-        *(f"q_{j} = f_{n + j} - ({linear(j, 'x')})" for j in half),
-        "bend = "
-        + stage
-        + " + 2.0 * counted * ("
-        + _sum(f"p_{j} * f_{j}" for j in range(size))
-        + ")",
-        "speed = math.sqrt(" + _sum(f"f_{j} * f_{j}" for j in range(size)) + ")",
-        "free = " + " & ".join(f"(abs(u_{j}) < _limit_{j})" for j in range(len(r.u))),
+        *_level(r, [f"x_{j}" for j in range(size)]),
+        *(f"q_{j} = {_rest(r, j, 'x')}" for j in half),
+        *(f"{row} = q_{j}" for j, row in enumerate(r.rest)),
+        f"{r.bend} = {_bend(r)}",
+        f"{r.speed} = math.sqrt(" + _sum(f"{row} * {row}" for row in r.slope) + ")",
+        "free = " + " & ".join(f"(abs({u}) < _limit_{j})" for j, u in enumerate(r.u)),
+        f"{r.free} = 1.0 if free else 0.0",
         *(
-            f"a_{j} = "
+            f"{r.stage_x[j]} = "
             + _sum(f"{e} * x_{k}" for k, e in enumerate(r.flow[j]))
             + " + "
             + _sum(f"{e} * q_{k}" for k, e in enumerate(r.force[j]))
             for j in range(size)
         ),
-        *(f"{row} = a_{j}" for j, row in enumerate(r.stage_x)),
-        *at_end,
-        *(f"f_{j} = {rate}" for j, rate in enumerate(rates)),
-        *(f"y_{j} = f_{n + j} - ({linear(j, 'a')}) - q_{j}" for j in half),
+    ]
+
+
+def second_half(r: Rows) -> list[str]:
+    """From the rates at a to the end of the step, where it is taken; and the next step."""
+    size, half = len(r.x), range(len(r.linear))
+    return [
+        *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
+        *(f"a_{j} = {row}" for j, row in enumerate(r.stage_x)),
+        *(f"y_{j} = {_rest(r, j, 'a')} - {r.rest[j]}" for j in half),
         *_level(r, [f"a_{j}" for j in range(size)]),
-        "late = "
-        + stage
-        + " + 2.0 * counted * ("
-        + _sum(f"p_{j} * f_{j}" for j in range(size))
-        + ")",
+        f"bend, late = {r.bend}, {_bend(r)}",
         "high = level",
         *(f"c_{j} = " + _sum(f"{e} * y_{k}" for k, e in enumerate(r.rise[j])) for j in range(size)),
         *_level(r, [f"c_{j}" for j in range(size)]),
@@ -153,7 +167,7 @@ def settling_step(
         "outer = math.sqrt(" + _sum(f"a_{j} * a_{j}" for j in range(size)) + ")",
         f"span, size, going = {r.span}, {r.power}, {r.active} > 0.0",
         # The trapezoidal rule, less h³/12 times the second derivative over this step and the last.
-        f"last, ago = {r.bend}, {r.ago}",
+        f"last, ago, speed, free = {r.last}, {r.ago}, {r.speed}, {r.free} > 0.0",
         "turn = (late - bend) / span - ((bend - last) / ago if ago > 0.0 else 0.0)",
         "turn = 2.0 * turn / (span + ago) if ago > 0.0 else 0.0",
         "mean = 0.5 * (bend + late) - span * span * turn / 12.0",
@@ -170,7 +184,9 @@ def settling_step(
         "part = max(0.0, min(1.0, part)) if inside else 1.0",
         "far = before - terminal > span * speed",
         "taken = going & sound & ((size <= 0.0) | ((level <= small) & far & (not inside)))",
-        *(f"{row} = x_{j} + part * m_{j} if taken else x_{j}" for j, row in enumerate(r.x)),
+        *(f"x_{j} = x_{j} + part * m_{j} if taken else x_{j}" for j in range(size)),
+        *(f"{row} = x_{j}" for j, row in enumerate(r.x)),
+        *(f"{row} = x_{j}" for j, row in enumerate(r.stage_x)),
         f"cost = {r.cost} + part * span * mean if taken else {r.cost}",
         f"end = {r.end} + part * span if taken else {r.end}",
         "radius = (terminal if inside else outer) if taken else before",
@@ -180,7 +196,7 @@ def settling_step(
         f"{r.power} = size + (1.0 if up else (-1.0 if down else 0.0))",
         f"{r.span} = span * (2.0 if up else (0.5 if down else 1.0))",
         f"{r.changed} = 1.0 if up | down else 0.0",
-        f"{r.bend} = bend if taken else last",
+        f"{r.last} = bend if taken else last",
         f"{r.ago} = span if taken else ago",
         f"{r.steps} = {r.steps} + (1.0 if going else 0.0)",
         f"{r.cost} = cost",
@@ -195,12 +211,15 @@ def settling_step(
     ]
 
 
-def end_settling(r: Rows) -> list[str]:
+def finish(r: Rows) -> list[str]:
     """Take V out of the costs again; lanes that are not done cannot be done in this way."""
+    size = len(r.x)
+    columns = {r.end: "1", r.radius: "3", r.steps: "-1"}
     return [
         *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
-        *_level(r, [f"x_{j}" for j in range(len(r.x))]),
-        f"begun, code, active = {r.begun} > 0.0, {r.code}, {r.active} > 0.0",
-        f"{r.cost} = {r.cost} - counted * level if begun else {r.cost}",
-        f"{r.code} = {UNSETTLED} if active else code",
+        *_level(r, [f"x_{j}" for j in range(size)]),
+        f"out[b + i, 0] = {r.cost} - counted * level",
+        f"out[b + i, 2] = {UNSETTLED} if {r.active} > 0.0 else {r.code}",
+        *(f"out[b + i, {column}] = {row}" for row, column in columns.items()),
+        *(f"out[b + i, out.shape[1] - {1 + size - j}] = x_{j}" for j in range(size)),
     ]
