@@ -64,6 +64,18 @@ class LoopRates(NamedTuple):
     push_slope: Interval
     kinked: NDArray[np.bool_]
 
+    def put(self, lanes: NDArray[np.intp], part: LoopRates) -> LoopRates:
+        """Return the same with some boxes' answers replaced."""
+
+        def one(old: Interval, new: Interval) -> Interval:
+            lo, hi = old.lo.copy(), old.hi.copy()
+            lo[..., lanes], hi[..., lanes] = new.lo, new.hi
+            return Interval(lo, hi)
+
+        kinked = self.kinked.copy()
+        kinked[lanes] = part.kinked
+        return LoopRates(*(one(a, b) for a, b in zip(self[:-1], part[:-1], strict=True)), kinked)
+
 
 @dataclass(frozen=True, eq=False)
 class LoopMotion:

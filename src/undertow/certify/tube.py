@@ -24,7 +24,7 @@ Everything is outward-rounded.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,9 @@ class Rates(Protocol):
     @property
     def kinked(self) -> Mask:
         """Boxes, (L,), for which it pays to say more of the points in them."""
+
+    def put(self, lanes: NDArray[np.intp], part: Self) -> Self:
+        """Return the same with some boxes' answers replaced."""
 
 
 class Paths(Protocol):
@@ -185,7 +188,7 @@ class Tubes:
         zero = Interval(np.minimum(rest.lo, 0.0), np.maximum(rest.hi, 0.0))
         return cls(field, middle, np.concatenate([spread, parameters], axis=1), basis, zero)
 
-    def take(self, lanes: Mask) -> Tubes:
+    def take(self, lanes: Mask | NDArray[np.intp]) -> Tubes:
         """Return some of the sets."""
         return Tubes(
             self.field,
@@ -259,25 +262,30 @@ class Tubes:
 
     def _enclose(self, h: float) -> tuple[Rates, Interval, Rates, Mask]:
         """Find boxes that hold the motions over a step; the field at its begin and over it."""
-        start = self.hull
-        span = Interval(0.0, h)
+        start, span = self.hull, Interval(0.0, h)
         begin = self.field.over(start)
         guess = start + span * begin.rate
-        outer = rates = None
-        good: Mask = np.zeros(start.lo.shape[1], dtype=bool)
+        lanes = start.lo.shape[1]
+        outer = Interval(np.empty_like(start.lo), np.empty_like(start.hi))
+        rates, good, todo = begin, np.zeros(lanes, dtype=bool), np.arange(lanes)
+        # A set's boxes are its own: what becomes of it does not depend on the others.
         for _ in range(12):
             room = 0.05 * (guess.hi - guess.lo) + 1e-9
-            outer = Interval(guess.lo - room, guess.hi + room)
-            rates = self.field.over(outer)
-            guess = start + span * rates.rate
+            tried = Interval(guess.lo - room, guess.hi + room)
+            found = self.field.over(tried)
+            guess = start[:, todo] + span * found.rate
+            outer.lo[:, todo], outer.hi[:, todo] = tried.lo, tried.hi
+            rates = rates.put(todo, found)
             with np.errstate(invalid="ignore"):
-                good = np.all((guess.lo >= outer.lo) & (guess.hi <= outer.hi), axis=0)
-            if good.all():
+                inside = np.all((guess.lo >= tried.lo) & (guess.hi <= tried.hi), axis=0)
+            good[todo] = inside
+            if inside.all():
                 break
-        assert outer is not None
-        assert rates is not None
-        if rates.kinked.any():
-            rates = self.field.over(outer, paths=_Motions(self, rates.rate, span))
+            todo, guess = todo[~inside], guess[:, ~inside]
+        kinked = np.flatnonzero(rates.kinked)
+        if len(kinked):
+            paths = _Motions(self.take(kinked), rates.rate[:, kinked], span)
+            rates = rates.put(kinked, self.field.over(outer[:, kinked], paths=paths))
         return begin, outer, rates, good
 
     def _assemble(self, Phi: Interval, Psi: Interval, drift: Interval) -> Tubes:
