@@ -219,6 +219,10 @@ def verify_region(
         }
         return Verdict(claim, kind, witness=point, method=method + why, details=details)
 
+    suspect = _sampled_witness(V, B, core, ends, enclosures)
+    if suspect is not None:
+        return finish("refuted", suspect, 0)
+
     # Boxes still to do: the inside, and the faces of D, where only V > 1 will do.
     start = [(-reach, reach, False)]
     if motion.odd:  # V is even: half of D will do
@@ -321,6 +325,47 @@ def _frame(motion: Motion, V: LyapunovFunction) -> tuple[FloatArray, FloatArray]
     if limit > reach[0]:
         room[0] = min(room[0], 0.3 * (limit - reach[0]))
     return np.asarray(B), np.asarray(reach + room)
+
+
+def _sampled_witness(
+    V: LyapunovFunction,
+    B: FloatArray,
+    core: FloatArray,
+    ends: FloatArray,
+    enclosures: _Enclosures,
+) -> FloatArray | None:
+    """A point of the set's star around 0 where V̇ > 0 in intervals; None where none was met.
+
+    Samples and a few rounds of samples near the worst ones: most sets that are too large
+    are refuted here, long before branch and bound meets the place.
+    """
+    rng = np.random.default_rng(1)
+    size = len(B)
+
+    def worst(z: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        radius = first_crossing(V, z / np.linalg.norm(z, axis=1, keepdims=True))
+        z = z[np.linalg.norm(z, axis=1) <= radius]
+        p = p[: len(z)]
+        x = np.vstack([np.linalg.solve(B, V.points(z).T), p.T])
+        value, rate = enclosures.point(*[Interval(row) for row in x])
+        wrong = (value.hi <= 1.0) & (rate.lo > 0.0) & (np.abs(x[:size]) > core[:, None]).any(0)
+        witness = x[:, int(np.flatnonzero(wrong)[0])] if wrong.any() else None
+        score = np.nan_to_num(rate.hi / np.sum(z * z, axis=1), nan=-np.inf)
+        best = np.argsort(score)[-200:]
+        return z[best], p[best], witness
+
+    count = 20_000
+    rays = rng.normal(size=(count, size))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    z = rays * (first_crossing(V, rays) * rng.random(count) ** 0.3)[:, None]
+    p = rng.uniform(ends[0], ends[1], (count, ends.shape[1]))
+    for width in (0.1, 0.03, 0.01, 0.003, 0.0):
+        z, p, witness = worst(z, p)
+        if witness is not None:
+            return witness
+        z, p = np.repeat(z, 20, axis=0), np.repeat(p, 20, axis=0)
+        z = z + width * rng.normal(size=z.shape) * np.linalg.norm(z, axis=1, keepdims=True)
+    return None
 
 
 def _clear(motion: Motion, V: LyapunovFunction, way: FloatArray) -> float:

@@ -54,12 +54,16 @@ class ProvedRegion:
         The proof.
     extent
         How far along the asked direction the set is proved to reach.
+    raised
+        What the checker says of a level at most 2 % higher: never ``proved``, and with a
+        witness.
     """
 
     motion: Motion
     function: LyapunovFunction
     verdict: Verdict
     extent: float
+    raised: Verdict
 
 
 class _Basis:
@@ -331,7 +335,8 @@ def search_region(
     direction: ArrayLike,
     *,
     degrees: Sequence[int] = (2, 4, 6),
-    seconds: float = 60.0,
+    programs: int = 200,
+    seconds: float = math.inf,
     seed: int = 0,
     start: Start = "far",
     goal: float = math.inf,
@@ -349,8 +354,10 @@ def search_region(
         In y, (N,); on a surface y = (q_u, q̇_u, w), so (1, 0, 0) is an angle at rest.
     degrees
         Even degrees of V, tried one after the other, each starting from the last.
+    programs
+        Linear programs at most, shared by the degrees: the same on every machine.
     seconds
-        Budget of process time, shared by the degrees.
+        Process time at most, likewise.
     start
         The quadratic V to begin with: ``"far"`` reaches far along the direction and grows
         little; ``"round"`` starts closer and often grows further.
@@ -377,11 +384,28 @@ def search_region(
     # The quadratic's set is made the unit ball; a little inside, so that t > 0 is possible.
     V = _quadratic(motion, stretch, way, rng, start).times(1.02)
     for k, degree in enumerate(degrees):
-        share = seconds * (k + 1) / sum(range(1, len(degrees) + 1))
-        V = _grow(_Basis(motion, V, degree), V, way, rng, share, goal, samples, progress)
+        share = (k + 1) / sum(range(1, len(degrees) + 1))
+        budget = _Budget(math.ceil(share * programs), share * seconds)
+        V = _grow(_Basis(motion, V, degree), V, way, rng, budget, goal, samples, progress)
         if extent(V, way) >= goal:
             break
     return V
+
+
+class _Budget:
+    """Linear programs and process time that are left."""
+
+    def __init__(self, programs: int, seconds: float) -> None:
+        self.programs, self.started, self.seconds = programs, time.process_time(), seconds
+
+    def spend(self) -> None:
+        """Count one linear program."""
+        self.programs -= 1
+
+    @property
+    def left(self) -> bool:
+        """Whether another may start."""
+        return self.programs > 0 and time.process_time() - self.started < self.seconds
 
 
 def _grow(
@@ -389,27 +413,26 @@ def _grow(
     V: LyapunovFunction,
     way: FloatArray,
     rng: np.random.Generator,
-    seconds: float,
+    budget: _Budget,
     goal: float,
     samples: int,
     progress: Progress | None,
 ) -> LyapunovFunction:
-    started = time.process_time()
     candidate = _Candidate(basis, rng)
     rate = _slowest(basis.motion)
     growth, step = 0.06, 0.04
-    while growth > 0.004 and time.process_time() - started < seconds:
+    while growth > 0.004 and budget.left:
         reach = extent(V, way)
         if reach >= goal:
             break
-        accepted = _step(candidate, V, way, growth, step, reach, rate, samples)
+        accepted = _step(candidate, V, way, growth, step, reach, rate, samples, budget)
         if accepted is not None and extent(basis.function(accepted[:-1]), way) > reach * 1.0005:
             V = basis.function(accepted[:-1])
             growth, step = min(1.2 * growth, 0.15), min(1.2 * step, 0.1)
             if progress is not None:
                 progress(
                     f"degree {basis.exponents.sum(axis=1).max()}: reach {extent(V, way):.4f}, "
-                    f"decay {accepted[-1] / rate:.3f}, {time.process_time() - started:.0f} s"
+                    f"decay {accepted[-1] / rate:.3f}, {budget.programs} programs left"
                 )
         else:
             growth, step = growth / 1.5, step / 1.5
@@ -425,6 +448,7 @@ def _step(
     reach: float,
     rate: float,
     samples: int,
+    budget: _Budget,
 ) -> FloatArray | None:
     """Coefficients and t on V's set, grown; None where fresh samples keep disagreeing."""
     basis, rng = candidate.basis, candidate.rng
@@ -459,6 +483,7 @@ def _step(
     for _ in range(8):
         A = np.vstack([decrease, edge, fixed])
         right = np.concatenate([np.zeros(len(decrease)), np.full(len(edge), -edge_value), limits])
+        budget.spend()
         x = minimise_linear(goal, A, right)
         if x is None or x[-1] < 1e-3 * rate:
             return None
@@ -470,26 +495,63 @@ def _step(
     return None
 
 
+#: How close to the largest level that the checker proves; the first step on the way there.
+TIGHT, STRIDE = 1.02, 1.05
+
+
+def _tight_level(
+    verdict_on: Callable[[LyapunovFunction], Verdict],
+    V: LyapunovFunction,
+    wanted: Callable[[LyapunovFunction], bool],
+) -> tuple[LyapunovFunction, Verdict, Verdict] | None:
+    """The set of V with a level that is proved and, 2 % higher, is not: both verdicts.
+
+    None where nothing that is wanted is proved.
+    """
+    level, stride = 1.0, STRIDE
+    proof = refusal = None
+    while proof is None or refusal is None or refusal[0] / proof[0] > TIGHT:
+        if proof is not None and refusal is not None:
+            level = math.sqrt(proof[0] * refusal[0])
+        candidate = V.times(1 / level)
+        if proof is None and not (wanted(candidate) and level > 0.3):
+            return None
+        verdict = verdict_on(candidate)
+        if verdict:
+            proof = (level, verdict)
+            level *= stride
+        else:
+            refusal = (level, verdict)
+            level /= stride
+            stride **= 1.0 if proof else 1.4
+    return V.times(1 / proof[0]), proof[1], refusal[1]
+
+
 def prove_region(
     motion: Motion,
     direction: ArrayLike,
     *,
     degrees: Sequence[int] = (2, 4, 6),
-    seconds: float = 60.0,
+    programs: int = 600,
+    seconds: float = math.inf,
     seed: int = 0,
     goal: float = math.inf,
     parameters: Mapping[str, tuple[float, float]] | None = None,
+    max_boxes: int = 20_000_000,
     progress: Progress | None = None,
 ) -> ProvedRegion:
-    """Search for a region of attraction and prove it.
+    """Search for a region of attraction, prove it, and raise its level as far as that goes.
 
     Parameters
     ----------
-    motion, direction, degrees, seconds, seed, goal, progress
-        As for :func:`search_region`; ``seconds``, of process time, are shared by three
-        searches with different starts and coordinates, which end when one meets the goal.
+    motion, direction, degrees, programs, seconds, seed, goal, progress
+        As for :func:`search_region`; the budget is shared by three searches with different
+        starts and coordinates, which end when one meets the goal.
     parameters
         Intervals of uncertain parameters, as for :func:`undertow.certify.verify_region`.
+    max_boxes
+        Of each proof.  The proofs are not timed: with ``seconds`` left out the result is
+        the same on every machine.
 
     Returns
     -------
@@ -511,6 +573,7 @@ def prove_region(
             motion,
             direction,
             degrees=degrees,
+            programs=math.ceil(programs / len(attempts)),
             seconds=seconds / len(attempts),
             seed=seed,
             start=start,
@@ -521,24 +584,29 @@ def prove_region(
         found.append(V)
         if extent(V, way) >= goal:
             break
-    best, verdict = None, None
+
+    def verdict_on(V: LyapunovFunction) -> Verdict:
+        verdict = verify_region(
+            motion, V, parameters=parameters, max_boxes=max_boxes, max_seconds=math.inf
+        )
+        if progress is not None:
+            boxes = verdict.details.get("boxes")
+            progress(f"reach {extent(V, way):.4f}: {verdict.kind}, {boxes} boxes")
+        return verdict
+
+    best: ProvedRegion | None = None
     for V in sorted(found, key=lambda V: -extent(V, way)):
-        for factor in (1.001, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3, 1.45, 1.7, 2.0):
-            candidate = V.times(factor)
-            reach = extent(candidate, way) * (1 - 1e-9)
-            if best is not None and reach <= best.extent:
-                break
-            verdict = verify_region(motion, candidate, parameters=parameters)
-            if progress is not None:
-                progress(f"level 1/{factor}: {verdict}, {verdict.details.get('boxes')} boxes")
-            if verdict:
-                best = ProvedRegion(motion, candidate, verdict, reach)
-                break
+        least = best.extent if best is not None else 0.0
+        tight = _tight_level(verdict_on, V, lambda W: extent(W, way) > least)  # noqa: B023
+        if tight is not None:
+            function, proof, raised = tight
+            reach = extent(function, way) * (1 - 1e-9)
+            best = ProvedRegion(motion, function, proof, reach, raised)
     if best is not None:
         return best
     raise InfeasibleError(
         f"region of attraction of {getattr(motion, 'surface', motion.names)}",
-        value=str(verdict),
+        value=f"{len(found)} functions found",
         limit="a proved sublevel set",
-        remedy="Give the search more seconds or another degree",
+        remedy="Give the search more programs or another degree",
     )
