@@ -10,8 +10,9 @@ import pytest
 import undertow as ut
 from undertow.estimators import Record
 from undertow.inner_loop import InnerLoop
+from undertow.practice import goal_for
 from undertow.rig import srv02_rig
-from undertow.trials.balance import OBJECTIVES, controllers
+from undertow.trials.balance import controllers
 from undertow.trials.nmpc import predictive
 from undertow.trials.report import balance_files, balance_report
 from undertow.trials.robustness import breaking_point, clipped_regulator, random_bench
@@ -26,7 +27,7 @@ def arm() -> ut.Mechanism:
 
 def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
     """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
-    x0, goal = arm.state(phi=ut.deg(35)), OBJECTIVES["energy"]
+    x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
     made = controllers(arm, goal, x0, budget=128)
     costs = {
         row: trial(arm, undisturbed(arm), made[row], x0, 8.0, 0, objective=goal).cost
@@ -36,7 +37,7 @@ def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mecha
 
 
 def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism) -> None:
-    x0, goal = arm.state(phi=ut.deg(35)), OBJECTIVES["energy"]
+    x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
     made = controllers(arm, goal, x0, budget=128)
     runs = {
         row: [trial(arm, srv02_rig(), made[row], x0, 8.0, s, objective=goal) for s in range(3)]
@@ -48,7 +49,7 @@ def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism)
 
 def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None:
     x0 = arm.state(phi=0.4)
-    cascade = ut.Cascade(arm, OBJECTIVES["energy"], warm=ut.Budget(64), cold=ut.Budget(256))
+    cascade = ut.Cascade(arm, goal_for(arm, "energy"), warm=ut.Budget(64), cold=ut.Budget(256))
     start = cascade.start(x0)
     records = [
         trial(arm, srv02_rig(), lambda _: CascadeSteering(cascade, start), x0, 1.0, 7).record
@@ -125,7 +126,7 @@ def test_a_clipped_regulator_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
 
 def test_predictive_control_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
     pytest.importorskip("casadi")
-    make = predictive(arm, OBJECTIVES["energy"])
+    make = predictive(arm, goal_for(arm, "energy"))
     run = trial(arm, undisturbed(arm), make, arm.state(phi=ut.deg(30)), 4.0, 0)
     assert run.caught
     assert np.abs(run.record.u).max() <= 15.0
