@@ -5,11 +5,14 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import platform
+import re
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import sympy as sp
@@ -253,6 +256,26 @@ def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
             if line.strip() and len(line) - len(line.lstrip()) <= depth:
                 break
             assert not line.strip().startswith(("if ", "for ", "while ", "break", "continue"))
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="reads x86-64 instructions")
+def test_lane_loops_are_compiled_to_vectors() -> None:
+    """The arithmetic of a step is packed: what is left as scalars runs once a block or a call."""
+    rig = ut.mechanisms.rotary_pendulum()
+    loop = ut.ClosedLoop(rig)
+    loop.simulate(rig.state(phi=0.1), ut.first_surface(rig), duration=0.01)
+    cached = loop._kernel
+    options = {k: cached.targetoptions[k] for k in ("nogil", "error_model", "fastmath")}
+    kernel = numba.njit(**options)(cached.py_func)  # a cached one shows no assembly
+    kernel.compile(next(iter(cached.signatures)))
+    (code,) = kernel.inspect_asm().values()
+
+    def count(pattern: str) -> int:
+        return len(re.findall(rf"\tv?{pattern}\s", code))
+
+    products = "(mul|fn?m(add|sub)[0-9]*)"
+    assert count(products + "pd") > 150
+    assert count(products + "sd") <= 0.12 * count(products + "pd")
 
 
 @pytest.mark.parametrize(

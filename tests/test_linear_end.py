@@ -21,11 +21,13 @@ def _prepared(loop: ClosedLoop, spread: float) -> tuple[Prepared, LinearEnd]:
     rig, rng = loop.mechanism, np.random.default_rng(3)
     base = ut.first_surface(rig).normalised().vector
     surfaces = base * np.exp(spread * rng.standard_normal((LANES, base.size)))
-    eta, layer = np.split(loop.reaching.vector(rig.m), 2)
     end = loop.linear_end
     assert end is not None
-    laws = [np.repeat(v[None], LANES, axis=0) for v in (eta, layer)]
-    return end.prepare(surfaces, *laws), end
+    law = np.repeat(loop.reaching.vector(rig.m)[None], LANES, axis=0)
+    lanes = np.hstack([surfaces, law, np.ones((LANES, 1))])[:, None]
+    prepared = end.room(LANES)
+    end.prepare(lanes, None, prepared)
+    return prepared, end
 
 
 def _full(rows: FloatArray) -> FloatArray:

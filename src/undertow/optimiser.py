@@ -61,8 +61,11 @@ WORTHWHILE = 1e-3
 #: Largest number of coordinates for a model search: its model has 55 terms then.
 MODEL_SIZE = 9
 
-#: Generations without a gain that end a search along a ridge; it gains in jumps.
-PATIENCE = 12
+#: Fruitless looks around that end a re-optimisation.
+LOOKS = 2
+
+#: Generations without such a gain that end a search along a ridge, where gains come in jumps.
+PATIENCE = 10
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
@@ -335,8 +338,12 @@ class _Task:
 
     # -- evaluation ------------------------------------------------------------------------
 
-    def cost(self, z: FloatArray, incumbent: Plan | None = None) -> FloatArray:
+    def cost(
+        self, z: FloatArray, incumbent: Plan | None = None, *, hopeless: float = HOPELESS
+    ) -> FloatArray:
         """Score coordinates (N, d), keeping the best plan; the incumbent goes in place of z[0].
+
+        Rollouts that cost ``hopeless`` times as much as the best one are given up.
 
         What is returned guides a search: admissible plans at their cost; unstable ones at
         1e10, others at 1e9 up, see ``Batch.score``; those that just miss the terminal set or
@@ -348,7 +355,7 @@ class _Task:
             vectors[0] = incumbent.vectors
             if gains is not None:
                 gains[0] = incumbent.gains(self.owner.loop.reaching)
-        scores, guide = self._score(vectors, gains, self.owner.freedom.times)
+        scores, guide = self._score(vectors, gains, self.owner.freedom.times, hopeless)
         if incumbent is not None:
             self._adopt(incumbent, z[0].copy(), float(scores[0]))
         best = int(np.argmin(scores))
@@ -370,7 +377,11 @@ class _Task:
         return self._best
 
     def _score(
-        self, vectors: FloatArray, gains: FloatArray | None, times: Sequence[float]
+        self,
+        vectors: FloatArray,
+        gains: FloatArray | None,
+        times: Sequence[float],
+        hopeless: float = HOPELESS,
     ) -> tuple[FloatArray, FloatArray]:
         """Return scores, below ``INADMISSIBLE`` only where admissible, and the guide."""
         loop, known = self.owner.loop, self.best_cost < INADMISSIBLE
@@ -378,7 +389,7 @@ class _Task:
         seek = self.owner.counts_time and known
         cap = math.inf
         if known:
-            cap = (NEARLY if seek else HOPELESS) * self.best_cost + self.resolution
+            cap = (NEARLY if seek else hopeless) * self.best_cost + self.resolution
         if loop.linear_end is None:
             stable = stability_margin(loop.mechanism, vectors[:, -1]) > 0
             if not stable.all():
@@ -466,16 +477,17 @@ class _Task:
         if not self.best_cost < INADMISSIBLE:
             self._look_around(here)
             return self._descend(self._centre(), 0.3, self.left, 1e-3)
-        # Where the incumbent stays the best, look further away, and go where that leads.
-        stagnant = not self.best_cost < (1.0 - WORTHWHILE) * self.incumbent_cost - self.resolution
-        while stagnant and self.left >= LANES and not self.late():
+        # Look further away, and go where that leads, until it leads nowhere any more.
+        fruitless = 0
+        while fruitless < LOOKS and self.left >= LANES and not self.late():
             before = self.best_cost
-            self._look_around(here)
-            if not self.best_cost < (1.0 - WORTHWHILE) * before - self.resolution:
-                return True
-            search = TrustRegion(self._centre(), 0.1, LANES, self.rng)
-            self._run(search, None)
-        return search.converged
+            self._look_around(self._centre())
+            fruitless += 1
+            if self.best_cost < (1.0 - WORTHWHILE) * before - self.resolution:
+                search = TrustRegion(self._centre(), 0.1, LANES, self.rng)
+                self._run(search, None)
+                fruitless = 0
+        return fruitless == LOOKS or search.converged
 
     def _centre(self) -> FloatArray:
         """Coordinates of the best plan so far."""
@@ -546,7 +558,7 @@ class _Task:
             self.cost,
             evaluations=min(most, self.left),
             tolerance=1e-4,
-            relative=1e-6,
+            relative=WORTHWHILE,
             patience=PATIENCE,
             stop=self.late,
         )
@@ -555,7 +567,8 @@ class _Task:
     def _look_around(self, here: FloatArray) -> None:
         wide = min(self.left, LANES)
         if wide > 0:
-            self.cost(here + self.decision.steps(self.rng, np.geomspace(0.1, 1.0, wide)))
+            around = here + self.decision.steps(self.rng, np.geomspace(0.1, 1.0, wide))
+            self.cost(around, hopeless=1.0)
 
     def shoot(self) -> bool:
         """Shrink the time of arrival: from a fresh start, then from the best plan, and so on."""

@@ -64,14 +64,29 @@ class _Room:
     def __init__(self, loop: ClosedLoop, count: int, segments: int) -> None:
         n, m = loop.mechanism.n, loop.mechanism.m
         self.count, self.padded = count, -(-count // LANES) * LANES
-        self.at_target, self.width, self.paths = loop._numbers.at_target, 2 * m * n, 0
-        self.paths = len(loop.objective.constraints)
+        self.at_target, self.width = loop._numbers.at_target, 2 * m * n
+        w = len(loop.objective.constraints)
         self.lanes = np.empty((self.padded, segments, self.width + 2 * m + 1))
         self.states = np.empty((self.padded, 2 * n))
         self.live = np.ones(self.padded)
-        self.out = np.empty((self.padded, 8 + self.paths + 4 * n))
+        self.ends = None if loop.linear_end is None else loop.linear_end.room(self.padded)
+        self.out = np.empty((self.padded, 8 + w + 4 * n))
         # A sampled kernel reads the noise of every lane.
         self.quiet = np.zeros((1, self.padded, 2 * n)) if loop.hold else _NOTHING
+        out = self.out[:count]
+        self._batch = Batch(
+            cost=out[:, 0],
+            time=out[:, 1],
+            event=np.empty(count, dtype=np.int64),
+            radius=out[:, 3],
+            singular=out[:, 4],
+            input=out[:, 5],
+            path=out[:, 6 : 6 + w],
+            closest=out[:, 6 + w],
+            closest_time=out[:, 7 + w],
+            closest_x=out[:, 8 + w : 8 + w + 2 * n],
+            x=out[:, 8 + w + 2 * n :],
+        )
 
     def fill(self, states: FloatArray, surfaces: FloatArray, laws: FloatArray) -> None:
         """Take states (…, 2n), surfaces (…, S, 2mn) and laws (…, S, 2m); the last fills up."""
@@ -86,20 +101,12 @@ class _Room:
 
     def batch(self, start: float) -> Batch:
         """Return the results as named views."""
-        out, w, n = self.out[: self.count], self.paths, self.states.shape[1] // 2
-        return Batch(
-            cost=out[:, 0],
-            time=out[:, 1] - start,
-            event=out[:, 2].astype(np.int64),
-            radius=out[:, 3],
-            singular=out[:, 4],
-            input=out[:, 5],
-            path=out[:, 6 : 6 + w],
-            closest=out[:, 6 + w],
-            closest_time=out[:, 7 + w] - start,
-            closest_x=out[:, 8 + w : 8 + w + 2 * n],
-            x=out[:, 8 + w + 2 * n :],
-        )
+        batch = self._batch
+        batch.event[:] = self.out[: self.count, 2]
+        if start != 0.0:
+            batch.time[:] -= start
+            batch.closest_time[:] -= start
+        return batch
 
 
 class Probe:
@@ -258,20 +265,16 @@ class ClosedLoop:
         end = self.linear_end
         return end is not None and end.stage is not None
 
-    def _prepare(self, lanes: FloatArray) -> Prepared | None:
-        """Linearise the last surface of every lane, (N, 2mn + 2m + 1)."""
-        if self.linear_end is None:
+    def _prepare(self, room: _Room) -> Prepared | None:
+        """Linearise the last surface of every lane."""
+        if self.linear_end is None or room.ends is None:
             return None
-        m = self.mechanism.m
-        surfaces, eta, layer = (
-            lanes[:, : -2 * m - 1],
-            lanes[:, -2 * m - 1 : -m - 1],
-            lanes[:, -m - 1 : -1],
-        )
-        gains = eta
+        gains = None
         if any(self.mechanism.disturbance_bounds):
-            gains = gains_at_target(self.mechanism, surfaces, eta)
-        return self.linear_end.prepare(surfaces, gains, layer)
+            surfaces, eta = room.lanes[:, -1, : room.width], room.lanes[:, -1, room.width :]
+            gains = gains_at_target(self.mechanism, surfaces, eta[:, : self.mechanism.m])
+        self.linear_end.prepare(room.lanes, gains, room.ends)
+        return room.ends
 
     def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:
         """Return the steps at which surfaces take over; the kernel meets them one by one."""
@@ -329,17 +332,17 @@ class ClosedLoop:
         noise: FloatArray | None = None,
     ) -> Batch:
         """Call the kernel on what the room holds; the results live there too."""
-        numbers = self._numbers
-        room.live.fill(1.0)
-        self._check_gains(room.lanes, room.live, stable_only)
+        numbers, live = self._numbers, room.live
+        live.fill(1.0)
+        self._check_gains(room.lanes, live, stable_only)
         hands_over = self._hands_over and not every
-        prepared = self._prepare(room.lanes[:, -1]) if hands_over or stable_only else None
+        prepared = self._prepare(room) if hands_over or stable_only else None
         end = self.linear_end if hands_over else None
         if prepared is not None and stable_only:
-            room.live *= prepared.stable
+            live *= prepared.stable
         self._kernel(
             room.states,
-            room.live,
+            live,
             room.lanes,
             switches,
             numbers.plant,

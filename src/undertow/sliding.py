@@ -63,7 +63,7 @@ class Surface:
         self, alpha_a: ArrayLike, lambda_a: ArrayLike, alpha_u: ArrayLike, lambda_u: ArrayLike
     ) -> None:
         blocks = {
-            name: np.atleast_2d(np.array(value, dtype=float))
+            name: np.array(value, dtype=float, ndmin=2)
             for name, value in (
                 ("alpha_a", alpha_a),
                 ("lambda_a", lambda_a),
@@ -90,7 +90,8 @@ class Surface:
                 )
             block.flags.writeable = False
             object.__setattr__(self, name, block)
-        if abs(np.linalg.det(blocks["alpha_a"])) < 1e-12:
+        alpha = blocks["alpha_a"]
+        if abs(alpha[0, 0] if m == 1 else np.linalg.det(alpha)) < 1e-12:
             raise InvalidInputError(
                 "surface block alpha_a",
                 value=blocks["alpha_a"].tolist(),

@@ -67,15 +67,21 @@ def quadratic_stage(mechanism: Mechanism, objective: Objective) -> QuadraticStag
     )
 
 
+#: Stands for gains that are η.
+_SAME = np.empty((0, 0))
+
+
 class Prepared(NamedTuple):
     """Linear ends of C closed loops.
 
-    ``A`` (C, n, 2n) acceleration rows; ``P`` (C, 2n, 2n); ``rate`` (C,), decay of the slowest
+    ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
+    ``P`` (C, 2n, 2n); ``rate`` (C,), decay of the slowest
     mode, 1/s; ``stable`` (C,), 1 or 0; ``powers`` of e^{At}, see
     :mod:`undertow.codegen.linear`.
     """
 
     A: FloatArray
+    Q: FloatArray
     P: FloatArray
     rate: FloatArray
     stable: FloatArray
@@ -117,32 +123,38 @@ class LinearEnd:
         self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
         self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
 
-    def prepare(self, surfaces: FloatArray, gains: FloatArray, layers: FloatArray) -> Prepared:
-        """Linearise closed loops and integrate what their linear ends need.
-
-        Parameters
-        ----------
-        surfaces
-            Surface vectors, (C, 2mn); C is a multiple of the lanes of a block.
-        gains, layers
-            k_i at the target and ε_i, (C, m).
-        """
-        count, n, m = len(surfaces), self.X.shape[0] + self.X.shape[1], self.X.shape[1]
-        N, stage = 2 * n, self._weights
-        out = Prepared(
+    def room(self, count: int) -> Prepared:
+        """Return room for the ends of ``count`` closed loops, a multiple of the lanes."""
+        n = self.X.shape[0] + self.X.shape[1]
+        N = 2 * n
+        return Prepared(
             np.empty((count, n, N)),
+            np.empty((count, N, N)) if self.counts_cost else np.eye(N)[None],
             np.empty((count, N, N)),
             np.empty(count),
             np.empty(count),
             np.empty((count // LANES, LEVELS, N * N * LANES)),
         )
-        Q = np.empty((count, N, N)) if self.counts_cost else np.eye(N)[None]
+
+    def prepare(self, lanes: FloatArray, gains: FloatArray | None, into: Prepared) -> None:
+        """Linearise closed loops and integrate what their linear ends need.
+
+        Parameters
+        ----------
+        lanes
+            Rows of loops, (C, S, 2mn + 2m + 1), as the kernel reads them: surface vector, η
+            and ε of each of S surfaces, of which the last counts.
+        gains
+            k_i at the target, (C, m), where that is not η_i.
+        into
+            What is filled, see :meth:`room`.
+        """
+        stage = self._weights
         _close(
-            np.ascontiguousarray(surfaces), gains / layers, self.X, self.Y, self.H, self.S,
-            self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, m, out.A, Q,
+            lanes, _SAME if gains is None else gains, self.X, self.Y, self.H, self.S,
+            self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, into.A, into.Q,
         )  # fmt: skip
-        self._blocks.double(out.A, Q, out.P, out.rate, out.stable, out.powers, LANES)
-        return out
+        self._blocks.double(into.A, into.Q, into.P, into.rate, into.stable, into.powers)
 
     def complete(self, prepared: Prepared, out: FloatArray, horizon: float) -> None:
         """Add the linear ends to the kernel's results, (C, columns), in place.
@@ -159,19 +171,20 @@ class LinearEnd:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _close(  # type: ignore[no-untyped-def]
-    surfaces, ratio, X, Y, H, S, B_inverse, xx, xu, uu, counts_cost, m, A, Q
+    lanes, gains, X, Y, H, S, B_inverse, xx, xu, uu, counts_cost, A, Q
 ):
     """Write the acceleration rows A and the stage cost Q of each closed loop; NaN if singular."""
-    free = X.shape[0]
+    free, m = X.shape
     n = m + free
     N = 2 * n
+    width = 2 * m * n
     gamma, drive = np.empty((m, m)), np.empty((m, N))
     K, D = np.empty((m, N)), np.empty((m, N))
-    for lane in range(surfaces.shape[0]):
-        p = surfaces[lane]
+    for lane in range(lanes.shape[0]):
+        p = lanes[lane, lanes.shape[1] - 1]
         lambda_a, alpha_u, lambda_u = m * m, 2 * m * m, m * m + m * n
         for i in range(m):
-            k = ratio[lane, i]
+            k = (p[width + i] if gains.size == 0 else gains[lane, i]) / p[width + m + i]
             for j in range(m):
                 value = p[i * m + j]
                 for f in range(free):

@@ -58,7 +58,8 @@ class TrustRegion:
         d = self.mean.size
         self.terms = (d + 1) * (d + 2) // 2
         self.population = population
-        self._x, self._f = np.empty((0, d)), np.empty(0)
+        self._count = 0
+        self._x, self._f = np.empty((8 * population, d)), np.empty(8 * population)
 
     @property
     def spread(self) -> float:
@@ -66,53 +67,91 @@ class TrustRegion:
         return max(self.radius, float(np.abs(self.step).max()))
 
     def ask(self) -> FloatArray:
-        """Return the next candidates, (N, d): the first time the mean and a design around it."""
-        if self.generation == 0:
-            count = self.population * math.ceil(1.2 * self.terms / self.population)
-            return np.vstack([self.mean, self._design(self.mean, count - 1)])
-        lengths = STRETCHES[: self.population // 2, None]
-        ahead = self._design(self.best_x + self.step, self.population - len(lengths))
-        return np.vstack([self.best_x + lengths * self.step, ahead])
+        """Return the next candidates, (N, d).
 
-    def _design(self, centre: FloatArray, count: int) -> FloatArray:
-        """Return points around a centre: both ways along random orthogonal axes, then beyond."""
-        d = centre.size
+        The first time the mean and a design around it; later steps of several lengths, and a
+        design around the place where the model expects the minimum.  A design goes both ways
+        along random orthogonal axes, then beyond.
+        """
+        d, lengths = self.mean.size, STRETCHES[: self.population // 2]
+        count = self.population - len(lengths)
+        if self.generation == 0:
+            lengths = STRETCHES[:1]  # along no step at all: the mean itself
+            count = self.population * math.ceil(1.2 * self.terms / self.population) - 1
         drawn = self.rng.standard_normal((1 + max(count - 2 * d, 0), d))
-        drawn /= np.sqrt((drawn * drawn).sum(axis=1, keepdims=True))
-        axes = np.eye(d) - 2.0 * np.outer(drawn[0], drawn[0])  # a reflection: orthogonal
-        beyond = 1.5 * drawn[1:]
-        points = np.concatenate([axes, -axes, beyond])[:count]
-        return np.asarray(centre + self.radius * points)
+        x = np.empty((len(lengths) + count, d))
+        _spread_out(self.best_x, self.step, lengths, self.radius, drawn, x)
+        return x
 
     def tell(self, x: FloatArray, f: FloatArray) -> None:
         """Learn the costs ``f``, (N,), of candidates ``x``, (N, d); NaN counts as +∞."""
-        f = np.where(np.isnan(f), np.inf, f)
-        best = int(np.argmin(f))
-        if f[best] < self.best_f:
-            self.best_f, self.best_x = float(f[best]), x[best].copy()
+        while self._count + len(f) > len(self._f):
+            self._x, self._f = np.repeat(self._x, 2, axis=0), np.repeat(self._f, 2)
         self.generation += 1
-        sound = f < PENALTY
-        self._x = np.concatenate([self._x, x[sound]])
-        self._f = np.concatenate([self._f, f[sound]])
-        if len(self._f) < self.terms:
+        self._count, best = _learn(x, f, self._x, self._f, self._count)
+        if best >= 0 and f[best] < self.best_f:
+            self.best_f, self.best_x = float(f[best]), x[best].copy()
+        if self._count < self.terms:
             self.step[:] = 0.0
             self.radius *= 0.5
             return
-        offsets = self._x - self.best_x
-        near = np.argsort((offsets * offsets).sum(axis=1), kind="stable")[: 3 * self.terms]
-        _model_step(offsets[near], self._f[near] - self.best_f, abs(self.best_f), self.step)
-        length = math.sqrt(float(self.step @ self.step))
+        length = _model_step(self._x[: self._count], self._f, self.best_x, self.best_f, self.step)
         self.radius = min(max(0.5 * length, 0.01), 0.3)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _model_step(x, f, scale, step):  # type: ignore[no-untyped-def]
-    """Fit a quadratic to costs above the best one, (K,), and write its trust-region step."""
-    count, d = x.shape
+def _spread_out(centre, step, lengths, radius, drawn, x):  # type: ignore[no-untyped-def]
+    """Write candidates: lengths along the step, then a design around its end."""
+    d, first = len(centre), len(lengths)
+    for k in range(first):
+        for j in range(d):
+            x[k, j] = centre[j] + lengths[k] * step[j]
+    norm = np.empty(len(drawn))
+    for k in range(len(drawn)):
+        norm[k] = math.sqrt(np.sum(drawn[k] * drawn[k]))
+    for k in range(first, len(x)):
+        axis = k - first
+        for j in range(d):
+            if axis < 2 * d:  # columns of a reflection: orthogonal
+                i = axis % d
+                way = (1.0 if i == j else 0.0) - 2.0 * drawn[0, i] * drawn[0, j] / norm[0] ** 2
+                way = way if axis < d else -way
+            else:
+                beyond = 1 + axis - 2 * d
+                way = 1.5 * drawn[beyond, j] / norm[beyond]
+            x[k, j] = centre[j] + step[j] + radius * way
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _learn(x, f, known_x, known_f, count):  # type: ignore[no-untyped-def]
+    """Keep what is no penalty; return how many are known now, and the best of the new ones."""
+    best = -1
+    for k in range(len(f)):
+        if f[k] < np.inf and (best < 0 or f[k] < f[best]):
+            best = k
+        if f[k] < PENALTY:
+            known_x[count] = x[k]
+            known_f[count] = f[k]
+            count += 1
+    return count, best
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _model_step(known_x, known_f, best_x, best_f, step):  # type: ignore[no-untyped-def]
+    """Fit a quadratic to the costs near the best one; write its trust-region step.
+
+    Returns the length of the step.
+    """
+    known, d = known_x.shape
     terms = (d + 1) * (d + 2) // 2
-    distance = np.empty(count)
+    count, scale = min(known, 3 * terms), abs(best_f)
+    away = np.empty(known)
+    for i in range(known):
+        away[i] = math.sqrt(np.sum((known_x[i] - best_x) ** 2))
+    near = np.argsort(away, kind="mergesort")[:count]
+    distance, f, x = away[near], known_f[near] - best_f, np.empty((count, d))
     for i in range(count):
-        distance[i] = math.sqrt(np.sum(x[i] * x[i]))
+        x[i] = known_x[near[i]] - best_x
     reach = max(distance[min(count - 1, terms + 3)], 1e-6)
     normal = np.zeros((terms, terms))
     right = np.zeros(terms)
@@ -161,7 +200,10 @@ def _model_step(x, f, scale, step):  # type: ignore[no-untyped-def]
         push = max(1.5 * push, 1e-3 * top)
     if not size < 1e3:
         y[:] = 0.0
+    length = 0.0
     for a in range(d):
         step[a] = 0.0
         for b in range(d):
             step[a] += basis[a, b] * y[b] * reach
+        length += step[a] * step[a]
+    return math.sqrt(length)

@@ -275,20 +275,31 @@ class _Writer:
     # -- events ----------------------------------------------------------------------------
 
     def watch(self) -> list[str]:
-        """Keep the smallest margins; stop a lane whose margin is negative."""
+        """Keep the smallest margins; stop a lane whose margin is negative.
+
+        Rows are read before they are chosen between: a choice between two elements of ``W``
+        would be compiled as a choice between two addresses, and the loop not as vectors.
+        """
         r = self.rows
+        low = [f"low_{j}" for j in range(len(r.margins))]
+        now = [f"now_{j}" for j in range(len(r.margins))]
         return [
-            f"active = {r.active}",
+            *(f"{name} = {row}" for name, row in zip(now, r.margins, strict=True)),
+            *(f"{name} = {row}" for name, row in zip(low, r.smallest, strict=True)),
+            f"active = {r.active} > 0.0",
+            f"end = {r.end}",
+            f"code = {r.code}",
             # Written so that a margin that is not a number counts as broken, and is kept.
-            "sound = " + " & ".join(f"({row} >= 0.0)" for row in r.margins),
+            "sound = " + " & ".join(f"({name} >= 0.0)" for name in now),
             *(
-                f"{low} = {now} if active > 0.0 and not ({now} >= {low}) else {low}"
-                for low, now in zip(r.smallest, r.margins, strict=True)
+                f"{row} = {a} if ({b} >= {a}) | (not active) else {b}"
+                for row, a, b in zip(r.smallest, low, now, strict=True)
             ),
-            "broken = active > 0.0 and not sound",
-            f"{r.end} = {self.time} if broken else {r.end}",
-            f"{r.code} = (3.0 if not ({r.singular} >= 0.0) else 2.0) if broken else {r.code}",
-            f"{r.active} = 0.0 if broken else active",
+            "broken = active & (not sound)",
+            f"kind = 2.0 if {now[0]} >= 0.0 else 3.0",
+            f"{r.end} = {self.time} if broken else end",
+            f"{r.code} = kind if broken else code",
+            f"{r.active} = 1.0 if active & sound else 0.0",
         ]
 
     def hand_over(self) -> list[str]:

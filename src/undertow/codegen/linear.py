@@ -37,17 +37,21 @@ def linear_source(size: int) -> str:
     """
     N = size
     area = N * N * LANES
-    # With a constant count LLVM unrolls the lane loop of a short product before it looks for
-    # vectors; with an unknown one it gives up on long ones.
-    lanes = "lanes" if N <= 4 else str(LANES)
-    product = " + ".join(
-        f"W[a + (r * {N} + {k}) * {LANES} + i] * W[b + ({k} * {N} + c) * {LANES} + i]"
-        for k in range(N)
-    )
-    turned = " + ".join(
-        f"W[a + ({k} * {N} + r) * {LANES} + i] * W[b + ({k} * {N} + c) * {LANES} + i]"
-        for k in range(N)
-    )
+    # Each matrix is an array of its own and a row is done at once: that way LLVM sees vectors.
+    read = [f"a_{k} = a[(r * {N} + {k}) * {LANES} + i]" for k in range(N)]
+    read_turned = [f"a_{k} = a[({k} * {N} + r) * {LANES} + i]" for k in range(N)]
+    entries = [
+        " + ".join(f"a_{k} * b[{(k * N + c) * LANES} + i]" for k in range(N)) for c in range(N)
+    ]
+    places = [f"(r * {N} + {c}) * {LANES} + i" for c in range(N)]
+    product = [
+        *read,
+        *(f"o[{e}] = add[{e}] + factor * ({v})" for e, v in zip(places, entries, strict=True)),
+    ]
+    turned = [
+        *read_turned,
+        *(f"o[{e}] = add[{e}] + {v}" for e, v in zip(places, entries, strict=True)),
+    ]
     image = " + ".join(
         f"powers[block, level, (r * {N} + {k}) * {LANES} + i] * X[{k * LANES} + i]"
         for k in range(N)
@@ -64,31 +68,27 @@ FAST = {{"contract", "nsz", "arcp"}}
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
-def _product(W, a, b, add, factor, o, lanes):
+def _product(a, b, add, factor, o):
     for r in range({N}):
-        for c in range({N}):
-            e = (r * {N} + c) * {LANES}
-            for i in range({lanes}):
-                W[o + e + i] = W[add + e + i] + factor * ({product})
+        for i in range({LANES}):
+{_indented(product)}
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
-def _turned(W, a, b, add, o, lanes):
+def _turned(a, b, add, o):
     for r in range({N}):
-        for c in range({N}):
-            e = (r * {N} + c) * {LANES}
-            for i in range({lanes}):
-                W[o + e + i] = W[add + e + i] + {turned}
+        for i in range({LANES}):
+{_indented(turned)}
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def double(A, Q, P, rate, stable, powers, lanes):
+def double(A, Q, P, rate, stable, powers):
     half = {N // 2}
-    W = np.zeros({8 * area})
-    zero, one, scaled, E, X, T, U, V = {", ".join(str(k * area) for k in range(8))}
+    W = np.zeros((9, {area}))
+    zero, one, scaled, E, X, T, U, V, Z = W[0], W[1], W[2], W[3], W[4], W[5], W[6], W[7], W[8]
     for r in range({N}):
         for i in range({LANES}):
-            W[one + (r * {N} + r) * {LANES} + i] = 1.0
+            one[(r * {N} + r) * {LANES} + i] = 1.0
     now, before = np.empty({LANES}), np.empty({LANES})
     for block in range(A.shape[0] // {LANES}):
         first = block * {LANES}
@@ -110,37 +110,36 @@ def double(A, Q, P, rate, stable, powers, lanes):
                     value = 1.0 if c == r + half else 0.0
                     if r >= half:
                         value = A[first + i, r - half, c] if sound else 0.0
-                    W[scaled + (r * {N} + c) * {LANES} + i] = value
+                    scaled[(r * {N} + c) * {LANES} + i] = value
                     which = first + i if Q.shape[0] > 1 else 0
-                    W[U + (r * {N} + c) * {LANES} + i] = Q[which, r, c]
+                    U[(r * {N} + c) * {LANES} + i] = Q[which, r, c]
         t = {UNIT}
         halvings = 0
         while t * worst > 0.5:
             t *= 0.5
             halvings += 1
         for e in range({area}):
-            W[scaled + e] *= t
-            W[E + e] = W[one + e]
-            W[X + e] = W[U + e]
+            scaled[e] *= t
+            E[e] = one[e]
+            X[e] = U[e]
         for k in range(10, 0, -1):
-            _product(W, scaled, E, one, 1.0 / k, T, lanes)
-            _product(W, X, scaled, zero, 1.0 / (k + 1), V, lanes)
+            _product(scaled, E, one, 1.0 / k, T)
+            _product(X, scaled, zero, 1.0 / (k + 1), V)
             for r in range({N}):
                 for c in range({N}):
                     e, m = (r * {N} + c) * {LANES}, (c * {N} + r) * {LANES}
                     for i in range({LANES}):
-                        W[X + e + i] = W[U + e + i] + W[V + e + i] + W[V + m + i]
-            for e in range({area}):
-                W[E + e] = W[T + e]
+                        X[e + i] = U[e + i] + V[e + i] + V[m + i]
+            E, T = T, E
         for e in range({area}):
-            W[X + e] *= t
+            X[e] *= t
         for level in range(-halvings, {LEVELS}):
             if level >= 0:
                 for i in range({LANES}):
                     now[i] = 0.0
                 for e in range({N * N}):
                     for i in range({LANES}):
-                        value = W[E + e * {LANES} + i]
+                        value = E[e * {LANES} + i]
                         powers[block, level, e * {LANES} + i] = value
                         now[i] += value * value
                 if level > 0:
@@ -150,18 +149,17 @@ def double(A, Q, P, rate, stable, powers, lanes):
                 for i in range({LANES}):
                     before[i] = now[i]
             if level + 1 < {LEVELS}:
-                _product(W, X, E, zero, 1.0, T, lanes)
-                _turned(W, E, T, X, X, lanes)
-                _product(W, E, E, zero, 1.0, T, lanes)
-                for e in range({area}):
-                    W[E + e] = W[T + e]
+                _product(X, E, zero, 1.0, T)
+                _turned(E, T, X, Z)
+                _product(E, E, zero, 1.0, T)
+                E, T, X, Z = T, E, Z, X
                 t *= 2.0
         for i in range({LANES}):
             if not before[i] < 1.0:
                 stable[first + i] = 0.0
             for r in range({N}):
                 for c in range({N}):
-                    P[first + i, r, c] = W[X + (r * {N} + c) * {LANES} + i]
+                    P[first + i, r, c] = X[(r * {N} + c) * {LANES} + i]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -245,3 +243,8 @@ def sum_of_squares(X, i):
         total += X[k * {LANES} + i] * X[k * {LANES} + i]
     return total
 '''
+
+
+def _indented(lines: list[str]) -> str:
+    """Return lines at the depth of a lane loop within a loop over rows."""
+    return "\n".join(" " * 12 + line for line in lines)
