@@ -143,6 +143,7 @@ class Controller:
         self._asked: Request | None = None
         self._pending: Answer | None = None
         self._arrived: Answer | None = None
+        self._used: tuple[Answer, float, float, float] | None = None
         self._followed, self._free, self._t = True, False, 0.0
         self._sequence = memory.sequence
         self._sound = self._swinging = 0.0
@@ -180,7 +181,10 @@ class Controller:
         """Do what could wait: judge the answer that has arrived, or ask for the next one."""
         self._followed = True
         answer, self._arrived = self._arrived, None
+        used, self._used = self._used, None
         try:
+            if used is not None:
+                self._tell(*used)
             if answer is not None:
                 self._receive(self._t, answer)
             elif self._free:
@@ -344,33 +348,39 @@ class Controller:
     def _use(self, t: float, answer: Answer) -> bool:
         """Put an answer to use at its time, if the state is the one it was made for.
 
-        The law in use afterwards is evaluated; whether it was a catch is returned.
+        The law in use afterwards is evaluated; whether it was a catch is returned.  What is
+        to be told of it is told in :meth:`follow_up`.
         """
         self._pending = None
-        self._sequence = max(self._sequence, answer.sequence)
         swinging, most = answer.swing >= 0, self.settings.surprise
         if swinging:
             assert self.swing_up is not None  # else nothing was asked in this state
             self._turn[:] = self.swing_up.region.turns(self.x)
             settle(self.x, self._turn, self.x, self.home)
             most = CATCH_SURPRISE
-        off = off_by(self.home, answer.x)
-        verdict = ""
+        off, margin = off_by(self.home, answer.x), math.nan
+        if answer.admission.accepted and off <= most:
+            self._law(self.home, answer.lanes[0], self._block)
+            margin = float(self.margin[0])
+        self._used = answer, off, most, margin
+        if margin > self.settings.margin:
+            self._install(answer.memory, answer.lanes)
+            return swinging
+        self._evaluate(t)
+        return False
+
+    def _tell(self, answer: Answer, off: float, most: float, margin: float) -> None:
+        """Note what became of an answer at its time of use."""
+        self._sequence = max(self._sequence, answer.sequence)
         if not answer.admission.accepted:
             verdict = f"kept the old plan, {answer.admission.reason}"
         elif not off <= most:
             verdict = f"refused, the state is off its prediction by {off:.2g}"
+        elif not margin > self.settings.margin:
+            verdict = f"refused, det Γ(q)/det Γ(0) would be {margin:.2g}"
         else:
-            self._law(self.home, answer.lanes[0], self._block)
-            if not self.margin[0] > self.settings.margin:
-                verdict = f"refused, det Γ(q)/det Γ(0) would be {self.margin[0]:.2g}"
-        if verdict:
-            self.notes.append(Note("answer", f"{answer.sequence}: {verdict}"))
-            self._evaluate(t)
-            return False
-        self._install(answer.memory, answer.lanes)
-        self.notes.append(Note("answer", f"{answer.sequence}: applied, off by {off:.2g}"))
-        return swinging
+            verdict = f"applied, off by {off:.2g}"
+        self.notes.append(Note("answer", f"{answer.sequence}: {verdict}"))
 
     def _install(self, memory: CascadeState, lanes: FloatArray) -> None:
         self.memory, self._lanes, self._times, self._segment = memory, lanes, memory.plan.times, 0

@@ -9,6 +9,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -250,7 +251,7 @@ class Runtime:
             if inputs.alarm:
                 log.event(k, inputs.t, "alarm", inputs.alarm)
             if inputs.answer is not None:
-                log.answer(answer_row(k, inputs.answer))
+                log.answer(partial(answer_row, k, inputs.answer))
         for note in controller.notes:
             self._tell(note.kind, note.text)
             if note.kind == "state":
