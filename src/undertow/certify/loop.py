@@ -1,9 +1,9 @@
 """The whole closed loop, boundary layer and input clip included, in coordinates (q, p, s).
 
-With p = M₀⁻¹ (M_auᵀ q̇_a + M_uu q̇_u), M₀ = M_uu at the target, and s the surface (10),
+With p = N (M_auᵀ q̇_a + M_uu q̇_u), N⁻¹ = M_uu at the target, and s the surface (10),
 
-    q̇ from  [M_auᵀ M_uu; α_a α_u] q̇ = [M₀ p; s − λ_a q_a − λ_u q_u],
-    ṗ = M₀⁻¹ (f_u + d/dt[M_auᵀ M_uu] q̇),
+    q̇ from  [N M_auᵀ  N M_uu; α_a α_u] q̇ = [p; s − λ_a q_a − λ_u q_u],
+    ṗ = N f_u + d/dt[N M_auᵀ  N M_uu] q̇,
     ṡ = −K sat(s/ε) + Γ S⁻¹ B [clip(u) − u°],
 
 where u is what the law (5), (12) demands and u° is what it would demand if it knew the plant
@@ -11,9 +11,7 @@ where u is what the law (5), (12) demands and u° is what it would demand if it 
 with a known plant ṡ = −K sat(s/ε) exactly.  det E, E = M_uu − M_auᵀ α_a⁻¹ α_u, is not zero
 where these coordinates exist, which is where Γ is invertible (37).
 
-sat and clip are Lipschitz, not smooth: their slopes are enclosed by intervals that hold every
-slope between two points of the box (Clarke's generalised derivative), which is all that a mean
-value form needs.
+A held input is a matter of :mod:`undertow.certify.loop_held`, which builds on the parts here.
 """
 
 from __future__ import annotations
@@ -27,24 +25,25 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.certify.batch import Interval, IntervalArithmetic
-from undertow.certify.interval import OutwardFunction, compile_outward, derivative_tape
-from undertow.certify.tube import Paths, bracket, matmul
-from undertow.codegen import Tape, compile_numpy
+from undertow.certify.batch import Interval
+from undertow.certify.interval import OutwardFunction
+from undertow.certify.loop_pieces import (
+    Reader,
+    excess,
+    saturation,
+    stacked,
+    through_switch,
+    zeros,
+)
+from undertow.certify.loop_program import LoopProgram
+from undertow.certify.tube import Paths, matmul, stack
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
 from undertow.sliding import ReachingLaw, Surface, check_surface_shape
 
-__all__ = ["LoopMotion", "LoopRates"]
+__all__ = ["LoopMotion", "LoopParts", "LoopRates", "put_boxes"]
 
 FloatArray = NDArray[np.float64]
-
-
-def _exact(block: ArrayLike) -> sp.Matrix:
-    array = np.asarray(block, dtype=float)
-    return sp.Matrix(
-        *array.shape, [sp.Rational(*float(v).as_integer_ratio()) for v in array.ravel()]
-    )
 
 
 class LoopRates(NamedTuple):
@@ -53,7 +52,7 @@ class LoopRates(NamedTuple):
     ``rate`` (N, L) encloses ż, ``slope`` (N, N + k, L) its generalised derivatives in z and in
     the k uncertain parameters, ``demand`` (m, L) the unclipped input, and ``push`` (m, L) what
     clip and ignorance add to ṡ = −K sat(s/ε) + push.  ``kinked`` (L,) marks boxes in which an
-    input may be on either side of its limit.
+    input may be on either side of its limit; ``W`` (m, m, L) is ∂ṡ/∂u.
     """
 
     rate: Interval
@@ -62,19 +61,44 @@ class LoopRates(NamedTuple):
     demand_slope: Interval
     push: Interval
     push_slope: Interval
+    W: Interval
     kinked: NDArray[np.bool_]
 
     def put(self, lanes: NDArray[np.intp], part: LoopRates) -> LoopRates:
         """Return the same with some boxes' answers replaced."""
+        return LoopRates(*put_boxes(self, lanes, part))
 
-        def one(old: Interval, new: Interval) -> Interval:
-            lo, hi = old.lo.copy(), old.hi.copy()
-            lo[..., lanes], hi[..., lanes] = new.lo, new.hi
-            return Interval(lo, hi)
 
-        kinked = self.kinked.copy()
-        kinked[lanes] = part.kinked
-        return LoopRates(*(one(a, b) for a, b in zip(self[:-1], part[:-1], strict=True)), kinked)
+def put_boxes(whole: tuple[Any, ...], lanes: NDArray[np.intp], part: tuple[Any, ...]) -> list[Any]:
+    """Return entries, intervals or masks whose last axis counts boxes, with some replaced."""
+
+    def one(old: Any, new: Any) -> Any:
+        copy = old.copy()
+        copy[..., lanes] = new
+        return copy
+
+    return [
+        Interval(one(a.lo, b.lo), one(a.hi, b.hi)) if isinstance(a, Interval) else one(a, b)
+        for a, b in zip(whole, part, strict=True)
+    ]
+
+
+class LoopParts(NamedTuple):
+    """What the equations are made of, over boxes, with slopes in z and in k parameters.
+
+    ``slow`` (2n − m, L), the ``demand`` (m, L), ``W`` = Γ S⁻¹ B (m, m, L), and the ``gap``
+    (m, L): the demand less what it would be if the law knew the plant.  The slopes of demand
+    and gap have m more columns, for sat(s/ε).
+    """
+
+    slow: Interval
+    slow_slope: Interval
+    demand: Interval
+    demand_slope: Interval
+    W: Interval
+    W_slope: Interval
+    gap: Interval
+    gap_slope: Interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,20 +115,24 @@ class LoopMotion:
         η and ε, constant; switching by saturation.
     uncertain
         Plant parameters that are only known to lie in [low, high], SI units; the law keeps
-        the mechanism's own values.
+        the mechanism's own values, which lie in there too.
+    period
+        The input is renewed every ``period`` seconds and held between; 0: at every instant.
 
     Raises
     ------
     InvalidInputError
         For a surface of another size, a force that depends on time, a switching function
         other than saturation, gains that vary with the state (declared disturbance bounds),
-        or an unknown parameter.
+        a parameter that is unknown or whose own value is outside its range, or a period that is
+        no time.
     """
 
     mechanism: Mechanism
     surface: Surface
     reaching: ReachingLaw = ReachingLaw()
     uncertain: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    period: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what this model of the loop does not cover."""
@@ -131,14 +159,18 @@ class LoopMotion:
                 limit="constant gains",
                 remedy="Declare no disturbance bounds; certify.reaching says what K overcomes",
             )
-        names = {p.name for p in mechanism.parameters}
+        own = {p.name: p.value for p in mechanism.parameters}
         for name, (low, high) in self.uncertain.items():
-            if name not in names or not low <= high:
+            if name not in own or not low <= own[name] <= high:
                 raise InvalidInputError(
                     "uncertain parameter",
                     value=f"{name}: [{low}, {high}]",
-                    limit=f"low ≤ high, one of {', '.join(sorted(names))}",
+                    limit=f"low ≤ {own[name]} ≤ high" if name in own else ", ".join(sorted(own)),
                 )
+        if not (np.isfinite(self.period) and self.period >= 0):
+            raise InvalidInputError(
+                "period of a held input", value=self.period, limit="finite, ≥ 0 s"
+            )
 
     # -- names and sizes -----------------------------------------------------------------
 
@@ -187,38 +219,33 @@ class LoopMotion:
     # -- equations -----------------------------------------------------------------------
 
     @cached_property
-    def _unit(self) -> sp.Matrix:
-        """M₀ in exact numbers (the nearest floats to its entries)."""
-        m = self.mechanism.m
-        return _exact(self.mechanism.M(np.zeros(self.mechanism.n))[m:, m:])
+    def _program(self) -> LoopProgram:
+        return LoopProgram(self.mechanism, self.surface, self.gains[0], self.uncertain.keys())
 
     @cached_property
-    def _program(self) -> _Program:
-        return _Program(self)
-
-    @cached_property
-    def _brackets(self) -> dict[str, tuple[float, float]]:
-        """Uncertain parameters as middle ± radius, in the mechanism's order."""
+    def _spread(self) -> dict[str, float]:
+        """Uncertain parameters: how far from the law's own value, in the mechanism's order."""
         found = {}
         for p in self.mechanism.parameters:
             if p.name in self.uncertain:
-                low, high = (np.asarray(v, dtype=float) for v in self.uncertain[p.name])
-                middle, radius = bracket(low, high)
-                found[p.name] = (float(middle), float(radius))
+                low, high = self.uncertain[p.name]
+                own = Interval(p.value)
+                ends = (Interval(high) - own).hi, (own - Interval(low)).hi
+                found[p.name] = max(0.0, *(float(e) for e in ends))
         return found
 
     @cached_property
     def radii(self) -> FloatArray:
-        """Radii of the k uncertain parameters, (k,)."""
-        return np.array([radius for _, radius in self._brackets.values()])
+        """Radii of the k uncertain parameters around the law's own values, (k,)."""
+        return np.array(list(self._spread.values()))
 
     def _parameters(self, middle: bool) -> list[Interval]:
         """Plant parameters as intervals, in the mechanism's order."""
         values = []
         for p in self.mechanism.parameters:
-            centre, radius = self._brackets.get(p.name, (p.value, 0.0))
-            one = Interval(centre)
-            values.append(one if middle or not radius else one + Interval(-radius, radius))
+            radius = 0.0 if middle else self._spread.get(p.name, 0.0)
+            one = Interval(p.value)
+            values.append(one + Interval(-radius, radius) if radius else one)
         return values
 
     def from_state(self, x: ArrayLike) -> FloatArray:
@@ -227,7 +254,9 @@ class LoopMotion:
         n, m = self.mechanism.n, self.mechanism.m
         q, v = state[..., :n], state[..., n:]
         momentum = np.einsum("...ij,...j->...i", self.mechanism.M(q)[..., m:, :], v)
-        unit = np.array(self._unit, dtype=float)
+        unit = self.mechanism.M(np.zeros(n))[m:, m:]
+        if self.uncertain:
+            unit = np.diag(np.diag(unit))
         p = np.linalg.solve(unit, momentum[..., None])[..., 0]
         return np.concatenate([q, p, self.surface.s(state)], axis=-1)
 
@@ -262,7 +291,14 @@ class LoopMotion:
         s_dot = -eta * switch + np.einsum("...ij,...j->...i", W, excess)
         return np.concatenate([np.stack(values[:n_slow], axis=-1), s_dot], axis=-1), u
 
-    def over(self, z: Interval, *, middle: bool = False, paths: Paths | None = None) -> LoopRates:
+    def over(
+        self,
+        z: Interval,
+        *,
+        middle: bool = False,
+        paths: Paths | None = None,
+        brief: bool = False,
+    ) -> LoopRates:
         """Enclose ż, its slopes and the demand over boxes z, (N, L).
 
         Parameters
@@ -271,52 +307,139 @@ class LoopMotion:
             For the uncertain parameters' middle values alone.
         paths
             What is known of the points in the boxes besides.
+        brief
+            Without effect: all slopes are enclosed.
         """
-        program, m, slow = self._program, self.mechanism.m, self.slow
+        m, slow = self.mechanism.m, self.slow
         eta, layer = self.gains
-        lanes = z.lo.shape[1]
-        rows = [z[i] for i in range(self.size)]
+        lanes, columns = z.lo.shape[1], self.size + len(self.radii)
         switch, bend = zip(
-            *(_saturation(rows[slow + i], float(layer[i])) for i in range(m)), strict=True
+            *(saturation(z[slow + i], float(layer[i])) for i in range(m)), strict=True
         )
-        flat = program.boxes(*rows, *switch, *self._parameters(middle))
-        get = _Reader(flat, lanes)
-        columns = self.size + len(self.radii)
-        rate = get.block(slow)
-        slope = get.block(slow, columns)
-        u = get.block(m)
-        u_slope = get.block(m, columns + m)
-        W = get.block(m, m)
-        W_slope = get.block(m * m, columns)
-        gap = get.block(m)
-        gap_slope = get.block(m, columns + m)
-        u_slope, gap_slope = (_through_switch(k, bend, columns, slow) for k in (u_slope, gap_slope))
-        if not middle:
-            # Mean value forms: the natural ones lose much to cancellation.
-            known = _Known.of(z, self.radii) if paths is None else paths
-            rate, u, gap = self._sharpen(known, (rate, slope), (u, u_slope), (gap, gap_slope))
+        parts = self.parts(z, switch, bend, middle=middle, paths=paths)
+        u, gap, W = parts.demand, parts.gap, parts.W
         # ṡ = −K sat + W (excess + gap): the clip's excess, and what the law does not know.
-        excess, kink = _excess(u, self.mechanism.input_limits)
-        total = excess + gap
-        total_slope = _expand(kink) * u_slope + gap_slope
+        more, kink = excess(u, self.mechanism.input_limits)
+        total = more + gap
+        total_slope = kink[:, None] * parts.demand_slope + parts.gap_slope
         push = matmul(W, total[:, None])[:, 0]
         push_slope = matmul(W, total_slope)
         for j in range(m):
-            push_slope = push_slope + W_slope.reshape(m, m, columns, lanes)[:, j] * total[j]
+            push_slope = push_slope + parts.W_slope[:, j] * total[j]
         hold = Interval(eta[:, None])
-        decay = _zeros(m, columns, lanes)
+        decay = zeros(m, columns, lanes)
         for i in range(m):
             loss = -(hold[i] * bend[i])
             decay.lo[i, slow + i], decay.hi[i, slow + i] = loss.lo, loss.hi
-        s_rate = push - hold * _rows(switch)
+        s_rate = push - hold * stacked(switch)
         return LoopRates(
-            _below(rate, s_rate),
-            _below(slope, push_slope + decay),
+            stack(parts.slow, s_rate),
+            stack(parts.slow_slope, push_slope + decay),
             u,
-            u_slope,
+            parts.demand_slope,
             push,
             push_slope,
+            W,
             (kink.lo != kink.hi).any(axis=0),
+        )
+
+    def parts(
+        self,
+        z: Interval,
+        switch: Sequence[Interval],
+        bend: Sequence[Interval],
+        *,
+        middle: bool = False,
+        paths: Paths | None = None,
+    ) -> LoopParts:
+        """Enclose the parts of the equations over boxes z, (N, L), for sat(s/ε) in ``switch``.
+
+        ``bend`` holds the slopes of ``switch`` in s; the rest as for :meth:`over`.  Slopes of
+        u and gap come back in z and the parameters alone.
+        """
+        m, slow, lanes, k = self.mechanism.m, self.slow, z.lo.shape[1], len(self.radii)
+        rows = [z[i] for i in range(self.size)]
+        own = self._parameters(True)
+        parts = self._blocks(rows, switch, own if middle else self._parameters(False), lanes)
+        if k:
+            zero = zeros(m, lanes)
+            if middle:  # the law knows a plant that is its own model
+                parts = parts._replace(gap=zero, gap_slope=_in_parameters(parts.gap_slope, k, m))
+            else:
+                parts = self._around(parts, self._blocks(rows, switch, own, lanes), rows, switch)
+        columns = self.size + k
+        parts = parts._replace(
+            demand_slope=through_switch(parts.demand_slope, bend, columns, slow),
+            gap_slope=through_switch(parts.gap_slope, bend, columns, slow),
+        )
+        if middle:
+            return parts
+        # Mean value forms: the natural ones lose much to cancellation.
+        known = _Known.of(z, self.radii) if paths is None else paths
+        rate, u, gap = self._sharpen(
+            known,
+            (parts.slow, parts.slow_slope),
+            (parts.demand, parts.demand_slope),
+            (parts.gap, parts.gap_slope),
+        )
+        return parts._replace(slow=rate, demand=u, gap=gap)
+
+    def _blocks(
+        self,
+        rows: Sequence[Interval],
+        switch: Sequence[Interval],
+        parameters: Sequence[Interval],
+        lanes: int,
+    ) -> LoopParts:
+        m, slow, columns = self.mechanism.m, self.slow, self.size + len(self.radii)
+        get = Reader(self._program.boxes(*rows, *switch, *parameters), lanes)
+        return LoopParts(
+            get.block(slow), get.block(slow, columns),
+            get.block(m), get.block(m, columns + m),
+            get.block(m, m), get.block(m, m, columns),
+            get.block(m), get.block(m, columns + m),
+        )  # fmt: skip
+
+    def _around(
+        self,
+        wide: LoopParts,
+        own: LoopParts,
+        rows: Sequence[Interval],
+        switch: Sequence[Interval],
+    ) -> LoopParts:
+        """Meet enclosures for unknown parameters with those around the law's own values.
+
+        f(z, p) ∈ f(z, p̂) + ∂f/∂p (p − p̂) for a slope f too; the gap vanishes at p̂.  Natural
+        enclosures of it would subtract two large numbers that hardly differ.
+        """
+        k, m, lanes = len(self.radii), self.mechanism.m, rows[0].lo.shape[0]
+        slow, columns = self.slow, self.size + k
+        get = Reader(self._program.mixed(*rows, *switch, *self._parameters(False)), lanes)
+        unknown = Interval(-self.radii[:, None], self.radii[:, None])
+
+        def change(block: Interval) -> Interval:
+            """Last axis but one counts parameters."""
+            total = block[..., 0, :] * unknown[0]
+            for j in range(1, k):
+                total = total + block[..., j, :] * unknown[j]
+            return total
+
+        gap_own = _in_parameters(own.gap_slope, k, m)
+        slow_slope = own.slow_slope + change(get.block(slow, columns, k))
+        demand_slope = own.demand_slope + change(get.block(m, columns + m, k))
+        W_slope = own.W_slope + change(get.block(m, m, columns, k))
+        gap_slope = gap_own + change(get.block(m, columns + m, k))
+        gap_slope = wide.gap_slope.intersect(gap_slope)
+        W = own.W + change(wide.W_slope[:, :, -k:])
+        return LoopParts(
+            wide.slow,
+            wide.slow_slope.intersect(slow_slope),
+            wide.demand,
+            wide.demand_slope.intersect(demand_slope),
+            wide.W.intersect(W),
+            wide.W_slope.intersect(W_slope),
+            wide.gap.intersect(change(gap_slope[:, self.size : columns])),
+            gap_slope,
         )
 
     def _sharpen(self, known: Paths, *pairs: tuple[Interval, Interval]) -> tuple[Interval, ...]:
@@ -324,12 +447,45 @@ class LoopMotion:
         slow, middle = self.slow, Interval(known.middle)
         rows = [middle[i] for i in range(self.size)]
         layer = self.gains[1]
-        switch = [_saturation(rows[slow + i], float(e))[0] for i, e in enumerate(layer)]
+        switch = [saturation(rows[slow + i], float(e))[0] for i, e in enumerate(layer)]
         flat = self._program.points(*rows, *switch, *self._parameters(True))
-        get = _Reader(flat, known.middle.shape[1])
+        get = Reader(flat, known.middle.shape[1])
         return tuple(
             value.intersect(get.block(len(value.lo)) + known.way(slope)) for value, slope in pairs
         )
+
+    def slow_rates(self, z: Interval, middle: bool) -> tuple[Interval, Interval]:
+        """Enclose the slow rows of ż, (2n − m, L), and their slopes, as :meth:`over` does."""
+        if len(self.radii):
+            rates = self.over(z, middle=middle)
+            return rates.rate[: self.slow], rates.slope[: self.slow]
+        rate, slope = self._slow_rates(z)
+        if middle:
+            return rate, slope
+        known = _Known.of(z, self.radii)
+        return rate.intersect(self._slow_rates(Interval(known.middle))[0] + known.way(slope)), slope
+
+    def _slow_rates(self, z: Interval) -> tuple[Interval, Interval]:
+        rows = [z[i] for i in range(self.size)]
+        get = Reader(self._program.slow(*rows, *self._parameters(True)), z.lo.shape[1])
+        return get.block(self.slow), get.block(self.slow, self.size)
+
+    def jerk(self, z: Interval, speed: Interval, middle: bool) -> Interval:
+        """Enclose s̈ for a held input, (m, L), over boxes z (N, L) and ṡ (m, L).
+
+        With ``middle`` for the law's own parameters alone.
+        """
+        return self._jerk(self._program.jerk, z, speed, middle).block(self.mechanism.m)
+
+    def jerk_slope(self, z: Interval, speed: Interval) -> tuple[Interval, Interval]:
+        """Enclose s̈ and its slopes in (z, ṡ, parameters), (m, N + m + k, L)."""
+        m = self.mechanism.m
+        get = self._jerk(self._program.jerk_slope, z, speed, False)
+        return get.block(m), get.block(m, self.size + m + len(self.radii))
+
+    def _jerk(self, run: OutwardFunction, z: Interval, speed: Interval, middle: bool) -> Reader:
+        rows, speeds = [z[i] for i in range(self.size)], [speed[i] for i in range(len(speed.lo))]
+        return Reader(run(*rows, *speeds, *self._parameters(middle)), z.lo.shape[1])
 
     def bend(self, z: Interval, rate: Interval) -> Interval:
         """Enclose d/dt of the slow rows of the slopes, (2n − m, N + k, L).
@@ -341,7 +497,7 @@ class LoopMotion:
         rows = [z[i] for i in range(self.size)]
         speeds = [rate[i] for i in range(self.size)]
         flat = self._program.second(*rows, *speeds, *self._parameters(False))
-        return _Reader(flat, lanes).block(self.slow, self.size + len(self.radii))
+        return Reader(flat, lanes).block(self.slow, self.size + len(self.radii))
 
 
 @dataclass(frozen=True)
@@ -363,191 +519,9 @@ class _Known:
         return matmul(slope, self.away[:, None])[:, 0]
 
 
-class _Program:
-    """The equations on a tape, as float and as interval functions."""
-
-    def __init__(self, motion: LoopMotion) -> None:
-        mechanism = motion.mechanism
-        n, m = mechanism.n, mechanism.m
-        self.z = tuple(sp.Symbol(f"z_{i}", real=True) for i in range(2 * n))
-        self.switch = tuple(sp.Symbol(f"sw_{i}", real=True) for i in range(m))
-        tape = Tape()
-        slow, q_dot = _slow_rates(tape, motion, self.z)
-        state = dict(zip(mechanism.x, [*self.z[:n], *q_dot], strict=True))
-        # Unknown parameters are the plant's; the law keeps its own numbers.
-        own = {
-            p.symbol: sp.Rational(*float(p.value).as_integer_ratio()) for p in mechanism.parameters
-        }
-        free = [p.symbol for p in mechanism.parameters if p.name in motion.uncertain]
-        u, W = _law(tape, motion, state, q_dot, self.switch)
-        gap: list[sp.Expr] = [sp.Integer(0)] * m
-        if free:
-            believed, _ = _law(tape, motion, {**state, **own}, q_dot, self.switch)
-            gap = tape.let_all([a - b for a, b in zip(believed, u, strict=True)])
-            u = believed
-        inputs = [*self.z, *self.switch, *mechanism.parameter_symbols]
-        self.floats = compile_numpy(tape, inputs, [*slow, *u, *W])
-        state_like = [*self.z, *free]
-        with_switch = [*self.z, *free, *self.switch]
-
-        def slopes(outputs: Sequence[sp.Expr], variables: Sequence[sp.Symbol]) -> list[sp.Expr]:
-            return [d for e in outputs for d in _derivatives(tape, variables, e)]
-
-        outputs = [
-            *slow, *slopes(slow, state_like), *u, *slopes(u, with_switch),
-            *W, *slopes(list(W), state_like), *gap, *slopes(gap, with_switch),
-        ]  # fmt: skip
-        self.points: OutwardFunction = compile_outward(
-            tape, inputs, [*slow, *u, *gap], IntervalArithmetic()
-        )
-        speeds = [sp.Symbol(f"dz_{i}", real=True) for i in range(2 * n)]
-        first = slopes(slow, self.z)
-        change = tape.let_all(
-            sum(d * v for d, v in zip(first[i * 2 * n : (i + 1) * 2 * n], speeds, strict=True))
-            for i in range(len(slow))
-        )
-        self.second: OutwardFunction = compile_outward(
-            tape,
-            [*self.z, *speeds, *mechanism.parameter_symbols],
-            slopes(change, state_like),
-            IntervalArithmetic(),
-        )
-        self.boxes: OutwardFunction = compile_outward(tape, inputs, outputs, IntervalArithmetic())
-
-
-def _derivatives(tape: Tape, variables: Sequence[sp.Symbol], e: sp.Expr) -> list[sp.Expr]:
-    if not sp.sympify(e).free_symbols:
-        return [sp.Integer(0)] * len(variables)
-    return derivative_tape(tape, variables, e)
-
-
-def _slow_rates(
-    tape: Tape, motion: LoopMotion, z: Sequence[sp.Symbol]
-) -> tuple[list[sp.Expr], list[sp.Expr]]:
-    """Lay (q̇, ṗ) on the tape; q̇ apart as atoms."""
-    mechanism, surface = motion.mechanism, motion.surface
-    n, m = mechanism.n, mechanism.m
-    q, p, s = sp.Matrix(z[:n]), sp.Matrix(z[n : 2 * n - m]), sp.Matrix(z[2 * n - m :])
-    where = dict(zip(mechanism.q, q, strict=True))
-    lower = mechanism.mass_matrix[m:, :]
-    rows = sp.Matrix(n - m, n, tape.let_all([e.xreplace(where) for e in lower]))
-    inverse = _exact(surface.alpha_a).inv()
-    alpha_u = _exact(surface.alpha_u)
-    r = tape.matrix(s - _exact(surface.lambda_a) * q[:m, :] - _exact(surface.lambda_u) * q[m:, :])
-    pull = tape.matrix(rows[:, :m] * inverse)
-    E = tape.matrix(rows[:, m:] - pull * alpha_u)
-    adjugate, determinant = tape.adjugate(E)
-    reciprocal = tape.let(1 / determinant)
-    right = tape.matrix(motion._unit * p - pull * r)
-    v_u = tape.matrix(tape.product(adjugate, right) * reciprocal)
-    v_a = tape.matrix(inverse * (r - alpha_u * v_u))
-    q_dot = [*v_a, *v_u]
-    rates = sp.zeros(n - m, n)
-    for symbol, speed in zip(mechanism.q, q_dot, strict=True):
-        rates += lower.diff(symbol).applyfunc(lambda e: e.xreplace(where)) * speed
-    state = {**where, **dict(zip(mechanism.x[n:], q_dot, strict=True))}
-    force = sp.Matrix([e.xreplace(state) for e in mechanism.force[m:, :]])
-    p_dot = tape.matrix(motion._unit.inv() * (force + rates * sp.Matrix(q_dot)))
-    return [*q_dot, *p_dot], q_dot
-
-
-def _law(
-    tape: Tape,
-    motion: LoopMotion,
-    rename: Mapping[sp.Symbol, sp.Expr],
-    q_dot: Sequence[sp.Expr],
-    switch: Sequence[sp.Symbol],
-) -> tuple[list[sp.Expr], list[sp.Expr]]:
-    """Lay the demand u, (5) with (12), and Γ S⁻¹ B on the tape."""
-    mechanism, surface = motion.mechanism, motion.surface
-    m = mechanism.m
-    part = mechanism.partition(tape, dict(rename))
-    alpha_u = _exact(surface.alpha_u)
-    gamma = tape.matrix(_exact(surface.alpha_a) - alpha_u * part.X)
-    adjugate, determinant = tape.adjugate(gamma)
-    reciprocal = tape.let(1 / determinant)
-    v = sp.Matrix(q_dot)
-    eta, _ = motion.gains
-    push = sp.Matrix([_exact([[k]])[0] * w for k, w in zip(eta, switch, strict=True)])
-    drive = tape.matrix(
-        alpha_u * part.y
-        + _exact(surface.lambda_a) * v[:m, :]
-        + _exact(surface.lambda_u) * v[m:, :]
-        + push
-    )
-    wanted = tape.matrix(-tape.product(adjugate, drive) * reciprocal)
-    force = tape.matrix(part.S * wanted - part.h)
-    b_adjugate, b_determinant = tape.adjugate(part.B)
-    u = tape.let_all(list(b_adjugate * force / b_determinant))
-    W = tape.product(gamma, tape.cholesky(part.S).solve(part.B))
-    return u, list(W)
-
-
-# -- interval pieces -------------------------------------------------------------------------
-
-
-class _Reader:
-    """Takes blocks off a flat list of results, all broadcast to L boxes."""
-
-    def __init__(self, flat: Sequence[Any], lanes: int) -> None:
-        self.flat, self.lanes, self.at = [Interval.of(v) for v in flat], lanes, 0
-
-    def block(self, *shape: int) -> Interval:
-        count = int(np.prod(shape))
-        part = self.flat[self.at : self.at + count]
-        self.at += count
-        lo = np.array([np.broadcast_to(v.lo, self.lanes) for v in part])
-        hi = np.array([np.broadcast_to(v.hi, self.lanes) for v in part])
-        return Interval(lo.reshape(*shape, self.lanes), hi.reshape(*shape, self.lanes))
-
-
-def _below(upper: Interval, lower: Interval) -> Interval:
-    """Stack two blocks of rows."""
-    return Interval(np.concatenate([upper.lo, lower.lo]), np.concatenate([upper.hi, lower.hi]))
-
-
-def _zeros(*shape: int) -> Interval:
-    """Return zeros whose ends are arrays of their own, to be written to."""
-    return Interval(np.zeros(shape), np.zeros(shape))
-
-
-def _rows(parts: Sequence[Interval]) -> Interval:
-    return Interval(np.array([v.lo for v in parts]), np.array([v.hi for v in parts]))
-
-
-def _expand(v: Interval) -> Interval:
-    return v[:, None]
-
-
-def _saturation(s: Interval, layer: float) -> tuple[Interval, Interval]:
-    """Return sat(s/ε) and its slopes in s, over boxes."""
-    ratio = s * (1 / Interval(layer))
-    value = Interval(np.clip(ratio.lo, -1.0, 1.0), np.clip(ratio.hi, -1.0, 1.0))
-    inside = (ratio.lo >= -1) & (ratio.hi <= 1)
-    outside = (ratio.lo >= 1) | (ratio.hi <= -1)
-    slope = 1 / Interval(layer)
-    return value, Interval(np.where(inside, slope.lo, 0.0), np.where(outside, 0.0, slope.hi))
-
-
-def _excess(u: Interval, limits: FloatArray) -> tuple[Interval, Interval]:
-    """Return clip(u) − u and its slopes in u, over boxes (m, L)."""
-    limit = limits[:, None]
-    free = (u.lo >= -limit) & (u.hi <= limit)
-    clipped = (u.lo >= limit) | (u.hi <= -limit)
-    # Decreasing in u: its extremes are at the ends.
-    low = Interval(np.clip(u.lo, -limit, limit)) - Interval(u.lo)
-    high = Interval(np.clip(u.hi, -limit, limit)) - Interval(u.hi)
-    value = Interval(np.where(free, 0.0, high.lo), np.where(free, 0.0, low.hi))
-    return value, Interval(np.where(free, 0.0, -1.0), np.where(clipped, -1.0, 0.0))
-
-
-def _through_switch(slope: Interval, bend: Sequence[Interval], columns: int, slow: int) -> Interval:
-    """Turn derivatives in (z, parameters, sw) into those in (z, parameters): sw = sat(s)."""
-    lo, hi = slope.lo[:, :columns].copy(), slope.hi[:, :columns].copy()
-    for i, b in enumerate(bend):
-        at = slow + i
-        more = Interval(lo[:, at], hi[:, at]) + b * Interval(
-            slope.lo[:, columns + i], slope.hi[:, columns + i]
-        )
-        lo[:, at], hi[:, at] = more.lo, more.hi
+def _in_parameters(slope: Interval, k: int, m: int) -> Interval:
+    """Return slopes (…, C + k + m, L) that vanish in z and in sat."""
+    lo, hi = np.zeros_like(slope.lo), np.zeros_like(slope.hi)
+    at = slice(slope.lo.shape[1] - k - m, slope.lo.shape[1] - m)
+    lo[:, at], hi[:, at] = slope.lo[:, at], slope.hi[:, at]
     return Interval(lo, hi)

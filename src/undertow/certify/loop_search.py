@@ -15,9 +15,10 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from undertow.certify.batch import Interval
 from undertow.certify.loop import LoopMotion
 from undertow.certify.loop_claim import LoopClaim, run_tubes, start_tubes, verify_loop
-from undertow.certify.loop_terminal import TerminalSet, verify_terminal
+from undertow.certify.loop_terminal import HOLD_SHARE, TerminalSet, verify_terminal
 from undertow.certify.verdict import Verdict
 from undertow.errors import InfeasibleError, UnstableSurfaceError
 from undertow.mechanism import Mechanism
@@ -71,63 +72,122 @@ def _jacobian(motion: LoopMotion, h: float = 1e-6) -> FloatArray:
     return np.asarray((motion(steps)[0] - motion(-steps)[0]).T / (2 * h))
 
 
-def _worst(motion: LoopMotion, T: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the growth of ½‖x‖² on rays, per ‖x‖², and the share of the input's range used."""
-    z = np.hstack([rays @ T.T, np.zeros((len(rays), motion.mechanism.m))])
-    rate, u = motion(z)
-    square = np.sum(rays * rays, axis=1)
-    growth = np.sum(rays * np.linalg.solve(T, rate[:, : motion.slow].T).T, axis=1) / square
-    return growth, np.abs(u / motion.mechanism.input_limits).max(axis=1)
+@dataclass(frozen=True)
+class _Trial:
+    """A candidate {‖x‖ ≤ r, |s_i| ≤ σ_i r}, y = T x, judged on samples."""
 
+    motion: LoopMotion
+    T: FloatArray
+    widths: FloatArray
 
-def _refined(
-    motion: LoopMotion, T: FloatArray, rays: FloatArray, rng: np.random.Generator
-) -> float:
-    """Level with fresh rays, and rays that climb to where the conditions are tightest."""
-    count, slow = 8 * len(rays), rays.shape[1]
-    fresh = rng.normal(size=(count, slow))
-    fresh /= np.linalg.norm(fresh, axis=1, keepdims=True)
-    r = _level(motion, T, fresh)
-    for width in (0.1, 0.03, 0.01, 0.003, 0.001):
-        inner = np.concatenate([r * f * fresh for f in (0.1, 0.4, 0.7, 1.0)])
-        growth, share = _worst(motion, T, inner)
-        top = np.concatenate([np.argsort(growth)[-150:], np.argsort(share)[-50:]])
-        near = np.repeat(inner[top], 12, axis=0)
-        near = near / np.linalg.norm(near, axis=1, keepdims=True)
-        near = near + width * rng.normal(size=near.shape)
-        fresh = near / np.linalg.norm(near, axis=1, keepdims=True)
-        while r > 1e-9:
-            inner = np.concatenate([r * f * fresh for f in (0.1, 0.4, 0.7, 1.0)])
-            growth, share = _worst(motion, T, inner)
-            if (growth < 0).all() and (share < 0.985).all():
-                break
-            r *= 0.97
-    return r
+    def worst(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the growth of ½‖x‖² at points x, per ‖x‖², for the worst |s_i| ≤ σ_i ‖x‖.
 
+        And the share of the input's range used, s = 0.
+        """
+        motion, T, m = self.motion, self.T, self.motion.mechanism.m
+        size = np.linalg.norm(points, axis=1)
+        rows = np.linalg.solve(T, np.eye(len(T)))
+        s = np.zeros((len(points), m))
+        rate, u = motion(np.hstack([points @ T.T, s]))
 
-def _level(motion: LoopMotion, T: FloatArray, rays: FloatArray) -> float:
-    """Largest r with ‖x‖ falling and the demand within 98.5 % of its limits on samples."""
+        def growth(rate: FloatArray) -> FloatArray:
+            x_rate = rate[:, : motion.slow] @ rows.T
+            return np.asarray(np.sum(points * x_rate, axis=1) / size**2)
 
-    def holds(r: float) -> bool:
-        growth, share = _worst(motion, T, r * rays)
+        total = growth(rate)
+        for j in range(m):
+            s[:, j] = self.widths[j] * size
+            up, down = (growth(motion(np.hstack([points @ T.T, d * s]))[0]) for d in (1, -1))
+            total = total + 0.5 * np.abs(up - down)
+            s[:, j] = 0.0
+        return total, np.abs(u / motion.mechanism.input_limits).max(axis=1)
+
+    def holds(self, points: FloatArray) -> bool:
+        """Whether ‖x‖ falls and the demand is within 98.5 % of its limits at points."""
+        growth, share = self.worst(points)
         return bool((growth < 0).all() and (share < 0.985).all())
 
-    r = 1.0
-    while not holds(r) and r > 1e-6:
-        r /= 2
-    while holds(1.05 * r) and r < 1e9:
-        r *= 1.05
-    return r
+    def level(self, rays: FloatArray) -> float:
+        """Largest r that holds on rays; 0 where ‖x‖ grows next to the target."""
+        r = 1.0
+        while not self.holds(r * rays):
+            r /= 2
+            if r < 1e-6:
+                return 0.0
+        while self.holds(1.05 * r * rays) and r < 1e9:
+            r *= 1.05
+        return r
+
+    def refined(self, rays: FloatArray, rng: np.random.Generator) -> float:
+        """Level with fresh rays, and rays that climb to where the conditions are tightest."""
+        fresh = rng.normal(size=(8 * len(rays), rays.shape[1]))
+        fresh /= np.linalg.norm(fresh, axis=1, keepdims=True)
+        r = self.level(fresh)
+        for width in (0.1, 0.03, 0.01, 0.003, 0.001):
+            inner = np.concatenate([r * f * fresh for f in (0.1, 0.4, 0.7, 1.0)])
+            growth, share = self.worst(inner)
+            top = np.concatenate([np.argsort(growth)[-150:], np.argsort(share)[-50:]])
+            near = np.repeat(inner[top], 12, axis=0)
+            near = near / np.linalg.norm(near, axis=1, keepdims=True)
+            near = near + width * rng.normal(size=near.shape)
+            fresh = near / np.linalg.norm(near, axis=1, keepdims=True)
+            while r > 1e-9:
+                inner = np.concatenate([r * f * fresh for f in (0.1, 0.4, 0.7, 1.0)])
+                if self.holds(inner):
+                    break
+                r *= 0.97
+        return r
 
 
-def _widths(motion: LoopMotion, T: FloatArray, A: FloatArray) -> FloatArray:
-    """σ such that s spends a fifth of the decay of ‖x‖ near 0, at most half a layer."""
-    slow = motion.slow
-    M = np.linalg.solve(T, A[:slow, :slow] @ T)
-    decay = -np.linalg.eigvalsh(0.5 * (M + M.T))[-1]
-    drag = np.linalg.norm(np.linalg.solve(T, A[:slow, slow:]), axis=0)
-    share = 0.2 * max(decay, 0.0) / (drag * len(drag))
-    return np.asarray(np.minimum(share, 0.5 * motion.gains[1]))
+@dataclass(frozen=True)
+class _Linear:
+    """The loop at the target: what sets how thin a terminal set may be."""
+
+    motion: LoopMotion
+    A: FloatArray
+    u_slope: FloatArray
+    W: FloatArray
+    unknown: FloatArray
+
+    @classmethod
+    def of(cls, motion: LoopMotion) -> _Linear:
+        zero = Interval(np.zeros((motion.size, 1)))
+        rates, h = motion.over(zero), 1e-6
+        steps = h * np.eye(motion.size)
+        slope = (motion(steps)[1] - motion(-steps)[1]).T / (2 * h)
+        push = rates.push_slope[:, : motion.size, 0]
+        size = np.maximum(np.abs(push.lo), np.abs(push.hi))
+        return cls(motion, _jacobian(motion), slope, 0.5 * (rates.W.lo + rates.W.hi)[..., 0], size)
+
+    def widths(self, T: FloatArray) -> FloatArray:
+        """σ for T: s spends a fifth of the decay of ‖x‖ at 0, or as much as it has to.
+
+        It has to where the plant is uncertain or the input held: the bounds of
+        :mod:`undertow.certify.loop_terminal`, linear at the target, and an eighth more.
+        """
+        motion, slow, A = self.motion, self.motion.slow, self.A
+        eta, layer = motion.gains
+        M = np.linalg.solve(T, A[:slow, :slow] @ T)
+        decay = -np.linalg.eigvalsh(0.5 * (M + M.T))[-1]
+        drag = np.linalg.norm(np.linalg.solve(T, A[:slow, slow:]), axis=0)
+        free = np.minimum(0.2 * max(decay, 0.0) / (drag * len(drag)), 0.5 * layer)
+        held, blind = motion.period > 0, len(motion.radii) > 0
+        share = 1.0 if not blind else HOLD_SHARE if held else 0.0
+        needed = np.zeros(len(eta))
+        if held:
+            reach = motion.period * np.abs(self.W)
+            creep = np.linalg.norm(self.u_slope[:, :slow] @ A[:slow, :slow] @ T, axis=1)
+            own = np.abs(self.u_slope[:, :slow] @ A[:slow, slow:])
+            own = own + 2 * np.abs(self.u_slope[:, slow:]) * (eta / layer)
+            left = share * eta / layer - np.diag(reach @ own)
+            needed = np.where(left > 0, reach @ creep / np.maximum(left, 1e-300), np.inf)
+        if blind:
+            gain = np.linalg.norm(self.unknown[:, :slow] @ np.abs(T), axis=1)
+            left = (1 - share) * eta / layer - np.diag(self.unknown[:, slow:])
+            more = np.where(left > 0, gain / np.maximum(left, 1e-300), np.inf)
+            needed = np.maximum(needed, more)
+        return np.asarray(np.maximum(free, 1.125 * needed))
 
 
 def search_terminal(
@@ -156,9 +216,9 @@ def search_terminal(
     InfeasibleError
         When no candidate could be proved.
     """
-    A = _jacobian(motion)
+    linear = _Linear.of(motion)
     slow = motion.slow
-    A_slow = A[:slow, :slow]
+    A_slow = linear.A[:slow, :slow]
     rate = -np.linalg.eigvals(A_slow).real.max()
     if not rate > 0:
         raise UnstableSurfaceError(
@@ -189,22 +249,32 @@ def search_terminal(
             T = np.linalg.inv(np.linalg.cholesky(0.5 * (P + P.T)).T)
         except np.linalg.LinAlgError:
             continue
+        widths = linear.widths(T)
+        if not np.isfinite(widths).all():
+            continue
+        candidate = _Trial(motion, T, widths)
         size = np.linalg.norm(points @ np.linalg.inv(T).T, axis=-1)
         reach = float(np.log(size).max(axis=1).mean())
-        level = _level(motion, T, rays)
-        if reach - math.log(level) < best:
-            level = min(level, _refined(motion, T, rays, rng))
-        T, score = T * level, reach - math.log(level)
+        level = min(candidate.level(rays), float(np.min(motion.gains[1] / widths)))
+        if level > 0 and reach - math.log(level) < best:
+            level = min(level, candidate.refined(rays, rng))
+        # Where nothing holds: how far from it.
+        score = (
+            reach - math.log(level)
+            if level > 0
+            else 1e3 + float(candidate.worst(1e-6 * rays)[0].max())
+        )
+        T = T * max(level, 1e-9)
         if trial >= trials // 4:
             width *= 1.25 if score < best else 0.94
         if score < best:
             best, chosen, root = score, T, attempt
     verdict = Verdict("a terminal set", "undecided")
-    for factor in (0.98, 0.95, 0.9, 0.8, 0.65, 0.5):
-        if chosen is None:
+    for factor in (0.98, 0.95, 0.9, 0.8, 0.65, 0.5, 0.4, 0.3):
+        if chosen is None or best >= 1e3:
             break
-        terminal = TerminalSet(chosen * factor, _widths(motion, chosen * factor, A))
-        verdict = verify_terminal(motion, terminal, max_seconds=120)
+        terminal = TerminalSet(chosen * factor, linear.widths(chosen * factor))
+        verdict = verify_terminal(motion, terminal, max_seconds=60)
         if progress is not None:
             progress(f"terminal set at {factor:g} of the sampled size: {verdict.kind}")
         if verdict:
@@ -227,6 +297,7 @@ def prove_loop(
     step: float = 0.001,
     duration: float = 3.0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
+    hold: int = 0,
     widest: float | None = None,
     splits: int = 1,
     trials: int = 150,
@@ -247,6 +318,8 @@ def prove_loop(
         Longest tube, s.
     uncertain
         Plant parameters known to lie in [low, high].
+    hold
+        The law is evaluated every ``hold`` steps and its input held; 0: at every instant.
     widest
         Widest box of starts, at the target; a 350th of the reach by default.
     splits
@@ -264,7 +337,8 @@ def prove_loop(
     """
     started = time.process_time()
     law = ReachingLaw() if reaching is None else reaching
-    motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}))
+    period = math.nextafter(hold * step, math.inf) if hold else 0.0
+    motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}), period)
     terminal, reach = _terminal(motion, coordinate, reach, step, duration, trials, seed, progress)
     pending = _boxes(motion, coordinate, reach, widest)
     done: list[tuple[float, float]] = []
@@ -301,7 +375,13 @@ def prove_loop(
             remedy="Take a smaller step, narrower boxes or a longer duration",
         )
     claim = LoopClaim(
-        coordinate, tuple(edges), terminal, step, horizon + step, dict(uncertain or {})
+        coordinate,
+        tuple(edges),
+        terminal,
+        step,
+        horizon + max(1, hold) * step,
+        dict(uncertain or {}),
+        hold,
     )
     verdict = verify_loop(mechanism, surface, law, claim, progress=progress)
     return ProvedLoop(claim, verdict, time.process_time() - started)
