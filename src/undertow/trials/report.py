@@ -20,7 +20,7 @@ from undertow.practice import ENERGY_PRICE, STATE_WEIGHT, TERMINAL
 from undertow.rollout import Trajectory
 from undertow.trials.balance import ROWS, BalanceResult
 from undertow.trials.estimation import EstimatorRow
-from undertow.trials.robustness import FACTORS, RobustnessResult
+from undertow.trials.robustness import FACTORS, SINGLE, RobustnessResult
 from undertow.trials.trial import balanced, motion, spread
 from undertow.trials.upright import EngineResult, SwingResult
 
@@ -284,7 +284,8 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             lines.append((f"{factor}, {unit}", *cells))
         parts.append(
             table(
-                f"Largest single change that all of {result.seeds} rigs survive",
+                f"Largest single change from which all of {result.seeds} rigs come home in "
+                f"{SINGLE:g} s",
                 ("", *names),
                 lines,
                 "in brackets the first seed that a little more breaks: "
