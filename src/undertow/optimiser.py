@@ -64,8 +64,12 @@ MODEL_SIZE = 9
 #: Fruitless looks around that end a re-optimisation.
 LOOKS = 2
 
-#: Generations without such a gain that end a search along a ridge, where gains come in jumps.
-PATIENCE = 10
+#: Time that packing an answer takes, s.
+ANSWERING = 1e-4
+
+#: Generations that end a search along a ridge, where gains come in jumps, unless together they
+#: gain this part of the time.
+PATIENCE, GAIN = 10, 3e-3
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
@@ -210,7 +214,7 @@ class Optimiser:
         if given is not None:
             return given
         if self.shoots:
-            return Budget(40_000 if warm else 160_000)
+            return Budget(40_000 if warm else 400_000)
         if warm:
             return Budget(576 if self.counts_time else 1024)
         # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
@@ -329,7 +333,7 @@ class _Task:
         """Whether another batch, taking as long as the last one, would overrun the time."""
         now = time.perf_counter()
         self._pace, self._last = now - self._last, now
-        return now - self.began + self._pace >= self.budget.seconds
+        return now - self.began + self._pace + ANSWERING >= self.budget.seconds
 
     @property
     def left(self) -> int:
@@ -518,6 +522,8 @@ class _Task:
             patience=2,
             stop=self.late,
         )
+        if first and incumbent is not None:  # no time for a single generation
+            self.cost(search.mean[None], incumbent)
 
     def _along_the_ridge(self, here: FloatArray) -> bool:
         """Search for an earlier arrival along the thin set of plans that arrive directly.
@@ -558,7 +564,7 @@ class _Task:
             self.cost,
             evaluations=min(most, self.left),
             tolerance=1e-4,
-            relative=WORTHWHILE,
+            relative=GAIN,
             patience=PATIENCE,
             stop=self.late,
         )
