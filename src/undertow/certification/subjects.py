@@ -235,7 +235,7 @@ def _region(
         if reaches(proved.function, point.tolist()):
             break
         point = 0.999 * point
-    data = {"function": function_data(proved.function), "start": point.tolist()}
+    data = {"functions": [function_data(V) for V in proved.chain], "start": point.tolist()}
     words = ", ".join(f"{n} = {v:.4g}" for n, v in zip(motion.names, point, strict=True) if v)
     verdict = Verdict(
         f"a region of attraction on the surface contains {words}",
