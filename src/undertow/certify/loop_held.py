@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.certify.batch import Interval
-from undertow.certify.loop import LoopMotion, put_boxes
-from undertow.certify.loop_pieces import zeros
+from undertow.certify.loop import LoopMotion
+from undertow.certify.loop_pieces import put_boxes, zeros
 from undertow.certify.tube import Paths, Tubes, stack
 
 __all__ = ["HeldLoop", "HeldRates"]
@@ -79,12 +79,12 @@ class HeldLoop:
         lanes, k = y.lo.shape[1], len(motion.radii)
         z, times = y[:size], Interval(self.times[:, None])
         speed = y[size:] / times
-        there, there_slope = motion.slow_rates(z, middle)
+        there, there_slope = motion.equations.slow_rates(z, middle)
         if brief or middle:
-            jerk = motion.jerk(z, speed, middle)
+            jerk = motion.equations.jerk(z, speed, middle)
             jerk_slope = zeros(m, size + m + k, lanes)
         else:
-            jerk, jerk_slope = motion.jerk_slope(z, speed)
+            jerk, jerk_slope = motion.equations.jerk_slope(z, speed)
         rate = stack(stack(there, speed), times * jerk)
         slope = zeros(size + m, size + m + k, lanes)
         own = np.r_[0:size, size + m : size + m + k]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from undertow.certify.batch import Interval
 
-__all__ = ["Reader", "clipped", "excess", "saturation", "stacked", "through_switch", "zeros"]
+__all__ = ["Reader", "excess", "put_boxes", "saturation", "stacked", "through_switch", "zeros"]
 
 FloatArray = NDArray[np.float64]
 
@@ -46,6 +46,20 @@ def stacked(parts: Sequence[Interval]) -> Interval:
     return Interval(np.array([v.lo for v in parts]), np.array([v.hi for v in parts]))
 
 
+def put_boxes(whole: tuple[Any, ...], lanes: NDArray[np.intp], part: tuple[Any, ...]) -> list[Any]:
+    """Return entries, intervals or masks whose last axis counts boxes, with some replaced."""
+
+    def one(old: Any, new: Any) -> Any:
+        copy = old.copy()
+        copy[..., lanes] = new
+        return copy
+
+    return [
+        Interval(one(a.lo, b.lo), one(a.hi, b.hi)) if isinstance(a, Interval) else one(a, b)
+        for a, b in zip(whole, part, strict=True)
+    ]
+
+
 def saturation(s: Interval, layer: float) -> tuple[Interval, Interval]:
     """Return sat(s/ε) and its slopes in s, over boxes."""
     ratio = s * (1 / Interval(layer))
@@ -66,15 +80,6 @@ def excess(u: Interval, limits: FloatArray) -> tuple[Interval, Interval]:
     high = Interval(np.clip(u.hi, -limit, limit)) - Interval(u.hi)
     value = Interval(np.where(free, 0.0, high.lo), np.where(free, 0.0, low.hi))
     return value, Interval(np.where(free, 0.0, -1.0), np.where(clipped, -1.0, 0.0))
-
-
-def clipped(u: Interval, limits: FloatArray) -> tuple[Interval, Interval]:
-    """Return clip(u) and its slopes in u, over boxes (m, L)."""
-    limit = limits[:, None]
-    value = Interval(np.clip(u.lo, -limit, limit), np.clip(u.hi, -limit, limit))
-    free = (u.lo >= -limit) & (u.hi <= limit)
-    beyond = (u.lo >= limit) | (u.hi <= -limit)
-    return value, Interval(np.where(free, 1.0, 0.0), np.where(beyond, 0.0, 1.0))
 
 
 def through_switch(slope: Interval, bend: Sequence[Interval], columns: int, slow: int) -> Interval:

@@ -29,6 +29,9 @@ __all__ = ["ProvedLoop", "follow", "prove_loop", "search_terminal"]
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None] | None
 
+#: Widths of terminal sets that are tried, as multiples of what they have to be at the target.
+MORE = (1.35, 1.12, 1.8)
+
 
 @dataclass(frozen=True)
 class ProvedLoop:
@@ -160,11 +163,11 @@ class _Linear:
         size = np.maximum(np.abs(push.lo), np.abs(push.hi))
         return cls(motion, _jacobian(motion), slope, 0.5 * (rates.W.lo + rates.W.hi)[..., 0], size)
 
-    def widths(self, T: FloatArray) -> FloatArray:
+    def widths(self, T: FloatArray, more: float = MORE[0]) -> FloatArray:
         """σ for T: s spends a fifth of the decay of ‖x‖ at 0, or as much as it has to.
 
         It has to where the plant is uncertain or the input held: the bounds of
-        :mod:`undertow.certify.loop_terminal`, linear at the target, and an eighth more.
+        :mod:`undertow.certify.loop_terminal`, linear at the target, times ``more``.
         """
         motion, slow, A = self.motion, self.motion.slow, self.A
         eta, layer = motion.gains
@@ -185,9 +188,16 @@ class _Linear:
         if blind:
             gain = np.linalg.norm(self.unknown[:, :slow] @ np.abs(T), axis=1)
             left = (1 - share) * eta / layer - np.diag(self.unknown[:, slow:])
-            more = np.where(left > 0, gain / np.maximum(left, 1e-300), np.inf)
-            needed = np.maximum(needed, more)
-        return np.asarray(np.maximum(free, 1.125 * needed))
+            blindly = np.where(left > 0, gain / np.maximum(left, 1e-300), np.inf)
+            needed = np.maximum(needed, blindly)
+        return np.asarray(np.maximum(free, more * needed))
+
+
+def _modes(A: FloatArray) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
+    """Return left eigenvectors as rows, and which modes share a weight: conjugate pairs."""
+    values, vectors = np.linalg.eig(A.astype(complex))
+    pairs = np.argmin(np.abs(values[:, None] - values[None].conj()), axis=1)
+    return np.linalg.inv(vectors), np.minimum(pairs, np.arange(len(A)))
 
 
 def search_terminal(
@@ -233,14 +243,19 @@ def search_terminal(
     base = scipy.linalg.solve_continuous_lyapunov(A_slow.T, -np.eye(slow))
     units = 1 / np.sqrt(np.diag(base))
     points = paths[..., :slow]
+    modes = _modes(A_slow)
     best, chosen, root, width = math.inf, None, np.eye(slow), 0.8
     for trial in range(trials):
         change = width * rng.normal(size=(slow, slow))
-        attempt = (
-            np.diag(np.exp(rng.normal(size=slow)))
-            if trial < trials // 4
-            else scipy.linalg.expm(0.5 * (change + change.T)) @ root
-        )
+        if trial >= trials // 4:
+            attempt = scipy.linalg.expm(0.5 * (change + change.T)) @ root
+        elif trial % 2:
+            attempt = np.diag(np.exp(rng.normal(size=slow)))
+        else:  # an ellipsoid of the modes: as long as it likes along a slow one
+            weights = np.exp(2 * rng.normal(size=slow))[modes[1]]
+            P = np.real(modes[0].conj().T @ np.diag(weights) @ modes[0])
+            Q = -(A_slow.T @ P + P @ A_slow) * np.outer(units, units)
+            attempt = np.linalg.cholesky(Q + 1e-9 * np.trace(Q) * np.eye(slow)).T
         # A floor under Q: where ‖x‖ hardly falls at 0, nothing can be proved.
         square = attempt.T @ attempt
         Q = (square + 0.003 * np.trace(square) * np.eye(slow)) / np.outer(units, units)
@@ -273,12 +288,15 @@ def search_terminal(
     for factor in (0.98, 0.95, 0.9, 0.8, 0.65, 0.5, 0.4, 0.3):
         if chosen is None or best >= 1e3:
             break
-        terminal = TerminalSet(chosen * factor, linear.widths(chosen * factor))
-        verdict = verify_terminal(motion, terminal, max_seconds=60)
-        if progress is not None:
-            progress(f"terminal set at {factor:g} of the sampled size: {verdict.kind}")
-        if verdict:
-            return terminal
+        tried = [linear.widths(chosen * factor, more) for more in MORE]
+        different = [w for k, w in enumerate(tried) if not any((w == v).all() for v in tried[:k])]
+        for sigma in different:
+            terminal = TerminalSet(chosen * factor, sigma)
+            verdict = verify_terminal(motion, terminal, max_seconds=60)
+            if progress is not None:
+                progress(f"terminal set at {factor:g} of the sampled size: {verdict.kind}")
+            if verdict:
+                return terminal
     raise InfeasibleError(
         f"terminal set of {motion.surface}",
         value=str(verdict),
@@ -419,7 +437,39 @@ def _terminal(
     seed: int,
     progress: Progress,
 ) -> tuple[TerminalSet, float]:
-    """Find a terminal set for the motions from up to ``reach``, and where they fail to enter."""
+    """Find a terminal set for the motions from up to ``reach``, and where they fail to enter.
+
+    A set that is made for motions from afar is not the best for those that can enter in time:
+    where many fail it is made again for a shorter reach.
+    """
+    best: tuple[TerminalSet, float] | None = None
+    for _ in range(3):
+        try:
+            found = _terminal_for(motion, coordinate, reach, step, duration, trials, seed, progress)
+        except InfeasibleError:
+            if best is None:
+                raise
+            break
+        if best is not None and found[1] <= best[1]:
+            break
+        best = found
+        if found[1] > 0.85 * reach:
+            break
+        reach = 1.2 * found[1]
+    assert best is not None
+    return best
+
+
+def _terminal_for(
+    motion: LoopMotion,
+    coordinate: str,
+    reach: float,
+    step: float,
+    duration: float,
+    trials: int,
+    seed: int,
+    progress: Progress,
+) -> tuple[TerminalSet, float]:
     names = [c.name for c in motion.mechanism.coordinates]
     x = np.zeros((64, motion.size))
     x[:, names.index(coordinate)] = np.linspace(reach / 64, reach, 64)
@@ -447,7 +497,10 @@ def _terminal(
     )
     enters = np.any(terminal.value(path) <= 1, axis=0)
     far = len(enters) if enters.all() else int(np.argmin(enters))
-    return terminal, float(x[min(far, 63), names.index(coordinate)])
+    end = float(x[min(far, 63), names.index(coordinate)])
+    if progress is not None:
+        progress(f"simulated motions from up to {end:.4g} enter within {duration:g} s")
+    return terminal, end
 
 
 def _ends(

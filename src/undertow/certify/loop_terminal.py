@@ -306,34 +306,56 @@ class _Enclosures:
         """Pull that is left to what the law does not know, per r, (m,)."""
         return Interval(1.0 - self.share) * self.stiff if self.held else self.stiff
 
+    def _falls(self, slope: Interval) -> bool:
+        """Whether ‖x‖ falls for slopes of ẋ at one box, (slow, slow + m + k, 1), |s_j| ≤ σ_j ‖x‖.
+
+        d/dt ½‖x‖² = xᵀMx + Σ_j x·c_j s_j/σ_j, and |x·c| ‖x‖ ≤ ½ (τ (x·c)² + ‖x‖²/τ) for any τ.
+        """
+        slow, m = self.slow, self.m
+        if not (np.isfinite(slope.lo).all() and np.isfinite(slope.hi).all()):
+            return False
+        M = slope[:, :slow, 0]
+        columns = [slope[:, j, 0] for j in range(slow, slow + m)]
+        for stretch in (1.0, 4.0, 16.0):
+            total, slack = M, Interval(0.0)
+            for c in columns:
+                size = max(float(_norm(c).hi), 1e-300)
+                tau = Interval(stretch) / Interval(size)
+                total = total + Interval(0.5) * tau * (c[:, None] * c[None])
+                slack = slack + Interval(0.5) / tau
+            if _negative_by(total, float(slack.hi)):
+                return True
+        return False
+
     def core(self, half: float) -> bool:
         """Whether all conditions but 2 hold in the cube |x_i| ≤ half, by homogeneity."""
         ones = np.full((self.slow, 1), half)
         _, slope, _, u_slope, push = self.slopes(Interval(-ones, ones))
         slow, m = self.slow, self.m
-        # d/dt ½‖x‖² ≤ xᵀMx + ‖x‖ Σ_j ‖column_j‖ |s_j|/σ_j, |s_j|/σ_j ≤ ‖x‖.
-        drag = Interval(0.0)
-        for j in range(slow, slow + m):
-            drag = drag + _total(slope[:, j] ** 2).sqrt()
-        slack = float(drag.hi.max())
-        if not math.isfinite(slack) or not _negative_by(slope[:, :slow, 0], slack):
+        if not self._falls(slope):
             return False
         if self.held:
             creep = matmul(u_slope[:, :slow], slope[:, :slow])
-            lag = np.array([_total(creep[j] ** 2).sqrt().hi for j in range(m)])
+            lag = np.array([_norm(creep[j]).hi for j in range(m)])
             lag = np.einsum("ij,jl->il", self.reach, lag) * (1 + 1e-12)
             if not bool((self._left(slope, u_slope).lo > lag).all()):
                 return False
         if not self.unknown:
             return True
         for i in range(m):
-            gain = _total(push[i, :slow] ** 2).sqrt()
+            gain = _norm(push[i, :slow])
             rest = self._pull()[i] - gain
             for j in range(slow, slow + m):
                 rest = rest - abs(push[i, j])
             if not bool((rest.lo > 0).all()):
                 return False
         return True
+
+
+def _norm(v: Interval) -> Interval:
+    """Euclidean norm over the first axis; a sum of squares is not below 0, whatever rounding."""
+    square = _total(v**2)
+    return Interval(np.maximum(square.lo, 0.0), square.hi).sqrt()
 
 
 def _total(v: Interval) -> Interval:

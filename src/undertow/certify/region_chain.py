@@ -40,6 +40,8 @@ Progress = Callable[[str], None]
 
 #: V where the ring begins; how far that edge may come in; cap of t over the slowest rate.
 INNER, INWARD, DECAY = 0.9, 0.93, 0.1
+#: Weight of a small V at the target point against t over the slowest rate.
+TOWARDS = 0.1
 #: Bounds of V on the shell, and of its coefficients in scaled coordinates.
 SHELL, LARGEST = 1.8, 60.0
 #: Rounds of counterexamples, samples of each linear program before them.
@@ -165,32 +167,31 @@ class _Ring:
         inside = rays * (low * INWARD * rng.random(len(rays)) ** 0.2)[:, None]
         length = float(np.linalg.norm(basis.chart.coordinates(reach * way)))
         on_way = _on_axis(basis.chart, way, (1 + step) * length)
-        coefficients = np.eye(columns - 1, columns)
+        size = np.ones((columns - 1, 1))
+        bounds = np.vstack([np.hstack([k * np.eye(columns - 1), -size]) for k in (1, -1)])
         fixed = np.vstack(
             [
                 self._padded(shell[some]),
                 self._padded(on_way),
                 self._padded(np.vstack([inside, rays * (low * INWARD)[:, None]])),
-                coefficients,
-                -coefficients,
-                np.eye(1, columns, columns - 1),
+                bounds,
             ]
         )
         limits = np.repeat(
-            [SHELL, 1.0, INNER, LARGEST, DECAY * rate],
-            [len(shell[some]), len(on_way), 2 * len(rays), 2 * (columns - 1), 1],
+            [SHELL, 1.0, INNER, 0.0],
+            [len(shell[some]), len(on_way), 2 * len(rays), 2 * (columns - 1)],
         )
         goal = np.zeros(columns)
-        goal[-1] = -1.0
+        goal[-1] = 1.0
         for _ in range(ROUNDS):
             budget.spend()
             right = np.concatenate(
-                [np.zeros(len(decrease)), np.full(len(outside), -1 - 0.25 * growth), limits]
+                [np.full(len(decrease), -DECAY * rate), np.full(len(outside), -1 - 0.25 * growth), limits]
             )
             x = minimise_linear(goal, np.vstack([decrease, outside, fixed]), right)
-            if x is None or x[-1] < 1e-3 * rate:
+            if x is None or x[-1] > LARGEST:
                 return None
-            bad, low_points = self._counterexamples(x[:-1], growth, x[-1], guard)
+            bad, low_points = self._counterexamples(x[:-1], growth, DECAY * rate, guard)
             if not len(bad) and not len(low_points):
                 return np.asarray(x[:-1])
             decrease = np.vstack([decrease, self._decrease(bad)])
@@ -220,15 +221,15 @@ class _Ring:
         return np.vstack([self._between(rays, high, edge), rays * edge[:, None]])
 
     def _padded(self, z: FloatArray) -> FloatArray:
-        """Rows of V, with a column for t."""
+        """Rows of V, with a column for the size of the coefficients."""
         return np.hstack([self.basis.values(z), np.zeros((len(z), 1))])
 
     def _decrease(self, z: FloatArray) -> FloatArray:
-        """Rows of V̇ + t (|z|² + |z||ż|/ω), over that weight."""
+        """Rows of V̇ over |z|² + |z||ż|/ω."""
         z_dot = self.basis.flow(z)
         length = np.linalg.norm(z, axis=1)
         weight = length * (length + np.linalg.norm(z_dot, axis=1) / self.omega)
-        return np.hstack([self.basis.rates(z, z_dot) / weight[:, None], np.ones((len(z), 1))])
+        return np.hstack([self.basis.rates(z, z_dot) / weight[:, None], np.zeros((len(z), 1))])
 
     def _counterexamples(
         self, row: FloatArray, growth: float, t: float, guard: FloatArray
