@@ -14,6 +14,7 @@ from undertow.certify.appendix import CASES
 from undertow.certify.batch import Interval
 from undertow.certify.loop import LoopMotion
 from undertow.certify.loop_claim import LoopClaim, run_tubes, start_tubes, verify_loop
+from undertow.certify.loop_held import HeldLoop
 from undertow.certify.loop_search import follow, prove_loop
 from undertow.certify.loop_terminal import TerminalSet, verify_terminal
 from undertow.certify.sampled import (
@@ -197,6 +198,145 @@ def test_lost_tubes_are_told_apart() -> None:
     end = run_tubes(MOTION, tubes, TERMINAL, 0.002, 0.8, stop_early=False)
     assert np.isfinite(end.entered[0])
     assert np.isnan(end.entered[1])
+
+
+# -- a held input, a plant in a box ----------------------------------------------------------
+
+#: The law at 1 kHz; a terminal set for it, thicker in s: there the lag must be made good.
+HELD = LoopMotion(RIG, SURFACE, LAW, period=0.001)
+THICK = TerminalSet(0.4 * TERMINAL.scale, [0.0034])
+
+
+def held_motion(x: FloatArray, period: float, count: int) -> FloatArray:
+    """Positions and velocities at the samples of a law that is held, (count + 1, L, 4)."""
+    law, path = SlidingModeLaw(RIG, SURFACE, LAW), [x]
+    parts = max(4, round(period / 0.00025))
+    h = period / parts
+    for _ in range(count):
+        u = law(0.0, x).u
+
+        def f(x: FloatArray, u: FloatArray = u) -> FloatArray:
+            return np.hstack([x[:, 2:], RIG.accelerations(0.0, x, u)])
+
+        for _ in range(parts):
+            a = f(x)
+            b = f(x + h / 2 * a)
+            c = f(x + h / 2 * b)
+            x = x + h / 6 * (a + 2 * b + 2 * c + f(x + h * c))
+        path.append(x)
+    return np.array(path)
+
+
+def test_held_tubes_hold_the_motions_of_the_sampled_loop() -> None:
+    """Far off, and through the edge of the layer; no room for a continuous law's motions."""
+    edges = np.radians([0.8, 0.81, 25.0, 25.05])
+    held = HeldLoop(HELD)
+    tubes = held.begin(start_tubes(HELD, "phi", edges).take(np.array([True, False, True])))
+    x = np.zeros((20, 4))
+    x[:, 1] = np.repeat(edges[::2], 10) + np.tile(np.linspace(0, 1, 10), 2) * np.repeat(
+        np.diff(edges)[::2], 10
+    )
+    path = HELD.from_state(held_motion(x, 0.001, 60))
+    lane = np.repeat([0, 1], 10)
+    for k in range(60):
+        tubes, demand = held.sample(tubes)
+        u = HELD(path[k])[1].T
+        assert (demand.lo[:, lane] <= u + 1e-9).all()
+        assert (u <= demand.hi[:, lane] + 1e-9).all()
+        tubes, _, _, moved = tubes.advance(0.001)
+        assert moved.all()
+        hull = tubes.hull[:4]
+        assert (hull.lo[:, lane] <= path[k + 1].T + 1e-9).all()
+        assert (path[k + 1].T <= hull.hi[:, lane] + 1e-9).all()
+    assert (hull.hi - hull.lo).max() < 0.02
+    continuous, _ = follow(HELD, HELD.from_state(x), 0.01, 1e-4, 100)
+    assert np.abs(continuous[-1] - path[10]).max() > 1e-4
+
+
+def test_a_terminal_set_of_the_sampled_loop() -> None:
+    """Proved at 1 kHz, where W falls from sample to sample; thin or slow sets are not."""
+    verdict = verify_terminal(HELD, THICK, max_seconds=60)
+    assert verdict, verdict
+    rng = np.random.default_rng(8)
+    rays = rng.normal(size=(200, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    s = rng.uniform(-1, 1, (200, 1)) * THICK.widths
+    z = np.hstack([0.9999 * rays @ THICK.scale.T, s])
+    x = np.hstack([z[:, :2], np.zeros((200, 2))])
+    for row, goal in zip(x, z, strict=True):  # (q, p, s) are linear in q̇ at given q
+        base = HELD.from_state(row)
+        unit = np.array([HELD.from_state(row + e) - base for e in np.eye(4)[2:]])
+        row[2:] = np.linalg.solve(unit[:, 2:].T, (goal - base)[2:])
+    W = THICK.value(HELD.from_state(held_motion(x, 0.001, 300)))
+    assert W[0].max() <= 1
+    assert (np.diff(W, axis=0) < 1e-12).all()
+    thin = TerminalSet(THICK.scale, 0.3 * THICK.widths)
+    assert not verify_terminal(HELD, thin, max_seconds=30)
+
+
+def test_a_hold_that_is_too_long_is_not_proved(claim: LoopClaim) -> None:
+    """At 20 ms the law is past its stable period 2 ε/η = 10 ms: simulation rings, no proof."""
+    loop = ut.ClosedLoop(RIG, ut.MinimumEnergy(), LAW, hold=1)
+    assert loop.batch(RIG.state(phi=0.01), SURFACE).reached
+    rings = held_motion(RIG.state(phi=0.01)[None], 0.02, 100)
+    assert np.abs(HELD.from_state(rings[-20:])[..., 3]).max() > 2 * LAW.vector(1)[1]
+    slow = LoopMotion(RIG, SURFACE, LAW, period=0.02)
+    for factor in (1.0, 0.03):
+        assert not verify_terminal(slow, THICK.times(factor), max_seconds=30)
+    held = replace(claim, terminal=THICK, step=0.002, hold=10)
+    assert not verify_loop(RIG, SURFACE, LAW, held)
+    with pytest.raises(InvalidInputError, match="hold"):
+        replace(claim, hold=-1)
+    with pytest.raises(InvalidInputError, match="period"):
+        LoopMotion(RIG, SURFACE, LAW, period=-0.001)
+
+
+def test_a_held_claim_is_verified_from_its_numbers_alone(claim: LoopClaim) -> None:
+    """0.45° at 1 kHz; the same in a plant whose mass is off by up to 5 %, held or not."""
+    near = replace(claim, edges=claim.edges[:7], terminal=THICK, hold=1)
+    again = LoopClaim.from_dict(json.loads(json.dumps(near.to_dict())))
+    verdict = verify_loop(RIG, SURFACE, LAW, again)
+    assert verdict, verdict
+    assert "held for 0.001 s" in verdict.claim
+
+
+BOX = {"m": (0.95 * 0.125, 1.05 * 0.125)}
+#: Thicker still: there what the law does not know must be made good.
+BLUNT = TerminalSet(
+    [[0.8444, 0.506, 1.0743], [0.0, 0.1602, -0.1017], [0.0, 0.0, 3.1547]], [0.00735]
+)
+
+
+def test_a_plant_in_a_box_is_proved_and_a_larger_box_is_not(claim: LoopClaim) -> None:
+    """The mass within 5 %: a terminal set, and tubes that end in it.  Within 40 %: none."""
+    near = replace(claim, edges=claim.edges[:7], terminal=BLUNT, uncertain=BOX)
+    verdict = verify_loop(RIG, SURFACE, LAW, near)
+    assert verdict, verdict
+    assert "m in [0.11875, 0.13125]" in verdict.claim
+    wide = LoopMotion(RIG, SURFACE, LAW, {"m": (0.6 * 0.125, 1.4 * 0.125)})
+    assert not verify_terminal(wide, BLUNT, max_seconds=30)
+    with pytest.raises(InvalidInputError, match="uncertain"):
+        LoopMotion(RIG, SURFACE, LAW, {"m": (0.2, 0.3)})
+
+
+def test_the_gap_is_enclosed_sharply() -> None:
+    """What the law does not know, against 5 % of mass: within a factor 2 of its size at 0."""
+    motion = LoopMotion(RIG, SURFACE, LAW, BOX)
+    slope = motion.over(Interval(np.zeros((4, 1)))).push_slope[0, :4, 0]
+    found = np.maximum(np.abs(slope.lo), np.abs(slope.hi))
+    for m in (BOX["m"][0], BOX["m"][1]):
+        plant = LoopMotion(RIG.with_parameters(m=m), SURFACE, LAW)
+        x = 1e-6 * np.eye(4)
+        u = SlidingModeLaw(RIG, SURFACE, LAW)(0.0, x).u
+        v = RIG.with_parameters(m=m).accelerations(0.0, x, u)
+        s_dot = np.hstack([x[:, 2:], v]) @ np.concatenate(
+            [SURFACE.position_row[0], SURFACE.velocity_row[0]]
+        )
+        z = plant.from_state(x)
+        push = s_dot + 200.0 * z[:, 3]
+        true = np.abs(np.linalg.solve(z, push))
+        assert (true <= found * (1 + 1e-6) + 1e-6).all()
+        assert (found <= 2 * true + 0.2).all()
 
 
 # -- sampled ---------------------------------------------------------------------------------
