@@ -247,7 +247,7 @@ def test_held_tubes_hold_the_motions_of_the_sampled_loop() -> None:
         assert moved.all()
         hull = tubes.hull[:4]
         assert (hull.lo[:, lane] <= path[k + 1].T + 1e-9).all()
-        assert (path[k + 1].T <= hull.hi[:, lane] + 1e-9).all()
+        assert (hull.hi[:, lane] + 1e-9 >= path[k + 1].T).all()
     assert (hull.hi - hull.lo).max() < 0.02
     continuous, _ = follow(HELD, HELD.from_state(x), 0.01, 1e-4, 100)
     assert np.abs(continuous[-1] - path[10]).max() > 1e-4

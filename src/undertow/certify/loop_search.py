@@ -285,7 +285,7 @@ def search_terminal(
         if score < best:
             best, chosen, root = score, T, attempt
     verdict = Verdict("a terminal set", "undecided")
-    for factor in (0.98, 0.95, 0.9, 0.8, 0.65, 0.5, 0.4, 0.3):
+    for factor in (0.98, 0.95, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1):
         if chosen is None or best >= 1e3:
             break
         tried = [linear.widths(chosen * factor, more) for more in MORE]
