@@ -6,10 +6,11 @@ An even polynomial V is linear in its coefficients, and so are its demands at sa
 The next function of a chain has to fall, V̇ ≤ −t (|z|² + |z||ż|/ω), in a ring alone: from a
 little inside the last set to a shell a little outside it.  On the shell and from there to a
 guard it has to be ≥ 1; inside the ring ≤ the level of the ring's inner edge, so that sets do not
-shrink; at the target point ≤ 1.  The linear program maximises t, up to a cap: a function that
-falls as fast as can be is steep and leaves no room for the next one.  Points where fresh samples
-disagree are added.  Before each step the coordinates are scaled so that the last set is about
-the unit ball, which keeps the programs well conditioned however far the sets have come.
+shrink much; at the target point ≤ 1.  Of all such V the linear program takes the one with the
+smallest largest coefficient: one that falls as fast as can be is steep or wavy, and leaves no
+room for the next.  Points where fresh samples disagree are added.  Before each step the
+coordinates are scaled so that the last set is about the unit ball, which keeps the programs
+well conditioned however far the sets have come.
 """
 
 from __future__ import annotations
@@ -38,12 +39,10 @@ __all__ = ["Budget", "grow"]
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None]
 
-#: V where the ring begins; how far that edge may come in; cap of t over the slowest rate.
-INNER, INWARD, DECAY = 0.9, 0.93, 0.1
-#: Weight of a small V at the target point against t over the slowest rate.
-TOWARDS = 0.1
+#: V where the ring begins; how far that edge may come in; t over the slowest rate.
+INNER, INWARD, DECAY = 0.9, 0.9, 0.03
 #: Bounds of V on the shell, and of its coefficients in scaled coordinates.
-SHELL, LARGEST = 1.8, 60.0
+SHELL, LARGEST = 1.8, 1000.0
 #: Rounds of counterexamples, samples of each linear program before them.
 ROUNDS, SAMPLES = 10, 3000
 #: The search ends where no set that is larger by this part is found.
@@ -186,7 +185,11 @@ class _Ring:
         for _ in range(ROUNDS):
             budget.spend()
             right = np.concatenate(
-                [np.full(len(decrease), -DECAY * rate), np.full(len(outside), -1 - 0.25 * growth), limits]
+                [
+                    np.full(len(decrease), -DECAY * rate),
+                    np.full(len(outside), -1 - 0.25 * growth),
+                    limits,
+                ]
             )
             x = minimise_linear(goal, np.vstack([decrease, outside, fixed]), right)
             if x is None or x[-1] > LARGEST:

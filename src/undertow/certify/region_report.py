@@ -168,7 +168,7 @@ def report(
     target: float,
     uncertain: str,
     *,
-    programs: int = 400,
+    programs: int = 300,
     boxes: bool = False,
     chain: tuple[LyapunovFunction, ...] = (),
     progress: Progress | None = None,
@@ -185,7 +185,7 @@ def report(
         )
         seconds = math.nan
     else:
-        region = prove_region(motion, way, programs=programs, goal=1.08 * target, progress=progress)
+        region = prove_region(motion, way, programs=programs, goal=1.03 * target, progress=progress)
         chain, verdict, raised = region.chain, region.verdict, region.raised
         seconds = time.process_time() - started
     reach = extent(chain[-1], way) * (1 - 1e-9) if verdict else 0.0
@@ -216,7 +216,7 @@ def main() -> None:
     )
     parser.add_argument("--only", nargs="*", default=[], help="rows: 1 … 5, or mechanisms")
     parser.add_argument("--boxes", action="store_true", help="with a parameter ±5 %% as well")
-    parser.add_argument("--programs", type=int, default=400, help="linear programs of each search")
+    parser.add_argument("--programs", type=int, default=300, help="linear programs of each search")
     parser.add_argument("--claims", type=Path, help="prove the functions of this file, no search")
     parser.add_argument("--out", type=Path, help="write the functions to this JSON file")
     arguments = parser.parse_args()

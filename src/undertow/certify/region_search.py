@@ -33,7 +33,7 @@ Chain = tuple[LyapunovFunction, ...]
 TIGHT, STRIDE = 1.02, 1.05
 
 #: Functions of a found chain that one proof tries to leap over, at first.
-LEAP = 8
+LEAP = 16
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def search_region(
     direction: ArrayLike,
     *,
     degrees: Sequence[int] = (4, 6),
-    programs: int = 400,
+    programs: int = 300,
     seconds: float = math.inf,
     seed: int = 0,
     start: Start = "round",
@@ -130,21 +130,20 @@ def prove_region(
     direction: ArrayLike,
     *,
     degrees: Sequence[int] = (4, 6),
-    programs: int = 400,
+    programs: int = 300,
     seconds: float = math.inf,
     seed: int = 0,
-    start: Start = "round",
     slow: bool = True,
     goal: float = math.inf,
     parameters: Mapping[str, tuple[float, float]] | None = None,
-    max_boxes: int = 5_000_000,
+    max_boxes: int = 2_000_000,
     progress: Progress | None = None,
 ) -> ProvedRegion:
     """Search for a region of attraction, prove it, and raise its level as far as that goes.
 
     Parameters
     ----------
-    motion, direction, degrees, programs, seconds, seed, start, slow, goal, progress
+    motion, direction, degrees, programs, seconds, seed, slow, goal, progress
         As for :func:`search_region`.
     parameters
         Intervals of uncertain parameters, as for :func:`undertow.certify.verify_region`.
@@ -172,11 +171,12 @@ def prove_region(
         programs=programs,
         seconds=seconds,
         seed=seed,
-        start=start,
         slow=slow,
         goal=goal,
         progress=progress,
     )
+    # Sets that start round grow furthest, but near 0 the far one is proved with far less work.
+    far = search_region(motion, direction, degrees=(), seed=seed, start="far", slow=slow)[0]
 
     def decide(chain: Sequence[LyapunovFunction]) -> Verdict:
         """The last function, those before it being proved."""
@@ -196,7 +196,7 @@ def prove_region(
             )
         return verdict
 
-    chain = _proved_chain(found, decide)
+    chain = _proved_chain(far, found, decide)
     level, raised = _tight_level(chain, decide)
     chain[-1] = level
     verdict = verify_region(
@@ -208,10 +208,9 @@ def prove_region(
 Decide = Callable[[Sequence[LyapunovFunction]], Verdict]
 
 
-def _proved_chain(found: Chain, decide: Decide) -> list[LyapunovFunction]:
-    """As few functions of a chain as prove one another, to the outermost that is proved."""
-    for factor in (1.0, 1.05, 1.15, 1.3, 1.6, 2.0, 3.0):
-        first = found[0].times(factor)
+def _proved_chain(far: LyapunovFunction, found: Chain, decide: Decide) -> list[LyapunovFunction]:
+    """As few functions as prove one another, from a quadratic to the outermost that is proved."""
+    for first in (V.times(factor) for factor in (1.0, 1.1, 1.3, 2.0) for V in (far, found[0])):
         verdict = decide([first])
         if verdict:
             break
@@ -220,16 +219,16 @@ def _proved_chain(found: Chain, decide: Decide) -> list[LyapunovFunction]:
             "region of attraction",
             value=str(verdict),
             limit="a proved sublevel set",
-            remedy="Give the search more programs or another start",
+            remedy="Give the search another seed",
         )
-    proved, at, leap = [first], 0, LEAP
+    proved, at, leap = [first], -1, LEAP
     while at < len(found) - 1:
         target = min(at + leap, len(found) - 1)
         if decide([*proved, found[target]]):
             proved.append(found[target])
             at, leap = target, min(2 * leap, LEAP)
-        elif leap > 1:
-            leap = max(1, min(leap, target - at) // 2)
+        elif target > at + 1:
+            leap = (target - at) // 2
         else:
             break
     return proved
