@@ -188,7 +188,7 @@ def _makers(belief: Mechanism, x0: FloatArray, budget: int) -> dict[str, MakeCon
 def robustness(
     *,
     rigs: int = 200,
-    seeds: int = 10,
+    seeds: int = 5,
     angle: float = math.radians(35),
     seconds: float = 10.0,
     budget: int = 256,
