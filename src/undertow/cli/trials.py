@@ -96,7 +96,7 @@ def trials(
             shown = report.robustness_report(
                 stress.robustness(
                     rigs=min(rigs, 10) if quick else rigs,
-                    seeds=5 if single and not quick else 0,
+                    seeds=3 if single and not quick else 0,
                     ledger=None if out is None else out / "robustness.jsonl",
                     progress=progress,
                 )

@@ -57,7 +57,11 @@ class Ledger:
             return
         head = {"settings": dict(settings), "versions": versions()}
         try:
-            lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+            text = path.read_text(encoding="utf-8") if path.exists() else ""
+            lines = text.splitlines()
+            if text and not text.endswith("\n"):  # a run was killed while it wrote
+                with path.open("a", encoding="utf-8") as file:
+                    file.write("\n")
             if not lines:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(json.dumps(head) + "\n", encoding="utf-8")

@@ -289,7 +289,7 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
                 ("", *names),
                 lines,
                 "in brackets the first seed that a little more breaks: "
-                "1/64 of the largest change looked for",
+                "1/32 of the largest change looked for",
             )
         )
     return Group(*parts)

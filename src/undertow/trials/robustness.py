@@ -140,7 +140,7 @@ class RobustnessResult:
 
 
 def breaking_point(
-    run: Callable[[float, int], bool], largest: float, *, seeds: int, bisections: int = 6
+    run: Callable[[float, int], bool], largest: float, *, seeds: int, bisections: int = 5
 ) -> Breaking:
     """Find the largest change survived on all seeds, by bisection from nothing.
 
@@ -188,7 +188,7 @@ def _makers(belief: Mechanism, x0: FloatArray, budget: int) -> dict[str, MakeCon
 def robustness(
     *,
     rigs: int = 200,
-    seeds: int = 5,
+    seeds: int = 3,
     angle: float = math.radians(35),
     seconds: float = 10.0,
     budget: int = 256,
