@@ -128,12 +128,14 @@ class TubeEnd(NamedTuple):
     """What became of L tubes.
 
     ``entered`` (L,) is the time at which each was inside the terminal set, NaN if it was not;
-    ``peak`` (L, m) bounds the demand on the way; ``steps`` counts steps of the longest.
+    ``peak`` (L, m) bounds the demand on the way; ``steps`` counts steps of the longest; ``lost``
+    (L,) marks those that burst.
     """
 
     entered: FloatArray
     peak: FloatArray
     steps: int
+    lost: NDArray[np.bool_]
 
 
 def start_tubes(motion: LoopMotion, coordinate: str, edges: Sequence[float] | FloatArray) -> Tubes:
@@ -193,6 +195,7 @@ def run_tubes(
     started = time.process_time()
     lanes, m = tubes.middle.shape[1], motion.mechanism.m
     entered, peak = np.full(lanes, np.nan), np.zeros((lanes, m))
+    lost = np.zeros(lanes, dtype=bool)
     active = np.arange(lanes)
     inverse = exact_inverse(terminal.scale)
     square = (motion.size, motion.size)
@@ -227,6 +230,7 @@ def run_tubes(
         inside = moved & _inside(tubes.image(rows), motion.slow, terminal.widths)
         inside &= k % parts == 0
         entered[active[inside]] = k * step
+        lost[active[~moved]] = True
         keep = moved & ~inside
         if not moved.all() and stop_early:
             break
@@ -234,7 +238,7 @@ def run_tubes(
             tubes, active = tubes.take(keep), active[keep]
         if progress is not None and k % 100 == 0:
             progress(f"{k * step:.3f} s: {len(active)} of {lanes} tubes on their way")
-    return TubeEnd(entered, peak, k)
+    return TubeEnd(entered, peak, k, lost)
 
 
 def _inside(image: Interval, slow: int, widths: FloatArray) -> NDArray[np.bool_]:
@@ -321,7 +325,9 @@ def verify_loop(
     }
     missing = np.flatnonzero(np.isnan(result.entered))
     if len(missing):
-        first = 0.5 * (claim.edges[missing[0]] + claim.edges[missing[0] + 1])
+        # Once one is lost the others are left where they are.
+        where_to = int(np.argmax(result.lost)) if result.lost.any() else int(missing[0])
+        first = 0.5 * (claim.edges[where_to] + claim.edges[where_to + 1])
         why = method + ", a tube did not end in the terminal set"
         witness = {claim.coordinate: first}
         return Verdict(text, "undecided", unit=unit, witness=witness, method=why, details=details)
