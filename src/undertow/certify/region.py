@@ -207,7 +207,9 @@ def verify_region(
     for k in range(proved, len(chain)):
         frame = _frame(motion, chain[max(k - 1, 0) : k + 1])
         if frame is None:
-            return Verdict(claim, "undecided", method="no box was found that holds {V ≤ 1}")
+            far = dict(zip(motion.names, _far_point(chain[k]).tolist(), strict=True))
+            why = "no box was found that holds {V ≤ 1}"
+            return Verdict(claim, "undecided", witness=far, method=why)
         proof = _Proof(motion, chain[k], chain[k - 1] if k else None, frame, box_parameters)
         left = max_seconds - (time.monotonic() - started)
         kind, why, witness, count = proof.decide(max_boxes - boxes, left, chunk)
@@ -437,6 +439,17 @@ def _frame(
     if limit > reach[0]:
         room[0] = min(room[0], 0.3 * (limit - reach[0]))
     return np.asarray(B), np.asarray(reach + room)
+
+
+def _far_point(V: LyapunovFunction) -> FloatArray:
+    """A point of {V ≤ 1} on a ray along which V does not reach 1, else the farthest edge."""
+    rays = np.random.default_rng(0).normal(size=(20000, len(V.scale)))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    radius = first_crossing(V, rays)
+    bounded = np.isfinite(radius)
+    limit = 3.0 * float(np.median(radius[bounded])) if bounded.any() else 1.0
+    k = int(np.argmax(radius))
+    return np.asarray(V.points(rays[k] * min(float(radius[k]), limit)))
 
 
 def _clear(motion: Motion, V: LyapunovFunction, way: FloatArray) -> float:
