@@ -66,15 +66,17 @@ def main() -> int:
     """Print the table; 1 where more is spent than is wanted."""
     options = command_line(__doc__).parse_args()
     now = clock(options.clock)
-    budget, rounds = (ut.Budget(32), 1) if options.quick else (ut.Budget(256), 5)
+    sizes, rounds = ((32, 64, 128, 256), 1) if options.quick else ((256,), 5)
     ended = certified_gate(tail=TAIL)
-    met = True
+    met, judged = True, True
     for objective in (ut.MinimumEnergy(), ut.MinimumTime()):
-        asked = questions(objective, budget)
+        # The smallest search that proposes anything: a quick run must judge something too.
+        asked: list[Any] = []
+        for size in sizes:
+            asked = asked or questions(objective, ut.Budget(size))
         if not asked:
-            print(
-                f"minimum {objective.name}: no proposal to judge with {budget.evaluations} rollouts"
-            )
+            print(f"minimum {objective.name}: no proposal to judge with {sizes[-1]} rollouts")
+            met = judged = False
             continue
         quick = replace(asked[0][0], tail=TAIL)
 
@@ -98,7 +100,7 @@ def main() -> int:
         verdict = "yes" if middle <= 1.0 else "no"
         name = objective.name
         print(f"\nminimum {name}: {middle:.2f} ms at the median (wanted: 1 ms): {verdict}")
-    return 0 if met or options.quick else 1
+    return 0 if met or (options.quick and judged) else 1
 
 
 if __name__ == "__main__":

@@ -26,7 +26,16 @@ from undertow.bring_up import (
 from undertow.cli import app
 from undertow.errors import InfeasibleError, InvalidInputError
 from undertow.mechanisms import LIBRARY
-from undertow.rig import Bench, Encoder, Friction, IdealRig, RealisticRig, Timing, srv02_rig
+from undertow.rig import (
+    Bench,
+    Encoder,
+    Friction,
+    IdealRig,
+    RealisticRig,
+    Timing,
+    plausible_rig,
+    srv02_rig,
+)
 
 
 @lru_cache(maxsize=16)
@@ -138,15 +147,9 @@ def test_a_fault_on_the_realistic_rig_is_found_and_nothing_else(
     ],
 )
 def test_faults_on_other_rigs(
-    fault: tuple[str, ...],
-    found: set[tuple[str, str]],
-    seed: int,
-    request: pytest.FixtureRequest,
+    fault: tuple[str, ...], found: set[tuple[str, str]], seed: int
 ) -> None:
     """Nine wirings on three rigs with other parameters, zeros and noise."""
-    if (fault, seed) == (("phi=0.25",), 0):
-        reason = "the scale is found, and the damping d_e is called wrong besides: a false alarm"
-        request.applymarker(pytest.mark.xfail(reason=reason))
     assert wrong(wizard(*fault, seed=seed)) == found
 
 
@@ -208,9 +211,12 @@ def test_parameters_come_back_from_noisy_counts() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="123 of 168 cover: fits that stop early, and friction that is not smooth")
 def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
-    """95 % intervals over 24 rigs: of all quantities together, nine in ten cover at least."""
+    """95 % intervals over 24 rigs: of all quantities together, nine in ten cover at least.
+
+    Those of one rig hang together: 168 intervals are worth about sixty that do not, and 0.9
+    is two standard deviations below 0.95 for as many.
+    """
     hits, total = 0, 0
     for seed in range(24):
         found, known = identified(seed)
@@ -220,7 +226,41 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
                 hits += low <= value <= high
                 total += 1
     assert total > 120
-    assert 0.85 <= hits / total <= 1.0, f"{hits} of {total}"
+    assert 0.9 <= hits / total <= 1.0, f"{hits} of {total}"
+
+
+@pytest.mark.slow
+def test_the_least_squares_are_reached() -> None:
+    """No worse than the truth, in units of the noise: a search that stops early is."""
+    belief, rig, known = bench_in_the_class(6)
+    u = doublets(2.5, [0.05, 0.1, 0.2, 0.1, 0.05, 0.2, 0.15], 0.3, 0.001)[:, None]
+    record = perform(rig, u, [3.0, 3.0])
+    found = identify(belief, rest_state(belief), record)
+    noiseless = replace(rig.bench, encoders=dict.fromkeys(("theta", "phi"), Encoder()))
+    still = perform(RealisticRig(noiseless, rest_state(belief), 6), u, [3.0, 3.0])
+    away = record.moved - still.moved
+    assert (found.residual <= (away - away.mean(axis=0)).std(axis=0) * (1 + 1e-3)).all()
+    assert known.keys() <= found.estimates.keys()
+
+
+def test_encoder_scales_near_a_known_one_are_that_one() -> None:
+    """Small pushes measure a scale to a third: enough to tell settings apart."""
+    for measured, setting in ((0.206, 0.25), (0.6, 0.5), (-3.3, -4.0), (50.0, 180 / np.pi)):
+        found = explain(np.array([[1.0, measured]]), np.ones((1, 2), dtype=bool))
+        assert found.encoders[1] == setting
+
+
+@pytest.mark.slow
+def test_a_healthy_cart_is_called_healthy() -> None:
+    """A slide with ends, a joint that swings for minutes: no false alarm."""
+    belief = LIBRARY["cart_pendulum"]()
+    rest = rest_state(belief)
+    rig = RealisticRig(plausible_rig(belief), rest, 1)
+    found = bring_up(rig, belief, delay=1e-3, rest=rest)
+    assert found.wrong == ()
+    assert rig.stops_hit == 0
+    assert found.identification is not None
+    assert (found.identification.explained > 0.99).all()
 
 
 def test_a_motion_without_motion_is_refused() -> None:

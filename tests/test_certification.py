@@ -99,7 +99,8 @@ def region() -> ProvedRegion:
     squares = np.array([[2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0], [0, 1, 1], [0, 0, 2]])
     values = [P[0, 0], 2 * P[0, 1], 2 * P[0, 2], P[1, 1], 2 * P[1, 2], P[2, 2]]
     V = LyapunovFunction(np.eye(3), squares, np.array(values) / 0.02)
-    return ProvedRegion(motion, V, Verdict("a region", "proved"), 0.02)
+    sound = Verdict("a region", "proved")
+    return ProvedRegion(motion, (V,), sound, 0.02, Verdict("a larger one", "refuted"))
 
 
 def test_the_simulated_region_is_the_non_singular_strip() -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -13,7 +16,9 @@ from undertow.certify.lyapunov import LyapunovFunction, first_crossing
 from undertow.certify.motion import Motion, SurfaceMotion, VectorField
 from undertow.certify.region import verify_region
 from undertow.certify.region_chart import natural_stretch
-from undertow.certify.region_search import prove_region, search_region
+from undertow.certify.region_report import motions, read_chains
+from undertow.certify.region_search import TIGHT, prove_region, search_region
+from undertow.certify.verify import reaches
 from undertow.errors import InvalidInputError, UnstableSurfaceError
 from undertow.mechanism import TIME
 from undertow.sliding import SlidingModeLaw
@@ -30,7 +35,7 @@ SQUARES = np.array([[2, 0, 0], [0, 2, 0], [0, 0, 2]])
 @pytest.fixture(scope="module")
 def ellipsoid() -> LyapunovFunction:
     """The quadratic V that the search starts from, a little inside."""
-    return search_region(MOTION, (1, 0, 0), degrees=(2,), seconds=0.0, start="round").times(1.05)
+    return search_region(MOTION, (1, 0, 0), degrees=(), slow=False)[0].times(1.03)
 
 
 def steps(motion: Motion, y: np.ndarray, seconds: float, h: float) -> np.ndarray:
@@ -189,14 +194,28 @@ def test_a_plain_vector_field_with_a_known_region(radius: float, kind: str) -> N
 
 
 def test_the_reversed_van_der_pol_region_stays_inside_its_limit_cycle() -> None:
-    """ẋ = −y, ẏ = x − (1 − x²) y: proved, converging, and no larger than the true region."""
+    """ẋ = −y, ẏ = x − (1 − x²) y: a proved chain, converging, no larger than the true region.
+
+    Each function serves with those inside it alone, and the last level is as high as it can be.
+    """
     x, y = sp.symbols("x y", real=True)
     motion = VectorField((x, y), (-y, x - (1 - x**2) * y))
-    found = prove_region(motion, (1, 0), degrees=(2, 4), seconds=60.0, goal=1.1)
-    path = steps(motion, inside(found.function, 2000, seed=5), seconds=12.0, h=0.02)
-    assert found.function(path).max() <= 1.0
-    assert found.function(path[-1]).max() < 1e-2
-    assert 1.0 < found.extent < 2.009  # where the limit cycle crosses y = 0
+    found = prove_region(motion, (1, 0), degrees=(4,), programs=30, goal=1.5)
+    *inner, last = found.chain
+    assert inner
+    assert last([found.extent, 0.0]) <= 1.0
+    assert 1.4 < found.extent < 2.009  # where the limit cycle crosses y = 0
+    path = steps(motion, inside(last, 2000, seed=5), seconds=12.0, h=0.02)
+    assert np.min([V(path) for V in found.chain], axis=0).max() <= 1.0
+    assert last(path[-1]).max() < 1e-2
+    assert found.raised.kind == "refuted"
+    point = np.array(list(found.raised.witness.values()))
+    assert inner[-1](point) > 1.0
+    assert 1.0 < last(point) <= TIGHT
+    step = 1e-6 * motion(point)
+    assert last(point + step) > last(point - step)
+    with pytest.raises(InvalidInputError, match="empty"):
+        verify_region(motion, [])
 
 
 def test_a_vector_field_must_be_closed_and_at_rest() -> None:
@@ -220,7 +239,7 @@ def test_a_repeated_zero_eigenvalue_is_never_proved() -> None:
     motion = SurfaceMotion(mechanism, ut.Surface(1, 1, 0, 0))
     assert np.sum(np.abs(np.linalg.eigvals(motion.jacobian)) < 1e-9) == 2
     with pytest.raises(UnstableSurfaceError):
-        search_region(motion, (1, 0, 0), seconds=1.0)
+        search_region(motion, (1, 0, 0), programs=1)
     verdict = verify_region(motion, LyapunovFunction(np.eye(3), SQUARES, np.ones(3)))
     assert verdict.kind == "undecided"
     assert "not negative definite" in verdict.method
@@ -249,7 +268,7 @@ def test_functions_that_cannot_be_lyapunov_functions_are_refused() -> None:
             LyapunovFunction(np.eye(3), np.array(exponents), np.ones(1))
     unstable = SurfaceMotion(RIG, ut.Surface(-1, -8.0, 1.96, 12.1))
     with pytest.raises(UnstableSurfaceError):
-        search_region(unstable, (1, 0, 0), seconds=1.0)
+        search_region(unstable, (1, 0, 0), programs=1)
 
 
 def test_a_dead_actuated_coordinate_is_refused() -> None:
@@ -274,32 +293,35 @@ def test_the_linear_program_reaches_a_known_optimum() -> None:
     assert empty is None
 
 
-@pytest.mark.slow
-def test_degree_four_reaches_further_than_the_ellipsoid(ellipsoid: LyapunovFunction) -> None:
-    """The search grows the set, and the checker proves it."""
-    found = prove_region(MOTION, (1, 0, 0), degrees=(4,), seconds=20.0)
-    start = 1 / np.sqrt(ellipsoid(np.array([1.0, 0, 0])))
-    assert found.verdict.kind == "proved"
-    assert found.extent > float(start)
-    assert found.function(np.array([found.extent, 0.0, 0.0])) <= 1.0
+CLAIMS = Path(__file__).parent / "data" / "region_claims.json"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [1, 4])
-def test_100000_motions_from_a_proved_set_stay_and_converge(case: int) -> None:
-    """Half of them start on the boundary; 5 % more is not proved, with a witness."""
-    motion = SurfaceMotion(RIG, CASES[case - 1].surface)
-    found = prove_region(motion, (1, 0, 0), degrees=(2, 4), seconds=90.0, goal=0.7)
-    V = found.function
-    rate = -np.linalg.eigvals(motion.jacobian).real.max()
-    for part in range(10):
-        y = inside(V, 10_000, seed=part)
-        highest = np.zeros(len(y))
-        for _ in range(int(7.0 / rate / 0.004)):  # e⁻⁷ of the slowest mode is left
-            y = steps(motion, y, seconds=0.004, h=0.004)[-1]
-            highest = np.maximum(highest, V(y))
-        assert highest.max() <= 1.0
-        assert V(y).max() < 1e-3
-    raised = verify_region(motion, V.times(1 / 1.05), max_seconds=120.0)
+@pytest.mark.parametrize("case", [1, 4, 5])
+def test_the_five_cases_reach_their_targets(case: int) -> None:
+    """The kept functions are proved, from rest at the asked angle on; a level 5 % up is not.
+
+    Then 20,000 motions, half of them from the boundary, stay inside and converge.
+    """
+    name, _, motion, target, _ = motions([str(case)])[0]
+    chain = read_chains(CLAIMS)[name]
+    verdict = verify_region(motion, chain)
+    assert verdict.kind == "proved"
+    assert reaches(chain[-1], [target, 0.0, 0.0])
+    *inner, V = chain
+    raised = verify_region(motion, [*inner, V.times(1 / 1.05)], proved=len(inner))
     assert raised.kind in ("refuted", "undecided")
     assert set(raised.witness) == {"phi", "phi_dot", "w_theta"}
+    y = inside(V, 20_000, seed=case)
+    slowest = -1 / np.linalg.eigvals(motion.jacobian).real.max()
+    fine = 50 * [(0.002, 2e-4)] + 90 * [(0.01, 1e-3)]  # the first second holds what is fast
+    for seconds, h in fine + math.ceil(12.0 * slowest / 0.2) * [(0.2, 0.01)]:
+        y = steps(motion, y, seconds, h)[-1]
+        outside = np.ones(len(y), dtype=bool)
+        for U in reversed(chain):
+            outside[outside] = U(y[outside]) > 1.0
+        assert not outside.any()
+        y = y[chain[0](y) > 0.05]  # the others are deep in the innermost set
+        if not len(y):
+            break
+    assert not len(y)

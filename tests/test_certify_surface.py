@@ -376,6 +376,25 @@ def test_a_gain_too_small_for_the_disturbance_is_refuted() -> None:
     assert reaching(loaded, BASE, REGION, 20.0, eta=6.0).scale == 0.0
 
 
+def test_a_stated_disturbance_that_k_does_not_carry_is_refused_in_engineering_units() -> None:
+    """0.3 N m on the arm, 2.3 V at the input, against K = 20: s grows in the plant itself."""
+    stated = [0.3, 0.0]
+    found = reaching(RIG, BASE, REGION, 20.0, disturbance=stated)
+    assert found.verdict.kind == "refuted"
+    assert found.scale == 0.0
+    assert "theta: 0.3 N m" in found.verdict.claim
+    alone = found.largest[0]
+    assert alone.refuted < 0.3
+    for words in (f"{alone.proved:.4g} N m", f"{alone.as_input:.4g} V", "falls short by"):
+        assert words in found.verdict.method
+    q = np.array(list(found.verdict.witness.values()))
+    excess = abs(surface_rate(RIG, BASE, q, np.array(stated))[0]) - 20.0
+    assert excess == pytest.approx(-found.verdict.margin, rel=1e-3)
+    assert excess > 0
+    enough = 20.0 - found.verdict.margin
+    assert reaching(RIG, BASE, REGION, 1.001 * enough, disturbance=stated).verdict
+
+
 def test_the_laws_own_gains_always_suffice() -> None:
     """Gains (13) for declared bounds leave η: proved, with room (they use norms)."""
     loaded = RIG.with_disturbance_bounds(0.05, 0.005)

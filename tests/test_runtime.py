@@ -18,7 +18,7 @@ import undertow as ut
 from undertow.cascade import Admission, CascadeState
 from undertow.errors import InvalidInputError
 from undertow.plan import Plan
-from undertow.rig import IdealRig, Measurement, RealisticRig
+from undertow.rig import Measurement, Push, RealisticRig
 from undertow.runtime import (
     Command,
     Controller,
@@ -30,12 +30,14 @@ from undertow.runtime import (
     Settings,
     SimulatedClock,
     background_worker,
+    replay,
     respond,
 )
 from undertow.runtime.clock import Histogram
 from undertow.runtime.faults import Witness
 from undertow.runtime.keeper import KeptRig
 from undertow.runtime.modes import Signs, successor
+from undertow.runtime.session import session
 from undertow.runtime.slow import Answer, Request
 
 RECIPE = Recipe(parameters={"d_e": 0.025}, evaluations=64, start=(0.0, 0.3, 0.0, 0.0))
@@ -91,21 +93,73 @@ def test_the_law_takes_over_inside_its_region_alone_and_hands_back() -> None:
         assert successor(mode, Signs(lost=True))[0] == Mode.SAFE_STOP
 
 
-def test_swing_up_is_used_outside_the_region_and_within_limits(memory: CascadeState) -> None:
-    controller = Controller(
-        RECIPE.cascade,
-        memory,
-        RECIPE.make_estimator(),
-        period=1e-3,
-        swing_up=lambda t, x: np.array([1e3]),
-        region=lambda x: abs(x[1]) < 0.1,
-    )
-    rig = IdealRig(RECIPE.belief, RECIPE.belief.state(phi=3.0))
-    for k in range(60):
+def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path: Path) -> None:
+    """Realistic rig, positions alone; the slow loop finds what catches; the replay agrees."""
+    recipe = Recipe(rig="realistic", swing_up=True, evaluations=32)
+    with session(recipe, simulated=True, log=tmp_path / "run.db") as runtime:
+        report = runtime.run(4.0)
+        end = runtime.rig.truth  # type: ignore[attr-defined]
+    states = [text.split(":")[0] for _, what, text in report.events if what == "state"]
+    assert states[:4] == [
+        "IDLE → BRING_UP", "BRING_UP → SWING_UP", "SWING_UP → CATCH", "CATCH → BALANCE",
+    ]  # fmt: skip
+    assert report.stopped_by == "operator: stop"
+    assert math.cos(end[1]) > 0.999
+    again = replay(tmp_path / "run.db")
+    assert again.identical
+    assert again.judged > 10
+
+
+def test_thrown_out_it_swings_up_again_within_limits() -> None:
+    """Knocked over while it balances: safe outputs throughout, and back to the top."""
+    recipe = Recipe(rig="realistic", swing_up=True, evaluations=32)
+    bench = replace(recipe.bench, pushes=(Push(4.0, "phi", 0.06),))
+    rig = RealisticRig(bench, recipe.x0, 0)
+    controller = recipe.make_controller(recipe.first())
+    witness = Witness(rig, controller.limits, controller.slew)
+    worker = InlineWorker(recipe.respond, 0.01)
+    report = Runtime(controller, witness, worker, clock=SimulatedClock()).run(9.0)
+    assert not witness.faults
+    assert report.entered["SWING_UP"] >= 2
+    assert report.stopped_by == "operator: stop"
+    assert math.cos(rig.truth[1]) > 0.999
+
+
+def test_a_catch_is_refused_where_the_state_is_not_the_predicted_one() -> None:
+    """An answer for another state, or for another mode, is never put to use."""
+    recipe = Recipe(rig="realistic", swing_up=True, evaluations=32)
+    controller, rig = recipe.make_controller(recipe.first()), recipe.make_rig()
+    answers = 0
+    for k in range(3000):
+        answer = None
+        if controller.request is not None and controller.request.swing >= 0:
+            honest = recipe.respond(controller.request)
+            answers += honest.admission.accepted
+            answer = replace(honest, x=honest.x + 0.5)
         command = Command.START if k == 0 else Command.NONE
-        rig.write(controller.step(Inputs(1e-3 * k, rig.read(), None, command)))
-    assert controller.mode == Mode.SWING_UP
-    assert controller.u[0] == 15.0
+        rig.write(controller.step(Inputs(1e-3 * k, rig.read(), answer, command)))
+        if answers:
+            break
+    assert answers == 1
+    for i in range(40):
+        rig.write(controller.step(Inputs(1e-3 * (k + 1 + i), rig.read())))
+        assert controller.mode == Mode.SWING_UP
+
+
+def test_the_two_halves_of_a_step_are_the_step(memory: CascadeState) -> None:
+    """Bookkeeping after the output, at once or with the next step: the same bits."""
+    whole, late = RECIPE.make_controller(memory), RECIPE.make_controller(memory)
+    rig, answer = RECIPE.make_rig(), None
+    for k in range(300):
+        inputs = Inputs(1e-3 * k, rig.read(), answer, Command(1 if k == 0 else 0))
+        u = whole.step(inputs).copy()
+        assert np.array_equal(late.decide(inputs), u)
+        request = whole.request
+        answer = RECIPE.respond(request) if request is not None else None
+        rig.write(u)
+    late.follow_up()
+    assert whole.memory == late.memory
+    assert whole.memory.sequence > 0
 
 
 # -- the output ------------------------------------------------------------------------------

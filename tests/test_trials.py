@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import undertow as ut
+from undertow.errors import ArtefactError
 from undertow.estimators import Record
+from undertow.estimators.compensation import take_off
 from undertow.inner_loop import InnerLoop
-from undertow.rig import srv02_rig
-from undertow.trials.balance import OBJECTIVES, controllers
+from undertow.practice import estimator_for, goal_for
+from undertow.rig import Friction, srv02_rig
+from undertow.trials.balance import controllers
+from undertow.trials.ledger import Ledger
 from undertow.trials.nmpc import predictive
 from undertow.trials.report import balance_files, balance_report
 from undertow.trials.robustness import breaking_point, clipped_regulator, random_bench
 from undertow.trials.steering import CascadeSteering, steady
-from undertow.trials.trial import judge, spread, trial, undisturbed
+from undertow.trials.trial import Outcome, judge, spread, trial, undisturbed
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +34,7 @@ def arm() -> ut.Mechanism:
 
 def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
     """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
-    x0, goal = arm.state(phi=ut.deg(35)), OBJECTIVES["energy"]
+    x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
     made = controllers(arm, goal, x0, budget=128)
     costs = {
         row: trial(arm, undisturbed(arm), made[row], x0, 8.0, 0, objective=goal).cost
@@ -36,7 +44,7 @@ def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mecha
 
 
 def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism) -> None:
-    x0, goal = arm.state(phi=ut.deg(35)), OBJECTIVES["energy"]
+    x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
     made = controllers(arm, goal, x0, budget=128)
     runs = {
         row: [trial(arm, srv02_rig(), made[row], x0, 8.0, s, objective=goal) for s in range(3)]
@@ -48,7 +56,7 @@ def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism)
 
 def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None:
     x0 = arm.state(phi=0.4)
-    cascade = ut.Cascade(arm, OBJECTIVES["energy"], warm=ut.Budget(64), cold=ut.Budget(256))
+    cascade = ut.Cascade(arm, goal_for(arm, "energy"), warm=ut.Budget(64), cold=ut.Budget(256))
     start = cascade.start(x0)
     records = [
         trial(arm, srv02_rig(), lambda _: CascadeSteering(cascade, start), x0, 1.0, 7).record
@@ -125,7 +133,60 @@ def test_a_clipped_regulator_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
 
 def test_predictive_control_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
     pytest.importorskip("casadi")
-    make = predictive(arm, OBJECTIVES["energy"])
+    make = predictive(arm, goal_for(arm, "energy"))
     run = trial(arm, undisturbed(arm), make, arm.state(phi=ut.deg(30)), 4.0, 0)
     assert run.caught
     assert np.abs(run.record.u).max() <= 15.0
+
+
+def test_a_ledger_goes_on_where_it_ended(tmp_path: Path) -> None:
+    """Kept runs come back, a line cut off by a kill is left out, other settings are refused."""
+    path = tmp_path / "ledger.jsonl"
+    record = Record(*(np.zeros((1, k)) for k in (1, 2, 4, 1, 4)))
+    lost = Outcome(4, False, True, math.inf, math.nan, 1.5, 2.5, record)
+    Ledger(path, {"angle": 0.5}).keep("cascade", "delay", 0.25, lost)
+    with path.open("a") as file:
+        file.write('["cascade", "delay", 0.5, {"se')
+    again = Ledger(path, {"angle": 0.5})
+    found = again.find("cascade", "delay", 0.25, 4)
+    assert found is not None
+    assert (found.seed, found.balanced, found.caught, found.effort) == (4, False, True, 1.5)
+    assert found.settled == math.inf
+    assert again.find("cascade", "delay", 0.5, 4) is None
+    again.keep("cascade", "delay", 0.5, lost)
+    assert Ledger(path, {"angle": 0.5}).find("cascade", "delay", 0.5, 4) is not None
+    with pytest.raises(ArtefactError, match="other versions or settings"):
+        Ledger(path, {"angle": 0.6})
+
+
+def test_the_observed_disturbance_frees_an_arm_that_stiction_holds(arm: ut.Mechanism) -> None:
+    """A soft surface and twice the friction: stuck far from home without, at home with it."""
+    soft = ut.Surface(alpha_a=-1, lambda_a=-0.32, alpha_u=2.5, lambda_u=15)
+    bench = srv02_rig()
+    rough = replace(bench, friction={"theta": Friction(0.06, 0.08), "phi": bench.friction["phi"]})
+    x0 = arm.state(theta=0.5)
+    ends = []
+    for drift in (0.0, None):
+        run = trial(
+            arm, rough, lambda _: steady(InnerLoop(arm, soft)), x0, 10.0, 0,
+            estimator=estimator_for(arm, bench, drift),
+        )  # fmt: skip
+        assert run.caught
+        ends.append(float(np.abs(run.record.truth[-1000:, 0]).max()))
+    assert ends[0] > 0.3
+    assert ends[1] < 0.15
+
+
+@given(
+    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
+    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
+)
+def test_what_is_taken_off_keeps_to_its_share_and_to_the_limits(
+    u: list[float], disturbance: list[float]
+) -> None:
+    limits, out = np.array([2.0, math.inf]), np.zeros(2)
+    take_off(np.array(u), np.array(disturbance), limits, out)
+    assert abs(out[0]) <= 2.0
+    free = min(max(u[0] - min(max(disturbance[0], -1.0), 1.0), -2.0), 2.0)
+    assert out[0] == free
+    assert out[1] == u[1] - disturbance[1]

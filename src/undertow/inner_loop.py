@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from undertow.codegen.function import COMPILED, PREAMBLE, function_source
+from undertow.codegen.function import PREAMBLE, function_source
 from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.memory import BRIEF, Memory, unpacked
 from undertow.sliding import (
     LawSymbols,
     ReachingLaw,
@@ -26,7 +27,7 @@ from undertow.sliding import (
     lay_law,
 )
 
-__all__ = ["InnerLoop"]
+__all__ = ["InnerLoop", "lane", "law_memory", "law_module"]
 
 
 @dataclass(eq=False)
@@ -53,8 +54,8 @@ class InnerLoop:
     >>> import undertow as ut
     >>> rig = ut.mechanisms.rotary_pendulum()
     >>> law = InnerLoop(rig, ut.Surface(-1, -0.5, 5, 10))
-    >>> float(law(rig.state(phi=0.5))[0])
-    -15.0
+    >>> round(float(law(rig.state(phi=0.5))[0]), 3)
+    -2.799
     """
 
     mechanism: Mechanism
@@ -63,10 +64,9 @@ class InnerLoop:
 
     def __post_init__(self) -> None:
         """Set out the arrays that every step fills."""
-        m = self.mechanism.m
-        self.u, self.demand, self.s, self.margin = (np.zeros(k) for k in (m, m, m, 1))
-        self._limits = self.mechanism.input_limits
-        self._parameters = self.mechanism.parameter_values
+        memory = law_memory(self.mechanism)
+        self.u, self.demand, self.s = memory["u"], memory["demand"], memory["s"]
+        self.margin, self._block = memory["margin"], memory.block
         self.use(self.surface, self.reaching)
 
     @cached_property
@@ -89,10 +89,16 @@ class InnerLoop:
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the input at the state x, (2n,): never NaN, never past the limits, (m,)."""
-        self._step(
-            x, self.lane, self._parameters, self._limits, self.u, self.demand, self.s, self.margin
-        )
-        return self.u
+        self._step(x, self.lane, self._block)
+        return self.u  # type: ignore[no-any-return]
+
+
+def law_memory(mechanism: Mechanism, limits: FloatArray | None = None) -> Memory:
+    """Return what a step of a law works on: u, demand, s, margin; limits may be narrower."""
+    memory = Memory(_LAYOUT, p=len(mechanism.parameters), m=mechanism.m)
+    memory["parameters"][:] = mechanism.parameter_values
+    memory["limits"][:] = mechanism.input_limits if limits is None else limits
+    return memory
 
 
 def lane(law: SlidingModeLaw) -> FloatArray:
@@ -101,10 +107,16 @@ def lane(law: SlidingModeLaw) -> FloatArray:
     return np.concatenate([law.surface.vector, reaching, [law.gamma_target]])
 
 
+#: What a step of the law reads besides the state and its surface, and what it fills.
+_LAYOUT = {
+    "parameters": "p", "limits": "m", "u": "m", "demand": "m", "s": "m", "margin": "1",
+}  # fmt: skip
+
 #: A demand that is not a number becomes no input at all; the rest is clipped.
 _CLIP = f"""
-{COMPILED}
-def step(x, lane, parameters, limits, u, demand, s, margin):
+{BRIEF}
+def step(x, lane, block):
+{unpacked(_LAYOUT)}
     law(x, lane, parameters, demand, s, margin)
     for i in range(u.shape[0]):
         if not (abs(demand[i]) < math.inf):
@@ -112,12 +124,12 @@ def step(x, lane, parameters, limits, u, demand, s, margin):
         u[i] = max(-limits[i], min(limits[i], demand[i]))
 """
 
-_GENERATOR = generators("inner_loop.py", "sliding.py", "codegen/function.py")
+_GENERATOR = generators("inner_loop.py", "memory.py", "sliding.py", "codegen/function.py")
 
 
 @lru_cache(maxsize=64)
 def law_module(mechanism: Mechanism, switching: Switching) -> Any:
-    """Return the compiled module of a law: ``law`` and, with limits, ``step``."""
+    """Return the compiled module of a law: ``law``, and ``step`` on a :func:`law_memory`."""
     key = content_key(mechanism.structure, mechanism.name, switching, sources=_GENERATOR)
 
     def write() -> str:
@@ -136,6 +148,7 @@ def law_module(mechanism: Mechanism, switching: Switching) -> Any:
             {"demand": law.u, "s": law.s, "margin": [law.margin]},
         )
         header = f'"""Sliding-mode law of {mechanism.name}; generated, do not edit."""\n\n'
-        return f"{header}{PREAMBLE}\n\n{body}\n{_CLIP}"
+        sizes = f"p, m = {len(mechanism.parameters)}, {mechanism.m}\n"
+        return f"{header}{PREAMBLE}{sizes}\n\n{body}\n{_CLIP}"
 
     return generated("law", mechanism.name, key, write)

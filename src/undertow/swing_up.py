@@ -33,6 +33,7 @@ from undertow.errors import InfeasibleError, InvalidInputError, ModelError, Unde
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import MinimumTime, state_box
+from undertow.rig.simulated import IdealRig
 from undertow.rig.stepping import dynamics_source
 from undertow.rollout import ClosedLoop
 from undertow.search import CMAES
@@ -478,8 +479,7 @@ class SwingUpAndCatch:
         if t - self._since > self.patience:
             self._since, self._choice = t, self._choice + 1
         offset = self.region.turns(x)
-        near = np.abs((x - offset)[m:n]).max() <= 0.8 * self.lost
-        if t >= self._next and near and self.region.worth_asking(x - offset):
+        if t >= self._next and self.worth_asking(x):
             self._next = t + self.every
             surface = self.region.surface(x - offset)
             if surface is not None:
@@ -488,6 +488,19 @@ class SwingUpAndCatch:
                 self.events.append((t, "catch"))
                 return self._law(x - offset)
         return self.swing(x, self._choice)
+
+    def worth_asking(self, x: FloatArray) -> bool:
+        """Whether a catch from x is worth the rollouts that answer it: a cheap test."""
+        m, n = self.region.mechanism.m, self.region.mechanism.n
+        home = x - self.region.turns(x)
+        return bool(np.abs(home[m:n]).max() <= 0.8 * self.lost) and self.region.worth_asking(home)
+
+    def ahead(self, x: FloatArray, seconds: float, choice: int = 0) -> FloatArray:
+        """Return where the swing-up, with one choice of its gains, brings x in a while, (2n,)."""
+        rig = IdealRig(self.region.mechanism, x)
+        for _ in range(round(seconds / rig.period)):
+            rig.write(self.swing(rig.truth, choice))
+        return rig.truth
 
     @property
     def balancing(self) -> bool:

@@ -12,9 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.optimize
+import scipy.signal
 import scipy.stats
 
 from undertow.bring_up.motion import Record
@@ -29,6 +31,28 @@ INDEPENDENT = 0.15
 
 #: Names of what a record begins with: fitted, not reported.
 _START, _RATE = "_start", "_rate"
+
+#: Stages of a fit: length of the pieces in which the motion is fitted, s; part of it that is;
+#: whether breaking away is fitted, which is sharp and can wait until the rest is nearly right.
+Stage = tuple[float, float, bool]
+
+#: Ways to the least squares.  What swings or sticks comes out of step with a model that is a
+#: little off, so that a long motion has other minima: where the first way leads to one of them,
+#: short pieces of the motion, and then more and more of it, lead past.
+ROUTES: tuple[tuple[Stage, ...], ...] = (
+    ((math.inf, 1.0, False), (math.inf, 1.0, True)),
+    ((0.15, 1.0, False), (0.4, 1.0, False), (math.inf, 0.4, True), (math.inf, 1.0, True)),
+    (
+        (0.15, 1.0, False), *((math.inf, part, True) for part in (0.25, 0.4, 0.6, 0.8, 1.0)),
+    ),
+    ((0.1, 1.0, False), (math.inf, 0.15, False), (math.inf, 0.5, True), (math.inf, 1.0, True)),
+)  # fmt: skip
+
+#: Share of every coordinate's motion that a way must explain for no other to be tried.
+ENOUGH = 0.998
+
+#: Window of the polynomials that a piece's first state is read from, s.
+WINDOW = 0.02
 
 #: Central differences in scaled variables.
 STEP = 2e-3
@@ -50,6 +74,9 @@ class Estimate:
         Its 95 % confidence interval.
     nominal
         What the model says; NaN where it says nothing.
+    matters
+        How much the motion would differ if this were as the model says and all else were fitted
+        again, to first order, as a share of the motion.
     """
 
     name: str
@@ -60,6 +87,7 @@ class Estimate:
     low: float
     high: float
     nominal: float = math.nan
+    matters: float = math.nan
 
     @property
     def covers_nominal(self) -> bool:
@@ -112,7 +140,18 @@ class _Variable:
     nominal: float
 
 
-def _candidates(mechanism: Mechanism, coulomb: float) -> list[_Variable]:
+def _tell(progress: Callable[[str, float], None], part: float, what: str) -> None:
+    progress(what, part)
+
+
+def _beginning(record: Record) -> tuple[FloatArray, FloatArray]:
+    """Return where a motion begins about its middle, and how fast, (n,) each: a first guess."""
+    late = min(len(record), 20)
+    slope = np.polyfit(record.t[:late] - record.t[0], record.q[:late], 1)[0]
+    return record.q[:late].mean(axis=0) - record.q.mean(axis=0), slope
+
+
+def _candidates(mechanism: Mechanism, coulomb: float, record: Record) -> list[_Variable]:
     """Return what may be free, in order of preference.
 
     Delay, dry friction, damping, inertias and motor constants first; then damping that the
@@ -165,11 +204,13 @@ def _candidates(mechanism: Mechanism, coulomb: float) -> list[_Variable]:
         )
         for c in mechanism.coordinates[mechanism.m :]
     ]
-    # A passive joint may still swing a little when the record begins.
+    # A passive joint may still swing when the record begins.
+    place, speed = _beginning(record)
     begins = [
-        _Variable(f"{stem}_{c.name}", c.unit + unit, "", 0.0, scale, -np.inf, np.inf, 0.0)
-        for c in mechanism.coordinates[mechanism.m :]
-        for stem, unit, scale in ((_START, "", 0.01), (_RATE, "/s", 0.05))
+        _Variable(f"{stem}_{c.name}", c.unit + unit, "", guess[i], scale, -np.inf, np.inf, 0.0)
+        for i, c in enumerate(mechanism.coordinates)
+        for stem, unit, scale, guess in ((_START, "", 0.01, place), (_RATE, "/s", 0.05, speed))
+        if i >= mechanism.m
     ]
     motors = {str(symbol) for symbol in mechanism.input_matrix.free_symbols}
     named[0].sort(key=lambda v: v.name not in motors)
@@ -211,21 +252,14 @@ def identify(
         When nothing moved.
     """
     fit = _Fit(mechanism, x0, record)
-    if progress is not None:
-        progress("which quantities the motion tells apart", 0.0)
-    values: dict[str, float] = {}
-    # Breaking away is sharp: it is added when the rest is nearly right.
-    for stage, smooth in enumerate((True, False)):
-        free = fit.choose(values, without="breakaway_" if smooth else None)
-        if progress is not None:
-            progress(f"identifying {len(free)} quantities", 0.2 + 0.4 * stage)
-        z = fit.solve(free, values)
-        values = {v.name: float(a) * v.scale for v, a in zip(free, z, strict=True)}
+    free, z = fit.search(progress or (lambda _what, _fraction: None))
     J, r = fit.jacobian(free, z), fit.residual(free, z)
     covariance = _covariance(J, r, mechanism.n)
     quantile = float(scipy.stats.norm.ppf(0.5 + confidence / 2))
     estimates = {}
-    for v, scaled, variance in zip(free, z, np.diag(covariance), strict=True):
+    alone = 1.0 / np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))  # of each column, the rest fitted
+    motion = float(np.linalg.norm((fit.moved - fit.moved.mean(axis=0)) / fit.sigma))
+    for v, scaled, variance, size in zip(free, z, np.diag(covariance), alone, strict=True):
         if v.name.startswith("_"):
             continue
         value, error = float(scaled * v.scale), float(math.sqrt(variance) * v.scale)
@@ -238,31 +272,38 @@ def identify(
             value - quantile * error,
             value + quantile * error,
             v.nominal,
+            abs(value - v.nominal) / v.scale * float(size) / motion,
         )
     known = {p.name for p in mechanism.parameters}
     changed = {k: e.value for k, e in estimates.items() if k in known}
     held = tuple(p.name for p in mechanism.parameters if p.name not in changed)
-    after = fit.difference(free, z).std(axis=0)
-    swing = np.maximum(record.moved.std(axis=0), 1e-300)
     return Identification(
         estimates,
         held,
-        after,
+        fit.difference(free, z).std(axis=0),
         fit.difference([], np.zeros(0)).std(axis=0),
-        1.0 - (after / swing) ** 2,
+        fit.explained(free, z),
         record.moved - fit.difference(free, z),
         mechanism.with_parameters(**changed),
     )
 
 
 def _covariance(J: FloatArray, r: FloatArray, n: int) -> FloatArray:
-    """(JᵀJ)⁻¹ S (JᵀJ)⁻¹, S with Bartlett's weights; rows come coordinate by coordinate."""
+    """(JᵀJ)⁻¹ S (JᵀJ)⁻¹, S with Bartlett's weights; rows come coordinate by coordinate.
+
+    How far the weights reach follows from the residuals (Andrews, *Econometrica* 59(3), 1991,
+    (5.3), (6.2) and (6.4)): a reach that white ones do not need only makes S smaller.
+    """
     inverse = np.linalg.pinv(J.T @ J)
     S = np.zeros_like(inverse)
     for part, rest in zip(np.split(J, n), np.split(r, n), strict=True):
         scores = part * rest[:, None]
         S += scores.T @ scores
-        for lag in range(1, window := max(2, round(len(rest) ** 0.5))):
+        power = float(rest @ rest)
+        near = float(rest[1:] @ rest[:-1]) / power if power > 0 else 0.0
+        alpha = 4 * near**2 / max((1 - near**2) ** 2, 1e-12)
+        window = min(math.ceil(1.1447 * (alpha * len(rest)) ** (1 / 3)), len(rest) // 4)
+        for lag in range(1, window):
             overlap = scores[lag:].T @ scores[:-lag]
             S += (1 - lag / window) * (overlap + overlap.T)
     freedom = len(r) / max(1, len(r) - J.shape[1])
@@ -273,9 +314,9 @@ class _Fit:
     """Residuals and Jacobians of one record."""
 
     def __init__(self, mechanism: Mechanism, x0: FloatArray, record: Record) -> None:
-        self.mechanism, self.record = mechanism, record
+        self.mechanism, self.whole = mechanism, record
         self.predictor = Predictor(mechanism, x0)
-        self.moved = record.moved
+        self.look_at(math.inf, 1.0)
         if not (np.abs(self.moved).max(axis=0) > 0).any():
             raise InvalidInputError(
                 "motion to identify from",
@@ -288,7 +329,30 @@ class _Fit:
         least = 1e-4 * np.abs(self.moved).max(axis=0)
         self.sigma = np.maximum(np.array(counts) / math.sqrt(12), least)
         passive = float(np.abs(mechanism.forces(0.0, x0 + 0.1, np.zeros(mechanism.n))).max())
-        self.candidates = _candidates(mechanism, 0.01 * max(passive, 1e-3))
+        self.candidates = _candidates(mechanism, 0.01 * max(passive, 1e-3), record)
+
+    def look_at(self, piece: float, part: float) -> None:
+        """Fit the first part of the motion from here on, in pieces so long, s.
+
+        A piece begins in a state that is read from the measurement, and what only matters
+        between pieces is held: how the motion begins, the delay, breaking away.
+        """
+        whole = self.whole
+        self.pieces = math.isfinite(piece)
+        period = float(np.median(np.diff(whole.t)))
+        self.length = round(piece / period) if self.pieces else 0
+        if self.pieces:
+            window = 2 * max(3, round(0.5 * WINDOW / period)) + 1
+            q = whole.moved + self.predictor.x0[: self.mechanism.n]
+            smooth = [
+                scipy.signal.savgol_filter(q, window, 3, deriv=d, delta=period, axis=0)
+                for d in (0, 1)
+            ]
+            self.read = np.hstack(smooth)
+        begins = int(np.argmax(np.abs(whole.u).max(axis=1) > 0))
+        count = begins + math.ceil(part * (len(whole) - begins))
+        self.record = Record(whole.t[:count], whole.q[:count], whole.u[:count])
+        self.moved = whole.moved[:count]
 
     def _simulate(self, values: Mapping[str, float]) -> FloatArray:
         mechanism = self.mechanism
@@ -301,9 +365,18 @@ class _Fit:
         for i, c in enumerate(mechanism.coordinates):
             start[i] += values.get(f"{_START}_{c.name}", 0.0)
             start[mechanism.n + i] += values.get(f"{_RATE}_{c.name}", 0.0)
-        states = self.predictor.states(
-            self.record, parameters, np.stack([coulomb, coulomb + excess]), viscous, gain, start
-        )
+        friction = np.stack([coulomb, coulomb + excess])
+        if self.pieces:
+            rows = np.empty((len(self.record), mechanism.n))
+            for first in range(0, len(rows), self.length):
+                few = slice(first, first + self.length)
+                record = Record(self.record.t[few], self.record.q[few], self.record.u[few])
+                states = self.predictor.states(
+                    record, parameters, friction, viscous, gain, self.read[first]
+                )
+                rows[few] = states[:, : mechanism.n]
+            return np.asarray(rows - self.predictor.x0[: mechanism.n])
+        states = self.predictor.states(self.record, parameters, friction, viscous, gain, start)
         q = self.predictor.positions(self.record, states, values.get("delay", 0.0))
         return np.asarray(q - self.predictor.x0[: mechanism.n])
 
@@ -339,7 +412,9 @@ class _Fit:
         ends = np.array([[v.low / v.scale + 1e-9, v.high / v.scale - 1e-9] for v in variables])
         return ends.T
 
-    def solve(self, free: list[_Variable], values: Mapping[str, float]) -> FloatArray:
+    def solve(
+        self, free: list[_Variable], values: Mapping[str, float], tolerance: float
+    ) -> FloatArray:
         """Return the scaled variables of the least squares, starting from some values."""
         low, high = self._bounds(free)
 
@@ -347,25 +422,65 @@ class _Fit:
             return self.residual(free, z)
 
         def jacobian(z: FloatArray) -> FloatArray:
-            # Forward differences are enough to find the way.
-            base = self.residual(free, z)
-            steps = z + STEP * np.eye(len(z))
-            return np.array([(self.residual(free, a) - base) / STEP for a in steps]).T
+            return self.jacobian(free, z)
 
+        # Quantities differ in how sharply they are seen by four decades: without the scale of
+        # the Jacobian's columns the search creeps, and stops short of the least squares by
+        # more than the intervals are wide.
         found = scipy.optimize.least_squares(
             residual,
             self._start(free, values),
             jac=jacobian,
             bounds=(low, high),
-            ftol=1e-6,
-            xtol=1e-6,
-            max_nfev=25,
+            x_scale="jac",
+            ftol=tolerance,
+            xtol=tolerance,
+            max_nfev=60,
         )
         return np.asarray(found.x)
 
-    def choose(self, values: Mapping[str, float], without: str | None) -> list[_Variable]:
+    def explained(self, free: list[_Variable], z: FloatArray) -> FloatArray:
+        """Share of each coordinate's motion that is explained, (n,)."""
+        swing = np.maximum(self.moved.std(axis=0), 1e-300)
+        return np.asarray(1.0 - (self.difference(free, z).std(axis=0) / swing) ** 2)
+
+    def search(self, progress: Callable[[str, float], None]) -> tuple[list[_Variable], FloatArray]:
+        """Return the least squares of the best of the ways: of the first, if that will do."""
+        best: tuple[float, list[_Variable], FloatArray] | None = None
+        for number, route in enumerate(ROUTES):
+            progress("which quantities the motion tells apart", number / len(ROUTES))
+            free, z = self.follow(route, partial(_tell, progress, number / len(ROUTES)))
+            cost = float((self.residual(free, z) ** 2).sum())
+            if best is None or cost < best[0]:
+                best = cost, free, z
+            if (self.explained(best[1], best[2]) > ENOUGH).all():
+                break
+        assert best is not None  # there are ways
+        return best[1], best[2]
+
+    def follow(
+        self, route: tuple[Stage, ...], tell: Callable[[str], None]
+    ) -> tuple[list[_Variable], FloatArray]:
+        """Fit stage by stage; what a whole motion told apart once stays free."""
+        values: dict[str, float] = {}
+        free: list[_Variable] = []
+        self.pieces = True
+        for number, (piece, part, sharp) in enumerate(route):
+            first = [] if self.pieces else free
+            self.look_at(piece, part)
+            free = self.choose(values, first, () if sharp else ("breakaway_",))
+            tell(f"identifying {len(free)} quantities")
+            z = self.solve(free, values, 1e-9 if number == len(route) - 1 else 1e-4)
+            values = {v.name: float(a) * v.scale for v, a in zip(free, z, strict=True)}
+        return free, z
+
+    def choose(
+        self, values: Mapping[str, float], first: list[_Variable], without: tuple[str, ...]
+    ) -> list[_Variable]:
         """Return the free variables: each tells something that those before it do not."""
-        offered = [v for v in self.candidates if without is None or not v.name.startswith(without)]
+        held = (*without, "_", "delay") if self.pieces else without
+        rest = [v for v in self.candidates if v not in first and not v.name.startswith(held)]
+        offered = [*first, *rest]
         J = self.jacobian(offered, self._start(offered, values))
         free: list[_Variable] = []
         basis = np.zeros((len(J), 0))

@@ -73,16 +73,11 @@ class Predictor:
         drive, held = np.zeros((3, m)), np.zeros((1, m))
         past, work = np.tile(x[:n], (1, 1)), np.zeros((8, max(n * n, 2 * n)))
         rows = np.empty((len(record), 2 * n))
-        rows[0] = x
-        inputs = record.u * gain
-        advance = self._module.advance
-        for k, length in enumerate(np.diff(record.t)):
-            advance(
-                record.t[k], length, counts, x, inputs[k], drive, held, past, self._delays,
-                parameters, friction, self._stops, self._amplifier, self._gap, self._encoder,
-                self._phase, self._pushes, self._noise, q, applied, work,
-            )  # fmt: skip
-            rows[k + 1] = x
+        self._module.play(
+            record.t, record.u * gain, rows, counts, x, drive, held, past, self._delays,
+            parameters, friction, self._stops, self._amplifier, self._gap, self._encoder,
+            self._phase, self._pushes, self._noise, q, applied, work,
+        )  # fmt: skip
         return rows
 
     def positions(self, record: Record, states: FloatArray, delay: float) -> FloatArray:

@@ -22,6 +22,9 @@ __all__ = ["Wiring", "explain", "known_factor"]
 #: A factor within this ratio of 1 is within the tolerance of parameters and friction.
 TOLERANCE = 1.45
 
+#: A factor within this ratio of a known one is taken for it: they are twice as far apart.
+NEAR = 1.41
+
 #: A response below this share of the predicted one is none.
 DEAD = 0.01
 
@@ -107,7 +110,8 @@ def explain(gain: FloatArray, known: FloatArray) -> Wiring:
     Returns
     -------
     Wiring
-        Factors within a ratio of 1.45 of ±1 are ±1.
+        Factors within a ratio of 1.45 of ±1 are ±1; scales of encoders near a known one are
+        that.
     """
     m, n = gain.shape
     dead = np.array([not (np.abs(gain[i][known[i]]) > DEAD).any() for i in range(m)])
@@ -126,7 +130,7 @@ def explain(gain: FloatArray, known: FloatArray) -> Wiring:
                 continue
             ratios = gain[rows, j] / np.array(k)[rows]
             c = float(np.median(ratios))
-            encoders[j] = _rounded(c) if abs(c) > DEAD else 0.0
+            encoders[j] = _settled(c) if abs(c) > DEAD else 0.0
             misfit += float(np.abs(ratios - c).sum())
         faults = sum(_rounded(v) != 1.0 for v in k) + int((encoders != 1.0).sum())
         cost = faults + 0.5 * min(misfit, 1.8)
@@ -143,9 +147,15 @@ def _rounded(factor: float) -> float:
     return math.copysign(1.0, factor) if 1 / TOLERANCE < abs(factor) < TOLERANCE else factor
 
 
+def _settled(factor: float) -> float:
+    """Return ±1 for the scale of an encoder within tolerance, else a known one near it."""
+    words = known_factor(factor)
+    within = _rounded(factor)
+    return math.copysign(KNOWN[words], factor) if words and abs(within) != 1.0 else within
+
+
 def known_factor(value: float) -> str:
     """Return what a factor looks like, in words, where it is near a known one."""
-    for words, factor in KNOWN.items():
-        if factor / 1.2 < abs(value) < factor * 1.2:
-            return words
-    return ""
+    apart = {words: abs(math.log(abs(value) / factor)) for words, factor in KNOWN.items() if value}
+    words = min(apart, key=apart.__getitem__, default="")
+    return words if words and apart[words] < math.log(NEAR) else ""

@@ -13,7 +13,7 @@ from undertow.bring_up.identify import Identification, identify
 from undertow.bring_up.motion import GuardError, Record, doublets, perform, ramp
 from undertow.bring_up.predict import Predictor
 from undertow.bring_up.rest import rest_state
-from undertow.bring_up.wiring import Wiring, explain, known_factor
+from undertow.bring_up.wiring import KNOWN, Wiring, explain, known_factor
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.rig.interface import Rig
 
@@ -25,6 +25,12 @@ SHARES = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5)
 #: Motion that is enough to compare, and the most that is allowed, rad and m.
 ENOUGH = {"rad": 0.2, "m": 0.08}
 MOST = {"rad": 2.0, "m": 0.6}
+
+#: A parameter is called wrong where it changes the motion by more than this part of it.
+MATTERS = 0.05
+
+#: Longest wait for rest between two motions, s: a good joint swings for minutes.
+CALM = 240.0
 
 Verdict = Literal["right", "wrong", "unclear"]
 
@@ -137,7 +143,7 @@ class _Wizard:
         self.wiring: Wiring | None = None
         self.identification: Identification | None = None
         self.record: Record | None = None
-        self.share = np.zeros(belief.m)
+        self.share, self.breakaway = np.zeros(belief.m), np.zeros(belief.m)
         self.predictor = Predictor(belief, rest)
         units = [c.unit for c in belief.coordinates]
         room = np.array([c.high - c.low for c in belief.coordinates])
@@ -160,7 +166,7 @@ class _Wizard:
     ) -> None:
         self.findings.append(Finding(check, part, measured, expected, verdict, remedy))
 
-    def _settle(self, seconds: float = 20.0) -> FloatArray:
+    def _settle(self, seconds: float = CALM) -> FloatArray:
         """Leave the inputs at zero until nothing moves, or for so long: the last motion, (n,)."""
         count = round(0.5 / self.rig.period)
         moved = np.full(self.belief.n, np.inf)
@@ -285,7 +291,7 @@ class _Wizard:
                 self._add(kind, name, "nothing reaches it", "moves", verdict="unclear",
                           remedy="No input moves it from rest: check it by hand")  # fmt: skip
                 continue
-            seen = factor if abs(factor) != 1.0 else self._typical(gain, known, index)
+            seen = abs(factor) * self._typical(gain, known, index)
             sign_right, scale_right = factor > 0, abs(factor) == 1.0
             self._add(f"{kind} sign", name, "as the model" if sign_right else "reversed",
                       "as the model", verdict="right" if sign_right else "wrong",
@@ -319,11 +325,12 @@ class _Wizard:
         for i, channel in enumerate(self.belief.inputs):
             levels = []
             for side in (1.0, -1.0):
+                self._settle()
                 rise = ramp(side * 0.3 * channel.limit, 1.5, self.rig.period)
                 record = perform(rig, self._one(i, rise), 30 * self.guard, until=until)
                 levels.append(abs(float(record.u[-1, i])))
-                self._settle()
             up, down = levels
+            self.breakaway[i] = 0.5 * (up + down)
             even = max(up, down) < 2.0 * min(up, down) + 0.02 * channel.limit
             level = 0.5 * (up + down)
             light = level < 0.25 * channel.limit
@@ -337,6 +344,23 @@ class _Wizard:
                 else "Look for what rubs, for a cable that pulls, or for a load that still swings",
             )  # fmt: skip
 
+    def _modest(self, u: FloatArray) -> FloatArray:
+        """Return inputs small enough for what the model says they do: within half the guards."""
+        belief, n = self.belief, self.belief.n
+        gain = np.abs(np.array(belief.input_matrix.subs(belief.substitution), dtype=float))
+        coulomb = np.zeros((2, n))
+        coulomb[:, : belief.m] = gain @ self.breakaway
+        t = np.arange(len(u), dtype=np.float64) * self.rig.period
+        for _ in range(20):
+            states = self.predictor.states(
+                Record(t, np.zeros((len(u), n)), u), belief.parameter_values, coulomb,
+                np.zeros(n), np.ones(belief.m),
+            )  # fmt: skip
+            if (np.abs(states[:, :n] - self.rest[:n]).max(axis=0) <= 0.5 * self.guard).all():
+                break
+            u = 0.85 * u
+        return u
+
     def learn(self, delay: float | None, progress: Callable[[str, float], None]) -> None:
         """Identify delay, friction and parameters from a longer motion."""
         assert self.wiring is not None  # push() came first
@@ -347,7 +371,7 @@ class _Wizard:
             factor = min(1.6, 0.6 / self.share[i])
             level = factor * self.share[i] * channel.limit / max(1.0, abs(self.wiring.inputs[i]))
             parts.append(self._one(i, doublets(level, widths, 0.3, self.rig.period)))
-        u = np.vstack(parts)
+        u = self._modest(np.vstack(parts))
         for _ in range(6):
             self._settle()
             try:
@@ -378,11 +402,17 @@ class _Wizard:
                 verdict="right" if good else "wrong",
                 remedy="" if good else "Something moves that the model does not have",
             )  # fmt: skip
+        # A scale that was only measured by small pushes is not exact enough to blame others.
+        sure = all(
+            abs(factor) in (0.0, 1.0, *KNOWN.values())
+            for factor in (*self.wiring.inputs, *self.wiring.encoders)
+        )
         for estimate in found.estimates.values():
             if math.isfinite(estimate.nominal) and estimate.nominal:
                 low, high = 0.75 * estimate.nominal, 1.33 * estimate.nominal
                 good = low < estimate.value < high
                 apart = estimate.high < low or estimate.low > high
+                apart = apart and sure and estimate.matters > MATTERS
                 self._add(
                     "parameter", estimate.name,
                     f"{estimate.value:.4g} ± {estimate.high - estimate.value:.2g} {estimate.unit}",

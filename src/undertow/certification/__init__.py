@@ -1,6 +1,7 @@
 """What `undertow certify` and `undertow verify` do: claims composed, shown, drawn, written."""
 
 from undertow.certification.figure import region_figure
+from undertow.certification.loop_figure import loop_figure
 from undertow.certification.report import (
     appendix_report,
     certificate_files,
@@ -23,6 +24,7 @@ __all__ = [
     "certify_appendix",
     "certify_run",
     "certify_surface",
+    "loop_figure",
     "mechanism_from_file",
     "region_figure",
     "run_report",

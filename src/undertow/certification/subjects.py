@@ -79,6 +79,8 @@ def certify_surface(
     title: str = "",
     seconds: float = 60.0,
     loop: bool = False,
+    hold: int = 0,
+    uncertain: Mapping[str, tuple[float, float]] | None = None,
     predict: bool = True,
     progress: Progress | None = None,
 ) -> Certified:
@@ -99,6 +101,9 @@ def certify_surface(
         Effort for the region on the surface; 0 leaves it out.
     loop
         Also prove how far off the target the full closed loop may start at rest: minutes.
+    hold, uncertain
+        For that proof: the input is held for so many steps of 1 ms (0: at every instant), and
+        plant parameters lie in [low, high] instead of being the law's own.
     predict
         Also predict the motion from the start, and from random ones up to it (sampled).
     progress
@@ -139,7 +144,7 @@ def certify_surface(
             keep("surface region", data, verdict)
         if loop:
             tell("the whole closed loop", 0.5)
-            keep("closed loop", *_loop(mechanism, surface, reaching_law, start))
+            keep("closed loop", *_loop(mechanism, surface, reaching_law, start, hold, uncertain))
         if predict and start.any():
             tell("prediction", 0.95)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
@@ -235,7 +240,7 @@ def _region(
         if reaches(proved.function, point.tolist()):
             break
         point = 0.999 * point
-    data = {"function": function_data(proved.function), "start": point.tolist()}
+    data = {"functions": [function_data(V) for V in proved.chain], "start": point.tolist()}
     words = ", ".join(f"{n} = {v:.4g}" for n, v in zip(motion.names, point, strict=True) if v)
     verdict = Verdict(
         f"a region of attraction on the surface contains {words}",
@@ -250,7 +255,12 @@ def _region(
 
 
 def _loop(
-    mechanism: Mechanism, surface: Surface, law: ReachingLaw, start: FloatArray
+    mechanism: Mechanism,
+    surface: Surface,
+    law: ReachingLaw,
+    start: FloatArray,
+    hold: int,
+    uncertain: Mapping[str, tuple[float, float]] | None,
 ) -> tuple[Mapping[str, object], Verdict]:
     from undertow.certify.loop_search import prove_loop
 
@@ -259,7 +269,10 @@ def _loop(
     index = int(np.argmax(away))
     reach = float(away[index]) or (1.0 if free[index].unit == "rad" else 0.5)
     try:
-        proved = prove_loop(mechanism, surface, law, coordinate=free[index].name, reach=reach)
+        proved = prove_loop(
+            mechanism, surface, law, coordinate=free[index].name, reach=reach, hold=hold,
+            uncertain=uncertain,
+        )  # fmt: skip
     except UndertowError as error:
         claim = "the full closed loop converges from rest"
         return {}, Verdict(claim, "undecided", method=str(error))

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from undertow.certify.batch import Interval
 from undertow.certify.loop import LoopMotion, LoopRates
+from undertow.certify.loop_held import HeldLoop
 from undertow.certify.loop_terminal import TerminalSet, exact_inverse, verify_terminal
 from undertow.certify.tube import Tubes, bracket
 from undertow.certify.verdict import Kind, Verdict
@@ -52,11 +53,15 @@ class LoopClaim:
         Latest time at which every tube is inside the terminal set, s.
     uncertain
         Plant parameters that are only known to lie in [low, high]; the law has its own.
+    hold
+        The law is evaluated every ``hold`` steps, first at 0, and its input held between;
+        0: at every instant.
 
     Raises
     ------
     InvalidInputError
-        For edges that do not rise from 0, or a step or horizon that is not positive.
+        For edges that do not rise from 0, a step or horizon that is not positive, or a hold
+        that is no whole number.
     """
 
     coordinate: str
@@ -65,6 +70,7 @@ class LoopClaim:
     step: float
     horizon: float
     uncertain: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    hold: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what claims nothing."""
@@ -79,6 +85,13 @@ class LoopClaim:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InvalidInputError(f"{name} of a claim", value=value, limit="finite, > 0 s")
+        if self.hold < 0 or self.hold != int(self.hold):
+            raise InvalidInputError("hold of a claim", value=self.hold, limit="a whole number ≥ 0")
+
+    @property
+    def period(self) -> float:
+        """The sampler's period rounded up, s; 0 for a law that acts at every instant."""
+        return math.nextafter(self.hold * self.step, math.inf) if self.hold else 0.0
 
     @property
     def extent(self) -> float:
@@ -94,6 +107,7 @@ class LoopClaim:
             "step": self.step,
             "horizon": self.horizon,
             "uncertain": {name: list(pair) for name, pair in self.uncertain.items()},
+            "hold": self.hold,
         }
 
     @classmethod
@@ -106,6 +120,7 @@ class LoopClaim:
             float(data["step"]),
             float(data["horizon"]),
             {str(k): (float(v[0]), float(v[1])) for k, v in data.get("uncertain", {}).items()},
+            int(data.get("hold", 0)),
         )
 
 
@@ -113,12 +128,14 @@ class TubeEnd(NamedTuple):
     """What became of L tubes.
 
     ``entered`` (L,) is the time at which each was inside the terminal set, NaN if it was not;
-    ``peak`` (L, m) bounds the demand on the way; ``steps`` counts steps of the longest.
+    ``peak`` (L, m) bounds the demand on the way; ``steps`` counts steps of the longest; ``lost``
+    (L,) marks those that burst.
     """
 
     entered: FloatArray
     peak: FloatArray
     steps: int
+    lost: NDArray[np.bool_]
 
 
 def start_tubes(motion: LoopMotion, coordinate: str, edges: Sequence[float] | FloatArray) -> Tubes:
@@ -166,7 +183,7 @@ def run_tubes(
     stop_early: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> TubeEnd:
-    """Follow tubes until they lie in the terminal set.
+    """Follow tubes until they lie in the terminal set, at a sample where the input is held.
 
     Parameters
     ----------
@@ -178,6 +195,7 @@ def run_tubes(
     started = time.process_time()
     lanes, m = tubes.middle.shape[1], motion.mechanism.m
     entered, peak = np.full(lanes, np.nan), np.zeros((lanes, m))
+    lost = np.zeros(lanes, dtype=bool)
     active = np.arange(lanes)
     inverse = exact_inverse(terminal.scale)
     square = (motion.size, motion.size)
@@ -188,17 +206,31 @@ def run_tubes(
     for i in range(m):
         rows.lo[motion.slow + i, motion.slow + i] = 1.0
         rows.hi[motion.slow + i, motion.slow + i] = 1.0
+    held = HeldLoop(motion) if motion.period else None
+    parts = max(1, round(motion.period / step))
+    if held is not None:
+        tubes = held.begin(tubes)
+        rows = Interval(
+            *(np.concatenate([a, np.zeros((motion.size, m))], axis=1) for a in (rows.lo, rows.hi))
+        )
     k, count = 0, max(1, round(horizon / step))
     while k < count and len(active):
         if time.process_time() - started > max_seconds:
             break
+        u = None
+        if held is not None and k % parts == 0:
+            tubes, u = held.sample(tubes)
         tubes, _, rates, moved = tubes.advance(step)
         k += 1
-        u = cast(LoopRates, rates).demand
-        demand = np.maximum(np.abs(u.lo), np.abs(u.hi)).T
-        peak[active] = np.maximum(peak[active], demand)
+        if held is None:
+            u = cast(LoopRates, rates).demand
+        if u is not None:
+            demand = np.maximum(np.abs(u.lo), np.abs(u.hi)).T
+            peak[active] = np.maximum(peak[active], demand)
         inside = moved & _inside(tubes.image(rows), motion.slow, terminal.widths)
+        inside &= k % parts == 0
         entered[active[inside]] = k * step
+        lost[active[~moved]] = True
         keep = moved & ~inside
         if not moved.all() and stop_early:
             break
@@ -206,7 +238,7 @@ def run_tubes(
             tubes, active = tubes.take(keep), active[keep]
         if progress is not None and k % 100 == 0:
             progress(f"{k * step:.3f} s: {len(active)} of {lanes} tubes on their way")
-    return TubeEnd(entered, peak, k)
+    return TubeEnd(entered, peak, k, lost)
 
 
 def _inside(image: Interval, slow: int, widths: FloatArray) -> NDArray[np.bool_]:
@@ -252,13 +284,15 @@ def verify_loop(
         For a claim that does not fit the mechanism.
     """
     started = time.process_time()
-    motion = LoopMotion(mechanism, surface, reaching, dict(claim.uncertain))
+    motion = LoopMotion(mechanism, surface, reaching, dict(claim.uncertain), claim.period)
     where = next((c for c in mechanism.coordinates if c.name == claim.coordinate), None)
     unit = where.unit if where is not None else ""
     text = (
         f"every start at rest with |{claim.coordinate}| ≤ {claim.extent:.6g} {unit} converges "
         "under the law with its boundary layer and clipped input"
     )
+    if claim.period:
+        text += f", its input held for {claim.hold * claim.step:.6g} s"
     if claim.uncertain:
         box = ", ".join(f"{k} in [{a:.6g}, {b:.6g}]" for k, (a, b) in claim.uncertain.items())
         text += f", for every plant with {box}"
@@ -291,7 +325,9 @@ def verify_loop(
     }
     missing = np.flatnonzero(np.isnan(result.entered))
     if len(missing):
-        first = 0.5 * (claim.edges[missing[0]] + claim.edges[missing[0] + 1])
+        # Once one is lost the others are left where they are.
+        where_to = int(np.argmax(result.lost)) if result.lost.any() else int(missing[0])
+        first = 0.5 * (claim.edges[where_to] + claim.edges[where_to + 1])
         why = method + ", a tube did not end in the terminal set"
         witness = {claim.coordinate: first}
         return Verdict(text, "undecided", unit=unit, witness=witness, method=why, details=details)

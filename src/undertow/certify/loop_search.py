@@ -12,18 +12,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from undertow.certify.loop import LoopMotion
 from undertow.certify.loop_claim import LoopClaim, run_tubes, start_tubes, verify_loop
-from undertow.certify.loop_terminal import TerminalSet, verify_terminal
+from undertow.certify.loop_terminal import TerminalSet
+from undertow.certify.loop_terminal_search import jacobian, search_terminal
 from undertow.certify.verdict import Verdict
-from undertow.errors import InfeasibleError, UnstableSurfaceError
+from undertow.errors import InfeasibleError
 from undertow.mechanism import Mechanism
 from undertow.sliding import ReachingLaw, Surface
 
-__all__ = ["ProvedLoop", "follow", "prove_loop", "search_terminal"]
+__all__ = ["ProvedLoop", "follow", "prove_loop"]
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None] | None
@@ -66,157 +66,6 @@ def follow(
     return np.array(path), np.array(times)
 
 
-def _jacobian(motion: LoopMotion, h: float = 1e-6) -> FloatArray:
-    steps = h * np.eye(motion.size)
-    return np.asarray((motion(steps)[0] - motion(-steps)[0]).T / (2 * h))
-
-
-def _worst(motion: LoopMotion, T: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the growth of ½‖x‖² on rays, per ‖x‖², and the share of the input's range used."""
-    z = np.hstack([rays @ T.T, np.zeros((len(rays), motion.mechanism.m))])
-    rate, u = motion(z)
-    square = np.sum(rays * rays, axis=1)
-    growth = np.sum(rays * np.linalg.solve(T, rate[:, : motion.slow].T).T, axis=1) / square
-    return growth, np.abs(u / motion.mechanism.input_limits).max(axis=1)
-
-
-def _refined(
-    motion: LoopMotion, T: FloatArray, rays: FloatArray, rng: np.random.Generator
-) -> float:
-    """Level with fresh rays, and rays that climb to where the conditions are tightest."""
-    count, slow = 8 * len(rays), rays.shape[1]
-    fresh = rng.normal(size=(count, slow))
-    fresh /= np.linalg.norm(fresh, axis=1, keepdims=True)
-    r = _level(motion, T, fresh)
-    for width in (0.1, 0.03, 0.01, 0.003, 0.001):
-        inner = np.concatenate([r * f * fresh for f in (0.1, 0.4, 0.7, 1.0)])
-        growth, share = _worst(motion, T, inner)
-        top = np.concatenate([np.argsort(growth)[-150:], np.argsort(share)[-50:]])
-        near = np.repeat(inner[top], 12, axis=0)
-        near = near / np.linalg.norm(near, axis=1, keepdims=True)
-        near = near + width * rng.normal(size=near.shape)
-        fresh = near / np.linalg.norm(near, axis=1, keepdims=True)
-        while r > 1e-9:
-            inner = np.concatenate([r * f * fresh for f in (0.1, 0.4, 0.7, 1.0)])
-            growth, share = _worst(motion, T, inner)
-            if (growth < 0).all() and (share < 0.985).all():
-                break
-            r *= 0.97
-    return r
-
-
-def _level(motion: LoopMotion, T: FloatArray, rays: FloatArray) -> float:
-    """Largest r with ‖x‖ falling and the demand within 98.5 % of its limits on samples."""
-
-    def holds(r: float) -> bool:
-        growth, share = _worst(motion, T, r * rays)
-        return bool((growth < 0).all() and (share < 0.985).all())
-
-    r = 1.0
-    while not holds(r) and r > 1e-6:
-        r /= 2
-    while holds(1.05 * r) and r < 1e9:
-        r *= 1.05
-    return r
-
-
-def _widths(motion: LoopMotion, T: FloatArray, A: FloatArray) -> FloatArray:
-    """σ such that s spends a fifth of the decay of ‖x‖ near 0, at most half a layer."""
-    slow = motion.slow
-    M = np.linalg.solve(T, A[:slow, :slow] @ T)
-    decay = -np.linalg.eigvalsh(0.5 * (M + M.T))[-1]
-    drag = np.linalg.norm(np.linalg.solve(T, A[:slow, slow:]), axis=0)
-    share = 0.2 * max(decay, 0.0) / (drag * len(drag))
-    return np.asarray(np.minimum(share, 0.5 * motion.gains[1]))
-
-
-def search_terminal(
-    motion: LoopMotion,
-    paths: FloatArray,
-    *,
-    trials: int = 150,
-    seed: int = 0,
-    progress: Progress = None,
-) -> TerminalSet:
-    """Find a terminal set that motions enter early, and prove it.
-
-    Parameters
-    ----------
-    paths
-        Points of motions after they reached the surface, (K, L, N): the set is made to hold
-        as many of them, as early as it can.
-    trials
-        Quadratic functions tried, by a (1+1) evolution strategy over the square root of Q
-        in the Lyapunov equation.
-
-    Raises
-    ------
-    UnstableSurfaceError
-        When the loop is not stable at the target.
-    InfeasibleError
-        When no candidate could be proved.
-    """
-    A = _jacobian(motion)
-    slow = motion.slow
-    A_slow = A[:slow, :slow]
-    rate = -np.linalg.eigvals(A_slow).real.max()
-    if not rate > 0:
-        raise UnstableSurfaceError(
-            f"terminal set of {motion.surface}",
-            value=f"slowest rate {rate:.4g} 1/s",
-            limit="> 0",
-            remedy="Start from undertow.first_surface(mechanism)",
-        )
-    rng = np.random.default_rng(seed)
-    rays = rng.normal(size=(400 * slow, slow))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    base = scipy.linalg.solve_continuous_lyapunov(A_slow.T, -np.eye(slow))
-    units = 1 / np.sqrt(np.diag(base))
-    points = paths[..., :slow]
-    best, chosen, root, width = math.inf, None, np.eye(slow), 0.8
-    for trial in range(trials):
-        change = width * rng.normal(size=(slow, slow))
-        attempt = (
-            np.diag(np.exp(rng.normal(size=slow)))
-            if trial < trials // 4
-            else scipy.linalg.expm(0.5 * (change + change.T)) @ root
-        )
-        # A floor under Q: where ‖x‖ hardly falls at 0, nothing can be proved.
-        square = attempt.T @ attempt
-        Q = (square + 0.003 * np.trace(square) * np.eye(slow)) / np.outer(units, units)
-        P = scipy.linalg.solve_continuous_lyapunov(A_slow.T, -Q)
-        try:
-            T = np.linalg.inv(np.linalg.cholesky(0.5 * (P + P.T)).T)
-        except np.linalg.LinAlgError:
-            continue
-        size = np.linalg.norm(points @ np.linalg.inv(T).T, axis=-1)
-        reach = float(np.log(size).max(axis=1).mean())
-        level = _level(motion, T, rays)
-        if reach - math.log(level) < best:
-            level = min(level, _refined(motion, T, rays, rng))
-        T, score = T * level, reach - math.log(level)
-        if trial >= trials // 4:
-            width *= 1.25 if score < best else 0.94
-        if score < best:
-            best, chosen, root = score, T, attempt
-    verdict = Verdict("a terminal set", "undecided")
-    for factor in (0.98, 0.95, 0.9, 0.8, 0.65, 0.5):
-        if chosen is None:
-            break
-        terminal = TerminalSet(chosen * factor, _widths(motion, chosen * factor, A))
-        verdict = verify_terminal(motion, terminal, max_seconds=120)
-        if progress is not None:
-            progress(f"terminal set at {factor:g} of the sampled size: {verdict.kind}")
-        if verdict:
-            return terminal
-    raise InfeasibleError(
-        f"terminal set of {motion.surface}",
-        value=str(verdict),
-        limit="a proved set",
-        remedy="Give the search more trials, or a larger decay rate to the surface",
-    )
-
-
 def prove_loop(
     mechanism: Mechanism,
     surface: Surface,
@@ -227,6 +76,7 @@ def prove_loop(
     step: float = 0.001,
     duration: float = 3.0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
+    hold: int = 0,
     widest: float | None = None,
     splits: int = 1,
     trials: int = 150,
@@ -247,6 +97,8 @@ def prove_loop(
         Longest tube, s.
     uncertain
         Plant parameters known to lie in [low, high].
+    hold
+        The law is evaluated every ``hold`` steps and its input held; 0: at every instant.
     widest
         Widest box of starts, at the target; a 350th of the reach by default.
     splits
@@ -264,7 +116,8 @@ def prove_loop(
     """
     started = time.process_time()
     law = ReachingLaw() if reaching is None else reaching
-    motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}))
+    period = math.nextafter(hold * step, math.inf) if hold else 0.0
+    motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}), period)
     terminal, reach = _terminal(motion, coordinate, reach, step, duration, trials, seed, progress)
     pending = _boxes(motion, coordinate, reach, widest)
     done: list[tuple[float, float]] = []
@@ -301,7 +154,13 @@ def prove_loop(
             remedy="Take a smaller step, narrower boxes or a longer duration",
         )
     claim = LoopClaim(
-        coordinate, tuple(edges), terminal, step, horizon + step, dict(uncertain or {})
+        coordinate,
+        tuple(edges),
+        terminal,
+        step,
+        horizon + max(1, hold) * step,
+        dict(uncertain or {}),
+        hold,
     )
     verdict = verify_loop(mechanism, surface, law, claim, progress=progress)
     return ProvedLoop(claim, verdict, time.process_time() - started)
@@ -339,7 +198,39 @@ def _terminal(
     seed: int,
     progress: Progress,
 ) -> tuple[TerminalSet, float]:
-    """Find a terminal set for the motions from up to ``reach``, and where they fail to enter."""
+    """Find a terminal set for the motions from up to ``reach``, and where they fail to enter.
+
+    A set that is made for motions from afar is not the best for those that can enter in time:
+    where many fail it is made again for a shorter reach.
+    """
+    best: tuple[TerminalSet, float] | None = None
+    for _ in range(3):
+        try:
+            found = _terminal_for(motion, coordinate, reach, step, duration, trials, seed, progress)
+        except InfeasibleError:
+            if best is None:
+                raise
+            break
+        if best is not None and found[1] <= best[1]:
+            break
+        best = found
+        if found[1] > 0.85 * reach:
+            break
+        reach = 1.2 * found[1]
+    assert best is not None
+    return best
+
+
+def _terminal_for(
+    motion: LoopMotion,
+    coordinate: str,
+    reach: float,
+    step: float,
+    duration: float,
+    trials: int,
+    seed: int,
+    progress: Progress,
+) -> tuple[TerminalSet, float]:
     names = [c.name for c in motion.mechanism.coordinates]
     x = np.zeros((64, motion.size))
     x[:, names.index(coordinate)] = np.linspace(reach / 64, reach, 64)
@@ -347,7 +238,7 @@ def _terminal(
     path, times = follow(motion, motion.from_state(x), duration, step, every)
     slow = motion.slow
     calm = np.all(np.abs(path[..., slow:]) <= 1e-3 * motion.gains[1], axis=-1)
-    rates = np.linalg.eigvals(_jacobian(motion)[:slow, :slow])
+    rates = np.linalg.eigvals(jacobian(motion)[:slow, :slow])
     alive = np.all(np.isfinite(path), axis=(0, 2)) & calm[-1]
     # The first start whose motion never settles ends the line.
     last = len(alive) if alive.all() else int(np.argmin(alive))
@@ -367,7 +258,10 @@ def _terminal(
     )
     enters = np.any(terminal.value(path) <= 1, axis=0)
     far = len(enters) if enters.all() else int(np.argmin(enters))
-    return terminal, float(x[min(far, 63), names.index(coordinate)])
+    end = float(x[min(far, 63), names.index(coordinate)])
+    if progress is not None:
+        progress(f"simulated motions from up to {end:.4g} enter within {duration:g} s")
+    return terminal, end
 
 
 def _ends(

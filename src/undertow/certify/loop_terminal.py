@@ -4,13 +4,24 @@ With y = (q, p) = T x the set is {W ≤ 1}, W = max(‖x‖, |s_i|/σ_i): an ell
 coordinates and a thin box in s.  W decreases strictly, but at 0, if for all 0 < ‖x‖ ≤ 1:
 
 1. d/dt ‖x‖² < 0 for all |s_i| ≤ σ_i ‖x‖ (there ‖x‖ is the larger part of W);
-2. |u_i| ≤ u_max for |s_i| ≤ σ_i, so the clip is not met and ṡ_i = −k_i sat(s_i/ε_i) + D_i, with
-   D = 0 where the law knows the plant; then |s_i| decreases by itself;
-3. else |D_i| < k_i sat(σ_i ‖x‖/ε_i) − … for |s_i| = σ_i r ≥ σ_i ‖x‖.
+2. |u_i| ≤ u_max for |s_i| ≤ σ_i, so the clip is not met and ṡ_i = −k_i sat(s_i/ε_i) + D_i + e_i,
+   with D = 0 where the law knows the plant and e = 0 where it acts at every instant; if both are
+   0, |s_i| decreases by itself;
+3. else |D_i| + |e_i| < k_i sat(σ_i r/ε_i) for |s_i| = σ_i r ≥ σ_i ‖x‖.
 
 A continuous positive definite W on a compact set that decreases strictly along every motion but
 0 proves convergence (a limit set would be invariant with W constant).  The set is convex and the
 coordinates exist all over it, so it lies in the non-singular set.
+
+**A held input.**  With u renewed at t_k = k T and held, e(t) = W(z(t)) (u(z(t_k)) − u(z(t))), so
+|e(t)| ≤ T |W| sup |u̇| over [t_k, t].  Let r be the largest W so far since t_k.  All these z are in
+{W ≤ r}, where u̇ = u_y ẏ + u_s ṡ is bounded by r times a constant: ẏ vanishes at 0, and
+|ṡ_i| ≤ r (k_i σ_i/ε_i + b_i), b_i r = k_i sat(σ_i r/ε_i) being what |D_i| + |e_i| is below (e is 0
+at t_k, and the first instant at which that failed would contradict the bound).  With 3. shown
+for this e, W falls whenever it equals its largest value since t_k: hence W(t) ≤ W(t_k) up to
+t_{k+1}, and W(t_{k+1}) < W(t_k) but at 0, for to come back to W(t_k) it would have to rise where
+it falls.  z(t_k) ↦ z(t_{k+1}) is continuous, so a limit point other than 0 is impossible, and
+motions converge, between samples too.
 
 The check is branch and bound over x in outward-rounded arithmetic with mean-value forms; near 0
 all three conditions are homogeneous and are decided on matrices (exactly, by rationals).
@@ -18,18 +29,15 @@ all three conditions are homogeneous and are decided on matrices (exactly, by ra
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
-from fractions import Fraction
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from undertow.certify.batch import Interval
 from undertow.certify.loop import LoopMotion
+from undertow.certify.terminal_set import TerminalSet, exact_inverse, negative_by
 from undertow.certify.tube import matmul
 from undertow.certify.verdict import Verdict
 from undertow.errors import InvalidInputError
@@ -38,122 +46,8 @@ __all__ = ["TerminalSet", "exact_inverse", "verify_terminal"]
 
 FloatArray = NDArray[np.float64]
 
-
-@dataclass(frozen=True, eq=False)
-class TerminalSet:
-    """{‖T⁻¹(q, p)‖ ≤ 1, |s_i| ≤ σ_i}.
-
-    Parameters
-    ----------
-    scale
-        T, (2n − m, 2n − m), invertible.
-    widths
-        σ, (m,), > 0, in units of s.
-
-    Raises
-    ------
-    InvalidInputError
-        For a singular or not finite T, or widths that are not positive.
-    """
-
-    scale: FloatArray
-    widths: FloatArray
-
-    def __init__(self, scale: ArrayLike, widths: ArrayLike) -> None:
-        T = np.array(scale, dtype=float)
-        sigma = np.atleast_1d(np.array(widths, dtype=float))
-        if T.ndim != 2 or T.shape[0] != T.shape[1] or not np.isfinite(T).all():
-            raise InvalidInputError(
-                "scale of a terminal set", value=T.shape, limit="square, finite"
-            )
-        if not (np.isfinite(sigma).all() and (sigma > 0).all()):
-            raise InvalidInputError(
-                "widths of a terminal set", value=widths, limit="finite and > 0"
-            )
-        if abs(np.linalg.det(T)) < 1e-300:
-            raise InvalidInputError("scale of a terminal set", value="singular", limit="invertible")
-        object.__setattr__(self, "scale", T)
-        object.__setattr__(self, "widths", sigma)
-
-    def value(self, z: ArrayLike) -> FloatArray:
-        """Return W at points z = (q, p, s), (…, N), in float64: ≤ 1 inside."""
-        points = np.asarray(z, dtype=float)
-        size = len(self.scale)
-        x = points[..., :size] @ np.linalg.inv(self.scale).T
-        part = np.abs(points[..., size:]) / self.widths
-        return np.asarray(np.maximum(np.linalg.norm(x, axis=-1), part.max(axis=-1)))
-
-    def times(self, factor: float) -> Self:
-        """Return the set grown by a factor in all coordinates."""
-        return type(self)(self.scale * factor, self.widths * factor)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers."""
-        return {"scale": self.scale.tolist(), "widths": self.widths.tolist()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild from :meth:`to_dict`."""
-        return cls(data["scale"], data["widths"])
-
-
-def exact_inverse(T: FloatArray) -> Interval:
-    """Enclose T⁻¹ of a float matrix by exact elimination over the rationals.
-
-    Raises
-    ------
-    InvalidInputError
-        For a singular matrix.
-    """
-    size = len(T)
-    rows = [
-        [Fraction(float(v)) for v in row] + [Fraction(int(i == j)) for j in range(size)]
-        for i, row in enumerate(T)
-    ]
-    for k in range(size):
-        pivot = max(range(k, size), key=lambda i: abs(rows[i][k]))
-        if rows[pivot][k] == 0:
-            raise InvalidInputError("matrix", value="singular", limit="invertible")
-        rows[k], rows[pivot] = rows[pivot], rows[k]
-        rows[k] = [v / rows[k][k] for v in rows[k]]
-        for i in range(size):
-            if i != k and rows[i][k]:
-                rows[i] = [a - rows[i][k] * b for a, b in zip(rows[i], rows[k], strict=True)]
-    near = np.array([[float(v) for v in row[size:]] for row in rows])
-    return Interval(np.nextafter(near, -np.inf), np.nextafter(near, np.inf))
-
-
-def _positive_definite(rows: list[list[Fraction]]) -> bool:
-    """Decide by exact elimination whether a symmetric rational matrix is positive definite."""
-    a = [list(row) for row in rows]
-    for k in range(len(a)):
-        if a[k][k] <= 0:
-            return False
-        for i in range(k + 1, len(a)):
-            factor = a[i][k] / a[k][k]
-            a[i] = [x - factor * y for x, y in zip(a[i], a[k], strict=True)]
-    return True
-
-
-def _negative_by(matrix: Interval, slack: float) -> bool:
-    """Whether xᵀMx ≤ −slack ‖x‖² for every M in an interval matrix (N, N)."""
-    if not (np.isfinite(matrix.lo).all() and np.isfinite(matrix.hi).all()):
-        return False
-    middle = 0.5 * (matrix.lo + matrix.hi)
-    middle = 0.5 * (middle + middle.T)
-    symmetric = 0.5 * (matrix + Interval(matrix.lo.T, matrix.hi.T))
-    away = symmetric - Interval(middle)
-    # ‖N‖₂ ≤ ‖N‖_∞ for symmetric N.
-    radius = np.maximum(np.abs(away.lo), np.abs(away.hi))
-    worst = max(math.fsum(row) for row in radius) * (1 + 1e-12)
-    shift = Fraction(worst) + Fraction(slack)
-    size = len(middle)
-    return _positive_definite(
-        [
-            [-Fraction(middle[i, j]) - (shift if i == j else 0) for j in range(size)]
-            for i in range(size)
-        ]
-    )
+#: Part of the pull k sat(σ r/ε) left to a held input where the plant is uncertain too.
+HOLD_SHARE = 0.7
 
 
 class _Enclosures:
@@ -169,6 +63,21 @@ class _Enclosures:
         sigma = terminal.widths
         # k sat(σ r/ε) ≥ r · stiff for r ≤ 1, by concavity.
         self.stiff = Interval(eta) * (Interval(sigma) / Interval(layer)).min(1.0)
+        # |ṡ_i|/σ_i ≤ fast_i r.
+        self.fast = Interval(eta) / Interval(layer) + self.stiff / Interval(sigma)
+        self.held, self.unknown = motion.period > 0, len(motion.radii) > 0
+        self.share = 1.0 if not self.unknown else HOLD_SHARE if self.held else 0.0
+        self.reach = self._reach() if self.held else np.zeros((self.m, self.m))
+
+    def _reach(self) -> FloatArray:
+        """Upper bounds of T |W_ij| over the set, (m, m)."""
+        parts = max(2, round(4000 ** (1 / self.slow)))
+        ends = np.linspace(-1.0, 1.0, parts + 1)
+        low = np.stack(np.meshgrid(*[ends[:-1]] * self.slow, indexing="ij")).reshape(self.slow, -1)
+        high = np.stack(np.meshgrid(*[ends[1:]] * self.slow, indexing="ij")).reshape(self.slow, -1)
+        keep = _total(Interval(low, high) ** 2).lo <= 1.0
+        W = self.motion.over(self.z(Interval(low[:, keep], high[:, keep]), 1.0)).W
+        return np.asarray((Interval(self.motion.period) * abs(W)).hi.max(axis=-1))
 
     def z(self, x: Interval, width: float) -> Interval:
         """Boxes of z that hold T x and |s| ≤ σ width."""
@@ -234,53 +143,99 @@ class _Enclosures:
             demand = demand + u_slope[:, j] * (one if slow <= j < slow + m else part)
         demand = demand.intersect(u)
         over = np.maximum(np.abs(demand.lo), np.abs(demand.hi)) - self.limit[:, None]
-        return (
-            square.lo,
-            decrease,
-            over.max(axis=0),
-            self._spare(push, here, moved, floor),
-            np.array(weights),
-        )
+        spare = self._spare(push, here, moved, floor)
+        if self.held:
+            still = rate_c
+            for j, part in enumerate(moved):
+                if not slow <= j < slow + m:
+                    still = still + slope[:, j] * part
+            creep = matmul(u_slope[:, :slow], still[:, None])[:, 0]
+            lag = np.einsum("ij,jl->il", self.reach, abs(creep).hi) * (1 + 1e-12)
+            left = self._left(slope, u_slope) * Interval(floor) - Interval(lag)
+            spare = np.minimum(spare, np.nan_to_num(left.lo, nan=-np.inf).min(axis=0))
+        return square.lo, decrease, over.max(axis=0), spare, np.array(weights)
+
+    def _left(self, slope: Interval, u_slope: Interval) -> Interval:
+        """Lower bound of the pull left to a held input, per r, but for u_y ẏ(x, 0), (m, L)."""
+        slow, m = self.slow, self.m
+        left = Interval(self.share) * self.stiff[:, None]
+        drift = matmul(u_slope[:, :slow], slope[:, slow : slow + m])
+        for j in range(m):
+            fast = abs(drift[:, j]) + abs(u_slope[:, slow + j]) * self.fast[j]
+            left = left - Interval(np.einsum("ij,jl->il", self.reach, fast.hi) * (1 + 1e-12))
+        return left
 
     def _spare(
         self, push: Interval, here: Any, moved: list[Interval], floor: FloatArray
     ) -> FloatArray:
         """Lower bound of (stiff − Σ|∂D/∂s|σ)‖x‖ − |D(x, 0)|; ∞ where D is 0."""
-        if not len(self.motion.radii):
+        if not self.unknown:
             return np.full(floor.shape, np.inf)
         slow, m = self.slow, self.m
         value = here.push
         for j, part in enumerate(moved):
             if not slow <= j < slow + m:
                 value = value + push[:, j] * part
-        rest = self.stiff[:, None]
+        rest = self._pull()[:, None]
         for j in range(slow, slow + m):
             rest = rest - abs(push[:, j])
         spare = rest * Interval(floor) - abs(value)
         return np.asarray(np.min(np.where(rest.lo > 0, spare.lo, -np.inf), axis=0))
 
+    def _pull(self) -> Interval:
+        """Pull that is left to what the law does not know, per r, (m,)."""
+        return Interval(1.0 - self.share) * self.stiff if self.held else self.stiff
+
+    def _falls(self, slope: Interval) -> bool:
+        """Whether ‖x‖ falls for slopes of ẋ at one box, (slow, slow + m + k, 1), |s_j| ≤ σ_j ‖x‖.
+
+        d/dt ½‖x‖² = xᵀMx + Σ_j x·c_j s_j/σ_j, and |x·c| ‖x‖ ≤ ½ (τ (x·c)² + ‖x‖²/τ) for any τ.
+        """
+        slow, m = self.slow, self.m
+        if not (np.isfinite(slope.lo).all() and np.isfinite(slope.hi).all()):
+            return False
+        M = slope[:, :slow, 0]
+        columns = [slope[:, j, 0] for j in range(slow, slow + m)]
+        for stretch in (1.0, 4.0, 16.0):
+            total, slack = M, Interval(0.0)
+            for c in columns:
+                size = max(float(_norm(c).hi), 1e-300)
+                tau = Interval(stretch) / Interval(size)
+                total = total + Interval(0.5) * tau * (c[:, None] * c[None])
+                slack = slack + Interval(0.5) / tau
+            if negative_by(total, float(slack.hi)):
+                return True
+        return False
+
     def core(self, half: float) -> bool:
         """Whether all conditions but 2 hold in the cube |x_i| ≤ half, by homogeneity."""
         ones = np.full((self.slow, 1), half)
-        _, slope, _, _, push = self.slopes(Interval(-ones, ones))
+        _, slope, _, u_slope, push = self.slopes(Interval(-ones, ones))
         slow, m = self.slow, self.m
-        # d/dt ½‖x‖² ≤ xᵀMx + ‖x‖ Σ_j ‖column_j‖ |s_j|/σ_j, |s_j|/σ_j ≤ ‖x‖.
-        drag = Interval(0.0)
-        for j in range(slow, slow + m):
-            drag = drag + _total(slope[:, j] ** 2).sqrt()
-        slack = float(drag.hi.max())
-        if not math.isfinite(slack) or not _negative_by(slope[:, :slow, 0], slack):
+        if not self._falls(slope):
             return False
-        if not len(self.motion.radii):
+        if self.held:
+            creep = matmul(u_slope[:, :slow], slope[:, :slow])
+            lag = np.array([_norm(creep[j]).hi for j in range(m)])
+            lag = np.einsum("ij,jl->il", self.reach, lag) * (1 + 1e-12)
+            if not bool((self._left(slope, u_slope).lo > lag).all()):
+                return False
+        if not self.unknown:
             return True
         for i in range(m):
-            gain = _total(push[i, :slow] ** 2).sqrt()
-            rest = self.stiff[i] - gain
+            gain = _norm(push[i, :slow])
+            rest = self._pull()[i] - gain
             for j in range(slow, slow + m):
                 rest = rest - abs(push[i, j])
             if not bool((rest.lo > 0).all()):
                 return False
         return True
+
+
+def _norm(v: Interval) -> Interval:
+    """Euclidean norm over the first axis; a sum of squares is not below 0, whatever rounding."""
+    square = _total(v**2)
+    return Interval(np.maximum(square.lo, 0.0), square.hi).sqrt()
 
 
 def _total(v: Interval) -> Interval:

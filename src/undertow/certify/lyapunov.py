@@ -172,6 +172,32 @@ class LyapunovFunction:
         e = self.exponents if exponents is None else exponents
         return LyapunovFunction(self.scale, e, coefficients, self.stretch, self.pole)
 
+    @cached_property
+    def guard(self) -> LyapunovFunction | None:
+        """A quadratic in the same coordinates whose set holds {V ≤ 1} with room, by rays.
+
+        Of some sizes the one on whose surface V is greatest at its least; None where V does
+        not reach 1 on some ray.  The checker decides whether V > 1 on that surface.
+        """
+        size = len(self.scale)
+        rays = np.random.default_rng(0).normal(size=(20000, size))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        radius = first_crossing(self, rays)
+        if not np.isfinite(radius).all():
+            return None
+        edge = rays * radius[:, None]
+        root = np.linalg.cholesky(edge.T @ edge / len(edge))
+        root = root * np.linalg.norm(np.linalg.solve(root, edge.T), axis=0).max()
+        squares = 2 * np.eye(size, dtype=np.int64)
+        guards = [
+            LyapunovFunction(
+                self.scale @ (room * root), squares, np.ones(size), self.stretch, self.pole
+            )
+            for room in (1.03, 1.06, 1.1, 1.15, 1.2)
+        ]
+        least = [float(self(g.points(rays)).min()) for g in guards]
+        return guards[int(np.argmax(least))]
+
     def lay(
         self, tape: Tape, y: Sequence[sp.Expr], y_dot: Sequence[sp.Expr]
     ) -> tuple[sp.Expr, sp.Expr]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -160,14 +160,24 @@ def reaching(
     ]
     worst = min(rows, key=lambda r: r.value)
     lower = min(r.lower for r in rows)
-    verdict = _verdict(names, bounds, rate, worst, lower, method)
+    units = [_unit(c.unit) for c in mechanism.coordinates]
+    verdict = _verdict(names, units, bounds, rate, worst, lower, method)
     largest = tuple(
         _alone(mechanism, j, spare, weights, box, tolerance, max_boxes) for j in range(n)
     )
+    if verdict.kind == "refuted":
+        does = "; ".join(str(bound) for bound in largest)
+        short = f"K falls short by {-verdict.margin:.4g} 1/s; alone it overcomes: {does}"
+        verdict = replace(verdict, method=f"{method}; {short}")
     scale = 0.0
     if lower >= 0:
         scale = _factor(spare, weights, box, bounds, m, tolerance, max_boxes)[0]
     return ReachingCertificate(verdict, largest, scale)
+
+
+def _unit(coordinate: str) -> str:
+    """Unit of the generalised force on a coordinate."""
+    return "N m" if coordinate == "rad" else "N"
 
 
 def _row(what: str, values: ArrayLike, size: int) -> list[float]:
@@ -223,13 +233,16 @@ def _balance(
 
 def _verdict(
     names: list[str],
+    units: list[str],
     bounds: list[float],
     rate: list[float],
     worst: Minimum,
     lower: float,
     method: str,
 ) -> Verdict:
-    loads = ", ".join(f"{k}: {v:.6g}" for k, v in zip(names, bounds, strict=True))
+    loads = ", ".join(
+        f"{k}: {v:.6g} {unit}" for k, v, unit in zip(names, bounds, units, strict=True)
+    )
     claim = f"K guarantees (16) with η = {rate} for disturbances |g| ≤ {{{loads}}}"
     witness = dict(zip(names, worst.point, strict=True))
     details = {"boxes": worst.boxes}
@@ -306,7 +319,7 @@ def _alone(
         matched,
         proved,
         refuted,
-        "N m" if coordinate.unit == "rad" else "N",
+        _unit(coordinate.unit),
         dict(zip(names, point, strict=True)),
         as_input,
         input_unit,

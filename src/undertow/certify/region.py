@@ -18,6 +18,15 @@ The proof, in outward-rounded arithmetic over a box D around 0:
 
 So V falls along every motion in K, which therefore cannot leave K, and V → 0.  Since V̇ < 0
 all over K but 0, V has its minimum over K there: V > 0 elsewhere, and the motion goes to 0.
+
+**Chains.**  One polynomial that falls everywhere is too much to ask of a large set.  In a chain
+V_1, V_2, … only V_1 is asked for all of the above; V_k has to fall on {V_k ≤ 1} without
+{V_(k-1) ≤ 1}.  A motion from {V_k ≤ 1} cannot leave it before it enters {V_(k-1) ≤ 1}, and does
+that in finite time, because V̇_k is bounded away from 0 on a compact set.  So by induction
+{V_k ≤ 1} is a region of attraction too.
+
+D is a guard {U ≤ 1}, |y_0| < L, inside a box: a quadratic U in the coordinates of V, around its
+set.  V > 1 is shown where U = 1 and where a face of the box has U ≤ 1.
 """
 
 from __future__ import annotations
@@ -25,7 +34,6 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -35,7 +43,7 @@ from undertow.certify.batch import Interval, IntervalArithmetic
 from undertow.certify.interval import OutwardFunction, compile_outward, derivative_tape
 from undertow.certify.lyapunov import LyapunovFunction, first_crossing
 from undertow.certify.motion import Motion, SurfaceMotion, VectorField, exact_matrix
-from undertow.certify.verdict import Verdict
+from undertow.certify.verdict import Kind, Verdict
 from undertow.codegen import Tape
 from undertow.errors import InvalidInputError
 
@@ -44,13 +52,14 @@ __all__ = ["LyapunovFunction", "SurfaceMotion", "VectorField", "first_crossing",
 FloatArray = NDArray[np.float64]
 
 
-class _Enclosures:
-    """V, V̇ and their derivatives as outward-rounded functions of x (y = B x) and of p."""
+class _Stage:
+    """V, its guard U and those of the set inside, over boxes in x (y = B x) and parameters."""
 
     def __init__(
         self,
         motion: Motion,
         V: LyapunovFunction,
+        inner: LyapunovFunction | None,
         B: FloatArray,
         parameters: Mapping[str, tuple[float, float]],
     ) -> None:
@@ -58,23 +67,25 @@ class _Enclosures:
         y = list(tape.matrix(exact_matrix(B) * sp.Matrix(x)))
         rates, _ = motion.lay(tape, y)
         value, rate = V.lay(tape, y, rates)
+        still = [sp.Integer(0)] * motion.size
+        others = [W for W in (V.guard, inner, inner and inner.guard) if W is not None]
+        parts = [value, rate, *(W.lay(tape, y, still)[0] for W in others)]
         free = [p.symbol for p in motion.parameters if p.name in parameters]
         fixed = [p for p in motion.parameters if p.name not in parameters]
         variables = [*x, *free]
-        slope = derivative_tape(tape, variables, value)
-        gradient = derivative_tape(tape, variables, rate)
+        slopes = [derivative_tape(tape, variables, part) for part in parts]
         inputs = [*variables, *(p.symbol for p in fixed)]
         self._constants = [Interval(p.value) for p in fixed]
-        self.point = self._compile(tape, inputs, [value, rate])
-        self.box = self._compile(tape, inputs, [value, rate, *slope, *gradient])
-        self._tape, self._inputs, self._gradient, self._x = tape, inputs, gradient, x
+        self.point = self._compile(tape, inputs, parts)
+        self._box = self._compile(tape, inputs, [*parts, *(d for row in slopes for d in row)])
+        self._tape, self._inputs, self._gradient, self._x = tape, inputs, slopes[1], x
         self._second: OutwardFunction | None = None
 
     def _compile(
         self, tape: Tape, inputs: Sequence[sp.Symbol], outputs: Sequence[sp.Expr]
     ) -> OutwardFunction:
         run = compile_outward(tape, inputs, outputs, IntervalArithmetic())
-        return lambda *variables: run(*variables, *self._constants)
+        return lambda *variables: [Interval.of(v) for v in run(*variables, *self._constants)]
 
     def hessian(self, box: list[Interval]) -> list[list[Interval]]:
         """Interval Hessian of V̇ in x over a box."""
@@ -82,25 +93,28 @@ class _Enclosures:
         if self._second is None:
             rows = [derivative_tape(self._tape, self._x, g) for g in self._gradient[:size]]
             self._second = self._compile(self._tape, self._inputs, [e for row in rows for e in row])
-        flat = [Interval.of(v) for v in self._second(*box)]
+        flat = self._second(*box)
         return [flat[i * size : (i + 1) * size] for i in range(size)]
 
-    def over(self, low: FloatArray, high: FloatArray) -> tuple[Interval, Interval, FloatArray]:
-        """V and V̇ over boxes (N + P, B): natural and mean-value forms, and where to split."""
+    def over(self, low: FloatArray, high: FloatArray) -> tuple[list[Interval], FloatArray]:
+        """V, V̇, U, … over boxes (N + P, B): natural and mean-value forms, and where to split."""
         size = len(low)
         middle = 0.5 * (low + high)
         box = [Interval(low[i], high[i]) for i in range(size)]
         away = [box[i] - Interval(middle[i]) for i in range(size)]
-        at = self.point(*[Interval(middle[i]) for i in range(size)])
-        value, rate, *slopes = (Interval.of(v) for v in self.box(*box))
-        mean_value, mean_rate = at
+        parts = self.point(*[Interval(row) for row in middle])
+        count = len(parts)
+        enclosed = self._box(*box)
         spread = []
         for i in range(size):
-            mean_value = mean_value + slopes[i] * away[i]
-            part = slopes[size + i] * away[i]
-            mean_rate = mean_rate + part
-            spread.append(np.broadcast_to(part.hi - part.lo, low.shape[1:]))
-        return value.intersect(mean_value), rate.intersect(mean_rate), np.array(spread)
+            for k in range(count):
+                term = enclosed[count + k * size + i] * away[i]
+                parts[k] = parts[k] + term
+                if k == 1:
+                    spread.append(np.broadcast_to(term.hi - term.lo, low.shape[1:]))
+        return [a.intersect(b) for a, b in zip(enclosed[:count], parts, strict=True)], np.array(
+            spread
+        )
 
 
 def _negative_definite(H: list[list[Interval]]) -> bool:
@@ -110,7 +124,8 @@ def _negative_definite(H: list[list[Interval]]) -> bool:
     outward-rounded arithmetic.
     """
     size = len(H)
-    middle = np.array([[float(0.5 * (h.lo + h.hi)) for h in row] for row in H])
+    with np.errstate(invalid="ignore"):  # an unbounded entry: no proof
+        middle = np.array([[float(0.5 * (h.lo + h.hi)) for h in row] for row in H])
     if not np.isfinite(middle).all():
         return False
     values, vectors = np.linalg.eigh(-0.5 * (middle + middle.T))
@@ -140,12 +155,13 @@ def _negative_definite(H: list[list[Interval]]) -> bool:
 
 def verify_region(
     motion: Motion,
-    V: LyapunovFunction,
+    V: LyapunovFunction | Sequence[LyapunovFunction],
     *,
     parameters: Mapping[str, tuple[float, float]] | None = None,
     max_boxes: int = 20_000_000,
     max_seconds: float = 600.0,
     chunk: int = 4096,
+    proved: int = 0,
 ) -> Verdict:
     """Decide whether {V ≤ 1} is a region of attraction.
 
@@ -154,12 +170,16 @@ def verify_region(
     motion
         The sliding dynamics, or any vector field.
     V
-        The function; the set is the component of {V ≤ 1} that contains 0.
+        The function; the set is the component of {V ≤ 1} that contains 0.  Or a chain of
+        functions from the innermost set to the outermost, whose {V ≤ 1} is decided.
     parameters
         Parameters that are only known to lie in [low, high], SI units; the set is
         then one for every constant value in the box (with the surface as it is).
     max_boxes, max_seconds
         Effort before giving up.
+    proved
+        So many functions at the head of the chain were proved before, with these very
+        parameters: they are taken for granted.  For searches; a proof leaves it at 0.
 
     Returns
     -------
@@ -168,125 +188,223 @@ def verify_region(
         converges.  ``refuted``: at the witness V ≤ 1 and V̇ > 0, proved in intervals.
         ``undecided``: the witness is the box where it got stuck, or where {V ≤ 1} meets the
         boundary of the box D, so that it may be unbounded or reach the singularity.
+        ``details["stage"]`` counts the function that it is about, from 1.
 
     Raises
     ------
     InvalidInputError
-        For an unknown parameter, an empty interval, or a V of another size.
+        For an unknown parameter, an empty interval, no function, or one of another size.
     """
+    chain = [V] if isinstance(V, LyapunovFunction) else list(V)
     started, used = time.monotonic(), time.process_time()
     claim = "{V ≤ 1} is a region of attraction on the surface, non-singular and compact"
     method = "branch and bound, outward-rounded float64 intervals, mean-value form"
     box_parameters = dict(parameters or {})
-    _check(motion, V, box_parameters)
+    _check(motion, chain, box_parameters)
     if not motion.at_rest:
         return Verdict(claim, "undecided", method="f(0) = 0 cannot be shown symbolically")
-    frame = _frame(motion, V)
-    if frame is None:
-        return Verdict(claim, "undecided", method="no box was found that holds {V ≤ 1}")
-    B, reach = frame
-    enclosures = _Enclosures(motion, V, B, box_parameters)
-    size = motion.size
-    names = [p.name for p in motion.parameters if p.name in box_parameters]
-    ends = np.array([box_parameters[k] for k in names], dtype=float).reshape(-1, 2).T
-
-    # The parameters in slices that cover their box: neighbours share their end.
-    cuts = [np.linspace(*box_parameters[k], 17 if len(names) == 1 else 5) for k in names]
-    slices = list(
-        itertools.product(*([Interval(a, b) for a, b in itertools.pairwise(c)] for c in cuts))
-    )
-    core = 0.25 * reach
-    for _ in range(24):
-        cube = [Interval(-c, c) for c in core]
-        if all(_negative_definite(enclosures.hessian([*cube, *part])) for part in slices):
+    boxes, core = 0, np.zeros(motion.size)
+    for k in range(proved, len(chain)):
+        frame = _frame(motion, chain[max(k - 1, 0) : k + 1])
+        if frame is None:
+            far = dict(zip(motion.names, _far_point(chain[k]).tolist(), strict=True))
+            why = "no box was found that holds {V ≤ 1}"
+            return Verdict(claim, "undecided", witness=far, method=why)
+        proof = _Proof(motion, chain[k], chain[k - 1] if k else None, frame, box_parameters)
+        left = max_seconds - (time.monotonic() - started)
+        kind, why, witness, count = proof.decide(max_boxes - boxes, left, chunk)
+        boxes += count
+        core = proof.core if k == 0 else core
+        if kind != "proved":
             break
-        core = core / 1.6
-    else:
-        return Verdict(claim, "undecided", method="V̇ is not negative definite at 0, as far as seen")
+    details = {
+        "stage": k + 1,
+        "boxes": boxes,
+        "seconds": time.monotonic() - started,
+        "process_seconds": time.process_time() - used,
+        "core": core.tolist(),
+        "box": proof.reach.tolist(),
+        "parameters": box_parameters,
+    }
+    return Verdict(claim, kind, witness=witness, method=method + why, details=details)
 
-    def finish(kind: Any, witness: FloatArray | None, boxes: int, why: str = "") -> Verdict:
-        point = {}
-        if witness is not None:
-            point = dict(zip(motion.names, (B @ witness[:size]).tolist(), strict=True))
-            point |= dict(zip(names, witness[size:].tolist(), strict=True))
-        details = {
-            "boxes": boxes,
-            "seconds": time.monotonic() - started,
-            "process_seconds": time.process_time() - used,
-            "core": core.tolist(),
-            "box": reach.tolist(),
-            "parameters": box_parameters,
-        }
-        return Verdict(claim, kind, witness=point, method=method + why, details=details)
 
-    # Boxes still to do: the inside, and the faces of D, where only V > 1 will do.
-    start = [(-reach, reach, False)]
-    if motion.odd:  # V is even: half of D will do
-        half = reach.copy()
-        half[-1] = 0.0
-        start = [(-reach, half, False)]
-    for i, end in itertools.product(range(size), (-1, 1)):
-        a, b = -reach.copy(), reach.copy()
-        a[i] = b[i] = end * reach[i]
-        start.append((a, b, True))
-    low = np.array([np.append(s[0], ends[0]) for s in start]).T
-    high = np.array([np.append(s[1], ends[1]) for s in start]).T
-    face = np.array([s[2] for s in start])
-    unit = np.append(reach, 0.5 * (ends[1] - ends[0]))
-    unit[unit == 0] = 1.0
-    count = 0
-    while low.shape[1]:
-        # Depth first: the newest boxes, which are the smallest, at the end of the arrays.
-        a, b, f = low[:, -chunk:], high[:, -chunk:], face[-chunk:]
-        low, high, face = low[:, :-chunk], high[:, :-chunk], face[:-chunk]
-        count += a.shape[1]
-        value, rate, spread = enclosures.over(a, b)
-        inside_core = (np.maximum(np.abs(a), np.abs(b))[:size] <= core[:, None]).all(0)
-        done = (value.lo > 1.0) | (~f & ((rate.hi < 0.0) | inside_core))
-        if done.all():
-            continue
-        a, b, f, spread = a[:, ~done], b[:, ~done], f[~done], spread[:, ~done]
-        tiny = ((b - a) / unit[:, None]).max(axis=0) < 1e-7
-        effort = count > max_boxes or time.monotonic() - started > max_seconds
-        suspects = np.flatnonzero(tiny) if tiny.any() else np.arange(min(len(f), 64))
-        middle = 0.5 * (a[:, suspects] + b[:, suspects])
-        at_value, at_rate = enclosures.point(*[Interval(row) for row in middle])
-        wrong = (at_value.hi <= 1.0) & ~f[suspects] & (at_rate.lo > 0.0)
-        outside = (np.abs(middle[:size]) > core[:, None]).any(0)
-        if (wrong & outside).any():
-            k = int(np.flatnonzero(wrong & outside)[0])
-            return finish("refuted", middle[:, k], count)
-        if (f[suspects] & (at_value.hi <= 1.0)).any():
-            k = int(np.flatnonzero(f[suspects] & (at_value.hi <= 1.0))[0])
-            return finish("undecided", middle[:, k], count, ", V ≤ 1 on the boundary of the box")
-        if tiny.any() or effort:
-            k = int(np.flatnonzero(tiny)[0]) if tiny.any() else 0
-            why = ", stuck in a tiny box" if tiny.any() else ", effort ran out"
-            return finish("undecided", 0.5 * (a[:, k] + b[:, k]), count, why)
-        # Split where V̇ varies most; where that is not finite, the longest side.
-        width = np.where(b > a, (b - a) / unit[:, None], 0.0)
-        weight = np.where(np.isfinite(spread).all(axis=0) & ~f, spread, width)
-        weight = np.where(width > 0.02 * width.max(axis=0), weight, 0.0)
-        axis = np.argmax(weight, axis=0)
-        columns = np.arange(a.shape[1])
-        cut = 0.5 * (a[axis, columns] + b[axis, columns])
-        left, right = b.copy(), a.copy()
-        left[axis, columns] = cut
-        right[axis, columns] = cut
-        low = np.concatenate([low, a, right], axis=1)
-        high = np.concatenate([high, left, b], axis=1)
-        face = np.concatenate([face, f, f])
-    return finish("proved", None, count)
+class _Proof:
+    """One function, over the box |B⁻¹ y| ≤ reach."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        V: LyapunovFunction,
+        inner: LyapunovFunction | None,
+        frame: tuple[FloatArray, FloatArray],
+        parameters: Mapping[str, tuple[float, float]],
+    ) -> None:
+        self.motion, self.V, self.inner = motion, V, inner
+        self.B, self.reach = frame
+        self.stage = _Stage(motion, V, inner, self.B, parameters)
+        self.names = [p.name for p in motion.parameters if p.name in parameters]
+        self.ends = np.array([parameters[k] for k in self.names], dtype=float).reshape(-1, 2).T
+        self.core = np.zeros(motion.size)
+
+    def decide(
+        self, max_boxes: int, max_seconds: float, chunk: int
+    ) -> tuple[Kind, str, dict[str, float], int]:
+        """Kind, a remark, the witness and the boxes that it took."""
+        if self.inner is None and not self._find_core():
+            return "undecided", ": V̇ is not negative definite at 0, as far as seen", {}, 0
+        suspect = self._sampled_witness()
+        if suspect is not None:
+            return "refuted", "", self._named(suspect), 0
+        return self._branch(max_boxes, time.monotonic() + max_seconds, chunk)
+
+    def _find_core(self) -> bool:
+        """A cube where V̇ = ½ xᵀHx with H ≺ 0, the parameters in slices that share their ends."""
+        ends, names = self.ends.T, self.names
+        cuts = [np.linspace(a, b, 17 if len(names) == 1 else 5) for a, b in ends]
+        slices = list(
+            itertools.product(*([Interval(a, b) for a, b in itertools.pairwise(c)] for c in cuts))
+        )
+        self.core = 0.25 * self.reach
+        for _ in range(24):
+            cube = [Interval(-c, c) for c in self.core]
+            if all(_negative_definite(self.stage.hessian([*cube, *part])) for part in slices):
+                return True
+            self.core = self.core / 1.6
+        return False
+
+    def _named(self, x: FloatArray) -> dict[str, float]:
+        size = self.motion.size
+        y = (self.B @ x[:size]).tolist()
+        return dict(zip([*self.motion.names, *self.names], [*y, *x[size:].tolist()], strict=True))
+
+    def _wrong(self, x: FloatArray, parts: Sequence[Interval]) -> NDArray[np.bool_]:
+        """Points, with V ≤ 1 and V̇ > 0 for certain, that no other function answers for."""
+        value, rate, guard = parts[:3]
+        wrong = (value.hi <= 1.0) & (rate.lo > 0.0) & (guard.hi <= 1.0)
+        if self.inner is not None:
+            return np.asarray(wrong & (parts[3].lo > 1.0))
+        return np.asarray(wrong & (np.abs(x[: len(self.core)]) > self.core[:, None]).any(0))
+
+    def _done(
+        self, a: FloatArray, b: FloatArray, face: NDArray[np.bool_], parts: Sequence[Interval]
+    ) -> NDArray[np.bool_]:
+        """Boxes that are settled; NaN settles nothing."""
+        value, rate, guard = parts[:3]
+        outside = (value.lo > 1.0) | (guard.lo > 1.0)
+        if self.inner is None:
+            home = (np.maximum(np.abs(a), np.abs(b))[: len(self.core)] <= self.core[:, None]).all(0)
+        else:
+            home = (parts[3].hi < 1.0) & (parts[4].hi < 1.0)
+        return np.asarray(outside | (~face & (((rate.hi < 0.0) & (guard.hi < 1.0)) | home)))
+
+    def _branch(
+        self, max_boxes: int, deadline: float, chunk: int
+    ) -> tuple[Kind, str, dict[str, float], int]:
+        reach = self.reach
+        low, high, face = self._start()
+        unit = np.append(reach, 0.5 * (self.ends[1] - self.ends[0]))
+        unit[unit == 0] = 1.0
+        count = 0
+        while low.shape[1]:
+            # Depth first: the newest boxes, which are the smallest, at the end of the arrays.
+            a, b, f = low[:, -chunk:], high[:, -chunk:], face[-chunk:]
+            low, high, face = low[:, :-chunk], high[:, :-chunk], face[:-chunk]
+            count += a.shape[1]
+            parts, spread = self.stage.over(a, b)
+            done = self._done(a, b, f, parts)
+            if done.all():
+                continue
+            a, b, f, spread = a[:, ~done], b[:, ~done], f[~done], spread[:, ~done]
+            tiny = ((b - a) / unit[:, None]).max(axis=0) < 1e-7
+            suspects = np.flatnonzero(tiny) if tiny.any() else np.arange(min(len(f), 64))
+            middle = 0.5 * (a[:, suspects] + b[:, suspects])
+            at = self.stage.point(*[Interval(row) for row in middle])
+            wrong = self._wrong(middle, at) & ~f[suspects]
+            if wrong.any():
+                return "refuted", "", self._named(middle[:, int(wrong.argmax())]), count
+            through = f[suspects] & (at[0].hi <= 1.0) & (at[2].hi <= 1.0)
+            if through.any():
+                where = self._named(middle[:, int(through.argmax())])
+                return "undecided", ", V ≤ 1 on the boundary of the box", where, count
+            if tiny.any() or count > max_boxes or time.monotonic() > deadline:
+                k = int(tiny.argmax())
+                why = ", stuck in a tiny box" if tiny.any() else ", effort ran out"
+                return "undecided", why, self._named(0.5 * (a[:, k] + b[:, k])), count
+            # Split where V̇ varies most; where that is not finite, the longest side.
+            width = np.where(b > a, (b - a) / unit[:, None], 0.0)
+            weight = np.where(np.isfinite(spread).all(axis=0) & ~f, spread, width)
+            weight = np.where(width > 0.02 * width.max(axis=0), weight, 0.0)
+            axis = np.argmax(weight, axis=0)
+            columns = np.arange(a.shape[1])
+            cut = 0.5 * (a[axis, columns] + b[axis, columns])
+            left, right = b.copy(), a.copy()
+            left[axis, columns] = cut
+            right[axis, columns] = cut
+            low = np.concatenate([low, a, right], axis=1)
+            high = np.concatenate([high, left, b], axis=1)
+            face = np.concatenate([face, f, f])
+        return "proved", "", {}, count
+
+    def _start(self) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Boxes to do: the inside, and the faces, where only V > 1 or U > 1 will do."""
+        size, reach, ends = self.motion.size, self.reach, self.ends
+        start = [(-reach, reach, False)]
+        if self.motion.odd:  # V is even: half of D will do
+            half = reach.copy()
+            half[-1] = 0.0
+            start = [(-reach, half, False)]
+        for i, end in itertools.product(range(size), (-1, 1)):
+            a, b = -reach.copy(), reach.copy()
+            a[i] = b[i] = end * reach[i]
+            start.append((a, b, True))
+        low = np.array([np.append(s[0], ends[0]) for s in start]).T
+        high = np.array([np.append(s[1], ends[1]) for s in start]).T
+        return low, high, np.array([s[2] for s in start])
+
+    def _sampled_witness(self) -> FloatArray | None:
+        """A point of the set's star around 0 that is wrong in intervals; None where none was met.
+
+        Samples and a few rounds of samples near the worst ones: many sets that are too large
+        are refuted here, long before branch and bound meets the place.
+        """
+        rng = np.random.default_rng(1)
+        size, count = self.motion.size, 20_000
+        rays = rng.normal(size=(count, size))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        z = rays * (first_crossing(self.V, rays) * rng.random(count) ** 0.3)[:, None]
+        p = rng.uniform(self.ends[0], self.ends[1], (count, len(self.names)))
+        for width in (0.1, 0.03, 0.01, 0.003, 0.0):
+            length = np.linalg.norm(z, axis=1)
+            near = length <= first_crossing(self.V, z / length[:, None])
+            z, p = z[near], p[near]
+            x = np.vstack([np.linalg.solve(self.B, self.V.points(z).T), p.T])
+            parts = self.stage.point(*[Interval(row) for row in x])
+            wrong = self._wrong(x, parts)
+            if wrong.any():
+                return np.asarray(x[:, int(wrong.argmax())])
+            score = parts[1].hi / np.sum(z * z, axis=1)
+            if self.inner is not None:
+                score = np.where(parts[3].hi > 1.0, score, -np.inf)
+            worst = np.argsort(np.nan_to_num(score, nan=-np.inf))[-200:]
+            z, p = np.repeat(z[worst], 20, axis=0), np.repeat(p[worst], 20, axis=0)
+            z = z + width * rng.normal(size=z.shape) * np.linalg.norm(z, axis=1, keepdims=True)
+        return None
 
 
 def _check(
-    motion: Motion, V: LyapunovFunction, parameters: Mapping[str, tuple[float, float]]
+    motion: Motion,
+    chain: Sequence[LyapunovFunction],
+    parameters: Mapping[str, tuple[float, float]],
 ) -> None:
     """Refuse what does not fit together."""
-    if V.exponents.shape[1] != motion.size:
-        raise InvalidInputError(
-            "size of a Lyapunov function", value=V.exponents.shape[1], limit=motion.size
-        )
+    if not chain:
+        raise InvalidInputError("chain of Lyapunov functions", value="empty", limit="one or more")
+    for V in chain:
+        if V.exponents.shape[1] != motion.size:
+            raise InvalidInputError(
+                "size of a Lyapunov function", value=V.exponents.shape[1], limit=motion.size
+            )
     unknown = set(parameters) - {p.name for p in motion.parameters}
     if unknown:
         raise InvalidInputError("parameter box", value=", ".join(sorted(unknown)))
@@ -297,30 +415,41 @@ def _check(
             )
 
 
-def _frame(motion: Motion, V: LyapunovFunction) -> tuple[FloatArray, FloatArray] | None:
-    """B, lower triangular, and half-sides in x = B⁻¹y of a box that holds {V ≤ 1} with room.
+def _frame(
+    motion: Motion, chain: Sequence[LyapunovFunction]
+) -> tuple[FloatArray, FloatArray] | None:
+    """B, lower triangular, and half-sides in x = B⁻¹y of a box that holds {U ≤ 1} with room.
 
     By rays in float64: the checker's faces decide whether it is so.  A triangular B keeps
     x_0 parallel to y_0, so that the box can end before the singularity and V's pole.
     """
-    rng = np.random.default_rng(0)
-    rays = rng.normal(size=(20000, motion.size))
+    rays = np.random.default_rng(0).normal(size=(20000, motion.size))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    radius = first_crossing(V, rays)
-    if not np.isfinite(radius).all():
-        return None
-    edge = V.points(rays * radius[:, None])
-    B = np.linalg.cholesky(np.cov(edge.T, bias=True) + 1e-300 * np.eye(motion.size)).reshape(
-        motion.size, motion.size
-    )
-    reach = np.abs(np.linalg.solve(B, edge.T)).max(axis=1)
+    edges = []
+    for V in chain:
+        if V.guard is None:
+            return None
+        edges.append(V.guard.points(rays))
+    B = np.linalg.cholesky(np.cov(edges[-1].T, bias=True).reshape(motion.size, motion.size))
+    reach = np.abs(np.linalg.solve(B, np.vstack(edges).T)).max(axis=1)
     room = 0.04 * reach
     ahead = np.zeros(motion.size)
     ahead[0] = 1.0
-    limit = _clear(motion, V, ahead) / B[0, 0]
+    limit = _clear(motion, chain[-1], ahead) / B[0, 0]
     if limit > reach[0]:
         room[0] = min(room[0], 0.3 * (limit - reach[0]))
     return np.asarray(B), np.asarray(reach + room)
+
+
+def _far_point(V: LyapunovFunction) -> FloatArray:
+    """A point of {V ≤ 1} on a ray along which V does not reach 1, else the farthest edge."""
+    rays = np.random.default_rng(0).normal(size=(20000, len(V.scale)))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    radius = first_crossing(V, rays)
+    bounded = np.isfinite(radius)
+    limit = 3.0 * float(np.median(radius[bounded])) if bounded.any() else 1.0
+    k = int(np.argmax(radius))
+    return np.asarray(V.points(rays[k] * min(float(radius[k]), limit)))
 
 
 def _clear(motion: Motion, V: LyapunovFunction, way: FloatArray) -> float:

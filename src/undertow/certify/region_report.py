@@ -1,32 +1,38 @@
 """Proved regions on the surface as a table: the appendix's five cases and other mechanisms.
 
 Run ``python -m undertow.certify.region_report`` for the table of ``docs/certificates.md``;
-``--only 1 4 cart_pendulum`` does some rows alone, ``--boxes`` adds the parameter boxes.
+``--only 1 4 cart_pendulum`` does some rows alone, ``--boxes`` adds the parameter boxes, ``--out
+regions.json`` keeps the functions, ``--claims regions.json`` proves kept ones without a search.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from undertow import mechanisms
 from undertow.certify.appendix import CASES
+from undertow.certify.certificate import function_data, function_of
 from undertow.certify.lyapunov import LyapunovFunction, extent
 from undertow.certify.motion import Motion, SurfaceMotion
 from undertow.certify.region import verify_region
+from undertow.certify.region_chain import Progress
 from undertow.certify.region_chart import singular_distance_on_axis
-from undertow.certify.region_search import ProvedRegion, prove_region
+from undertow.certify.region_search import prove_region
 from undertow.certify.verdict import Verdict
 from undertow.mechanism import Mechanism
 from undertow.stability import first_surface
 
-__all__ = ["Row", "report", "simulated_limit"]
+__all__ = ["Row", "motions", "read_chains", "report", "simulated_limit"]
 
 FloatArray = NDArray[np.float64]
 
@@ -54,12 +60,12 @@ class Row:
         Which surface; unit of the unactuated coordinate.
     target, simulated
         What is asked for, and how far simulated motions from rest converge.
-    region
-        The proof.
+    chain, extent
+        The functions, and how far along y_0 their set is proved to reach.
+    verdict, raised
+        The proof; the verdict with the last level raised.
     seconds
-        Process time of the search, its proofs included.
-    raised
-        Verdict on the same function with the level 5 % up.
+        Process time of the search, its proofs included; NaN where it was not searched for.
     box
         Verdict with the parameter uncertain, and its text.
     """
@@ -68,26 +74,29 @@ class Row:
     unit: str
     target: float
     simulated: float
-    region: ProvedRegion
-    seconds: float
+    chain: tuple[LyapunovFunction, ...]
+    extent: float
+    verdict: Verdict
     raised: Verdict
+    seconds: float
     box: str
 
     def markdown(self) -> str:
         """One line of the table."""
-        degree = int(self.region.function.exponents.sum(axis=1).max())
+        degree = max(int(V.exponents.sum(axis=1).max()) for V in self.chain)
+        searched = "" if math.isnan(self.seconds) else f"{self.seconds:.0f} s"
         return (
-            f"| {self.title} | {self.region.extent:.3f} {self.unit} | {self.target:.2f} "
-            f"| {self.simulated:.3f} | {degree} | {self.region.verdict.details['boxes']:,} "
-            f"| {self.seconds:.0f} s | {self.region.verdict.details['process_seconds']:.0f} s "
-            f"| {self.raised.kind} "
-            f"| {self.box} |"
+            f"| {self.title} | {self.extent:.3f} {self.unit} | {self.target:.2f} "
+            f"| {self.simulated:.3f} | {len(self.chain)}, {degree} "
+            f"| {self.verdict.details['boxes']:,} | {searched} "
+            f"| {self.verdict.kind}, {self.verdict.details['process_seconds']:.0f} s "
+            f"| {self.raised.kind} | {self.box} |"
         )
 
 
 HEAD = (
-    "| surface | proved from rest | asked | simulated | degree | boxes | search and proof "
-    "| check | level +5 % | ±5 % |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| surface | proved from rest | asked | simulated | functions, degree | boxes "
+    "| search and proof | check | level raised | ±5 % |\n|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -117,8 +126,8 @@ def simulated_limit(motion: Motion, top: float, points: int = 100) -> float:
     return float(start[good.argmin() - 1, 0]) if not good.all() else top
 
 
-def motions(only: Sequence[str] = ()) -> list[tuple[str, SurfaceMotion, float, str]]:
-    """Title, motion, target and uncertain parameter of each row."""
+def motions(only: Sequence[str] = ()) -> list[tuple[str, str, SurfaceMotion, float, str]]:
+    """Name, title, motion, target and uncertain parameter of each row."""
     rig = mechanisms.rotary_pendulum()
     rows = [
         (str(c.number), f"case {c.number}, {c.title}", SurfaceMotion(rig, c.surface), t, "r_o")
@@ -128,21 +137,29 @@ def motions(only: Sequence[str] = ()) -> list[tuple[str, SurfaceMotion, float, s
         mechanism: Mechanism = getattr(mechanisms, name)()
         motion = SurfaceMotion(mechanism, first_surface(mechanism))
         rows.append((name, name.replace("_", " "), motion, target, uncertain))
-    return [row[1:] for row in rows if not only or row[0] in only]
+    return [row for row in rows if not only or row[0] in only]
 
 
 def _box(
-    motion: SurfaceMotion, V: LyapunovFunction, name: str, way: FloatArray, part: float = 0.05
+    motion: SurfaceMotion,
+    chain: tuple[LyapunovFunction, ...],
+    name: str,
+    way: FloatArray,
+    part: float = 0.05,
 ) -> str:
-    """Prove a smaller level for every plant with one parameter ±5 %."""
+    """Prove as many functions as go for every plant with one parameter ±5 %."""
     value = next(p.value for p in motion.parameters if p.name == name)
     interval = {name: (value * (1 - part), value * (1 + part))}
-    for factor in (1.05, 1.3, 2.0, 4.0, 10.0):
-        smaller = V.times(factor)
-        verdict = verify_region(motion, smaller, parameters=interval, max_seconds=200.0)
-        if verdict:
-            return f"{name}: {extent(smaller, way):.3f}"
-    return f"{name}: {verdict.kind}"
+    for k in range(len(chain)):
+        verdict = verify_region(
+            motion, chain[: k + 1], parameters=interval, max_boxes=3_000_000, proved=k
+        )
+        if not verdict:
+            break
+        reach = extent(chain[k], way)
+    else:
+        k += 1
+    return f"{name}: {reach:.3f}" if k else f"{name}: {verdict.kind}"
 
 
 def report(
@@ -151,40 +168,78 @@ def report(
     target: float,
     uncertain: str,
     *,
-    seconds: float = 100.0,
+    programs: int = 300,
     boxes: bool = False,
+    chain: tuple[LyapunovFunction, ...] = (),
+    progress: Progress | None = None,
 ) -> Row:
-    """Prove one row, with its parameter box if asked."""
+    """Search for one row and prove it, or prove the chain that is given."""
     way = np.eye(motion.size)[0]
     free = motion.mechanism.coordinates[motion.mechanism.m]
-    started = time.process_time()
-    region = prove_region(motion, way, seconds=seconds, degrees=(2, 4, 6), goal=1.12 * target)
-    found = time.process_time()
-    raised = verify_region(motion, region.function.times(1 / 1.05), max_seconds=120.0)
     top = singular_distance_on_axis(motion, math.pi if free.unit == "rad" else 10 * target)
+    started = time.process_time()
+    if chain:
+        verdict = verify_region(motion, chain)
+        raised = verify_region(
+            motion, [*chain[:-1], chain[-1].times(1 / 1.05)], proved=len(chain) - 1
+        )
+        seconds = math.nan
+    else:
+        region = prove_region(motion, way, programs=programs, goal=1.03 * target, progress=progress)
+        chain, verdict, raised = region.chain, region.verdict, region.raised
+        seconds = time.process_time() - started
+    reach = extent(chain[-1], way) * (1 - 1e-9) if verdict else 0.0
     return Row(
         title,
         free.unit,
         target,
         simulated_limit(motion, 0.999 * top),
-        region,
-        found - started,
+        chain,
+        reach,
+        verdict,
         raised,
-        _box(motion, region.function, uncertain, way) if boxes else "",
+        seconds,
+        _box(motion, chain, uncertain, way) if boxes else "",
     )
+
+
+def read_chains(file: Path) -> dict[str, tuple[LyapunovFunction, ...]]:
+    """Return the chains of a file that ``--out`` wrote, by the names of their rows."""
+    claims = json.loads(file.read_text(encoding="utf-8"))
+    return {k: tuple(function_of(f) for f in v["functions"]) for k, v in claims.items()}
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", nargs="*", default=[], help="rows: 1 … 5, or mechanisms")
     parser.add_argument("--boxes", action="store_true", help="with a parameter ±5 %% as well")
-    parser.add_argument("--seconds", type=float, default=100.0, help="of each search")
+    parser.add_argument("--programs", type=int, default=300, help="linear programs of each search")
+    parser.add_argument("--claims", type=Path, help="prove the functions of this file, no search")
+    parser.add_argument("--out", type=Path, help="write the functions to this JSON file")
     arguments = parser.parse_args()
+    known = read_chains(arguments.claims) if arguments.claims else {}
+    claims: dict[str, object] = {}
     print(HEAD, flush=True)
-    for row in motions(arguments.only):
-        line = report(*row, seconds=arguments.seconds, boxes=arguments.boxes)
-        print(line.markdown(), flush=True)
+    for name, title, motion, target, uncertain in motions(arguments.only):
+        if known and name not in known:
+            continue
+        row = report(
+            title,
+            motion,
+            target,
+            uncertain,
+            programs=arguments.programs,
+            boxes=arguments.boxes,
+            chain=known.get(name, ()),
+            progress=lambda line: print(line, file=sys.stderr, flush=True),
+        )
+        print(row.markdown(), flush=True)
+        claims[name] = {"functions": [function_data(V) for V in row.chain]}
+        if arguments.out:
+            arguments.out.write_text(json.dumps(claims) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -24,14 +24,14 @@ Everything is outward-rounded.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from undertow.certify.batch import Interval
 
-__all__ = ["Field", "Rates", "Tubes", "bracket", "matmul"]
+__all__ = ["Field", "Rates", "Tubes", "bracket", "matmul", "stack"]
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,6 +54,9 @@ class Rates(Protocol):
     @property
     def kinked(self) -> Mask:
         """Boxes, (L,), for which it pays to say more of the points in them."""
+
+    def put(self, lanes: NDArray[np.intp], part: Self) -> Self:
+        """Return the same with some boxes' answers replaced."""
 
 
 class Paths(Protocol):
@@ -80,18 +83,8 @@ class _Motions:
         return self.tubes.middle
 
     def way(self, slope: Interval) -> Interval:
-        tubes, k = self.tubes, len(self.tubes.field.radii)
-        size = len(tubes.middle)
-        first = slope[:, :size]
-        spread = matmul(first, Interval(tubes.spread))
-        if k:
-            own = spread[:, -k:] + slope[:, size:] * Interval(tubes.field.radii[None, :, None])
-            spread = _beside(spread[:, :-k], own)
-        return (
-            _spread(spread)
-            + matmul(matmul(first, Interval(tubes.basis)), tubes.rest[:, None])[:, 0]
-            + self.span * matmul(first, self.rate[:, None])[:, 0]
-        )
+        first = slope[:, : len(self.tubes.middle)]
+        return self.tubes.way(slope) + self.span * matmul(first, self.rate[:, None])[:, 0]
 
 
 class Field(Protocol):
@@ -101,10 +94,18 @@ class Field(Protocol):
     def radii(self) -> FloatArray:
         """ρ, (k,)."""
 
-    def over(self, z: Interval, *, middle: bool = False, paths: Paths | None = None) -> Rates:
+    def over(
+        self,
+        z: Interval,
+        *,
+        middle: bool = False,
+        paths: Paths | None = None,
+        brief: bool = False,
+    ) -> Rates:
         """Enclose rates and slopes over boxes.
 
-        With ``middle`` for ξ = 0 alone; ``paths`` says more of the points in the boxes.
+        With ``middle`` for ξ = 0 alone; ``paths`` says more of the points in the boxes; with
+        ``brief`` no slopes are asked for but those of the smooth rows.
         """
 
     def bend(self, z: Interval, rate: Interval) -> Interval:
@@ -136,7 +137,7 @@ def _row_sum(a: FloatArray) -> FloatArray:
     return np.asarray(total.max(axis=0))
 
 
-def _below(upper: Interval, lower: Interval) -> Interval:
+def stack(upper: Interval, lower: Interval) -> Interval:
     """Stack two blocks of rows."""
     return Interval(np.concatenate([upper.lo, lower.lo]), np.concatenate([upper.hi, lower.hi]))
 
@@ -185,7 +186,7 @@ class Tubes:
         zero = Interval(np.minimum(rest.lo, 0.0), np.maximum(rest.hi, 0.0))
         return cls(field, middle, np.concatenate([spread, parameters], axis=1), basis, zero)
 
-    def take(self, lanes: Mask) -> Tubes:
+    def take(self, lanes: Mask | NDArray[np.intp]) -> Tubes:
         """Return some of the sets."""
         return Tubes(
             self.field,
@@ -203,6 +204,23 @@ class Tubes:
             + _spread(matmul(R, Interval(self.spread)))
             + matmul(matmul(R, Interval(self.basis)), self.rest[:, None])[:, 0]
         )
+
+    def way(self, slope: Interval) -> Interval:
+        """Enclose slope · (z − m, p − p̂) over the sets, (I, N + k, L) to (I, L)."""
+        size, k = len(self.middle), len(self.field.radii)
+        first = slope[:, :size]
+        spread = matmul(first, Interval(self.spread))
+        if k:
+            own = spread[:, -k:] + slope[:, size:] * Interval(self.field.radii[None, :, None])
+            spread = _beside(spread[:, :-k], own)
+        return (
+            _spread(spread) + matmul(matmul(first, Interval(self.basis)), self.rest[:, None])[:, 0]
+        )
+
+    def mapped(self, value: Interval, slope: Interval) -> Tubes:
+        """Apply a Lipschitz map g: ``value`` holds g(m, p̂), ``slope`` (N, N + k, L) its slopes."""
+        size = len(self.middle)
+        return self._assemble(slope[:, :size], slope[:, size:], value - Interval(self.middle))
 
     @property
     def hull(self) -> Interval:
@@ -230,15 +248,15 @@ class Tubes:
         step, third = Interval(h), 1 / Interval(3.0)
         begin, outer, rates, good = self._enclose(h)
         size = len(self.middle)
-        here = self.field.over(Interval(self.middle), middle=True)
+        here = self.field.over(Interval(self.middle), middle=True, brief=True)
         G = self.field.bend(outer, rates.rate)
         smooth = len(G.lo)
         kinked = rates.slope[smooth:]
         drawn = begin.slope[:smooth] + Interval(0.0, h) * G
-        J = _below(rates.slope[:smooth].intersect(drawn), kinked)
+        J = stack(rates.slope[:smooth].intersect(drawn), kinked)
         J_z = J[:, :size]
-        mean = _below(begin.slope[:smooth] + 0.5 * step * G, kinked)
-        along = _below(here.slope[:smooth] + third * step * G, kinked)[:, :size]
+        mean = stack(begin.slope[:smooth] + 0.5 * step * G, kinked)
+        along = stack(here.slope[:smooth] + third * step * G, kinked)[:, :size]
         # Ordered integrals of A…A for [Φ Ψ], and of A…A f(m) for the middle.
         flow, drift = mean * step, (here.rate * step)[:, None]
         term, move = J * step, drift
@@ -259,25 +277,30 @@ class Tubes:
 
     def _enclose(self, h: float) -> tuple[Rates, Interval, Rates, Mask]:
         """Find boxes that hold the motions over a step; the field at its begin and over it."""
-        start = self.hull
-        span = Interval(0.0, h)
-        begin = self.field.over(start)
+        start, span = self.hull, Interval(0.0, h)
+        begin = self.field.over(start, brief=True)
         guess = start + span * begin.rate
-        outer = rates = None
-        good: Mask = np.zeros(start.lo.shape[1], dtype=bool)
+        lanes = start.lo.shape[1]
+        outer = Interval(np.empty_like(start.lo), np.empty_like(start.hi))
+        rates, good, todo = begin, np.zeros(lanes, dtype=bool), np.arange(lanes)
+        # A set's boxes are its own: what becomes of it does not depend on the others.
         for _ in range(12):
             room = 0.05 * (guess.hi - guess.lo) + 1e-9
-            outer = Interval(guess.lo - room, guess.hi + room)
-            rates = self.field.over(outer)
-            guess = start + span * rates.rate
+            tried = Interval(guess.lo - room, guess.hi + room)
+            found = self.field.over(tried)
+            guess = start[:, todo] + span * found.rate
+            outer.lo[:, todo], outer.hi[:, todo] = tried.lo, tried.hi
+            rates = rates.put(todo, found)
             with np.errstate(invalid="ignore"):
-                good = np.all((guess.lo >= outer.lo) & (guess.hi <= outer.hi), axis=0)
-            if good.all():
+                inside = np.all((guess.lo >= tried.lo) & (guess.hi <= tried.hi), axis=0)
+            good[todo] = inside
+            if inside.all():
                 break
-        assert outer is not None
-        assert rates is not None
-        if rates.kinked.any():
-            rates = self.field.over(outer, paths=_Motions(self, rates.rate, span))
+            todo, guess = todo[~inside], guess[:, ~inside]
+        kinked = np.flatnonzero(rates.kinked)
+        if len(kinked):
+            paths = _Motions(self.take(kinked), rates.rate[:, kinked], span)
+            rates = rates.put(kinked, self.field.over(outer[:, kinked], paths=paths))
         return begin, outer, rates, good
 
     def _assemble(self, Phi: Interval, Psi: Interval, drift: Interval) -> Tubes:

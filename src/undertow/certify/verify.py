@@ -240,16 +240,23 @@ def _reaching(m: Mechanism, s: Subject, data: Mapping[str, Any], _seconds: float
     ).verdict
 
 
+#: Functions of one region that are read.
+LONGEST_CHAIN = 200
+
+
 def _region(m: Mechanism, s: Subject, data: Mapping[str, Any], seconds: float) -> Verdict:
     motion = SurfaceMotion(m, s.surface)
-    V = function_of(data["function"])
+    listed = data["functions"] if "functions" in data else [data["function"]]
+    if not 0 < len(listed) <= LONGEST_CHAIN:
+        raise ValueError(f"a chain of {len(listed)} functions")
+    chain = [function_of(item) for item in listed]
     start = [float(v) for v in data["start"]]
     verdict = verify_region(
-        motion, V, parameters=_box(data.get("parameters", {})), max_seconds=seconds
+        motion, chain, parameters=_box(data.get("parameters", {})), max_seconds=seconds
     )
     if not verdict:
         return verdict
-    if not reaches(V, start):
+    if not reaches(chain[-1], start):
         return Verdict(verdict.claim, "undecided", method="the stated start is not shown inside")
     names = ", ".join(f"{n} = {v:.6g}" for n, v in zip(motion.names, start, strict=True) if v)
     return Verdict(

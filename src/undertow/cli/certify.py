@@ -41,12 +41,30 @@ def _mechanism(name: str, settings: list[str] | None) -> Mechanism:
     return mechanism.with_parameters(**inputs.parse_values(settings)) if settings else mechanism
 
 
+def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[float, float]]:
+    """Return [low, high] of plant parameters from per cents."""
+    own = {p.name: p.value for p in mechanism.parameters}
+    box = {}
+    for name, percent in inputs.parse_values(within or ()).items():
+        if name not in own or not 0 < percent < 100:
+            raise InvalidInputError(
+                "--within",
+                value=f"{name}={percent:g}",
+                limit=f"0 to 100 per cent of one of {', '.join(sorted(own))}",
+            )
+        ends = own[name] * (1 - percent / 100), own[name] * (1 + percent / 100)
+        box[name] = (min(ends), max(ends))
+    return box
+
+
 @app.command(
     epilog=examples(
         "undertow certify rotary_pendulum --surface 'lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1'",
         "undertow certify cart_pendulum --seconds 30 --out proof",
         "undertow certify rotary_pendulum --run --start phi=40deg --set d_e=0.025 --out proof",
-        "undertow certify rotary_pendulum --loop --seconds 0 --start phi=20deg",
+        "undertow certify rotary_pendulum --loop --seconds 0 --start phi=20deg --out proof",
+        "undertow certify rotary_pendulum --loop --seconds 0 --start phi=10deg --hold 1",
+        "undertow certify rotary_pendulum --loop --seconds 0 --start phi=10deg --within m=5",
         "undertow certify --appendix",
         "undertow certify model.py:make",
     )
@@ -86,6 +104,18 @@ def certify(
             "start, or where the proof ends. Takes minutes.",
         ),
     ] = False,
+    hold: Annotated[
+        int,
+        typer.Option(help="With --loop: the input is held for this many ms. Default: not held."),
+    ] = 0,
+    within: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="With --loop: a parameter of the plant that the law knows to so many per cent "
+            "only. Repeatable.",
+            metavar="NAME=PERCENT",
+        ),
+    ] = None,
     seed: Seed = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for certificate.json and the figures.")
@@ -97,6 +127,7 @@ def certify(
     """
     from undertow import certification
     from undertow.certify.gate import certified_gate
+    from undertow.certify.loop_claim import LoopClaim
     from undertow.plot import figure_bytes
 
     if appendix == (name is not None):
@@ -111,6 +142,12 @@ def certify(
         )
     if seconds is not None and not 0 <= seconds < 1e5:
         raise InvalidInputError("--seconds", value=seconds, limit="in [0, 100000)")
+    if (hold or within) and not loop:
+        raise InvalidInputError(
+            "--hold and --within", value="without --loop", limit="options of the loop's proof"
+        )
+    if not 0 <= hold <= 1000:
+        raise InvalidInputError("--hold", value=hold, limit="whole ms, 0 to 1000")
     if out is not None:
         results.check_folder(out)
     console = terminal()
@@ -140,7 +177,7 @@ def certify(
             )
             one = certification.certify_surface(
                 mechanism, given, x0, seconds=60.0 if seconds is None else seconds,
-                loop=loop, progress=progress,
+                loop=loop, hold=hold, uncertain=_box(mechanism, within), progress=progress,
             )  # fmt: skip
             certified, report = (one,), certification.subject_report(mechanism, one)
         if out is not None:
@@ -151,6 +188,13 @@ def certify(
                     figure = certification.region_figure(item.region, title)
                     key = "region.png" if len(certified) == 1 else f"region_{index + 1}.png"
                     figures[key] = figure_bytes(figure)
+                for claim in (c for c in item.subject.claims if c.kind == "closed loop"):
+                    found = LoopClaim.from_dict(claim.data)
+                    title = f"{mechanism.name}: {item.title.removeprefix('Surface')}"
+                    picture = certification.loop_figure(
+                        mechanism, item.subject.surface, item.subject.reaching, found, title
+                    )
+                    figures["loop.png"] = figure_bytes(picture)
     written = None
     if out is not None:
         written = write(out, certification.certificate_files(mechanism, certified, figures))

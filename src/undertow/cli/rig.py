@@ -36,6 +36,7 @@ __all__ = ["drill", "replay", "run"]
         "undertow run rotary_pendulum --seconds 60 --lead 0.02",
         "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
         "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
+        "undertow run rotary_pendulum --rig realistic --swing-up --seconds 20",
     )
 )
 @reports_errors
@@ -48,6 +49,9 @@ def run(
         typer.Option(help="The simulated plant: its model, or a bench with all its flaws."),
     ] = "ideal",
     objective: Goal = "energy",
+    swing_up: Annotated[
+        bool, typer.Option("--swing-up", help="Begin hanging at rest: swing up, catch, balance.")
+    ] = False,
     setting: Settings = None,
     period: Annotated[float, typer.Option(help="Period of the fast loop, s.")] = 0.001,
     lead: Annotated[
@@ -81,7 +85,10 @@ def run(
     recipe = Recipe(
         mechanism=name,
         parameters=inputs.parse_values(setting or ()),
-        start=tuple(inputs.parse_start(belief, start or ()).tolist()),
+        start=()
+        if swing_up and not start
+        else tuple(inputs.parse_start(belief, start or ()).tolist()),
+        swing_up=swing_up,
         objective=objective,
         rig=rig,
         seed=seed,

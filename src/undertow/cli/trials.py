@@ -28,7 +28,7 @@ __all__ = ["trials"]
         "undertow trials balance --quick",
         "undertow trials swing-up",
         "undertow trials mujoco",
-        "undertow trials robustness --rigs 50",
+        "undertow trials robustness --rigs 50 --out bench",
     )
 )
 @reports_errors
@@ -57,7 +57,11 @@ def trials(
         bool, typer.Option("--quick", help="A look: three rigs, no search for catch limits.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="balance: folder for balance.csv and the figures.")
+        Path | None,
+        typer.Option(
+            help="balance: folder for balance.csv and the figures. robustness: folder for "
+            "robustness.jsonl, every run as it is made: called again, it goes on from there."
+        ),
     ] = None,
 ) -> None:
     """Run controllers on realistic rigs, over and over, and print what came of it."""
@@ -92,7 +96,8 @@ def trials(
             shown = report.robustness_report(
                 stress.robustness(
                     rigs=min(rigs, 10) if quick else rigs,
-                    seeds=5 if single and not quick else 0,
+                    seeds=3 if single and not quick else 0,
+                    ledger=None if out is None else out / "robustness.jsonl",
                     progress=progress,
                 )
             )

@@ -1,5 +1,6 @@
 """Estimators: from positions, measured one sample after another, to states."""
 
+from undertow.estimators.compensation import compensated
 from undertow.estimators.differentiators import FilteredDerivative, SuperTwisting
 from undertow.estimators.drive import Controller, Record, drive
 from undertow.estimators.interface import Estimator, Measured
@@ -13,5 +14,6 @@ __all__ = [
     "Measured",
     "Record",
     "SuperTwisting",
+    "compensated",
     "drive",
 ]

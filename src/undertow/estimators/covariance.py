@@ -8,7 +8,7 @@ from undertow.mechanism import FloatArray
 __all__ = ["carry", "correct"]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def carry(F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: float) -> None:
     """Turn P into F P Fᵀ + h diag(noise), exactly symmetric; A, of P's size, is scratch."""
     size = P.shape[0]
@@ -28,7 +28,7 @@ def carry(F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: flo
         P[i, i] += h * noise[i]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def correct(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray
 ) -> None:

@@ -61,6 +61,7 @@ class _Differentiator:
         self.period = float(positive("period of an estimator", [period], 1)[0])
         self._x = np.zeros(2 * mechanism.n)
         self._t = math.nan
+        self.disturbance = np.zeros(mechanism.m)
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""

@@ -15,7 +15,16 @@ __all__ = ["Estimator", "Measured"]
 
 
 class Estimator(Protocol):
-    """What turns measurements into states, one sample after another."""
+    """What turns measurements into states, one sample after another.
+
+    Attributes
+    ----------
+    disturbance
+        Estimated matched disturbance, (m,), in the inputs' units: what a controller may take
+        off its output; zeros where none is estimated.  The next call writes it over.
+    """
+
+    disturbance: FloatArray
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
@@ -50,6 +59,7 @@ class Measured:
 
     def __init__(self, mechanism: Mechanism) -> None:
         self._x = np.zeros(2 * mechanism.n)
+        self.disturbance = np.zeros(mechanism.m)
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""

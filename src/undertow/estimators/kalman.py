@@ -21,10 +21,18 @@ from undertow.codegen.store import content_key, generated, generators
 from undertow.errors import InvalidInputError
 from undertow.estimators.interface import positive
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.memory import BRIEF, Memory, unpacked
 from undertow.rig.interface import Measurement
 from undertow.rig.stepping import dynamics_source
 
 __all__ = ["KalmanFilter"]
+
+#: What the filter remembers: ``size`` numbers are estimated, inputs act ``lead`` periods late.
+_LAYOUT = {
+    "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
+    "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
+    "F": "size, size", "A": "size, size", "work": "6, size",
+}  # fmt: skip
 
 _BODY = f"""
 {COMPILED}
@@ -81,32 +89,33 @@ def jacobian(h, x, u, n, m, parameters, F, A, qdd, base, viscous, driven):
             F[i, j] = (1.0 if i == j else 0.0) + h * A[i, j] + 0.5 * h * h * total
 
 
-{COMPILED}
-def estimate(h, q, u, x, P, past, count, limits, parameters, noise, variance, out, F, A, work):
-    n, m = q.shape[0], u.shape[0]
-    lead = past.shape[0] - 1
+{BRIEF}
+def estimate(h, q, u, block, size, lead):
+{unpacked(_LAYOUT)}
+    start = int(count[0])
     stage, total, qdd, base, viscous, driven = (
         work[0], work[1], work[2], work[3], work[4], work[5]
     )
     for i in range(m):
-        past[count[0] % (lead + 1), i] = max(-limits[i], min(limits[i], u[i]))
-    then = past[(count[0] + 1) % (lead + 1)]
+        past[start % (lead + 1), i] = max(-limits[i], min(limits[i], u[i]))
+    then = past[(start + 1) % (lead + 1)]
     jacobian(h, x, then, n, m, parameters, F, A, qdd, base, viscous, driven)
     move(h, x, then, n, m, parameters, stage, total, qdd, viscous, driven)
     carry(F, P, A, noise, h)
     correct(x, P, q, variance, total)
-    count[0] += 1
-    for i in range(x.shape[0]):
+    count[0] = start + 1.0
+    for i in range(size):
         out[i] = x[i]
     for k in range(lead):
-        then = past[(count[0] + 1 + k) % (lead + 1)]
+        then = past[(start + 2 + k) % (lead + 1)]
         move(h, out, then, n, m, parameters, stage, total, qdd, viscous, driven)
 """
 
 
 _GENERATOR = generators(
-    "estimators/kalman.py", "estimators/covariance.py", "rig/stepping.py", "codegen/function.py"
-)
+    "estimators/kalman.py", "estimators/covariance.py", "memory.py", "rig/stepping.py",
+    "codegen/function.py",
+)  # fmt: skip
 
 
 @lru_cache(maxsize=64)
@@ -117,6 +126,7 @@ def _module(mechanism: Mechanism) -> Any:
         # numba's cache does not notice that an imported function has changed: the key does.
         header = f'"""Kalman filter of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
         parts = "from undertow.estimators.covariance import carry, correct\n"
+        parts += f"\nn, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
         return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
 
     return generated("kalman", mechanism.name, key, write)
@@ -143,6 +153,11 @@ class KalmanFilter:
     delay
         Known delay of measurement and input together, s, rounded to periods: the estimate is
         for the moment when the answer to it acts.
+
+    Attributes
+    ----------
+    disturbance
+        The estimated matched disturbance, in units of the inputs, (m,); written over.
 
     Raises
     ------
@@ -178,17 +193,19 @@ class KalmanFilter:
         self.mechanism = mechanism
         self.period = float(positive("period of an estimator", [period], 1)[0])
         size = 2 * n + (m if disturbance_drift > 0 else 0)
-        self._variance = positive("position_noise", position_noise, n) ** 2
-        self._noise = np.zeros(size)
-        self._noise[n : 2 * n] = positive("acceleration_noise", acceleration_noise, n) ** 2
-        self._noise[2 * n :] = disturbance_drift**2
-        self._x, self._out = np.zeros(size), np.zeros(size)
-        self._P, self._F, self._A = (np.zeros((size, size)) for _ in range(3))
-        self._work = np.zeros((6, size))
-        self._past = np.zeros((round(delay / period) + 1, m))
-        self._count = np.zeros(1, dtype=np.int64)
-        self._limits = mechanism.input_limits
-        self._parameters = mechanism.parameter_values
+        self._size, self._lead = size, round(delay / period)
+        memory = Memory(_LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, lead=self._lead)
+        self._block, self._count, self._past = memory.block, memory["count"], memory["past"]
+        self._x, self._out = memory["x"], memory["out"]
+        self._P: FloatArray = memory["P"]
+        self._variance = memory["variance"]
+        self._variance[:] = positive("position_noise", position_noise, n) ** 2
+        memory["noise"][n : 2 * n] = positive("acceleration_noise", acceleration_noise, n) ** 2
+        memory["noise"][2 * n :] = disturbance_drift**2
+        memory["limits"][:] = self._limits = mechanism.input_limits
+        memory["parameters"][:] = mechanism.parameter_values
+        self._state: FloatArray = self._out[: 2 * n]
+        self.disturbance = self._x[2 * n :] if size > 2 * n else np.zeros(m)
         self._estimate = _module(mechanism).estimate
         self.reset(np.zeros(2 * n))
 
@@ -216,19 +233,8 @@ class KalmanFilter:
         self._t = measurement.t
         if not 0.0 < h < 100.0 * self.period:
             h = self.period
-        self._estimate(
-            h, measurement.q, u, self._x, self._P, self._past, self._count, self._limits,
-            self._parameters, self._noise, self._variance, self._out, self._F, self._A, self._work,
-        )  # fmt: skip
-        return self._out[: 2 * self.mechanism.n]
-
-    @property
-    def disturbance(self) -> FloatArray:
-        """The estimated matched disturbance, in units of the inputs, (m,)."""
-        n, m = self.mechanism.n, self.mechanism.m
-        if len(self._x) == 2 * n:
-            return np.zeros(m)
-        return self._x[2 * n :].copy()
+        self._estimate(h, measurement.q, u, self._block, self._size, self._lead)
+        return self._state
 
     @property
     def covariance(self) -> FloatArray:

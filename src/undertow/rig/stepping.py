@@ -89,6 +89,22 @@ def advance(
             past[(j + 1) % past.shape[0], i] = x[i]
     measure(counts[0], past, delays[1], encoder, phase, noise, q)
     return t
+
+
+{COMPILED}
+def play(
+    times, inputs, rows, counts, x, drive, held, past, delays, parameters, friction, stops,
+    amplifier, gap, encoder, phase, pushes, noise, q, applied, work,
+):
+    # Inputs, (N, m), from one of the times to the next; ``rows`` gets the states there.
+    rows[0] = x
+    for k in range(times.shape[0] - 1):
+        advance(
+            times[k], times[k + 1] - times[k], counts, x, inputs[k], drive, held, past, delays,
+            parameters, friction, stops, amplifier, gap, encoder, phase, pushes, noise, q,
+            applied, work,
+        )
+        rows[k + 1] = x
 """
 
 
@@ -130,7 +146,7 @@ _GENERATOR = generators("rig/stepping.py", "rig/parts.py", "codegen/function.py"
 
 @lru_cache(maxsize=64)
 def stepping(mechanism: Mechanism) -> Any:
-    """Return the compiled module that advances a rig of this mechanism: ``advance``."""
+    """Return the compiled module that advances a rig of this mechanism: ``advance``, ``play``."""
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
 
     def write() -> str:

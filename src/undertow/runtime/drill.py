@@ -99,6 +99,7 @@ class _SpoiltEstimator:
 
     def __init__(self, honest: Estimator, spoil: Callable[[FloatArray], FloatArray], since: float):
         self.honest, self.spoil, self.since = honest, spoil, since
+        self.disturbance = honest.disturbance
 
     def reset(self, x0: ArrayLike) -> None:
         self.honest.reset(x0)

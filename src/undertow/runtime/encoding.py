@@ -80,6 +80,7 @@ def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
         "number": proposal.sequence,
         "computed_for": proposal.computed_for,
         "message": proposal.message,
+        "swing": answer.swing,
     }
     return (
         k, answer.sequence, answer.use, int(admission.accepted), admission.reason, proposal.status,
@@ -117,4 +118,5 @@ def answer_from(row: Mapping[str, Any]) -> Answer:
         memory_from(body["after"]),
         np.array(body["lanes"]),
         row["seconds"],
+        body["swing"],
     )

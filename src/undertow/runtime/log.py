@@ -17,7 +17,7 @@ import math
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -42,6 +42,10 @@ RING = 8192
 
 #: Time between transactions, s; and rows, where no thread writes.
 FLUSH, BATCH = 0.025, 250
+
+
+#: Values of one line of a table.
+Line = tuple[object, ...]
 
 
 @dataclass(frozen=True)
@@ -124,7 +128,7 @@ class Log:
         self.row = np.zeros(len(columns.names))
         self._ring = np.zeros((RING, len(columns.names)))
         self._head = self._tail = 0
-        self._waiting: deque[tuple[str, tuple[object, ...]]] = deque()
+        self._waiting: deque[tuple[str, Callable[[], Line]]] = deque()
         self._insert = f"INSERT INTO steps VALUES ({', '.join('?' * len(columns.names))})"
         self._over = threading.Event()
         self._lock = threading.Lock()
@@ -180,11 +184,11 @@ class Log:
 
     def event(self, k: int, t: float, kind: str, text: str) -> None:
         """Keep a line of ``events``."""
-        self._waiting.append(("events", (k, t, kind, text)))
+        self._waiting.append(("events", lambda: (k, t, kind, text)))
 
-    def answer(self, values: tuple[object, ...]) -> None:
-        """Keep a line of ``answers``."""
-        self._waiting.append(("answers", values))
+    def answer(self, line: Callable[[], Line]) -> None:
+        """Keep a line of ``answers``; it is made when it is written, away from the loop."""
+        self._waiting.append(("answers", line))
 
     # -- called by the thread --------------------------------------------------------------
 
@@ -196,7 +200,7 @@ class Log:
         """Write what waits, in one transaction; a disk that refuses ends the log, not the run."""
         with self._lock:
             head, count = self._head, self._head - self._tail
-            waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            waiting = self._lines()
             if not count and not waiting:
                 return
             if self.failure:
@@ -211,7 +215,18 @@ class Log:
                         self._file.execute("ROLLBACK")
             self._tail = head
 
-    def _transact(self, head: int, waiting: Sequence[tuple[str, tuple[object, ...]]]) -> None:
+    def _lines(self) -> list[tuple[str, Line]]:
+        """Make the lines that wait; one that cannot be written is counted and left out."""
+        made = []
+        for _ in range(len(self._waiting)):
+            table, line = self._waiting.popleft()
+            try:
+                made.append((table, line()))
+            except Exception:  # what an optimiser says may be anything
+                self.dropped += 1
+        return made
+
+    def _transact(self, head: int, waiting: Sequence[tuple[str, Line]]) -> None:
         places = np.arange(self._tail, head) % RING
         self._file.execute("BEGIN")
         self._file.executemany(self._insert, self._ring[places].tolist())

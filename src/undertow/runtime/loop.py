@@ -9,6 +9,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -27,6 +28,9 @@ __all__ = ["Report", "Runtime"]
 #: Time before a step is due at which the shadow rehearses, s.
 REHEARSAL = 1.5e-4
 
+#: Steps between two collections of what is young.
+COLLECT = 10_000
+
 
 @dataclass(eq=False)
 class Report:
@@ -35,14 +39,15 @@ class Report:
     Attributes
     ----------
     steps, missed
-        Steps made, and steps whose output came after the end of their period.
+        Steps made, and steps that ended after their period: output, what follows it, log.
     asleep
         Missed steps that took less than a period, but were woken too late.
     skipped
         Periods in which no step was made, because an earlier one took too long.
-    think, whole, late
+    think, whole, late, rest
         Time of the fast step's own computation between reading and writing; from when the
-        step was due to when its output was written; and to when it began.
+        step was due to when its output was written; to when it began; and what follows the
+        output: answers judged, requests made, rows of the log copied.
     shadowed, disagreed
         Steps that the shadow made again, and those in which its output was another.
     mode, stopped_by
@@ -64,6 +69,7 @@ class Report:
     think: Histogram = field(default_factory=Histogram)
     whole: Histogram = field(default_factory=Histogram)
     late: Histogram = field(default_factory=Histogram)
+    rest: Histogram = field(default_factory=Histogram)
     shadowed: int = 0
     disagreed: int = 0
     mode: Mode = Mode.IDLE
@@ -144,7 +150,7 @@ class Runtime:
 
     def _loop(self, seconds: float) -> None:
         clock, period, report = self.clock, self.controller.period, self.report
-        think, whole, late = report.think, report.whole, report.late
+        think, whole, late, rest = report.think, report.whole, report.late, report.rest
         stall = self.controller.settings.stall
         origin = self._origin = clock.now()
         k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
@@ -162,10 +168,11 @@ class Runtime:
             measurement, alarm = self._read(alarm)
             read = clock.now()
             inputs = Inputs(t, measurement, self.worker.take(t), command, alarm)
-            u = self.controller.step(inputs)
+            u = self.controller.decide(inputs)
             thought = clock.now()
             alarm = self._write(u)
             written = clock.now()
+            self.controller.follow_up()
             self._after(k, inputs)
             if self.shadow is not None:
                 self._behind.append((inputs, u.copy()))
@@ -177,15 +184,19 @@ class Runtime:
             late.add(began - due)
             think.add(thought - read)
             whole.add(written - due)
+            ended = clock.now()
+            rest.add(ended - written)
             k += 1
             report.steps = k
+            if k % COLLECT == 0 and not clock.simulated:
+                gc.collect(0)  # what an exception leaves behind; some microseconds
             if self.controller.mode == Mode.SAFE_STOP and not u.any():
                 break
             slot += 1
-            over = (written - origin) / period - slot
+            over = (ended - origin) / period - slot
             if over > 0:
                 report.missed += 1
-                report.asleep += written - began < period
+                report.asleep += ended - began < period
                 report.skipped += int(over)
                 slot += int(over)
 
@@ -240,7 +251,7 @@ class Runtime:
             if inputs.alarm:
                 log.event(k, inputs.t, "alarm", inputs.alarm)
             if inputs.answer is not None:
-                log.answer(answer_row(k, inputs.answer))
+                log.answer(partial(answer_row, k, inputs.answer))
         for note in controller.notes:
             self._tell(note.kind, note.text)
             if note.kind == "state":
@@ -305,20 +316,24 @@ class Runtime:
 
 @contextlib.contextmanager
 def _quiet_interpreter(clock: Clock) -> Iterator[None]:
-    """Keep the interpreter from pausing the loop: old objects frozen, threads yield quickly.
+    """Keep the interpreter from pausing the loop: no collections but those that the loop makes.
 
+    Old objects are frozen, and other threads yield quickly.
     The fast loop also asks for a real-time priority, where the system grants it.
     """
     if clock.simulated:
         yield
         return
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-4)
+    interval, collecting = sys.getswitchinterval(), gc.isenabled()
+    sys.setswitchinterval(2e-5)
     gc.collect()
     gc.freeze()
+    gc.disable()
     try:
         with prompt():
             yield
     finally:
         gc.unfreeze()
+        if collecting:
+            gc.enable()
         sys.setswitchinterval(interval)

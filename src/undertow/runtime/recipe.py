@@ -8,28 +8,22 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal, Self
 
-import numpy as np
-
 from undertow import mechanisms
 from undertow.cascade import Cascade, CascadeState
-from undertow.delay import delay_gate
 from undertow.errors import InvalidInputError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import MinimumEnergy, MinimumTime, Objective, state_box
 from undertow.optimiser import Budget
-from undertow.rig import Bench, IdealRig, RealisticRig, plausible_rig, srv02_rig
+from undertow.plan import Plan
+from undertow.practice import estimator_for, gate_for, goal_for
+from undertow.rig import Bench, IdealRig, RealisticRig
+from undertow.rig.presets import bench_for
 from undertow.runtime.controller import Controller
 from undertow.runtime.settings import Settings
+from undertow.runtime.slow import Answer, Request, respond
+from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
 
 __all__ = ["Recipe"]
-
-
-#: Weight of the state in minimum energy; radius of the ball in which a motion ends.
-STATE_WEIGHT, TERMINAL = 0.05, 0.05
-
-#: Periods of delay that an admitted surface must bear.
-BEARS = 6
 
 
 @dataclass(frozen=True)
@@ -56,6 +50,8 @@ class Recipe:
         Budget of a re-optimisation; without ``seconds`` it depends on the seed alone.
     period
         Of the fast loop, s.
+    swing_up
+        Begin hanging at rest, where no other start is given, and swing up.
     settings
         Limits and patience.
 
@@ -75,6 +71,7 @@ class Recipe:
     evaluations: int = 1024
     seconds: float = math.inf
     period: float = 0.001
+    swing_up: bool = False
     settings: Settings = field(default_factory=Settings)
 
     @cached_property
@@ -94,58 +91,61 @@ class Recipe:
         """Initial state, (2n,)."""
         if self.start:
             return self.belief.check_state(self.start)
+        if self.swing_up:
+            return hanging(self.belief)
         return self.belief.state(**self.belief.start)
 
     @cached_property
     def cascade(self) -> Cascade:
         """Law, optimiser and gate."""
-        ends = {
-            c.name: 0.95 * min(-c.low, c.high)
-            for c in self.belief.coordinates
-            if math.isfinite(min(-c.low, c.high))
-        }
-        goal: Objective = MinimumEnergy(
-            horizon=self.horizon,
-            state_weight=STATE_WEIGHT,
-            terminal_radius=TERMINAL,
-            constraints=state_box(**ends),
+        return Cascade(
+            self.belief,
+            goal_for(self.belief, self.objective, horizon=self.horizon),
+            warm=Budget(self.evaluations, self.seconds),
+            gate=gate_for(self.period),
+            seed=self.seed,
         )
-        if self.objective == "time":
-            goal = MinimumTime(
-                horizon=self.horizon, terminal_radius=TERMINAL, constraints=state_box(**ends)
-            )
-        warm = Budget(self.evaluations, self.seconds)
-        gate = delay_gate(BEARS * self.period, self.period)
-        return Cascade(self.belief, goal, warm=warm, gate=gate, seed=self.seed)
+
+    @cached_property
+    def swing(self) -> SwingUpAndCatch | None:
+        """Swing-up and catch, where it is wanted."""
+        if not self.swing_up:
+            return None
+        return SwingUpAndCatch(SwingUp.designed(self.belief), CatchRegion(self.belief))
+
+    def first(self) -> CascadeState:
+        """Return what the cascade starts with: the first optimum, or what awaits a catch.
+
+        Raises
+        ------
+        InfeasibleError
+            When the first optimisation finds no admissible surface.
+        """
+        if self.swing is not None:
+            return CascadeState(Plan.of(self.swing.region.surfaces[0]))
+        return self.cascade.start(self.x0)[0]
+
+    def respond(self, request: Request) -> Answer:
+        """Answer a request of the fast loop: what the slow loop computes."""
+        return respond(self.cascade, request, self.swing)
 
     @cached_property
     def bench(self) -> Bench:
         """What the realistic rig is like."""
-        if self.mechanism == "rotary_pendulum" and not self.parameters:
-            return srv02_rig()
-        return plausible_rig(self.belief)
+        return bench_for(self.belief).with_timing(period=self.period)
 
     def make_rig(self) -> RealisticRig:
         """Return the simulated rig, at the start."""
         if self.rig == "ideal":
             return IdealRig(self.belief, self.x0, self.period)
-        return RealisticRig(self.bench.with_timing(period=self.period), self.x0, self.seed)
+        return RealisticRig(self.bench, self.x0, self.seed)
 
     def make_estimator(self) -> KalmanFilter:
         """Return the estimator that suits the rig's sensors and delays."""
-        if self.rig == "ideal":
-            return KalmanFilter(self.belief, self.period, position_noise=1e-6)
-        bench, names = self.bench, [c.name for c in self.belief.coordinates]
-        counts = [bench.encoders[name].resolution for name in names]
-        delay = bench.timing.input_delay + bench.timing.measurement_delay
-        limit = float(np.min(self.belief.input_limits))
-        return KalmanFilter(
-            self.belief,
-            self.period,
-            position_noise=np.array(counts) / math.sqrt(12),
-            disturbance_drift=limit / 3 if math.isfinite(limit) else 1.0,
-            delay=delay,
-        )
+        if self.rig == "ideal":  # belief is truth: nothing disturbs it
+            exact = Bench(self.belief).with_timing(period=self.period)
+            return estimator_for(self.belief, exact, drift=0.0)
+        return estimator_for(self.belief, self.bench)
 
     def make_controller(self, memory: CascadeState) -> Controller:
         """Return the controller, idle."""
@@ -155,6 +155,7 @@ class Recipe:
             self.make_estimator(),
             period=self.period,
             settings=self.settings,
+            swing_up=self.swing,
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from undertow.cascade import Cascade
 from undertow.errors import ArtefactError
 from undertow.mechanism import FloatArray
 from undertow.results import versions
@@ -165,7 +164,7 @@ def replay_controller(
         if decisions:
             for answer in arrived:
                 judged += 1
-                misjudged += not _same_decision(controller.cascade, answer)
+                misjudged += not _same_decision(controller, answer)
         if not _same_step(controller, row, columns):
             differing += 1
             first = k if first is None else first
@@ -193,8 +192,11 @@ def _same_step(controller: Controller, row: FloatArray, columns: Columns) -> boo
     return same and controller.mode == row[3] and controller.memory.sequence == row[4]
 
 
-def _same_decision(cascade: Cascade, answer: Answer) -> bool:
-    """Let the gate judge a recorded answer again."""
+def _same_decision(controller: Controller, answer: Answer) -> bool:
+    """Let the gate judge a recorded answer again, or look for the surface that catches."""
+    cascade = controller.cascade
+    if answer.swing >= 0 and controller.swing_up is not None:
+        return controller.swing_up.region.surface(answer.x) == answer.proposal.surface
     if answer.proposal.plan is None and answer.proposal.status not in ("failed", "infeasible"):
         return True  # what the optimiser said could not be written down
     _, admission, lanes = judge(cascade, answer.before, answer.proposal, answer.x, answer.use)

@@ -20,6 +20,7 @@ import numpy as np
 from undertow.codegen.function import COMPILED, PREAMBLE
 from undertow.codegen.store import content_key, generated, generators
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.memory import BRIEF, Memory, unpacked
 from undertow.rig.interface import Measurement
 from undertow.rig.stepping import dynamics_source
 from undertow.runtime.settings import Settings
@@ -31,6 +32,13 @@ REST = 0.3
 
 #: When nothing has moved for this long a probe begins; it lasts so long, each side of it, s.
 PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
+
+#: What the watch remembers; settings: period, jump, frozen.
+_LAYOUT = {
+    "settings": "3", "band": "m", "felt": "m", "parameters": "p", "viscous": "n",
+    "last": "n", "gaps": "n", "ages": "n", "counts": "n", "quiet": "1", "expected": "2 * n",
+    "free": "n, 2 * n", "work": "3, 2 * n",
+}  # fmt: skip
 
 _BODY = f"""
 {COMPILED}
@@ -48,14 +56,12 @@ def roll(h, x, u, viscous, parameters, work):
         x[n + i] += 0.5 * h * (first[i] + second[i])
 
 
-{COMPILED}
-def believe(
-    h, q, x, u, band, jump, frozen, expected, free, last, gaps, ages, counts, quiet, felt,
-    viscous, parameters, work,
-):
+{BRIEF}
+def believe(q, x, u, block):
     # What is not believable becomes NaN; returns how many are missing, the longest gap and
     # where, and which reading is frozen (-1: none).
-    n = q.shape[0]
+{unpacked(_LAYOUT)}
+    h, jump, frozen = settings[0], settings[1], settings[2]
     for i in range(2 * n):
         expected[i] = x[i]
     roll(h, expected, u, viscous, parameters, work)
@@ -96,7 +102,7 @@ def believe(
     return missing, worst, gaps[worst], still
 """
 
-_GENERATOR = generators("runtime/sensors.py", "rig/stepping.py", "codegen/function.py")
+_GENERATOR = generators("runtime/sensors.py", "memory.py", "rig/stepping.py", "codegen/function.py")
 
 
 @lru_cache(maxsize=64)
@@ -105,7 +111,8 @@ def _module(mechanism: Mechanism) -> Any:
 
     def write() -> str:
         header = f'"""Sensor watch of {mechanism.name}; generated, do not edit."""\n\n'
-        return f"{header}{PREAMBLE}\n\n{dynamics_source(mechanism)}\n{_BODY}"
+        sizes = f"n, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
+        return f"{header}{PREAMBLE}{sizes}\n\n{dynamics_source(mechanism)}\n{_BODY}"
 
     return generated("watch", mechanism.name, key, write)
 
@@ -135,15 +142,16 @@ class SensorWatch:
         self.names = [c.name for c in mechanism.coordinates]
         n = mechanism.n
         self._believe = _module(mechanism).believe
-        self._q, self._last, self._gaps, self._nothing = (np.zeros(n) for _ in range(4))
-        self._expected, self._free, self._ages = np.zeros(2 * n), np.zeros((n, 2 * n)), np.zeros(n)
-        self._quiet, self._counts = np.zeros(1), np.full(n, 0.01)
+        memory = Memory(_LAYOUT, n=n, m=mechanism.m, p=len(mechanism.parameters))
+        self._block, self._last, self._free = memory.block, memory["last"], memory["free"]
+        self._gaps, self._ages, self._quiet = memory["gaps"], memory["ages"], memory["quiet"]
+        memory["settings"][:] = period, settings.jump, settings.frozen
+        memory["parameters"][:] = mechanism.parameter_values
+        memory["counts"][:] = 0.01
         limits = settings.limits(mechanism)
-        self.band = np.where(np.isfinite(limits), settings.dead_band * limits, 0.0)
-        self._numbers = (
-            np.zeros(mechanism.m), np.zeros(n), mechanism.parameter_values, np.zeros((3, 2 * n)),
-        )  # fmt: skip
-        self._nothing[:] = math.nan
+        self.band = memory["band"]
+        self.band[:] = np.where(np.isfinite(limits), settings.dead_band * limits, 0.0)
+        self._q, self._nothing = np.zeros(n), np.full(n, math.nan)
         low, high = settings.travels(mechanism).T
         self._low, self._high = low.tolist(), high.tolist()
         self._bounded = bool(np.isfinite([low, high]).any())
@@ -201,10 +209,8 @@ class SensorWatch:
             return None, self._wait()
         settings = self.settings
         self.missing, worst, gap, still = self._believe(
-            self.period, self._q, self._free[0] if self.first else x, u, self.band, settings.jump,
-            settings.frozen, self._expected, self._free, self._last, self._gaps, self._ages,
-            self._counts, self._quiet, *self._numbers,
-        )  # fmt: skip
+            self._q, self._free[0] if self.first else x, u, self._block
+        )
         fault = ""
         if gap > settings.patience:
             fault = f"sensor '{self.names[worst]}' lost for {1e3 * gap:.0f} ms"

@@ -17,13 +17,10 @@ from undertow.runtime.loop import Runtime
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
 from undertow.runtime.slow import (
-    Answer,
     Compute,
     InlineWorker,
-    Request,
     Worker,
     background_worker,
-    respond,
 )
 
 __all__ = ["session", "warm_up"]
@@ -76,12 +73,10 @@ def session(
         if progress is not None:
             progress(what, fraction)
 
-    def compute(request: Request) -> Answer:
-        return respond(recipe.cascade, request)
-
+    compute = recipe.respond
     tell("first optimum", 0.1)
     plant = recipe.make_rig() if rig is None else rig
-    memory, _ = recipe.cascade.start(recipe.x0)
+    memory = recipe.first()
     tell("warming up", 0.6)
     warm_up(recipe, memory, compute)
     controller = recipe.make_controller(memory)

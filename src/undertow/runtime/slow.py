@@ -30,6 +30,7 @@ from undertow.optimiser import Proposal
 from undertow.plan import Plan
 from undertow.runtime.processes import fork, pipe
 from undertow.sliding import SlidingModeLaw
+from undertow.swing_up import SwingUpAndCatch
 
 __all__ = [
     "Answer",
@@ -46,12 +47,17 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Request:
-    """What the fast loop asks: re-optimise ``memory.plan`` from x at t for use at ``use``, s."""
+    """What the fast loop asks: re-optimise ``memory.plan`` from x at t for use at ``use``, s.
+
+    With ``swing`` ≥ 0 the mechanism is being swung up, with these gains: is there a surface
+    that catches it?
+    """
 
     t: float
     x: FloatArray
     use: float
     memory: CascadeState
+    swing: int = -1
 
     @property
     def sequence(self) -> int:
@@ -77,6 +83,8 @@ class Answer:
         Numbers of the law for each surface of the plan, (S, 2mn + 2m + 1).
     seconds
         Time from request to answer, s.
+    swing
+        That of the request.
     """
 
     sequence: int
@@ -88,6 +96,7 @@ class Answer:
     memory: CascadeState
     lanes: FloatArray
     seconds: float
+    swing: int = -1
 
 
 Compute = Callable[[Request], Answer]
@@ -106,9 +115,14 @@ def lanes_of(cascade: Cascade, plan: Plan) -> FloatArray:
     return np.stack([lane(SlidingModeLaw(cascade.mechanism, s, law)) for s, law in pairs])
 
 
-def respond(cascade: Cascade, request: Request) -> Answer:
-    """Predict, re-optimise, judge; never raises."""
+def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None = None) -> Answer:
+    """Predict, re-optimise, judge; never raises.
+
+    In a swing-up: predict, and look for a surface that catches.
+    """
     began = time.perf_counter()
+    if request.swing >= 0 and swing_up is not None:
+        return _catch(cascade, request, swing_up, began)
     x = _predicted(cascade, request)
     memory = request.memory
     proposal: object = cascade.propose(memory, x, request.use)
@@ -128,6 +142,42 @@ def respond(cascade: Cascade, request: Request) -> Answer:
         after,
         lanes,
         time.perf_counter() - began,
+    )
+
+
+def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began: float) -> Answer:
+    """Return an answer whose plan is the surface that catches, if there is one."""
+    try:
+        x = swing_up.ahead(request.x, request.use - request.t, request.swing)
+        home = x - swing_up.region.turns(x)
+        surface = swing_up.region.surface(home)
+    except Exception:
+        home, surface = np.full_like(request.x, math.nan), None
+    memory = request.memory
+    plan = memory.plan if surface is None else Plan.of(surface)
+    proposal = Proposal(
+        None if surface is None else plan,
+        "infeasible" if surface is None else "converged",
+        math.inf,
+        math.inf,
+        (),
+        0,
+        time.perf_counter() - began,
+        request.sequence,
+        request.use,
+    )
+    words = "not to be caught from here" if surface is None else "comes home from here"
+    return Answer(
+        request.sequence,
+        request.use,
+        home,
+        proposal,
+        Admission(surface is not None, words, math.inf),
+        memory,
+        replace(memory, plan=plan, since=request.use, sequence=request.sequence),
+        lanes_of(cascade, plan),
+        time.perf_counter() - began,
+        request.swing,
     )
 
 

@@ -96,6 +96,7 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         (
             ("computation of the fast step", report.think),
             ("due to written", report.whole),
+            ("what follows the output", report.rest),
             ("woken late", report.late),
         )
     )

@@ -15,42 +15,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.cascade import Cascade
-from undertow.delay import bench_gate
 from undertow.errors import InfeasibleError
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import MinimumEnergy, Objective
+from undertow.objective import Objective
 from undertow.optimiser import Budget
+from undertow.practice import Goal, gate_for, goal_for
 from undertow.rig import Bench, srv02_rig
 from undertow.sliding import Surface
 from undertow.trials.steering import CascadeSteering, steady
 from undertow.trials.trial import MakeController, Outcome, trial, undisturbed
 
-__all__ = ["BASE", "OBJECTIVES", "BalanceResult", "Limits", "balance", "catch_limit", "controllers"]
+__all__ = ["BASE", "GOALS", "BalanceResult", "Limits", "balance", "catch_limit", "controllers"]
 
 Progress = Callable[[str, float], None]
 
 #: The base case of Tables 1 and 2.
 BASE = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
 
-#: Weight of the state in minimum energy, V²; price of energy in minimum time, 1/V².
-STATE_WEIGHT, ENERGY_PRICE = 0.05, 0.01
-
-#: What every admitted surface must bear: a delay, s, and so much less of the input.
-BEARS, RESERVE = 0.006, 0.15
-
-#: Radius of the ball in which the counting ends.
-TERMINAL = 0.05
-
-OBJECTIVES: dict[str, Objective] = {
-    "energy": MinimumEnergy(state_weight=STATE_WEIGHT, terminal_radius=TERMINAL),
-    "time": Objective(
-        "time",
-        lambda v: 1 + ENERGY_PRICE * (v.inputs.T * v.inputs)[0],
-        "s",
-        terminal_radius=TERMINAL,
-    ),
-}
+#: The two objectives of the paper, as they suit a bench.
+GOALS: tuple[Goal, ...] = ("energy", "time")
 
 ROWS = ("base", "one-time", "cascade")
 
@@ -89,16 +73,21 @@ class BalanceResult:
 
 
 def controllers(
-    belief: Mechanism, objective: Objective, x0: FloatArray, *, budget: int = 256, seed: int = 0
+    belief: Mechanism,
+    objective: Objective,
+    x0: FloatArray,
+    *,
+    budget: int = 256,
+    seed: int = 0,
+    period: float = 0.001,
 ) -> dict[str, MakeController]:
     """Return the three controllers of the paper's tables, by name.
 
     ``one-time`` is optimised once, from x0; ``cascade`` starts from there, and its
-    re-optimisations may spend ``budget`` rollouts each.
+    re-optimisations may spend ``budget`` rollouts each.  ``period`` is that of the
+    rig's samples, s.
     """
-    cascade = Cascade(
-        belief, objective, warm=Budget(budget), gate=bench_gate(BEARS, RESERVE), seed=seed
-    )
+    cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate_for(period), seed=seed)
     start = cascade.start(x0)
     once = start[1].surface
     assert once is not None  # start() raises otherwise
@@ -182,9 +171,10 @@ def balance(
     ideal_bench = undisturbed(belief, bench.timing.period)
     outcomes: dict[tuple[str, str], list[Outcome]] = {}
     ideal: dict[tuple[str, str], Outcome] = {}
-    parts = len(OBJECTIVES) * len(ROWS) + limits * 2 * len(ROWS)
+    parts = len(GOALS) * len(ROWS) + limits * 2 * len(ROWS)
     done = 0
-    for goal, objective in OBJECTIVES.items():
+    for goal in GOALS:
+        objective = goal_for(belief, goal)
         made = controllers(belief, objective, x0, budget=budget)
         for row in ROWS:
             what = f"minimum {goal}, {row}"
@@ -200,7 +190,7 @@ def balance(
     found: dict[str, Limits] = {}
     for row in ROWS if limits else ():
         progress(f"catch limit, {row}", done / parts)
-        goal_objective = OBJECTIVES["energy"]
+        goal_objective = goal_for(belief, "energy")
         alone = catch_limit(belief, ideal_bench, row, goal_objective, seeds=1)
         progress(f"catch limit on the bench, {row}", (done + 1) / parts)
         real = catch_limit(belief, bench, row, goal_objective, seeds=seeds)

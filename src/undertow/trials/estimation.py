@@ -12,10 +12,11 @@ import numpy as np
 from undertow.estimators import Estimator, FilteredDerivative, KalmanFilter, Measured, SuperTwisting
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.practice import estimator_for
 from undertow.rig import Bench, Measurement, srv02_rig
 from undertow.stability import first_surface
 from undertow.trials.steering import steady
-from undertow.trials.trial import Outcome, balanced, estimator_for, trial, undisturbed
+from undertow.trials.trial import Outcome, balanced, trial, undisturbed
 
 __all__ = ["EstimatorRow", "compared", "estimators_for"]
 

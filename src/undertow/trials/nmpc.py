@@ -88,6 +88,10 @@ class NMPC:
             [np.full(self.size * (self.count + 1), np.inf), np.tile(limit, self.count)]
         )
         self._box = {"lbx": -high, "ubx": high, "lbg": 0.0, "ubg": 0.0}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all plans, and count the time from 0 again."""
         self._guess = np.zeros(self.size * (self.count + 1) + self.m * self.count)
         self._plan: FloatArray = np.zeros((self.count, self.m))
         self._due = self._began = 0.0
@@ -134,5 +138,11 @@ def _terminal(belief: Mechanism, objective: Objective) -> FloatArray:
 
 
 def predictive(belief: Mechanism, objective: Objective, **settings: Any) -> MakeController:
-    """Return the maker of an NMPC controller, a new one for each run."""
-    return lambda _: NMPC(belief, objective, **settings)
+    """Return the maker of an NMPC controller: the same one for each run, set back."""
+    controller = NMPC(belief, objective, **settings)
+
+    def make(_start: FloatArray) -> NMPC:
+        controller.reset()
+        return controller
+
+    return make

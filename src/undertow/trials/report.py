@@ -16,10 +16,11 @@ from rich.text import Text
 
 from undertow import results
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
+from undertow.practice import ENERGY_PRICE, STATE_WEIGHT, TERMINAL
 from undertow.rollout import Trajectory
-from undertow.trials.balance import ENERGY_PRICE, ROWS, STATE_WEIGHT, BalanceResult
+from undertow.trials.balance import ROWS, BalanceResult
 from undertow.trials.estimation import EstimatorRow
-from undertow.trials.robustness import FACTORS, RobustnessResult
+from undertow.trials.robustness import FACTORS, SINGLE, RobustnessResult
 from undertow.trials.trial import balanced, motion, spread
 from undertow.trials.upright import EngineResult, SwingResult
 
@@ -68,7 +69,9 @@ def balance_report(result: BalanceResult) -> RenderableType:
                 )
             )
         formula = (
-            f"Φ = u² + {STATE_WEIGHT:g} xᵀx" if goal == "energy" else f"Φ = 1 + {ENERGY_PRICE:g} u²"
+            f"Φ = u² + {STATE_WEIGHT:g} xᵀx"
+            if goal == "energy"
+            else f"Φ = 1 + {ENERGY_PRICE:g} (u/u_max)²"
         )
         parts.append(
             table(
@@ -79,7 +82,8 @@ def balance_report(result: BalanceResult) -> RenderableType:
                     "settled\ns", "chatter\nV/s",
                 ),
                 rows,
-                "mean ± standard deviation over the balanced runs; costs until ‖x‖ ≤ 0.05",
+                "mean ± standard deviation over the balanced runs; "
+                f"costs until ‖x‖ ≤ {TERMINAL:g}",
             )
         )  # fmt: skip
     if result.limits:
@@ -255,13 +259,13 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
                 name,
                 f"{balanced(runs)} of {len(runs)}",
                 f"{sum(run.caught for run in runs)}",
-                *(str(spread(fair, what)) for what in ("effort", "settled", "chatter")),
+                *(str(spread(fair, what)) for what in ("cost", "effort", "settled", "chatter")),
             )
         )
     parts: list[RenderableType] = [
         table(
             "Random rigs: masses ±20 %, friction up to twice, delay up to 5 ms, a knock",
-            ("", "balanced", "caught", "∫u² dt\nV² s", "settled\ns", "chatter\nV/s"),
+            ("", "balanced", "caught", "cost\nV² s", "∫u² dt\nV² s", "settled\ns", "chatter\nV/s"),
             rows,
             f"mean ± standard deviation over the {sum(both)} rigs that all of them balanced; "
             "caught: the pendulum is up, wherever the arm is",
@@ -280,10 +284,12 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             lines.append((f"{factor}, {unit}", *cells))
         parts.append(
             table(
-                "Largest single change that is survived on every seed",
+                f"Largest single change from which all of {result.seeds} rigs come home in "
+                f"{SINGLE:g} s",
                 ("", *names),
                 lines,
-                "in brackets the first seed that a little more breaks",
+                "in brackets the first seed that a little more breaks: "
+                "1/32 of the largest change looked for",
             )
         )
     return Group(*parts)

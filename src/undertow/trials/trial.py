@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.estimators import Controller, Estimator, KalmanFilter, Record, drive
+from undertow.estimators import Controller, Estimator, Record, compensated, drive
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import Objective, state_box
-from undertow.rig import Bench, Encoder, RealisticRig
+from undertow.objective import Objective
+from undertow.practice import estimator_for
+from undertow.rig import Bench, RealisticRig
 from undertow.rollout import Event, Trajectory
 
 __all__ = [
@@ -20,8 +22,6 @@ __all__ = [
     "Outcome",
     "Spread",
     "balanced",
-    "bench_objective",
-    "estimator_for",
     "judge",
     "motion",
     "spread",
@@ -73,36 +73,6 @@ class Outcome:
     record: Record
 
 
-def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -> KalmanFilter:
-    """Return the Kalman filter that knows the bench's encoders, period and delay.
-
-    Parameters
-    ----------
-    belief
-        The controller's model.
-    bench
-        Its encoders, sampling period and delays are known; nothing else is.
-    drift
-        Density of the matched disturbance's drift, input units per √s; by default a third
-        of the smallest input limit.  0 estimates none.
-    """
-    sigmas = []
-    for c in belief.coordinates:
-        encoder = bench.encoders.get(c.name, Encoder())
-        sigmas.append(max(math.hypot(encoder.resolution / math.sqrt(12), encoder.noise), 1e-6))
-    timing = bench.timing
-    if drift is None:
-        limit = float(np.min(belief.input_limits))
-        drift = limit / 3 if math.isfinite(limit) else 1.0
-    return KalmanFilter(
-        belief,
-        timing.period,
-        position_noise=sigmas,
-        disturbance_drift=drift,
-        delay=timing.input_delay + timing.measurement_delay,
-    )
-
-
 def trial(
     belief: Mechanism,
     bench: Bench,
@@ -133,13 +103,15 @@ def trial(
     objective
         What the cost is counted by.
     estimator
-        By default :func:`estimator_for` the bench.
+        By default :func:`undertow.practice.estimator_for` the bench.  What it knows of a
+        matched disturbance is taken off the controller's output.
     """
     rig = RealisticRig(bench, x0, seed)
     seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
     estimator = estimator_for(belief, bench) if estimator is None else estimator
     estimator.reset(seen)
-    record = drive(rig, estimator, make(seen), seconds)
+    controller = compensated(make(seen), estimator, belief.input_limits)
+    record = drive(rig, estimator, controller, seconds)
     return judge(belief, record, seed, objective)
 
 
@@ -161,7 +133,16 @@ def judge(
     )
 
 
-def balanced(outcomes: Sequence[Outcome]) -> int:
+class Judged(Protocol):
+    """What a run that was judged tells."""
+
+    @property
+    def balanced(self) -> bool:
+        """See :class:`Outcome`."""
+        ...
+
+
+def balanced(outcomes: Sequence[Judged]) -> int:
     """Count the runs that ended balanced."""
     return sum(outcome.balanced for outcome in outcomes)
 
@@ -207,7 +188,7 @@ class Spread:
         return f"{self.mean:.{digits}f} ± {self.deviation:.{digits}f}"
 
 
-def spread(outcomes: Sequence[Outcome], what: str) -> Spread:
+def spread(outcomes: Sequence[Judged], what: str) -> Spread:
     """Return mean and standard deviation of an attribute over the balanced runs."""
     values = [float(getattr(o, what)) for o in outcomes if o.balanced]
     if not values:
@@ -229,30 +210,6 @@ def motion(mechanism: Mechanism, record: Record, every: int = 5) -> Trajectory:
         nothing,
         np.ones(count),
         Event.HORIZON,
-    )
-
-
-def bench_objective(mechanism: Mechanism) -> Objective:
-    """Return an objective that suits a bench: Σ (u_i/u_max,i)² + 0.01 xᵀx, within the ranges.
-
-    The same for every mechanism.  The weight of the state makes Theorem 1 hold, and brings
-    the driven coordinates home; finite ranges of travel are kept to 95 %.
-    """
-    limits = [float(v) if math.isfinite(v) else 1.0 for v in mechanism.input_limits]
-    ranges = {
-        c.name: 0.95 * min(-c.low, c.high)
-        for c in mechanism.coordinates
-        if math.isfinite(min(-c.low, c.high)) and min(-c.low, c.high) > 0
-    }
-    return Objective(
-        "effort and error",
-        lambda v: (
-            sum((u / limit) ** 2 for u, limit in zip(v.inputs, limits, strict=True))
-            + 0.01 * (v.states.T * v.states)[0]
-        ),
-        "s",
-        terminal_radius=0.02,
-        constraints=state_box(**ranges),
     )
 
 

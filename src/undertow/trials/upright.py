@@ -9,14 +9,14 @@ from functools import partial
 import numpy as np
 
 from undertow.cascade import Cascade
-from undertow.delay import delay_gate
-from undertow.estimators import Controller, KalmanFilter, drive
+from undertow.estimators import Controller, compensated, drive
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.optimiser import Budget
+from undertow.practice import estimator_for, gate_for, goal_for
 from undertow.rig import Bench, MuJoCoRig, plausible_rig, srv02_rig
 from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
 from undertow.trials.steering import CascadeSteering
-from undertow.trials.trial import Outcome, bench_objective, estimator_for, judge, trial
+from undertow.trials.trial import Outcome, judge, trial
 
 __all__ = [
     "ENGINES",
@@ -123,9 +123,7 @@ class EngineResult:
     admitted: int
 
 
-def engine_trial(
-    mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 256, bears: float = 0.005
-) -> EngineResult:
+def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 256) -> EngineResult:
     """Balance a mechanism of the library in MuJoCo, from its usual start, positions only.
 
     The same settings for all of them.
@@ -138,17 +136,16 @@ def engine_trial(
         Length of the run, s.
     budget
         Rollouts that one re-optimisation may spend.
-    bears
-        Delay that every admitted surface must bear, s.
     """
     x0 = mechanism.state(**mechanism.start)
     rig = MuJoCoRig(mechanism, x0)
-    objective = bench_objective(mechanism)
-    cascade = Cascade(mechanism, objective, gate=delay_gate(bears), warm=Budget(budget))
+    objective = goal_for(mechanism, "effort")
+    cascade = Cascade(mechanism, objective, gate=gate_for(rig.period), warm=Budget(budget))
     steering = CascadeSteering(cascade, cascade.start(x0))
-    kalman: KalmanFilter = estimator_for(mechanism, Bench(mechanism), drift=0.0)
+    kalman = estimator_for(mechanism, Bench(mechanism))
     kalman.reset(x0)
-    record = drive(rig, kalman, steering, seconds)
+    controller = compensated(steering, kalman, mechanism.input_limits)
+    record = drive(rig, kalman, controller, seconds)
     return EngineResult(mechanism, judge(mechanism, record, 0, objective), steering.admitted)
 
 

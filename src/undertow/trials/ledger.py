@@ -1,0 +1,106 @@
+"""A ledger of runs: each is written down as it is made; long work goes on where it ended."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from undertow.errors import ArtefactError
+from undertow.results import versions
+from undertow.trials.trial import Outcome
+
+__all__ = ["Ledger", "Result"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one run, without its record: see :class:`undertow.trials.trial.Outcome`."""
+
+    seed: int
+    balanced: bool
+    caught: bool
+    settled: float
+    cost: float
+    effort: float
+    chatter: float
+
+    @classmethod
+    def of(cls, outcome: Outcome) -> Result:
+        """Return what is kept of an outcome."""
+        return cls(**{name: getattr(outcome, name) for name in cls.__dataclass_fields__})
+
+
+class Ledger:
+    """Results by controller, what was changed, by how much, and seed; in memory or in a file.
+
+    Parameters
+    ----------
+    path
+        File of JSON lines, continued where there is one; ``None`` keeps nothing.
+    settings
+        What the runs have in common: JSON values.
+
+    Raises
+    ------
+    ArtefactError
+        When the file is of other versions or settings, or cannot be written.
+    """
+
+    def __init__(self, path: Path | None, settings: Mapping[str, Any]) -> None:
+        self.path = path
+        self._known: dict[tuple[str, str, float, int], Result] = {}
+        if path is None:
+            return
+        head = {"settings": dict(settings), "versions": versions()}
+        try:
+            text = path.read_text(encoding="utf-8") if path.exists() else ""
+            lines = text.splitlines()
+            if text and not text.endswith("\n"):  # a run was killed while it wrote
+                with path.open("a", encoding="utf-8") as file:
+                    file.write("\n")
+            if not lines:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(json.dumps(head) + "\n", encoding="utf-8")
+            elif json.loads(lines[0]) != head:
+                raise ArtefactError(
+                    f"ledger '{path}'",
+                    value="runs of other versions or settings",
+                    limit="those of now",
+                    remedy="Name another folder, or remove the file",
+                )
+            for line in lines[1:]:
+                self._take(line)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ArtefactError(
+                f"ledger '{path}'",
+                value=f"{type(error).__name__}: {error}",
+                limit="a ledger that can be read and written",
+                remedy="Name another folder, or remove the file",
+            ) from error
+
+    def _take(self, line: str) -> None:
+        try:
+            name, what, value, numbers = json.loads(line)
+        except ValueError:  # the last line of a run that was killed
+            return
+        numbers = {k: math.inf if v is None else v for k, v in numbers.items()}
+        result = Result(**numbers)
+        self._known[name, what, value, result.seed] = result
+
+    def find(self, name: str, what: str, value: float, seed: int) -> Result | None:
+        """Return the result of a run that was made already."""
+        return self._known.get((name, what, value, seed))
+
+    def keep(self, name: str, what: str, value: float, outcome: Outcome) -> Result:
+        """Keep the result of a run at once."""
+        result = self._known[name, what, value, outcome.seed] = Result.of(outcome)
+        if self.path is not None:
+            numbers = {k: v if math.isfinite(v) else None for k, v in asdict(result).items()}
+            line = json.dumps([name, what, value, numbers], allow_nan=False)
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(f"{line}\n")
+        return result
