@@ -63,7 +63,7 @@ def generations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def source(*arguments: Any) -> str:
     """Source of a kernel as a new process would find or write it."""
     kernel.compile_loop.cache_clear()
-    return str(kernel.compile_loop(*arguments)())
+    return str(kernel.compile_loop(*arguments).rollout())
 
 
 # -- equations -----------------------------------------------------------------------------------
