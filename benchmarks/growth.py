@@ -4,7 +4,7 @@ Mechanisms: pendulums with one, two and three links on a cart (n = 2, 3, 4; one 
 its usual start, minimum energy.  A re-optimisation is warm-started 0.1 s into the motion of the
 first optimum, with the default budget.  All mechanisms take turns, round after round; ratios are
 of medians to n = 2.  *Step* is what one Runge-Kutta step of one rollout costs in a batch of 256,
-without a linear end.
+in small steps throughout.
 
 The horizon and the population are varied on the rotary pendulum (d_e = 0.025, 38°), with the
 other settings as usual.
@@ -96,7 +96,7 @@ def dimensions(rounds: int, now: Clock) -> float:
 
 
 def horizons(values: list[float], rounds: int, now: Clock) -> None:
-    """Print the growth with the longest prediction, with the linear end and without."""
+    """Print the growth with the longest prediction, in large steps at the end and in small ones."""
     rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
     x = rig.state(phi=ut.deg(38))
     tasks = {h: Task(rig, x, h) for h in progress(values, "horizons")}
@@ -116,7 +116,7 @@ def horizons(values: list[float], rounds: int, now: Clock) -> None:
         )  # fmt: skip
     table(
         "growth with the horizon",
-        ["horizon, s", "cost", "linear end, ms", "integrated, ms", "ratio"],
+        ["horizon, s", "cost", "large steps, ms", "small ones, ms", "ratio"],
         rows,
     )
 

@@ -301,7 +301,7 @@ CLAIMS = Path(__file__).parent / "data" / "region_claims.json"
 def test_the_five_cases_reach_their_targets(case: int) -> None:
     """The kept functions are proved, from rest at the asked angle on; a level 5 % up is not.
 
-    Then 20,000 motions, half of them from the boundary, stay inside and converge.
+    Then 34,000 motions, half of them from the boundary, stay inside and converge.
     """
     name, _, motion, target, _ = motions([str(case)])[0]
     chain = read_chains(CLAIMS)[name]
@@ -312,7 +312,7 @@ def test_the_five_cases_reach_their_targets(case: int) -> None:
     raised = verify_region(motion, [*inner, V.times(1 / 1.05)], proved=len(inner))
     assert raised.kind in ("refuted", "undecided")
     assert set(raised.witness) == {"phi", "phi_dot", "w_theta"}
-    y = inside(V, 20_000, seed=case)
+    y = inside(V, 34_000, seed=case)
     slowest = -1 / np.linalg.eigvals(motion.jacobian).real.max()
     fine = 50 * [(0.002, 2e-4)] + 90 * [(0.01, 1e-3)]  # the first second holds what is fast
     for seconds, h in fine + math.ceil(12.0 * slowest / 0.2) * [(0.2, 0.01)]:

@@ -10,9 +10,11 @@ import pytest
 import scipy.linalg
 
 import undertow as ut
+from undertow.cascade import TAIL
 from undertow.codegen.rows import LANES
 from undertow.mechanism import FloatArray
 from undertow.rollout import ClosedLoop
+from undertow.stability import sliding_matrix
 from undertow.tail import LinearEnd, Prepared
 
 
@@ -53,22 +55,62 @@ def test_linear_ends_agree_with_scipy(build: Callable[[], ut.Mechanism]) -> None
         np.testing.assert_allclose(prepared.P[lane], P, rtol=1e-8, atol=1e-8 * np.abs(P).max())
         power = prepared.powers[0, 5].reshape(len(A), len(A), LANES)[:, :, lane]
         np.testing.assert_allclose(power, scipy.linalg.expm(0.16 * A), atol=1e-7)
+        # ∫ e^{As} ds and ∫ e^{A(t−s)} s/t ds, from the exponential of one larger matrix.
+        n = len(A)
+        chain = np.zeros((3 * n, 3 * n))
+        chain[:n, :n], chain[:n, n : 2 * n] = A, np.eye(n)
+        chain[n : 2 * n, 2 * n :] = np.eye(n)
+        whole = scipy.linalg.expm(0.16 * chain)[:n]
+        forced = prepared.forced[0, 5].reshape(2, n, n, LANES)[..., lane]
+        np.testing.assert_allclose(forced[0], whole[:, n : 2 * n], atol=1e-7)
+        np.testing.assert_allclose(forced[1], whole[:, 2 * n :] / 0.16, atol=1e-7)
     assert stable >= LANES // 2
 
 
-def test_the_linear_end_agrees_with_integration(rig: ut.Mechanism) -> None:
-    """Cost to 0.1 %, time to 1 %, on random surfaces and states, in a fraction of the steps."""
+def _drawn(count: int) -> tuple[FloatArray, FloatArray]:
+    """Random surfaces and states of the rotary pendulum, many of them admissible."""
     rng = np.random.default_rng(5)
-    entries = np.array([-1.5, 1.7, 12.0]) * np.exp(0.5 * rng.standard_normal((200, 3)))
-    vectors = np.column_stack([-np.ones(200), entries])
-    states = rng.uniform([-1, -0.5, -1, -1], [1, 0.5, 1, 1], (200, 4))
-    exact = ClosedLoop(rig, ut.MinimumEnergy())
+    entries = np.array([-1.5, 1.7, 12.0]) * np.exp(0.5 * rng.standard_normal((count, 3)))
+    vectors = np.column_stack([-np.ones(count), entries])
+    return rng.uniform([-1, -0.5, -1, -1], [1, 0.5, 1, 1], (count, 4)), vectors
+
+
+@pytest.mark.parametrize("objective", [ut.MinimumEnergy(), ut.MinimumTime()])
+def test_large_steps_agree_with_small_ones(rig: ut.Mechanism, objective: ut.Objective) -> None:
+    """Cost and arrival to 0.1 % on random surfaces and states, in a fifth of the steps or less."""
+    states, vectors = _drawn(200)
+    exact = ClosedLoop(rig, objective)
     whole = exact.batch(states, vectors, stable_only=True)
-    ended = replace(exact, tail=5e-4).batch(states, vectors, stable_only=True)
-    both = whole.reached & ended.reached
-    assert both.sum() > 60
+    ended = replace(exact, tail=TAIL).batch(states, vectors, stable_only=True)
+    assert whole.reached.sum() > 60
     np.testing.assert_array_equal(whole.reached, ended.reached)
+    both = whole.reached
     np.testing.assert_allclose(ended.cost[both], whole.cost[both], rtol=1e-3)
+    np.testing.assert_allclose(ended.time[both], whole.time[both], rtol=1e-3)
+    assert ended.steps[both].sum() < 0.2 * both.sum() * objective.horizon / exact.step
+
+
+def test_large_steps_of_a_lane_are_its_own(rig: ut.Mechanism) -> None:
+    """A rollout does not depend on what else is in its block, to rounding."""
+    states, vectors = _drawn(40)
+    loop = ClosedLoop(rig, ut.MinimumEnergy(), tail=TAIL)
+    together = loop.batch(states, vectors, stable_only=True)
+    for k in range(0, 40, 7):
+        alone = loop.batch(states[k], vectors[k], stable_only=True)
+        assert alone.cost[0] == pytest.approx(together.cost[k], rel=1e-9, nan_ok=True)
+        assert alone.time[0] == pytest.approx(together.time[k], rel=1e-9)
+
+
+def test_what_is_too_fast_for_large_steps_takes_small_ones(rig: ut.Mechanism) -> None:
+    """A sliding mode at −200/s is integrated as without large steps, to the last bit."""
+    surface = ut.Surface(-1, -1.841, 1.078, 10.076)
+    x = np.array([0.04, 0.21, 1.96, -0.92])
+    assert np.linalg.eigvals(sliding_matrix(rig, surface)).real.min() < -150
+    exact = ClosedLoop(rig, ut.MinimumEnergy())
+    small, large = exact.batch(x, surface), replace(exact, tail=TAIL).batch(x, surface)
+    assert small.reached[0]
+    assert (small.cost[0], small.time[0]) == (large.cost[0], large.time[0])
+    assert large.steps[0] > small.steps[0]  # it was tried
 
 
 def test_a_fast_pass_through_the_terminal_set_is_seen(rig: ut.Mechanism) -> None:

@@ -329,7 +329,7 @@ class Cascade:
             When no admissible surface was found.
         """
         proposal, plan, cost = self._global(self.optimiser, x)
-        if not math.isfinite(cost):  # the linear end was too hopeful: integrate throughout
+        if not math.isfinite(cost):  # large steps were too hopeful: small ones throughout
             exact = replace(self.optimiser, loop=self.loop)
             proposal, plan, cost = self._global(exact, x)
         return CascadeState(plan, 0, cost, cost), proposal

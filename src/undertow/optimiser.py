@@ -223,7 +223,7 @@ class Optimiser:
 
     @property
     def _promptness(self) -> float:
-        """Part of the horizon to plan for: the linear end may be late by its tolerance."""
+        """Part of the horizon to plan for: a prediction may be early by its tolerance."""
         return 1.0 - min(0.5 * self.loop.tail, 0.1)
 
     def propose(

@@ -166,10 +166,10 @@ class ClosedLoop:
     escape
         ‖x‖₂ beyond which a motion counts as diverged.
     tail
-        Relative tolerance δ at which a batch hands over to the exact linear end, see
-        :mod:`undertow.tail`; 0 integrates to the end.  Used by :meth:`batch` where belief
-        and truth agree, the loop is continuous, there are no path constraints and the
-        stage cost has a second-order model; otherwise everything is integrated.
+        Relative tolerance of the large steps that a batch takes once the law is in its
+        boundary layer, see :mod:`undertow.codegen.settle`; 0: small steps to the end.  Used by
+        :meth:`batch` where belief and truth agree, the loop is continuous, there are no path
+        constraints and the stage cost has a second-order model.
 
     Examples
     --------

@@ -371,8 +371,8 @@ def certified_gate(
     base
         The gate that comes first: stable, feasible, cost not raised (Lemma 3).
     tail
-        Relative tolerance at which the base gate's predictions hand over to the exact linear
-        end (see :mod:`undertow.tail`); 0 integrates to the terminal set.
+        Relative tolerance of the large steps in which the base gate's predictions end (see
+        :mod:`undertow.codegen.settle`); 0: small steps to the terminal set.
 
     Returns
     -------

@@ -243,7 +243,7 @@ class _Writer:
         layers = [r.lane[symbol] for symbol in self.program.lane_inputs[-1 - m : -1]]
         return [
             f"calm = {r.active} > 0.0",
-            *(f"calm = calm & (abs({s}) <= 0.9 * {e})" for s, e in zip(r.s, layers, strict=True)),
+            *(f"calm = calm & (abs({s}) <= 0.1 * {e})" for s, e in zip(r.s, layers, strict=True)),
             *(f"calm = calm & (abs({row}) <= 0.5 * _limit_{j})" for j, row in enumerate(r.u)),
             f"code, active = {r.code}, {r.active}",
             f"{r.code} = {settle.HANDED_OVER} if calm else code",

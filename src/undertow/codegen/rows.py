@@ -62,7 +62,7 @@ class Rows:
         self.linear = [self._take(nx) for _ in range(nx // 2)]
         self.value = [self._take(nx) for _ in range(nx)]
         self.span, self.power, self.changed, self.bend, self.last, self.ago = self._take(6)
-        self.speed, self.free = self._take(2)
+        self.speed, self.free, self.begun = self._take(3)
         self.rest = self._take(nx // 2)
         self.flow = [self._take(nx) for _ in range(nx)]
         self.force = [self._take(nx // 2) for _ in range(nx)]

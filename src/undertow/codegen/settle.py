@@ -78,8 +78,10 @@ def begin(r: Rows) -> list[str]:
             for k, e in enumerate(row)
         ),
         *_level(r, [f"x_{j}" for j in range(size)]),
-        f"{r.active} = 1.0 if {r.code} == {HANDED_OVER} else 0.0",
-        f"{r.cost} = {r.cost} + counted * level",
+        f"cost, begins = {r.cost}, {r.code} == {HANDED_OVER}",
+        f"{r.active} = 1.0 if begins else 0.0",
+        f"{r.begun} = 1.0 if begins else 0.0",
+        f"{r.cost} = cost + counted * level if begins else cost",
         f"{r.span} = {UNIT}",
         f"{r.power} = 0.0",
         f"{r.ago} = 0.0",
@@ -218,7 +220,8 @@ def finish(r: Rows) -> list[str]:
     return [
         *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
         *_level(r, [f"x_{j}" for j in range(size)]),
-        f"out[b + i, 0] = {r.cost} - counted * level",
+        f"cost, begun = {r.cost}, {r.begun} > 0.0",
+        "out[b + i, 0] = cost - counted * level if begun else cost",
         f"out[b + i, 2] = {UNSETTLED} if {r.active} > 0.0 else {r.code}",
         *(f"out[b + i, {column}] = {row}" for row, column in columns.items()),
         *(f"out[b + i, out.shape[1] - {1 + size - j}] = x_{j}" for j in range(size)),
