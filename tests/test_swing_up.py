@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 import undertow as ut
 from undertow.errors import ModelError
 from undertow.rig import Bench, Push, RealisticRig, srv02_rig
-from undertow.swing_up import CatchRegion, Gains, SwingUp, SwingUpAndCatch, hanging
+from undertow.swing_up import CatchRegion, Gains, SwingUp, SwingUpAndCatch, _tried, hanging
 from undertow.trials.trial import trial
 
 
@@ -113,3 +114,13 @@ def test_nothing_moves_without_a_swing(arm: ut.Mechanism) -> None:
     for _ in range(2000):
         rig.write([0.0])
     assert abs(rig.truth[1] - math.pi) < 0.1
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", "cart_pendulum", "pendubot"])
+def test_gains_that_were_tried_are_those_of_the_library(name: str) -> None:
+    """A mechanism whose numbers change has a new fingerprint, and is searched for again."""
+    mechanism = getattr(ut.mechanisms, name)()
+    found = SwingUp.designed(mechanism)
+    assert [list(astuple(gains)) for gains in found.gains] == _tried()[mechanism.fingerprint]
+    other = mechanism.with_parameters(g=9.7)
+    assert other.fingerprint not in _tried()

