@@ -74,6 +74,7 @@ GENERATOR = generators(
     "objective.py",
     "sliding.py",
     "codegen/block.py",
+    "codegen/linear.py",
     "codegen/rows.py",
     "codegen/settle.py",
 )

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import sympy as sp
 
 from undertow.codegen import settle
-from undertow.codegen.rows import LANES, LoopProgram, Rows
+from undertow.codegen.rows import LANES, LoopProgram, Rows, entrance, total
 from undertow.codegen.scalar import Emitter
 
 __all__ = ["block_source"]
@@ -62,7 +62,7 @@ class _Writer:
         r = self.rows
         return [
             *(f"{row} = x0[b + i, {j}]" for j, row in enumerate(r.x)),
-            "radius = math.sqrt(" + _sum(f"{row} * {row}" for row in r.x) + ")",
+            "radius = math.sqrt(" + total(f"{row} * {row}" for row in r.x) + ")",
             f"{r.cost} = 0.0",
             f"{r.end} = start",
             f"{r.radius} = radius",
@@ -269,11 +269,11 @@ class _Writer:
         nx = len(r.x)
         return [
             *(f"m_{j} = sixth * {slope}" for j, slope in enumerate(r.slope)),
-            "chord = " + _sum(f"m_{j} * m_{j}" for j in range(nx)),
-            "slant = -(" + _sum(f"{x} * m_{j}" for j, x in enumerate(r.x)) + ")",
+            "chord = " + total(f"m_{j} * m_{j}" for j in range(nx)),
+            "slant = -(" + total(f"{x} * m_{j}" for j, x in enumerate(r.x)) + ")",
             "part = max(0.0, min(1.0, slant / chord)) if chord > 0.0 else 0.0",
             *(f"m_{j} = {x} + part * m_{j}" for j, x in enumerate(r.x)),
-            "near = math.sqrt(" + _sum(f"m_{j} * m_{j}" for j in range(nx)) + ")",
+            "near = math.sqrt(" + total(f"m_{j} * m_{j}" for j in range(nx)) + ")",
             f"nearer = {r.active} > 0.0 and near < {r.near}",
             f"{r.near} = near if nearer else {r.near}",
             f"{r.near_time} = {self.time} + part * h if nearer else {r.near_time}",
@@ -292,17 +292,11 @@ class _Writer:
             ),
             f"c_new = {r.cost} + sixth * {r.cost_slope}",
             *(f"m_{j} = n_{j} - {x}" for j, x in enumerate(r.x)),
-            "outer = " + _sum(f"n_{j} * n_{j}" for j in range(nx)),
+            "outer = " + total(f"n_{j} * n_{j}" for j in range(nx)),
             "radius = math.sqrt(outer)",
             f"before = {r.radius}",
-            # Where the chord of the step enters the terminal ball, if it does: the smaller
-            # root of |x + part (n - x)|² = terminal².
-            "chord = " + _sum(f"m_{j} * m_{j}" for j in range(nx)),
-            "slant = -(" + _sum(f"{x} * m_{j}" for j, x in enumerate(r.x)) + ")",
-            "depth = slant * slant - chord * (before * before - terminal * terminal)",
-            "passed = (slant > 0.0) & (depth >= 0.0) & (slant <= chord)",
+            *entrance(r.x, "before"),
             "reached = (radius <= terminal) | passed",
-            "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
             "part = max(0.0, min(1.0, part)) if reached else 1.0",
             "lost = not (radius < escape)",
             *(f"m_{j} = {x} + part * m_{j} if reached else n_{j}" for j, x in enumerate(r.x)),
@@ -445,14 +439,6 @@ def _lanes(lines: Iterable[str], depth: int) -> str:
     """Return a loop over the lanes of a block around ``lines``, indented."""
     text = f"for i in range({LANES}):\n" + textwrap.indent("\n".join(lines), "    ")
     return textwrap.indent(text, "    " * depth)
-
-
-def _sum(terms: Iterable[str]) -> str:
-    return " + ".join(terms)
-
-
-def _entries(matrix: Sequence[Sequence[str]]) -> Iterable[tuple[int, int, str]]:
-    return ((j, k, entry) for j, row in enumerate(matrix) for k, entry in enumerate(row))
 
 
 @dataclass(frozen=True)

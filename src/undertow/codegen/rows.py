@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import sympy as sp
 
 from undertow.codegen.tape import Tape
 
-__all__ = ["LANES", "LoopProgram", "Rows"]
+__all__ = ["LANES", "LoopProgram", "Rows", "entrance", "total"]
 
 #: Closed loops in one block: two AVX-512 registers or four AVX2 registers of float64.
 LANES = 16
@@ -80,3 +80,22 @@ class Rows:
     def margins(self) -> list[str]:
         """Margins of the present step, in the order of ``smallest``."""
         return [self.singular, self.input, *self.path]
+
+
+def total(terms: Iterable[str]) -> str:
+    """Return the sum of terms, as text."""
+    return " + ".join(terms)
+
+
+def entrance(x: Sequence[str], radius: str) -> list[str]:
+    """Whether and where the chord m of a step from x, of this radius, enters the terminal ball.
+
+    ``part`` is the smaller root of |x + part m|² = terminal², if the chord has ``passed`` it.
+    """
+    return [
+        "chord = " + total(f"m_{j} * m_{j}" for j in range(len(x))),
+        "slant = -(" + total(f"{e} * m_{j}" for j, e in enumerate(x)) + ")",
+        f"depth = slant * slant - chord * ({radius} * {radius} - terminal * terminal)",
+        "passed = (slant > 0.0) & (depth >= 0.0) & (slant <= chord)",
+        "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
+    ]

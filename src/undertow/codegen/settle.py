@@ -16,10 +16,10 @@ Once r has died out the steps are as long as the terminal set is far.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from undertow.codegen.linear import SETTLING, UNIT
-from undertow.codegen.rows import LANES, Rows
+from undertow.codegen.rows import LANES, Rows, entrance, total
 
 __all__ = [
     "HANDED_OVER",
@@ -42,19 +42,15 @@ MOST = 4000
 CORRECTION = 0.2
 
 
-def _sum(terms: Iterable[str]) -> str:
-    return " + ".join(terms)
-
-
 def _level(r: Rows, x: Sequence[str]) -> list[str]:
     """V = xᵀPx and p = P x."""
     size = len(x)
     return [
         *(
-            f"p_{j} = " + _sum(f"{e} * {x[k]}" for k, e in enumerate(r.value[j]))
+            f"p_{j} = " + total(f"{e} * {x[k]}" for k, e in enumerate(r.value[j]))
             for j in range(size)
         ),
-        "level = " + _sum(f"p_{j} * {x[j]}" for j in range(size)),
+        "level = " + total(f"p_{j} * {x[j]}" for j in range(size)),
     ]
 
 
@@ -120,14 +116,16 @@ for lane in range({LANES}):
 
 def _bend(r: Rows) -> str:
     """Φ + V̇, or Φ alone where the cost has no quadratic part, from p = P x and the rates."""
-    slope = _sum(f"p_{j} * {row}" for j, row in enumerate(r.slope))
+    slope = total(f"p_{j} * {row}" for j, row in enumerate(r.slope))
     return f"{r.cost_slope} + 2.0 * counted * ({slope})"
 
 
 def _rest(r: Rows, j: int, x: str) -> str:
     """The part of the j-th acceleration at a state x_0, x_1, … that A leaves over."""
     n = len(r.linear)
-    return f"{r.slope[n + j]} - (" + _sum(f"{e} * {x}_{k}" for k, e in enumerate(r.linear[j])) + ")"
+    return (
+        f"{r.slope[n + j]} - (" + total(f"{e} * {x}_{k}" for k, e in enumerate(r.linear[j])) + ")"
+    )
 
 
 def first_half(r: Rows) -> list[str]:
@@ -139,14 +137,14 @@ def first_half(r: Rows) -> list[str]:
         *(f"q_{j} = {_rest(r, j, 'x')}" for j in half),
         *(f"{row} = q_{j}" for j, row in enumerate(r.rest)),
         f"{r.bend} = {_bend(r)}",
-        f"{r.speed} = math.sqrt(" + _sum(f"{row} * {row}" for row in r.slope) + ")",
+        f"{r.speed} = math.sqrt(" + total(f"{row} * {row}" for row in r.slope) + ")",
         "free = " + " & ".join(f"(abs({u}) < _limit_{j})" for j, u in enumerate(r.u)),
         f"{r.free} = 1.0 if free else 0.0",
         *(
             f"{r.stage_x[j]} = "
-            + _sum(f"{e} * x_{k}" for k, e in enumerate(r.flow[j]))
+            + total(f"{e} * x_{k}" for k, e in enumerate(r.flow[j]))
             + " + "
-            + _sum(f"{e} * q_{k}" for k, e in enumerate(r.force[j]))
+            + total(f"{e} * q_{k}" for k, e in enumerate(r.force[j]))
             for j in range(size)
         ),
     ]
@@ -162,11 +160,14 @@ def second_half(r: Rows) -> list[str]:
         *_level(r, [f"a_{j}" for j in range(size)]),
         f"bend, late = {r.bend}, {_bend(r)}",
         "high = level",
-        *(f"c_{j} = " + _sum(f"{e} * y_{k}" for k, e in enumerate(r.rise[j])) for j in range(size)),
+        *(
+            f"c_{j} = " + total(f"{e} * y_{k}" for k, e in enumerate(r.rise[j]))
+            for j in range(size)
+        ),
         *_level(r, [f"c_{j}" for j in range(size)]),
         f"small = ({CORRECTION} * tail) * ({CORRECTION} * tail) * high",
         *(f"a_{j} = a_{j} + c_{j}" for j in range(size)),
-        "outer = math.sqrt(" + _sum(f"a_{j} * a_{j}" for j in range(size)) + ")",
+        "outer = math.sqrt(" + total(f"a_{j} * a_{j}" for j in range(size)) + ")",
         f"span, size, going = {r.span}, {r.power}, {r.active} > 0.0",
         # The trapezoidal rule, less h³/12 times the second derivative over this step and the last.
         f"last, ago, speed, free = {r.last}, {r.ago}, {r.speed}, {r.free} > 0.0",
@@ -175,14 +176,9 @@ def second_half(r: Rows) -> list[str]:
         "mean = 0.5 * (bend + late) - span * span * turn / 12.0",
         "sound = free & (outer < escape) & ((size > 0.0) | (level <= 16.0 * small))",
         f"before = {r.radius}",
-        # Where the chord of the step enters the terminal ball, if it does: the smaller root
-        # of |x + part (a - x)|² = terminal².
         *(f"m_{j} = a_{j} - x_{j}" for j in range(size)),
-        "chord = " + _sum(f"m_{j} * m_{j}" for j in range(size)),
-        "slant = -(" + _sum(f"x_{j} * m_{j}" for j in range(size)) + ")",
-        "depth = slant * slant - chord * (before * before - terminal * terminal)",
-        "inside = (outer <= terminal) | ((slant > 0.0) & (depth >= 0.0) & (slant <= chord))",
-        "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
+        *entrance([f"x_{j}" for j in range(size)], "before"),
+        "inside = (outer <= terminal) | passed",
         "part = max(0.0, min(1.0, part)) if inside else 1.0",
         "far = before - terminal > span * speed",
         "taken = going & sound & ((size <= 0.0) | ((level <= small) & far & (not inside)))",
