@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.delay import bench_gate, delay_gate, delay_margin, feedback
+from undertow.delay import bench_gate, delay_gate, delay_margin, feedback, noise_share
 from undertow.errors import InvalidInputError
 from undertow.inner_loop import InnerLoop
 from undertow.plan import Plan
-from undertow.rig import Bench, RealisticRig, Timing
+from undertow.practice import estimator_for
+from undertow.rig import Bench, RealisticRig, Timing, srv02_rig
 
 #: Nearly singular (37): excellent on the model, enormous gains.
 KEEN = ut.Surface(-1, -3.561, 1.051, 8.234)
@@ -59,6 +60,27 @@ def test_gates_refuse_what_bears_too_little(arm: ut.Mechanism, base: ut.Surface)
     assert "delay" in refused.reason
     assert delay_gate(0.001)(loop, old, keen, x, 60.0).accepted
     assert refused.cost == pytest.approx(float(loop.batch(x, base).cost[0]))
+
+
+def test_what_an_estimator_does_not_know_comes_out_as_input(
+    arm: ut.Mechanism, base: ut.Surface
+) -> None:
+    """The share is the spread of the law over errors drawn from P; near (37) it is too much."""
+    P = estimator_for(arm, srv02_rig()).settled()[:4, :4]
+    rng = np.random.default_rng(0)
+    for surface in (base, KEEN):
+        law = InnerLoop(arm, surface)
+        inputs = [law.demand[0] for e in rng.multivariate_normal(np.zeros(4), 1e-8 * P, 4000)
+                  if law(e) is not None]  # fmt: skip
+        share = noise_share(arm, surface, P)
+        assert 1e4 * np.std(inputs) / 15.0 == pytest.approx(share, rel=0.05)
+    assert noise_share(arm, base, P) < 0.2 < noise_share(arm, KEEN, P)
+    loop, x = ut.ClosedLoop(arm, ut.MinimumTime()), arm.state(phi=0.1)
+    plans = Plan.of(base), Plan.of(KEEN)
+    refused = bench_gate(0.001, 0.0, covariance=P)(loop, *plans, x, 60.0)
+    assert not refused.accepted
+    assert "noise" in refused.reason
+    assert bench_gate(0.001, 0.0, covariance=P, noise=9.0)(loop, *plans, x, 60.0).accepted
 
 
 def test_a_weaker_motor_must_do(arm: ut.Mechanism) -> None:

@@ -35,7 +35,7 @@ def arm() -> ut.Mechanism:
 def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
     """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
     x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
-    made = controllers(arm, goal, x0, budget=128)
+    made = controllers(arm, undisturbed(arm), goal, x0, budget=128)
     costs = {
         row: trial(arm, undisturbed(arm), made[row], x0, 8.0, 0, objective=goal).cost
         for row in ("one-time", "cascade")
@@ -45,7 +45,7 @@ def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mecha
 
 def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism) -> None:
     x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
-    made = controllers(arm, goal, x0, budget=128)
+    made = controllers(arm, srv02_rig(), goal, x0, budget=128)
     runs = {
         row: [trial(arm, srv02_rig(), made[row], x0, 8.0, s, objective=goal) for s in range(3)]
         for row in ("one-time", "cascade")

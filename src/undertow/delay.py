@@ -1,11 +1,12 @@
-"""What a surface must bear before a bench may meet it: delay, and a weaker actuator.
+"""What a surface must bear before a bench may meet it: delay, noise, and a weaker actuator.
 
 Inside the boundary layer the law is smooth; at the target it is a state feedback u = k x.
 Held from sample to sample and applied d samples late it closes a discrete loop whose
 spectral radius says whether it is stable.  A surface can be excellent on the model and yet
 bear no delay: near-singular ones (37) have the largest gains.  And far from the target the
 cheapest motion uses all of the actuator, so that a motor a little weaker than its data sheet
-loses it.
+loses it.  The same gains turn what an estimator does not know of the state, one count of an
+encoder, into input: of a near-singular surface more than the actuator has.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from undertow.rollout import ClosedLoop, Event
 from undertow.sliding import ReachingLaw, Surface
 from undertow.stability import linearise
 
-__all__ = ["bench_gate", "delay_gate", "delay_margin", "feedback"]
+__all__ = ["bench_gate", "delay_gate", "delay_margin", "feedback", "noise_share"]
 
 
 def feedback(law: InnerLoop) -> FloatArray:
@@ -119,6 +120,38 @@ def delay_margin(
     return (late - 1) * period
 
 
+def noise_share(
+    mechanism: Mechanism,
+    surface: Surface,
+    covariance: FloatArray,
+    reaching: ReachingLaw | None = None,
+) -> float:
+    """Return the standard deviation of the input at the target that is noise alone.
+
+    With u = k x̂ near the target and an error of the estimate with covariance P it is
+    √(k P kᵀ)_ii, as a part of the input's limit; of several inputs the largest part.
+
+    Parameters
+    ----------
+    mechanism
+        The model; an input without a limit does not count.
+    surface, reaching
+        The law; the paper's gains by default.
+    covariance
+        P of the estimated state, (2n, 2n).
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> noise_share(rig, ut.first_surface(rig), np.zeros((4, 4)))
+    0.0
+    """
+    k = feedback(InnerLoop(mechanism, surface, reaching or ReachingLaw()))
+    variances = np.einsum("ij,jk,ik->i", k, covariance, k)
+    return float((np.sqrt(np.maximum(variances, 0.0)) / mechanism.input_limits).max())
+
+
 def delay_gate(least: float, period: float = 0.001) -> Gate:
     """Return a gate that, besides the cost, asks every surface to bear a delay.
 
@@ -147,9 +180,15 @@ def delay_gate(least: float, period: float = 0.001) -> Gate:
 
 
 def bench_gate(
-    least: float, reserve: float = 0.15, *, period: float = 0.001, seconds: float = 4.0
+    least: float,
+    reserve: float = 0.15,
+    *,
+    period: float = 0.001,
+    seconds: float = 4.0,
+    covariance: FloatArray | None = None,
+    noise: float = 0.2,
 ) -> Gate:
-    """Return a gate that asks for a delay margin and for a reserve of the actuator.
+    """Return a gate that asks for a delay margin, little noise, and a reserve of the actuator.
 
     Parameters
     ----------
@@ -162,21 +201,38 @@ def bench_gate(
         Sampling period of the inner loop, s.
     seconds
         How far that is looked ahead.
+    covariance
+        Of what an estimator does not know of the state, (2n, 2n); ``None``: nothing.
+    noise
+        Largest :func:`noise_share` that this may cause.
     """
     late = delay_gate(least, period)
+
+    def refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: str) -> Admission:
+        score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
+        return Admission(False, why, score if score < INADMISSIBLE else math.inf)
+
+    def noisiest(loop: ClosedLoop, plan: Plan) -> float:
+        if covariance is None:
+            return 0.0
+        laws = plan.reaching or (loop.reaching,) * len(plan.surfaces)
+        pairs = zip(plan.surfaces, laws, strict=True)
+        return max(noise_share(loop.mechanism, s, covariance, law) for s, law in pairs)
 
     def gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
         admission = late(loop, old, new, x, horizon)
         if not admission.accepted or new == old:
             return admission
+        share = noisiest(loop, new)
+        if share > noise:
+            why = f"{100 * share:.3g} % of the input would be noise, {100 * noise:g} % at most"
+            return refused(loop, old, x, horizon, why)
         limits = (1.0 - reserve) * loop.mechanism.input_limits
         weak = replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail=0.0)
         event = Event(int(weak.batch(x, new, duration=min(seconds, horizon)).event[0]))
         if event in (Event.HORIZON, Event.REACHED):
             return admission
-        score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
-        cost = score if score < INADMISSIBLE else math.inf
-        reason = f"with {100 * reserve:g} % less input: {event.name.lower()}"
-        return Admission(False, reason, cost)
+        why = f"with {100 * reserve:g} % less input: {event.name.lower()}"
+        return refused(loop, old, x, horizon, why)
 
     return gate

@@ -36,8 +36,9 @@ ENERGY_PRICE = 2.25
 #: in no smaller one.
 TERMINAL = 0.05
 
-#: What every admitted surface must bear: periods of delay, and so much less of the input.
-BEARS, RESERVE = 6, 0.15
+#: What every admitted surface must bear: periods of delay, and so much less of the input; and
+#: the part of the input that noise of the sensors may take, standard deviation.
+BEARS, RESERVE, NOISE = 6, 0.15, 0.2
 
 #: Density of the drift of a matched disturbance, parts of the smallest input limit per √s.
 DRIFT = 0.1
@@ -79,9 +80,17 @@ def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -
     )
 
 
-def gate_for(period: float) -> Gate:
-    """Return the gate that a surface must pass before a rig sampled so often, s, may meet it."""
-    return bench_gate(BEARS * period, RESERVE, period=period)
+def gate_for(estimator: KalmanFilter) -> Gate:
+    """Return the gate that a surface must pass before a rig may meet it.
+
+    Parameters
+    ----------
+    estimator
+        That of the rig: its period, and what it does not know of the state at the target.
+    """
+    period, size = estimator.period, 2 * estimator.mechanism.n
+    covariance = estimator.settled()[:size, :size]
+    return bench_gate(BEARS * period, RESERVE, period=period, covariance=covariance, noise=NOISE)
 
 
 def goal_for(mechanism: Mechanism, goal: Goal, *, horizon: float = 60.0) -> Objective:

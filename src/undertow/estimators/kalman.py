@@ -190,6 +190,11 @@ class KalmanFilter:
                 limit="finite and ≥ 0",
                 remedy="0 turns either off",
             )
+        self._arguments: dict[str, Any] = {
+            "mechanism": mechanism, "period": period, "position_noise": position_noise,
+            "acceleration_noise": acceleration_noise, "disturbance_drift": disturbance_drift,
+            "delay": delay,
+        }  # fmt: skip
         self.mechanism = mechanism
         self.period = float(positive("period of an estimator", [period], 1)[0])
         size = 2 * n + (m if disturbance_drift > 0 else 0)
@@ -235,6 +240,18 @@ class KalmanFilter:
             h = self.period
         self._estimate(h, measurement.q, u, self._block, self._size, self._lead)
         return self._state
+
+    def settled(self, seconds: float = 0.5) -> FloatArray:
+        """Return the covariance that a filter like this one comes to, at rest at the target.
+
+        It is the filter's own, after so long, s.
+        """
+        double = KalmanFilter(**self._arguments)
+        n, m = self.mechanism.n, self.mechanism.m
+        double.reset(np.zeros(2 * n))
+        for k in range(round(seconds / self.period)):
+            double.estimate(Measurement(k * self.period, np.zeros(n)), np.zeros(m))
+        return double.covariance
 
     @property
     def covariance(self) -> FloatArray:

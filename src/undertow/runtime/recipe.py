@@ -102,7 +102,7 @@ class Recipe:
             self.belief,
             goal_for(self.belief, self.objective, horizon=self.horizon),
             warm=Budget(self.evaluations, self.seconds),
-            gate=gate_for(self.period),
+            gate=gate_for(self.make_estimator()),
             seed=self.seed,
         )
 

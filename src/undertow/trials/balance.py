@@ -20,7 +20,7 @@ from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.optimiser import Budget
-from undertow.practice import Goal, gate_for, goal_for
+from undertow.practice import Goal, estimator_for, gate_for, goal_for
 from undertow.rig import Bench, srv02_rig
 from undertow.sliding import Surface
 from undertow.trials.steering import CascadeSteering, steady
@@ -74,20 +74,21 @@ class BalanceResult:
 
 def controllers(
     belief: Mechanism,
+    bench: Bench,
     objective: Objective,
     x0: FloatArray,
     *,
     budget: int = 256,
     seed: int = 0,
-    period: float = 0.001,
 ) -> dict[str, MakeController]:
     """Return the three controllers of the paper's tables, by name.
 
     ``one-time`` is optimised once, from x0; ``cascade`` starts from there, and its
-    re-optimisations may spend ``budget`` rollouts each.  ``period`` is that of the
-    rig's samples, s.
+    re-optimisations may spend ``budget`` rollouts each.  Of the bench the gate knows what its
+    estimator does.
     """
-    cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate_for(period), seed=seed)
+    gate = gate_for(estimator_for(belief, bench))
+    cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate, seed=seed)
     start = cascade.start(x0)
     once = start[1].surface
     assert once is not None  # start() raises otherwise
@@ -116,7 +117,7 @@ def catch_limit(
     def holds(angle: float) -> bool:
         x0 = belief.state(phi=angle)
         try:
-            make = controllers(belief, objective, x0)[row]
+            make = controllers(belief, bench, objective, x0)[row]
         except InfeasibleError:
             return False
         missed = 0
@@ -175,7 +176,7 @@ def balance(
     done = 0
     for goal in GOALS:
         objective = goal_for(belief, goal)
-        made = controllers(belief, objective, x0, budget=budget)
+        made = controllers(belief, bench, objective, x0, budget=budget)
         for row in ROWS:
             what = f"minimum {goal}, {row}"
             ideal[goal, row] = trial(

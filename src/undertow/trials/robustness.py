@@ -173,10 +173,12 @@ def breaking_point(
     return Breaking(low, high, seed)
 
 
-def _makers(belief: Mechanism, x0: FloatArray, budget: int) -> dict[str, MakeController]:
+def _makers(
+    belief: Mechanism, bench: Bench, x0: FloatArray, budget: int
+) -> dict[str, MakeController]:
     """Return the controllers by name; NMPC where CasADi is there."""
     objective = goal_for(belief, "energy")
-    made = controllers(belief, objective, x0, budget=budget)
+    made = controllers(belief, bench, objective, x0, budget=budget)
     makers = dict(
         zip(NAMES, (made["cascade"], made["one-time"], clipped_regulator(belief)), strict=False)
     )
@@ -223,7 +225,7 @@ def robustness(
     belief = bench.mechanism
     x0: FloatArray = belief.state(phi=angle)
     objective = goal_for(belief, "energy")
-    makers = _makers(belief, x0, budget)
+    makers = _makers(belief, bench, x0, budget)
     settings = {"angle": angle, "seconds": [seconds, SINGLE], "budget": budget}
     book = Ledger(ledger, settings | {"fingerprint": belief.fingerprint})
 
