@@ -5,16 +5,21 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 import undertow as ut
 from undertow.cli import app
 from undertow.errors import InvalidInputError
-from undertow.inputs import parse_start, parse_surface
+from undertow.inputs import mechanism_named, objective_named, parse_start, parse_surface
+from undertow.report import ended
 
 runner = CliRunner()
 RIG = "rotary_pendulum"
@@ -30,15 +35,42 @@ def run(*words: str) -> tuple[int, str, str]:
 # -- help ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["reproduce", "simulate", "optimise"])
-def test_help_has_examples_that_parse(command: str) -> None:
-    """Each command shows examples, and every option in them exists."""
-    code, out, _ = run(command, "--help")
+def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """All commands with their words, those of groups too."""
+    for name, child in getattr(command, "commands", {}).items():
+        yield from leaves(child, (*path, name))
+    if path and not hasattr(command, "commands"):
+        yield path, command
+
+
+COMMANDS = dict(leaves(get_command(app)))
+
+
+@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
+def test_help_ends_with_examples_that_parse_as_they_stand(path: tuple[str, ...]) -> None:
+    """Pasted into a shell, folded lines and all, each example is a call of this command."""
+    code, out, _ = run(*path, "--help")
     assert code == 0
-    examples = out.split("Examples")[1]
-    assert f"undertow {command}" in examples
-    options = set(re.findall(r"--[a-z-]+", out.split("Examples")[0]))
-    assert set(re.findall(r"--[a-z-]+", examples)) <= options
+    shown = out.split("Examples")[1].replace("\\\n", "").strip()
+    found = [shlex.split(line) for line in shown.splitlines() if line.strip()]
+    assert found
+    for words in found:
+        assert words[: len(path) + 1] == ["undertow", *path]
+        COMMANDS[path].make_context(path[-1], words[len(path) + 1 :])
+
+
+def test_long_examples_are_folded_for_a_terminal_of_80_columns() -> None:
+    """No line is longer."""
+    for command in COMMANDS.values():
+        for line in command.epilog.splitlines():
+            assert len(line) <= 78
+
+
+def test_flags_show_no_type() -> None:
+    """A flag takes no value, and its help does not look as if it did."""
+    _, out, _ = run("simulate", "--help")
+    assert "--hard-input" in out
+    assert "<bool>" not in out
 
 
 def test_version_and_bare_call() -> None:
@@ -67,6 +99,17 @@ def test_version_and_bare_call() -> None:
         (("simulate", RIG, "--set", "mass=1"), "'mass'", "d_e"),
         (("simulate", RIG, "--set", "m=nan"), "'nan'", "finite"),
         (("simulate", RIG, "--plant", "q=1"), "'q'", "one of"),
+        (("simulate", RIG, "--limit", "current=3"), "'current'", "one of voltage"),
+        (("optimise", RIG, "--limit", "voltage=-3"), "-3 V", "positive"),
+        (("optimise", RIG, "--limit", "voltage=nan"), "'nan'", "finite"),
+        (("optimise", RIG, "--box", "theta=60"), "'60'", "deg or rad"),
+        (("optimise", RIG, "--box", "theta=60m"), "'60m'", "deg or rad"),
+        (("optimise", RIG, "--box", "theta=-60deg"), "'-60deg'", "> 0"),
+        (("optimise", RIG, "--box", "theta=9deg:20deg"), "'9deg:20deg'", "LOW < 0 < HIGH"),
+        (("optimise", RIG, "--box", "theta=-1rad:0rad:1rad"), "'-1rad:0rad:1rad'", "LOW:HIGH"),
+        (("optimise", RIG, "--box", "psi=-1rad:1rad"), "'psi'", "theta, phi"),
+        (("optimise", RIG, "--box", "phi=1rad", "--box", "phi=2rad"), "'phi' twice", "one pair"),
+        (("animate", RIG, "--start", "phi=20deg", "--box", "phi=10deg"), "-0.1745 rad", "≥ 0"),
         (("simulate", RIG, "--horizon", "-1"), "-1", "finite and > 0"),
         (("simulate", RIG, "--period", "0.0333"), "0.0333", "multiple"),
         (("simulate", RIG, "--surface", "alpha_u=5"), "'alpha_u=5'", "missing"),
@@ -201,6 +244,62 @@ def test_simulate_that_fails_says_so_and_exits_1() -> None:
     assert "singularity (37)" in out
 
 
+def test_a_hard_limit_binds_the_law_before_it_is_clipped() -> None:
+    """With ``--hard-input`` the answer asks for less than ``--limit``; without, for more."""
+    words = (
+        "optimise", RIG, "--start", "phi=20deg", "--objective", "time", "--set", "d_e=0.025",
+        "--evaluations", "400", "--limit", "voltage=9",
+    )  # fmt: skip
+    code, out, _ = run(*words, "--hard-input")
+    assert code == 0
+    assert "|voltage| ≤ 9 V before clipping" in out
+    found = re.search(r"hard input limit.*?([-\d.]+) +V", out)
+    assert found is not None
+    assert float(found[1]) >= 0
+    code, free, _ = run(*words)
+    assert code == 0
+    assert "clipping" not in free
+    assert cost(free) < cost(out)
+
+
+def cost(out: str) -> float:
+    found = re.search(r"cost +([\d.]+)", out)
+    assert found is not None
+    return float(found[1])
+
+
+@pytest.mark.slow  # kernels of their own
+def test_a_box_binds_the_motion_and_one_that_breaks_is_named() -> None:
+    """The optimum of a box that binds costs more, and its margin is in degrees."""
+    words = ("--start", "phi=20deg", "--set", "d_e=0.025")
+    _, free, _ = run("optimise", RIG, *words)
+    code, out, _ = run("optimise", RIG, *words, "--box", "theta=60deg")
+    assert code == 0
+    found = re.search(r"\|theta\| ≤ 60° +([-\d.]+) +°", out)
+    assert found is not None
+    assert 0 <= float(found[1]) < 10
+    assert cost(out) > cost(free)
+    code, out, _ = run("simulate", RIG, *words, "--surface", SURFACE, "--box", "theta=5deg")
+    assert code == 1
+    assert "broke |theta| ≤ 5°, at" in out
+
+
+def test_the_end_of_a_motion_names_what_it_broke(rig: ut.Mechanism) -> None:
+    """The states outside their boxes, else the hard limit: for people."""
+    goal = objective_named("time", rig, 5.0, ["theta=5deg", "phi=-90deg:90deg"], hard_input=True)
+    row = np.zeros((1, 1))
+
+    def motion(**state: float) -> ut.Trajectory:
+        x = rig.state(**state)[None]
+        end = ut.Event.CONSTRAINT
+        return ut.Trajectory(rig, np.array([0.25]), x, row, row, row[0], row[0], end)
+
+    assert ended(motion(theta=0.1), goal) == "broke |theta| ≤ 5°, at 0.250 s"
+    both = ended(motion(theta=0.1, phi=-1.6), goal)
+    assert both == "broke |theta| ≤ 5° and -90° ≤ phi ≤ 90°, at 0.250 s"
+    assert ended(motion(theta=0.01), goal) == "broke the hard input limit, at 0.250 s"
+
+
 def test_optimise_prints_the_surface_with_its_margins(tmp_path: Path) -> None:
     """The answer on the screen and in proposal.json is the optimiser's."""
     code, out, _ = run(
@@ -229,6 +328,30 @@ def test_start_words_become_si() -> None:
     x = parse_start(rig, ["phi=90deg", "theta=-0.5rad", "phi_dot=180deg/s", "theta_dot=1e-1rad/s"])
     np.testing.assert_allclose(x, [-0.5, np.pi / 2, 0.1, np.pi])
     np.testing.assert_array_equal(parse_start(rig, []), rig.state(**rig.start))
+
+
+def test_box_words_become_constraints_in_si() -> None:
+    """One bound is a modulus, two are an interval; the margin is in the unit that it names."""
+    rig = ut.mechanisms.rotary_pendulum()
+    words = ["theta=60deg", "phi_dot=-4rad/s:180deg/s", "phi=-0.5rad:90deg"]
+    objective = objective_named("time", rig, 5.0, words, hard_input=True)
+    assert objective.hard_input
+    assert [(c.name, c.unit) for c in objective.constraints] == [
+        ("|theta| ≤ 60°", "rad"),
+        ("-4 rad/s ≤ phi_dot ≤ 180°/s", "rad/s"),
+        ("-0.5 rad ≤ phi ≤ 90°", "rad"),
+    ]
+    at = dict(zip(rig.x, rig.state(theta=-1.0, phi=-0.4, phi_dot=3.0), strict=True))
+    margins = [float(margin.subs(at)) for margin in objective.path_margins(rig)]
+    np.testing.assert_allclose(margins, [np.pi / 3 - 1.0, np.pi - 3.0, 0.1])
+
+
+def test_limit_words_replace_the_named_inputs_alone() -> None:
+    """Of two motors the one that is named gets another limit."""
+    pair = mechanism_named("two_motor_three_link")
+    first, second = pair.inputs
+    changed = mechanism_named("two_motor_three_link", limits=[f"{second.name}=0.25"])
+    np.testing.assert_array_equal(changed.input_limits, [first.limit, 0.25])
 
 
 def test_surface_words_of_several_inputs() -> None:

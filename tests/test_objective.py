@@ -89,6 +89,40 @@ def test_state_boxes_are_bounds_on_moduli(rig: ut.Mechanism) -> None:
     assert float(rate.subs(at)) == 3.0
 
 
+def test_boxes_need_not_be_symmetric(rig: ut.Mechanism) -> None:
+    """low ≤ state ≤ high: the margin is the distance to the nearer end, negative outside."""
+    (bound,) = ut.state_box(phi=(-0.2, 0.6))
+    assert bound.name == "-0.2 ≤ phi ≤ 0.6"
+    (margin,) = ut.MinimumTime(constraints=(bound,)).path_margins(rig)
+    found = [float(margin.subs(rig.x[1], phi)) for phi in (-0.3, -0.2, 0.0, 0.5, 0.7)]
+    np.testing.assert_allclose(found, [-0.1, 0.0, 0.2, 0.1, -0.1], atol=1e-15)
+
+
+def test_a_start_outside_is_refused_and_one_that_inputs_decide_is_not(rig: ut.Mechanism) -> None:
+    """A margin that depends on the input is no reason to refuse a state."""
+    box = ut.state_box(phi=0.2)
+    with pytest.raises(InvalidInputError, match=r"\|phi\| ≤ 0.2.*-0\.1"):
+        ut.MinimumTime(constraints=box).check_start(rig, rig.state(phi=0.3))
+    ut.MinimumTime(constraints=box).check_start(rig, rig.state(phi=0.1))
+    power = ut.Constraint("power", lambda v: v.voltage * v.theta_dot + 1)
+    ut.MinimumTime(constraints=(power,)).check_start(rig, rig.state(theta_dot=2.0))
+
+
+def test_between_tests_a_bound_is_passed_by_no_more_than_the_chord_allows(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """(h²/8) max |q̈|: what `Constraint` says of motions between the starts of steps, h apart."""
+    fine = ut.ClosedLoop(rig, step=1e-4).simulate(rig.state(phi=0.3), quick, duration=0.6)
+    swing = np.abs(fine["theta"])
+    peak = int(np.argmax(swing))
+    assert 0 < peak < len(swing) - 1
+    rate = rig.accelerations(0.0, fine.x[:-1], fine.u[:-1])[:, 0]
+    for stride in (20, 100, 400):  # tests every 2, 10 and 40 ms
+        passed = [swing.max() - swing[first::stride].max() for first in range(stride)]
+        allowed = (stride * 1e-4) ** 2 / 8 * np.abs(rate).max()
+        assert 0 < max(passed) <= allowed
+
+
 def test_names_are_states_inputs_and_parameters_and_nothing_else(rig: ut.Mechanism) -> None:
     v = Names(rig)
     assert (v.theta, v.phi_dot, v.voltage) == (rig.x[0], rig.x[3], rig.u[0])
@@ -133,6 +167,10 @@ REFUSALS: dict[str, tuple[Callable[[ut.Mechanism], object], str]] = {
         r"stage cost of 'odd'.*nan",
     ),
     "negative bound": (lambda rig: ut.state_box(theta=-1.0), r"'theta'.*-1\.0.*> 0"),
+    "interval without the target": (
+        lambda rig: ut.state_box(theta=(0.1, 0.5)),
+        r"'theta'.*\(0\.1, 0\.5\).*low < 0 < high",
+    ),
     "NaN bound": (lambda rig: ut.state_box(theta=math.nan), r"'theta'.*nan.*finite"),
     "zero horizon": (lambda rig: ut.MinimumTime(horizon=0.0), r"horizon.*0\.0.*> 0"),
     "infinite horizon": (lambda rig: ut.MinimumTime(horizon=math.inf), r"horizon.*inf.*finite"),

@@ -9,16 +9,24 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from undertow import mechanisms
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import MinimumEnergy, MinimumTime, Objective
+from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
 from undertow.sliding import Surface
 
-__all__ = ["mechanism_named", "objective_named", "parse_start", "parse_surface", "parse_values"]
+__all__ = [
+    "mechanism_named",
+    "objective_named",
+    "parse_box",
+    "parse_start",
+    "parse_surface",
+    "parse_values",
+]
 
 #: Unit as typed to (SI unit of the coordinate, whether it is a rate, factor to SI).
 UNITS: Mapping[str, tuple[str, bool, float]] = {
@@ -33,31 +41,86 @@ UNITS: Mapping[str, tuple[str, bool, float]] = {
 _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)")
 
 
-def mechanism_named(name: str, settings: Sequence[str] = ()) -> Mechanism:
-    """Return a mechanism of the library, with parameters replaced by ``name=value``.
+def mechanism_named(
+    name: str, settings: Sequence[str] = (), limits: Sequence[str] = ()
+) -> Mechanism:
+    """Return a mechanism of the library, with parameters and input limits replaced.
+
+    Parameters
+    ----------
+    name
+        Its name in the library.
+    settings
+        Parameters as ``name=value``, SI units.
+    limits
+        Largest magnitudes of inputs as ``name=value``, each in the input's unit.
 
     Raises
     ------
     InvalidInputError
-        For an unknown mechanism or parameter, or a value outside its bounds.
+        For an unknown mechanism, parameter or input, or a value outside its bounds.
     """
     if name not in mechanisms.LIBRARY:
         raise InvalidInputError(
             "mechanism", value=repr(name), limit=f"one of {', '.join(mechanisms.LIBRARY)}"
         )
-    mechanism = mechanisms.LIBRARY[name]()
-    return mechanism.with_parameters(**parse_values(settings)) if settings else mechanism
+    mechanism = mechanisms.LIBRARY[name]().with_parameters(**parse_values(settings))
+    if not limits:
+        return mechanism
+    new = parse_values(limits, "limit of input", "voltage=10")
+    known = {channel.name: channel.limit for channel in mechanism.inputs}
+    for channel in new:
+        if channel not in known:
+            raise InvalidInputError(
+                f"input of '{mechanism.name}'",
+                value=repr(channel),
+                limit=f"one of {', '.join(known)}",
+                remedy=f"Write for instance --limit {next(iter(known))}=10",
+            )
+    return mechanism.with_input_limit(*(known | new).values())
 
 
-def objective_named(name: str, mechanism: Mechanism, horizon: float) -> Objective:
-    """Return the objective called ``energy`` or ``time``, its unit that of the inputs."""
+def objective_named(
+    name: str,
+    mechanism: Mechanism,
+    horizon: float,
+    box: Sequence[str] = (),
+    *,
+    hard_input: bool = False,
+) -> Objective:
+    """Return the objective called ``energy`` or ``time``, its unit that of the inputs.
+
+    Parameters
+    ----------
+    name
+        ``energy`` or ``time``.
+    mechanism
+        Whose inputs and states are meant.
+    horizon
+        Longest motion, s.
+    box
+        Bounds on states, see :func:`parse_box`.
+    hard_input
+        Whether a motion whose law asks for more than the actuator gives is refused.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown name, a bound that cannot be, or a horizon that is not positive.
+    """
+    constraints = parse_box(mechanism, box)
     if name == "time":
-        return MinimumTime(horizon=horizon)
+        return MinimumTime(horizon=horizon, constraints=constraints, hard_input=hard_input)
     if name != "energy":
         raise InvalidInputError("objective", value=repr(name), limit="one of energy, time")
     units = {channel.unit for channel in mechanism.inputs}
     unit = units.pop() if len(units) == 1 else "mixed units"
-    return MinimumEnergy(horizon=horizon, unit=f"({unit})² s" if " " in unit else f"{unit}² s")
+    return MinimumEnergy(
+        horizon=horizon,
+        unit=f"({unit})² s" if " " in unit else f"{unit}² s",
+        constraints=constraints,
+        hard_input=hard_input,
+    )
 
 
 def _split(word: str, example: str) -> tuple[str, str]:
@@ -77,14 +140,51 @@ def _number(text: str, what: str) -> float:
     return value
 
 
-def parse_values(words: Sequence[str]) -> dict[str, float]:
+def parse_values(
+    words: Sequence[str], what: str = "parameter", example: str = "d_e=0.025"
+) -> dict[str, float]:
     """Read ``name=value`` words, SI units.
 
     >>> parse_values(["d_e=0.025"])
     {'d_e': 0.025}
     """
-    pairs = [_split(word, "d_e=0.025") for word in words]
-    return {name: _number(value, f"parameter '{name}'") for name, value in pairs}
+    pairs = [_split(word, example) for word in words]
+    return {name: _number(value, f"{what} '{name}'") for name, value in pairs}
+
+
+def _units_of(mechanism: Mechanism, name: str, what: str) -> tuple[str, ...]:
+    """Return the units in which a state may be typed."""
+    if name not in mechanism.state_names:
+        raise InvalidInputError(
+            f"{what} of '{mechanism.name}'",
+            value=repr(name),
+            limit=f"one of {', '.join(mechanism.state_names)}",
+        )
+    index = mechanism.state_names.index(name)
+    kind = (mechanism.coordinates[index % mechanism.n].unit, index >= mechanism.n)
+    return tuple(unit for unit, (si, rate, _) in UNITS.items() if (si, rate) == kind)
+
+
+def _shown(number: float, unit: str) -> str:
+    """Return a typed quantity as it is shown.
+
+    >>> _shown(60.0, "deg"), _shown(-4.0, "rad/s")
+    ('60°', '-4 rad/s')
+    """
+    return f"{number:g}{'' if unit.startswith('deg') else ' '}{unit.replace('deg', '°')}"
+
+
+def _quantity(text: str, units: Sequence[str], what: str, example: str) -> tuple[float, str]:
+    """Return the number and the unit of a quantity, refusing others than ``units``."""
+    match = _QUANTITY.fullmatch(text.strip())
+    if match is None or match[2] not in units:
+        raise InvalidInputError(
+            what,
+            value=repr(text),
+            limit=f"a number with its unit, {' or '.join(units)}",
+            remedy=f"Write for instance {example}",
+        )
+    return float(match[1]), match[2]
 
 
 def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
@@ -114,25 +214,63 @@ def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
     values: dict[str, float] = {}
     for word in words:
         name, text = _split(word, f"{mechanism.coordinates[-1].name}=40deg")
-        if name not in mechanism.state_names:
-            raise InvalidInputError(
-                f"initial state of '{mechanism.name}'",
-                value=repr(name),
-                limit=f"one of {', '.join(mechanism.state_names)}",
-            )
-        index = mechanism.state_names.index(name)
-        kind = (mechanism.coordinates[index % mechanism.n].unit, index >= mechanism.n)
-        units = [unit for unit, (si, rate, _) in UNITS.items() if (si, rate) == kind]
-        match = _QUANTITY.fullmatch(text)
-        if match is None or match[2] not in units:
-            raise InvalidInputError(
-                f"initial state '{name}'",
-                value=repr(text),
-                limit=f"a number with its unit, {' or '.join(units)}",
-                remedy=f"Write for instance --start {name}=10{units[0]}",
-            )
-        values[name] = float(match[1]) * UNITS[match[2]][2]
+        units = _units_of(mechanism, name, "initial state")
+        example = f"--start {name}=10{units[0]}"
+        number, unit = _quantity(text, units, f"initial state '{name}'", example)
+        values[name] = number * UNITS[unit][2]
     return mechanism.state(**values)
+
+
+def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, ...]:
+    """Read bounds on states from words with units.
+
+    Parameters
+    ----------
+    mechanism
+        Whose states they are.
+    words
+        Like ``theta=60deg``, which is |theta| ≤ 60°, or ``x=-0.2m:0.5m``.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown state, a missing or wrong unit, bounds that exclude the target, or two
+        pairs of bounds on one state.
+
+    Examples
+    --------
+    >>> rig = mechanisms.rotary_pendulum()
+    >>> [c.name for c in parse_box(rig, ["theta=60deg", "phi_dot=-4rad/s:5rad/s"])]
+    ['|theta| ≤ 60°', '-4 rad/s ≤ phi_dot ≤ 5 rad/s']
+    """
+    found: dict[str, Constraint] = {}
+    for word in words:
+        name, text = _split(word, f"{mechanism.coordinates[0].name}=LOW:HIGH")
+        units = _units_of(mechanism, name, "box")
+        if name in found:
+            raise InvalidInputError(
+                "--box",
+                value=f"'{name}' twice",
+                limit="one pair of bounds for each state",
+                remedy=f"Write --box {name}=LOW:HIGH",
+            )
+        example = f"--box {name}=-10{units[0]}:20{units[0]}"
+        parts = [_quantity(p, units, f"box of '{name}'", example) for p in text.split(":")]
+        ends = [number * UNITS[unit][2] for number, unit in parts]
+        low, high = (-ends[0], ends[0]) if len(ends) == 1 else (ends[0], ends[-1])
+        if len(ends) > 2 or not low < 0 < high:
+            raise InvalidInputError(
+                f"box of '{name}'",
+                value=repr(text),
+                limit="one bound > 0, or LOW:HIGH around the target, LOW < 0 < HIGH",
+                remedy=f"Write for instance {example}",
+            )
+        si, rate, _ = UNITS[units[0]]
+        shown = [_shown(*part) for part in parts]
+        (bound,) = state_box(**{name: (low, high)})
+        label = f"|{name}| ≤ {shown[0]}" if len(ends) == 1 else f"{shown[0]} ≤ {name} ≤ {shown[1]}"
+        found[name] = replace(bound, name=label, unit=f"{si}/s" if rate else si)
+    return tuple(found.values())
 
 
 def parse_surface(mechanism: Mechanism, text: str) -> Surface:

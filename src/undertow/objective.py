@@ -15,7 +15,7 @@ import numpy as np
 import sympy as sp
 
 from undertow.errors import InvalidInputError
-from undertow.mechanism import Mechanism
+from undertow.mechanism import FloatArray, Mechanism
 
 __all__ = [
     "Constraint",
@@ -71,6 +71,22 @@ class Constraint:
         Shown when it is the one that fails.
     formula
         Function of :class:`Names` that returns w as a SymPy expression.
+    unit
+        Unit of w, for people.
+
+    Notes
+    -----
+    *Where it is tested.*  A rollout tests w at the start of each of its small Runge-Kutta steps,
+    ``ClosedLoop.step`` apart (2 ms unless told otherwise), at the state and the input applied
+    there; nothing is tested between them, and a loop with constraints takes no large steps.  A
+    motion stops at the first test that fails.  The state at its end, where it enters the terminal
+    set or the horizon is over, is tested no more.
+
+    *What may happen in between.*  Where ẇ is Lipschitz, w exceeds its larger value at two
+    neighbouring tests, h apart, by at most (h²/8) max |ẅ| (the error of linear interpolation).
+    A bound on a coordinate has ẅ = ± q̈: at h = 2 ms and 200 rad/s², 1e-4 rad.  The input of a
+    continuous law has kinks where it saturates: for a bound on it (h/2) max |ẇ| holds.  Who
+    needs a bound at every instant tightens it by as much, or takes shorter steps.
 
     Examples
     --------
@@ -79,26 +95,46 @@ class Constraint:
 
     name: str
     formula: Formula
+    unit: str = ""
 
 
-def state_box(**bounds: float) -> tuple[Constraint, ...]:
-    """Return constraints |state| ≤ bound for the named states, SI units: (24)'s x ∈ 𝒳.
+def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
+    """Return bounds on the named states, SI units, as constraints: (24)'s x ∈ 𝒳.
+
+    Parameters
+    ----------
+    **bounds
+        A number for |state| ≤ bound, or (low, high) around the target, low < 0 < high.
+
+    Raises
+    ------
+    InvalidInputError
+        For a bound that is not finite, or that excludes the target.
+
+    See Also
+    --------
+    Constraint : where in a motion they are tested.
 
     Examples
     --------
-    >>> [c.name for c in state_box(theta=1.047)]
-    ['|theta| ≤ 1.047']
+    >>> [c.name for c in state_box(theta=1.047, phi=(-0.2, 0.5))]
+    ['|theta| ≤ 1.047', '-0.2 ≤ phi ≤ 0.5']
     """
 
-    def bounded(name: str, bound: float) -> Constraint:
-        if not (math.isfinite(bound) and bound > 0):
+    def bounded(name: str, bound: float | tuple[float, float]) -> Constraint:
+        low, high = bound if isinstance(bound, tuple) else (-bound, bound)
+        if not (math.isfinite(low) and math.isfinite(high) and low < 0 < high):
+            alone = not isinstance(bound, tuple)
             raise InvalidInputError(
                 f"bound of state '{name}'",
                 value=bound,
-                limit="finite and > 0",
-                remedy="The box is |state| ≤ bound; leave out states without a bound",
+                limit="finite and > 0" if alone else "finite, low < 0 < high",
+                remedy="The box is |state| ≤ bound, or low ≤ state ≤ high around the target; leave "
+                "out states without a bound",
             )
-        return Constraint(f"|{name}| ≤ {bound:g}", lambda v: sp.Abs(getattr(v, name)) - bound)
+        middle, half = (low + high) / 2, (high - low) / 2
+        words = f"|{name}| ≤ {high:g}" if middle == 0 else f"{low:g} ≤ {name} ≤ {high:g}"
+        return Constraint(words, lambda v: sp.Abs(getattr(v, name) - middle) - half)
 
     return tuple(bounded(name, bound) for name, bound in bounds.items())
 
@@ -121,10 +157,11 @@ class Objective:
     terminal_radius
         ν of the terminal set ‖x‖₂ ≤ ν, (31); the cost is counted until it is reached.
     constraints
-        Path constraints w(x, u) ≤ 0, (25).
+        Path constraints w(x, u) ≤ 0, (25); :class:`Constraint` says where they are tested.
     hard_input
         False: the actuator clips (38).  True: |u| ≤ u_max is a constraint on the
-        *unclipped* law, and a motion that would saturate is not admissible.
+        *unclipped* law, and a motion that would saturate is not admissible.  It is tested where
+        the others are; in a sampled loop at the samples.
 
     Examples
     --------
@@ -178,6 +215,32 @@ class Objective:
             -self._expression(mechanism, f"constraint '{c.name}'", c.formula)
             for c in self.constraints
         ]
+
+    def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
+        """Refuse an initial state that breaks a path constraint, whatever the input does.
+
+        Parameters
+        ----------
+        mechanism
+            Whose state it is.
+        x
+            State, (2n,).
+
+        Raises
+        ------
+        InvalidInputError
+            With the constraint and its margin.
+        """
+        values = mechanism.substitution | dict(zip(mechanism.x, x.tolist(), strict=True))
+        for constraint, margin in zip(self.constraints, self.path_margins(mechanism), strict=True):
+            at_start = margin.subs(values)
+            if at_start.is_number and float(at_start) < 0:
+                raise InvalidInputError(
+                    f"initial state of '{mechanism.name}' breaks '{constraint.name}'",
+                    value=f"margin {float(at_start):.4g} {constraint.unit}".rstrip(),
+                    limit="≥ 0",
+                    remedy="Start inside the constraints, or widen them",
+                )
 
     @staticmethod
     def _expression(mechanism: Mechanism, what: str, formula: Formula) -> sp.Expr:

@@ -20,12 +20,12 @@ from undertow.rollout import Event, Trajectory
 from undertow.sliding import Surface
 from undertow.stability import Margin
 
-__all__ = ["motion_files", "motion_report", "proposal_files", "proposal_report"]
+__all__ = ["ended", "motion_files", "motion_report", "proposal_files", "proposal_report"]
 
 _ENDINGS = {
     Event.REACHED: "reached the target, ‖x‖ ≤ {radius:g}",
     Event.HORIZON: "had not reached ‖x‖ ≤ {radius:g} by the horizon",
-    Event.CONSTRAINT: "broke a path constraint or the hard input limit",
+    Event.CONSTRAINT: "broke {broken}",
     Event.SINGULAR: "met the singularity (37): the law does not exist further on",
     Event.DIVERGED: "diverged",
 }
@@ -58,17 +58,36 @@ def _surface_words(surface: Surface) -> str:
 
 
 def _head(mechanism: Mechanism, objective: Objective, start: FloatArray) -> list[tuple[str, str]]:
+    kept = [constraint.name for constraint in objective.constraints]
+    if objective.hard_input:
+        kept += [f"|{i.name}| ≤ {i.limit:g} {i.unit} before clipping" for i in mechanism.inputs]
     return [
         ("mechanism", f"{mechanism.name}: {mechanism.description}"),
         ("objective", f"minimum {objective.name}, {objective.unit}"),
+        *([("constraints", ", ".join(kept))] if kept else []),
         ("start", _state_words(mechanism, start)),
     ]
 
 
 def ended(motion: Trajectory, objective: Objective) -> str:
     """Say in words how a motion ended."""
-    words = _ENDINGS[motion.event].format(radius=objective.terminal_radius)
+    broken = _broken(motion, objective) if motion.event == Event.CONSTRAINT else ""
+    words = _ENDINGS[motion.event].format(radius=objective.terminal_radius, broken=broken)
     return f"{words}, at {motion.duration:.3f} s"
+
+
+def _broken(motion: Trajectory, objective: Objective) -> str:
+    """Return the constraints that the last state of a motion breaks, whatever the input is."""
+    mechanism = motion.mechanism
+    at_end = mechanism.substitution | dict(zip(mechanism.x, motion.x[-1].tolist(), strict=True))
+    margins = [margin.subs(at_end) for margin in objective.path_margins(mechanism)]
+    names = [
+        constraint.name
+        for constraint, margin in zip(objective.constraints, margins, strict=True)
+        if margin.is_number and margin < 0
+    ]
+    hard = "the hard input limit" if objective.hard_input else "a constraint on the input"
+    return " and ".join(names) or hard
 
 
 def motion_report(
@@ -106,7 +125,11 @@ def motion_report(
             rows.append(("evidence", _evidence(run)))
         if len(run.descent):
             rows.append(
-                ("Lemma 3", f"smallest slack {run.descent.min():.2e} {objective.unit} (≥ 0 wanted)")
+                (
+                    "Lemma 3",
+                    f"smallest slack {run.descent.min():.1e} {objective.unit} "
+                    "(≥ 0 wanted, to rounding)",
+                )
             )
     rows += [
         ("cost", f"{motion.total:.6g} {objective.unit}"),
@@ -226,8 +249,13 @@ def proposal_report(
     table.add_column("margin (≥ 0 is satisfied)")
     table.add_column("value", justify="right")
     table.add_column("")
+    units = {constraint.name: constraint.unit for constraint in objective.constraints}
     for margin in proposal.margins:
-        table.add_row(Text(margin.name), f"{margin.value:.4g}", margin.unit)
+        unit = margin.unit or units.get(margin.name, "")
+        factor, shown = 1.0, unit
+        if unit in ("rad", "rad/s"):
+            factor, shown = display("rad", unit == "rad/s")
+        table.add_row(Text(margin.name), f"{factor * margin.value:.4g}", shown)
     return Group(_facts(rows), "", table)
 
 

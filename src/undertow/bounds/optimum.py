@@ -253,18 +253,7 @@ def _check(
         raise InvalidInputError("horizon of the bound", value=longest, limit="finite and > 0 s")
     if intervals < 10:
         raise InvalidInputError("intervals of the first mesh", value=intervals, limit="≥ 10")
-    values = mechanism.substitution | dict(zip(mechanism.x, start.tolist(), strict=True))
-    for constraint, margin in zip(
-        objective.constraints, objective.path_margins(mechanism), strict=True
-    ):
-        at_start = margin.subs(values)
-        if at_start.is_number and float(at_start) < 0:
-            raise InvalidInputError(
-                f"initial state breaks '{constraint.name}'",
-                value=f"margin {float(at_start):g}",
-                limit="≥ 0",
-                remedy="Start inside the constraints",
-            )
+    objective.check_start(mechanism, start)
     return start, longest
 
 

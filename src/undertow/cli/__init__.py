@@ -8,7 +8,7 @@ import typer
 
 from undertow import results
 from undertow.cli import bench, certify, control, export, library, paper, rig, trials
-from undertow.cli.terminal import app
+from undertow.cli.terminal import app, examples
 
 __all__ = [
     "app",
@@ -23,6 +23,16 @@ __all__ = [
     "trials",
 ]
 
+#: The order in which help shows the commands: look, steer, prove, run, repeat.
+_ORDER = (
+    "mechanisms", "derive", "animate", "survey", "optimise", "simulate", "certify", "verify",
+    "bench", "run", "replay", "drill", "trials", "reproduce",
+)  # fmt: skip
+
+app.registered_commands.sort(
+    key=lambda command: _ORDER.index(command.name or getattr(command.callback, "__name__", ""))
+)
+
 
 def _version(asked: bool) -> None:
     if asked:
@@ -30,7 +40,11 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(
+    epilog=examples(
+        "undertow simulate rotary_pendulum --start phi=35deg", "undertow simulate --help"
+    )
+)
 def root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
@@ -41,4 +55,4 @@ def root(
 
 def main() -> None:
     """Run the command line."""
-    app()
+    app(prog_name="undertow")

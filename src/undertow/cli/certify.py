@@ -73,7 +73,9 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
 def certify(
     name: Annotated[
         str | None,
-        typer.Argument(help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME."),
+        typer.Argument(
+            help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME.", metavar="NAME"
+        ),
     ] = None,
     surface: Annotated[
         str | None,
@@ -215,7 +217,9 @@ def certify(
 )
 @reports_errors
 def verify(
-    file: Annotated[Path, typer.Argument(help="A certificate of undertow certify.")],
+    file: Annotated[
+        Path, typer.Argument(help="A certificate of undertow certify.", metavar="FILE")
+    ],
     mechanism: Annotated[
         str | None,
         typer.Option(
@@ -236,8 +240,7 @@ def verify(
 ) -> None:
     """Check a certificate again, from the file and the mechanism alone.
 
-    Exit status 0 when every claim is proved again; 1 when one is not, or the file is damaged or
-    about another model.
+    Exit status 0 when every claim is proved again, else 1.
     """
     from undertow import certification
     from undertow.certify.certificate import read_certificate

@@ -10,8 +10,11 @@ import typer
 from undertow import inputs, results
 from undertow.cascade import Cascade
 from undertow.cli.terminal import (
+    Box,
     Goal,
+    HardInput,
     Horizon,
+    Limits,
     Name,
     Seed,
     Settings,
@@ -40,6 +43,8 @@ __all__ = ["optimise", "simulate"]
         "undertow simulate rotary_pendulum --start phi=20deg "
         "--surface 'lambda_a=-0.5 alpha_u=5 lambda_u=10'",
         "undertow simulate rotary_pendulum --control one-time --plant m=0.15",
+        "undertow simulate rotary_pendulum --start phi=20deg --box theta=60deg "
+        "--limit voltage=8 --hard-input",
     )
 )
 @reports_errors
@@ -71,15 +76,19 @@ def simulate(
             metavar="NAME=VALUE",
         ),
     ] = None,
+    limit: Limits = None,
+    hard_input: HardInput = False,
+    box: Box = None,
     horizon: Horizon = 60.0,
     period: Annotated[float, typer.Option(help="Time between re-optimisations, s.")] = 0.1,
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Evidence that a new surface of the cascade needs at the present state: it is in "
-            "a proved region; its predicted motion enters one (dual mode); states nearby arrive; "
-            "or stability near the target. Repeatable. Default: region, dual or local.",
-            metavar="region|dual|sampled|local",
+            help="Evidence that a new surface of the cascade needs at the present state. region: "
+            "it is in a proved region. dual: its predicted motion enters one. sampled: states "
+            "nearby arrive. local: stability near the target. Repeatable. Default: region, dual "
+            "or local.",
+            metavar="EVIDENCE",
         ),
     ] = None,
     seed: Seed = 0,
@@ -91,10 +100,11 @@ def simulate(
     from undertow import report
 
     request = {k: v for k, v in locals().items() if k not in ("report", "out")}
-    belief = inputs.mechanism_named(name, setting or ())
+    belief = inputs.mechanism_named(name, setting or (), limit or ())
     truth = belief.with_parameters(**inputs.parse_values(plant)) if plant else None
     x0 = inputs.parse_start(belief, start or ())
-    goal = inputs.objective_named(objective, belief, horizon)
+    goal = inputs.objective_named(objective, belief, horizon, box or (), hard_input=hard_input)
+    goal.check_start(belief, x0)
     given = None if surface is None else inputs.parse_surface(belief, surface)
     if given is not None and control is not None:
         raise InvalidInputError(
@@ -141,6 +151,7 @@ def simulate(
         "undertow optimise rotary_pendulum --start phi=40deg",
         "undertow optimise rotary_pendulum --start phi=41deg --objective time --set d_e=0.025",
         "undertow optimise rotary_pendulum --evaluations 20000 --seed 3 --out answer",
+        "undertow optimise cart_pendulum --box x=-0.5m:0.5m --box phi_dot=90deg/s",
     )
 )
 @reports_errors
@@ -149,6 +160,9 @@ def optimise(
     start: Start = None,
     objective: Goal = "energy",
     setting: Settings = None,
+    limit: Limits = None,
+    hard_input: HardInput = False,
+    box: Box = None,
     horizon: Horizon = 60.0,
     evaluations: Annotated[int, typer.Option(help="Rollouts that the search may spend.")] = 3072,
     seed: Seed = 0,
@@ -158,9 +172,10 @@ def optimise(
     from undertow import report
 
     request: dict[str, Any] = {k: v for k, v in locals().items() if k not in ("report", "out")}
-    belief = inputs.mechanism_named(name, setting or ())
+    belief = inputs.mechanism_named(name, setting or (), limit or ())
     x0 = inputs.parse_start(belief, start or ())
-    goal = inputs.objective_named(objective, belief, horizon)
+    goal = inputs.objective_named(objective, belief, horizon, box or (), hard_input=hard_input)
+    goal.check_start(belief, x0)
     if out is not None:
         results.check_folder(out)
     optimiser = Optimiser(ClosedLoop(belief, goal), cold=Budget(evaluations), seed=seed)

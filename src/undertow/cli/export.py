@@ -11,6 +11,7 @@ import typer
 
 from undertow import inputs, results
 from undertow.cli.terminal import (
+    Application,
     Goal,
     Seed,
     Settings,
@@ -38,7 +39,7 @@ __all__ = ["export_c"]
 #: Length of a run on a rig, s.
 SECONDS = 10.0
 
-export = typer.Typer(no_args_is_help=True, help="Write the controller in another language.")
+export = Application(help="Write the controller in another language.")
 app.add_typer(export, name="export")
 
 

@@ -10,8 +10,11 @@ import typer
 
 from undertow import inputs, results
 from undertow.cli.terminal import (
+    Box,
     Goal,
+    HardInput,
     Horizon,
+    Limits,
     Name,
     Seed,
     Settings,
@@ -129,6 +132,9 @@ def animate(
     start: Start = None,
     objective: Goal = "energy",
     setting: Settings = None,
+    limit: Limits = None,
+    hard_input: HardInput = False,
+    box: Box = None,
     horizon: Horizon = 20.0,
     speed: Annotated[float, typer.Option(help="Motion seconds in a second of film.")] = 1.0,
     seed: Seed = 0,
@@ -138,9 +144,10 @@ def animate(
     from undertow import commands
 
     request = {k: v for k, v in locals().items() if k not in ("commands", "out")}
-    belief = inputs.mechanism_named(name, setting or ())
+    belief = inputs.mechanism_named(name, setting or (), limit or ())
     x0 = inputs.parse_start(belief, start or ())
-    goal = inputs.objective_named(objective, belief, horizon)
+    goal = inputs.objective_named(objective, belief, horizon, box or (), hard_input=hard_input)
+    goal.check_start(belief, x0)
     results.check_folder(out)
     loop = ClosedLoop(belief, goal)
     plan = Optimiser(loop, seed=seed).require(x0).plan

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Literal, ParamSpec, TypeVar
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.text import Text
+from typer.core import TyperCommand, TyperGroup
 
 from undertow import results
 from undertow.errors import UndertowError
 
 __all__ = [
+    "Application",
+    "Box",
     "Goal",
+    "HardInput",
     "Horizon",
+    "Limits",
     "Name",
     "Seed",
     "Settings",
@@ -34,18 +42,75 @@ __all__ = [
 P = ParamSpec("P")
 R = TypeVar("R")
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="rich",
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+#: Longest line of an example, so that a terminal of 80 columns need not break it.
+WIDTH = 76
+
+
+class _Plain:
+    """Help that shows no type for flags, which take no value, and examples as they are typed."""
+
+    epilog: str | None
+
+    def get_params(self, ctx: Any) -> Any:
+        params = super().get_params(ctx)  # type: ignore[misc]
+        for param in params:
+            if getattr(param, "is_flag", False):
+                param.metavar = ""
+        return params
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        epilog, self.epilog = self.epilog, None
+        super().format_help(ctx, formatter)  # type: ignore[misc]
+        self.epilog = epilog
+        if epilog:  # not padded to the width: nothing may follow a backslash
+            console = terminal()
+            console.print(Text(" Examples\n", style="bold"))
+            console.print(Text(textwrap.indent(f"{epilog}\n", " ")), soft_wrap=True)
+
+
+class _Command(_Plain, TyperCommand):
+    pass
+
+
+class _Group(_Plain, TyperGroup):
+    pass
+
+
+class Application(typer.Typer):
+    """A group of commands whose help shows what they take, and nothing that they do not."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(
+            cls=_Group,
+            no_args_is_help=True,
+            add_completion=False,
+            rich_markup_mode="rich",
+            pretty_exceptions_enable=False,
+            context_settings={"help_option_names": ["-h", "--help"]},
+            **options,
+        )
+
+    def command(self, name: str | None = None, **options: Any) -> Any:
+        """Register a command, as :class:`typer.Typer` does."""
+        return super().command(name, cls=_Command, **options)
+
+
+app = Application()
 
 
 def examples(*lines: str) -> str:
-    """Return the examples that end a command's help."""
-    return "\n\n".join(["[bold]Examples[/bold]", *lines])
+    """Return the examples that end a command's help, folded so that they can be pasted."""
+    return "\n".join(map(_folded, lines))
+
+
+def _folded(line: str) -> str:
+    """Break a command between its options, with a backslash at the end of all lines but one."""
+    rows = [""]
+    for word in re.findall(r"(?:--\S+ )?(?:'[^']*'|[^-\s]\S*)|\S+", line):
+        if rows[-1].strip() and len(rows[-1]) + len(word) > WIDTH - 2:
+            rows.append("   ")
+        rows[-1] += f" {word}" if rows[-1] else word
+    return " \\\n".join(rows)
 
 
 def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
@@ -100,7 +165,7 @@ def say(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, markup=False)
 
 
-Name = Annotated[str, typer.Argument(help="Mechanism, e.g. rotary_pendulum.")]
+Name = Annotated[str, typer.Argument(help="Mechanism, e.g. rotary_pendulum.", metavar="NAME")]
 Start = Annotated[
     list[str] | None,
     typer.Option(
@@ -112,6 +177,30 @@ Start = Annotated[
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", help="Parameter in SI units. Repeatable.", metavar="NAME=VALUE"),
+]
+Limits = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--limit",
+        help="Largest magnitude of an input, in its own unit: voltage=10. Repeatable. Default: "
+        "the mechanism's.",
+        metavar="INPUT=VALUE",
+    ),
+]
+HardInput = Annotated[
+    bool,
+    typer.Option(
+        "--hard-input",
+        help="Refuse motions whose law asks for more than the limit. Default: the actuator clips.",
+    ),
+]
+Box = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Bounds that a state must keep on its way, with units: theta=60deg for both sides, "
+        "or x=-0.2m:0.5m. Repeatable. Tested every 2 ms.",
+        metavar="STATE=LOW:HIGH",
+    ),
 ]
 Goal = Annotated[Literal["energy", "time"], typer.Option(help="What is minimised.")]
 Horizon = Annotated[float, typer.Option(help="Longest motion, s.")]

@@ -38,7 +38,9 @@ def trials(
         typer.Argument(
             help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
             "rest to balanced. mujoco: MuJoCo as the truth, no retuning. "
-            "robustness: random rigs, and what breaks whom. estimators: the same law with each."
+            "robustness: random rigs, and what breaks whom. estimators: the same law with each.",
+            metavar="WHAT",
+            show_choices=False,
         ),
     ],
     seeds: Annotated[int, typer.Option(help="Rigs, one for each seed.", min=1)] = 20,
