@@ -204,7 +204,7 @@ def test_s_reaches_zero_within_the_time_of_16_under_disturbance(n: int, m: int) 
             )
         }
     )
-    eta, step = 10.0, 5e-4
+    eta, step = 10.0, 1e-3
     law = ut.SlidingModeLaw(believed, surface, ut.ReachingLaw(eta=eta, switching="sign"))
     x0 = random_states(believed, 6, position=0.4, speed=0.8)
     s0 = surface.s(x0)
