@@ -11,8 +11,9 @@ from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective
 from undertow.optimiser import Budget, Optimiser, Proposal
 from undertow.plan import Plan
 from undertow.rollout import ClosedLoop, Event, Trajectory
-from undertow.sliding import ReachingLaw, SlidingModeLaw, Surface
+from undertow.sliding import SlidingModeLaw
 from undertow.stability import check_surface, first_surface, placed_surface, surface_margins
+from undertow.surface import ReachingLaw, Surface
 
 __all__ = [
     "Budget",

@@ -25,8 +25,8 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.optimiser import INADMISSIBLE
 from undertow.plan import Plan
 from undertow.rollout import ClosedLoop, Event
-from undertow.sliding import ReachingLaw, Surface
 from undertow.stability import linearise
+from undertow.surface import ReachingLaw, Surface
 
 __all__ = ["bench_gate", "delay_gate", "delay_margin", "feedback", "noise_share"]
 

@@ -18,14 +18,8 @@ from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.memory import BRIEF, Memory, unpacked
-from undertow.sliding import (
-    LawSymbols,
-    ReachingLaw,
-    SlidingModeLaw,
-    Surface,
-    Switching,
-    lay_law,
-)
+from undertow.sliding import LawSymbols, SlidingModeLaw, lay_law
+from undertow.surface import ReachingLaw, Surface, Switching
 
 __all__ = ["InnerLoop", "lane", "law_memory", "law_module"]
 

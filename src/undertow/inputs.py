@@ -17,7 +17,7 @@ from undertow import mechanisms
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
-from undertow.sliding import Surface
+from undertow.surface import Surface
 
 __all__ = [
     "mechanism_named",

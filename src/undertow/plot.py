@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
 from undertow.rollout import Trajectory
-from undertow.sliding import Surface
+from undertow.surface import Surface
 
 __all__ = [
     "COLOURS",

@@ -17,8 +17,8 @@ from undertow.objective import Objective
 from undertow.optimiser import Proposal
 from undertow.plot import display, figure_bytes, motion_figure
 from undertow.rollout import Event, Trajectory
-from undertow.sliding import Surface
 from undertow.stability import Margin
+from undertow.surface import Surface
 
 __all__ = ["ended", "motion_files", "motion_report", "proposal_files", "proposal_report"]
 

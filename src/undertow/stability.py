@@ -27,13 +27,8 @@ from undertow.errors import (
     UnstableSurfaceError,
 )
 from undertow.mechanism import TIME, FloatArray, Mechanism, numbers
-from undertow.sliding import (
-    Surface,
-    check_surface_shape,
-    coupling,
-    gamma_determinant,
-    singularity,
-)
+from undertow.sliding import check_surface_shape, coupling, gamma_determinant, singularity
+from undertow.surface import Surface
 
 __all__ = [
     "Linearisation",

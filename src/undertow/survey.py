@@ -31,8 +31,8 @@ from undertow.objective import Objective
 from undertow.optimiser import Budget
 from undertow.plan import Plan
 from undertow.plot import display
-from undertow.sliding import Surface
 from undertow.stability import linearise
+from undertow.surface import Surface
 
 __all__ = [
     "TRIALS",

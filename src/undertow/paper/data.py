@@ -22,7 +22,7 @@ from types import MappingProxyType
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms import rotary_pendulum
 from undertow.objective import MinimumEnergy, MinimumTime, Objective
-from undertow.sliding import Surface
+from undertow.surface import Surface
 
 __all__ = [
     "CASES",

@@ -21,8 +21,8 @@ from undertow.paper.data import CONDITIONS, OBJECTIVES, PERIOD, PRINTED, ROWS, C
 from undertow.paper.limits import Limit, Sensitivity, base_sensitivity, case_limits, own_reach
 from undertow.paper.repeats import Repeats, noisy_repeats
 from undertow.rollout import ClosedLoop, Event, Trajectory
-from undertow.sliding import Surface
 from undertow.stability import first_surface
+from undertow.surface import Surface
 
 __all__ = [
     "Bound",

@@ -14,7 +14,7 @@ from undertow.objective import MinimumTime, Objective
 from undertow.optimiser import Budget, Optimiser
 from undertow.paper.data import CASES, OBJECTIVES, PRINTED, Condition
 from undertow.rollout import ClosedLoop
-from undertow.sliding import Surface
+from undertow.surface import Surface
 
 __all__ = [
     "Limit",
