@@ -37,7 +37,7 @@ TABLE = [
     (0.073, 40.0, 24.112, 23.849, 0.544),
     (0.0, 41.0, 7.352, 7.116, 0.509),
 ]
-DEFAULT = {(0.025, 41.0), (0.073, 40.0)}
+DEFAULT = {(0.025, 41.0)}
 #: First intervals of the finer mesh.
 FINE = 100
 UPRIGHT = ut.state_box(phi=math.pi / 2)
