@@ -27,6 +27,7 @@ __all__ = ["trials"]
         "undertow trials balance --out bench",
         "undertow trials balance --quick",
         "undertow trials swing-up",
+        "undertow trials swing-up --fresh 1",
         "undertow trials mujoco",
         "undertow trials robustness --rigs 50 --out bench",
     )
@@ -58,15 +59,27 @@ def trials(
     quick: Annotated[
         bool, typer.Option("--quick", help="A look: three rigs, no search for catch limits.")
     ] = False,
+    fresh: Annotated[
+        int | None,
+        typer.Option(
+            help="swing-up: search for the gains anew, with this seed, and use no kept ones.",
+            metavar="SEED",
+            min=0,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             help="balance: folder for balance.csv and the figures. robustness: folder for "
-            "robustness.jsonl, every run as it is made: called again, it goes on from there."
+            "robustness.jsonl, every run as it is made: called again, it goes on from there. "
+            "swing-up --fresh: folder for gains.json, what the search found, as the library keeps "
+            "it."
         ),
     ] = None,
 ) -> None:
     """Run controllers on realistic rigs, over and over, and print what came of it."""
+    from undertow.swing_up import SwingUp
+    from undertow.swing_up.search import KEPT, as_kept
     from undertow.trials import balance as experiment
     from undertow.trials import estimation, report, upright
     from undertow.trials import robustness as stress
@@ -85,12 +98,13 @@ def trials(
             )
             shown = report.balance_report(result)
         elif what == "swing-up":
-            names = upright.SWINGING
-            found = []
-            for i, mechanism in enumerate(upright.all_of(names)):
-                progress(mechanism.name, i / len(names))
-                found.append(upright.swing_trials(mechanism, seeds=seeds))
-            shown = report.swing_report(found, upright.SWING_SECONDS)
+            searched = upright.searched(upright.SWINGING, fresh, progress)
+            runs_up = []
+            for i, (mechanism, found) in enumerate(searched.items()):
+                progress(mechanism.name, i / len(searched))
+                swing = SwingUp(mechanism, tuple(one.gains for one in found))
+                runs_up.append(upright.swing_trials(mechanism, swing=swing, seeds=seeds))
+            shown = report.swing_report(runs_up, upright.SWING_SECONDS)
         elif what == "estimators":
             progress("estimators", 0.0)
             shown = report.estimator_report(estimation.compared(seeds=min(seeds, 5)))
@@ -112,3 +126,5 @@ def trials(
     console.print(shown)
     if out is not None and what == "balance":
         say(console, write(out, report.balance_files(result)))
+    if out is not None and what == "swing-up":
+        say(console, write(out, {KEPT.name: as_kept(searched).encode()}))

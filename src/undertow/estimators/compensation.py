@@ -9,6 +9,8 @@ An observer that keeps counting while a joint sticks also sets it free: integral
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from undertow.codegen.machine import numba
@@ -32,7 +34,12 @@ def take_off(u: FloatArray, disturbance: FloatArray, limits: FloatArray, out: Fl
         out[i] = max(-limits[i], min(limits[i], wanted))
 
 
-def compensated(controller: Controller, estimator: Estimator, limits: FloatArray) -> Controller:
+def compensated(
+    controller: Controller,
+    estimator: Estimator,
+    limits: FloatArray,
+    when: Callable[[], bool] = lambda: True,
+) -> Controller:
     """Return a controller whose output lacks what the estimator knows of the disturbance.
 
     Parameters
@@ -43,11 +50,16 @@ def compensated(controller: Controller, estimator: Estimator, limits: FloatArray
         Whose ``disturbance`` is taken off.
     limits
         Largest |u_i|, (m,).
+    when
+        Asked after each step of the controller: whether its output shall lack it.
     """
     out = np.zeros_like(limits)
 
     def both(t: float, x: FloatArray) -> FloatArray:
-        take_off(controller(t, x), estimator.disturbance, limits, out)
+        u = controller(t, x)
+        if not when():
+            return u
+        take_off(u, estimator.disturbance, limits, out)
         return out
 
     return both

@@ -21,7 +21,7 @@ from undertow.rig.presets import bench_for
 from undertow.runtime.controller import Controller
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import Answer, Request, respond
-from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
+from undertow.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 
 __all__ = ["Recipe"]
 
@@ -111,7 +111,7 @@ class Recipe:
         """Swing-up and catch, where it is wanted."""
         if not self.swing_up:
             return None
-        return SwingUpAndCatch(SwingUp.designed(self.belief), CatchRegion(self.belief))
+        return SwingUpAndCatch(designed(self.belief), CatchRegion(self.belief))
 
     def first(self) -> CascadeState:
         """Return what the cascade starts with: the first optimum, or what awaits a catch.

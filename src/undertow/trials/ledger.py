@@ -5,33 +5,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from undertow.errors import ArtefactError
 from undertow.results import versions
-from undertow.trials.trial import Outcome
+from undertow.trials.trial import Outcome, Result
 
-__all__ = ["Ledger", "Result"]
+__all__ = ["Ledger"]
 
 
-@dataclass(frozen=True)
-class Result:
-    """What came of one run, without its record: see :class:`undertow.trials.trial.Outcome`."""
-
-    seed: int
-    balanced: bool
-    caught: bool
-    settled: float
-    cost: float
-    effort: float
-    chatter: float
-
-    @classmethod
-    def of(cls, outcome: Outcome) -> Result:
-        """Return what is kept of an outcome."""
-        return cls(**{name: getattr(outcome, name) for name in cls.__dataclass_fields__})
+def _numbers(outcome: Outcome) -> Result:
+    """Return what is kept of an outcome: all but its record."""
+    return Result(**{field.name: getattr(outcome, field.name) for field in fields(Result)})
 
 
 class Ledger:
@@ -97,7 +84,7 @@ class Ledger:
 
     def keep(self, name: str, what: str, value: float, outcome: Outcome) -> Result:
         """Keep the result of a run at once."""
-        result = self._known[name, what, value, outcome.seed] = Result.of(outcome)
+        result = self._known[name, what, value, outcome.seed] = _numbers(outcome)
         if self.path is not None:
             numbers = {k: v if math.isfinite(v) else None for k, v in asdict(result).items()}
             line = json.dumps([name, what, value, numbers], allow_nan=False)

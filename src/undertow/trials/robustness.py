@@ -25,9 +25,9 @@ from undertow.practice import estimator_for, goal_for
 from undertow.rig import Bench, Friction, Push, srv02_rig
 from undertow.stability import linearise
 from undertow.trials.balance import controllers
-from undertow.trials.ledger import Ledger, Result
+from undertow.trials.ledger import Ledger
 from undertow.trials.nmpc import predictive
-from undertow.trials.trial import MakeController, trial
+from undertow.trials.trial import MakeController, Result, trial
 
 __all__ = [
     "FACTORS",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +19,7 @@ from undertow.rollout import Event, Trajectory
 __all__ = [
     "MakeController",
     "Outcome",
+    "Result",
     "Spread",
     "balanced",
     "judge",
@@ -39,9 +39,9 @@ HOME_FREE, HOME_DRIVEN = math.radians(2.0), math.radians(20.0)
 LAST = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What came of one run.
+@dataclass(frozen=True)
+class Result:
+    """What came of one run, in numbers.
 
     Attributes
     ----------
@@ -59,8 +59,6 @@ class Outcome:
         ∫ uᵀu dt.
     chatter
         Total variation of the inputs per second, in their unit.
-    record
-        The run.
     """
 
     seed: int
@@ -70,6 +68,12 @@ class Outcome:
     cost: float
     effort: float
     chatter: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome(Result):
+    """What came of one run, and the ``record`` of it."""
+
     record: Record
 
 
@@ -83,6 +87,7 @@ def trial(
     *,
     objective: Objective | None = None,
     estimator: Estimator | None = None,
+    compensates: Callable[[], bool] = lambda: True,
 ) -> Outcome:
     """Run a controller on a rig, once.
 
@@ -105,12 +110,14 @@ def trial(
     estimator
         By default :func:`undertow.practice.estimator_for` the bench.  What it knows of a
         matched disturbance is taken off the controller's output.
+    compensates
+        Asked at each step: whether it is.
     """
     rig = RealisticRig(bench, x0, seed)
     seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
     estimator = estimator_for(belief, bench) if estimator is None else estimator
     estimator.reset(seen)
-    controller = compensated(make(seen), estimator, belief.input_limits)
+    controller = compensated(make(seen), estimator, belief.input_limits, compensates)
     record = drive(rig, estimator, controller, seconds)
     return judge(belief, record, seed, objective)
 
@@ -133,16 +140,7 @@ def judge(
     )
 
 
-class Judged(Protocol):
-    """What a run that was judged tells."""
-
-    @property
-    def balanced(self) -> bool:
-        """See :class:`Outcome`."""
-        ...
-
-
-def balanced(outcomes: Sequence[Judged]) -> int:
+def balanced(outcomes: Sequence[Result]) -> int:
     """Count the runs that ended balanced."""
     return sum(outcome.balanced for outcome in outcomes)
 
@@ -188,7 +186,7 @@ class Spread:
         return f"{self.mean:.{digits}f} ± {self.deviation:.{digits}f}"
 
 
-def spread(outcomes: Sequence[Judged], what: str) -> Spread:
+def spread(outcomes: Sequence[Result], what: str) -> Spread:
     """Return mean and standard deviation of an attribute over the balanced runs."""
     values = [float(getattr(o, what)) for o in outcomes if o.balanced]
     if not values:

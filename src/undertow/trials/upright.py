@@ -14,7 +14,8 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.optimiser import Budget
 from undertow.practice import estimator_for, gate_for, goal_for
 from undertow.rig import Bench, MuJoCoRig, plausible_rig, srv02_rig
-from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
+from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
+from undertow.swing_up.search import Found, found_for
 from undertow.trials.steering import CascadeSteering
 from undertow.trials.trial import Outcome, judge, trial
 
@@ -27,6 +28,7 @@ __all__ = [
     "all_of",
     "bench_of",
     "engine_trial",
+    "searched",
     "swing_trials",
 ]
 
@@ -44,6 +46,29 @@ def bench_of(mechanism: Mechanism) -> Bench:
     if mechanism.name == "rotary_pendulum":
         return replace(srv02_rig(), mechanism=mechanism)
     return plausible_rig(mechanism)
+
+
+def searched(
+    names: Sequence[str], fresh: int | None = None, progress: Progress = lambda _what, _part: None
+) -> dict[Mechanism, tuple[Found, ...]]:
+    """Return the swing-up gains of mechanisms of the library, kept or searched for.
+
+    Parameters
+    ----------
+    names
+        Of the mechanisms.
+    fresh
+        Seed of a new search; ``None``: what is kept is taken.
+    progress
+        Called with what is being done and the part done.
+    """
+    found = {}
+    for mechanism in all_of(names):
+        what = f"gains of {mechanism.name}"
+        found[mechanism] = found_for(
+            mechanism, seed=fresh or 0, fresh=fresh is not None, progress=partial(progress, what)
+        )
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +99,7 @@ class SwingResult:
 def swing_trials(
     mechanism: Mechanism,
     *,
+    swing: SwingUp | None = None,
     bench: Bench | None = None,
     seeds: int = 20,
     seconds: float = SWING_SECONDS,
@@ -85,6 +111,8 @@ def swing_trials(
     ----------
     mechanism
         The belief.
+    swing
+        The energy law; with the gains that are kept by default.
     bench
         The truth; :func:`bench_of` by default.
     seeds
@@ -95,14 +123,21 @@ def swing_trials(
         Called with the part done.
     """
     bench = bench_of(mechanism) if bench is None else bench
-    swing, region = SwingUp.designed(mechanism), CatchRegion(mechanism)
+    swing = designed(mechanism) if swing is None else swing
+    region = CatchRegion(mechanism)
     outcomes, catches, thrown, stops = [], [], 0, 0
     edges = np.array([[c.low, c.high] for c in mechanism.coordinates])
     for seed in range(seeds):
         progress(seed / seeds)
         controller = SwingUpAndCatch(swing, region)
         run = trial(
-            mechanism, bench, partial(_given, controller), hanging(mechanism), seconds, seed
+            mechanism,
+            bench,
+            partial(_given, controller),
+            hanging(mechanism),
+            seconds,
+            seed,
+            compensates=partial(getattr, controller, "balancing"),
         )
         truth = run.record.truth - controller.offset
         outcomes.append(judge(mechanism, replace(run.record, truth=truth), seed))
