@@ -383,7 +383,7 @@ number = 3
 
 def test_certify_and_verify_from_the_command_line(tmp_path: Path) -> None:
     """0 for proved, 1 for a file that is not, 2 for a wrong request; own mechanisms too."""
-    run = CliRunner().invoke
+    run = CliRunner(env={"COLUMNS": "140"}).invoke
     out = tmp_path / "proof"
     words = ["certify", "rotary_pendulum", "--start", "phi=20deg", "--seconds", "0"]
     surface = ["--surface", "lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1"]

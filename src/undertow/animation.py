@@ -291,16 +291,15 @@ def gif(film: Film, *, width: float = 4.2, dpi: int = 72) -> bytes:
 
 
 def _gauge(axes: Axes, film: Film, k: int, bar: FloatArray) -> None:
-    """Bars of the inputs, full width at the limit."""
+    """Bars of the inputs, full width at the limit, beside their names and values."""
     m = film.mechanism.m
-    names = [f"{i.name} ({i.unit})" for i in film.mechanism.inputs]
     axes.barh(range(m), film.u[k] / bar, height=0.5, color=COLOURS["vermilion"])
     axes.axvline(0, color=COLOURS["grey"], linewidth=0.8)
-    axes.set_xlim(-1.02, 1.02)
+    axes.set_xlim(-2.0, 1.02)
     axes.set_ylim(m - 0.5, -0.5)
-    for index, name in enumerate(names):
-        text = f"{name} {film.u[k, index]:+.2g} of ±{bar[index]:.3g}"
-        axes.text(-1.0, index, text, va="center", fontsize=7.5, color=COLOURS["black"])
+    for index, channel in enumerate(film.mechanism.inputs):
+        text = f"{channel.name} {film.u[k, index]:+.2g} of ±{bar[index]:.3g} {channel.unit}"
+        axes.text(-2.0, index, text, va="center", fontsize=7.5, color=COLOURS["black"])
     axes.axis("off")
 
 

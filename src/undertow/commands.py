@@ -29,15 +29,23 @@ __all__ = ["animation_files", "derivation_files", "library_picture", "mechanism_
 COLUMNS = 5
 
 
-def mechanism_table() -> Table:
-    """Return the mechanisms of the library with their coordinates, inputs and listed start."""
+def mechanism_table(width: int = 120) -> Table:
+    """Return the mechanisms of the library with their inputs and what they are.
+
+    Parameters
+    ----------
+    width
+        Of the terminal; from 100 columns on there is room for the listed starts too.
+    """
     table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
-    for head in ("mechanism", "n, m", "inputs", "start", "what it is"):
+    wide = width >= 100
+    for head in ("mechanism", "n, m", "inputs", *(["start"] if wide else []), "what it is"):
         table.add_column(head, no_wrap=head != "what it is")
     for build in LIBRARY.values():
         m = build()
-        inputs = ", ".join(f"{i.name} ≤ {i.limit:g} {i.unit}" for i in m.inputs)
-        cells = (m.name, f"{m.n}, {m.m}", inputs, start_words(m), m.description)
+        inputs = "\n".join(f"{i.name} ≤ {i.limit:g} {i.unit}" for i in m.inputs)
+        start = start_words(m).replace(", ", "\n")
+        cells = (m.name, f"{m.n}, {m.m}", inputs, *([start] if wide else []), m.description)
         table.add_row(*(Text(cell) for cell in cells))
     return table
 
@@ -55,8 +63,10 @@ def library_picture(progress: Callable[[str, float], None] | None = None) -> byt
             x0 = mechanism.state(**mechanism.start)
             plan = Optimiser(loop).require(x0).plan
             assert plan is not None  # require() raises otherwise
-            film = Film.of(loop.simulate(x0, plan))
-            still(figure.add_subplot(rows, COLUMNS, index + 1), film)
+            film = Film.of(loop.simulate(x0, plan), longest=loop.objective.horizon)
+            axes = figure.add_subplot(rows, COLUMNS, index + 1)
+            axes.set_anchor("N")  # titles of a row stand side by side
+            still(axes, film)
         return figure_bytes(figure)
 
 

@@ -11,6 +11,7 @@ with v = q̈_a and w = q̈_u: (1), (10) and (12) without a disturbance, equal to
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,9 @@ __all__ = ["Derivation", "Equation", "Section", "derivation"]
 
 #: The variable of characteristic polynomials, 1/s; s is taken by the surface.
 _s = sp.Symbol("sigma", real=True)
+
+#: Longest line of words.
+WIDTH = 79
 
 
 @dataclass(frozen=True)
@@ -65,12 +69,15 @@ class Derivation:
         return next(section for section in self.sections if section.title.startswith(title))
 
     def text(self) -> str:
-        """Return everything as lines of plain text with mathematical signs."""
+        """Return everything as lines of plain text with mathematical signs.
+
+        Words are folded for a terminal of 80 columns; a formula has one line, as long as it is.
+        """
         lines = [f"{self.mechanism.name}: {self.mechanism.description}"]
         for section in self.sections:
             lines += ["", section.title, "-" * len(section.title)]
             if section.words:
-                lines.append(section.words)
+                lines += textwrap.wrap(section.words, WIDTH)
             lines += [
                 f"  {plain(e.left)} {_RELATIONS[e.relation]} {plain(e.right)}"
                 for e in section.equations

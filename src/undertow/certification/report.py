@@ -51,17 +51,16 @@ def _witness(verdict: Verdict) -> str:
 
 
 def _claims(certified: Certified) -> Table:
-    table = _table("claim", "verdict", "margin", "worst point or witness", "method")
-    table.columns[1].no_wrap = True
+    """Verdict and margin beside each claim; its worst point and its method below it."""
+    table = _table("verdict", "claim", "margin")
+    table.columns[0].no_wrap = table.columns[2].no_wrap = True
     subject = certified.subject
     for verdict in (*(c.verdict for c in subject.claims), *subject.remarks):
-        table.add_row(
-            Text(verdict.claim),
-            _kind(verdict),
-            _margin(verdict),
-            Text(_witness(verdict)),
-            Text(verdict.method, style="dim"),
-        )
+        words = Text(verdict.claim)
+        if verdict.witness:
+            words.append(f"\nat {_witness(verdict)}", style="dim")
+        words.append(f"\n{verdict.method}", style="dim")
+        table.add_row(_kind(verdict), words, _margin(verdict))
     return table
 
 
@@ -138,17 +137,18 @@ def run_report(run: Run) -> RenderableType:
 
 def verification_report(certificate: Certificate, checked: Sequence[Checked]) -> RenderableType:
     """Return every claim of a certificate as it was decided again, and the sum."""
-    table = _table("surface", "claim", "kind of check", "verdict", "margin")
+    table = _table("verdict", "claim", "margin")
+    table.columns[0].no_wrap = table.columns[2].no_wrap = True
+    surface = None
     for item in checked:
-        table.add_row(
-            Text(str(item.subject.surface).removeprefix("Surface"), style="dim"),
-            Text(item.claim.verdict.claim),
-            item.claim.kind,
-            _kind(item.verdict),
-            _margin(item.verdict),
-        )
+        if item.subject.surface != surface:
+            surface = item.subject.surface
+            table.add_row("", Text(str(surface), style="bold"), "")
+        words = Text(item.claim.verdict.claim)
+        words.append(f"\n{item.claim.kind}", style="dim")
         if not item.verdict:
-            table.add_row("", Text(str(item.verdict.method), style="red"), "", "", "")
+            words.append(f"\n{item.verdict.method}", style="red")
+        table.add_row(_kind(item.verdict), words, _margin(item.verdict))
     held = sum(bool(item.verdict) for item in checked)
     good = held == len(checked)
     mark = Text("✓ " if good else "✗ ", style="green" if good else "red")

@@ -153,7 +153,7 @@ def certify(
     if out is not None:
         results.check_folder(out)
     console = terminal()
-    console.width = max(console.width, 140)
+    console.width = max(console.width, 80)
     mechanism = _mechanism(name or "rotary_pendulum", setting)
     report: Any
     figures: dict[str, bytes] = {}
@@ -258,7 +258,7 @@ def verify(
     model = _mechanism(mechanism or certificate.name, None)
     own = mechanism is not None and ".py:" in mechanism
     console = terminal()
-    console.width = max(console.width, 120)
+    console.width = max(console.width, 80)
     with progress_bar() as progress:
         checked = decide(
             certificate, model, own_parameters=own, max_seconds=seconds, progress=progress

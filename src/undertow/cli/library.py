@@ -46,8 +46,8 @@ def list_mechanisms(
     from undertow import commands
 
     console = terminal()
-    console.width = max(console.width, 150)  # rows may wrap, but no cell is cut
-    console.print(commands.mechanism_table(), crop=False, soft_wrap=True)
+    console.width = max(console.width, 80)
+    console.print(commands.mechanism_table(console.width))
     if out is not None:
         results.check_folder(out)
         with progress_bar() as progress:
