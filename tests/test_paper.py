@@ -65,6 +65,23 @@ def test_totals_do_not_depend_on_the_integration_step(row: str) -> None:
     assert np.ptp(totals) <= 1e-4 * totals[0]
 
 
+@pytest.mark.parametrize(
+    "change", ["40.95°", "d_e = 0.0256", pytest.param("held 0.5 ms", marks=pytest.mark.slow)]
+)
+def test_the_base_case_is_known_to_its_rounding_alone(change: str) -> None:
+    """A change inside the rounding of 40.9° and 0.025 moves 45.0, 13.8 to about 46.8, 14.0."""
+    condition, printed = CONDITIONS["matched"], PRINTED["energy", "base"]
+    rig = condition.mechanism
+    start = rig.state(phi=radians(40.95 if change == "40.95°" else 40.9))
+    belief = rig.with_parameters(d_e=0.0256) if change == "d_e = 0.0256" else rig
+    loop = ut.ClosedLoop(belief, OBJECTIVES["energy"])
+    if change == "held 0.5 ms":
+        loop = ut.ClosedLoop(belief, OBJECTIVES["energy"], step=5e-4, hold=1)
+    motion = loop.simulate(start, printed.surfaces)
+    assert motion.total == pytest.approx(46.8, abs=0.25)
+    assert motion.duration == pytest.approx(14.03, abs=0.05)
+
+
 def test_cascade_is_the_four_printed_sets_at_a_tenth_of_a_second() -> None:
     """Up to 0.1 s the cascade moves as the one-time optimum does, and then no more."""
     once = printed_motion(CONDITIONS["matched"], "energy", "one-time").trajectory
