@@ -118,7 +118,11 @@ def prove_loop(
     law = ReachingLaw() if reaching is None else reaching
     period = math.nextafter(hold * step, math.inf) if hold else 0.0
     motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}), period)
-    terminal, reach = _terminal(motion, coordinate, reach, step, duration, trials, seed, progress)
+
+    def attempt(far: float) -> tuple[TerminalSet, float]:
+        return _terminal_for(motion, coordinate, far, step, duration, trials, seed, progress)
+
+    terminal, reach = _terminal(attempt, reach)
     pending = _boxes(motion, coordinate, reach, widest)
     done: list[tuple[float, float]] = []
     horizon, barrier = 0.0, math.inf
@@ -189,14 +193,7 @@ def _boxes(
 
 
 def _terminal(
-    motion: LoopMotion,
-    coordinate: str,
-    reach: float,
-    step: float,
-    duration: float,
-    trials: int,
-    seed: int,
-    progress: Progress,
+    attempt: Callable[[float], tuple[TerminalSet, float]], reach: float
 ) -> tuple[TerminalSet, float]:
     """Find a terminal set for the motions from up to ``reach``, and where they fail to enter.
 
@@ -206,7 +203,7 @@ def _terminal(
     best: tuple[TerminalSet, float] | None = None
     for _ in range(3):
         try:
-            found = _terminal_for(motion, coordinate, reach, step, duration, trials, seed, progress)
+            found = attempt(reach)
         except InfeasibleError:
             if best is None:
                 raise
