@@ -214,7 +214,7 @@ class Optimiser:
         if given is not None:
             return given
         if self.shoots:
-            return Budget(40_000 if warm else 400_000)
+            return Budget(40_000 if warm else 800_000)
         if warm:
             return Budget(576 if self.counts_time else 1024)
         # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
@@ -389,8 +389,9 @@ class _Task:
     ) -> tuple[FloatArray, FloatArray]:
         """Return scores, below ``INADMISSIBLE`` only where admissible, and the guide."""
         loop, known = self.owner.loop, self.best_cost < INADMISSIBLE
+        # An incumbent, which comes first, is held to the small steps of those that follow.
+        seek = self.owner.counts_time and (known or (self.warm and not self.evaluations))
         self.evaluations += len(vectors)
-        seek = self.owner.counts_time and known
         cap = math.inf
         if known:
             cap = (NEARLY if seek else hopeless) * self.best_cost + self.resolution
@@ -577,16 +578,17 @@ class _Task:
             self.cost(around, hopeless=1.0)
 
     def shoot(self) -> bool:
-        """Shrink the time of arrival: from a fresh start, then from the best plan, and so on."""
+        """Shrink the time of arrival from a fresh start, then from the best plan; and so on."""
         loop, rng = self.owner.loop, self.rng
         aim = Shooting(self._miss, 0.9 * loop.objective.terminal_radius, loop.step, self._exhausted)
-        attempt = 0
+        fresh = True
         while not self._exhausted():
-            shot = self._fresh(aim) if attempt % 4 == 0 else self._again(aim)
+            before = self.best_cost
+            shot = self._fresh(aim) if fresh else self._again(aim)
             if shot is not None:
                 z, _ = aim.hop(*aim.shrink(*shot), lambda z: self._mutants(z, 256), rng, 15)
                 self.cost(z[None])
-            attempt += 1
+            fresh = not fresh and self.best_cost >= before
         return False
 
     def _fresh(self, aim: Shooting) -> tuple[FloatArray, float] | None:

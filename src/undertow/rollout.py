@@ -38,6 +38,9 @@ __all__ = ["Batch", "ClosedLoop", "Event", "Probe", "Trajectory"]
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
 
+#: Small steps before large ones are tried again, s; each time as long again as all before.
+CALMER = 0.5
+
 #: Stands in for linear ends that are not there.
 _NOTHING = np.zeros((1, 1, 1))
 
@@ -64,6 +67,7 @@ class _Room:
 
     def __init__(self, loop: ClosedLoop, count: int, segments: int) -> None:
         n, m = loop.mechanism.n, loop.mechanism.m
+        self.loop = loop
         self.count, self.padded = count, -(-count // LANES) * LANES
         self.at_target, self.width = loop._numbers.at_target, 2 * m * n
         w = len(loop.objective.constraints)
@@ -100,6 +104,13 @@ class _Room:
         if self.padded > count:
             lanes[count:] = lanes[count - 1]
             self.states[count:] = self.states[count - 1]
+
+    def part(self, which: NDArray[np.intp]) -> _Room:
+        """Return room for some of the lanes, filled alike."""
+        room = _Room(self.loop, len(which), self.lanes.shape[1])
+        lanes, width = self.lanes[which], self.width
+        room.fill(self.states[which], lanes[:, :, :width], lanes[:, :, width:-1])
+        return room
 
     def batch(self, start: float) -> Batch:
         """Return the results as named views."""
@@ -325,79 +336,67 @@ class ClosedLoop:
         *,
         start: float = 0.0,
         terminal: float | None = None,
+        every: int = 0,
+        seek: bool = False,
+        **options: Any,
+    ) -> Batch:
+        """Roll out what the room holds; the results live there too."""
+        end_radius = self.objective.terminal_radius if terminal is None else terminal
+        # Large steps see no closest approach, and leave nothing to record.
+        calm_from = 0 if self._hands_over and not every and not seek else steps
+        self._roll(room, switches, steps, calm_from, start, end_radius, seek, every, **options)
+        return room.batch(start)
+
+    def _roll(
+        self,
+        room: _Room,
+        switches: NDArray[np.int64],
+        steps: int,
+        calm_from: int,
+        start: float,
+        terminal: float,
+        seek: bool,
+        every: int,
+        *,
         cap: float = math.inf,
         stable_only: bool = False,
-        seek: bool = False,
-        every: int = 0,
         record: FloatArray = _NOTHING,
         noise: FloatArray | None = None,
-    ) -> Batch:
-        """Call the kernel on what the room holds; the results live there too."""
-        numbers, live = self._numbers, room.live
+    ) -> None:
+        """Call the kernel; from the step ``calm_from`` on, lanes may go on in large steps."""
+        numbers, live, out = self._numbers, room.live, room.out
         live.fill(1.0)
         self._check_gains(room.lanes, live, stable_only)
-        # Large steps see no closest approach, and leave nothing to record.
-        hands_over = self._hands_over and not every and not seek
+        hands_over = calm_from < steps
         prepared = self._prepare(room) if hands_over or stable_only else None
-        end = self.linear_end if hands_over else None
         if prepared is not None and stable_only:
             live *= prepared.stable
-
-        end_radius = self.objective.terminal_radius if terminal is None else terminal
-
-        def run(
-            states: FloatArray, live: FloatArray, lanes: FloatArray, yields: bool, out: FloatArray
-        ) -> None:
-            self._kernels.rollout(
-                states,
-                live,
-                lanes,
-                switches,
-                numbers.plant,
-                numbers.belief,
-                numbers.limits,
-                room.quiet if noise is None else noise,
-                start,
-                self.step,
-                steps,
-                max(1, self.hold),
-                end_radius,
-                self.escape,
-                cap,
-                1.0 if seek else 0.0,
-                yields,
-                every,
-                record,
-                out,
-            )
-
-        out = room.out
-        run(room.states, live, room.lanes, hands_over, out)
-        if hands_over and prepared is not None and end is not None:
-            self._kernels.settle(
-                room.lanes,
-                numbers.plant,
-                numbers.belief,
-                numbers.limits,
-                start + steps * self.step,
-                end_radius,
-                self.escape,
-                self.tail,
-                1.0 if end.counts_cost else 0.0,
-                prepared.A,
-                prepared.P,
-                prepared.powers,
-                prepared.forced,
-                out,
-            )
-            again = np.flatnonzero(out[:, 2] == UNSETTLED)
-            if len(again):  # too fast for large steps, or at a limit again: small steps to the end
-                rows = np.resize(again, -(-len(again) // LANES) * LANES)
-                whole = np.empty((len(rows), out.shape[1]))
-                run(room.states[rows], live[rows], room.lanes[rows], False, whole)
-                whole[: len(again), -1] += out[again, -1]
-                out[again] = whole[: len(again)]
-        return room.batch(start)
+        self._kernels.rollout(
+            room.states, live, room.lanes, switches, numbers.plant, numbers.belief,
+            numbers.limits, room.quiet if noise is None else noise, start, self.step, steps,
+            max(1, self.hold), terminal, self.escape, cap, 1.0 if seek else 0.0, calm_from,
+            every, record, out,
+        )  # fmt: skip
+        if not hands_over or prepared is None or self.linear_end is None:
+            return
+        self._kernels.settle(
+            room.lanes, numbers.plant, numbers.belief, numbers.limits, start + steps * self.step,
+            terminal, self.escape, self.tail, 1.0 if self.linear_end.counts_cost else 0.0,
+            prepared.A, prepared.P, prepared.powers, prepared.forced, out,
+        )  # fmt: skip
+        again = np.flatnonzero(out[: room.count, 2] == UNSETTLED)
+        if not len(again):
+            return
+        # Too fast for large steps, or at a limit again: small steps until later.
+        part = room.part(again)
+        failed = round((float(out[again, 1].max()) - start) / self.step)
+        later = failed + max(round(CALMER / self.step), calm_from)
+        self._roll(
+            part, switches, steps, min(later, steps), start, terminal, seek, every,
+            cap=cap, stable_only=stable_only,
+        )  # fmt: skip
+        part.out[:, -1] += np.resize(out[again, -1], len(part.out))
+        out[again] = part.out[: len(again)]
 
     def probe(self, x: FloatArray, times: Sequence[float] = (0.0,), horizon: float = 0.0) -> Probe:
         """Return a function that rolls out plans from x, again and again, without checks.

@@ -361,7 +361,7 @@ import numpy as np
 )
 def rollout(
     x0, live, lanes, switch, plant, belief, limits, noise,
-    start, h, steps, hold, terminal, escape, cap, seek, hands_over, every, record, out,
+    start, h, steps, hold, terminal, escape, cap, seek, calm_from, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
     W = np.empty({w.rows.count * LANES})
@@ -379,7 +379,7 @@ def rollout(
 {_lanes([*w.first_stage(sampled=sampled), *w.watch()], 3)}
             if every > 0 and step % every == 0:
 {_lanes(w.record(), 4)}
-            if hands_over and step % stride == 0 and segment == switch.shape[0]:
+            if step >= calm_from and step % stride == 0 and segment == switch.shape[0]:
 {_lanes(w.hand_over(), 4)}
             for rk in range(3):
                 weight = 1.0 if rk == 2 else 2.0
