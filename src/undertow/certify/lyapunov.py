@@ -103,8 +103,8 @@ class LyapunovFunction:
         gap = square - q * q
         return q * q / gap, 2 * q * square / (gap * gap)
 
-    def _stretched(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """I + Σ τ^j S_j and its derivative by q, (…, N, N)."""
+    def stretched(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return I + Σ τ^j S_j and its derivative by q, (…, N, N)."""
         assert self.stretch is not None
         tau, slope = self._tau(q)
         size = len(self.scale)
@@ -119,14 +119,14 @@ class LyapunovFunction:
         """Return z at the points y, (…, N); |y_0| < L."""
         c = np.asarray(y, dtype=float)
         if self.stretch is not None:
-            c = np.einsum("...ij,...j->...i", self._stretched(c[..., 0])[0], c)
+            c = np.einsum("...ij,...j->...i", self.stretched(c[..., 0])[0], c)
         return np.asarray(c @ self._inverse.T)
 
     def coordinate_rates(self, y: FloatArray, y_dot: FloatArray) -> FloatArray:
         """Return ż at the points y that move with ẏ, (…, N)."""
         c_dot = y_dot
         if self.stretch is not None:
-            total, slope = self._stretched(y[..., 0])
+            total, slope = self.stretched(y[..., 0])
             c_dot = np.einsum("...ij,...j->...i", total, y_dot)
             c_dot = c_dot + np.einsum("...ij,...j->...i", slope, y) * y_dot[..., :1]
         return np.asarray(c_dot @ self._inverse.T)
@@ -150,7 +150,7 @@ class LyapunovFunction:
                 low, high = np.where(error <= 0, q, low), np.where(error >= 0, q, high)
                 step = q - error / (value + q * rate)
                 q = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
-        total = self._stretched(np.minimum(q, np.nextafter(self.pole, 0)) * np.sign(c[..., 0]))[0]
+        total = self.stretched(np.minimum(q, np.nextafter(self.pole, 0)) * np.sign(c[..., 0]))[0]
         return np.asarray(np.linalg.solve(total, c[..., None])[..., 0])
 
     def __call__(self, y: ArrayLike) -> FloatArray:
@@ -158,8 +158,18 @@ class LyapunovFunction:
         points = np.asarray(y, dtype=float)
         outside = np.abs(points[..., 0]) >= self.pole
         z = self.coordinates(np.where(outside[..., None], 0.0, points))
-        powers = np.prod(z[..., None, :] ** self.exponents, axis=-1)
-        return np.asarray(np.where(outside, np.inf, powers @ self.coefficients))
+        values = self.monomials(z) @ self.coefficients
+        return np.asarray(np.where(outside, np.inf, values))
+
+    def monomials(self, z: FloatArray) -> FloatArray:
+        """Return Π z_i^e_ki, (…, N) to (…, K)."""
+        out = np.ones((*z.shape[:-1], len(self.exponents)))
+        for i, column in enumerate(self.exponents.T):
+            powers = [np.ones(z.shape[:-1])]
+            for _ in range(int(column.max())):
+                powers.append(powers[-1] * z[..., i])
+            out *= np.stack(powers, axis=-1)[..., column]
+        return out
 
     def times(self, factor: float) -> LyapunovFunction:
         """Return the function whose set is the smaller {V ≤ 1/factor} (for factor > 1)."""
@@ -202,22 +212,31 @@ class LyapunovFunction:
         self, tape: Tape, y: Sequence[sp.Expr], y_dot: Sequence[sp.Expr]
     ) -> tuple[sp.Expr, sp.Expr]:
         """Lay V and V̇ on a tape, for y and ẏ given as atoms; the numbers enter exactly."""
-        size = len(y)
         c, c_dot = sp.Matrix(y), sp.Matrix(y_dot)
         if self.stretch is not None:
-            q, square = y[0], sp.Rational(*float(self.pole).as_integer_ratio()) ** 2
-            inverse = tape.let(1 / (square - q**2))
-            tau = tape.let(square * inverse - 1)
-            slope = tape.let(2 * q * inverse**2 * square)
-            total, rate = sp.eye(size), sp.zeros(size, size)
-            power: sp.Expr = sp.Integer(1)
-            for j, S in enumerate(self.stretch, start=1):
-                rate = rate + exact_matrix(S) * (j * power)
-                power = tape.let(power * tau)
-                total = total + exact_matrix(S) * power
-            total, rate = tape.matrix(total), tape.matrix(rate * slope)
+            total, rate = self.lay_stretch(tape, y[0])
             c_dot = tape.matrix(total * c_dot + rate * c * y_dot[0])
             c = tape.matrix(total * c)
+        return self.lay_polynomial(tape, c, c_dot)
+
+    def lay_stretch(self, tape: Tape, q: sp.Expr) -> tuple[sp.Matrix, sp.Matrix]:
+        """Lay I + Σ τ^j S_j and its derivative by y_0 = q, an atom, on a tape."""
+        assert self.stretch is not None
+        size, square = len(self.scale), sp.Rational(*float(self.pole).as_integer_ratio()) ** 2
+        inverse = tape.let(1 / (square - q**2))
+        tau = tape.let(square * inverse - 1)
+        slope = tape.let(2 * q * inverse**2 * square)
+        total, rate = sp.eye(size), sp.zeros(size, size)
+        power: sp.Expr = sp.Integer(1)
+        for j, S in enumerate(self.stretch, start=1):
+            rate = rate + exact_matrix(S) * (j * power)
+            power = tape.let(power * tau)
+            total = total + exact_matrix(S) * power
+        return tape.matrix(total), tape.matrix(rate * slope)
+
+    def lay_polynomial(self, tape: Tape, c: sp.Matrix, c_dot: sp.Matrix) -> tuple[sp.Expr, sp.Expr]:
+        """Lay V and V̇ on a tape, for c = T z and ċ."""
+        size = len(c)
         inverse_scale = exact_matrix(self.scale).inv()
         z = tape.matrix(inverse_scale * c)
         z_dot = tape.matrix(inverse_scale * c_dot)
@@ -246,10 +265,7 @@ def first_crossing(V: LyapunovFunction, rays: FloatArray, level: float = 1.0) ->
     double crossing is missed, which a search can bear), and bisection refines it.
     """
     totals = V.exponents.sum(axis=1)
-    powers = np.ones((len(rays), len(V.exponents)))
-    for j in range(rays.shape[1]):
-        table = rays[:, j, None] ** np.arange(V.exponents.max() + 1)
-        powers *= table[:, V.exponents[:, j]]
+    powers = V.monomials(rays)
     parts = {
         int(d): powers[:, totals == d] @ V.coefficients[totals == d] for d in np.unique(totals)
     }

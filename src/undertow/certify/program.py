@@ -3,7 +3,7 @@
 :mod:`undertow.certify.interval` makes Python functions of a tape; here the tape becomes data
 (opcodes and registers) for one numba kernel, which is compiled once for all mechanisms and
 evaluates values and first derivatives over one box in some microseconds: fast enough for the
-admission gate, and an implementation apart from the one that the searches are checked with.
+admission gate.
 
 Why it is sound: the arithmetic of :mod:`undertow.certify.outward`.  Derivatives follow the
 chain rule in intervals; where |·|, max or min may switch, they are the hull of both sides

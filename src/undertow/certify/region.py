@@ -26,7 +26,8 @@ that in finite time, because V̇_k is bounded away from 0 on a compact set.  So 
 {V_k ≤ 1} is a region of attraction too.
 
 D is a guard {U ≤ 1}, |y_0| < L, inside a box: a quadratic U in the coordinates of V, around its
-set.  V > 1 is shown where U = 1 and where a face of the box has U ≤ 1.
+set.  U > 1 is shown on the faces of the box, so that D, which is connected, is inside; and
+V > 1 where U = 1, or that such a point is in the set inside.
 """
 
 from __future__ import annotations
@@ -36,85 +37,18 @@ import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import sympy as sp
 from numpy.typing import NDArray
 
-from undertow.certify.batch import Interval, IntervalArithmetic
-from undertow.certify.interval import OutwardFunction, compile_outward, derivative_tape
+from undertow.certify.batch import Interval
 from undertow.certify.lyapunov import LyapunovFunction, first_crossing
-from undertow.certify.motion import Motion, SurfaceMotion, VectorField, exact_matrix
+from undertow.certify.motion import Motion, SurfaceMotion, VectorField
+from undertow.certify.region_stage import Chart, Stage
 from undertow.certify.verdict import Kind, Verdict
-from undertow.codegen import Tape
 from undertow.errors import InvalidInputError
 
 __all__ = ["LyapunovFunction", "SurfaceMotion", "VectorField", "first_crossing", "verify_region"]
 
 FloatArray = NDArray[np.float64]
-
-
-class _Stage:
-    """V, its guard U and those of the set inside, over boxes in x (y = B x) and parameters."""
-
-    def __init__(
-        self,
-        motion: Motion,
-        V: LyapunovFunction,
-        inner: LyapunovFunction | None,
-        B: FloatArray,
-        parameters: Mapping[str, tuple[float, float]],
-    ) -> None:
-        tape, x = Tape(), motion.symbols
-        y = list(tape.matrix(exact_matrix(B) * sp.Matrix(x)))
-        rates, _ = motion.lay(tape, y)
-        value, rate = V.lay(tape, y, rates)
-        still = [sp.Integer(0)] * motion.size
-        others = [W for W in (V.guard, inner, inner and inner.guard) if W is not None]
-        parts = [value, rate, *(W.lay(tape, y, still)[0] for W in others)]
-        free = [p.symbol for p in motion.parameters if p.name in parameters]
-        fixed = [p for p in motion.parameters if p.name not in parameters]
-        variables = [*x, *free]
-        slopes = [derivative_tape(tape, variables, part) for part in parts]
-        inputs = [*variables, *(p.symbol for p in fixed)]
-        self._constants = [Interval(p.value) for p in fixed]
-        self.point = self._compile(tape, inputs, parts)
-        self._box = self._compile(tape, inputs, [*parts, *(d for row in slopes for d in row)])
-        self._tape, self._inputs, self._gradient, self._x = tape, inputs, slopes[1], x
-        self._second: OutwardFunction | None = None
-
-    def _compile(
-        self, tape: Tape, inputs: Sequence[sp.Symbol], outputs: Sequence[sp.Expr]
-    ) -> OutwardFunction:
-        run = compile_outward(tape, inputs, outputs, IntervalArithmetic())
-        return lambda *variables: [Interval.of(v) for v in run(*variables, *self._constants)]
-
-    def hessian(self, box: list[Interval]) -> list[list[Interval]]:
-        """Interval Hessian of V̇ in x over a box."""
-        size = len(self._x)
-        if self._second is None:
-            rows = [derivative_tape(self._tape, self._x, g) for g in self._gradient[:size]]
-            self._second = self._compile(self._tape, self._inputs, [e for row in rows for e in row])
-        flat = self._second(*box)
-        return [flat[i * size : (i + 1) * size] for i in range(size)]
-
-    def over(self, low: FloatArray, high: FloatArray) -> tuple[list[Interval], FloatArray]:
-        """V, V̇, U, … over boxes (N + P, B): natural and mean-value forms, and where to split."""
-        size = len(low)
-        middle = 0.5 * (low + high)
-        box = [Interval(low[i], high[i]) for i in range(size)]
-        away = [box[i] - Interval(middle[i]) for i in range(size)]
-        parts = self.point(*[Interval(row) for row in middle])
-        count = len(parts)
-        enclosed = self._box(*box)
-        spread = []
-        for i in range(size):
-            for k in range(count):
-                term = enclosed[count + k * size + i] * away[i]
-                parts[k] = parts[k] + term
-                if k == 1:
-                    spread.append(np.broadcast_to(term.hi - term.lo, low.shape[1:]))
-        return [a.intersect(b) for a, b in zip(enclosed[:count], parts, strict=True)], np.array(
-            spread
-        )
 
 
 def _negative_definite(H: list[list[Interval]]) -> bool:
@@ -198,7 +132,7 @@ def verify_region(
     chain = [V] if isinstance(V, LyapunovFunction) else list(V)
     started, used = time.monotonic(), time.process_time()
     claim = "{V ≤ 1} is a region of attraction on the surface, non-singular and compact"
-    method = "branch and bound, outward-rounded float64 intervals, mean-value form"
+    method = "branch and bound, outward-rounded quadratic Taylor models in float64"
     box_parameters = dict(parameters or {})
     _check(motion, chain, box_parameters)
     if not motion.at_rest:
@@ -230,19 +164,19 @@ def verify_region(
 
 
 class _Proof:
-    """One function, over the box |B⁻¹ y| ≤ reach."""
+    """One function, over the box |x| ≤ reach."""
 
     def __init__(
         self,
         motion: Motion,
         V: LyapunovFunction,
         inner: LyapunovFunction | None,
-        frame: tuple[FloatArray, FloatArray],
+        frame: tuple[Chart, FloatArray],
         parameters: Mapping[str, tuple[float, float]],
     ) -> None:
         self.motion, self.V, self.inner = motion, V, inner
-        self.B, self.reach = frame
-        self.stage = _Stage(motion, V, inner, self.B, parameters)
+        self.chart, self.reach = frame
+        self.stage = Stage(motion, V, inner, self.chart, parameters)
         self.names = [p.name for p in motion.parameters if p.name in parameters]
         self.ends = np.array([parameters[k] for k in self.names], dtype=float).reshape(-1, 2).T
         self.core = np.zeros(motion.size)
@@ -275,7 +209,7 @@ class _Proof:
 
     def _named(self, x: FloatArray) -> dict[str, float]:
         size = self.motion.size
-        y = (self.B @ x[:size]).tolist()
+        y = self.chart.y(x[:size]).tolist()
         return dict(zip([*self.motion.names, *self.names], [*y, *x[size:].tolist()], strict=True))
 
     def _wrong(self, x: FloatArray, parts: Sequence[Interval]) -> NDArray[np.bool_]:
@@ -287,16 +221,23 @@ class _Proof:
         return np.asarray(wrong & (np.abs(x[: len(self.core)]) > self.core[:, None]).any(0))
 
     def _done(
-        self, a: FloatArray, b: FloatArray, face: NDArray[np.bool_], parts: Sequence[Interval]
+        self,
+        a: FloatArray,
+        b: FloatArray,
+        face: NDArray[np.bool_],
+        parts: Sequence[Interval],
+        settled: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
         """Boxes that are settled; NaN settles nothing."""
         value, rate, guard = parts[:3]
-        outside = (value.lo > 1.0) | (guard.lo > 1.0)
+        outside = (guard.lo > 1.0) | (~face & (value.lo > 1.0))
         if self.inner is None:
             home = (np.maximum(np.abs(a), np.abs(b))[: len(self.core)] <= self.core[:, None]).all(0)
+            falls = settled | (rate.hi < 0.0)
         else:
+            falls = (settled & (parts[4].hi < 1.0)) | (rate.hi < 0.0)
             home = (parts[3].hi < 1.0) & (parts[4].hi < 1.0)
-        return np.asarray(outside | (~face & (((rate.hi < 0.0) & (guard.hi < 1.0)) | home)))
+        return np.asarray(outside | (~face & ((falls & (guard.hi < 1.0)) | home)))
 
     def _branch(
         self, max_boxes: int, deadline: float, chunk: int
@@ -311,22 +252,22 @@ class _Proof:
             a, b, f = low[:, -chunk:], high[:, -chunk:], face[-chunk:]
             low, high, face = low[:, :-chunk], high[:, :-chunk], face[:-chunk]
             count += a.shape[1]
-            parts, spread = self.stage.over(a, b)
-            done = self._done(a, b, f, parts)
+            parts, settled, spread = self.stage.over(a, b)
+            done = self._done(a, b, f, parts, settled)
             if done.all():
                 continue
             a, b, f, spread = a[:, ~done], b[:, ~done], f[~done], spread[:, ~done]
             tiny = ((b - a) / unit[:, None]).max(axis=0) < 1e-7
             suspects = np.flatnonzero(tiny) if tiny.any() else np.arange(min(len(f), 64))
             middle = 0.5 * (a[:, suspects] + b[:, suspects])
-            at = self.stage.point(*[Interval(row) for row in middle])
+            at = self.stage.point(middle)
             wrong = self._wrong(middle, at) & ~f[suspects]
             if wrong.any():
                 return "refuted", "", self._named(middle[:, int(wrong.argmax())]), count
-            through = f[suspects] & (at[0].hi <= 1.0) & (at[2].hi <= 1.0)
+            through = f[suspects] & (at[2].hi <= 1.0)
             if through.any():
                 where = self._named(middle[:, int(through.argmax())])
-                return "undecided", ", V ≤ 1 on the boundary of the box", where, count
+                return "undecided", ", the guard meets the boundary of the box", where, count
             if tiny.any() or count > max_boxes or time.monotonic() > deadline:
                 k = int(tiny.argmax())
                 why = ", stuck in a tiny box" if tiny.any() else ", effort ran out"
@@ -378,8 +319,8 @@ class _Proof:
             length = np.linalg.norm(z, axis=1)
             near = length <= first_crossing(self.V, z / length[:, None])
             z, p = z[near], p[near]
-            x = np.vstack([np.linalg.solve(self.B, self.V.points(z).T), p.T])
-            parts = self.stage.point(*[Interval(row) for row in x])
+            x = np.vstack([self.chart.x(self.V.points(z)).T, p.T])
+            parts = self.stage.point(x)
             wrong = self._wrong(x, parts)
             if wrong.any():
                 return np.asarray(x[:, int(wrong.argmax())])
@@ -415,10 +356,8 @@ def _check(
             )
 
 
-def _frame(
-    motion: Motion, chain: Sequence[LyapunovFunction]
-) -> tuple[FloatArray, FloatArray] | None:
-    """B, lower triangular, and half-sides in x = B⁻¹y of a box that holds {U ≤ 1} with room.
+def _frame(motion: Motion, chain: Sequence[LyapunovFunction]) -> tuple[Chart, FloatArray] | None:
+    """A chart and half-sides in x of a box that holds {U ≤ 1} with room.
 
     By rays in float64: the checker's faces decide whether it is so.  A triangular B keeps
     x_0 parallel to y_0, so that the box can end before the singularity and V's pole.
@@ -426,19 +365,21 @@ def _frame(
     rays = np.random.default_rng(0).normal(size=(20000, motion.size))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     edges = []
+    chart = Chart(chain[-1], chain[0] if len(chain) > 1 else None)
     for V in chain:
         if V.guard is None:
             return None
-        edges.append(V.guard.points(rays))
-    B = np.linalg.cholesky(np.cov(edges[-1].T, bias=True).reshape(motion.size, motion.size))
-    reach = np.abs(np.linalg.solve(B, np.vstack(edges).T)).max(axis=1)
+        edges.append(chart.x(V.guard.points(rays)))
+    covariance = np.cov(edges[-1].T, bias=True).reshape(motion.size, motion.size)
+    chart.B = np.asarray(np.linalg.cholesky(covariance))
+    reach = np.abs(np.linalg.solve(chart.B, np.vstack(edges).T)).max(axis=1)
     room = 0.04 * reach
     ahead = np.zeros(motion.size)
     ahead[0] = 1.0
-    limit = _clear(motion, chain[-1], ahead) / B[0, 0]
+    limit = _clear(motion, chain[-1], ahead) / chart.B[0, 0]
     if limit > reach[0]:
         room[0] = min(room[0], 0.3 * (limit - reach[0]))
-    return np.asarray(B), np.asarray(reach + room)
+    return chart, np.asarray(reach + room)
 
 
 def _far_point(V: LyapunovFunction) -> FloatArray:

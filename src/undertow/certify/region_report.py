@@ -12,8 +12,9 @@ import json
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -172,8 +173,12 @@ def report(
     boxes: bool = False,
     chain: tuple[LyapunovFunction, ...] = (),
     progress: Progress | None = None,
+    keep: Callable[[tuple[LyapunovFunction, ...]], None] | None = None,
 ) -> Row:
-    """Search for one row and prove it, or prove the chain that is given."""
+    """Search for one row and prove it, or prove the chain that is given.
+
+    ``keep`` is as for :func:`undertow.certify.region_search.prove_region`.
+    """
     way = np.eye(motion.size)[0]
     free = motion.mechanism.coordinates[motion.mechanism.m]
     top = singular_distance_on_axis(motion, math.pi if free.unit == "rad" else 10 * target)
@@ -185,7 +190,9 @@ def report(
         )
         seconds = math.nan
     else:
-        region = prove_region(motion, way, programs=programs, goal=1.03 * target, progress=progress)
+        region = prove_region(
+            motion, way, programs=programs, goal=1.15 * target, progress=progress, keep=keep
+        )
         chain, verdict, raised = region.chain, region.verdict, region.raised
         seconds = time.process_time() - started
     reach = extent(chain[-1], way) * (1 - 1e-9) if verdict else 0.0
@@ -222,6 +229,13 @@ def main() -> None:
     arguments = parser.parse_args()
     known = read_chains(arguments.claims) if arguments.claims else {}
     claims: dict[str, object] = {}
+
+    def keep(name: str, chain: tuple[LyapunovFunction, ...]) -> None:
+        """Write what is proved as soon as it is: a run that is stopped loses nothing."""
+        if arguments.out:
+            claims[name] = {"functions": [function_data(V) for V in chain]}
+            arguments.out.write_text(json.dumps(claims) + "\n", encoding="utf-8")
+
     print(HEAD, flush=True)
     for name, title, motion, target, uncertain in motions(arguments.only):
         if known and name not in known:
@@ -235,11 +249,10 @@ def main() -> None:
             boxes=arguments.boxes,
             chain=known.get(name, ()),
             progress=lambda line: print(line, file=sys.stderr, flush=True),
+            keep=partial(keep, name),
         )
         print(row.markdown(), flush=True)
-        claims[name] = {"functions": [function_data(V) for V in row.chain]}
-        if arguments.out:
-            arguments.out.write_text(json.dumps(claims) + "\n", encoding="utf-8")
+        keep(name, row.chain)
 
 
 if __name__ == "__main__":

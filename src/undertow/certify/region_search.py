@@ -136,8 +136,9 @@ def prove_region(
     slow: bool = True,
     goal: float = math.inf,
     parameters: Mapping[str, tuple[float, float]] | None = None,
-    max_boxes: int = 2_000_000,
+    max_boxes: int = 1_000_000,
     progress: Progress | None = None,
+    keep: Callable[[Chain], None] | None = None,
 ) -> ProvedRegion:
     """Search for a region of attraction, prove it, and raise its level as far as that goes.
 
@@ -150,6 +151,9 @@ def prove_region(
     max_boxes
         Of each function's proof.  The proofs are not timed: with ``seconds`` left out the
         work does not depend on the machine.
+    keep
+        Called with the functions that are proved so far, whenever there is one more: a run
+        that is stopped need not lose them.
 
     Returns
     -------
@@ -194,6 +198,8 @@ def prove_region(
                 f"function {len(chain)}: reach {extent(chain[-1], way):.4f} {verdict.kind}, "
                 f"{boxes} boxes"
             )
+        if verdict and keep is not None:
+            keep(tuple(chain))
         return verdict
 
     chain = _proved_chain(far, found, decide)
