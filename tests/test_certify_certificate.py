@@ -16,7 +16,7 @@ import sympy as sp
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.certification import certificate_files, certify_surface, mechanism_from_file
+from undertow.certification import certificate_files, certify_surface
 from undertow.certify.certificate import (
     LARGEST,
     Certificate,
@@ -32,6 +32,7 @@ from undertow.certify.sets import ProvedStarts, proved_sets
 from undertow.certify.verify import reaches, verify
 from undertow.cli import app
 from undertow.errors import ArtefactError, CertificateError, InvalidInputError
+from undertow.modelling import mechanism_from_file
 from undertow.plan import Plan
 from undertow.verdict import Verdict
 

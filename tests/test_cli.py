@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy as sp
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -344,6 +345,24 @@ def test_box_words_become_constraints_in_si() -> None:
     at = dict(zip(rig.x, rig.state(theta=-1.0, phi=-0.4, phi_dot=3.0), strict=True))
     margins = [float(margin.subs(at)) for margin in objective.path_margins(rig)]
     np.testing.assert_allclose(margins, [np.pi / 3 - 1.0, np.pi - 3.0, 0.1])
+
+
+def test_a_mechanism_of_a_file_is_one_like_any_other(tmp_path: Path) -> None:
+    """``FILE.py:NAME`` serves where a name of the library does, with parameters and limits."""
+    file = tmp_path / "model.py"
+    file.write_text("import undertow as ut\nmine = ut.mechanisms.cart_pendulum()\n")
+    found = mechanism_named(f"{file}:mine", ["l=0.4"], ["force=7"])
+    assert found.substitution[sp.Symbol("l", real=True)] == 0.4
+    assert found.input_limits == [7.0]
+    code, out, _ = run("derive", f"{file}:mine")
+    assert code == 0
+    assert "M₁₂ = l m_p cos(φ)" in out
+    code, out, err = run("derive", f"{file}:yours")
+    assert (code, out) == (2, "")
+    assert "yours" in err
+    code, _, err = run("simulate", f"{tmp_path}/none.py:mine")
+    assert code == 1
+    assert "none.py" in err
 
 
 def test_limit_words_replace_the_named_inputs_alone() -> None:

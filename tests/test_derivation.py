@@ -194,6 +194,19 @@ def test_numbers_in_energies_are_shown_as_people_write_them() -> None:
     assert plain(shown) == "4 h²/3 + h + 9.81"
 
 
+def test_words_fit_a_terminal_and_lists_stay_lists() -> None:
+    """Claim: no line of words is longer than 79; each coordinate and parameter has its own."""
+    formulas = shown("gantry_crane")
+    lines = formulas.text().splitlines()
+    for section in formulas.sections:
+        at = lines.index(section.title) + 2
+        words = lines[at : at + len(section.words.splitlines())]
+        assert all(len(line) <= 79 for line in words)
+    mechanism = formulas.mechanism
+    for name in [i.name for i in mechanism.inputs] + [p.name for p in mechanism.parameters]:
+        assert any(re.match(rf"  {name} ", line) for line in lines), name
+
+
 def test_derive_on_the_command_line(tmp_path: object) -> None:
     """Claim: text by default, LaTeX on request, both files with --out."""
     words = ["derive", "cart_pendulum"]

@@ -49,6 +49,16 @@ class Section:
     equations: tuple[Equation, ...] = ()
 
 
+def _heading(mechanism: Mechanism) -> str:
+    return f"{mechanism.name}: {mechanism.description}".removesuffix(": ")
+
+
+def _folded(line: str) -> list[str]:
+    """Fold a line of words; what goes over is indented a little more than the line is."""
+    indent = line[: len(line) - len(line.lstrip())]
+    return textwrap.wrap(line, WIDTH, subsequent_indent=f"{indent}  " if indent else "")
+
+
 @dataclass(frozen=True, eq=False)
 class Derivation:
     """The formulas of one mechanism, section by section.
@@ -73,11 +83,11 @@ class Derivation:
 
         Words are folded for a terminal of 80 columns; a formula has one line, as long as it is.
         """
-        lines = [f"{self.mechanism.name}: {self.mechanism.description}"]
+        lines = [_heading(self.mechanism)]
         for section in self.sections:
             lines += ["", section.title, "-" * len(section.title)]
             if section.words:
-                lines += textwrap.wrap(section.words, WIDTH)
+                lines += [part for line in section.words.splitlines() for part in _folded(line)]
             lines += [
                 f"  {plain(e.left)} {_RELATIONS[e.relation]} {plain(e.right)}"
                 for e in section.equations

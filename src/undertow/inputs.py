@@ -16,6 +16,7 @@ import numpy as np
 from undertow import mechanisms
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.modelling import mechanism_from_file
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
 from undertow.surface import Surface
 
@@ -44,12 +45,13 @@ _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)
 def mechanism_named(
     name: str, settings: Sequence[str] = (), limits: Sequence[str] = ()
 ) -> Mechanism:
-    """Return a mechanism of the library, with parameters and input limits replaced.
+    """Return a mechanism of the library or of a file, its parameters and input limits replaced.
 
     Parameters
     ----------
     name
-        Its name in the library.
+        Its name in the library, or ``FILE.py:NAME`` for one's own, see
+        :func:`undertow.modelling.mechanism_from_file`.
     settings
         Parameters as ``name=value``, SI units.
     limits
@@ -59,12 +61,21 @@ def mechanism_named(
     ------
     InvalidInputError
         For an unknown mechanism, parameter or input, or a value outside its bounds.
+    ArtefactError
+        When the file cannot be read or fails.
     """
-    if name not in mechanisms.LIBRARY:
+    if ".py:" in name:
+        mechanism = mechanism_from_file(name)
+    elif name in mechanisms.LIBRARY:
+        mechanism = mechanisms.LIBRARY[name]()
+    else:
         raise InvalidInputError(
-            "mechanism", value=repr(name), limit=f"one of {', '.join(mechanisms.LIBRARY)}"
+            "mechanism",
+            value=repr(name),
+            limit=f"one of {', '.join(mechanisms.LIBRARY)}",
+            remedy="One of your own is FILE.py:NAME",
         )
-    mechanism = mechanisms.LIBRARY[name]().with_parameters(**parse_values(settings))
+    mechanism = mechanism.with_parameters(**parse_values(settings))
     if not limits:
         return mechanism
     new = parse_values(limits, "limit of input", "voltage=10")

@@ -62,7 +62,7 @@ def _head(mechanism: Mechanism, objective: Objective, start: FloatArray) -> list
     if objective.hard_input:
         kept += [f"|{i.name}| ≤ {i.limit:g} {i.unit} before clipping" for i in mechanism.inputs]
     return [
-        ("mechanism", f"{mechanism.name}: {mechanism.description}"),
+        ("mechanism", f"{mechanism.name}: {mechanism.description}".removesuffix(": ")),
         ("objective", f"minimum {objective.name}, {objective.unit}"),
         *([("constraints", ", ".join(kept))] if kept else []),
         ("start", _state_words(mechanism, start)),

@@ -14,7 +14,6 @@ from undertow.certification.subjects import (
     certify_appendix,
     certify_run,
     certify_surface,
-    mechanism_from_file,
 )
 
 __all__ = [

@@ -31,16 +31,6 @@ from undertow.stability import first_surface
 __all__ = ["certify", "verify"]
 
 
-def _mechanism(name: str, settings: list[str] | None) -> Mechanism:
-    """Return a mechanism of the library, or one's own from ``FILE.py:NAME``."""
-    if ".py:" not in name:
-        return inputs.mechanism_named(name, settings or ())
-    from undertow.certification import mechanism_from_file
-
-    mechanism = mechanism_from_file(name)
-    return mechanism.with_parameters(**inputs.parse_values(settings)) if settings else mechanism
-
-
 def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[float, float]]:
     """Return [low, high] of plant parameters from per cents."""
     own = {p.name: p.value for p in mechanism.parameters}
@@ -154,7 +144,7 @@ def certify(
         results.check_folder(out)
     console = terminal()
     console.width = max(console.width, 80)
-    mechanism = _mechanism(name or "rotary_pendulum", setting)
+    mechanism = inputs.mechanism_named(name or "rotary_pendulum", setting or ())
     report: Any
     figures: dict[str, bytes] = {}
     with progress_bar() as progress:
@@ -255,7 +245,7 @@ def verify(
             value=certificate.name,
             remedy="Name its file: --mechanism FILE.py:NAME",
         )
-    model = _mechanism(mechanism or certificate.name, None)
+    model = inputs.mechanism_named(mechanism or certificate.name)
     own = mechanism is not None and ".py:" in mechanism
     console = terminal()
     console.width = max(console.width, 80)

@@ -10,12 +10,12 @@ import typer
 from undertow import inputs, results
 from undertow.cascade import Cascade
 from undertow.cli.terminal import (
+    AnyName,
     Box,
     Goal,
     HardInput,
     Horizon,
     Limits,
-    Name,
     Seed,
     Settings,
     Start,
@@ -45,11 +45,12 @@ __all__ = ["optimise", "simulate"]
         "undertow simulate rotary_pendulum --control one-time --plant m=0.15",
         "undertow simulate rotary_pendulum --start phi=20deg --box theta=60deg "
         "--limit voltage=8 --hard-input",
+        "undertow simulate model.py:bar",
     )
 )
 @reports_errors
 def simulate(
-    name: Name,
+    name: AnyName,
     start: Start = None,
     objective: Goal = "energy",
     control: Annotated[
@@ -156,7 +157,7 @@ def simulate(
 )
 @reports_errors
 def optimise(
-    name: Name,
+    name: AnyName,
     start: Start = None,
     objective: Goal = "energy",
     setting: Settings = None,

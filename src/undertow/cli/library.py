@@ -10,12 +10,12 @@ import typer
 
 from undertow import inputs, results
 from undertow.cli.terminal import (
+    AnyName,
     Box,
     Goal,
     HardInput,
     Horizon,
     Limits,
-    Name,
     Seed,
     Settings,
     Start,
@@ -60,11 +60,12 @@ def list_mechanisms(
         "undertow derive rotary_pendulum",
         "undertow derive gantry_crane --latex",
         "undertow derive acrobot --out formulas",
+        "undertow derive model.py:bar",
     )
 )
 @reports_errors
 def derive(
-    name: Name,
+    name: AnyName,
     latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX document.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for NAME.txt and NAME.tex.")] = None,
 ) -> None:
@@ -75,7 +76,7 @@ def derive(
     if out is not None:
         results.check_folder(out)
     files = commands.derivation_files(mechanism)
-    typer.echo(files[f"{name}.tex" if latex else f"{name}.txt"].decode(), nl=False)
+    typer.echo(files[f"{mechanism.name}.{'tex' if latex else 'txt'}"].decode(), nl=False)
     if out is not None:
         say(terminal(stderr=True), write(out, files))
 
@@ -128,7 +129,7 @@ def survey(
 )
 @reports_errors
 def animate(
-    name: Name,
+    name: AnyName,
     start: Start = None,
     objective: Goal = "energy",
     setting: Settings = None,

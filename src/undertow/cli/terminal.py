@@ -20,6 +20,7 @@ from undertow import results
 from undertow.errors import UndertowError
 
 __all__ = [
+    "AnyName",
     "Application",
     "Box",
     "Goal",
@@ -166,6 +167,12 @@ def say(console: Console, text: str) -> None:
 
 
 Name = Annotated[str, typer.Argument(help="Mechanism, e.g. rotary_pendulum.", metavar="NAME")]
+AnyName = Annotated[
+    str,
+    typer.Argument(
+        help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME.", metavar="NAME"
+    ),
+]
 Start = Annotated[
     list[str] | None,
     typer.Option(

@@ -9,6 +9,7 @@ from undertow.modelling.drives import DCMotor, voltage_driven
 from undertow.modelling.equations import from_energies, from_matrices
 from undertow.modelling.equilibrium import find_equilibrium, holding_input, move_target
 from undertow.modelling.mjcf import from_mjcf, read_mjcf
+from undertow.modelling.python_file import mechanism_from_file
 from undertow.modelling.rigid_body import mechanism_from_tree
 from undertow.modelling.sympy_mechanics import from_kane, from_lagrange
 from undertow.modelling.tree import Actuator, Coupling, Joint, Link, Tree
@@ -31,6 +32,7 @@ __all__ = [
     "from_mjcf",
     "from_urdf",
     "holding_input",
+    "mechanism_from_file",
     "mechanism_from_tree",
     "move_target",
     "read_mjcf",
