@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -24,7 +25,7 @@ __all__ = ["ended", "motion_files", "motion_report", "proposal_files", "proposal
 
 _ENDINGS = {
     Event.REACHED: "reached the target, ‖x‖ ≤ {radius:g}",
-    Event.HORIZON: "had not reached ‖x‖ ≤ {radius:g} by the horizon",
+    Event.HORIZON: "had not reached ‖x‖ ≤ {radius:g} by the horizon: ‖x‖ = {norm:.3g}",
     Event.CONSTRAINT: "broke {broken}",
     Event.SINGULAR: "met the singularity (37): the law does not exist further on",
     Event.DIVERGED: "diverged",
@@ -72,7 +73,9 @@ def _head(mechanism: Mechanism, objective: Objective, start: FloatArray) -> list
 def ended(motion: Trajectory, objective: Objective) -> str:
     """Say in words how a motion ended."""
     broken = _broken(motion, objective) if motion.event == Event.CONSTRAINT else ""
-    words = _ENDINGS[motion.event].format(radius=objective.terminal_radius, broken=broken)
+    words = _ENDINGS[motion.event].format(
+        radius=objective.terminal_radius, norm=float(np.linalg.norm(motion.x[-1])), broken=broken
+    )
     return f"{words}, at {motion.duration:.3f} s"
 
 

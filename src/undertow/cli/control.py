@@ -42,7 +42,7 @@ __all__ = ["optimise", "simulate"]
         "--out motion",
         "undertow simulate rotary_pendulum --start phi=20deg "
         "--surface 'lambda_a=-0.5 alpha_u=5 lambda_u=10'",
-        "undertow simulate rotary_pendulum --control one-time --plant m=0.15",
+        "undertow simulate rotary_pendulum --objective time --control one-time --plant m=0.13",
         "undertow simulate rotary_pendulum --start phi=20deg --box theta=60deg "
         "--limit voltage=8 --hard-input",
         "undertow simulate model.py:bar",
