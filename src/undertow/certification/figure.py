@@ -187,4 +187,5 @@ def _units(motion: SurfaceMotion, index: int) -> tuple[float, str]:
     coordinate = mechanism.coordinates[index - 2 * free]
     factor, unit = display(coordinate.unit)
     stem = names.get(coordinate.name, coordinate.name)
-    return factor, f"w = {stem} + λₐ⁻¹λᵤ q ({unit})"
+    other = mechanism.coordinates[m].name if free == 1 else "q_u"
+    return factor, f"w = {stem} + λₐ⁻¹λᵤ {names.get(other, other)} ({unit})"

@@ -82,7 +82,7 @@ def loop_figure(
             Line2D([], [], color=COLOURS["blue"], lw=1.2, label="from there"),
             Line2D([], [], color=COLOURS["sky"], lw=1.2, label="from beyond, arrives"),
             Line2D(
-                [], [], color=COLOURS["vermilion"], lw=1.2, label=f"does not in {duration:.1f} s"
+                [], [], color=COLOURS["vermilion"], lw=1.2, label=f"not within {duration:.3g} s"
             ),
             Patch(color=to_rgba(COLOURS["green"], 0.35), label="proved terminal set"),
         ]

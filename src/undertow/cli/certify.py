@@ -174,15 +174,14 @@ def certify(
             certified, report = (one,), certification.subject_report(mechanism, one)
         if out is not None:
             for index, item in enumerate(certified):
+                title = f"{mechanism.name}: {item.title.removeprefix('Surface').strip('()')}"
                 if item.region is not None:
                     progress("figure", 0.95)
-                    title = f"{mechanism.name}: {item.title.removeprefix('Surface')}"
                     figure = certification.region_figure(item.region, title)
                     key = "region.png" if len(certified) == 1 else f"region_{index + 1}.png"
                     figures[key] = figure_bytes(figure)
                 for claim in (c for c in item.subject.claims if c.kind == "closed loop"):
                     found = LoopClaim.from_dict(claim.data)
-                    title = f"{mechanism.name}: {item.title.removeprefix('Surface')}"
                     picture = certification.loop_figure(
                         mechanism, item.subject.surface, item.subject.reaching, found, title
                     )
