@@ -12,8 +12,8 @@ from undertow.delay import bench_gate, delay_gate, delay_margin, feedback, noise
 from undertow.errors import InvalidInputError
 from undertow.inner_loop import InnerLoop
 from undertow.plan import Plan
-from undertow.practice import estimator_for
-from undertow.rig import Bench, RealisticRig, Timing, srv02_rig
+from undertow.practice import NOISE, estimator_for, reaching_for
+from undertow.rig import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
 
 #: Nearly singular (37): excellent on the model, enormous gains.
 KEEN = ut.Surface(-1, -3.561, 1.051, 8.234)
@@ -81,6 +81,17 @@ def test_what_an_estimator_does_not_know_comes_out_as_input(
     assert not refused.accepted
     assert "noise" in refused.reason
     assert bench_gate(0.001, 0.0, covariance=P, noise=9.0)(loop, *plans, x, 60.0).accepted
+
+
+def test_the_boundary_layer_is_as_thick_as_the_sensors_need(arm: ut.Mechanism) -> None:
+    """The paper's where that is quiet; else the thinnest that is, of halves."""
+    assert reaching_for(estimator_for(arm, srv02_rig())) == ut.ReachingLaw()
+    crane = ut.mechanisms.overhead_crane()
+    estimator = estimator_for(crane, plausible_rig(crane))
+    law, P = reaching_for(estimator), estimator.settled()[:4, :4]
+    surface = ut.first_surface(crane)
+    thinner = ut.ReachingLaw(layer=float(np.max(law.layer)) / 2)
+    assert noise_share(crane, surface, P, law) <= NOISE < noise_share(crane, surface, P, thinner)
 
 
 def test_a_weaker_motor_must_do(arm: ut.Mechanism) -> None:

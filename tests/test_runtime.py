@@ -473,3 +473,28 @@ def test_a_keeper_brings_the_output_to_zero_when_its_controller_falls_silent(
     finally:
         rig.close()
     assert not rig.process.is_alive()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("reaction_wheel_pendulum", 1), ("reaction_wheel_pendulum", 2), ("two_motor_three_link", 2),
+     ("two_motor_three_link", 4), ("tora", 0)],
+)  # fmt: skip
+def test_mechanisms_of_all_kinds_are_held_on_their_realistic_rigs(name: str, seed: int) -> None:
+    """A wheel that spins at 240 rad/s, two motors, an arm that sticks: held to the end."""
+    recipe = Recipe(mechanism=name, rig="realistic", evaluations=256, seed=seed)
+    with session(recipe, simulated=True) as runtime:
+        report = runtime.run(6.0)
+    assert report.stopped_by == "operator: stop"
+    assert report.mode is Mode.SAFE_STOP
+    assert "BALANCE" in report.entered
+
+
+@pytest.mark.slow
+def test_a_pendulum_that_falls_is_let_go_of() -> None:
+    """A reaction wheel beyond what its motor can do: a safe stop at a right angle."""
+    recipe = Recipe(mechanism="reaction_wheel_pendulum", rig="realistic", evaluations=64, seed=0)
+    with session(recipe, simulated=True) as runtime:
+        report = runtime.run(3.0)
+    assert report.stopped_by == "thrown out"

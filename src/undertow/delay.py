@@ -204,7 +204,7 @@ def bench_gate(
     covariance
         Of what an estimator does not know of the state, (2n, 2n); ``None``: nothing.
     noise
-        Largest :func:`noise_share` that this may cause.
+        Largest :func:`noise_share` that this may cause, where the old plan causes less.
     """
     late = delay_gate(least, period)
 
@@ -224,7 +224,7 @@ def bench_gate(
         if not admission.accepted or new == old:
             return admission
         share = noisiest(loop, new)
-        if share > noise:
+        if share > max(noise, noisiest(loop, old)):
             why = f"{100 * share:.3g} % of the input would be noise, {100 * noise:g} % at most"
             return refused(loop, old, x, horizon, why)
         limits = (1.0 - reserve) * loop.mechanism.input_limits

@@ -15,13 +15,15 @@ import numpy as np
 import sympy as sp
 
 from undertow.cascade import Gate
-from undertow.delay import bench_gate
+from undertow.delay import bench_gate, noise_share
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Names, Objective, state_box
 from undertow.rig import Bench, Encoder
+from undertow.sliding import ReachingLaw
+from undertow.stability import first_surface
 
-__all__ = ["Goal", "estimator_for", "gate_for", "goal_for"]
+__all__ = ["Goal", "estimator_for", "gate_for", "goal_for", "reaching_for"]
 
 #: ``energy``: Φ = uᵀu + w xᵀx.  ``time``: Φ = 1 + r Σ (u_i/u_max,i)².  ``effort``: the same for
 #: every mechanism, Φ = Σ (u_i/u_max,i)² + 0.01 xᵀx.
@@ -39,6 +41,10 @@ TERMINAL = 0.05
 #: What every admitted surface must bear: periods of delay, and so much less of the input; and
 #: the part of the input that noise of the sensors may take, standard deviation.
 BEARS, RESERVE, NOISE = 6, 0.15, 0.2
+
+#: The paper's boundary layer ε, and how often it may be doubled for the noise: η/ε from 200 to
+#: 25 per second.
+LAYER, DOUBLED = 0.1, 3
 
 #: Density of the drift of a matched disturbance, parts of the smallest input limit per √s.
 DRIFT = 0.1
@@ -91,6 +97,19 @@ def gate_for(estimator: KalmanFilter) -> Gate:
     period, size = estimator.period, 2 * estimator.mechanism.n
     covariance = estimator.settled()[:size, :size]
     return bench_gate(BEARS * period, RESERVE, period=period, covariance=covariance, noise=NOISE)
+
+
+def reaching_for(estimator: KalmanFilter) -> ReachingLaw:
+    """Return the paper's reaching law, its boundary layer as thick as the sensors need.
+
+    The gains near the target go with η/ε: ε is doubled until what the estimator does not know
+    takes no more than ``NOISE`` of the input on the first surface, ``DOUBLED`` times at most.
+    """
+    mechanism, size = estimator.mechanism, 2 * estimator.mechanism.n
+    covariance, surface = estimator.settled()[:size, :size], first_surface(estimator.mechanism)
+    laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
+    quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)
+    return next(quiet, laws[-1])
 
 
 def goal_for(mechanism: Mechanism, goal: Goal, *, horizon: float = 60.0) -> Objective:

@@ -27,7 +27,7 @@ from undertow.runtime.modes import Command, Mode, Signs, successor
 from undertow.runtime.sensors import SensorWatch
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import Answer, Request, lanes_of
-from undertow.runtime.steps import apart, confine, off_by, settle, sound
+from undertow.runtime.steps import apart, confine, farthest, off_by, settle, sound
 from undertow.swing_up import SwingUpAndCatch
 
 __all__ = ["Controller", "Inputs", "Note"]
@@ -131,6 +131,8 @@ class Controller:
         self._law = law_module(mechanism, cascade.reaching.switching).step
         self._block, self._limited = law.block, law["u"]
         self._turn, self._of_u = np.zeros(2 * n), np.r_[m:n, n + m : 2 * n]
+        units = [c.unit for c in mechanism.coordinates]
+        self._angles = np.array([i for i in range(m, n) if units[i] == "rad"], dtype=np.int64)
         self.mode, self.stopped_by = Mode.IDLE, ""
         self.memory = memory
         self.notes: list[Note] = []
@@ -211,7 +213,7 @@ class Controller:
         allowed = margin > settings.margin
         signs.inside = caught if self.swing_up is not None else allowed
         swing, far = apart(home, self._of_u)
-        signs.lost = not allowed or not far < self.cascade.loop.escape or self._thrown_out()
+        signs.lost = not allowed or not far < settings.escape or self._thrown_out()
         signs.settled = swing <= settings.near * (2.0 if mode is Mode.BALANCE else 1.0)
         self._change(t, *successor(mode, signs))
         mode = self.mode
@@ -226,11 +228,9 @@ class Controller:
             self._free = False
 
     def _thrown_out(self) -> bool:
-        """Whether a free coordinate is so far away that swinging up again is the better way."""
-        if self.swing_up is None:
-            return False
-        n, m = self.cascade.mechanism.n, self.cascade.mechanism.m
-        return bool(np.abs(self.home[m:n]).max() > self.swing_up.lost)
+        """Whether a free angle is where no law holds it, or swinging up again is better."""
+        lost = self.settings.lost if self.swing_up is None else self.swing_up.lost
+        return farthest(self.home, self._angles) > lost
 
     def _observe(self, measurement: Measurement | None) -> str:
         """Update the estimate; return what is wrong with the sensors, or with the estimate."""

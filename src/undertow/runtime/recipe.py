@@ -15,7 +15,7 @@ from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.optimiser import Budget
 from undertow.plan import Plan
-from undertow.practice import estimator_for, gate_for, goal_for
+from undertow.practice import estimator_for, gate_for, goal_for, reaching_for
 from undertow.rig import Bench, IdealRig, RealisticRig
 from undertow.rig.presets import bench_for
 from undertow.runtime.controller import Controller
@@ -98,11 +98,13 @@ class Recipe:
     @cached_property
     def cascade(self) -> Cascade:
         """Law, optimiser and gate."""
+        estimator = self.make_estimator()
         return Cascade(
             self.belief,
             goal_for(self.belief, self.objective, horizon=self.horizon),
+            reaching_for(estimator),
             warm=Budget(self.evaluations, self.seconds),
-            gate=gate_for(self.make_estimator()),
+            gate=gate_for(estimator),
             seed=self.seed,
         )
 
@@ -111,7 +113,8 @@ class Recipe:
         """Swing-up and catch, where it is wanted."""
         if not self.swing_up:
             return None
-        return SwingUpAndCatch(designed(self.belief), CatchRegion(self.belief))
+        region = CatchRegion(self.belief, reaching=self.cascade.reaching)
+        return SwingUpAndCatch(designed(self.belief), region)
 
     def first(self) -> CascadeState:
         """Return what the cascade starts with: the first optimum, or what awaits a catch.

@@ -3,8 +3,9 @@
 Each reading is compared with what the belief expects one period after the last estimate.
 A reading that stands still is compared with the model running freely from when it last
 moved: encoders repeat themselves, but not while the mechanism moves.  So that what sticks
-in its friction is not taken for a broken sensor, the free model feels only what an input
-exceeds a dead band by, and starts again, at rest, after a while.  When no reading at all has
+in its friction is not taken for a broken sensor, the driven joints of the free model have dry
+friction as large as a dead band of the input, and it starts again after a while, what stands
+still at rest.  When no reading at all has
 moved for some time, the mechanism is either at rest or unseen: a small probe on the inputs
 tells which.
 """
@@ -35,7 +36,7 @@ PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
 
 #: What the watch remembers; settings: period, jump, frozen.
 _LAYOUT = {
-    "settings": "3", "band": "m", "felt": "m", "parameters": "p", "viscous": "n",
+    "settings": "3", "band": "m", "gain": "n", "parameters": "p", "viscous": "n", "W": "n * n",
     "last": "n", "gaps": "n", "ages": "n", "counts": "n", "quiet": "1", "expected": "2 * n",
     "free": "n, 2 * n", "work": "3, 2 * n",
 }  # fmt: skip
@@ -56,6 +57,18 @@ def roll(h, x, u, viscous, parameters, work):
         x[n + i] += 0.5 * h * (first[i] + second[i])
 
 
+{COMPILED}
+def slow(h, x, band, gain, parameters, W):
+    # Impulses of dry friction in the driven joints, of the size of the dead band, in place.
+    n = x.shape[0] // 2
+    mobility(x, parameters, W)
+    for i in range(band.shape[0]):
+        most = h * band[i] * abs(gain[i])
+        impulse = max(-most, min(most, -x[n + i] / W[i * n + i]))
+        for k in range(n):
+            x[n + k] += W[k * n + i] * impulse
+
+
 {BRIEF}
 def believe(q, x, u, block):
     # What is not believable becomes NaN; returns how many are missing, the longest gap and
@@ -65,8 +78,7 @@ def believe(q, x, u, block):
     for i in range(2 * n):
         expected[i] = x[i]
     roll(h, expected, u, viscous, parameters, work)
-    for i in range(u.shape[0]):
-        felt[i] = max(0.0, u[i] - band[i]) + min(0.0, u[i] + band[i])
+    gains(parameters, gain)
     missing, worst, still, moved = 0, 0, -1, False
     probing = quiet[0] >= {PROBE}
     for i in range(n):
@@ -79,7 +91,8 @@ def believe(q, x, u, block):
         if gaps[i] > gaps[worst]:
             worst = i
         if q[i] == last[i]:
-            roll(h, free[i], felt, viscous, parameters, work)
+            roll(h, free[i], u, viscous, parameters, work)
+            slow(h, free[i], band, gain, parameters, W)
             ages[i] += h
             if abs(free[i, i] - q[i]) > frozen:
                 still = i
@@ -87,10 +100,9 @@ def believe(q, x, u, block):
                 still = i
             if ages[i] > {REST} or (quiet[0] < {PROBE} <= quiet[0] + h):
                 ages[i] = 0.0
-                for j in range(n):
+                for j in range(2 * n):
                     free[i, j] = x[j]
-                    free[i, n + j] = 0.0
-                free[i, i] = q[i]
+                free[i, i], free[i, n + i] = q[i], 0.0
         elif q[i] == q[i]:
             moved = True
             counts[i] = min(counts[i], abs(q[i] - last[i]))

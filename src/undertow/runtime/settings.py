@@ -51,6 +51,10 @@ class Settings:
         det Γ(q)/det Γ(0) below which the law is taken to be lost, (37).
     travel
         Largest |q_i|, rad or m, besides the ranges of the coordinates.
+    lost
+        A free angle further than this from the target has been thrown out, rad.
+    escape
+        ‖x‖₂ beyond which the mechanism has been thrown out, whatever the predictions' own limit.
     stall
         Longest gap between two steps, s; after a longer one the loop stops safely.
     """
@@ -69,6 +73,8 @@ class Settings:
     near: float = 0.2
     margin: float = 0.02
     travel: float = math.inf
+    lost: float = math.pi / 2
+    escape: float = 500.0
     stall: float = 0.1
 
     def __post_init__(self) -> None:

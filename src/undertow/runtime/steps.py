@@ -12,7 +12,7 @@ from undertow.mechanism import FloatArray
 
 IntArray = NDArray[np.int64]
 
-__all__ = ["apart", "confine", "off_by", "settle", "sound"]
+__all__ = ["apart", "confine", "farthest", "off_by", "settle", "sound"]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -70,3 +70,12 @@ def apart(x: FloatArray, some: IntArray) -> tuple[float, float]:
     for i in some:
         part += x[i] * x[i]
     return math.sqrt(part), math.sqrt(whole)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def farthest(x: FloatArray, some: IntArray) -> float:
+    """Return the largest |x_i| of some entries, 0 of none."""
+    worst = 0.0
+    for i in some:
+        worst = max(worst, abs(x[i]))
+    return worst
