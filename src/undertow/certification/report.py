@@ -53,7 +53,8 @@ def _witness(verdict: Verdict) -> str:
 def _claims(certified: Certified) -> Table:
     """Verdict and margin beside each claim; its worst point and its method below it."""
     table = _table("verdict", "claim", "margin")
-    table.columns[0].no_wrap = table.columns[2].no_wrap = True
+    table.columns[0].no_wrap = True
+    table.columns[2].max_width = 24
     subject = certified.subject
     for verdict in (*(c.verdict for c in subject.claims), *subject.remarks):
         words = Text(verdict.claim)
@@ -97,26 +98,21 @@ SHOWN = 12
 
 def run_report(run: Run) -> RenderableType:
     """Return the decisions of a run with the evidence for the plan in use after each."""
-    table = _table("t, s", "decision", "evidence", "margin", "reason")
-    for column in table.columns[:4]:
-        column.no_wrap = True
+    table = _table("t, s", "decision", "evidence, its margin, and the reason")
+    table.columns[0].no_wrap = table.columns[1].no_wrap = True
     updates = run.updates
     shown = updates if len(updates) <= SHOWN + 1 else (*updates[:SHOWN], updates[-1])
     for update in shown:
         verdict = update.admission.verdict
         evidence = Text("none", style="red")
-        margin = ""
         if verdict is not None:
-            name = str(verdict.details.get("evidence"))
+            name = verdict.details.get("evidence") or "none"
             evidence = Text(f"{name}, ") + _kind(verdict)
-            margin = _margin(verdict)
-        table.add_row(
-            f"{update.t:.2f}",
-            "admitted" if update.admission.accepted else "kept the old",
-            evidence,
-            margin,
-            Text(update.admission.reason, style="dim"),
-        )
+            if margin := _margin(verdict):
+                evidence.append(f", {margin}")
+        evidence.append(f"\n{update.admission.reason}", style="dim")
+        decision = "admitted" if update.admission.accepted else "kept the old"
+        table.add_row(f"{update.t:.2f}", decision, evidence)
     lines: list[RenderableType] = [table]
     if len(shown) < len(updates):
         lines.append(Text(f"{len(updates) - len(shown)} decisions not shown", style="dim"))
@@ -129,16 +125,16 @@ def run_report(run: Run) -> RenderableType:
     lines.append(Text(f"{len(updates)} decisions: {counts}"))
     if np.isfinite(run.descent).any():
         smallest = float(np.nanmin(run.descent))
-        lines.append(
-            Text(f"Lemma 3: smallest slack J̃_k − spent − J̃_k+1 = {smallest:.3g} (≥ 0 wanted)")
-        )
+        slack = f"J̃_k − spent − J̃_k+1 = {smallest:.1e}"
+        lines.append(Text(f"Lemma 3: smallest slack {slack} (≥ 0 wanted, to rounding)"))
     return Group(*lines)
 
 
 def verification_report(certificate: Certificate, checked: Sequence[Checked]) -> RenderableType:
     """Return every claim of a certificate as it was decided again, and the sum."""
     table = _table("verdict", "claim", "margin")
-    table.columns[0].no_wrap = table.columns[2].no_wrap = True
+    table.columns[0].no_wrap = True
+    table.columns[2].max_width = 24
     surface = None
     for item in checked:
         if item.subject.surface != surface:
