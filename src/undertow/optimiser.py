@@ -69,7 +69,7 @@ ANSWERING = 1e-4
 
 #: Generations that end a search along a ridge, where gains come in jumps, unless together they
 #: gain this part of the time.
-PATIENCE, GAIN = 10, 3e-3
+PATIENCE, GAIN = 8, 3e-3
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
