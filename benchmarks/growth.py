@@ -83,7 +83,7 @@ def dimensions(rounds: int, now: Clock) -> float:
         step = float(np.median(single[str(n)])) / (256 * steps)
         base = float(np.median(single["2"])) / (256 * steps)
         rows.append(
-            [f"{n}  {task.loop.mechanism.name}", str(task.optimiser.decision.size),
+            [f"{n}  {task.loop.mechanism.name}", str(task.optimiser.problem.decision.size),
              f"{np.median(task.evaluations):.0f}", f"{1e3 * medians[n]:.2f}",
              f"{medians[n] / medians[2]:.2f}", f"{1e9 * step:.1f}", f"{step / base:.2f}"]
         )  # fmt: skip
@@ -127,8 +127,10 @@ def populations(rounds: int, now: Clock) -> None:
     task = Task(rig, rig.state(phi=ut.deg(38)))
     rng = np.random.default_rng(0)
     sizes = (1, 16, 64, 256, 1024)
-    z = task.optimiser.decision.encode(ut.Plan((task.surface,)))
-    vectors, _ = task.optimiser.decision.decode(z + 0.1 * rng.standard_normal((max(sizes), z.size)))
+    z = task.optimiser.problem.decision.encode(ut.Plan((task.surface,)))
+    vectors, _ = task.optimiser.problem.decision.decode(
+        z + 0.1 * rng.standard_normal((max(sizes), z.size))
+    )
 
     def batch(size: int) -> Callable[[], object]:
         return lambda: task.loop.batch(task.x, vectors[:size], stable_only=True)

@@ -230,7 +230,7 @@ def main() -> int:
     x0 = rig.state(phi=ut.deg(38))
     for objective in (ut.MinimumEnergy(), ut.MinimumTime()):
         loop = ut.ClosedLoop(rig, objective, tail=TAIL)
-        decision = ut.Optimiser(loop).decision
+        decision = ut.Optimiser(loop).problem.decision
         start = decision.encode(ut.Plan((ut.first_surface(rig),)))
 
         def cost(z: FloatArray, loop: ut.ClosedLoop = loop, decision: Any = decision) -> FloatArray:

@@ -20,12 +20,13 @@ import numpy as np
 import undertow as ut
 from undertow.cascade import TAIL
 from undertow.mechanism import FloatArray
+from undertow.motion import Batch
 from undertow.stability import sliding_matrix
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 
 
-def admissible(exact: ut.ClosedLoop, count: int) -> tuple[FloatArray, FloatArray, ut.rollout.Batch]:
+def admissible(exact: ut.ClosedLoop, count: int) -> tuple[FloatArray, FloatArray, Batch]:
     """Draw surfaces (N, 4) and states (N, 4) until ``count`` motions arrive."""
     rng = np.random.default_rng(0)
     states, vectors = np.empty((0, 4)), np.empty((0, 4))

@@ -18,9 +18,9 @@ from undertow.errors import (
     SingularSurfaceError,
     UnstableSurfaceError,
 )
-from undertow.optimiser import Proposal
 from undertow.paper import CASES
 from undertow.plan import Plan
+from undertow.proposal import Proposal
 
 GOOD = CASES["4 one-time, time"]
 BASE = CASES["1 base case"]

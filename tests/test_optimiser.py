@@ -119,7 +119,7 @@ def test_budget_in_seconds_still_answers(optimisers: dict[str, ut.Optimiser]) ->
 
 def test_search_coordinates_are_invertible(optimisers: dict[str, ut.Optimiser]) -> None:
     """decode ∘ encode is the identity on normalised surfaces, of any sign."""
-    decision = optimisers["energy"].decision
+    decision = optimisers["energy"].problem.decision
     for surface in (*CASES.values(), ut.Surface(-1, 3.0, -0.2, 40.0)):
         vectors, gains = decision.decode(decision.encode(ut.Plan.of(surface))[None])
         np.testing.assert_allclose(vectors[0, 0], surface.vector, rtol=1e-12)

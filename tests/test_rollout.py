@@ -23,7 +23,7 @@ from support import (
 )
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, FloatArray
-from undertow.rollout import Batch
+from undertow.motion import Batch
 from undertow.sliding import reaching_time_bound
 
 PUSH = ut.Parameter("push", 0.05, "N m", "size of the disturbance")

@@ -7,10 +7,12 @@ from undertow.cascade import Cascade, Run
 from undertow.check import MechanismReport, check_mechanism
 from undertow.decision import Freedom
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
+from undertow.motion import Event, Trajectory
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
-from undertow.optimiser import Budget, Optimiser, Proposal
+from undertow.optimiser import Optimiser
 from undertow.plan import Plan
-from undertow.rollout import ClosedLoop, Event, Trajectory
+from undertow.proposal import Budget, Proposal
+from undertow.rollout import ClosedLoop
 from undertow.sliding import SlidingModeLaw
 from undertow.stability import check_surface, first_surface, placed_surface, surface_margins
 from undertow.surface import ReachingLaw, Surface

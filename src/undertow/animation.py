@@ -22,8 +22,8 @@ from PIL import Image
 
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.motion import Trajectory
 from undertow.plot import COLOURS, style
-from undertow.rollout import Trajectory
 from undertow.sketches import Box, Disc, Line, Sketch, sketch
 
 __all__ = ["Film", "gif", "still"]

@@ -18,12 +18,15 @@ from numpy.typing import ArrayLike
 from undertow.decision import Freedom
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, FloatArray, Mechanism
+from undertow.motion import INADMISSIBLE, Event, Trajectory
 from undertow.objective import MinimumEnergy, Objective
-from undertow.optimiser import INADMISSIBLE, Budget, Optimiser, Proposal
+from undertow.optimiser import Optimiser
 from undertow.plan import Plan
-from undertow.rollout import ClosedLoop, Event, Trajectory
-from undertow.sliding import Control, ReachingLaw, SlidingModeLaw, Surface
+from undertow.proposal import Budget, Proposal
+from undertow.rollout import ClosedLoop
+from undertow.sliding import Control, SlidingModeLaw
 from undertow.stability import check_surface, stability_margin
+from undertow.surface import ReachingLaw, Surface
 from undertow.verdict import Verdict
 
 __all__ = ["Admission", "Cascade", "CascadeState", "Gate", "Run", "Update", "cost_gate"]

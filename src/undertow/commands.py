@@ -17,10 +17,11 @@ from undertow.animation import Film, gif, still
 from undertow.derivation import derivation
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import LIBRARY
+from undertow.motion import Trajectory
 from undertow.objective import MinimumEnergy
 from undertow.optimiser import Optimiser
 from undertow.plot import figure_bytes, style
-from undertow.rollout import ClosedLoop, Trajectory
+from undertow.rollout import ClosedLoop
 from undertow.survey import start_words
 
 __all__ = ["animation_files", "derivation_files", "library_picture", "mechanism_table"]

@@ -22,9 +22,9 @@ from undertow.cascade import Admission, Gate, cost_gate
 from undertow.errors import InvalidInputError
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.optimiser import INADMISSIBLE
+from undertow.motion import INADMISSIBLE, Event
 from undertow.plan import Plan
-from undertow.rollout import ClosedLoop, Event
+from undertow.rollout import ClosedLoop
 from undertow.stability import linearise
 from undertow.surface import ReachingLaw, Surface
 

@@ -14,7 +14,10 @@ from undertow.codegen.machine import numba
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 
-__all__ = ["Batch", "Event", "Trajectory"]
+__all__ = ["INADMISSIBLE", "Batch", "Event", "Trajectory"]
+
+#: Scores from here on mark inadmissible motions, see :meth:`Batch.score`.
+INADMISSIBLE = 1e8
 
 
 class Event(IntEnum):

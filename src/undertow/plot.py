@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
-from undertow.rollout import Trajectory
+from undertow.motion import Trajectory
 from undertow.surface import Surface
 
 __all__ = [

@@ -14,10 +14,10 @@ from rich.text import Text
 from undertow import results
 from undertow.cascade import Run, Update
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.motion import Event, Trajectory
 from undertow.objective import Objective
-from undertow.optimiser import Proposal
 from undertow.plot import display, figure_bytes, motion_figure
-from undertow.rollout import Event, Trajectory
+from undertow.proposal import Proposal
 from undertow.stability import Margin
 from undertow.surface import Surface
 

@@ -23,17 +23,17 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.motion import Batch, Event, Trajectory
 from undertow.objective import MinimumEnergy, Objective
 from undertow.plan import Plan
+from undertow.room import NOTHING, Room, Shape
 from undertow.sliding import (
     ReachingLaw,
     Surface,
     check_surface_shape,
     coupling,
     gains_at_target,
-    gamma_determinant,
 )
 from undertow.tail import LinearEnd, Prepared
 
-__all__ = ["Batch", "ClosedLoop", "Event", "Probe", "Trajectory"]
+__all__ = ["ClosedLoop", "Probe"]
 
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
@@ -41,85 +41,17 @@ MOST_STEPS = 10_000_000
 #: Small steps before large ones are tried again, s; each time as long again as all before.
 CALMER = 0.5
 
-#: Stands in for linear ends that are not there.
-_NOTHING = np.zeros((1, 1, 1))
-
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
 
 
 class _Numbers(NamedTuple):
-    """Plant and belief parameters, input limits, X at the target, η and ε of the loop."""
+    """Plant and belief parameters, input limits, η and ε of the loop."""
 
     plant: FloatArray
     belief: FloatArray
     limits: FloatArray
-    at_target: FloatArray
     law: FloatArray
-
-
-class _Room:
-    """What one call of the kernel reads and writes: whole blocks of lanes.
-
-    A lane is a row of ``lanes``: for each of S surfaces its vector, η and ε, and det Γ at the
-    target.
-    """
-
-    def __init__(self, loop: ClosedLoop, count: int, segments: int) -> None:
-        n, m = loop.mechanism.n, loop.mechanism.m
-        self.loop = loop
-        self.count, self.padded = count, -(-count // LANES) * LANES
-        self.at_target, self.width = loop._numbers.at_target, 2 * m * n
-        w = len(loop.objective.constraints)
-        self.lanes = np.empty((self.padded, segments, self.width + 2 * m + 1))
-        self.states = np.empty((self.padded, 2 * n))
-        self.live = np.ones(self.padded)
-        self.ends = None if loop.linear_end is None else loop.linear_end.room(self.padded)
-        self.out = np.empty((self.padded, 9 + w + 4 * n))
-        # A sampled kernel reads the noise of every lane.
-        self.quiet = np.zeros((1, self.padded, 2 * n)) if loop.hold else _NOTHING
-        out = self.out[:count]
-        self._batch = Batch(
-            cost=out[:, 0],
-            time=out[:, 1],
-            event=np.empty(count, dtype=np.int64),
-            radius=out[:, 3],
-            singular=out[:, 4],
-            input=out[:, 5],
-            path=out[:, 6 : 6 + w],
-            closest=out[:, 6 + w],
-            closest_time=out[:, 7 + w],
-            closest_x=out[:, 8 + w : 8 + w + 2 * n],
-            x=out[:, 8 + w + 2 * n : -1],
-            steps=out[:, -1],
-        )
-
-    def fill(self, states: FloatArray, surfaces: FloatArray, laws: FloatArray) -> None:
-        """Take states (…, 2n), surfaces (…, S, 2mn) and laws (…, S, 2m); the last fills up."""
-        lanes, count = self.lanes, self.count
-        lanes[:count, :, : self.width] = surfaces
-        lanes[:count, :, self.width : -1] = laws
-        lanes[:count, :, -1] = gamma_determinant(self.at_target, surfaces)
-        self.states[:count] = states
-        if self.padded > count:
-            lanes[count:] = lanes[count - 1]
-            self.states[count:] = self.states[count - 1]
-
-    def part(self, which: NDArray[np.intp]) -> _Room:
-        """Return room for some of the lanes, filled alike."""
-        room = _Room(self.loop, len(which), self.lanes.shape[1])
-        lanes, width = self.lanes[which], self.width
-        room.fill(self.states[which], lanes[:, :, :width], lanes[:, :, width:-1])
-        return room
-
-    def batch(self, start: float) -> Batch:
-        """Return the results as named views."""
-        batch = self._batch
-        batch.event[:] = self.out[: self.count, 2]
-        if start != 0.0:
-            batch.time[:] -= start
-            batch.closest_time[:] -= start
-        return batch
 
 
 class Probe:
@@ -139,7 +71,7 @@ class Probe:
         self, loop: ClosedLoop, x: FloatArray, switches: NDArray[np.int64], steps: int
     ) -> None:
         self.loop, self.x, self.switches, self.steps = loop, x, switches, steps
-        self._rooms: dict[int, _Room] = {}
+        self._rooms: dict[int, Room] = {}
 
     def __call__(self, surfaces: FloatArray, laws: FloatArray | None, **options: Any) -> Batch:
         """Roll out surfaces (N, S, 2mn) with reaching laws (N, S, 2m).
@@ -150,7 +82,7 @@ class Probe:
         count = len(surfaces)
         room = self._rooms.get(count)
         if room is None:
-            room = self._rooms[count] = _Room(self.loop, count, len(self.switches))
+            room = self._rooms[count] = Room(self.loop._shape, count, len(self.switches))
         room.fill(self.x, surfaces, self.loop._numbers.law if laws is None else laws)
         return self.loop._launch(room, self.switches, self.steps, **options)
 
@@ -259,8 +191,19 @@ class ClosedLoop:
             truth.parameter_values,
             belief.parameter_values,
             truth.input_limits,
-            coupling(belief, np.zeros(belief.n)),
             self.reaching.vector(belief.m),
+        )
+
+    @cached_property
+    def _shape(self) -> Shape:
+        belief = self.mechanism
+        return Shape(
+            belief.n,
+            belief.m,
+            len(self.objective.constraints),
+            coupling(belief, np.zeros(belief.n)),
+            self.linear_end,
+            self.hold > 0,
         )
 
     @cached_property
@@ -278,7 +221,7 @@ class ClosedLoop:
         end = self.linear_end
         return end is not None and end.stage is not None
 
-    def _prepare(self, room: _Room) -> Prepared | None:
+    def _prepare(self, room: Room) -> Prepared | None:
         """Linearise the last surface of every lane."""
         if self.linear_end is None or room.ends is None:
             return None
@@ -317,7 +260,7 @@ class ClosedLoop:
     ) -> tuple[Batch, FloatArray]:
         """Roll out states (N, 2n) and surfaces (N, S, 2mn), or one of either, in new buffers."""
         steps = self._steps(self.objective.horizon if duration is None else duration)
-        room = _Room(self, max(len(x0), len(surfaces)), surfaces.shape[1])
+        room = Room(self._shape, max(len(x0), len(surfaces)), surfaces.shape[1])
         room.fill(x0, surfaces, self._numbers.law if reaching is None else reaching)
         columns = 2 * self.mechanism.n + 2 * self.mechanism.m + 2
         shape = (room.padded, -(-steps // every), columns) if every else (0, 0, 0)
@@ -330,7 +273,7 @@ class ClosedLoop:
 
     def _launch(
         self,
-        room: _Room,
+        room: Room,
         switches: NDArray[np.int64],
         steps: int,
         *,
@@ -349,7 +292,7 @@ class ClosedLoop:
 
     def _roll(
         self,
-        room: _Room,
+        room: Room,
         switches: NDArray[np.int64],
         steps: int,
         calm_from: int,
@@ -360,7 +303,7 @@ class ClosedLoop:
         *,
         cap: float = math.inf,
         stable_only: bool = False,
-        record: FloatArray = _NOTHING,
+        record: FloatArray = NOTHING,
         noise: FloatArray | None = None,
     ) -> None:
         """Call the kernel; from the step ``calm_from`` on, lanes may go on in large steps."""

@@ -28,9 +28,9 @@ from undertow.inputs import mechanism_named, objective_named
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms import LIBRARY
 from undertow.objective import Objective
-from undertow.optimiser import Budget
 from undertow.plan import Plan
 from undertow.plot import display
+from undertow.proposal import Budget
 from undertow.stability import linearise
 from undertow.surface import Surface
 

@@ -12,7 +12,7 @@ import scipy.linalg
 
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.rollout import Trajectory
+from undertow.motion import Trajectory
 from undertow.stability import linearise
 
 __all__ = ["Guess", "built_in", "recorded", "rests", "time_scale"]

@@ -17,8 +17,8 @@ from undertow.bounds.mesh import hermite
 from undertow.bounds.programme import Programme, Solution
 from undertow.errors import InfeasibleError, InvalidInputError, MissingExtraError
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.motion import Trajectory
 from undertow.objective import Objective
-from undertow.rollout import Trajectory
 
 __all__ = ["Bound", "bound"]
 

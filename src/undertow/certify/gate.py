@@ -32,8 +32,9 @@ from undertow.cascade import Admission, Gate, cost_gate
 from undertow.certify.ellipsoid_search import EllipsoidSearch, search_for
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
+from undertow.motion import Event
 from undertow.plan import Plan
-from undertow.rollout import ClosedLoop, Event
+from undertow.rollout import ClosedLoop
 from undertow.sliding import ReachingLaw, Surface
 from undertow.stability import stability_margin
 from undertow.verdict import Verdict

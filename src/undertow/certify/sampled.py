@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from undertow.certify.verdict import Verdict
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
-from undertow.rollout import ClosedLoop, Event
+from undertow.motion import Event
+from undertow.rollout import ClosedLoop
 from undertow.sliding import Surface
 
 __all__ = ["box_starts", "ellipsoid_starts", "failure_bound", "sampled_extent", "sampled_region"]

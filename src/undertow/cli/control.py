@@ -28,7 +28,8 @@ from undertow.cli.terminal import (
     write,
 )
 from undertow.errors import InvalidInputError
-from undertow.optimiser import Budget, Optimiser
+from undertow.optimiser import Optimiser
+from undertow.proposal import Budget
 from undertow.rollout import ClosedLoop
 from undertow.stability import check_surface, first_surface
 

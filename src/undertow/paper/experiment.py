@@ -15,12 +15,13 @@ from math import degrees, pi
 from undertow.cascade import Cascade, Run
 from undertow.errors import InfeasibleError, MissingExtraError, UndertowError
 from undertow.mechanisms import rotary_pendulum
+from undertow.motion import Event, Trajectory
 from undertow.objective import state_box
-from undertow.optimiser import Budget
 from undertow.paper.data import CONDITIONS, OBJECTIVES, PERIOD, PRINTED, ROWS, Condition
 from undertow.paper.limits import Limit, Sensitivity, base_sensitivity, case_limits, own_reach
 from undertow.paper.repeats import Repeats, noisy_repeats
-from undertow.rollout import ClosedLoop, Event, Trajectory
+from undertow.proposal import Budget
+from undertow.rollout import ClosedLoop
 from undertow.stability import first_surface
 from undertow.surface import Surface
 

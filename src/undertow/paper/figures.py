@@ -12,11 +12,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from undertow.mechanism import FloatArray
+from undertow.motion import Trajectory
 from undertow.paper.data import CONDITIONS, ROWS
 from undertow.paper.experiment import Reproduction
 from undertow.paper.repeats import Repeats
 from undertow.plot import COLOURS, input_series, phase, state_series, style, surface_trace
-from undertow.rollout import Trajectory
 
 __all__ = ["comparison", "figures", "phase_plane", "repeats_figure"]
 

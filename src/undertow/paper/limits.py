@@ -11,8 +11,9 @@ import numpy as np
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import rotary_pendulum
 from undertow.objective import MinimumTime, Objective
-from undertow.optimiser import Budget, Optimiser
+from undertow.optimiser import Optimiser
 from undertow.paper.data import CASES, OBJECTIVES, PRINTED, Condition
+from undertow.proposal import Budget
 from undertow.rollout import ClosedLoop
 from undertow.surface import Surface
 

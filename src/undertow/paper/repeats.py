@@ -14,8 +14,9 @@ import numpy as np
 import sympy as sp
 
 from undertow.mechanism import Parameter
+from undertow.motion import Trajectory
 from undertow.paper.data import PRINTED, Condition
-from undertow.rollout import ClosedLoop, Trajectory
+from undertow.rollout import ClosedLoop
 
 __all__ = ["Repeats", "noisy_repeats"]
 

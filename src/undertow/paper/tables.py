@@ -12,13 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow import results
-from undertow.optimiser import Budget
 from undertow.paper.data import CASES, CONDITIONS, OBJECTIVES, PERIOD, ROWS
 from undertow.paper.experiment import Reproduction, Row
 from undertow.paper.figures import figures
 from undertow.paper.findings import findings
 from undertow.paper.repeats import ANGLE_NOISE, COULOMB_FRICTION, RATE_NOISE, START_SPREAD
 from undertow.plot import figure_bytes
+from undertow.proposal import Budget
 
 __all__ = ["COLUMNS", "csv", "files", "manifest", "report"]
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from undertow.mechanism import FloatArray
-from undertow.optimiser import Proposal
 from undertow.plan import Plan
+from undertow.proposal import Proposal
 from undertow.rig.interface import Measurement
 from undertow.runtime.faults import Change, Drive, Hang, Sense, Spoil
 from undertow.runtime.slow import Answer

@@ -10,8 +10,8 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from undertow.cascade import Admission, CascadeState
-from undertow.optimiser import Proposal
 from undertow.plan import Plan
+from undertow.proposal import Proposal
 from undertow.runtime.slow import Answer
 from undertow.sliding import ReachingLaw, Surface
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from undertow.cascade import Cascade
 from undertow.mechanism import FloatArray
-from undertow.optimiser import Optimiser, Proposal
+from undertow.optimiser import Optimiser
+from undertow.proposal import Proposal
 from undertow.rig.interface import Measurement, Rig
 from undertow.runtime.clock import SimulatedClock
 from undertow.runtime.slow import Answer, Request, Worker

@@ -13,9 +13,9 @@ from undertow.cascade import Cascade, CascadeState
 from undertow.errors import InvalidInputError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.optimiser import Budget
 from undertow.plan import Plan
 from undertow.practice import estimator_for, gate_for, goal_for, reaching_for
+from undertow.proposal import Budget
 from undertow.rig import Bench, IdealRig, RealisticRig
 from undertow.rig.presets import bench_for
 from undertow.runtime.controller import Controller

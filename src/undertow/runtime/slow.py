@@ -26,8 +26,8 @@ import numpy as np
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.inner_loop import lane
 from undertow.mechanism import FloatArray
-from undertow.optimiser import Proposal
 from undertow.plan import Plan
+from undertow.proposal import Proposal
 from undertow.runtime.processes import fork, pipe
 from undertow.sliding import SlidingModeLaw
 from undertow.swing_up import SwingUpAndCatch

@@ -19,8 +19,8 @@ from undertow.errors import InfeasibleError
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Objective
-from undertow.optimiser import Budget
 from undertow.practice import Goal, estimator_for, gate_for, goal_for
+from undertow.proposal import Budget
 from undertow.rig import Bench, srv02_rig
 from undertow.sliding import Surface
 from undertow.trials.steering import CascadeSteering, steady

@@ -15,9 +15,9 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow import results
+from undertow.motion import Trajectory
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
 from undertow.practice import ENERGY_PRICE, STATE_WEIGHT, TERMINAL
-from undertow.rollout import Trajectory
 from undertow.trials.balance import ROWS, BalanceResult
 from undertow.trials.estimation import EstimatorRow
 from undertow.trials.robustness import FACTORS, SINGLE, RobustnessResult

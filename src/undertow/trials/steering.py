@@ -9,7 +9,7 @@ import numpy as np
 from undertow.cascade import Cascade, CascadeState
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray
-from undertow.optimiser import Proposal
+from undertow.proposal import Proposal
 
 __all__ = ["CascadeSteering", "steady"]
 

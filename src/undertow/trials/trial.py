@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from undertow.estimators import Controller, Estimator, Record, compensated, drive
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.motion import Event, Trajectory
 from undertow.objective import Objective
 from undertow.practice import estimator_for
 from undertow.rig import Bench, RealisticRig
-from undertow.rollout import Event, Trajectory
 
 __all__ = [
     "MakeController",

@@ -11,8 +11,8 @@ import numpy as np
 from undertow.cascade import Cascade
 from undertow.estimators import Controller, compensated, drive
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.optimiser import Budget
 from undertow.practice import estimator_for, gate_for, goal_for
+from undertow.proposal import Budget
 from undertow.rig import Bench, MuJoCoRig, plausible_rig, srv02_rig
 from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
 from undertow.swing_up.search import Found, found_for
