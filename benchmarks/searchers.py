@@ -5,7 +5,8 @@ The task: the surface of least energy, or least time, for the rotary pendulum (d
 surface with the same width, and may ask for the same number of rollouts; the costs it is told
 are those of the kernel.  Repeated from several seeds.
 
-* *ours*: undertow.search.CMAES, a whole population a call.
+* *ours*: undertow.search.CMAES, a whole population a call, and undertow.trust_region.TrustRegion,
+  16 a call, restarted at random when its model has converged.
 * *cmaes*: the package of that name, told one member at a time.
 * *SciPy …*: routines that call the cost themselves, turned inside out by a thread; differential
   evolution hands over populations, the others one point at a time, restarted at random when
@@ -33,8 +34,10 @@ import scipy.optimize
 
 import undertow as ut
 from undertow.cascade import TAIL
+from undertow.codegen.rows import LANES
 from undertow.mechanism import FloatArray
 from undertow.search import CMAES
+from undertow.trust_region import TrustRegion
 
 Cost = Callable[[FloatArray], FloatArray]
 POPULATION, WIDTH, REACH = 32, 0.5, 4.0
@@ -56,6 +59,25 @@ Make = Callable[[FloatArray, int], Searcher]
 def ours(start: FloatArray, seed: int) -> Searcher:
     """Return undertow's own."""
     return CMAES(start, WIDTH, POPULATION, np.random.default_rng(seed))
+
+
+class Restarted:
+    """The quadratic-model search; from another start once it has converged."""
+
+    def __init__(self, start: FloatArray, seed: int) -> None:
+        self._start, self._rng = start, np.random.default_rng(seed)
+        self._search = TrustRegion(start, WIDTH, LANES, self._rng)
+
+    def ask(self) -> FloatArray:
+        """Return a batch."""
+        return self._search.ask()
+
+    def tell(self, x: FloatArray, f: FloatArray) -> None:
+        """Learn; begin again elsewhere where nothing is left to learn."""
+        self._search.tell(x, f)
+        if self._search.spread < 0.02:
+            elsewhere = self._start + WIDTH * self._rng.standard_normal(self._start.size)
+            self._search = TrustRegion(elsewhere, WIDTH, LANES, self._rng)
 
 
 class CmaesPackage:
@@ -177,6 +199,7 @@ def restarted(method: str) -> Make:
 
 METHODS: dict[str, Make] = {
     "ours, CMA-ES": ours,
+    "ours, quadratic model": Restarted,
     "cmaes, CMA-ES": CmaesPackage,
     "random, shrinking": Random,
     "SciPy differential evolution": differential_evolution,
