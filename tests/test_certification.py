@@ -21,6 +21,7 @@ from undertow.certification import (
     figure,
     region_figure,
     run_report,
+    subject_report,
 )
 from undertow.certify.gate import Policy, certified_gate
 from undertow.certify.lyapunov import LyapunovFunction
@@ -36,8 +37,8 @@ GOOD = ut.Surface(-1, -1.59, 1.96, 12.1)
 GOAL = ut.MinimumTime(horizon=20.0)
 
 
-def text(shown: Any) -> str:
-    console = Console(width=150, record=True, file=io.StringIO())
+def text(shown: Any, width: int = 150) -> str:
+    console = Console(width=width, record=True, file=io.StringIO())
     console.print(shown)
     return console.export_text()
 
@@ -74,6 +75,17 @@ def test_a_run_is_shown_decision_by_decision(run: ut.Run) -> None:
         replace(u, admission=replace(u.admission, verdict=None)) for u in run.updates
     ))  # fmt: skip
     assert "without accepted evidence" in text(run_report(bare))
+
+
+def test_reports_are_readable_on_a_terminal_of_80_columns(run: ut.Run) -> None:
+    """A few lines for each decision and claim: no column is squeezed to a letter a line."""
+    decisions = text(run_report(run), 80).splitlines()
+    assert len(decisions) <= 7 * min(len(run.updates), 13) + 5
+    certified = certify_run(RIG, run)[-1]
+    claims = text(subject_report(RIG, certified), 80).splitlines()
+    count = len(certified.subject.claims) + len(certified.subject.remarks)
+    assert count >= 4
+    assert len(claims) <= 9 * count + 5
 
 
 def test_each_surface_of_a_run_is_certified(run: ut.Run) -> None:
