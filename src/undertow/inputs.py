@@ -141,6 +141,19 @@ def _split(word: str, example: str) -> tuple[str, str]:
     return name.strip(), value.strip()
 
 
+def _pairs(words: Sequence[str], example: str) -> dict[str, str]:
+    """Split ``name=value`` words, refusing a name that is given twice."""
+    found: dict[str, str] = {}
+    for word in words:
+        name, value = _split(word, example)
+        if name in found:
+            raise InvalidInputError(
+                "settings", value=f"'{name}' twice", limit="each name once", remedy="Keep one"
+            )
+        found[name] = value
+    return found
+
+
 def _number(text: str, what: str) -> float:
     try:
         value = float(text)
@@ -159,8 +172,8 @@ def parse_values(
     >>> parse_values(["d_e=0.025"])
     {'d_e': 0.025}
     """
-    pairs = [_split(word, example) for word in words]
-    return {name: _number(value, f"{what} '{name}'") for name, value in pairs}
+    pairs = _pairs(words, example)
+    return {name: _number(value, f"{what} '{name}'") for name, value in pairs.items()}
 
 
 def _units_of(mechanism: Mechanism, name: str, what: str) -> tuple[str, ...]:
@@ -223,8 +236,7 @@ def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
     if not words:
         return mechanism.state(**mechanism.start)
     values: dict[str, float] = {}
-    for word in words:
-        name, text = _split(word, f"{mechanism.coordinates[-1].name}=40deg")
+    for name, text in _pairs(words, f"{mechanism.coordinates[-1].name}=40deg").items():
         units = _units_of(mechanism, name, "initial state")
         example = f"--start {name}=10{units[0]}"
         number, unit = _quantity(text, units, f"initial state '{name}'", example)
@@ -254,17 +266,9 @@ def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, .
     >>> [c.name for c in parse_box(rig, ["theta=60deg", "phi_dot=-4rad/s:5rad/s"])]
     ['|theta| ≤ 60°', '-4 rad/s ≤ phi_dot ≤ 5 rad/s']
     """
-    found: dict[str, Constraint] = {}
-    for word in words:
-        name, text = _split(word, f"{mechanism.coordinates[0].name}=LOW:HIGH")
+    found = []
+    for name, text in _pairs(words, f"{mechanism.coordinates[0].name}=LOW:HIGH").items():
         units = _units_of(mechanism, name, "box")
-        if name in found:
-            raise InvalidInputError(
-                "--box",
-                value=f"'{name}' twice",
-                limit="one pair of bounds for each state",
-                remedy=f"Write --box {name}=LOW:HIGH",
-            )
         example = f"--box {name}=-10{units[0]}:20{units[0]}"
         parts = [_quantity(p, units, f"box of '{name}'", example) for p in text.split(":")]
         ends = [number * UNITS[unit][2] for number, unit in parts]
@@ -280,8 +284,8 @@ def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, .
         shown = [_shown(*part) for part in parts]
         (bound,) = state_box(**{name: (low, high)})
         label = f"|{name}| ≤ {shown[0]}" if len(ends) == 1 else f"{shown[0]} ≤ {name} ≤ {shown[1]}"
-        found[name] = replace(bound, name=label, unit=f"{si}/s" if rate else si)
-    return tuple(found.values())
+        found.append(replace(bound, name=label, unit=f"{si}/s" if rate else si))
+    return tuple(found)
 
 
 def parse_surface(mechanism: Mechanism, text: str) -> Surface:
