@@ -28,7 +28,7 @@ from undertow.rollout import ClosedLoop
 from undertow.stability import linearise
 from undertow.surface import ReachingLaw, Surface
 
-__all__ = ["bench_gate", "delay_gate", "delay_margin", "feedback", "noise_share"]
+__all__ = ["bench_gate", "delay_gate", "delay_margin", "feedback", "noise_share", "weakened"]
 
 
 def feedback(law: InnerLoop) -> FloatArray:
@@ -179,6 +179,12 @@ def delay_gate(least: float, period: float = 0.001) -> Gate:
     return gate
 
 
+def weakened(loop: ClosedLoop, reserve: float) -> ClosedLoop:
+    """Return the loop on a plant whose input limits are lower by a part of them."""
+    limits = (1.0 - reserve) * loop.mechanism.input_limits
+    return replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail=0.0)
+
+
 def bench_gate(
     least: float,
     reserve: float = 0.15,
@@ -227,8 +233,7 @@ def bench_gate(
         if share > max(noise, noisiest(loop, old)):
             why = f"{100 * share:.3g} % of the input would be noise, {100 * noise:g} % at most"
             return refused(loop, old, x, horizon, why)
-        limits = (1.0 - reserve) * loop.mechanism.input_limits
-        weak = replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail=0.0)
+        weak = weakened(loop, reserve)
         event = Event(int(weak.batch(x, new, duration=min(seconds, horizon)).event[0]))
         if event in (Event.HORIZON, Event.REACHED):
             return admission

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -10,11 +11,12 @@ from typing import Any, Literal, Self
 
 from undertow import mechanisms
 from undertow.cascade import Cascade, CascadeState
-from undertow.errors import InvalidInputError
+from undertow.delay import weakened
+from undertow.errors import InvalidInputError, UndertowError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plan import Plan
-from undertow.practice import estimator_for, gate_for, goal_for, reaching_for
+from undertow.practice import RESERVE, estimator_for, gate_for, goal_for, reaching_for
 from undertow.proposal import Budget
 from undertow.rig import Bench, IdealRig, RealisticRig
 from undertow.rig.presets import bench_for
@@ -131,6 +133,20 @@ class Recipe:
     def respond(self, request: Request) -> Answer:
         """Answer a request of the fast loop: what the slow loop computes."""
         return respond(self.cascade, request, self.swing)
+
+    def rehearse(self, memory: CascadeState) -> None:
+        """Make everything compile that an answer may need, whatever the gate refuses before.
+
+        A run that begins balanced has most of it from its first optimum; one that swings up
+        meets the optimiser in the middle of the run.  ``memory`` is what :meth:`first` returned.
+        """
+        x, cascade, step = self.belief.state(**self.belief.start), self.cascade, self.cascade.step
+        if self.swing is not None:
+            with contextlib.suppress(UndertowError):
+                memory = cascade.start(x)[0]
+            self.respond(Request(0.0, x, step, memory, 0))
+        self.respond(Request(0.0, x, step, memory))
+        weakened(cascade.loop, RESERVE).batch(x, memory.plan, duration=step)
 
     @cached_property
     def bench(self) -> Bench:

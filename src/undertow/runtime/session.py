@@ -101,6 +101,7 @@ def session(
 
 def warm_up(recipe: Recipe, memory: CascadeState, compute: Compute) -> None:
     """Make a short run in simulated time and throw it away, so that everything is compiled."""
+    recipe.rehearse(memory)
     controller, lead = recipe.make_controller(memory), recipe.settings.lead
     worker = InlineWorker(compute, 0.5 * lead)
     runtime = Runtime(controller, recipe.make_rig(), worker, clock=SimulatedClock())
