@@ -25,7 +25,7 @@ def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> Fl
 
     A motion that has not within ``limit`` seconds, or meets the singularity, does not.
     """
-    motion, V = region.motion, region.function
+    motion = region.motion
     home = np.zeros(len(y), dtype=bool)
     at_target = motion.determinant(np.zeros(motion.size))
     alive = np.arange(len(y))
@@ -34,7 +34,7 @@ def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> Fl
     step = 0.01 / max(1.0, fastest / 20.0)
     with np.errstate(all="ignore"):
         for _ in range(int(limit / step)):
-            inside = V(state) < 1.0
+            inside = region.level(state) < 1.0
             home[alive[inside]] = True
             ratio = motion.determinant(state) / at_target
             sound = (ratio > 0) & np.isfinite(state).all(axis=1) & (np.abs(state[:, 0]) < 1e3)
@@ -92,14 +92,14 @@ def region_figure(region: ProvedRegion, title: str) -> Figure:
 
 def _slice(axes: Axes, region: ProvedRegion, other: int) -> None:
     """Draw the plane of coordinates 0 and ``other``."""
-    motion, V = region.motion, region.function
+    motion = region.motion
     assert isinstance(motion, SurfaceMotion)
     wide, high = _extents(region, other)
     a, b = np.linspace(-wide, wide, GRID), np.linspace(-high, high, GRID)
     points = np.zeros((GRID, GRID, motion.size))
     points[..., 0], points[..., other] = np.meshgrid(a, b)
     with np.errstate(all="ignore"):
-        proved = V(points)
+        proved = region.level(points)
     flat = points.reshape(-1, motion.size)
     if motion.odd:  # the picture is the same turned by half a turn
         part = simulated(region, flat[: len(flat) // 2 + 1])
@@ -150,14 +150,14 @@ def _extents(region: ProvedRegion, other: int) -> tuple[float, float]:
 
 def _edge(region: ProvedRegion, other: int, count: int = 14) -> FloatArray:
     """Points just inside V = 1 in the slice, in directions spread evenly, (count, N)."""
-    motion, V = region.motion, region.function
+    motion = region.motion
     size = np.array([_first(region, 0), _first(region, other)])
     angles = 2 * np.pi * (np.arange(count) + 0.5) / count
     rays = np.zeros((count, motion.size))
     rays[:, 0], rays[:, other] = size[0] * np.cos(angles), size[1] * np.sin(angles)
     parts = np.linspace(0.0, 3.0, 1201)
     with np.errstate(all="ignore"):
-        above = ~(V(parts[:, None, None] * rays) < 1.0)
+        above = ~(region.level(parts[:, None, None] * rays) < 1.0)
     first = np.maximum(above.argmax(axis=0) - 1, 0)
     return np.asarray(0.999 * parts[first][:, None] * rays)
 

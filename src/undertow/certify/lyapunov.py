@@ -273,9 +273,11 @@ def first_crossing(V: LyapunovFunction, rays: FloatArray, level: float = 1.0) ->
     def value(r: FloatArray) -> FloatArray:
         square = r * r
         total = np.zeros(np.broadcast_shapes(r.shape, (len(rays),)))
-        for d in sorted(parts, reverse=True):
-            total = total + parts[d] * square ** (d // 2)
-        return np.asarray(total)
+        for d in range(max(parts), 0, -2):  # Horner's scheme
+            if d in parts:
+                total += parts[d]
+            total *= square
+        return total
 
     size = 1.0 / np.sqrt(max(1e-300, float(np.median(np.abs(parts[2]))) if 2 in parts else 1.0))
     grid = size * np.sqrt(level) * np.geomspace(0.02, 80.0, 193)

@@ -27,7 +27,7 @@ that in finite time, because V̇_k is bounded away from 0 on a compact set.  So 
 
 D is a guard {U ≤ 1}, |y_0| < L, inside a box: a quadratic U in the coordinates of V, around its
 set.  U > 1 is shown on the faces of the box, so that D, which is connected, is inside; and
-V > 1 where U = 1, or that such a point is in the set inside.
+V > 1 where U = 1.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ class _Proof:
         else:
             falls = (settled & (parts[4].hi < 1.0)) | (rate.hi < 0.0)
             home = (parts[3].hi < 1.0) & (parts[4].hi < 1.0)
-        return np.asarray(outside | (~face & ((falls & (guard.hi < 1.0)) | home)))
+        return np.asarray(outside | (~face & (guard.hi < 1.0) & (falls | home)))
 
     def _branch(
         self, max_boxes: int, deadline: float, chunk: int

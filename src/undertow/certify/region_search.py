@@ -67,6 +67,15 @@ class ProvedRegion:
         """The last V of the chain."""
         return self.chain[-1]
 
+    def level(self, y: ArrayLike) -> FloatArray:
+        """Return the larger of V and its guard at points y, (…, N): ≤ 1 on what is proved alone.
+
+        {V ≤ 1} may have parts elsewhere, of which nothing is proved.
+        """
+        guard = self.function.guard
+        assert guard is not None
+        return np.maximum(self.function(y), guard(y))
+
 
 def search_region(
     motion: Motion,
