@@ -151,6 +151,14 @@ def test_parts_of_a_level_set_elsewhere_are_not_counted() -> None:
     assert (region.level(points) <= 1.0).tolist() == [True, True, False, False, False]
 
 
+def test_coordinates_of_very_different_sizes_have_a_first_set() -> None:
+    """The reaction wheel turns some thousand times as fast as its pendulum: balanced units."""
+    _, _, motion, target, _ = motions(["reaction_wheel_pendulum"])[0]
+    V = search_region(motion, (1, 0, 0), degrees=(), start="balanced")[0].times(1.1)
+    assert verify_region(motion, V).kind == "proved"
+    assert reaches(V, [target, 0.0, 0.0])
+
+
 def test_a_level_set_that_crosses_the_singularity_is_not_proved() -> None:
     """Locally fine, but {V ≤ 1} reaches past arccos ε."""
     verdict = verify_region(

@@ -15,7 +15,7 @@ from undertow.certify.region_basis import CLEARANCE, POLE_PART, directions, slow
 __all__ = ["Start", "quadratic"]
 
 FloatArray = NDArray[np.float64]
-Start = Literal["far", "round"]
+Start = Literal["far", "round", "balanced"]
 
 
 def quadratic(
@@ -41,6 +41,10 @@ def quadratic(
         r = _quadratic_radius(motion, LyapunovFunction(T, squares, np.ones(size), *bend), rays)
         return LyapunovFunction(r * T, squares, np.ones(size), *bend)
 
+    if start == "balanced":
+        B, D = scipy.linalg.matrix_balance(A, permute=False)
+        P = scipy.linalg.solve_continuous_lyapunov(B.T, -np.eye(size))
+        return largest(D @ _root(P), stretched=True)
     if start == "round":
         return largest(_root(base), stretched=True)
     best, root, width = -1.0, np.eye(size), 0.8

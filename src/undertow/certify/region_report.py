@@ -30,6 +30,7 @@ from undertow.certify.region_chain import Progress
 from undertow.certify.region_chart import singular_distance_on_axis
 from undertow.certify.region_search import prove_region
 from undertow.certify.verdict import Verdict
+from undertow.errors import InfeasibleError
 from undertow.mechanism import Mechanism
 from undertow.stability import first_surface
 
@@ -240,17 +241,21 @@ def main() -> None:
     for name, title, motion, target, uncertain in motions(arguments.only):
         if known and name not in known:
             continue
-        row = report(
-            title,
-            motion,
-            target,
-            uncertain,
-            programs=arguments.programs,
-            boxes=arguments.boxes,
-            chain=known.get(name, ()),
-            progress=lambda line: print(line, file=sys.stderr, flush=True),
-            keep=partial(keep, name),
-        )
+        try:
+            row = report(
+                title,
+                motion,
+                target,
+                uncertain,
+                programs=arguments.programs,
+                boxes=arguments.boxes,
+                chain=known.get(name, ()),
+                progress=lambda line: print(line, file=sys.stderr, flush=True),
+                keep=partial(keep, name),
+            )
+        except InfeasibleError as error:
+            print(f"| {title} | not proved | {target:.2f} | {error} |", flush=True)
+            continue
         print(row.markdown(), flush=True)
         keep(name, row.chain)
 

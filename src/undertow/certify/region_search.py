@@ -106,7 +106,8 @@ def search_region(
         Process time at most, likewise.
     start
         The quadratic V to begin with: ``"far"`` reaches far along the direction and grows
-        little; ``"round"`` starts closer and grows further.
+        little; ``"round"`` starts closer and grows further; ``"balanced"`` is for coordinates
+        of very different sizes.
     slow
         On a surface with one unactuated coordinate: whether the third of the coordinates of
         :mod:`undertow.certify.region_chart` is η, not w.
@@ -189,7 +190,10 @@ def prove_region(
         progress=progress,
     )
     # Sets that start round grow furthest, but near 0 the far one is proved with far less work.
-    far = search_region(motion, direction, degrees=(), seed=seed, start="far", slow=slow)[0]
+    far, balanced = (
+        search_region(motion, direction, degrees=(), seed=seed, start=start, slow=slow)[0]
+        for start in ("far", "balanced")
+    )
 
     def decide(chain: Sequence[LyapunovFunction]) -> Verdict:
         """The last function, those before it being proved."""
@@ -211,7 +215,9 @@ def prove_region(
             keep(tuple(chain))
         return verdict
 
-    chain = _proved_chain(far, found, decide)
+    chain = _proved_chain((far, found[0], balanced), found, decide)
+    if extent(chain[0], way) > extent(chain[-1], way):
+        chain = chain[:1]
     level, raised = _tight_level(chain, decide)
     chain[-1] = level
     verdict = verify_region(
@@ -223,9 +229,9 @@ def prove_region(
 Decide = Callable[[Sequence[LyapunovFunction]], Verdict]
 
 
-def _proved_chain(far: LyapunovFunction, found: Chain, decide: Decide) -> list[LyapunovFunction]:
+def _proved_chain(firsts: Chain, found: Chain, decide: Decide) -> list[LyapunovFunction]:
     """As few functions as prove one another, from a quadratic to the outermost that is proved."""
-    for first in (V.times(factor) for factor in (1.0, 1.1, 1.3, 2.0) for V in (far, found[0])):
+    for first in (V.times(factor) for factor in (1.0, 1.1, 1.3, 2.0) for V in firsts):
         verdict = decide([first])
         if verdict:
             break
