@@ -29,17 +29,21 @@ __all__ = ["trials"]
         "undertow trials swing-up",
         "undertow trials swing-up --fresh 1",
         "undertow trials mujoco",
+        "undertow trials library --seeds 3",
+        "undertow trials coverage --seeds 60 --out bench",
         "undertow trials robustness --rigs 50 --out bench",
     )
 )
 @reports_errors
 def trials(
     what: Annotated[
-        Literal["balance", "swing-up", "mujoco", "robustness", "estimators"],
+        Literal["balance", "swing-up", "mujoco", "robustness", "estimators", "library", "coverage"],
         typer.Argument(
             help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
             "rest to balanced. mujoco: MuJoCo as the truth, no retuning. "
-            "robustness: random rigs, and what breaks whom. estimators: the same law with each.",
+            "robustness: random rigs, and what breaks whom. estimators: the same law with each. "
+            "library: every mechanism through the runtime. coverage: how often the intervals of "
+            "the bring-up wizard hold the truth.",
             metavar="WHAT",
             show_choices=False,
         ),
@@ -72,8 +76,8 @@ def trials(
         typer.Option(
             help="balance: folder for balance.csv and the figures. robustness: folder for "
             "robustness.jsonl, every run as it is made: called again, it goes on from there. "
-            "swing-up --fresh: folder for gains.json, what the search found, as the library keeps "
-            "it."
+            "coverage: the same, coverage.jsonl. swing-up --fresh: folder for gains.json, what "
+            "the search found, as the library keeps it."
         ),
     ] = None,
 ) -> None:
@@ -81,8 +85,10 @@ def trials(
     from undertow.swing_up import SwingUp
     from undertow.swing_up.search import KEPT, as_kept
     from undertow.trials import balance as experiment
+    from undertow.trials import coverage as covering
     from undertow.trials import estimation, report, upright
     from undertow.trials import robustness as stress
+    from undertow.trials.library import through_the_runtime
 
     if out is not None:
         results.check_folder(out)
@@ -108,6 +114,13 @@ def trials(
         elif what == "estimators":
             progress("estimators", 0.0)
             shown = report.estimator_report(estimation.compared(seeds=min(seeds, 5)))
+        elif what == "coverage":
+            file = None if out is None else out / "coverage.jsonl"
+            rows = covering.coverage(seeds, keep=file, progress=progress)
+            shown = report.coverage_report(rows)
+        elif what == "library":
+            few = min(seeds, 5)
+            shown = report.library_report(through_the_runtime(seeds=few, progress=progress))
         elif what == "robustness":
             shown = report.robustness_report(
                 stress.robustness(

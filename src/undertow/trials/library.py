@@ -1,0 +1,100 @@
+"""Every mechanism of the library through the runtime, on realistic rigs, in simulated time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from undertow.mechanisms import LIBRARY
+from undertow.runtime import Recipe
+from undertow.runtime.session import session
+
+__all__ = ["LibraryRow", "through_the_runtime"]
+
+
+@dataclass(frozen=True)
+class LibraryRow:
+    """Runs of one mechanism.
+
+    Attributes
+    ----------
+    name
+        Of the mechanism.
+    inputs
+        How many it has.
+    layer
+        Boundary layer ε that its rig's sensors need.
+    held, runs
+        Runs in which the law held it to the end, of how many.
+    ends
+        Why the others were stopped, and how often.
+    applied
+        Answers of the optimiser that were put to use, per run that was held.
+    chatter
+        Total variation per second of the input that varies most, in parts of its limit.
+    """
+
+    name: str
+    inputs: int
+    layer: float
+    held: int
+    runs: int
+    ends: dict[str, int]
+    applied: float
+    chatter: float
+
+
+def through_the_runtime(
+    *,
+    names: Sequence[str] = tuple(LIBRARY),
+    seeds: int = 5,
+    seconds: float = 10.0,
+    evaluations: int = 256,
+    progress: Callable[[str, float], None] = lambda _what, _part: None,
+) -> list[LibraryRow]:
+    """Run mechanisms from their usual starts, each on its realistic rigs.
+
+    Parameters
+    ----------
+    names
+        Of the mechanisms.
+    seeds
+        Rigs of each.
+    seconds
+        Length of a run, s.
+    evaluations
+        Rollouts that one re-optimisation may spend.
+    progress
+        Called with what is being done and the part done.
+    """
+    rows = []
+    for number, name in enumerate(names):
+        ends: Counter[str] = Counter()
+        applied, chatter = [], []
+        for seed in range(seeds):
+            progress(name, (number + seed / seeds) / len(names))
+            recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=evaluations)
+            with session(recipe, simulated=True) as runtime:
+                report = runtime.run(seconds)
+            if not report.stopped_by.startswith("operator"):
+                ends[report.stopped_by] += 1
+                continue
+            applied.append(report.answers.get("applied", 0))
+            limits = recipe.settings.limits(recipe.belief)
+            chatter.append(float((report.variation / limits).max() / seconds))
+        rows.append(
+            LibraryRow(
+                name,
+                recipe.belief.m,
+                float(np.max(recipe.cascade.reaching.layer)),
+                seeds - ends.total(),
+                seeds,
+                dict(ends),
+                float(np.mean(applied)) if applied else 0.0,
+                float(np.mean(chatter)) if chatter else float("nan"),
+            )
+        )
+    return rows
