@@ -12,7 +12,7 @@ import sympy as sp
 import undertow as ut
 from undertow.certify.appendix import CASES, Constants
 from undertow.certify.linear_program import minimise_linear
-from undertow.certify.lyapunov import LyapunovFunction, first_crossing
+from undertow.certify.lyapunov import LyapunovFunction, extent, first_crossing
 from undertow.certify.motion import Motion, SurfaceMotion, VectorField
 from undertow.certify.region import verify_region
 from undertow.certify.region_chart import natural_stretch
@@ -377,8 +377,11 @@ def test_the_five_cases_reach_their_targets(case: int) -> None:
     chain = read_chains(CLAIMS)[name]
     verdict = verify_region(motion, chain)
     assert verdict.kind == "proved"
-    assert reaches(chain[-1], [target, 0.0, 0.0])
     *inner, V = chain
+    far = 0.9999 * extent(V, [1.0, 0.0, 0.0])
+    assert far > target
+    assert reaches(V, [far, 0.0, 0.0])
+    assert not reaches(V, [1.001 * far, 0.0, 0.0])
     raised = verify_region(motion, [*inner, V.times(1 / 1.05)], proved=len(inner))
     assert raised.kind in ("refuted", "undecided")
     assert set(raised.witness) == {"phi", "phi_dot", "w_theta"}

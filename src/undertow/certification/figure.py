@@ -42,10 +42,16 @@ def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> Fl
             alive, state, ratio = alive[keep], state[keep], ratio[keep]
             if not len(alive):
                 break
-            # Shorter steps near the singularity and at speed; motions need not keep the same time.
-            hurry = np.clip(ratio, 0.01, 1.0) / (1.0 + 0.3 * np.abs(state).max(axis=1))
-            state = _step(motion, state, step * hurry[:, None])
+            state = _step(motion, state, step * _hurry(state, ratio))
     return home
+
+
+def _hurry(y: FloatArray, ratio: FloatArray) -> FloatArray:
+    """Parts of a step, (B, 1), shorter near the singularity and at speed.
+
+    Motions then need not keep the same time.
+    """
+    return np.asarray(np.clip(ratio, 0.01, 1.0) / (1.0 + 0.3 * np.abs(y).max(axis=1)))[:, None]
 
 
 def _step(motion: object, y: FloatArray, h: float | FloatArray) -> FloatArray:
@@ -114,9 +120,10 @@ def _slice(axes: Axes, region: ProvedRegion, other: int) -> None:
     axes.contourf(fa * a, fb * b, inside, [-1.0, 1.0], colors=[to_rgba(COLOURS["blue"], 0.55)])
     axes.contour(fa * a, fb * b, inside, [1.0], colors=COLOURS["blue"], linewidths=1.2)
     edge = _edge(region, other)
-    path = [edge]
-    for _ in range(4000):
-        path.append(_step(motion, path[-1], 0.005))
+    path, at_target = [edge], motion.determinant(np.zeros(motion.size))
+    for _ in range(6000):
+        ratio = motion.determinant(path[-1]) / at_target
+        path.append(_step(motion, path[-1], 0.01 * _hurry(path[-1], ratio)))
     lines = np.array(path)
     for k in range(lines.shape[1]):
         axes.plot(fa * lines[:, k, 0], fb * lines[:, k, other], color=COLOURS["vermilion"], lw=0.8)

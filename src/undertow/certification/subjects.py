@@ -237,6 +237,8 @@ def _region(
         if reaches(proved.function, point.tolist()):
             break
         point = 0.999 * point
+    else:
+        return proved, {}, Verdict(claim, "undecided", method="no start is shown inside")
     data = {"functions": [function_data(V) for V in proved.chain], "start": point.tolist()}
     words = ", ".join(f"{n} = {v:.4g}" for n, v in zip(motion.names, point, strict=True) if v)
     verdict = Verdict(
