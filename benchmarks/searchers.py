@@ -260,7 +260,8 @@ def main() -> int:
             vectors, _ = decision.decode(np.asarray(z, dtype=float))
             return loop.batch(x0, vectors, stable_only=True).score(loop.objective.horizon)
 
-        cost(start[None])
+        for make in chosen.values():  # compile
+            run(make, start, 0, cost, 64, now)
         found = {
             (name, budget): [
                 run(make, start, seed, cost, budget, now)
