@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import undertow as ut
 from undertow.errors import InfeasibleError, InvalidInputError
 from undertow.paper import CASES
+from undertow.proposal import motion_margins
 
 OBJECTIVES = {"energy": ut.MinimumEnergy(), "time": ut.MinimumTime()}
 
@@ -149,6 +150,26 @@ def test_state_constraint_binds_and_is_kept(rig: ut.Mechanism) -> None:
     assert motions[1].total > motions[0].total
     assert proposal.margins[-1].name.startswith("|theta|")
     assert 0 <= proposal.margins[-1].value < 0.1
+
+
+def test_what_a_best_candidate_breaks_is_said_with_its_unit(rig: ut.Mechanism) -> None:
+    """The constraint that is broken, not the smallest number of whatever unit."""
+    box = (ut.Constraint("arm below 5°", lambda v: v.theta - ut.deg(5), "rad"),)
+    loop = ut.ClosedLoop(rig, ut.MinimumEnergy(constraints=box))
+    x = -rig.state(phi=ut.deg(20))
+    margins, message, _ = motion_margins(loop, ut.Plan((ut.first_surface(rig),)), x, 5.0)
+    broken = next(m for m in margins if m.value < 0)
+    assert (broken.name, broken.unit) == (box[0].name, "rad")
+    assert f"breaks '{box[0].name}' by {-broken.value:.3g} rad at" in message
+
+
+def test_a_start_outside_the_constraints_is_refused_before_a_search(rig: ut.Mechanism) -> None:
+    """No rollout is spent on what nothing can mend."""
+    loop = ut.ClosedLoop(rig, ut.MinimumEnergy(constraints=ut.state_box(phi=ut.deg(10))))
+    with pytest.raises(InvalidInputError, match="initial state of") as caught:
+        ut.Optimiser(loop).require(rig.state(phi=ut.deg(20)))
+    assert "Start inside" in str(caught.value)
+    assert "_kernels" not in vars(loop)  # not even compiled
 
 
 def test_hard_input_limit_is_a_constraint_on_the_unclipped_law(rig: ut.Mechanism) -> None:

@@ -437,6 +437,20 @@ def watched(rig: ut.Mechanism) -> ut.Objective:
     )
 
 
+def test_a_motion_ends_with_what_the_law_does_there(rig: ut.Mechanism) -> None:
+    """The last row is of the last state: input, surface value and margin, also after a switch."""
+    first, second = ut.Surface(-1, -1.59, 1.96, 12.1), ut.Surface(-1, -0.7, 1.5, 9.0)
+    loop = ut.ClosedLoop(rig, ut.MinimumEnergy())
+    run = loop.simulate(
+        rig.state(phi=0.5), (first, second), switch_times=(0.0, 0.1), duration=0.1503
+    )
+    end = ut.SlidingModeLaw(rig, second, loop.reaching)(run.t[-1], run.x[-1])
+    assert run.t[-1] == pytest.approx(0.15, abs=2e-3)
+    np.testing.assert_allclose(run.u[-1], end.u, rtol=1e-9)
+    np.testing.assert_allclose(run.s[-1], end.s, rtol=1e-9, atol=1e-12)
+    assert run.margin[-1] == pytest.approx(float(end.margin), rel=1e-9)
+
+
 def test_constraints_end_a_motion_and_margins_are_the_smallest_met(
     rig: ut.Mechanism, watched: ut.Objective, quick: ut.Surface
 ) -> None:

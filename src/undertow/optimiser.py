@@ -140,9 +140,13 @@ class Optimiser:
 
         Raises
         ------
+        InvalidInputError
+            For a start that breaks a path constraint itself.
         InfeasibleError
             When no candidate was admissible; says what the best of them broke.
         """
+        mechanism = self.loop.mechanism
+        self.loop.objective.check_start(mechanism, mechanism.check_state(x))
         proposal = self.propose(x)
         if proposal.plan is None:
             raise InfeasibleError(

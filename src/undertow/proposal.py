@@ -118,17 +118,22 @@ def motion_margins(
             Margin(
                 "(38) hard input limit: min u_max − |demand|",
                 float(batch.input[0]),
-                loop.mechanism.inputs[0].unit,
+                " or ".join(dict.fromkeys(i.unit for i in loop.mechanism.inputs)),
                 "Raise the actuator limit, start closer to the target, lower η, or let the "
                 "actuator clip (hard_input=False)",
             )
         )
     margins += [
-        Margin(constraint.name, float(value), "", "Relax the constraint or start elsewhere")
+        Margin(
+            constraint.name,
+            float(value),
+            constraint.unit,
+            "Relax the constraint or start elsewhere",
+        )
         for constraint, value in zip(objective.constraints, batch.path[0], strict=True)
     ]
     event = Event(int(batch.event[0]))
-    worst = min(margins, key=lambda m: m.value)
+    broken = next((m for m in margins if not m.value >= 0), margins[-1])
     ending = {
         Event.REACHED: f"reaches the terminal set at {batch.time[0]:.3g} s",
         Event.HORIZON: f"is still at ‖x‖ = {batch.radius[0]:.3g} after {batch.time[0]:.3g} s",
@@ -136,12 +141,12 @@ def motion_margins(
         Event.COSTLY: "costs too much",
         Event.DIVERGED: f"diverges at {batch.time[0]:.3g} s",
         Event.SINGULAR: f"meets the singularity (37) at {batch.time[0]:.3g} s",
-        Event.CONSTRAINT: f"breaks '{worst.name}' by {-worst.value:.3g} {worst.unit} "
-        f"at {batch.time[0]:.3g} s",
+        Event.CONSTRAINT: f"breaks '{broken.name}' by {-broken.value:.3g} {broken.unit}".rstrip()
+        + f" at {batch.time[0]:.3g} s",
     }[event]
     remedy = {
         Event.HORIZON: "Lengthen the horizon, widen the terminal set, or spend a larger budget",
         Event.COSTLY: "Spend a larger budget",
-        Event.CONSTRAINT: worst.remedy,
+        Event.CONSTRAINT: broken.remedy,
     }.get(event, "Start closer to the target, or spend a larger budget")
     return tuple(margins), f"the best candidate {ending}", remedy

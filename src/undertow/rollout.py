@@ -536,7 +536,8 @@ class ClosedLoop:
             every=every,
             noise=noise,
         )
-        return self._trajectory(batch, record[0], start, every)
+        last = self._ending(plan, batch, start)
+        return self._trajectory(batch, record[0], last, start, every)
 
     def _steps(self, duration: float) -> int:
         """Return the number of steps of a rollout, refusing what memory or patience forbid."""
@@ -580,17 +581,39 @@ class ClosedLoop:
                 remedy="Leave it out for the objective's horizon",
             )
 
-    def _trajectory(self, batch: Batch, record: FloatArray, start: float, every: int) -> Trajectory:
+    def _ending(self, plan: Plan, batch: Batch, start: float) -> FloatArray | None:
+        """Return the line of a record for the end of a motion, where the law acts there."""
+        if self.hold or not np.isfinite(batch.x).all():
+            return None
+        end = float(batch.time[0])
+        surface, law = plan.at(end)
+        _, record = self._run(
+            batch.x,
+            surface.vector[None, None],
+            reaching=(law or self.reaching).vector(self.mechanism.m)[None, None],
+            duration=self.step,
+            start=start + end,
+            terminal=0.0,
+            every=1,
+        )
+        line = record[0, 0]
+        return line if np.isfinite(line).all() else None
+
+    def _trajectory(
+        self, batch: Batch, record: FloatArray, last: FloatArray | None, start: float, every: int
+    ) -> Trajectory:
         n, m = self.mechanism.n, self.mechanism.m
         end = float(batch.time[0])
         times = np.arange(len(record)) * (every * self.step)
         rows = record[times < end - 1e-12]
-        if len(rows) == 0:
-            rows = record[:1] if len(record) else np.zeros((1, 2 * n + 2 * m + 2))
-            if batch.time[0] == 0.0:
-                rows[0, : 2 * n] = batch.x[0]
-        last = rows[-1].copy()
+        if last is None:  # a held input is still the last one
+            lines = [*rows[-1:], *record[:1], np.zeros(2 * n + 2 * m + 2)]
+            last = lines[0].copy()
         last[: 2 * n], last[2 * n + 2 * m] = batch.x[0], batch.cost[0]
+        if len(rows) == 0:
+            rows = record[:1] if len(record) else last[None]
+            if end == 0.0:
+                rows[0, : 2 * n] = batch.x[0]
         rows = np.vstack([rows, last])
         t = np.append(times[: len(rows) - 1], end)
         x, u, s, cost, margin = np.split(
