@@ -476,19 +476,17 @@ def test_a_keeper_brings_the_output_to_zero_when_its_controller_falls_silent(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "seed"),
-    [("reaction_wheel_pendulum", 1), ("reaction_wheel_pendulum", 2), ("two_motor_three_link", 2),
-     ("two_motor_three_link", 4), ("tora", 0)],
-)  # fmt: skip
-def test_mechanisms_of_all_kinds_are_held_on_their_realistic_rigs(name: str, seed: int) -> None:
-    """A wheel that spins at 240 rad/s, two motors, an arm that sticks: held to the end."""
-    recipe = Recipe(mechanism=name, rig="realistic", evaluations=256, seed=seed)
+def test_a_mechanism_with_two_inputs_is_held_on_its_realistic_rig() -> None:
+    """Motors that stick, encoders too coarse for the paper's boundary layer: held to the end.
+
+    `undertow trials library` does the same for all.
+    """
+    recipe = Recipe(mechanism="two_motor_three_link", rig="realistic", evaluations=256, seed=2)
     with session(recipe, simulated=True) as runtime:
         report = runtime.run(6.0)
     assert report.stopped_by == "operator: stop"
-    assert report.mode is Mode.SAFE_STOP
     assert "BALANCE" in report.entered
+    assert float(np.max(recipe.cascade.reaching.layer)) > 0.1
 
 
 @pytest.mark.slow
