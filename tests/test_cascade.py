@@ -296,7 +296,7 @@ def test_fast_step_is_bounded_and_never_nan(cascade: ut.Cascade) -> None:
 def test_hard_input_limit_that_no_surface_meets_is_refused(rig: ut.Mechanism) -> None:
     """The first optimisation raises, with value, limit and remedy, before anything moves."""
     cascade = ut.Cascade(
-        rig.with_input_limit(0.3), ut.MinimumEnergy(hard_input=True), cold=ut.Budget(300)
+        rig.with_input_limit(0.3), ut.MinimumTime(hard_input=True), cold=ut.Budget(300)
     )
     with pytest.raises(InfeasibleError) as caught:
         cascade.simulate(phi=ut.deg(30))

@@ -301,7 +301,7 @@ def test_names_of_users_meet_no_variable_of_the_kernel(parameter: str, coordinat
             parameters=(mass,),
         )
         surface = ut.first_surface(mechanism)
-        loop = ut.ClosedLoop(mechanism)
-        return loop.simulate(mechanism.state(**{coordinate: 0.4}), surface, duration=0.5).total
+        loop = interpreted(ut.ClosedLoop(mechanism, step=0.005))
+        return loop.simulate(mechanism.state(**{coordinate: 0.4}), surface, duration=0.2).total
 
     assert cost(parameter, coordinate) == pytest.approx(cost("mass", "phi"), rel=1e-12)
