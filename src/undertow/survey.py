@@ -293,12 +293,22 @@ def _trial_words(entry: Entry) -> str:
 
 
 def table(entries: Sequence[Entry]) -> Table:
-    """Return the survey for the terminal, with the median gap and the trials below it."""
-    grid = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
-    for index, head in enumerate(_HEAD):
-        grid.add_column(head, justify="left" if index in (0, 1, 2) else "right", no_wrap=True)
+    """Return the survey for a terminal of 80 columns: start and unit stand on second lines."""
+    grid = Table(box=None, header_style="dim", padding=(0, 1, 0, 0), pad_edge=False)
+    heads = ("mechanism, start", *_HEAD[3:7], "gap, %", "time, s")
+    for index, head in enumerate(heads):
+        grid.add_column(
+            head, justify="right" if index else "left", no_wrap=index > 0, ratio=not index or None
+        )
     for entry in entries:
-        grid.add_row(*(Text(cell) for cell in _cells(entry)))
+        name, _, start, first, one_time, cascade, bound, gap, when = _cells(entry)
+        cost, _, unit = cascade.partition(" ")
+        grid.add_row(
+            Text(name).append(f"\n{start}", "dim"),
+            *map(Text, (first, one_time, cost)),
+            Text(bound).append(f"\n{unit}", "dim"),
+            *(Text(cell.removesuffix(" %").removesuffix(" s")) for cell in (gap, when)),
+        )
     return grid
 
 

@@ -112,7 +112,7 @@ def survey(
         )
     console = terminal()
     written = None if out is None else write(out, study.files(request, entries))
-    console.width = max(console.width, 150)
+    console.width = max(console.width, 80)
     console.print(study.table(entries), crop=False, soft_wrap=True)
     for line in study.summary(entries):
         say(console, line)
