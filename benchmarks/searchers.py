@@ -217,7 +217,8 @@ def run(
     best, spent, inside, rolling = np.inf, 0, 0.0, 0.0
     while spent < budget:
         a = now()
-        x = searcher.ask()[: budget - spent]
+        asked = searcher.ask()
+        x = asked[: budget - spent]
         b = now()
         f = cost(x)
         c = now()
@@ -226,7 +227,7 @@ def run(
             searcher.tell(x, f)
         inside, rolling = inside + b - a + now() - c, rolling + c - b
     if isinstance(searcher, InsideOut):
-        searcher.tell(x, f)
+        searcher.tell(asked, np.concatenate([f, np.full(len(asked) - len(x), np.inf)]))
         searcher.close()
     return best, inside, rolling
 
