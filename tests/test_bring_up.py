@@ -24,13 +24,14 @@ from undertow.bring_up import (
     perform,
     rest_state,
 )
+from undertow.bring_up.coverage import NOISES, coverage, deviations, rig_in_the_class
+from undertow.bring_up.intervals import counted
+from undertow.bring_up.report import coverage_table
 from undertow.cli import app
 from undertow.errors import ArtefactError, InfeasibleError, InvalidInputError
 from undertow.mechanisms import LIBRARY
 from undertow.results import versions
 from undertow.rig import Encoder, IdealRig, RealisticRig, plausible_rig, srv02_rig
-from undertow.trials.coverage import NOISES, coverage, deviations, rig_in_the_class
-from undertow.trials.report import coverage_report
 
 
 @lru_cache(maxsize=16)
@@ -211,7 +212,7 @@ def test_what_was_done_is_not_done_again(tmp_path: Path) -> None:
     assert rows[0].mean == 0.5
     console = Console(width=100)
     with console.capture() as shown:
-        console.print(coverage_report(rows))
+        console.print(coverage_table(rows))
     assert "50.0 %" in shown.get()
     file.write_text("{}\n")
     with pytest.raises(ArtefactError, match="other versions"):
@@ -283,3 +284,16 @@ def test_command_refuses_faults_that_are_none(fault: str) -> None:
     assert result.exit_code == 2
     assert "voltage" in result.stderr
     assert result.stderr.startswith("error: ")
+
+
+def test_a_count_that_stands_still_is_as_uncertain_as_its_zero() -> None:
+    """A place measured at rest is known no better for being looked at longer."""
+    N, step = 2000, 1.0
+    sigma, J, still = np.array([step / np.sqrt(12)]), np.ones((N, 1)), np.zeros((N, 1))
+    J[: N // 2] = 0
+    stands = np.where(np.arange(N) < N // 2, 0.3, 7.81)[:, None]
+    moves = np.linspace(0.0, 100.0, N)[:, None]
+    assert counted(moves, still, sigma, J)[0] < 0.1
+    # Half the difference of two counts: places 0.51 counts apart differ by 0 or 1 when counted.
+    expected = 0.25 * 0.51 * 0.49 / sigma[0] ** 2
+    assert counted(stands, still, sigma, J)[0] == pytest.approx(expected, rel=0.15)

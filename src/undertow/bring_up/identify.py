@@ -19,6 +19,7 @@ import scipy.optimize
 import scipy.signal
 import scipy.stats
 
+from undertow.bring_up.intervals import correlated, counted
 from undertow.bring_up.motion import Record
 from undertow.bring_up.predict import Predictor
 from undertow.errors import InvalidInputError
@@ -244,7 +245,8 @@ def identify(
     -------
     Identification
         Estimates with confidence intervals from the Jacobian, corrected for residuals that are
-        correlated in time (Newey and West, *Econometrica* 55(3), 1987).
+        correlated in time (Newey and West, *Econometrica* 55(3), 1987), and no narrower than
+        what the counting of the encoders alone would make them.
 
     Raises
     ------
@@ -254,12 +256,15 @@ def identify(
     fit = _Fit(mechanism, x0, record)
     free, z = fit.search(progress or (lambda _what, _fraction: None))
     J, r = fit.jacobian(free, z), fit.residual(free, z)
-    covariance = _covariance(J, r, mechanism.n)
+    away = fit.difference(free, z)
+    variances = np.maximum(
+        correlated(J, r, mechanism.n), counted(fit.moved - away, away, fit.sigma, J)
+    )
     quantile = float(scipy.stats.norm.ppf(0.5 + confidence / 2))
     estimates = {}
     alone = 1.0 / np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))  # of each column, the rest fitted
     motion = float(np.linalg.norm((fit.moved - fit.moved.mean(axis=0)) / fit.sigma))
-    for v, scaled, variance, size in zip(free, z, np.diag(covariance), alone, strict=True):
+    for v, scaled, variance, size in zip(free, z, variances, alone, strict=True):
         if v.name.startswith("_"):
             continue
         value, error = float(scaled * v.scale), float(math.sqrt(variance) * v.scale)
@@ -286,28 +291,6 @@ def identify(
         record.moved - fit.difference(free, z),
         mechanism.with_parameters(**changed),
     )
-
-
-def _covariance(J: FloatArray, r: FloatArray, n: int) -> FloatArray:
-    """(JᵀJ)⁻¹ S (JᵀJ)⁻¹, S with Bartlett's weights; rows come coordinate by coordinate.
-
-    How far the weights reach follows from the residuals (Andrews, *Econometrica* 59(3), 1991,
-    (5.3), (6.2) and (6.4)): a reach that white ones do not need only makes S smaller.
-    """
-    inverse = np.linalg.pinv(J.T @ J)
-    S = np.zeros_like(inverse)
-    for part, rest in zip(np.split(J, n), np.split(r, n), strict=True):
-        scores = part * rest[:, None]
-        S += scores.T @ scores
-        power = float(rest @ rest)
-        near = float(rest[1:] @ rest[:-1]) / power if power > 0 else 0.0
-        alpha = 4 * near**2 / max((1 - near**2) ** 2, 1e-12)
-        window = min(math.ceil(1.1447 * (alpha * len(rest)) ** (1 / 3)), len(rest) // 4)
-        for lag in range(1, window):
-            overlap = scores[lag:].T @ scores[:-lag]
-            S += (1 - lag / window) * (overlap + overlap.T)
-    freedom = len(r) / max(1, len(r) - J.shape[1])
-    return np.asarray(freedom * inverse @ S @ inverse)
 
 
 class _Fit:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from rich import box
 from rich.table import Table
 from rich.text import Text
 
 from undertow import results
+from undertow.bring_up.coverage import CoverageRow
 from undertow.bring_up.identify import Identification
 from undertow.bring_up.wizard import BringUp
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plot import figure_bytes, style
 
-__all__ = ["files", "findings_table", "parameter_table", "summary"]
+__all__ = ["coverage_table", "files", "findings_table", "parameter_table", "summary"]
 
 _STYLES = {"right": "green", "wrong": "bold red", "unclear": "yellow"}
 
@@ -47,6 +49,24 @@ def parameter_table(found: Identification) -> Table:
         nominal = f"{e.nominal:.4g}" if math.isfinite(e.nominal) else ""
         row = (e.name, f"{e.value:.{digits}g}", interval, nominal, e.unit, e.description)
         table.add_row(*map(Text, row))
+    return table
+
+
+def coverage_table(rows: Sequence[CoverageRow]) -> Table:
+    """Return how often intervals hold the truth, see :func:`undertow.bring_up.coverage`."""
+    table = Table(
+        title="95 % intervals of the bring-up wizard, SRV02 rigs that its model contains",
+        title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
+        caption="mean, deviation: of (estimate − truth)/(standard error); noise: of the "
+        "positions,\nbefore they are counted (1.53 mrad)", caption_justify="left",
+    )  # fmt: skip
+    for head in ("", "noise\nmrad", "intervals", "hold the truth", "mean", "deviation"):
+        table.add_column(head, justify="right" if head else "left")
+    for row in rows:
+        table.add_row(
+            row.name or "all", f"{1e3 * row.noise:g}", str(row.count),
+            f"{100 * row.covered / row.count:.1f} %", f"{row.mean:+.2f}", f"{row.deviation:.2f}",
+        )  # fmt: skip
     return table
 
 

@@ -82,10 +82,11 @@ def trials(
     ] = None,
 ) -> None:
     """Run controllers on realistic rigs, over and over, and print what came of it."""
+    from undertow.bring_up.coverage import coverage
+    from undertow.bring_up.report import coverage_table
     from undertow.swing_up import SwingUp
     from undertow.swing_up.search import KEPT, as_kept
     from undertow.trials import balance as experiment
-    from undertow.trials import coverage as covering
     from undertow.trials import estimation, report, upright
     from undertow.trials import robustness as stress
     from undertow.trials.library import through_the_runtime
@@ -116,8 +117,7 @@ def trials(
             shown = report.estimator_report(estimation.compared(seeds=min(seeds, 5)))
         elif what == "coverage":
             file = None if out is None else out / "coverage.jsonl"
-            rows = covering.coverage(seeds, keep=file, progress=progress)
-            shown = report.coverage_report(rows)
+            shown = coverage_table(coverage(seeds, keep=file, progress=progress))
         elif what == "library":
             few = min(seeds, 5)
             shown = report.library_report(through_the_runtime(seeds=few, progress=progress))

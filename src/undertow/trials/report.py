@@ -19,7 +19,6 @@ from undertow.motion import Trajectory
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
 from undertow.practice import ENERGY_PRICE, STATE_WEIGHT, TERMINAL
 from undertow.trials.balance import ROWS, BalanceResult
-from undertow.trials.coverage import CoverageRow
 from undertow.trials.estimation import EstimatorRow
 from undertow.trials.library import LibraryRow
 from undertow.trials.robustness import FACTORS, SINGLE, RobustnessResult
@@ -30,7 +29,6 @@ __all__ = [
     "balance_files",
     "balance_report",
     "comparison_figure",
-    "coverage_report",
     "engine_report",
     "estimator_report",
     "library_report",
@@ -223,27 +221,6 @@ def swing_report(found: Sequence[SwingResult], seconds: float) -> RenderableType
         ("", "balanced", "caught after\nmedian, s", "longest\ns", "thrown\nout", "end stop\nhit"),
         rows,
         "balanced: home for the last second",
-    )
-
-
-def coverage_report(rows: Sequence[CoverageRow]) -> RenderableType:
-    """Return the table of :func:`undertow.trials.coverage.coverage`."""
-    return table(
-        "95 % intervals of the bring-up wizard, SRV02 rigs that its model contains",
-        ("", "noise\nmrad", "intervals", "hold the truth", "mean", "deviation"),
-        [
-            (
-                row.name or "all",
-                f"{1e3 * row.noise:g}",
-                str(row.count),
-                f"{100 * row.covered / row.count:.1f} %",
-                f"{row.mean:+.2f}",
-                f"{row.deviation:.2f}",
-            )
-            for row in rows
-        ],
-        "mean, deviation: of (estimate − truth)/(standard error); noise: of the positions, "
-        "before\nthey are counted (1.53 mrad)",
     )
 
 

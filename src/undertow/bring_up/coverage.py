@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
-from undertow.bring_up import rest_state
 from undertow.bring_up.identify import identify
 from undertow.bring_up.motion import doublets, perform
+from undertow.bring_up.rest import rest_state
 from undertow.errors import ArtefactError
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import rotary_pendulum
