@@ -227,8 +227,8 @@ def swing_report(found: Sequence[SwingResult], seconds: float) -> RenderableType
 def library_report(rows: Sequence[LibraryRow]) -> RenderableType:
     """Return the table of :func:`undertow.trials.library.through_the_runtime`."""
     return table(
-        "Every mechanism through the runtime, realistic rigs, usual starts, positions only",
-        ("", "inputs", "ε", "held", "surfaces\nadmitted", "chatter\nlimits/s", "else"),
+        "Every mechanism through the runtime, realistic rigs, positions only",
+        ("", "m", "ε", "held", "admitted", "limits/s", "else"),
         [
             (
                 row.name,
@@ -241,8 +241,8 @@ def library_report(rows: Sequence[LibraryRow]) -> RenderableType:
             )
             for row in rows
         ],
-        "held: to the end, without a safe stop; chatter: total variation of the input that "
-        "varies most",
+        "m: inputs; ε: boundary layer; held: to the end, without a safe stop; admitted:\n"
+        "surfaces; limits/s: total variation of the input that varies most, by its limit",
     )
 
 
