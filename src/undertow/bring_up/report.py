@@ -57,8 +57,8 @@ def coverage_table(rows: Sequence[CoverageRow]) -> Table:
     table = Table(
         title="95 % intervals of the bring-up wizard, SRV02 rigs that its model contains",
         title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
-        caption="mean, deviation: of (estimate − truth)/(standard error); noise: of the "
-        "positions,\nbefore they are counted (1.53 mrad)", caption_justify="left",
+        caption="mean, deviation: of (estimate − truth)/(standard error)\nnoise: before counting, "
+        "at 1.53 mrad per count", caption_justify="left",
     )  # fmt: skip
     for head in ("", "noise\nmrad", "intervals", "hold the truth", "mean", "deviation"):
         table.add_column(head, justify="right" if head else "left")
