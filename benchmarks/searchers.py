@@ -6,7 +6,7 @@ surface with the same width, and may ask for the same number of rollouts; the co
 are those of the kernel.  Repeated from several seeds.
 
 * *ours*: undertow.search.CMAES, a whole population a call, and undertow.trust_region.TrustRegion,
-  16 a call, restarted at random when its model has converged.
+  16 a call, restarted at random when it gains nothing any more.
 * *cmaes*: the package of that name, told one member at a time.
 * *SciPy …*: routines that call the cost themselves, turned inside out by a thread; differential
   evolution hands over populations, the others one point at a time, restarted at random when
@@ -62,11 +62,15 @@ def ours(start: FloatArray, seed: int) -> Searcher:
 
 
 class Restarted:
-    """The quadratic-model search; from another start once it has converged."""
+    """The quadratic-model search; from another start once it gains nothing any more."""
 
     def __init__(self, start: FloatArray, seed: int) -> None:
         self._start, self._rng = start, np.random.default_rng(seed)
+        self._begin(start)
+
+    def _begin(self, start: FloatArray) -> None:
         self._search = TrustRegion(start, WIDTH, LANES, self._rng)
+        self._best, self._fruitless = np.inf, 0
 
     def ask(self) -> FloatArray:
         """Return a batch."""
@@ -75,9 +79,11 @@ class Restarted:
     def tell(self, x: FloatArray, f: FloatArray) -> None:
         """Learn; begin again elsewhere where nothing is left to learn."""
         self._search.tell(x, f)
-        if self._search.spread < 0.02:
-            elsewhere = self._start + WIDTH * self._rng.standard_normal(self._start.size)
-            self._search = TrustRegion(elsewhere, WIDTH, LANES, self._rng)
+        gained = self._search.best_f < (1 - 1e-4) * self._best
+        self._fruitless = 0 if gained else self._fruitless + 1
+        self._best = self._search.best_f
+        if self._fruitless == 3:
+            self._begin(self._start + WIDTH * self._rng.standard_normal(self._start.size))
 
 
 class CmaesPackage:
