@@ -242,6 +242,26 @@ def test_untrue_regions_meet_the_proof(written: bytes) -> None:
     assert "start" in function(good, 0.02, start=0.5).method
 
 
+def test_a_region_for_other_plants_alone_is_refused(written: bytes) -> None:
+    """A box of parameters must hold the mechanism's own values, and the claim says it."""
+
+    def claim(low: float, high: float) -> Verdict:
+        def edit(document: dict[str, Any]) -> None:
+            document["subjects"][0]["claims"][0]["data"] = {
+                "function": function_data(quadratic(lyapunov_matrix(), 0.01)),
+                "start": [0.01, 0, 0],
+                "parameters": {"r_o": [low, high]},
+            }
+
+        return verdict_after(written, "surface region", edit)
+
+    near = claim(0.2149, 0.2151)
+    assert near.kind == "proved"
+    assert "for every r_o in [0.2149, 0.2151]" in near.claim
+    with pytest.raises(CertificateError, match=r"without its 0\.215"):
+        claim(0.3, 0.31)
+
+
 def test_reaching_a_point_is_proved_in_intervals() -> None:
     V = quadratic(np.diag([4.0, 1.0, 1.0]), 1.0)
     assert reaches(V, [0.4999, 0.0, 0.0])

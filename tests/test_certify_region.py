@@ -214,6 +214,24 @@ def test_a_plain_vector_field_with_a_known_region(radius: float, kind: str) -> N
         assert 1.0 < abs(verdict.witness["x"]) <= radius
 
 
+def test_a_chain_of_different_stretches_is_not_proved() -> None:
+    """Beyond the pole of the inner function its formula is small again, and means nothing.
+
+    ẋ = −x + x³/9 has the region |x| < 3; (x/5)² would pass if all that looks inside were.
+    """
+    x = sp.Symbol("x", real=True)
+    motion = VectorField((x,), (-x + x**3 / 9,))
+    square, one = np.array([[2]]), np.ones(1)
+    inner = LyapunovFunction(np.eye(1), square, one, stretch=np.ones((1, 1, 1)), pole=1.0)
+    wide = LyapunovFunction(np.array([[5.0]]), square, one)
+    assert verify_region(motion, inner)
+    other = LyapunovFunction(np.eye(1), square, one, stretch=np.ones((1, 1, 1)), pole=2.0)
+    for outer in (wide, other):
+        verdict = verify_region(motion, [inner, outer])
+        assert verdict.kind == "undecided"
+        assert "different stretches" in verdict.method
+
+
 @pytest.mark.parametrize("inner", [None, 0.5])
 def test_branch_and_bound_alone_proves_no_set_that_is_too_large(
     monkeypatch: pytest.MonkeyPatch, inner: float | None

@@ -90,6 +90,16 @@ def test_what_is_undefined_on_a_box_has_no_bounds() -> None:
         assert not (high < 1e100).any()
 
 
+@pytest.mark.parametrize("centre", [1e80, 1.1e127, 1e-80])
+def test_magnitudes_whose_powers_vanish_have_no_bounds(centre: float) -> None:
+    """Remainders of roots, reciprocals and logarithms underflow there: none is claimed."""
+    tape = Tape()
+    program = TaylorProgram.of(tape, [x], [], tape.let_all([1 / x, sp.sqrt(x), sp.log(x)]))
+    low, high = bounds(program(np.array([[0.9 * centre]]), np.array([[1.1 * centre]])), 1)
+    assert not np.isfinite(low).any()
+    assert not np.isfinite(high).any()
+
+
 def test_a_program_of_too_many_variables_is_refused() -> None:
     """The bound on rounding errors is for sums of few terms."""
     many = sp.symbols("v0:9", real=True)

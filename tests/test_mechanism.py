@@ -371,6 +371,11 @@ REFUSALS: dict[str, tuple[Callable[[], object], type[UndertowError], tuple[str, 
         ModelError,
         ("used twice", "got t"),
     ),
+    "name of a derivation's own symbols": (
+        lambda: build(parameters=(ut.Parameter("_v0", 1.0, "m"),)),
+        InvalidInputError,
+        ("parameter name", "_v0"),
+    ),
     "undeclared symbol": (
         lambda: build(mass_matrix=unit_mass * sp.Symbol("k", real=True)),
         ModelError,

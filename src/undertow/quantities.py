@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,21 @@ FloatArray = NDArray[np.float64]
 
 #: The symbol of time in disturbances, s.
 TIME = sp.Symbol("t", real=True)
+
+
+#: Names of symbols that derivations make up.
+_RESERVED = re.compile(r"_(v|y|cse_|viscous_)\d+")
+
+
+def _check_name(what: str, name: str) -> None:
+    """Refuse what is no identifier, and what a derivation could take for a symbol of its own."""
+    if not name.isidentifier() or _RESERVED.fullmatch(name):
+        raise InvalidInputError(
+            what,
+            value=repr(name),
+            limit="a Python identifier; not _v0, _y0, _cse_0 or the like",
+            remedy="Use letters, digits and underscores, a letter first",
+        )
 
 
 @dataclass(frozen=True)
@@ -50,13 +66,7 @@ class Parameter:
 
     def __post_init__(self) -> None:
         """Refuse a value that is not finite or not inside its interval."""
-        if not self.name.isidentifier():
-            raise InvalidInputError(
-                "parameter name",
-                value=repr(self.name),
-                limit="a Python identifier",
-                remedy="Use letters, digits and underscores, a letter first",
-            )
+        _check_name("parameter name", self.name)
         if not math.isfinite(self.value) or not self.low < self.value < self.high:
             interval = f"finite and inside ({self.low:g}, {self.high:g}) {self.unit}".rstrip()
             raise InvalidInputError(
@@ -97,11 +107,12 @@ class Coordinate:
 
     def __post_init__(self) -> None:
         """Refuse a name or unit of another kind, and an empty range of travel."""
-        if not self.name.isidentifier() or self.unit not in ("rad", "m"):
+        _check_name("coordinate name", self.name)
+        if self.unit not in ("rad", "m"):
             raise InvalidInputError(
-                "coordinate",
-                value=f"name {self.name!r}, unit {self.unit!r}",
-                limit="a Python identifier, in rad or m",
+                f"unit of coordinate '{self.name}'",
+                value=repr(self.unit),
+                limit="rad or m",
                 remedy="Scale other units to SI first",
             )
         if not self.low < self.high:
@@ -143,13 +154,7 @@ class Input:
 
     def __post_init__(self) -> None:
         """Refuse a name that is no identifier and a limit that is not positive."""
-        if not self.name.isidentifier():
-            raise InvalidInputError(
-                "input name",
-                value=repr(self.name),
-                limit="a Python identifier",
-                remedy="Use letters, digits and underscores",
-            )
+        _check_name("input name", self.name)
         if not self.limit > 0:
             raise InvalidInputError(
                 f"limit of input '{self.name}'",

@@ -65,7 +65,7 @@ class Motion(ABC):
     @cached_property
     def symbols(self) -> tuple[sp.Symbol, ...]:
         """Symbols of the N coordinates."""
-        return tuple(sp.Symbol(f"y_{i}", real=True) for i in range(self.size))
+        return tuple(sp.Symbol(f"_y{i}", real=True) for i in range(self.size))
 
     @cached_property
     def _field(self) -> Any:

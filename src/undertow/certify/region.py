@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from undertow.certify.batch import Interval
 from undertow.certify.lyapunov import LyapunovFunction, first_crossing
 from undertow.certify.motion import Motion, SurfaceMotion, VectorField
-from undertow.certify.region_stage import Chart, Stage
+from undertow.certify.region_stage import Chart, Stage, stretched_alike
 from undertow.certify.verdict import Kind, Verdict
 from undertow.errors import InvalidInputError
 
@@ -139,6 +139,9 @@ def verify_region(
         return Verdict(claim, "undecided", method="f(0) = 0 cannot be shown symbolically")
     boxes, core = 0, np.zeros(motion.size)
     for k in range(proved, len(chain)):
+        if k and chain[k - 1].stretch is not None and not stretched_alike(chain[k], chain[k - 1]):
+            why = f": functions {k} and {k + 1} have different stretches"
+            return Verdict(claim, "undecided", method=method + why, details={"stage": k + 1})
         frame = _frame(motion, chain[max(k - 1, 0) : k + 1])
         if frame is None:
             far = dict(zip(motion.names, _far_point(chain[k]).tolist(), strict=True))

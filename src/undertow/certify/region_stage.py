@@ -22,9 +22,21 @@ from undertow.certify.taylor import TaylorProgram
 from undertow.certify.taylor_kernel import bounds, excluded, spreads
 from undertow.codegen import Tape
 
-__all__ = ["Chart", "Stage"]
+__all__ = ["Chart", "Stage", "stretched_alike"]
 
 FloatArray = NDArray[np.float64]
+
+
+def stretched_alike(V: LyapunovFunction, inner: LyapunovFunction) -> bool:
+    """Whether the sets of two functions are described in the same coordinates z of y.
+
+    The z of a stretched function is one to one up to its pole alone: beyond, its formula says
+    nothing of its set.
+    """
+    if inner.stretch is None or V.stretch is None:
+        return inner.stretch is V.stretch
+    S, T = np.asarray(inner.stretch), np.asarray(V.stretch)
+    return inner.pole == V.pole and np.array_equal(S, T)
 
 
 class Chart:
@@ -32,11 +44,7 @@ class Chart:
 
     def __init__(self, V: LyapunovFunction, inner: LyapunovFunction | None) -> None:
         """For the stretch that both functions have, if they have one; B is the unit matrix."""
-        same = inner is None or (
-            inner.stretch is not None
-            and inner.pole == V.pole
-            and np.array_equal(np.asarray(inner.stretch), np.asarray(V.stretch))
-        )
+        same = inner is None or (inner.stretch is not None and stretched_alike(V, inner))
         self.bent = V if V.stretch is not None and same and len(V.scale) > 1 else None
         self.B: FloatArray = np.eye(len(V.scale))
 

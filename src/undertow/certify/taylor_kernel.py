@@ -39,7 +39,11 @@ __all__ = ["LOAD", "SCALE", "SHIFT", "bounds", "excluded", "run", "spreads"]
 SCALE, SHIFT, LOAD = 14, 15, 16
 
 #: For sums of at most 60 terms.
-ROUND, GROW, TINY = 4e-15, 1.0 + 4e-14, 1e-300
+ROUND, GROW, TINY = 8e-15, 1.0 + 4e-14, 1e-300
+
+#: Reciprocals, roots and logarithms outside [1/FAR, FAR] have no bounds: powers of them would
+#: underflow or overflow unseen.
+FAR = 1e60
 
 #: Boxes that go through the code together.
 LANES = 32
@@ -184,7 +188,7 @@ def _point(op, c, r):  # type: ignore[no-untyped-def]
     none = np.inf
     if op == RECIPROCAL:
         gap = (abs(c) - r * GROW) * (1.0 - 1e-15)
-        if not gap > 0.0:
+        if not (gap > 1.0 / FAR and abs(c) < FAR):
             return 0.0, 0.0, 0.0, none, none
         f = 1.0 / c
         return f, -f * f, f * f * f, 0.0, abs(f * f * f) / gap * GROW
@@ -200,7 +204,7 @@ def _point(op, c, r):  # type: ignore[no-untyped-def]
         return k, -s, -0.5 * k, max(ds, dk), 0.16666666666666669
     if op == SQRT:
         gap = (c - r * GROW) * (1.0 - 1e-15)
-        if not gap > 0.0:
+        if not (gap > 1.0 / FAR and c < FAR):
             return 0.0, 0.0, 0.0, none, none
         f = np.sqrt(c)
         return f, 0.5 / f, -0.125 / (c * f), 0.0, 0.0625 / (gap * gap * np.sqrt(gap)) * GROW
@@ -210,7 +214,7 @@ def _point(op, c, r):  # type: ignore[no-untyped-def]
         return 0.5 * (p + q), 0.5 * (p + q), 0.25 * (p + q), q - p, top / 6.0 * GROW
     if op == LOG:
         gap = (c - r * GROW) * (1.0 - 1e-15)
-        if not gap > 0.0:
+        if not (gap > 1.0 / FAR and c < FAR):
             return 0.0, 0.0, 0.0, none, none
         p, q = logarithm(c, c)
         return 0.5 * (p + q), 1.0 / c, -0.5 / (c * c), q - p, GROW / (3.0 * gap * gap * gap)
@@ -283,8 +287,8 @@ def _ends(column, V):  # type: ignore[no-untyped-def]
     for i in range(V):
         g, h = abs(column[1 + i]), column[k]
         total += g + abs(h)
-        high += g * g / (-4.0 * h) if 2.0 * h < -g else g + h
-        low -= g * g / (4.0 * h) if 2.0 * h > g else g - h
+        high += g * (g / (-4.0 * h)) if 2.0 * h < -g else g + h
+        low -= g * (g / (4.0 * h)) if 2.0 * h > g else g - h
         k += 1
         for _ in range(i + 1, V):
             cross = abs(column[k])

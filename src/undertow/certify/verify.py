@@ -251,16 +251,20 @@ def _region(m: Mechanism, s: Subject, data: Mapping[str, Any], seconds: float) -
         raise ValueError(f"a chain of {len(listed)} functions")
     chain = [function_of(item) for item in listed]
     start = [float(v) for v in data["start"]]
-    verdict = verify_region(
-        motion, chain, parameters=_box(data.get("parameters", {})), max_seconds=seconds
-    )
+    box = _box(data.get("parameters", {}))
+    own = {p.name: p.value for p in m.parameters}
+    for name, (low, high) in box.items():
+        if not low <= own[name] <= high:
+            raise ValueError(f"a box [{low:g}, {high:g}] of {name} without its {own[name]:g}")
+    verdict = verify_region(motion, chain, parameters=box, max_seconds=seconds)
     if not verdict:
         return verdict
     if not reaches(chain[-1], start):
         return Verdict(verdict.claim, "undecided", method="the stated start is not shown inside")
     names = ", ".join(f"{n} = {v:.6g}" for n, v in zip(motion.names, start, strict=True) if v)
+    ranges = "".join(f", for every {n} in [{a:.6g}, {b:.6g}]" for n, (a, b) in box.items())
     return Verdict(
-        f"{verdict.claim}, that contains {names}",
+        f"{verdict.claim}, that contains {names}{ranges}",
         "proved",
         float(np.linalg.norm(start)),
         "",
