@@ -24,9 +24,10 @@ from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.mechanism import TIME, Mechanism
 
-__all__ = ["dynamics_source", "stepping"]
+__all__ = ["SMOOTH", "dynamics_source", "stepping"]
 
-_BODY = f"""
+#: Calls what :func:`dynamics_source` compiles.
+SMOOTH = f"""
 {COMPILED}
 def smooth(t, h, x, u, viscous, parameters, work):
     # Runge-Kutta's step of the smooth dynamics, in place.
@@ -48,7 +49,10 @@ def smooth(t, h, x, u, viscous, parameters, work):
             stage[n + i] = x[n + i] + reach * dd
     for i in range(2 * n):
         x[i] += h / 6.0 * total[i]
+"""
 
+_BODY = f"""
+{SMOOTH}
 
 {COMPILED}
 def advance(

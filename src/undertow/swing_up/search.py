@@ -26,7 +26,7 @@ from undertow.codegen.store import content_key, generated, generators, recall, r
 from undertow.errors import InfeasibleError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.rig.presets import plausible_rig
-from undertow.rig.stepping import dynamics_source
+from undertow.rig.stepping import SMOOTH, dynamics_source
 from undertow.search import CMAES
 from undertow.swing_up.catch import unclipped
 from undertow.swing_up.law import Gains, SwingUp, hanging, periods, swing_source
@@ -58,26 +58,14 @@ DECADES = np.array([[-2.5, 1.5], [-2.5, 1.5], [-2.5, 1.5], [-3.0, -0.3]])
 WORSE = 2.5
 
 _BODY = f"""
+{SMOOTH}
+
 {COMPILED}
-def advance(x, force, plant, drag, limit, gain, stops, h, stage, total, qdd, viscous, u):
-    # Runge-Kutta's step with dry friction of the driven joint; whether it met no stop.
+def advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
+    # A smooth step with dry friction of the driven joint; whether it met no stop.
     n = x.shape[0] // 2
     u[0] = force - drag * limit * math.tanh(x[n] / 0.02) * (1.0 if gain > 0.0 else -1.0)
-    for i in range(2 * n):
-        stage[i] = x[i]
-        total[i] = 0.0
-    for s in range(4):
-        forward(0.0, stage, u, viscous, plant, qdd)
-        weight = 1.0 if s == 0 or s == 3 else 2.0
-        reach = h if s == 2 else 0.5 * h
-        for i in range(n):
-            d, dd = stage[n + i], qdd[i]
-            total[i] += weight * d
-            total[n + i] += weight * dd
-            stage[i] = x[i] + reach * d
-            stage[n + i] = x[n + i] + reach * dd
-    for i in range(2 * n):
-        x[i] += h / 6.0 * total[i]
+    smooth(0.0, h, x, u, viscous, plant, stages)
     for i in range(n):
         if not stops[i, 0] < x[i] < stops[i, 1]:
             return False
@@ -97,14 +85,14 @@ def distance(x, P):
 def attempt(x0, gains, belief, plant, drag, limit, stops, P, level, k, wraps, seconds, h, out):
     # Time from which the regulator brings it home, infinite where there is none; least xᵀPx/level.
     n = x0.shape[0] // 2
-    x, near, stage, total = x0.copy(), x0.copy(), x0.copy(), x0.copy()
-    qdd, viscous, u, work = np.zeros(n), np.zeros(n), np.zeros(1), np.zeros(5)
+    x, near, stages = x0.copy(), x0.copy(), np.zeros((3, 2 * n))
+    viscous, u, work = np.zeros(n), np.zeros(1), np.zeros(5)
     out[0], out[1] = math.inf, math.inf
     wait = 0
     for step in range(int(seconds / h)):
         force = swing(x, gains, belief, limit, 0.0, work)
         gain = work[4]
-        if not advance(x, force, plant, drag, limit, gain, stops, h, stage, total, qdd, viscous, u):
+        if not advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
             out[1] = math.inf
             return
         for i in range(n):
@@ -122,9 +110,7 @@ def attempt(x0, gains, belief, plant, drag, limit, stops, P, level, k, wraps, se
             for i in range(2 * n):
                 force += k[i] * near[i]
             force = max(-limit, min(limit, force))
-            if not advance(
-                near, force, plant, drag, limit, gain, stops, h, stage, total, qdd, viscous, u
-            ):
+            if not advance(near, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
                 break
             ratio = distance(near, P) / level
             if ratio > 10.0 * {REACH}:
