@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ from undertow.runtime import (
 from undertow.runtime.clock import Histogram
 from undertow.runtime.faults import Witness
 from undertow.runtime.keeper import KeptRig
-from undertow.runtime.modes import Signs, successor
+from undertow.runtime.modes import Reason, successor
 from undertow.runtime.session import session
 from undertow.runtime.slow import Answer, Request
 
@@ -68,29 +69,52 @@ def settled(controller: Controller, steps: int = 30) -> int:
 
 @pytest.mark.parametrize("mode", [m for m in Mode if m not in (Mode.IDLE, Mode.SAFE_STOP)])
 def test_faults_and_the_operator_come_before_everything(mode: Mode) -> None:
-    for signs in (Signs(fault="broken", inside=True), Signs(command=Command.STOP, inside=True)):
-        assert successor(mode, signs)[0] == Mode.SAFE_STOP
+    assert successor(mode, fault=True, inside=True) == (Mode.SAFE_STOP, Reason.FAULT)
+    assert successor(mode, Command.STOP, inside=True) == (Mode.SAFE_STOP, Reason.STOP)
 
 
 def test_nothing_but_the_operator_leads_out_of_a_safe_stop() -> None:
-    every = Signs(ready=True, inside=True, settled=True, swings=True)
-    assert successor(Mode.SAFE_STOP, every)[0] == Mode.SAFE_STOP
-    assert successor(Mode.SAFE_STOP, replace(every, command=Command.START))[0] == Mode.SAFE_STOP
-    assert successor(Mode.SAFE_STOP, replace(every, command=Command.RESET))[0] == Mode.IDLE
-    still = replace(every, command=Command.RESET, fault="still broken")
-    assert successor(Mode.SAFE_STOP, still)[0] == Mode.SAFE_STOP
+    every = partial(successor, Mode.SAFE_STOP, ready=True, inside=True, settled=True, swings=True)
+    for command in (Command.NONE, Command.START, Command.STOP):
+        assert every(command) == (Mode.SAFE_STOP, Reason.NONE)
+    assert every(Command.RESET) == (Mode.IDLE, Reason.RESET)
+    assert every(Command.RESET, fault=True) == (Mode.SAFE_STOP, Reason.NONE)
 
 
 def test_the_law_takes_over_inside_its_region_alone_and_hands_back() -> None:
-    ready = Signs(ready=True, swings=True)
-    assert successor(Mode.BRING_UP, ready)[0] == Mode.SWING_UP
-    assert successor(Mode.BRING_UP, replace(ready, swings=False))[0] == Mode.BRING_UP
-    assert successor(Mode.SWING_UP, ready)[0] == Mode.SWING_UP
-    assert successor(Mode.SWING_UP, replace(ready, inside=True))[0] == Mode.CATCH
-    assert successor(Mode.CATCH, Signs(settled=True))[0] == Mode.BALANCE
+    assert successor(Mode.BRING_UP, ready=True, swings=True)[0] == Mode.SWING_UP
+    assert successor(Mode.BRING_UP, ready=True)[0] == Mode.BRING_UP
+    assert successor(Mode.SWING_UP, ready=True, swings=True)[0] == Mode.SWING_UP
+    assert successor(Mode.SWING_UP, inside=True, swings=True)[0] == Mode.CATCH
+    assert successor(Mode.CATCH, settled=True)[0] == Mode.BALANCE
+    assert successor(Mode.BALANCE) == (Mode.CATCH, Reason.DISTURBED)
     for mode in (Mode.CATCH, Mode.BALANCE):
-        assert successor(mode, Signs(lost=True, swings=True))[0] == Mode.SWING_UP
-        assert successor(mode, Signs(lost=True))[0] == Mode.SAFE_STOP
+        assert successor(mode, lost=True, swings=True)[0] == Mode.SWING_UP
+        assert successor(mode, lost=True)[0] == Mode.SAFE_STOP
+
+
+def test_a_step_never_compiles_anything(controller: Controller) -> None:
+    """Whatever a driver's numbers are made of: one machine code for each compiled part."""
+    settled(controller)
+    readings = (
+        Measurement(0.030, np.array([0.0, 0.3])),
+        Measurement(np.float32(0.031), [0.0, 0.3]),  # type: ignore[arg-type]
+        Measurement(np.float64(0.032), np.array([0.0, 0.3], dtype=np.float32)),
+        Measurement(1, np.array([0.0, 9.0, 0.3, 9.0])[::2]),
+        None,
+    )
+    for k, measurement in enumerate(readings):
+        controller.step(Inputs(0.03 + 1e-3 * k, measurement))
+    parts = controller._act, controller._law, controller.sensors._check
+    assert [len(part.signatures) for part in parts] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("q", [[0.3], [0.0, 0.3, 0.0], 0.3, [[0.0, 0.3]]])
+def test_a_measurement_of_another_shape_is_a_safe_stop(controller: Controller, q: object) -> None:
+    k = settled(controller)
+    controller.step(Inputs(1e-3 * k, Measurement(1e-3 * k, q)))  # type: ignore[arg-type]
+    assert controller.mode == Mode.SAFE_STOP
+    assert controller.stopped_by
 
 
 def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path: Path) -> None:

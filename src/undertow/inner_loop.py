@@ -21,7 +21,7 @@ from undertow.memory import BRIEF, Memory, unpacked
 from undertow.sliding import LawSymbols, SlidingModeLaw, lay_law
 from undertow.surface import ReachingLaw, Surface, Switching
 
-__all__ = ["InnerLoop", "lane", "law_memory", "law_module"]
+__all__ = ["LAYOUT", "InnerLoop", "lane", "law_memory", "law_module"]
 
 
 @dataclass(eq=False)
@@ -89,7 +89,7 @@ class InnerLoop:
 
 def law_memory(mechanism: Mechanism, limits: FloatArray | None = None) -> Memory:
     """Return what a step of a law works on: u, demand, s, margin; limits may be narrower."""
-    memory = Memory(_LAYOUT, p=len(mechanism.parameters), m=mechanism.m)
+    memory = Memory(LAYOUT, p=len(mechanism.parameters), m=mechanism.m)
     memory["parameters"][:] = mechanism.parameter_values
     memory["limits"][:] = mechanism.input_limits if limits is None else limits
     return memory
@@ -102,7 +102,7 @@ def lane(law: SlidingModeLaw) -> FloatArray:
 
 
 #: What a step of the law reads besides the state and its surface, and what it fills.
-_LAYOUT = {
+LAYOUT = {
     "parameters": "p", "limits": "m", "u": "m", "demand": "m", "s": "m", "margin": "1",
 }  # fmt: skip
 
@@ -110,7 +110,7 @@ _LAYOUT = {
 _CLIP = f"""
 {BRIEF}
 def step(x, lane, block):
-{unpacked(_LAYOUT)}
+{unpacked(LAYOUT)}
     law(x, lane, parameters, demand, s, margin)
     for i in range(u.shape[0]):
         if not (abs(demand[i]) < math.inf):

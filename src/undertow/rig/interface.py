@@ -10,7 +10,7 @@ from undertow.mechanism import FloatArray
 __all__ = ["Measurement", "Rig"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Measurement:
     """What the sensors say at one instant.
 

@@ -18,16 +18,21 @@ from typing import NamedTuple
 import numpy as np
 
 from undertow.cascade import Cascade, CascadeState
-from undertow.estimators.compensation import take_off
 from undertow.estimators.interface import Estimator
-from undertow.inner_loop import law_memory, law_module
+from undertow.inner_loop import law_module
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement
-from undertow.runtime.modes import Command, Mode, Signs, successor
-from undertow.runtime.sensors import SensorWatch
+from undertow.runtime.modes import Command, Mode, Reason
+from undertow.runtime.sensors import LAST_HARMLESS, SensorWatch
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import Answer, Request, lanes_of
-from undertow.runtime.steps import apart, confine, farthest, off_by, settle, sound
+from undertow.runtime.steps import (
+    PAST,
+    confine,
+    sound,
+    step_memory,
+    step_module,
+)
 from undertow.swing_up import SwingUpAndCatch
 
 __all__ = ["Controller", "Inputs", "Note"]
@@ -119,36 +124,36 @@ class Controller:
     ) -> None:
         mechanism = cascade.mechanism
         settings = Settings() if settings is None else settings
-        n, m = mechanism.n, mechanism.m
         self.cascade, self.estimator, self.period = cascade, estimator, period
         self.settings, self.swing_up = settings, swing_up
-        self.limits = settings.limits(mechanism)
-        slew = settings.slew(mechanism) * period
-        self.slew = np.where(np.isfinite(slew), slew, np.inf)
-        self.u, self.x, self.home = np.zeros(m), np.zeros(2 * n), np.zeros(2 * n)
-        law = law_memory(mechanism)
-        self.demand, self.s, self.margin = law["demand"], law["s"], law["margin"]
+        lost = settings.lost if swing_up is None else swing_up.lost
+        fast = step_memory(mechanism, settings, period, lost)
+        self._block = fast.block
+        self.u: FloatArray = fast["output"]
+        self.x, self.home, self.s = fast["x"], fast["home"], fast["s"]
+        self.demand, self.margin = fast["demand"], fast["margin"]
+        self.limits, self.slew = fast["limits"], fast["slew"]
+        self._turn, self._wanted = fast["turn"], fast["wanted"]
+        self._act = step_module(mechanism, cascade.reaching.switching).act
         self._law = law_module(mechanism, cascade.reaching.switching).step
-        self._block, self._limited = law.block, law["u"]
-        self._turn, self._of_u = np.zeros(2 * n), np.r_[m:n, n + m : 2 * n]
-        units = [c.unit for c in mechanism.coordinates]
-        self._angles = np.array([i for i in range(m, n) if units[i] == "rad"], dtype=np.int64)
+        self._swings = swing_up is not None
         self.mode, self.stopped_by = Mode.IDLE, ""
         self.memory = memory
         self.notes: list[Note] = []
         self.request: Request | None = None
         self.gives_up = False
         self.sensors = SensorWatch(mechanism, settings, period)
-        self._wanted = np.zeros(m)
-        self._signs = Signs(swings=swing_up is not None)
-        self._install(memory, lanes_of(cascade, memory.plan))
+        self._names = [c.name for c in mechanism.coordinates]
+        self._lanes, self._times = lanes_of(cascade, memory.plan), memory.plan.times
+        self._segment, self._lane = 0, self._lanes[0]
+        self._next = memory, self._lanes, self._times
+        self._expected, self._off, self._most, self._due = fast["expected"], fast["off"], 0.0, 0.0
         self._asked: Request | None = None
         self._pending: Answer | None = None
         self._arrived: Answer | None = None
-        self._used: tuple[Answer, float, float, float] | None = None
+        self._used: Answer | None = None
         self._followed, self._free, self._t = True, False, 0.0
-        self._sequence = memory.sequence
-        self._sound = self._swinging = 0.0
+        self._sequence, self._swinging = memory.sequence, 0.0
         self._lead = settings.lead
         self._catch_lead = CATCH_LEAD
 
@@ -176,7 +181,7 @@ class Controller:
             self._think(inputs)
         except Exception as error:  # whatever it was, the output goes to zero within its slew
             self._stop(f"{type(error).__name__}: {error}")
-        confine(self._wanted, self.u, self.limits, self.slew)
+            confine(self._wanted, self.u, self.limits, self.slew)
         return self.u
 
     def follow_up(self) -> None:
@@ -186,7 +191,7 @@ class Controller:
         used, self._used = self._used, None
         try:
             if used is not None:
-                self._tell(*used)
+                self._tell(used)
             if answer is not None:
                 self._receive(self._t, answer)
             elif self._free:
@@ -195,67 +200,70 @@ class Controller:
             self._stop(f"{type(error).__name__}: {error}")
 
     def _think(self, inputs: Inputs) -> None:
-        t, signs = inputs.t, self._signs
+        t, sensors, mode, pending = inputs.t, self.sensors, self.mode, self._pending
         self._arrived = inputs.answer
-        fault = inputs.alarm or self._observe(inputs.measurement)
-        caught = False
-        pending = self._pending
-        if pending is not None and t >= pending.use - 0.5 * self.period:
-            caught = self._use(t, pending)  # and the law is evaluated
-        else:
-            self._evaluate(t)
-            self._free = True
-        mode, settings, home = self.mode, self.settings, self.home
-        signs.command, signs.fault = inputs.command, fault
-        self._sound = 0.0 if fault or self.sensors.missing else self._sound + self.period
-        signs.ready = self._sound >= settings.settle
-        margin = float(self.margin[0])
-        allowed = margin > settings.margin
-        signs.inside = caught if self.swing_up is not None else allowed
-        swing, far = apart(home, self._of_u)
-        signs.lost = not allowed or not far < settings.escape or self._thrown_out()
-        signs.settled = swing <= settings.near * (2.0 if mode is Mode.BALANCE else 1.0)
-        self._change(t, *successor(mode, signs))
-        mode = self.mode
-        if mode is Mode.CATCH or mode is Mode.BALANCE:
-            take_off(self.demand, self.estimator.disturbance, self.limits, self._wanted)
-            if self.sensors.probe:
-                self._wanted += 2.0 * self.sensors.probe * self.sensors.band
-        elif mode is Mode.SWING_UP and self.swing_up is not None:
+        if mode is Mode.IDLE:
+            sensors.forget()
+        believed, found, sensor = sensors.check(inputs.measurement, self.x, self.u)
+        estimate = self.x
+        if believed is not None:
+            if sensors.first:
+                self.estimator.reset(np.concatenate([believed.q, np.zeros_like(believed.q)]))
+            estimate = self.estimator.estimate(believed, self.u)
+        if self._segment + 1 < len(self._times):
+            self._proceed(t)
+        new, most = self._lane, -1.0
+        due = pending is not None and t >= self._due
+        if due:
+            new, most = self._next[1][0], self._most
+            if mode is Mode.SWING_UP and self.swing_up is not None:
+                self._turn[:] = self.swing_up.region.turns(estimate)
+        used, number, why, wrong, place = self._act(
+            estimate,
+            self.estimator.disturbance,
+            self._lane,
+            new,
+            most,
+            self._block,
+            mode.value,
+            inputs.command.value,
+            found > LAST_HARMLESS or inputs.alarm != "",
+            sensors.missing > 0,
+            self._swings,
+            sensors.probe,
+        )
+        self._free = not due
+        if due:
+            self._used, self._pending = pending, None
+            if used:
+                self.memory, self._lanes, self._times = self._next
+                self._segment, self._lane = 0, new
+        if why:
+            reason = Reason(why).text
+            if why == Reason.FAULT:
+                reason = inputs.alarm or sensors.describe(found, sensor)
+                reason = reason or self._describe(wrong, place)
+            self._change(t, Mode(number), reason)
+            mode = self.mode
+        if mode is Mode.SWING_UP:
+            assert self.swing_up is not None  # else nothing leads to this state
             self._wanted[:] = self.swing_up.swing(self.x, self._choice(t))
-        else:
-            self._wanted[:] = 0.0
+            confine(self._wanted, self.u, self.limits, self.slew)
+        elif mode is not Mode.BALANCE and mode is not Mode.CATCH:
             self._free = False
 
-    def _thrown_out(self) -> bool:
-        """Whether a free angle is where no law holds it, or swinging up again is better."""
-        lost = self.settings.lost if self.swing_up is None else self.swing_up.lost
-        return farthest(self.home, self._angles) > lost
+    def _describe(self, wrong: int, place: int) -> str:
+        """Return in words what a step found wrong with the estimate."""
+        if wrong == PAST:
+            return f"'{self._names[place]}' at {self.x[place]:.3g}, past its travel"
+        return "the estimate is not finite"
 
-    def _observe(self, measurement: Measurement | None) -> str:
-        """Update the estimate; return what is wrong with the sensors, or with the estimate."""
-        if self.mode is Mode.IDLE:
-            self.sensors.forget()
-        checked, fault = self.sensors.check(measurement, self.x, self.u)
-        if checked is None:
-            return fault
-        if self.sensors.first:
-            start = np.zeros_like(self.x)
-            start[: checked.q.shape[0]] = checked.q
-            self.estimator.reset(start)
-        x = self.estimator.estimate(checked, self.u)
-        if not settle(x, self._turn, self.x, self.home):
-            return fault or "the estimate is not finite"
-        return fault or self.sensors.beyond(self.x)
-
-    def _evaluate(self, t: float) -> None:
-        """Evaluate the law in use at the estimate."""
-        times = self._times
-        if self._segment + 1 < len(times):
-            elapsed = t - self.memory.since + 1e-9
-            while self._segment + 1 < len(times) and elapsed >= times[self._segment + 1]:
-                self._segment += 1
-        self._law(self.home, self._lanes[self._segment], self._block)
+    def _proceed(self, t: float) -> None:
+        """Go on to the surface of a schedule that is in force at the time t."""
+        elapsed, times = t - self.memory.since + 1e-9, self._times
+        while self._segment + 1 < len(times) and elapsed >= times[self._segment + 1]:
+            self._segment += 1
+        self._lane = self._lanes[self._segment]
 
     def _change(self, t: float, mode: Mode, reason: str) -> None:
         if mode is self.mode:
@@ -267,7 +275,7 @@ class Controller:
             self._swinging, self._pending = t, None
         elif mode is Mode.CATCH and self.mode is Mode.BRING_UP:
             self.memory = replace(self.memory, since=t)  # a schedule starts with the catch
-            self._segment = 0
+            self._segment, self._lane = 0, self._lanes[0]
         self.mode = mode
 
     def _stop(self, reason: str) -> None:
@@ -328,6 +336,16 @@ class Controller:
             if answer.use - t > 0.5 * self._lead:
                 self._plan_ahead(0.9)
             self._asked, self._pending = None, answer
+            self._make_ready(answer)
+
+    def _make_ready(self, answer: Answer) -> None:
+        """Bring what the step of its use needs of an answer to where that step finds it."""
+        memory, surprise = answer.memory, self.settings.surprise
+        self._due = answer.use - 0.5 * self.period
+        self._next = memory, np.array(answer.lanes, dtype=float), memory.plan.times
+        self._expected[:] = answer.x
+        most = CATCH_SURPRISE if answer.swing >= 0 else surprise
+        self._most = most if answer.admission.accepted else -1.0
 
     def _unfit(self, t: float, answer: Answer) -> str:
         if self._asked is None or answer.sequence != self._asked.sequence:
@@ -337,7 +355,8 @@ class Controller:
             return f"late by {1e3 * (t - self._asked.use):.1f} ms"
         lanes = answer.lanes
         plan = answer.memory.plan
-        if lanes.shape != (len(plan.times), self._lanes.shape[1]) or not sound(lanes):
+        shape = len(plan.times), self._lanes.shape[1]
+        if lanes.shape != shape or answer.x.shape != self.x.shape or not sound(lanes):
             return "not a plan for this mechanism"
         if answer.use != self._asked.use or answer.memory.sequence != answer.sequence:
             return "not what was asked for"
@@ -345,32 +364,9 @@ class Controller:
             return "for another state"
         return ""
 
-    def _use(self, t: float, answer: Answer) -> bool:
-        """Put an answer to use at its time, if the state is the one it was made for.
-
-        The law in use afterwards is evaluated; whether it was a catch is returned.  What is
-        to be told of it is told in :meth:`follow_up`.
-        """
-        self._pending = None
-        swinging, most = answer.swing >= 0, self.settings.surprise
-        if swinging:
-            assert self.swing_up is not None  # else nothing was asked in this state
-            self._turn[:] = self.swing_up.region.turns(self.x)
-            settle(self.x, self._turn, self.x, self.home)
-            most = CATCH_SURPRISE
-        off, margin = off_by(self.home, answer.x), math.nan
-        if answer.admission.accepted and off <= most:
-            self._law(self.home, answer.lanes[0], self._block)
-            margin = float(self.margin[0])
-        self._used = answer, off, most, margin
-        if margin > self.settings.margin:
-            self._install(answer.memory, answer.lanes)
-            return swinging
-        self._evaluate(t)
-        return False
-
-    def _tell(self, answer: Answer, off: float, most: float, margin: float) -> None:
+    def _tell(self, answer: Answer) -> None:
         """Note what became of an answer at its time of use."""
+        (off, margin), most = self._off.tolist(), self._most
         self._sequence = max(self._sequence, answer.sequence)
         if not answer.admission.accepted:
             verdict = f"kept the old plan, {answer.admission.reason}"
@@ -381,6 +377,3 @@ class Controller:
         else:
             verdict = f"applied, off by {off:.2g}"
         self.notes.append(Note("answer", f"{answer.sequence}: {verdict}"))
-
-    def _install(self, memory: CascadeState, lanes: FloatArray) -> None:
-        self.memory, self._lanes, self._times, self._segment = memory, lanes, memory.plan.times, 0

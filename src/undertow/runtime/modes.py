@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 
-__all__ = ["Command", "Mode", "Signs", "successor"]
+from undertow.codegen.machine import numba
+
+__all__ = ["Command", "Mode", "Reason", "successor", "transition"]
 
 
 class Mode(IntEnum):
@@ -34,16 +35,103 @@ class Command(IntEnum):
     RESET = 3
 
 
-@dataclass(slots=True)
-class Signs:
-    """What the guards look at.
+class Reason(IntEnum):
+    """Why the state has changed; ``text`` says it, but what a ``FAULT`` is knows the caller."""
 
-    Attributes
+    NONE = 0
+    START = 1
+    STOP = 2
+    RESET = 3
+    FAULT = 4
+    INSIDE = 5
+    OUTSIDE = 6
+    THROWN_OUT = 7
+    SETTLED = 8
+    DISTURBED = 9
+
+    @property
+    def text(self) -> str:
+        """The reason in words."""
+        return _WORDS[self]
+
+
+_WORDS = (
+    "", "operator: start", "operator: stop", "operator: reset", "fault",
+    "inside the region of the law", "outside the region of the law", "thrown out", "settled",
+    "disturbed",
+)  # fmt: skip
+
+# Compiled code knows them as numbers.
+_IDLE, _BRING_UP, _SWING_UP, _CATCH, _BALANCE, _SAFE_STOP = map(int, Mode)
+_NO_COMMAND, _START, _STOP, _RESET = map(int, Command)
+_STAY, _BY_START, _BY_STOP, _BY_RESET, _FAULT, _INSIDE, _OUTSIDE, _THROWN, _SETTLED, _DISTURBED = (
+    map(int, Reason)
+)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def transition(
+    mode: int,
+    command: int,
+    fault: bool,
+    ready: bool,
+    inside: bool,
+    lost: bool,
+    settled: bool,
+    swings: bool,
+) -> tuple[int, int]:
+    """Return the next state and the reason for a change, as numbers: :func:`successor`."""
+    if mode == _SAFE_STOP:
+        if command == _RESET and not fault:
+            return _IDLE, _BY_RESET
+        return mode, _STAY
+    if command == _STOP:
+        return _SAFE_STOP, _BY_STOP
+    if mode == _IDLE:
+        if command == _START:
+            return _BRING_UP, _BY_START
+        return mode, _STAY
+    if fault:
+        return _SAFE_STOP, _FAULT
+    if mode == _BRING_UP and ready:
+        if inside:
+            return _CATCH, _INSIDE
+        if swings:
+            return _SWING_UP, _OUTSIDE
+    if mode == _SWING_UP and inside:
+        return _CATCH, _INSIDE
+    if mode in (_CATCH, _BALANCE) and lost:
+        return (_SWING_UP if swings else _SAFE_STOP), _THROWN
+    if mode == _CATCH and settled:
+        return _BALANCE, _SETTLED
+    if mode == _BALANCE and not settled:
+        return _CATCH, _DISTURBED
+    return mode, _STAY
+
+
+def successor(
+    mode: Mode,
+    command: Command = Command.NONE,
+    *,
+    fault: bool = False,
+    ready: bool = False,
+    inside: bool = False,
+    lost: bool = False,
+    settled: bool = False,
+    swings: bool = False,
+) -> tuple[Mode, Reason]:
+    """Return the next state and the reason for a change; the same state if there is none.
+
+    Faults come before everything, and nothing but the operator leads out of a safe stop.
+
+    Parameters
     ----------
+    mode
+        The present state.
     command
         The operator's wish.
     fault
-        Why the run cannot go on; empty when it can.
+        The run cannot go on.
     ready
         The sensors have been sound for long enough.
     inside
@@ -54,50 +142,13 @@ class Signs:
         The state is close to the target.
     swings
         There is a swing-up.
-    """
-
-    command: Command = Command.NONE
-    fault: str = ""
-    ready: bool = False
-    inside: bool = False
-    lost: bool = False
-    settled: bool = False
-    swings: bool = False
-
-
-def successor(mode: Mode, signs: Signs) -> tuple[Mode, str]:
-    """Return the next state and the reason for a change; the same state with ``""`` if none.
-
-    Faults come before everything, and nothing but the operator leads out of a safe stop.
 
     Examples
     --------
-    >>> successor(Mode.IDLE, Signs(command=Command.START))
-    (<Mode.BRING_UP: 1>, 'operator: start')
-    >>> successor(Mode.SAFE_STOP, Signs(ready=True, inside=True))
-    (<Mode.SAFE_STOP: 5>, '')
+    >>> successor(Mode.IDLE, Command.START)
+    (<Mode.BRING_UP: 1>, <Reason.START: 1>)
+    >>> successor(Mode.SAFE_STOP, ready=True, inside=True)
+    (<Mode.SAFE_STOP: 5>, <Reason.NONE: 0>)
     """
-    if mode == Mode.SAFE_STOP:
-        reset = signs.command == Command.RESET and not signs.fault
-        return (Mode.IDLE, "operator: reset") if reset else (mode, "")
-    if signs.command == Command.STOP:
-        return Mode.SAFE_STOP, "operator: stop"
-    if mode == Mode.IDLE:
-        start = signs.command == Command.START
-        return (Mode.BRING_UP, "operator: start") if start else (mode, "")
-    if signs.fault:
-        return Mode.SAFE_STOP, signs.fault
-    if mode == Mode.BRING_UP and signs.ready:
-        if signs.inside:
-            return Mode.CATCH, "inside the region of the law"
-        if signs.swings:
-            return Mode.SWING_UP, "outside the region of the law"
-    if mode == Mode.SWING_UP and signs.inside:
-        return Mode.CATCH, "inside the region of the law"
-    if mode in (Mode.CATCH, Mode.BALANCE) and signs.lost:
-        return (Mode.SWING_UP if signs.swings else Mode.SAFE_STOP), "thrown out"
-    if mode == Mode.CATCH and signs.settled:
-        return Mode.BALANCE, "settled"
-    if mode == Mode.BALANCE and not signs.settled:
-        return Mode.CATCH, "disturbed"
-    return mode, ""
+    number, why = transition(int(mode), int(command), fault, ready, inside, lost, settled, swings)
+    return Mode(number), Reason(why)

@@ -16,17 +16,16 @@ import math
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
-
 from undertow.codegen.function import COMPILED, PREAMBLE
 from undertow.codegen.store import content_key, generated, generators
+from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.memory import BRIEF, Memory, unpacked
 from undertow.rig.interface import Measurement
 from undertow.rig.stepping import dynamics_source
 from undertow.runtime.settings import Settings
 
-__all__ = ["SensorWatch"]
+__all__ = ["LAST_HARMLESS", "SensorWatch"]
 
 #: A model that has run freely for this long starts again, s.
 REST = 0.3
@@ -34,11 +33,17 @@ REST = 0.3
 #: When nothing has moved for this long a probe begins; it lasts so long, each side of it, s.
 PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
 
-#: What the watch remembers; settings: period, jump, frozen.
+#: What :meth:`SensorWatch.check` found: nothing wrong; no sound reading yet; none for too long; a
+#: sensor lost for too long; one that stands still.  What comes after the second is a fault.
+SOUND, NOT_YET, NEVER, LOST, FROZEN = range(5)
+LAST_HARMLESS = NOT_YET
+
+#: What the watch remembers; settings: period, jump, frozen, patience, stall; clock: the rig's at
+#: the last reading, ours, time waited, whether there was a sound reading at all.
 _LAYOUT = {
-    "settings": "3", "band": "m", "gain": "n", "parameters": "p", "viscous": "n", "W": "n * n",
-    "last": "n", "gaps": "n", "ages": "n", "counts": "n", "quiet": "1", "expected": "2 * n",
-    "free": "n, 2 * n", "work": "3, 2 * n",
+    "settings": "5", "clock": "4", "q": "n", "v": "n", "band": "m", "gain": "n",
+    "parameters": "p", "viscous": "n", "W": "n * n", "last": "n", "gaps": "n", "ages": "n",
+    "counts": "n", "quiet": "1", "expected": "2 * n", "free": "n, 2 * n", "work": "3, 2 * n",
 }  # fmt: skip
 
 _BODY = f"""
@@ -69,10 +74,10 @@ def slow(h, x, band, gain, parameters, W):
             x[n + k] += W[k * n + i] * impulse
 
 
-{BRIEF}
-def believe(q, x, u, block):
-    # What is not believable becomes NaN; returns how many are missing, the longest gap and
-    # where, and which reading is frozen (-1: none).
+{COMPILED}
+def believe(x, u, block):
+    # What is not believable becomes NaN; returns how many are missing, where the longest gap
+    # is, and which reading is frozen (-1: none).
 {unpacked(_LAYOUT)}
     h, jump, frozen = settings[0], settings[1], settings[2]
     for i in range(2 * n):
@@ -85,7 +90,7 @@ def believe(q, x, u, block):
         if abs(q[i] - expected[i]) <= jump + 2.0 * h * abs(expected[n + i]):
             gaps[i] = 0.0
         else:
-            q[i] = math.nan
+            q[i] = v[i] = math.nan
             gaps[i] += h
             missing += 1
         if gaps[i] > gaps[worst]:
@@ -111,7 +116,46 @@ def believe(q, x, u, block):
                 free[i, j] = x[j]
             free[i, i] = last[i] = q[i]
     quiet[0] = 0.0 if moved or quiet[0] > {PROBE + PROBES} else quiet[0] + h
-    return missing, worst, gaps[worst], still
+    return missing, worst, still
+
+
+{BRIEF}
+def check(stamp, x, u, block):
+    # One reading, already in q and v: returns what is wrong, with which sensor, how many are
+    # missing, whether this is the first, the time, and what to probe with.  A clock that makes
+    # no sense spoils a reading.
+{unpacked(_LAYOUT)}
+    elapsed = settings[0]
+    usable = abs(stamp) < math.inf
+    if usable:
+        if clock[0] > -math.inf:
+            elapsed = stamp - clock[0]
+            usable = 0.0 < elapsed <= settings[4]
+        clock[0] = stamp
+    clock[1] += elapsed if usable else settings[0]
+    size = 0.0
+    for i in range(n):
+        q[i] = q[i] + 0.0 if usable else math.nan  # no −0: a log does not keep its sign
+        v[i] = v[i] + 0.0 if usable else math.nan
+        size += abs(q[i])
+    if clock[3] == 0.0 and size < math.inf:
+        clock[3] = 1.0
+        for i in range(n):
+            last[i] = q[i]
+            for j in range(n):
+                free[i, j], free[i, n + j] = q[j], 0.0
+        return {SOUND}, 0, 0, True, clock[1], 0.0
+    if clock[3] == 0.0:
+        clock[2] += settings[0]
+        return ({NEVER} if clock[2] > settings[3] else {NOT_YET}), 0, n, False, clock[1], 0.0
+    missing, worst, still = believe(x, u, block)
+    beyond = quiet[0] - {PROBE}
+    probe = 0.0 if beyond < 0.0 else 1.0 - 2.0 * (int(beyond / {SIDE}) % 2)
+    if gaps[worst] > settings[3]:
+        return {LOST}, worst, missing, False, clock[1], probe
+    if still >= 0:
+        return {FROZEN}, still, missing, False, clock[1], probe
+    return {SOUND}, 0, missing, False, clock[1], probe
 """
 
 _GENERATOR = generators("runtime/sensors.py", "memory.py", "rig/stepping.py", "codegen/function.py")
@@ -147,45 +191,37 @@ class SensorWatch:
         Readings of the last step that are missing or not believed.
     first
         Whether the last step was the first with a sound reading.
+    probe
+        −1, 0 or 1: what to add to the inputs, in units of twice their dead band.
     """
 
     def __init__(self, mechanism: Mechanism, settings: Settings, period: float) -> None:
         self.settings, self.period = settings, period
         self.names = [c.name for c in mechanism.coordinates]
         n = mechanism.n
-        self._believe = _module(mechanism).believe
+        self._check = _module(mechanism).check
         memory = Memory(_LAYOUT, n=n, m=mechanism.m, p=len(mechanism.parameters))
-        self._block, self._last, self._free = memory.block, memory["last"], memory["free"]
-        self._gaps, self._ages, self._quiet = memory["gaps"], memory["ages"], memory["quiet"]
-        memory["settings"][:] = period, settings.jump, settings.frozen
+        self._block, self._clock, self._gaps = memory.block, memory["clock"], memory["gaps"]
+        self._ages, self._quiet = memory["ages"], memory["quiet"]
+        memory["settings"][:] = (
+            period, settings.jump, settings.frozen, settings.patience, settings.stall,
+        )  # fmt: skip
         memory["parameters"][:] = mechanism.parameter_values
         memory["counts"][:] = 0.01
-        limits = settings.limits(mechanism)
-        self.band = memory["band"]
-        self.band[:] = np.where(np.isfinite(limits), settings.dead_band * limits, 0.0)
-        self._q, self._nothing = np.zeros(n), np.full(n, math.nan)
-        low, high = settings.travels(mechanism).T
-        self._low, self._high = low.tolist(), high.tolist()
-        self._bounded = bool(np.isfinite([low, high]).any())
+        memory["band"][:] = settings.bands(mechanism)
+        self._q, self._v = memory["q"], memory["v"]
+        self._believed = Measurement(0.0, self._q)
         self.forget()
 
     def forget(self) -> None:
         """Start afresh: the next sound reading is the first."""
-        self.missing, self.first, self._known = 0, False, False
-        self._rig_time, self._time, self._waited = -math.inf, 0.0, 0.0
+        self.missing, self.first, self.probe = 0, False, 0.0
+        self._clock[:] = -math.inf, 0.0, 0.0, 0.0
         self._gaps[:] = self._ages[:] = self._quiet[:] = 0.0
-
-    @property
-    def probe(self) -> float:
-        """−1, 0 or 1: what to add to the inputs, in units of twice their dead band."""
-        beyond = float(self._quiet[0]) - PROBE
-        if beyond < 0:
-            return 0.0
-        return 1.0 if int(beyond / SIDE) % 2 == 0 else -1.0
 
     def check(
         self, measurement: Measurement | None, x: FloatArray, u: FloatArray
-    ) -> tuple[Measurement | None, str]:
+    ) -> tuple[Measurement | None, int, int]:
         """Return what can be believed of a measurement, and what is wrong for too long.
 
         Parameters
@@ -200,67 +236,45 @@ class SensorWatch:
         Returns
         -------
         Measurement or None
-            With NaN for what is missing; ``None`` before the first sound reading.
-        str
-            The fault, or ``""``.
+            With NaN for what is missing; ``None`` before the first sound reading.  The next
+            call writes it over.
+        int, int
+            What was found, a fault if it is above ``LAST_HARMLESS``, and at which sensor:
+            :meth:`describe` says it in words.
+
+        Raises
+        ------
+        InvalidInputError
+            When the rig does not give one number per coordinate.
         """
-        elapsed = None if measurement is None else self._elapsed(measurement.t)
-        v = None
-        if measurement is None or elapsed is None:
-            self._q[:] = math.nan
-            self._time += self.period
-            if measurement is not None and measurement.v is not None:
-                v = self._nothing
-        else:
-            np.add(measurement.q, 0.0, out=self._q)  # no −0: a log does not keep its sign
-            self._time += elapsed
+        stamp, believed = math.nan, self._believed
+        if measurement is not None:
+            stamp = float(measurement.t)
+            self._take(measurement.q, self._q)
             if measurement.v is not None:
-                v = measurement.v + 0.0
-        self.first = False
-        if not self._known and not self._meet():
-            return None, self._wait()
-        settings = self.settings
-        self.missing, worst, gap, still = self._believe(
-            self._q, self._free[0] if self.first else x, u, self._block
+                self._take(measurement.v, self._v)
+            believed.v = None if measurement.v is None else self._v
+        found, where, self.missing, self.first, believed.t, self.probe = self._check(
+            stamp, x, u, self._block
         )
-        fault = ""
-        if gap > settings.patience:
-            fault = f"sensor '{self.names[worst]}' lost for {1e3 * gap:.0f} ms"
-        elif still >= 0:
-            fault = f"sensor '{self.names[still]}' frozen"
-        if self.missing and v is not None:
-            v = np.where(np.isnan(self._q), math.nan, v)
-        return Measurement(self._time, self._q, v), fault
+        return (None if found in (NOT_YET, NEVER) else believed), found, where
 
-    def _meet(self) -> bool:
-        """Take the first sound reading as it is."""
-        if not np.isfinite(self._q).all():
-            return False
-        self._known = self.first = True
-        self._last[:] = self._q
-        self._free[:, : len(self._q)], self._free[:, len(self._q) :] = self._q, 0.0
-        return True
+    @staticmethod
+    def _take(said: FloatArray, place: FloatArray) -> None:
+        """Copy what a rig said, whatever it is made of, if it is one number per coordinate."""
+        if len(said) != len(place):
+            raise InvalidInputError(
+                "measurement",
+                value=f"{len(said)} numbers",
+                limit=f"{len(place)}, one per coordinate",
+                remedy="NaN stands for what was not measured",
+            )
+        place[:] = said
 
-    def _wait(self) -> str:
-        """Wait for the first sound reading, as long as patience lasts."""
-        self.missing = len(self._q)
-        self._waited += self.period
-        return "no sound reading yet" if self._waited > self.settings.patience else ""
-
-    def _elapsed(self, t: float) -> float | None:
-        """Time since the reading before, s; ``None`` where the rig's clock makes no sense."""
-        if not math.isfinite(t):
-            return None
-        before, self._rig_time = self._rig_time, t
-        if before == -math.inf:
-            return self.period
-        elapsed = t - before
-        return elapsed if 0.0 < elapsed <= self.settings.stall else None
-
-    def beyond(self, x: FloatArray) -> str:
-        """Return which coordinate is past its range of travel, or ``""``."""
-        if self._bounded:
-            for i, name in enumerate(self.names):
-                if not self._low[i] <= x[i] <= self._high[i]:
-                    return f"'{name}' at {x[i]:.3g}, past its travel"
-        return ""
+    def describe(self, found: int, where: int) -> str:
+        """Return in words what :meth:`check` found."""
+        if found == NEVER:
+            return "no sound reading yet"
+        if found == LOST:
+            return f"sensor '{self.names[where]}' lost for {1e3 * self._gaps[where]:.0f} ms"
+        return f"sensor '{self.names[where]}' frozen" if found == FROZEN else ""

@@ -97,6 +97,11 @@ class Settings:
         """Largest |du_i/dt|, (m,), in the input's unit per second."""
         return 2.0 * self.limits(mechanism) / self.slew_time
 
+    def bands(self, mechanism: Mechanism) -> FloatArray:
+        """Part of each input that friction may swallow, (m,); 0 where there is no limit."""
+        limits = self.limits(mechanism)
+        return np.where(np.isfinite(limits), self.dead_band * limits, 0.0)
+
     def travels(self, mechanism: Mechanism) -> FloatArray:
         """Lowest and highest positions, (n, 2), rad or m."""
         low = [max(c.low, -self.travel) for c in mechanism.coordinates]

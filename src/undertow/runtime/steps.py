@@ -1,18 +1,149 @@
-"""The arithmetic of the fast loop that is the same for every mechanism, compiled."""
+"""The arithmetic of the fast loop, compiled: from an estimate to the next state and output."""
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from undertow.codegen.function import PREAMBLE
 from undertow.codegen.machine import numba
-from undertow.mechanism import FloatArray
+from undertow.codegen.store import content_key, generated, generators
+from undertow.inner_loop import LAYOUT, law_module
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.memory import BRIEF, Memory, unpacked
+from undertow.runtime.modes import Mode
+from undertow.runtime.settings import Settings
+from undertow.surface import Switching
 
-IntArray = NDArray[np.int64]
+__all__ = ["PAST", "UNSOUND", "confine", "off_by", "settle", "sound", "step_memory", "step_module"]
 
-__all__ = ["apart", "confine", "farthest", "off_by", "settle", "sound"]
+#: What a step may find wrong by itself: an estimate that is no number, a coordinate past its
+#: travel.
+UNSOUND, PAST = 1, 2
+
+#: What a step remembers, after what the law does; settings: margin, escape, near, lost, settle,
+#: period; off: by how much the state is off the expected one, and the margin of a new law there.
+_LAYOUT = LAYOUT | {
+    "x": "2 * n", "home": "2 * n", "turn": "2 * n", "wanted": "m", "output": "m", "slew": "m",
+    "settings": "6", "low": "n", "high": "n", "angles": "n", "band": "m", "since": "1",
+    "expected": "2 * n", "off": "2",
+}  # fmt: skip
+
+_BODY = f"""
+{BRIEF}
+def act(
+    estimate, disturbance, lane, new, most, block, mode, command, wrong, missing, swings, probe
+):
+    # From an estimate to the next state and the output.  A new surface is put to use if the state
+    # is off the one expected by at most ``most``, and if its law is sound there: it is then the
+    # law of this step.  Returns whether it is, the state, the reason for a change, what is wrong
+    # with the estimate and with which coordinate.  While it swings up, the output is left to the
+    # caller.
+{unpacked(_LAYOUT)}
+    what, where = 0, 0
+    if not settle(estimate, turn, x, home):
+        what = {UNSOUND}
+    else:
+        for i in range(n):
+            if what == 0 and not (low[i] <= x[i] <= high[i]):
+                what, where = {PAST}, i
+    fault = wrong or what != 0
+    used = False
+    off[0] = off[1] = math.nan
+    if most >= 0.0:
+        off[0] = off_by(home, expected)
+        if off[0] <= most:
+            law(home, new, block)
+            off[1] = margin[0]
+            used = margin[0] > settings[0]
+    if not used:
+        law(home, lane, block)
+    part = whole = away = 0.0
+    for i in range(2 * n):
+        square = home[i] * home[i]
+        whole += square
+        if i % n >= m:
+            part += square
+        if i < n and angles[i] > 0.0:
+            away = max(away, abs(home[i]))
+    since[0] = 0.0 if fault or missing else since[0] + settings[5]
+    allowed = margin[0] > settings[0]
+    inside = used if swings else allowed
+    lost = not allowed or not math.sqrt(whole) < settings[1] or away > settings[3]
+    near = settings[2] * (2.0 if mode == {Mode.BALANCE:d} else 1.0)
+    after, reason = transition(
+        mode, command, fault, since[0] >= settings[4], inside, lost, math.sqrt(part) <= near, swings
+    )
+    if after == {Mode.CATCH:d} or after == {Mode.BALANCE:d}:
+        take_off(demand, disturbance, limits, wanted)
+        for i in range(m):
+            wanted[i] += 2.0 * probe * band[i]
+    else:
+        for i in range(m):
+            wanted[i] = 0.0
+    if after != {Mode.SWING_UP:d}:
+        confine(wanted, output, limits, slew)
+    return used, after, reason, what, where
+"""
+
+_GENERATOR = generators(
+    "runtime/steps.py", "runtime/modes.py", "estimators/compensation.py", "memory.py",
+    "inner_loop.py", "codegen/function.py",
+)  # fmt: skip
+
+
+def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: float) -> Memory:
+    """Return what a step of the fast loop works on, its settings filled in.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's belief.
+    settings
+        Limits and patience.
+    period
+        Of the fast loop, s.
+    lost
+        A free angle further than this from the target has been thrown out, rad.
+    """
+    n, m = mechanism.n, mechanism.m
+    memory = Memory(_LAYOUT, n=n, m=m, p=len(mechanism.parameters))
+    memory["parameters"][:] = mechanism.parameter_values
+    limits = memory["limits"]
+    limits[:] = settings.limits(mechanism)
+    slew = settings.slew(mechanism) * period
+    memory["slew"][:] = np.where(np.isfinite(slew), slew, np.inf)
+    memory["settings"][:] = (
+        settings.margin, settings.escape, settings.near, lost, settings.settle, period,
+    )  # fmt: skip
+    memory["low"][:], memory["high"][:] = settings.travels(mechanism).T
+    memory["angles"][m:] = [c.unit == "rad" for c in mechanism.coordinates[m:]]
+    memory["band"][:] = settings.bands(mechanism)
+    return memory
+
+
+@lru_cache(maxsize=64)
+def step_module(mechanism: Mechanism, switching: Switching) -> Any:
+    """Return the compiled module of a fast step: ``act`` on a :func:`step_memory`."""
+    law = law_module(mechanism, switching)
+    key = content_key(mechanism.structure, mechanism.name, law.__name__, sources=_GENERATOR)
+
+    def write() -> str:
+        # numba's cache does not notice that an imported function has changed: the key does.
+        header = f'"""Fast step of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
+        parts = (
+            f"from {law.__name__} import step as law\n"
+            "from undertow.estimators.compensation import take_off\n"
+            "from undertow.runtime.modes import transition\n"
+            "from undertow.runtime.steps import confine, off_by, settle\n"
+            f"\np, n, m = {len(mechanism.parameters)}, {mechanism.n}, {mechanism.m}\n"
+        )
+        return f"{header}{PREAMBLE}{parts}\n\n{_BODY}"
+
+    return generated("step", mechanism.name, key, write)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -59,23 +190,3 @@ def settle(estimate: FloatArray, turn: FloatArray, x: FloatArray, home: FloatArr
         x[i] = estimate[i]
         home[i] = estimate[i] - turn[i]
     return True
-
-
-@numba.njit(cache=True, error_model="numpy")
-def apart(x: FloatArray, some: IntArray) -> tuple[float, float]:
-    """Return the norms of some entries of x, and of all of them."""
-    part = whole = 0.0
-    for value in x:
-        whole += value * value
-    for i in some:
-        part += x[i] * x[i]
-    return math.sqrt(part), math.sqrt(whole)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def farthest(x: FloatArray, some: IntArray) -> float:
-    """Return the largest |x_i| of some entries, 0 of none."""
-    worst = 0.0
-    for i in some:
-        worst = max(worst, abs(x[i]))
-    return worst
