@@ -165,7 +165,7 @@ class RealisticRig:
             )
         noise = self._draw()
         timing: Timing = self.bench.timing
-        lateness = timing.jitter * noise[0]
+        lateness = timing.jitter * float(noise[0])
         length = timing.period + lateness - self._lateness
         self._module.advance(
             self._t, length, self._counts, self._x, self._u, self._drive, self._held, self._past,
