@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 import shutil
@@ -109,6 +110,34 @@ def test_strict_c99_without_a_warning_and_its_own_test_passes(
     assert " 0 failed" in said
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("differentiator", [DerivativeStep(), SuperTwistingStep()])
+@pytest.mark.parametrize("name", ["rotary_pendulum", "double_pendulum_on_a_cart", M])
+def test_estimator_limits_slew_and_plans_agree_over_a_long_run(
+    name: str, differentiator: object, tmp_path: Path
+) -> None:
+    """Positions that jump and are lost, whole states between, plans offered: equal to 1e-12."""
+    controller = exported(name, differentiator=differentiator, slew=3000.0)
+    limit, n = controller.mechanism.input_limits, controller.mechanism.n
+    rng, twin, number = np.random.default_rng(0), Twin(controller), 1
+    x = np.zeros(2 * n)
+    with Build(controller, tmp_path).start() as process:
+        for k in range(4000):
+            x[n:] = 0.98 * x[n:] + 0.05 * rng.standard_normal(n)
+            x[:n] += 1e-3 * x[n:] + (rng.random() < 0.01) * rng.uniform(-1, 1, n)
+            seen = np.where(rng.random(2 * n) < 0.02, rng.choice([np.nan, np.inf, 1e12]), x)
+            if k % 97 == 0:
+                number += 1
+                plan = Plan.of(three_rows(controller.mechanism, rng.uniform(0.8, 1.2)).surfaces[0])
+                assert process.offer(plan, number) == twin.offer(plan, number)
+            if k // 50 % 3 == 0:
+                (u, said), (u_twin, said_twin) = process.step_state(seen), twin.step_state(seen)
+            else:
+                (u, said), (u_twin, said_twin) = process.step(seen[:n]), twin.step(seen[:n])
+            assert said == said_twin
+            assert (np.abs(u - u_twin) <= 1e-12 * limit).all()
+
+
 def test_the_test_can_fail(tmp_path: Path) -> None:
     """A parameter that is 1 % off is found by the vectors."""
     controller = exported()
@@ -133,14 +162,15 @@ def test_agrees_with_python_at_1e5_random_states(tmp_path: Path) -> None:
 def test_every_mechanism_of_the_library(name: str, real: str, tmp_path: Path) -> None:
     """Show 6 for all: own test, agreement over 1e5 states, nothing asked of the library but maths.
 
-    Single precision: a millionth of the margin-weighted demand's scale is 10 of its roundings.
+    Single precision: a thousandth, but where the sign of det Γ is rounding.
     """
     controller = exported(name, real=real)
     build = Build(controller, tmp_path)
     assert build.self_test()[0]
     near = build.agreement(100_000)
-    if real == "double":
-        assert max(near.output, near.demand, near.s, near.margin) <= 1e-12
+    worst = max(near.output, near.demand, near.s, near.margin)
+    assert worst <= (1e-12 if real == "double" else 1e-3)
+    assert near.left_out <= 5
     positions = run_positions(controller)
     footprint = build.footprint(positions[np.isfinite(positions).all(axis=1)])
     assert set(footprint.calls) <= {"sincos", "sincosf", "sin", "cos", "sinf", "cosf", "memcpy"}
@@ -358,87 +388,94 @@ INTERRUPTED = r"""
 #include <sys/time.h>
 #include "rotary_pendulum.h"
 
-/* The step runs in a signal handler, as in an interrupt; the main loop offers plans whose rows
- * are all the same number, and the handler looks whether it ever sees two. */
+/* One side runs in a signal handler, as in an interrupt, the other in the main loop. Plans are
+ * offered whose rows are all the same number, and each step looks whether it ever sees two. */
 static ut_controller c;
-static volatile sig_atomic_t steps, torn, changes, offers_between;
+static ut_plan plan;
+static volatile sig_atomic_t steps, torn, changes, accepted, refused, wrong;
 
-static void handler(int signum)
+static void fast(void)
 {
     static const ut_real q[UT_N] = {0.0, 0.01};
     ut_real u[UT_M];
-    (void)signum;
     if (ut_step(&c, q, u) & UT_SWITCHED) {
         changes++;
     }
-    const ut_plan *plan = &c.slot[c.taken];
+    const ut_plan *used = &c.slot[c.taken];
     for (int k = 0; k < UT_ROWS; k++) {
-        if (plan->row[k].surface[1] != plan->row[0].surface[1] ||
-            plan->row[k].eta[0] != -10 * plan->row[0].surface[1]) {
+        if (used->row[k].surface[1] != used->row[0].surface[1] ||
+            used->row[k].eta[0] != -10 * used->row[0].surface[1]) {
             torn++;
         }
     }
     steps++;
 }
 
+static void slow(void)
+{
+    const double size = 1 + (double)(plan.number % 97) / 97;
+    for (int k = 0; k < UT_ROWS; k++) {
+        plan.row[k].surface[1] = -size;
+        plan.row[k].eta[0] = 10 * size;
+    }
+    plan.number++;
+    const int verdict = ut_offer(&c, &plan);
+    accepted += verdict == UT_ACCEPTED;
+    refused += verdict == UT_BUSY;
+    wrong += verdict != UT_ACCEPTED && verdict != UT_BUSY;
+}
+
+static void handler(int signum)
+{
+    (void)signum;
+    HANDLER();
+}
+
 int main(void)
 {
-    static ut_plan plan;
     struct itimerval every = {{0, 50}, {0, 50}};
-    unsigned long accepted = 0, busy = 0;
     plan = ut_built_in;
     for (int k = 0; k < UT_ROWS; k++) {
         plan.row[k] = plan.row[0];
         plan.start[k] = (unsigned long)k;
-        plan.row[k].eta[0] = -10 * plan.row[0].surface[1];
     }
     plan.count = UT_ROWS;
     ut_init(&c);
-    plan.number = 2;
-    if (ut_offer(&c, &plan) != UT_ACCEPTED) {
-        return 2;
-    }
+    slow();
     signal(SIGALRM, handler);
     setitimer(ITIMER_REAL, &every, NULL);
-    for (unsigned long n = 3; accepted < 2000 && n < 2000000000UL; n++) {
-        const double size = 1 + (double)(n % 97) / 97;
-        for (int k = 0; k < UT_ROWS; k++) {
-            plan.row[k].surface[1] = -size;
-            plan.row[k].eta[0] = 10 * size;
-        }
-        plan.number = n;
-        const int verdict = ut_offer(&c, &plan);
-        accepted += verdict == UT_ACCEPTED;
-        busy += verdict == UT_BUSY;
-        if (verdict != UT_ACCEPTED && verdict != UT_BUSY) {
-            return 3;
-        }
+    for (unsigned long n = 0; accepted < 2000 && n < 2000000000UL; n++) {
+        MAIN();
     }
-    printf("%lu %lu %d %d %d\n", accepted, busy, (int)steps, (int)changes, (int)torn);
-    return torn != 0;
+    printf("%d %d %d %d %d %d\n", (int)accepted, (int)refused, (int)steps, (int)changes, (int)torn,
+           (int)wrong);
+    return torn != 0 || wrong != 0;
 }
 """
 
 
-def test_plans_are_exchanged_whole_under_interruption(tmp_path: Path) -> None:
-    """Steps interrupt the filling of a slot at any instant: never is a mixed plan in use."""
+@pytest.mark.parametrize(("handler", "main"), [("fast", "slow"), ("slow", "fast")])
+def test_plans_are_exchanged_whole_under_interruption(
+    handler: str, main: str, tmp_path: Path
+) -> None:
+    """One side interrupts the other at any instant: never is a mixed plan in use."""
     controller = replace(exported(), rows=16)
     build = Build(controller, tmp_path)
     (tmp_path / "interrupted.c").write_text(INTERRUPTED)
-    done = gcc(
-        tmp_path, "-std=gnu99", "-O2", "rotary_pendulum.c", "interrupted.c", "-lm", "-o", "run"
-    )
+    sides = (f"-DHANDLER={handler}", f"-DMAIN={main}")
+    sources = ("rotary_pendulum.c", "interrupted.c")
+    done = gcc(tmp_path, "-std=gnu99", "-O2", *sides, *sources, "-lm", "-o", "run")
     assert done.returncode == 0, done.stderr
     ran = subprocess.run(
         [build.folder / "run"], capture_output=True, text=True, check=False, timeout=60
     )
     assert ran.returncode == 0, ran.stdout
-    accepted, busy, steps, changes, torn = map(int, ran.stdout.split())
-    assert accepted == 2000
-    assert busy > 0
+    accepted, refused, steps, changes, torn, wrong = map(int, ran.stdout.split())
+    assert accepted >= 2000
+    assert refused > 0 or handler == "slow"
     assert steps > 1000
     assert changes > 1000
-    assert torn == 0
+    assert torn == wrong == 0
 
 
 # -- in the loop ---------------------------------------------------------------------------------
@@ -471,6 +508,84 @@ def test_without_control_the_rig_falls(tmp_path: Path) -> None:
 
 
 # -- names, refusals -----------------------------------------------------------------------------
+
+
+def bar(name: str, coordinates: tuple[str, str], channel: str, names: str) -> ut.Mechanism:
+    x, tilt = ut.Coordinate(coordinates[0], "m", "*/ ??/"), ut.Coordinate(coordinates[1], "rad")
+    values = zip(names.split(), (0.8, 0.3, 0.25), strict=True)
+    M, m, l = (ut.Parameter(name, value, "kg\\", low=0) for name, value in values)  # noqa: E741
+    moment, rate = m.symbol * l.symbol * sp.cos(tilt.symbol), tilt.velocity
+    kinetic = (M.symbol + m.symbol) * x.velocity**2 / 2 + moment * x.velocity * rate
+    return ut.Mechanism.from_energies(
+        name, [x, tilt], [ut.Input(channel, "N", 10.0)],
+        kinetic=kinetic + 2 * m.symbol * l.symbol**2 * rate**2 / 3, potential=9.81 * moment,
+        parameters=(M, m, l), start={tilt.name: 0.1},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "coordinates", "channel", "parameters", "stem", "prefix"),
+    [
+        ("math", ("double", "float"), "return", "for while struct", "math_rig", "ut"),
+        ("ut_rig", ("ut_x", "UT_N"), "ut_u", "M N X", "ut_rig", "foo"),
+        ("Über/pendel", ("θ", "φ"), "main", "α EOF NAN", "Uber_pendel", "ut"),
+    ],
+)
+def test_names_of_a_user_stay_clear_of_c(
+    name: str, coordinates: tuple[str, str], channel: str, parameters: str, stem: str, prefix: str,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    """Keywords, names of headers, of this export and of no ASCII letter: it compiles, and runs."""
+    mechanism = bar(name, coordinates, channel, parameters)
+    controller = EmbeddedController(mechanism, ut.first_surface(mechanism), prefix=prefix)
+    assert Build(controller, tmp_path).self_test()[0]
+    assert (tmp_path / f"{stem}.h").exists()
+    if coordinates == ("θ", "φ"):
+        header = (tmp_path / f"{stem}.h").read_text()
+        assert "q[0]  theta" in header
+        assert "#define UT_PARAMETER_alpha 0.8" in header
+
+
+def test_parameters_that_are_one_name_in_ascii_are_refused() -> None:
+    """``θ`` is spelled out, so it cannot stand beside ``theta``."""
+    mechanism = bar("bar", ("x", "y"), "f", "θ theta c")
+    with pytest.raises(InvalidInputError, match="different in ASCII"):
+        EmbeddedController(mechanism, ut.first_surface(mechanism))
+
+
+@pytest.mark.skipif(shutil.which("arm-none-eabi-gcc") is None, reason="needs arm-none-eabi-gcc")
+def test_single_precision_asks_a_small_processor_for_no_double(tmp_path: Path) -> None:
+    """On a Cortex-M4 all arithmetic is the FPU's: nothing is emulated."""
+    Build(exported(real="float", differentiator=SuperTwistingStep()), tmp_path)
+    unit = "rotary_pendulum"
+    cpu = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-c")
+    subprocess.run(
+        ["arm-none-eabi-gcc", *FLAGS, *STRICT, *cpu, f"{unit}.c"], cwd=tmp_path, check=True
+    )
+    asked = subprocess.run(
+        ["arm-none-eabi-nm", "-u", f"{unit}.o"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    assert set(asked) - {"U"} <= {"sinf", "cosf", "sqrtf", "memcpy"}
+
+
+def test_far_from_zero_single_precision_rounds_as_the_page_says() -> None:
+    """A position of |q| rad is rounded by |q| 2⁻²⁴, its derivative by 4/(2τ + T) times that."""
+    far = 2 * math.pi * 100
+    bound = 4 / (2 * 0.01 + 0.001) * far * 2.0**-24
+    assert bound < 8e-3  # rad/s, as docs/embedded.md has it
+    truth = Twin(exported())
+    rounded = Twin(exported())
+    worst = 0.0
+    for k in range(400):
+        q = np.array([far + 0.3 * math.sin(0.01 * k), 0.0])
+        truth.step(q)
+        rounded.step(q.astype(np.float32))
+        worst = max(worst, abs(float(truth.x[2] - rounded.x[2])))
+    assert 0.1 * bound < worst <= bound
 
 
 def test_two_controllers_link_into_one_program(tmp_path: Path) -> None:
@@ -612,8 +727,8 @@ def test_a_process_that_ends_is_noticed(tmp_path: Path) -> None:
 # -- the command line ----------------------------------------------------------------------------
 
 
-def invoke(*words: str) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, ["export", "c", *words], env={"COLUMNS": "120"})
+def invoke(*words: str, columns: int = 120) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, ["export", "c", *words], env={"COLUMNS": str(columns)})
     return result.exit_code, result.stdout, result.stderr
 
 
@@ -660,10 +775,11 @@ def test_command_refuses(words: tuple[str, ...], part: str) -> None:
 def test_report_counts_instructions_and_bytes(tmp_path: Path) -> None:
     """``--report`` prints a row with agreement, instructions and sizes, and keeps it as CSV."""
     code, said, _ = invoke(
-        "rotary_pendulum", "--report", "--states", "1000", "--out", str(tmp_path)
+        "rotary_pendulum", "--report", "--states", "1000", "--out", str(tmp_path), columns=80
     )
     assert code == 0
-    assert "instr./step" in said
-    row = (tmp_path / "report.csv").read_text().splitlines()[1].split(",")
-    assert row[0] == "rotary_pendulum"
-    assert 200 < int(row[6]) < 1000
+    assert "Instructions of a step" in said
+    (row,) = csv.DictReader((tmp_path / "report.csv").read_text().splitlines())
+    assert row["mechanism"] == "rotary_pendulum"
+    assert 200 < int(row["instr."]) < 1000
+    assert max(len(line) for line in said.splitlines() if "Written" not in line) <= 80

@@ -50,13 +50,18 @@ app.add_typer(export, name="export")
         "undertow export c cart_pendulum --control one-time --start phi=20deg --real float "
         "--velocity super-twisting --slew 400 --out firmware",
         "undertow export c gantry_crane --check --rigs 3",
+        "undertow export c bar.py:bar --velocity super-twisting --acceleration 80 --out firmware",
         "undertow export c --all --report",
     ),
 )
 @reports_errors
 def export_c(
     name: Annotated[
-        str | None, typer.Argument(help="Mechanism, e.g. rotary_pendulum.", show_default=False)
+        str | None,
+        typer.Argument(
+            help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME.",
+            show_default=False,
+        ),
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="All mechanisms of the library.")] = False,
     out: Annotated[
@@ -101,6 +106,10 @@ def export_c(
         typer.Option(help="Where velocities come from when positions alone are measured."),
     ] = "derivative",
     time_constant: Annotated[float, typer.Option(help="Of the filtered derivative, s.")] = 0.01,
+    acceleration: Annotated[
+        float,
+        typer.Option(help="Bound for super-twisting on every coordinate's, rad/s² or m/s²."),
+    ] = 200.0,
     slew: Annotated[
         float | None,
         typer.Option(help="Largest rate of an input, its unit per second. Default: no limit."),
@@ -114,7 +123,7 @@ def export_c(
     seed: Seed = 0,
 ) -> None:
     """Write the inner loop in C99: no heap, no dependencies, limits, estimator, surface table."""
-    from undertow.export.report import csv, measure, table
+    from undertow.export.report import csv, measure, tables
 
     if every == (name is not None):
         raise InvalidInputError(
@@ -133,7 +142,9 @@ def export_c(
     if out is not None:
         results.check_folder(out)
     differentiator = (
-        SuperTwistingStep() if velocity == "super-twisting" else DerivativeStep(time_constant)
+        SuperTwistingStep(acceleration)
+        if velocity == "super-twisting"
+        else DerivativeStep(time_constant)
     )
 
     def controller(belief: Mechanism) -> EmbeddedController:
@@ -200,11 +211,9 @@ def export_c(
             entries = measure(chosen, states=states, compiler=compiler, progress=progress)
         good &= all(entry.passed for entry in entries)
         written["report.csv"] = csv(entries)
-        console.width = max(console.width, 150)
-        console.print(table(entries), crop=False, soft_wrap=True)
-        say(console, "")
+        console.print(*tables(entries), sep="\n")
         for line in notes(one=chosen[0], states=states, compiler=compiler):
-            say(console, line)
+            console.print(line, markup=False)
     if out is not None:
         say(console, write(out, written))
     if not good:
@@ -236,12 +245,16 @@ def on_rigs(
 
 def notes(one: EmbeddedController, states: int, compiler: str) -> tuple[str, ...]:
     """Return what the columns of the report mean."""
-    from undertow.export.host import FLAGS, version
+    from undertow.export.host import FLAGS, NEAREST, version
 
+    nearest = NEAREST[one.real]
     return (
         f"Built by {version(compiler)} with {' '.join(FLAGS)}, real = {one.real}.",
-        f"u: largest difference from Python's law at {states} random states, by max(|u|, limit). "
-        "demand: before the limits, times |det Γ(q)/det Γ(0)| where that is below 1.",
-        "instr./step: mean of a run from positions, math.h included, by valgrind's callgrind. "
-        "stack: all frames together.",
+        f"At {states} random states; u and demand by max(|value|, limit), s and margin by "
+        "max(|value|, 1). demand: before the limits, times |det Γ(q)/det Γ(0)| where that is below "
+        "1, for it has the inverse as a factor."
+        + f" States with less than {nearest:g} of it are left out: there its sign is rounding."
+        * (nearest > 0),
+        "instr.: mean of a run from positions, math.h included, by valgrind's callgrind. stack: "
+        "all frames together, without math.h's.",
     )

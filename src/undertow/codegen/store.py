@@ -11,6 +11,7 @@ import hashlib
 import importlib.util
 import os
 import platform
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
@@ -149,7 +150,7 @@ def load_module(name: str, source: str) -> ModuleType:
     The file appears whole or not at all, so several processes may ask at once.
     """
     digest = hashlib.sha256((_versions() + source).encode()).hexdigest()[:16]
-    module_name = f"{name}_{digest}"
+    module_name = f"{re.sub(r'[^A-Za-z0-9_]', '_', name)[:80]}_{digest}"
     if module_name in sys.modules:
         return sys.modules[module_name]
     path = _writable_folder() / f"{module_name}.py"

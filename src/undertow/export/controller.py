@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -89,6 +90,12 @@ class EmbeddedController:
     #: Sequence number of the plan that is built in.
     number: ClassVar[int] = 1
 
+    @property
+    def stem(self) -> str:
+        """Name of the files: the mechanism's, as far as a file and ``#include`` can bear it."""
+        stem = re.sub(r"[^A-Za-z0-9_]+", "_", "".join(map(_letter, self.mechanism.name)))
+        return f"{stem}_rig" if stem in _HEADERS else stem[:60] or "rig"
+
     @cached_property
     def plan(self) -> Plan:
         """The plan that is built in."""
@@ -154,6 +161,14 @@ class EmbeddedController:
                     limit=f"below 2 ε/k = {np.min(2 * layer / gains):g} s",
                     remedy="Use a shorter period, a thicker boundary layer or smaller gains",
                 )
+        named = [_c_name(p.name) for p in self.mechanism.parameters]
+        if len(set(named)) < len(named):
+            raise InvalidInputError(
+                f"parameters of '{self.mechanism.name}' in C",
+                value=", ".join(sorted({name for name in named if named.count(name) > 1})),
+                limit="different in ASCII letters",
+                remedy="Rename one: Greek letters are spelled out, accents dropped",
+            )
         self.starts(self.plan)
         self.slew_rates  # noqa: B018  # refuses what cannot be used
         self.differentiator.gains(self.mechanism.n)
@@ -170,11 +185,12 @@ class EmbeddedController:
     def starts(self, plan: Plan) -> list[int]:
         """Return the periods, from the start of a plan, at which its surfaces take over."""
         starts = [round(t / self.period) for t in plan.times]
-        if len(starts) > self.most_rows or any(np.diff(starts) < 1):
+        if len(starts) > self.most_rows or any(np.diff(starts) < 1) or starts[-1] >= 2**32:
             raise InvalidInputError(
                 "times of an exported plan",
                 value=list(plan.times),
-                limit=f"at most {self.most_rows}, a period of {self.period:g} s apart or more",
+                limit=f"at most {self.most_rows}, a period of {self.period:g} s apart or more, "
+                "below 2^32 periods",
                 remedy="Leave out the surfaces that never act, or ask for more rows",
             )
         return starts
@@ -258,17 +274,31 @@ _HELPERS = {
 }
 
 
+#: Headers that the generated C includes: a file of its own under such a name would hide them.
+_HEADERS = {"math", "signal", "stdio", "stdlib"}
+
+
+def _letter(sign: str) -> str:
+    """Return an ASCII spelling of one letter: Greek by its name, others without accents."""
+    if sign.isascii():
+        return sign
+    *kind, name = unicodedata.name(sign, "unnamed").split()
+    if kind[:1] == ["GREEK"] and kind[-1:] == ["LETTER"]:
+        return name.lower() if "SMALL" in kind else name.title()
+    plain = unicodedata.normalize("NFKD", sign).encode("ascii", "ignore").decode()
+    return plain or f"u{ord(sign):x}"
+
+
 def _c_name(name: str) -> str:
     """Return a Python identifier in ASCII."""
-    return "".join(c if c.isascii() else f"u{ord(c):x}" for c in name)
+    return "".join(map(_letter, name))
 
 
 def _ascii(text: str) -> str:
     """Return words with no other letters but ASCII, and no end of a comment."""
-    greek = {"²": "^2", "³": "^3", "φ": "phi", "θ": "theta", "ψ": "psi", "·": " ", "Ω": "Ohm"}
-    for sign, words in greek.items():
+    for sign, words in {"²": "^2", "³": "^3", "·": " ", "Ω": "Ohm"}.items():
         text = text.replace(sign, words)
-    plain = text.encode("ascii", "replace").decode()
+    plain = "".join(map(_letter, text))
     return " ".join(plain.replace("*/", "* /").replace("\\", "/").replace("??", "? ?").split())
 
 
@@ -292,12 +322,21 @@ def plan_text(controller: EmbeddedController, plan: Plan) -> dict[str, str]:
     }
 
 
+#: Values of the templates that hold a user's words: their ``ut_`` stays as it is.
+_WORDS = {"name", "title", "coordinates", "inputs", "estimator", "gain_meaning"}
+
+
 def render(name: str, values: dict[str, str], prefix: str) -> bytes:
     """Fill a template and give its names their prefix."""
+
+    def prefixed(text: str) -> str:
+        text = re.sub(r"\but_", f"{prefix}_", text)
+        return re.sub(r"\bUT_", f"{prefix.upper()}_", text)
+
     source = resources.files("undertow.export") / "templates" / name
-    text = Template(source.read_text(encoding="ascii")).substitute(values)
-    text = re.sub(r"\but_", f"{prefix}_", text)
-    text = re.sub(r"\bUT_", f"{prefix.upper()}_", text)
+    text = Template(prefixed(source.read_text(encoding="ascii"))).substitute(
+        {key: value if key in _WORDS else prefixed(value) for key, value in values.items()}
+    )
     return re.sub(r"[ \t]+$", "", text, flags=re.MULTILINE).encode("ascii")
 
 
@@ -312,7 +351,7 @@ def common(controller: EmbeddedController) -> dict[str, str]:
     """Return what every template is told."""
     mechanism = controller.mechanism
     title = f"{mechanism.name}: sliding-mode law, n = {mechanism.n}, m = {mechanism.m}"
-    return {"name": mechanism.name, "title": title, "version": _version()}
+    return {"name": controller.stem, "title": _ascii(title), "version": _version()}
 
 
 def files(controller: EmbeddedController) -> dict[str, bytes]:
@@ -324,7 +363,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     from undertow.export.vectors import vectors
 
     mechanism, real = controller.mechanism, controller.real
-    name, prefix = mechanism.name, controller.prefix
+    name, prefix = controller.stem, controller.prefix
     shared = common(controller)
     plan = plan_text(controller, controller.plan)
     code = _lay(controller)
@@ -352,7 +391,6 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         "starts": plan["starts"],
         "plan": plan["rows"],
         "estimator": _ascii(controller.differentiator.description),
-        "differentiator": _ascii(controller.differentiator.description),
         "gains": _listed(gains, real),
         "gain_meaning": _ascii(controller.differentiator.meaning),
         "limits": ", ".join(controller.limit(v) for v in limits),

@@ -25,10 +25,14 @@ from undertow.export.vectors import random_states
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
 
-__all__ = ["FLAGS", "Agreement", "Build", "Footprint", "HostProcess", "tool", "version"]
+__all__ = ["FLAGS", "NEAREST", "Agreement", "Build", "Footprint", "HostProcess", "tool", "version"]
 
 #: How the C is compiled: every warning is an error.
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2")
+
+
+#: |det Γ(q)/det Γ(0)| from which on the law is compared, by precision.
+NEAREST = {"double": 0.0, "float": 1e-4}
 
 
 def tool(name: str) -> str:
@@ -68,10 +72,12 @@ class Agreement:
     ``output`` and ``demand`` by max(|value|, the input's limit), ``s`` and ``margin`` by
     max(|value|, 1).  A demand has 1/det Γ as a factor, and with it the rounding of sines and
     cosines, which differs between libraries: where det Γ(q)/det Γ(0) is below 1 in magnitude,
-    its difference is multiplied by that.
+    its difference is multiplied by that.  States nearer to the singularity than :data:`NEAREST`
+    are left out: there the sign of det Γ is rounding, and with it that of the demand.
     """
 
     states: int
+    left_out: int
     output: float
     demand: float
     s: float
@@ -127,7 +133,7 @@ class Build:
 
     def __init__(self, controller: EmbeddedController, folder: Path, compiler: str = "gcc") -> None:
         self.controller, self.folder = controller, folder
-        self.name = controller.mechanism.name
+        self.name = controller.stem
         self._compiler = tool(compiler)
         for name, content in files(controller).items():
             if not (folder / name).exists():
@@ -172,6 +178,7 @@ class Build:
         demand, s, margin = np.split(got, [mechanism.m, 2 * mechanism.m], axis=1)
         said = self.controller.laws[0](0.0, states)
         limit = mechanism.input_limits
+        near = np.abs(said.margin) < NEAREST[self.controller.real]
 
         def largest(
             value: FloatArray,
@@ -180,10 +187,11 @@ class Build:
             weight: float | FloatArray = 1.0,
         ) -> float:
             error = np.abs(value - expected) / np.maximum(np.abs(expected), scale)
-            return float(np.max(error * weight))
+            return float(np.max((error * weight)[~near], initial=0.0))
 
         return Agreement(
             count,
+            int(near.sum()),
             largest(np.clip(demand, -limit, limit), said.u, limit),
             largest(demand, said.demand, limit, np.minimum(1.0, np.abs(said.margin))[:, None]),
             largest(s, said.s, 1.0),

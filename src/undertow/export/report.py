@@ -1,4 +1,4 @@
-"""What the exported C of many mechanisms costs and how far it agrees with Python: one table."""
+"""What the exported C of many mechanisms costs and how far it agrees with Python: two tables."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rich import box
 from rich.table import Table
 
 from undertow.export.controller import EmbeddedController
@@ -15,7 +16,7 @@ from undertow.export.host import Agreement, Build, Footprint
 from undertow.export.vectors import run_positions
 from undertow.results import to_csv
 
-__all__ = ["Entry", "csv", "measure", "table"]
+__all__ = ["Entry", "csv", "measure", "tables"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,39 +29,30 @@ class Entry:
     agreement: Agreement
     footprint: Footprint
 
-    def cells(self) -> tuple[object, ...]:
-        """Return the row, in the order of :data:`COLUMNS`."""
+    def row(self) -> dict[str, object]:
+        """Return the row: column to value."""
         mechanism, cost, near = self.controller.mechanism, self.footprint, self.agreement
-        return (
-            mechanism.name,
-            mechanism.n,
-            mechanism.m,
-            "passed" if self.passed else "FAILED",
-            f"{near.output:.1e}",
-            f"{near.demand:.1e}",
-            round(cost.instructions),
-            cost.code,
-            cost.constants,
-            cost.memory,
-            cost.stack,
-            ", ".join(cost.calls),
-        )
+        return {
+            "mechanism": mechanism.name,
+            "n": mechanism.n,
+            "m": mechanism.m,
+            "own test": "passed" if self.passed else "FAILED",
+            "u": f"{near.output:.1e}",
+            "demand": f"{near.demand:.1e}",
+            "s": f"{near.s:.1e}",
+            "margin": f"{near.margin:.1e}",
+            "instr.": round(cost.instructions),
+            "code": cost.code,
+            "const": cost.constants,
+            "state": cost.memory,
+            "stack": cost.stack,
+            "calls": ", ".join(cost.calls),
+        }
 
 
-COLUMNS = (
-    "mechanism",
-    "n",
-    "m",
-    "own test",
-    "u: C - Python",
-    "demand",
-    "instr./step",
-    "code B",
-    "const B",
-    "state B",
-    "stack B",
-    "calls",
-)
+#: Columns of the two tables, which fit a terminal of 80 columns.
+AGREEMENT = ("mechanism", "n", "m", "own test", "u", "demand", "s", "margin")
+COST = ("mechanism", "instr.", "code", "const", "state", "stack", "calls")
 
 
 def measure(
@@ -104,18 +96,29 @@ def measure(
     return entries
 
 
-def table(entries: Sequence[Entry]) -> Table:
-    """Return the table for a terminal."""
-    shown = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
-    for head in COLUMNS:
-        left = head in ("mechanism", "own test", "calls")
-        shown.add_column(head, no_wrap=True, justify="left" if left else "right")
-    for entry in entries:
-        style = "" if entry.passed else "red"
-        shown.add_row(*(str(cell) for cell in entry.cells()), style=style)
-    return shown
+def tables(entries: Sequence[Entry]) -> tuple[Table, Table]:
+    """Return for a terminal how far the C agrees with Python, and what it costs."""
+    shown = []
+    for title, columns in (
+        ("Largest difference from Python", AGREEMENT),
+        ("Instructions of a step, and bytes", COST),
+    ):
+        table = Table(
+            title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD,
+            pad_edge=False, padding=(0, 1, 0, 0),
+        )  # fmt: skip
+        for head in columns:
+            left = head in ("mechanism", "own test", "calls")
+            table.add_column(head, no_wrap=True, justify="left" if left else "right")
+        for entry in entries:
+            row = entry.row()
+            style = "" if entry.passed else "red"
+            table.add_row(*(str(row[head]) for head in columns), style=style)
+        shown.append(table)
+    return shown[0], shown[1]
 
 
 def csv(entries: Sequence[Entry]) -> bytes:
-    """Return the table as comma-separated values."""
-    return to_csv(COLUMNS, (entry.cells() for entry in entries))
+    """Return all columns as comma-separated values."""
+    rows = [entry.row() for entry in entries]
+    return to_csv(list(rows[0]), (list(row.values()) for row in rows))

@@ -109,6 +109,7 @@ class Twin:
         self._running = not status & Status.LOST
         if self._running:
             self.x = np.concatenate([at, velocity])
+            self._estimator.reset(self.x)
         return self._control(status)
 
     def _repair(self, q: FloatArray, velocity: FloatArray) -> Status:

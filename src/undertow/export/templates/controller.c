@@ -10,8 +10,9 @@
 #error "without NaN the controller cannot notice a lost sensor: compile without -ffast-math"
 #endif
 
-/* Between the filling of a slot and its offer. The volatile stores keep the compiler's order; a
- * second processor core, or one that reorders stores, needs a barrier here: define it. */
+/* Where one side has read or written a table before it tells the other. The volatile stores keep
+ * the compiler's order, which is enough on one core; where the sides run on two, define a full
+ * memory barrier here. */
 #ifndef UT_BARRIER
 #define UT_BARRIER() ((void)0)
 #endif
@@ -53,7 +54,7 @@ ${gamma}
     return value;
 }
 
-/* ${differentiator} */
+/* ${estimator} */
 static void ut_differentiate(ut_real gain, ut_real q, ut_real filter[2])
 {
 ${filter}
@@ -67,6 +68,7 @@ void ut_law(const ut_row *row, const ut_real x[UT_X], ut_output *out)
     for (int i = 0; i < UT_M; i++) {
         if (isnan(out->demand[i])) {
             out->demand[i] = 0;
+            out->margin = 0;
         }
         out->u[i] = ut_clip(out->demand[i], -ut_limit[i], ut_limit[i]);
     }
@@ -107,6 +109,7 @@ static int ut_control(ut_controller *c, int status, ut_real u[UT_M])
 {
     const sig_atomic_t slot = c->offered;
     const ut_plan *plan = &c->slot[slot];
+    UT_BARRIER();
     if (slot != c->taken) {
         c->taken = slot;
         c->clock = 0;
@@ -176,6 +179,7 @@ int ut_step_state(ut_controller *c, const ut_real x[UT_X], ut_real u[UT_M])
     if (c->running) {
         for (int i = 0; i < UT_X; i++) {
             c->x[i] = at[i];
+            c->filter[i % UT_N][i / UT_N] = at[i]; /* where ut_step would go on */
         }
     }
     return ut_control(c, status, u);
@@ -214,6 +218,7 @@ int ut_offer(ut_controller *c, const ut_plan *plan)
     if (c->taken != c->offered) {
         return UT_BUSY;
     }
+    UT_BARRIER();
     if (plan->number <= c->newest) {
         return UT_STALE;
     }

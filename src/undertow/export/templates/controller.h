@@ -59,7 +59,8 @@ typedef struct {
     ut_real demand[UT_M]; /* before the limits */
     ut_real s[UT_M];      /* values of the surface */
     ut_real gain[UT_M];   /* reaching gains in use, disturbance bounds included */
-    ut_real margin;       /* det Gamma(q) / det Gamma(0): > 0 where the law exists */
+    ut_real margin;       /* det Gamma(q) / det Gamma(0): > 0 where the law exists; 0 also where
+                             a demand was no number */
 } ut_output;
 
 /* Status of a step, or-ed. */

@@ -73,7 +73,8 @@ static void ut_test_run(void)
 /* Whatever comes in, the output is a number within the limits. */
 static void ut_test_nonsense(void)
 {
-    static const double nonsense[] = {NAN, INFINITY, -INFINITY, 1e300, -1e300, 1e8, -1e8, 0};
+    static const double nonsense[] = {(double)NAN, (double)INFINITY, -(double)INFINITY, 1e300,
+                                      -1e300,      1e8,              -1e8,              0};
     const int kinds = (int)(sizeof nonsense / sizeof nonsense[0]);
     static ut_controller c;
     ut_init(&c);
