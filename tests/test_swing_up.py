@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.errors import ModelError
+from undertow.certify import terminal_sets
+from undertow.certify.ellipsoid_search import ProvedEllipsoid
+from undertow.errors import InvalidInputError, ModelError
 from undertow.rig import Bench, Push, RealisticRig, srv02_rig
 from undertow.swing_up import CatchRegion, Gains, SwingUp, SwingUpAndCatch, designed, hanging
 from undertow.swing_up.search import KEPT, _judged, _Swings, as_kept, found_for, search
@@ -76,6 +78,37 @@ def test_the_catch_region_is_where_the_law_comes_home(
     assert region.surface(np.full(4, math.nan)) is None
     wide = CatchRegion(arm, spread=np.array([0.01, 0.3, 0.1, 3.0]))
     assert wide.surface(arm.state(phi=ut.deg(35))) is None
+
+
+def test_a_proved_set_catches_without_a_prediction(
+    arm: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From its very edge the motion comes home, under the surface that it is proved for."""
+    region = CatchRegion(arm, prove=terminal_sets)
+    assert region.proved
+    rng = np.random.default_rng(0)
+    starts = []
+    for known in region.proved:
+        assert isinstance(known, ProvedEllipsoid)
+        x = rng.standard_normal(4)
+        x *= 0.999 / float(known.ellipsoid.level(x))
+        assert region.loop.batch(x, known.surface).reached[0]
+        outside = 1.01 * x
+        assert not known.contains(outside)
+        starts.append(x)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(ut.ClosedLoop, "batch", refuse)
+    for x in starts:
+        first = next(known for known in region.proved if known.contains(x))
+        assert region.surface(x) is first.surface
+    with pytest.raises(AssertionError):
+        region.surface(arm.state(phi=ut.deg(25)))
+    other = ut.ReachingLaw(eta=10.0)
+    with pytest.raises(InvalidInputError, match="reaching law of a proved set"):
+        CatchRegion(arm, reaching=other, prove=lambda *_: region.proved)
 
 
 def test_turns_are_taken_off_freely_turning_joints_alone() -> None:

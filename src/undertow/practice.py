@@ -7,8 +7,9 @@ and of its delays.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -16,14 +17,16 @@ import sympy as sp
 
 from undertow.cascade import Gate
 from undertow.delay import bench_gate, noise_share
+from undertow.errors import MissingExtraError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Names, Objective, state_box
 from undertow.rig import Bench, Encoder
 from undertow.sliding import ReachingLaw
 from undertow.stability import first_surface
+from undertow.surface import ProvedSet, Surface
 
-__all__ = ["Goal", "estimator_for", "gate_for", "goal_for", "reaching_for"]
+__all__ = ["Goal", "estimator_for", "gate_for", "goal_for", "provable", "reaching_for"]
 
 #: ``energy``: Φ = uᵀu + w xᵀx.  ``time``: Φ = 1 + r Σ (u_i/u_max,i)².  ``effort``: the same for
 #: every mechanism, Φ = Σ (u_i/u_max,i)² + 0.01 xᵀx.
@@ -160,3 +163,14 @@ def _ranges(mechanism: Mechanism) -> Mapping[str, float]:
     """Return 95 % of the nearer end of each coordinate's range, where it has one around 0."""
     nearest = {c.name: min(-c.low, c.high) for c in mechanism.coordinates}
     return {name: 0.95 * end for name, end in nearest.items() if 0 < end < math.inf}
+
+
+def provable(
+    mechanism: Mechanism, surfaces: Sequence[Surface], reaching: ReachingLaw
+) -> tuple[ProvedSet, ...]:
+    """Return the sets that are proved for a catch: none can be without ``undertow[certify]``."""
+    from undertow.certify import terminal_sets
+
+    with contextlib.suppress(MissingExtraError):
+        return terminal_sets(mechanism, surfaces, reaching)
+    return ()

@@ -7,7 +7,7 @@ mechanism on it is :mod:`undertow.sliding`'s.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from undertow.errors import InvalidInputError
 from undertow.quantities import FloatArray
 
-__all__ = ["ReachingLaw", "Surface", "Switching"]
+__all__ = ["ProvedSet", "ReachingLaw", "Surface", "Switching"]
 
 Switching = Literal["saturation", "tanh", "sign"]
 
@@ -211,3 +211,18 @@ class ReachingLaw:
                     remedy="Give one number for all surfaces, or one per input",
                 )
         return np.concatenate([np.broadcast_to(v, (m,)) for v in values])
+
+
+class ProvedSet(Protocol):
+    """A proved region of attraction of a full closed loop, for one surface and reaching law."""
+
+    @property
+    def surface(self) -> Surface:
+        """The surface it is for."""
+
+    @property
+    def reaching(self) -> ReachingLaw:
+        """Its reaching law."""
+
+    def contains(self, x: FloatArray) -> bool:
+        """Whether the state is inside for certain."""

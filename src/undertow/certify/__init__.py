@@ -5,6 +5,7 @@ Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when fi
 
 from undertow.certify.certificate import Certificate, Claim, Subject, read_certificate
 from undertow.certify.ellipsoid import TerminalEllipsoid, verify_ellipsoid
+from undertow.certify.ellipsoid_search import terminal_sets
 from undertow.certify.gate import Policy, assess, certified_gate
 from undertow.certify.reaching import DisturbanceBound, ReachingCertificate, reaching
 from undertow.certify.region import LyapunovFunction, SurfaceMotion, verify_region
@@ -42,6 +43,7 @@ __all__ = [
     "reaching",
     "read_certificate",
     "singular_distance",
+    "terminal_sets",
     "verify_ellipsoid",
     "verify_region",
 ]

@@ -6,6 +6,7 @@ Nothing here proves anything: every set that is returned is one that the kernel 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -16,7 +17,7 @@ from undertow.certify.ellipsoid import ClosedLoopProgram, TerminalEllipsoid, pro
 from undertow.mechanism import Mechanism
 from undertow.sliding import ReachingLaw, Surface
 
-__all__ = ["EllipsoidSearch", "search_for"]
+__all__ = ["EllipsoidSearch", "ProvedEllipsoid", "search_for", "terminal_sets"]
 
 FloatArray = NDArray[np.float64]
 
@@ -216,3 +217,37 @@ def search_for(
         np.array(rates),
         np.array(modes),
     )
+
+
+@dataclass(frozen=True)
+class ProvedEllipsoid:
+    """A terminal set and the closed loop that it is proved for."""
+
+    surface: Surface
+    reaching: ReachingLaw
+    ellipsoid: TerminalEllipsoid
+
+    def contains(self, x: ArrayLike) -> bool:
+        """Whether the state is inside for certain."""
+        return self.ellipsoid.contains(x)
+
+
+def terminal_sets(
+    mechanism: Mechanism, surfaces: Iterable[Surface], reaching: ReachingLaw
+) -> tuple[ProvedEllipsoid, ...]:
+    """Return the terminal sets of surfaces, one for each that a proof is found for.
+
+    Raises
+    ------
+    MissingExtraError
+        Without ``undertow[certify]``.
+    InvalidInputError
+        For a force that depends on time, or a switching function that is not smooth at 0.
+    """
+    found = []
+    for surface in surfaces:
+        search = search_for(mechanism, surface, reaching)
+        ellipsoid = None if search is None else search.largest()
+        if ellipsoid is not None:
+            found.append(ProvedEllipsoid(surface, reaching, ellipsoid))
+    return tuple(found)

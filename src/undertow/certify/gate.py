@@ -24,7 +24,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -37,30 +37,16 @@ from undertow.plan import Plan
 from undertow.rollout import ClosedLoop
 from undertow.sliding import ReachingLaw, Surface
 from undertow.stability import stability_margin
+from undertow.surface import ProvedSet
 from undertow.verdict import Verdict
 
-__all__ = ["CertifiedGate", "Evidence", "Policy", "ProvedSet", "assess", "certified_gate"]
+__all__ = ["CertifiedGate", "Evidence", "Policy", "assess", "certified_gate"]
 
 Evidence = Literal["region", "dual", "sampled", "local"]
 #: When a prediction is first looked at, s; then after half the time again, and so on.
 FIRST_LOOK = 1.0
 
 _KINDS: tuple[Evidence, ...] = ("region", "dual", "sampled", "local")
-
-
-class ProvedSet(Protocol):
-    """A proved region of attraction of a full closed loop, for one surface and reaching law."""
-
-    @property
-    def surface(self) -> Surface:
-        """The surface it is for."""
-
-    @property
-    def reaching(self) -> ReachingLaw:
-        """Its reaching law."""
-
-    def contains(self, x: FloatArray) -> bool:
-        """Whether the state is inside for certain."""
 
 
 @dataclass(frozen=True)

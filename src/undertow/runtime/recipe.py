@@ -16,7 +16,14 @@ from undertow.errors import InvalidInputError, UndertowError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plan import Plan
-from undertow.practice import RESERVE, estimator_for, gate_for, goal_for, reaching_for
+from undertow.practice import (
+    RESERVE,
+    estimator_for,
+    gate_for,
+    goal_for,
+    provable,
+    reaching_for,
+)
 from undertow.proposal import Budget
 from undertow.rig import Bench, IdealRig, RealisticRig
 from undertow.rig.presets import bench_for
@@ -115,7 +122,7 @@ class Recipe:
         """Swing-up and catch, where it is wanted."""
         if not self.swing_up:
             return None
-        region = CatchRegion(self.belief, reaching=self.cascade.reaching)
+        region = CatchRegion(self.belief, reaching=self.cascade.reaching, prove=provable)
         return SwingUpAndCatch(designed(self.belief), region)
 
     def first(self) -> CascadeState:

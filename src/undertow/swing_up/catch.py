@@ -1,15 +1,15 @@
 """Catch and hand-over: from the energy law to the sliding-mode law, and back if thrown out.
 
-What counts in a swing-up is the hand-over: only from a state from which the law is
-*predicted* to bring the mechanism home, with the clip and the end stops in place, and from
-disturbed copies of that state too.
+What counts in a swing-up is the hand-over: only from a state from which the law is *proved*
+to bring the mechanism home, or else *predicted* to, with the clip and the end stops in place,
+and from disturbed copies of that state too.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,9 +23,13 @@ from undertow.rig.simulated import IdealRig
 from undertow.rollout import ClosedLoop
 from undertow.sliding import ReachingLaw, Surface
 from undertow.stability import first_surface, linearise
+from undertow.surface import ProvedSet
 from undertow.swing_up.law import SwingUp, periods
 
-__all__ = ["CatchRegion", "SwingUpAndCatch", "unclipped"]
+__all__ = ["CatchRegion", "Prove", "SwingUpAndCatch", "unclipped"]
+
+#: Proves regions of attraction for some of a mechanism's surfaces under a reaching law.
+Prove = Callable[[Mechanism, Sequence[Surface], ReachingLaw], Iterable[ProvedSet]]
 
 
 def unclipped(mechanism: Mechanism) -> tuple[FloatArray, float, FloatArray]:
@@ -45,11 +49,11 @@ def unclipped(mechanism: Mechanism) -> tuple[FloatArray, float, FloatArray]:
 
 
 class CatchRegion:
-    """From where the sliding-mode law is predicted to bring the mechanism home: sampled.
+    """From where the sliding-mode law brings the mechanism home: proved, or else sampled.
 
-    Several surfaces are rolled out at once from the state and from disturbed copies of it;
-    a surface catches when all of its copies come home: no proof, but a prediction with a
-    margin.
+    Inside a set that is proved for one of the surfaces that surface catches.  From elsewhere
+    several surfaces are rolled out at once, from the state and from disturbed copies of it; a
+    surface catches when all of its copies come home: no proof, but a prediction with a margin.
 
     Parameters
     ----------
@@ -66,6 +70,16 @@ class CatchRegion:
         Home within this time, s.
     copies
         Disturbed copies per surface.
+    prove
+        Called with mechanism, surfaces and reaching law: returns regions of attraction that are
+        proved for some of the surfaces, as :func:`undertow.certify.terminal_sets` does.  The
+        first that holds a state counts.
+
+    Raises
+    ------
+    InvalidInputError
+        When the shape of ``spread`` does not fit, there is no copy, or a proved set is of
+        another reaching law.
     """
 
     def __init__(
@@ -77,6 +91,7 @@ class CatchRegion:
         spread: FloatArray | None = None,
         seconds: float = 8.0,
         copies: int = 7,
+        prove: Prove | None = None,
     ) -> None:
         n = mechanism.n
         self.mechanism = mechanism
@@ -99,6 +114,16 @@ class CatchRegion:
                 value=(np.shape(spread), copies),
                 limit=f"({2 * n},) and at least 1",
             )
+        self.proved: tuple[ProvedSet, ...] = ()
+        if prove is not None:
+            self.proved = tuple(prove(mechanism, self.surfaces, self.reaching))
+        if any(known.reaching != self.reaching for known in self.proved):
+            raise InvalidInputError(
+                "reaching law of a proved set",
+                value=[known.reaching for known in self.proved],
+                limit=f"{self.reaching}, the catch region's",
+                remedy="Prove the set for the law that catches",
+            )
         rng = np.random.default_rng(0)
         shifts = rng.standard_normal((copies, 2 * n)) * spread
         self._shifts = np.vstack([np.zeros(2 * n), shifts])
@@ -118,9 +143,15 @@ class CatchRegion:
         return bool(x @ self._P @ x <= 100.0 * self._level)
 
     def surface(self, x: FloatArray) -> Surface | None:
-        """Return the surface that catches soonest from x, turns taken off; ``None``: outside."""
+        """Return the surface that catches from x, turns taken off; ``None``: outside.
+
+        Where nothing is proved it is the one that is predicted to be home soonest.
+        """
         if not np.isfinite(x).all():
             return None
+        for known in self.proved:
+            if known.contains(x):
+                return known.surface
         count = len(self._shifts)
         batch = self.loop.batch(np.tile(x + self._shifts, (len(self.surfaces), 1)), self._vectors)
         reached = batch.reached.reshape(-1, count).all(axis=1)
