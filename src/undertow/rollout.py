@@ -9,86 +9,34 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.codegen.rows import LANES
-from undertow.codegen.settle import UNSETTLED
 from undertow.errors import InvalidInputError
-from undertow.kernel import compile_loop
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.mechanism import FloatArray
 from undertow.motion import Batch, Event, Trajectory
-from undertow.objective import MinimumEnergy, Objective
 from undertow.plan import Plan
-from undertow.room import NOTHING, Room, Shape
+from undertow.room import Room
 from undertow.sliding import (
-    ReachingLaw,
     Surface,
     check_surface_shape,
-    coupling,
-    gains_at_target,
 )
-from undertow.tail import LinearEnd, Prepared
+from undertow.unchecked import Probe, UncheckedLoop
 
-__all__ = ["ClosedLoop", "Probe"]
+__all__ = ["ClosedLoop"]
 
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
-
-#: Small steps before large ones are tried again, s; each time as long again as all before.
-CALMER = 0.5
 
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
 
 
-class _Numbers(NamedTuple):
-    """Plant and belief parameters, input limits, η and ε of the loop."""
-
-    plant: FloatArray
-    belief: FloatArray
-    limits: FloatArray
-    law: FloatArray
-
-
-class Probe:
-    """Rollouts of many plans from one state, unchecked and in the same buffers: for searches.
-
-    Parameters
-    ----------
-    loop
-        The closed loop.
-    x
-        State, (2n,).
-    switches, steps
-        Switch times of the plans and length, in steps.
-    """
-
-    def __init__(
-        self, loop: ClosedLoop, x: FloatArray, switches: NDArray[np.int64], steps: int
-    ) -> None:
-        self.loop, self.x, self.switches, self.steps = loop, x, switches, steps
-        self._rooms: dict[int, Room] = {}
-
-    def __call__(self, surfaces: FloatArray, laws: FloatArray | None, **options: Any) -> Batch:
-        """Roll out surfaces (N, S, 2mn) with reaching laws (N, S, 2m).
-
-        What is returned is valid until the next call.  Options are those of
-        :meth:`ClosedLoop.batch`: ``terminal``, ``cap``, ``stable_only``, ``seek``.
-        """
-        count = len(surfaces)
-        room = self._rooms.get(count)
-        if room is None:
-            room = self._rooms[count] = Room(self.loop._shape, count, len(self.switches))
-        room.fill(self.x, surfaces, self.loop._numbers.law if laws is None else laws)
-        return self.loop._launch(room, self.switches, self.steps, **options)
-
-
 @dataclass(frozen=True, eq=False)
-class ClosedLoop:
+class ClosedLoop(UncheckedLoop):
     """A mechanism under its sliding-mode law, compiled for batches of rollouts.
 
     Parameters
@@ -123,15 +71,6 @@ class ClosedLoop:
     >>> run.event.name
     'REACHED'
     """
-
-    mechanism: Mechanism
-    objective: Objective = MinimumEnergy()
-    reaching: ReachingLaw = ReachingLaw()
-    plant: Mechanism | None = None
-    step: float = 0.002
-    hold: int = 0
-    escape: float = 200.0
-    tail: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
@@ -173,65 +112,6 @@ class ClosedLoop:
                 limit=f"n = {self.mechanism.n}, m = {self.mechanism.m} like the belief",
             )
 
-    @property
-    def truth(self) -> Mechanism:
-        """The plant that moves."""
-        return self.mechanism if self.plant is None else self.plant
-
-    @cached_property
-    def _kernels(self) -> Any:
-        return compile_loop(
-            self.mechanism, self.plant, self.objective, self.reaching.switching, self.hold > 0
-        )
-
-    @cached_property
-    def _numbers(self) -> _Numbers:
-        belief, truth = self.mechanism, self.truth
-        return _Numbers(
-            truth.parameter_values,
-            belief.parameter_values,
-            truth.input_limits,
-            self.reaching.vector(belief.m),
-        )
-
-    @cached_property
-    def _shape(self) -> Shape:
-        belief = self.mechanism
-        return Shape(
-            belief.n,
-            belief.m,
-            len(self.objective.constraints),
-            coupling(belief, np.zeros(belief.n)),
-            self.linear_end,
-            self.hold > 0,
-        )
-
-    @cached_property
-    def linear_end(self) -> LinearEnd | None:
-        """The linear model of this loop at the target, where it has one."""
-        if self.hold or self.reaching.switching == "sign" or self.plant is not None:
-            return None
-        return LinearEnd(self.mechanism, self.objective)
-
-    @cached_property
-    def _hands_over(self) -> bool:
-        """Whether rollouts may end in the linear model."""
-        if not self.tail > 0 or self.objective.constraints:
-            return False
-        end = self.linear_end
-        return end is not None and end.stage is not None
-
-    def _prepare(self, room: Room) -> Prepared | None:
-        """Linearise the last surface of every lane."""
-        if self.linear_end is None or room.ends is None:
-            return None
-        gains = None
-        if any(self.mechanism.disturbance_bounds):
-            surfaces, eta = room.lanes[:, -1, : room.width], room.lanes[:, -1, room.width :]
-            gains = gains_at_target(self.mechanism, surfaces, eta[:, : self.mechanism.m])
-        self.linear_end.prepare(room.lanes, gains, room.ends)
-        return room.ends
-
     def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:
         """Return the steps at which surfaces take over; the kernel meets them one by one."""
         if len(switch_times) == 1 and switch_times[0] == 0:
@@ -270,76 +150,6 @@ class ClosedLoop:
             room, switches, steps, start=start, every=every, record=record, **options
         )
         return batch, record
-
-    def _launch(
-        self,
-        room: Room,
-        switches: NDArray[np.int64],
-        steps: int,
-        *,
-        start: float = 0.0,
-        terminal: float | None = None,
-        every: int = 0,
-        seek: bool = False,
-        **options: Any,
-    ) -> Batch:
-        """Roll out what the room holds; the results live there too."""
-        end_radius = self.objective.terminal_radius if terminal is None else terminal
-        # Large steps see no closest approach, and leave nothing to record.
-        calm_from = 0 if self._hands_over and not every and not seek else steps
-        self._roll(room, switches, steps, calm_from, start, end_radius, seek, every, **options)
-        return room.batch(start)
-
-    def _roll(
-        self,
-        room: Room,
-        switches: NDArray[np.int64],
-        steps: int,
-        calm_from: int,
-        start: float,
-        terminal: float,
-        seek: bool,
-        every: int,
-        *,
-        cap: float = math.inf,
-        stable_only: bool = False,
-        record: FloatArray = NOTHING,
-        noise: FloatArray | None = None,
-    ) -> None:
-        """Call the kernel; from the step ``calm_from`` on, lanes may go on in large steps."""
-        numbers, live, out = self._numbers, room.live, room.out
-        live.fill(1.0)
-        self._check_gains(room.lanes, live, stable_only)
-        hands_over = calm_from < steps
-        prepared = self._prepare(room) if hands_over or stable_only else None
-        if prepared is not None and stable_only:
-            live *= prepared.stable
-        self._kernels.rollout(
-            room.states, live, room.lanes, switches, numbers.plant, numbers.belief,
-            numbers.limits, room.quiet if noise is None else noise, start, self.step, steps,
-            max(1, self.hold), terminal, self.escape, cap, 1.0 if seek else 0.0, calm_from,
-            every, record, out,
-        )  # fmt: skip
-        if not hands_over or prepared is None or self.linear_end is None:
-            return
-        self._kernels.settle(
-            room.lanes, numbers.plant, numbers.belief, numbers.limits, start + steps * self.step,
-            terminal, self.escape, self.tail, 1.0 if self.linear_end.counts_cost else 0.0,
-            prepared.A, prepared.P, prepared.powers, prepared.forced, out,
-        )  # fmt: skip
-        again = np.flatnonzero(out[: room.count, 2] == UNSETTLED)
-        if not len(again):
-            return
-        # Too fast for large steps, or at a limit again: small steps until later.
-        part = room.part(again)
-        failed = round((float(out[again, 1].max()) - start) / self.step)
-        later = failed + max(round(CALMER / self.step), calm_from)
-        self._roll(
-            part, switches, steps, min(later, steps), start, terminal, seek, every,
-            cap=cap, stable_only=stable_only,
-        )  # fmt: skip
-        part.out[:, -1] += np.resize(out[again, -1], len(part.out))
-        out[again] = part.out[: len(again)]
 
     def probe(self, x: FloatArray, times: Sequence[float] = (0.0,), horizon: float = 0.0) -> Probe:
         """Return a function that rolls out plans from x, again and again, without checks.
@@ -550,27 +360,6 @@ class ClosedLoop:
                 remedy="Change the horizon, or the step",
             )
         return steps
-
-    def _check_gains(self, lanes: FloatArray, live: FloatArray, stable_only: bool) -> None:
-        """Refuse gains (13) that this step cannot follow, or switch their lanes off."""
-        if not any(self.mechanism.disturbance_bounds) or self.reaching.switching == "sign":
-            return
-        n, m = self.mechanism.n, self.mechanism.m
-        flat = lanes.reshape(-1, lanes.shape[-1])
-        surfaces, eta, layer = np.split(flat[:, :-1], [2 * m * n, 2 * m * n + m], axis=1)
-        gains = gains_at_target(self.mechanism, surfaces, eta)
-        rate = (gains / layer).max(axis=1).reshape(lanes.shape[:2]).max(axis=1)
-        period = self.step * max(1, self.hold)
-        fast = rate * period >= 2.0
-        if stable_only:
-            live[fast] = 0.0
-        elif fast.any():
-            raise InvalidInputError(
-                "step for the gains (13) that the disturbance bounds ask for",
-                value=f"{period:g} s at k/ε = {rate.max():.4g} 1/s",
-                limit=f"below 2 ε/k = {2 / rate.max():.3g} s",
-                remedy="Use a shorter step, a thicker boundary layer or smaller bounds",
-            )
 
     def _check_duration(self, duration: float | None) -> None:
         if duration is not None and not (math.isfinite(duration) and duration >= 0):
