@@ -106,6 +106,38 @@ def test_same_seed_same_log(logged: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.steps, again.steps)
 
 
+HASHED = """
+import hashlib
+import undertow as ut
+from undertow.cascade import CascadeState
+from undertow.plan import Plan
+from undertow.runtime import Command, Inputs, Recipe
+recipe = Recipe(rig="realistic", start=(0.0, 0.2, 0.0, 0.0))
+surface = ut.Surface(alpha_a=-1, lambda_a=-0.25, alpha_u=1.6, lambda_u=17.3)
+controller = recipe.make_controller(CascadeState(Plan.of(surface)))
+rig, digest = recipe.make_rig(), hashlib.sha256()
+for k in range(400):
+    u = controller.step(Inputs(1e-3 * k, rig.read(), None, Command(1 if k == 0 else 0)))
+    digest.update(u.tobytes() + controller.x.tobytes())
+    rig.write(u.copy())
+assert u.any()
+print(digest.hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_what_compiles_and_what_loads_the_compiled_gives_the_same_bits(tmp_path: Path) -> None:
+    """The first run on a machine can be replayed by the processes after it."""
+    here = {**os.environ, "UNDERTOW_CACHE": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", HASHED]
+    said = [
+        subprocess.run(command, env=here, check=True, capture_output=True, text=True).stdout
+        for _ in range(2)
+    ]
+    assert said[0] == said[1]
+    assert len(said[0]) == 65
+
+
 # -- the file ---------------------------------------------------------------------------------
 
 

@@ -17,7 +17,10 @@ __all__ = ["BRIEF", "Memory", "unpacked"]
 
 #: Decorator of generated functions that take about a microsecond.  They keep the interpreter's
 #: lock: to let go of it for so short a time is to hand it to another thread, and to wait.
-BRIEF = "@numba.njit(cache=True, error_model='numpy', fastmath={'contract', 'nsz', 'arcp'})"
+BRIEF = (
+    "@numba.njit(cache=True, error_model='numpy', forceinline=True, "
+    "fastmath={'contract', 'nsz', 'arcp'})"
+)
 
 #: Name of an array to its dimensions, Python expressions: ``{"P": "size, size"}``.
 Layout = Mapping[str, str]

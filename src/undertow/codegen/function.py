@@ -18,9 +18,12 @@ __all__ = ["COMPILED", "PREAMBLE", "function_source"]
 #: Head of a generated module.
 PREAMBLE = "import math\n\nimport numba\nimport numpy as np\n"
 
-#: Decorator of every function that is compiled: no lock of the interpreter, no exceptions.
+#: Decorator of every function that is compiled: no lock of the interpreter, no exceptions.  What
+#: another one calls is inlined there: else the process that compiles it calls it in its own
+#: library, later ones the copy that was stored with its caller, and the two round otherwise.
 COMPILED = (
-    "@numba.njit(cache=True, nogil=True, error_model='numpy', fastmath={'contract', 'nsz', 'arcp'})"
+    "@numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True, "
+    "fastmath={'contract', 'nsz', 'arcp'})"
 )
 
 

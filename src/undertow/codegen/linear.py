@@ -63,14 +63,14 @@ import numpy as np
 FAST = {{"contract", "nsz", "arcp"}}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST)
 def _product(a, b, add, factor, o):
     for r in range({N}):
         for i in range({LANES}):
 {_indented(product)}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST)
 def _turned(a, b, add, o):
     for r in range({N}):
         for i in range({LANES}):
