@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import sys
 import threading
 from collections import Counter, deque
@@ -13,6 +14,7 @@ from functools import partial
 
 import numpy as np
 
+from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
 from undertow.runtime.clock import Clock, Histogram, WallClock, prompt
@@ -20,7 +22,7 @@ from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import answer_row
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
-from undertow.runtime.slow import Worker
+from undertow.runtime.slow import Answer, Worker
 
 __all__ = ["Report", "Runtime"]
 
@@ -30,6 +32,9 @@ REHEARSAL = 1.5e-4
 
 #: Steps between two collections of what is young.
 COLLECT = 10_000
+
+#: Events that are kept at most.
+EVENTS = 10_000
 
 
 @dataclass(eq=False)
@@ -100,10 +105,10 @@ class Runtime:
         in the last moments before the next one is due: that brings code and data back into
         the processor's caches, and shows at once when the same inputs give other outputs.
 
-    Attributes
-    ----------
-    command
-        The operator's wish: set it from anywhere; the next step takes it.
+    Raises
+    ------
+    InvalidInputError
+        For a rig with another period than the controller.
     """
 
     def __init__(
@@ -116,27 +121,44 @@ class Runtime:
         log: Log | None = None,
         shadow: Controller | None = None,
     ) -> None:
+        if not math.isclose(rig.period, controller.period, rel_tol=1e-9):
+            raise InvalidInputError(
+                "period of the rig",
+                value=f"{rig.period:g} s",
+                limit=f"that of the controller, {controller.period:g} s",
+                remedy="Give both the same one: Recipe(period=...)",
+            )
         self.shadow = shadow
         self._behind: deque[tuple[Inputs, FloatArray]] = deque(maxlen=1000)
         self.controller, self.rig, self.worker = controller, rig, worker
         self.clock = WallClock() if clock is None else clock
         self.log = log
-        self.command = Command.NONE
         self.report = Report(variation=np.zeros_like(controller.u))
-        self._silent = ""
-        self._failing = 0.0
+        self._stopping, self._silent = False, ""
+        self._unread = self._unwritten = 0.0
         self._beat = self._origin = self.clock.now()
 
     def stop(self) -> None:
-        """Ask for a safe stop, as an operator does."""
-        self.command = Command.STOP
+        """Ask for a safe stop, as an operator does: from anywhere, also before the run."""
+        self._stopping = True
 
     def run(self, seconds: float) -> Report:
         """Run from start to a safe stop; the operator's stop comes after ``seconds``.
 
         The loop ends once a safe stop has brought the output to zero.
+
+        Raises
+        ------
+        InvalidInputError
+            When it has run already: its rig has been let go of.
         """
-        self.command = Command.START
+        if self.report.steps:
+            raise InvalidInputError(
+                "second run of a runtime",
+                value=f"stopped by {self.report.stopped_by}",
+                limit="one run: the rig has been let go of",
+                remedy="Make another session",
+            )
         with _quiet_interpreter(self.clock), self._watchdog():
             try:
                 self._loop(seconds)
@@ -145,7 +167,7 @@ class Runtime:
                 with contextlib.suppress(Exception):  # a rig that failed may fail again
                     self.rig.close()
         report, controller = self.report, self.controller
-        report.mode, report.stopped_by = controller.mode, self._silent or controller.stopped_by
+        report.mode, report.stopped_by = controller.mode, controller.stopped_by
         return report
 
     def _loop(self, seconds: float) -> None:
@@ -154,7 +176,7 @@ class Runtime:
         stall = self.controller.settings.stall
         origin = self._origin = clock.now()
         k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
-        while not self._silent:
+        while True:
             due = origin + slot * period
             self._wait(due)
             last, began = self._beat, clock.now()
@@ -162,25 +184,28 @@ class Runtime:
             t = began - origin
             if k > 0 and began - last > stall:
                 alarm = f"no step for {1e3 * (began - last):.0f} ms"
-            command, self.command = self.command, Command.NONE
-            if t >= seconds and self.controller.mode != Mode.SAFE_STOP:
+            command = Command.START if k == 0 else Command.NONE
+            if (self._stopping or t >= seconds) and self.controller.mode != Mode.SAFE_STOP:
                 command = Command.STOP
             measurement, alarm = self._read(alarm)
             read = clock.now()
-            inputs = Inputs(t, measurement, self.worker.take(t), command, alarm)
+            inputs = Inputs(t, measurement, self._take(t), command, alarm)
             u = self.controller.decide(inputs)
             thought = clock.now()
             alarm = self._write(u)
             written = clock.now()
             self.controller.follow_up()
-            self._after(k, inputs)
+            try:
+                self._after(k, inputs)
+                if self.log is not None:
+                    self._record(self.log, k, began, due, (read, thought, written), inputs)
+            except Exception as error:  # the output must come to zero before the loop may end
+                alarm = alarm or f"{type(error).__name__}: {error}"
             if self.shadow is not None:
                 self._behind.append((inputs, u.copy()))
             np.abs(u - before, out=before)
             report.variation += before
             before[:] = u
-            if self.log is not None:
-                self._record(self.log, k, began, due, (read, thought, written), inputs)
             late.add(began - due)
             think.add(thought - read)
             whole.add(written - due)
@@ -190,7 +215,7 @@ class Runtime:
             report.steps = k
             if k % COLLECT == 0 and not clock.simulated:
                 gc.collect(0)  # what an exception leaves behind; some microseconds
-            if self.controller.mode == Mode.SAFE_STOP and not u.any():
+            if self.controller.mode == Mode.SAFE_STOP and (self._silent or not u.any()):
                 break
             slot += 1
             over = (ended - origin) / period - slot
@@ -214,37 +239,63 @@ class Runtime:
         clock.spin_until(due)
 
     def _read(self, alarm: str) -> tuple[Measurement | None, str]:
-        """Read the rig; a rig that fails gives nothing, and is a gap in the sensors."""
+        """Read the rig; one that fails gives nothing, and one that keeps failing is an alarm."""
+        if not self._silent:  # else the watchdog has let go of it
+            try:
+                measurement = _own(self.rig.read(), self.controller.x.shape[0] // 2)
+                self._unread = 0.0
+                return measurement, self._silent or alarm
+            except Exception as error:
+                what = f"read: {type(error).__name__}: {error}"
+            self._unread += self.controller.period
+            self._tell("rig", what)
+            if self._unread > self.controller.settings.patience:
+                alarm = alarm or f"the rig gave nothing for {1e3 * self._unread:.0f} ms, {what}"
+        return None, self._silent or alarm
+
+    def _take(self, t: float) -> Answer | None:
+        """Take an answer of the slow loop; what is none is not looked at."""
         try:
-            return self.rig.read(), alarm
+            answer = self.worker.take(t)
         except Exception as error:
-            self._tell("rig", f"read: {type(error).__name__}: {error}")
-            return None, alarm
+            self._tell("optimiser", f"{type(error).__name__}: {error}")
+            return None
+        if answer is None or isinstance(answer, Answer):
+            return answer
+        self._tell("optimiser", f"not an answer but a {type(answer).__name__}")
+        return None
 
     def _write(self, u: FloatArray) -> str:
         """Write to the rig; one that keeps failing is an alarm for the next step."""
+        if self._silent:
+            return self._silent
         try:
-            self.rig.write(u)
+            self.rig.write(u.copy())  # the rig may keep it, or change it
         except Exception as error:
-            self._failing += self.controller.period
+            self._unwritten += self.controller.period
             what = f"write: {type(error).__name__}: {error}"
             self._tell("rig", what)
-            return what if self._failing > self.controller.settings.patience else ""
-        self._failing = 0.0
+            return what if self._unwritten > self.controller.settings.patience else ""
+        self._unwritten = 0.0
         return ""
 
     def _tell(self, what: str, text: str) -> None:
-        events = self.report.events
-        if len(events) < 10_000:
-            events.append((self._beat - self._origin, what, text))
+        t, events = self._beat - self._origin, self.report.events
+        if len(events) < EVENTS:
+            events.append((t, what, text))
+        if self.log is not None:
+            self.log.event(self.report.steps, t, what, text)
 
     def _after(self, k: int, inputs: Inputs) -> None:
         """Hand requests to the slow loop, and keep what happened."""
         controller, report, log = self.controller, self.report, self.log
-        if controller.gives_up and not self.worker.replace():
-            self._tell("optimiser", "nobody is left to take over: the last plan stays")
-        if controller.request is not None:
-            self.worker.ask(controller.request)
+        try:
+            if controller.gives_up and not self.worker.replace():
+                self._tell("optimiser", "nobody is left to take over: the last plan stays")
+            if controller.request is not None:
+                self.worker.ask(controller.request)
+        except Exception as error:
+            self._tell("optimiser", f"{type(error).__name__}: {error}")
         if log is not None:
             if inputs.command:
                 log.event(k, inputs.t, "command", inputs.command.name)
@@ -258,8 +309,6 @@ class Runtime:
                 report.entered[controller.mode.name] += 1
             else:
                 report.answers[note.text.split(": ", 1)[1].split(",")[0].split(" by ")[0]] += 1
-            if log is not None:
-                log.event(k, inputs.t, note.kind, note.text)
 
     def _record(
         self,
@@ -312,6 +361,17 @@ class Runtime:
             yield
         finally:
             over.set()
+
+
+def _own(measurement: Measurement, n: int) -> Measurement:
+    """Return a copy that the rig cannot change any more, of numbers in the right shape."""
+    q = np.array(measurement.q, dtype=float)
+    v = None if measurement.v is None else np.array(measurement.v, dtype=float)
+    for values in (q,) if v is None else (q, v):
+        if values.shape != (n,):
+            message = f"a measurement of shape {values.shape}, not ({n},)"
+            raise ValueError(message)
+    return Measurement(float(measurement.t), q, v)
 
 
 @contextlib.contextmanager
