@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -189,6 +190,45 @@ def test_an_earlier_log_is_kept(tmp_path: Path) -> None:
     for _ in range(3):
         Log(tmp_path / "run.db", COLUMNS, {}, threaded=False).close()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.db", "run.db.1", "run.db.2"]
+
+
+@pytest.mark.parametrize("what", ["a log in use", "a folder", "a text"])
+def test_what_is_in_use_or_no_log_is_left_alone(tmp_path: Path, what: str) -> None:
+    """Two runs must not write to one another's files, nor a log push other things aside."""
+    path = tmp_path / "run.db"
+    first = Log(path, COLUMNS, {}, threaded=False) if what == "a log in use" else None
+    if what == "a folder":
+        path.mkdir()
+    elif what == "a text":
+        path.write_text("not a database, by any means" * 20)
+    with pytest.raises(ArtefactError, match="in use|still writes|not a log"):
+        Log(path, COLUMNS, {}, threaded=False)
+    if first is not None:
+        fill(first, 300)
+        first.close()
+        assert len(read_log(path).steps) == 300
+    assert [p.name for p in tmp_path.iterdir()] == ["run.db"]
+
+
+def test_a_log_that_was_removed_says_so(tmp_path: Path) -> None:
+    log = Log(tmp_path / "sub" / "run.db", COLUMNS, {}, threaded=False)
+    fill(log, 300)
+    shutil.rmtree(tmp_path / "sub")
+    fill(log, 300)
+    log.close()
+    assert "removed" in log.failure
+    assert log.dropped == 600
+
+
+def test_a_text_that_no_file_can_hold_costs_no_rows(tmp_path: Path) -> None:
+    """What a driver says of itself may be any bytes."""
+    log = Log(tmp_path / "run.db", COLUMNS, {}, threaded=False)
+    log.event(0, 0.0, "rig", "\udcff broke")
+    fill(log, 100)
+    log.close()
+    recording = read_log(tmp_path / "run.db")
+    assert (log.failure, len(recording.steps)) == ("", 100)
+    assert recording.events == ((0, 0.0, "rig", "? broke"),)
 
 
 @pytest.mark.parametrize("what", ["nothing", "text", "empty"])

@@ -111,7 +111,7 @@ class Log:
     Raises
     ------
     ArtefactError
-        When the file cannot be made.
+        When the file cannot be made, or is in use, or is no log: then it is left alone.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class Log:
 
     def event(self, k: int, t: float, kind: str, text: str) -> None:
         """Keep a line of ``events``."""
-        self._waiting.append(("events", lambda: (k, t, kind, text)))
+        self._waiting.append(("events", lambda: (k, t, kind, _writable(text))))
 
     def answer(self, line: Callable[[], Line]) -> None:
         """Keep a line of ``answers``; it is made when it is written, away from the loop."""
@@ -208,7 +208,7 @@ class Log:
             else:
                 try:
                     self._transact(head, waiting)
-                except sqlite3.Error as error:
+                except Exception as error:  # the thread must live, or the ring overflows unseen
                     self.failure = str(error)
                     self.dropped += count
                     with contextlib.suppress(sqlite3.Error):
@@ -245,6 +245,8 @@ class Log:
             self._file.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._file.execute("PRAGMA journal_mode=DELETE")
         self._file.close()
+        if not self.path.exists():
+            self.failure, self.dropped = "the file was removed during the run", self._head
 
     def __enter__(self) -> Self:
         """Return the log."""
@@ -260,14 +262,37 @@ class Log:
         self.close()
 
 
+def _writable(text: str) -> str:
+    """Return a text as a file can hold it: what a rig says of itself may be anything."""
+    return text.encode("utf-8", "replace").decode()
+
+
 def _move_earlier(path: Path) -> None:
-    """Keep an earlier log of the same name, with what belongs to it."""
+    """Keep an earlier log of the same name, unless a run still writes it.
+
+    Raises
+    ------
+    OSError
+        When something else has that name, or the log is in use: to rename it then would let
+        two runs write to one another's files.
+    """
+    if not path.exists():
+        return
+    message = "something else of that name, not a log"
+    if not path.is_file():
+        raise FileExistsError(message)
+    with contextlib.closing(sqlite3.connect(path, timeout=0.0)) as file:
+        try:
+            file.execute("PRAGMA journal_mode=DELETE")  # one file, and nobody else has it open
+        except sqlite3.OperationalError as error:
+            message = f"a log that a run still writes, or a program has open ({error})"
+            raise FileExistsError(message) from error
+        except sqlite3.DatabaseError as error:
+            raise FileExistsError(message) from error
     number = 1
     while Path(f"{path}.{number}").exists():
         number += 1
-    for ending in ("", "-wal", "-shm"):
-        with contextlib.suppress(FileNotFoundError):
-            Path(f"{path}{ending}").rename(f"{path}.{number}{ending}")
+    path.rename(f"{path}.{number}")
 
 
 @dataclass(frozen=True, eq=False)
