@@ -1,19 +1,26 @@
 """A rig behind a serial line, and a device emulated on a pseudo-terminal to try it on.
 
-Run ``python examples/serial_rig.py`` for a balanced pendulum over the pseudo-terminal, or give
-the name of a port: ``python examples/serial_rig.py /dev/ttyACM0``.  POSIX only.
+``python examples/serial_rig.py`` balances a pendulum over the pseudo-terminal, as fast as it
+goes; with the name of a port, ``python examples/serial_rig.py /dev/ttyACM0``, the device there.
+Against the clock, with the optimiser, watchdog and log of the runtime:
+
+    undertow run rotary_pendulum --rig examples/serial_rig.py:emulated --start phi=20deg
+
+POSIX only.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import sys
 import termios
 import threading
+import time
 import tty
 
-from wire import Device, command, parse
+from wire import LOST, Device, command, parse
 
 import undertow as ut
 from undertow.estimators import KalmanFilter, drive
@@ -25,30 +32,37 @@ from undertow.rig import Measurement, RealisticRig, srv02_rig
 class SerialRig:
     """A driver: all that Undertow needs of hardware."""
 
-    def __init__(self, port: str, period: float = 0.001, timeout: float = 1.0) -> None:
+    def __init__(self, port: str, period: float = 0.001, timeout: float = 0.004) -> None:
         self.period, self.timeout = period, timeout
-        self.line = os.open(port, os.O_RDWR | os.O_NOCTTY)
+        self.line = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         tty.setraw(self.line)
         termios.tcflush(self.line, termios.TCIOFLUSH)
-        self.rest = b""
+        self.number, self.answered, self.rest = 0, 0, b""
         self.write([0.0])
 
     def read(self) -> Measurement:
-        """Return the answer to the last write; NaN where none came."""
-        while b"\n" not in self.rest:
-            if not select.select([self.line], [], [], self.timeout)[0]:
-                return parse(b"")  # nothing came: a lost reading
-            self.rest += os.read(self.line, 256)
-        answer, _, self.rest = self.rest.partition(b"\n")
-        return parse(answer)
+        """Return the answer to the last write, or the newest that came in time, else NaN."""
+        newest, until = LOST, time.monotonic() + self.timeout
+        while self.answered < self.number and (left := until - time.monotonic()) > 0:
+            if not select.select([self.line], [], [], left)[0]:
+                break
+            if not (data := os.read(self.line, 4096)):
+                raise ConnectionError("the serial line was closed")
+            *lines, self.rest = (self.rest[-80:] + data).split(b"\n")
+            for number, measurement in map(parse, lines):
+                if self.answered < number <= self.number:
+                    self.answered, newest = number, measurement
+        return newest
 
     def write(self, u: FloatArray | list[float]) -> None:
         """Send the voltage; the device answers with a measurement."""
-        os.write(self.line, command(u[0]))
+        self.number += 1
+        os.write(self.line, command(self.number, u[0]))
 
     def close(self) -> None:
         """Leave the motor without voltage."""
-        self.write([0.0])
+        with contextlib.suppress(OSError):  # the device may be gone
+            self.write([0.0])
         os.close(self.line)
 
 
@@ -72,20 +86,24 @@ def emulate(rig: RealisticRig) -> str:
     return os.ttyname(theirs)
 
 
-def main(port: str | None = None, seconds: float = 5.0) -> float:
-    """Balance the pendulum for a while; return the largest |φ| of the last second, rad."""
+def emulated() -> SerialRig:
+    """Return a driver of an emulated device, for ``undertow run --rig``."""
     bench = srv02_rig()
-    arm = bench.mechanism
-    x0 = arm.state(phi=ut.deg(20))
-    rig = SerialRig(port or emulate(RealisticRig(bench, x0, seed=1)))
+    return SerialRig(emulate(RealisticRig(bench, bench.mechanism.state(phi=ut.deg(20)), seed=1)))
+
+
+def main(port: str | None = None, seconds: float = 5.0) -> float:
+    """Balance the pendulum for a while; return the largest |φ̂| of the last second, rad."""
+    arm = srv02_rig().mechanism
+    rig = SerialRig(port) if port else emulated()
     estimator = KalmanFilter(arm, delay=0.0025, disturbance_drift=5.0)
-    estimator.reset(x0)
+    estimator.reset(arm.state(phi=ut.deg(20)))
     law = InnerLoop(arm, ut.first_surface(arm))
-    record = drive(rig, estimator, lambda t, x: law(x), seconds)
-    rig.close()
-    return float(abs(record.q[-1000:, 1]).max())
+    with contextlib.closing(rig):
+        record = drive(rig, estimator, lambda t, x: law(x), seconds)
+    return float(abs(record.x[-1000:, 1]).max())
 
 
 if __name__ == "__main__":
     largest = main(sys.argv[1] if len(sys.argv) > 1 else None)
-    print(f"largest |φ| of the last second: {largest / ut.deg(1):.2f}°")
+    print(f"largest |φ̂| of the last second: {largest / ut.deg(1):.2f}°")

@@ -1,16 +1,21 @@
 """A rig at the other end of a network, over UDP, and a device emulated on this machine.
 
-Run ``python examples/udp_rig.py``, or give a host and a port.  A datagram may be lost: then the
-reading is lost, and the Kalman filter goes on without it.
+``python examples/udp_rig.py`` balances a pendulum on the emulated device, as fast as it goes;
+give a host and a port for another. A datagram may be lost: then the reading is lost, and the
+Kalman filter goes on without it. Against the clock:
+
+    undertow run rotary_pendulum --rig examples/udp_rig.py:emulated --start phi=20deg
 """
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import sys
 import threading
+import time
 
-from wire import Device, command, parse
+from wire import LOST, Device, command, parse
 
 import undertow as ut
 from undertow.estimators import KalmanFilter, drive
@@ -22,27 +27,35 @@ from undertow.rig import Measurement, RealisticRig, srv02_rig
 class UdpRig:
     """A driver: all that Undertow needs of hardware."""
 
-    def __init__(self, host: str, port: int, period: float = 0.001, timeout: float = 0.2) -> None:
-        self.period = period
+    def __init__(self, host: str, port: int, period: float = 0.001, timeout: float = 0.004) -> None:
+        self.period, self.timeout = period, timeout
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.settimeout(timeout)
         self.socket.connect((host, port))
+        self.number, self.answered = 0, 0
         self.write([0.0])
 
     def read(self) -> Measurement:
-        """Return the answer to the last write; NaN where none came."""
-        try:
-            return parse(self.socket.recv(256))
-        except (TimeoutError, ConnectionError):
-            return parse(b"")
+        """Return the answer to the last write, or the newest that came in time, else NaN."""
+        newest, until = LOST, time.monotonic() + self.timeout
+        while self.answered < self.number and (left := until - time.monotonic()) > 0:
+            self.socket.settimeout(left)
+            try:
+                number, measurement = parse(self.socket.recv(256))
+            except TimeoutError:
+                break
+            if self.answered < number <= self.number:
+                self.answered, newest = number, measurement
+        return newest
 
     def write(self, u: FloatArray | list[float]) -> None:
         """Send the voltage; the device answers with a measurement."""
-        self.socket.send(command(u[0]))
+        self.number += 1
+        self.socket.send(command(self.number, u[0]))
 
     def close(self) -> None:
         """Leave the motor without voltage."""
-        self.write([0.0])
+        with contextlib.suppress(OSError):  # the device may be gone
+            self.write([0.0])
         self.socket.close()
 
 
@@ -57,30 +70,33 @@ def emulate(rig: RealisticRig, lose_every: int = 0) -> tuple[str, int]:
             line, sender = server.recvfrom(256)
             number += 1
             answer = device.answer(line)
-            if lose_every and number % lose_every == 0:
-                answer = b"lost\n"
-            server.sendto(answer, sender)
+            if not lose_every or number % lose_every:
+                server.sendto(answer, sender)
 
     threading.Thread(target=serve, daemon=True).start()
     host, port = server.getsockname()
     return str(host), int(port)
 
 
+def emulated() -> UdpRig:
+    """Return a driver of an emulated device that loses datagrams, for ``undertow run --rig``."""
+    bench = srv02_rig()
+    simulated = RealisticRig(bench, bench.mechanism.state(phi=ut.deg(20)), seed=1)
+    return UdpRig(*emulate(simulated, lose_every=50))
+
+
 def main(host: str | None = None, port: str = "0", seconds: float = 5.0) -> float:
     """Balance the pendulum for a while; return the largest |φ̂| of the last second, rad."""
-    bench = srv02_rig()
-    arm = bench.mechanism
-    x0 = arm.state(phi=ut.deg(20))
-    simulated = RealisticRig(bench, x0, seed=1)
-    rig = UdpRig(host, int(port)) if host else UdpRig(*emulate(simulated, lose_every=50))
+    arm = srv02_rig().mechanism
+    rig = UdpRig(host, int(port)) if host else emulated()
     estimator = KalmanFilter(arm, delay=0.0025, disturbance_drift=5.0)
-    estimator.reset(x0)
+    estimator.reset(arm.state(phi=ut.deg(20)))
     law = InnerLoop(arm, ut.first_surface(arm))
-    record = drive(rig, estimator, lambda t, x: law(x), seconds)
-    rig.close()
+    with contextlib.closing(rig):
+        record = drive(rig, estimator, lambda t, x: law(x), seconds)
     return float(abs(record.x[-1000:, 1]).max())
 
 
 if __name__ == "__main__":
     largest = main(*(sys.argv[1:3] if len(sys.argv) > 2 else (None, "0")))
-    print(f"largest |φ| of the last second: {largest / ut.deg(1):.2f}°")
+    print(f"largest |φ̂| of the last second: {largest / ut.deg(1):.2f}°")

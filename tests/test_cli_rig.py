@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import re
 import sqlite3
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from undertow.cli import app
@@ -57,6 +59,7 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
         (("run", "piano"), "'piano'"),
         (("run", "rotary_pendulum", "--start", "phi=40"), "'40'"),
         (("run", "rotary_pendulum", "--lead", "-1"), "-1"),
+        (("run", "rotary_pendulum", "--rig", "real"), "FILE.py:NAME"),
     ],
 )
 def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -> None:
@@ -65,6 +68,78 @@ def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -
     assert out == ""
     assert value in err
     assert len(err.strip().splitlines()) == 1
+
+
+DRIVERS = """
+from dataclasses import dataclass
+import numpy as np
+from undertow.rig import Measurement
+
+class NoRead:
+    period = 0.001
+    def write(self, u): pass
+    def close(self): pass
+
+@dataclass
+class Three(NoRead):
+    count: int = 3
+    def read(self): return Measurement(0.0, np.zeros(self.count))
+
+class Quick(Three):
+    period = 0.0005
+    def __init__(self): super().__init__(2)
+
+class Dead(Three):
+    def read(self): raise OSError(5, "unplugged")
+
+class Port(Three):
+    def __init__(self): raise OSError(2, "no such port")
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("NoRead", "without read"),
+        ("Three", "q of shape (3,), must be undertow.rig.Measurement with q = (theta, phi)"),
+        ("Quick", "--period 0.0005"),
+        ("Dead", "unplugged"),
+        ("Port", "no such port"),
+        ("Nobody", "without read, write, close, period"),
+    ],
+)
+def test_what_is_no_driver_is_refused_before_anything_runs(
+    name: str, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "drivers.py").write_text(DRIVERS)
+    code, out, err = run("run", "rotary_pendulum", "--rig", f"{tmp_path / 'drivers.py'}:{name}")
+    assert code in (1, 2)
+    assert out == ""
+    assert words in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_screens_fit_80_columns() -> None:
+    """Tables of made-up runs, whose words are long, at the usual width of a terminal."""
+    from undertow.runtime import tables
+    from undertow.runtime.drill_live import Killed, LiveOutcome
+    from undertow.runtime.loop import Report
+
+    report = Report(steps=60_000, missed=47, asleep=44, stopped_by="sensor 'theta' lost " * 5)
+    report.events = [(0.1, "rig", "read: OSError: [Errno 5] Input/output error " * 3)] * 9
+    live = [LiveOutcome("optimiser", "a read blocks for 1 s", "what happened, " * 12, True)]
+    killed = [Killed(0.123, 1234, 0.01, True, 0.02)]
+    console = Console(width=80, record=True, file=io.StringIO())
+    for shown in (
+        tables.run_table(report, 1e-3, "N m", simulated=False),
+        tables.drill_table([], live),
+        tables.kill_table(killed),
+    ):
+        console.print(shown)
+    text = console.export_text()
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
+    assert "9 times read: OSError" in text
 
 
 def test_a_missing_log_is_refused(tmp_path: Path) -> None:

@@ -39,4 +39,4 @@ def test_every_block_of_the_page_runs(
             (tmp_path / "bar.gif").unlink()
             films += 1
     assert films == 2
-    assert len(more) == 3
+    assert len(more) == 4

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from undertow import inputs, results
 from undertow.cli.terminal import (
+    AnyName,
     Goal,
-    Name,
     Seed,
     Settings,
     Start,
@@ -27,6 +28,11 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
+from undertow.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from undertow.rig import Rig
+    from undertow.runtime import Recipe
 
 __all__ = ["drill", "replay", "run"]
 
@@ -37,16 +43,22 @@ __all__ = ["drill", "replay", "run"]
         "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
         "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
         "undertow run rotary_pendulum --rig realistic --swing-up --seconds 20",
+        "undertow run rotary_pendulum --rig examples/serial_rig.py:emulated",
     )
 )
 @reports_errors
 def run(
-    name: Name,
+    name: AnyName,
     start: Start = None,
     seconds: Annotated[float, typer.Option(help="Length of the run, s.", min=0.001)] = 10.0,
     rig: Annotated[
-        Literal["ideal", "realistic"],
-        typer.Option(help="The simulated plant: its model, or a bench with all its flaws."),
+        str,
+        typer.Option(
+            help="ideal: the model. realistic: a bench with all its flaws. mujoco: another engine. "
+            "FILE.xml: MJCF of your own. FILE.py:NAME: a driver of your own, a class or a function "
+            "that makes one.",
+            metavar="RIG",
+        ),
     ] = "ideal",
     objective: Goal = "energy",
     swing_up: Annotated[
@@ -75,7 +87,7 @@ def run(
     ] = None,
     seed: Seed = 0,
 ) -> None:
-    """Run the two-rate controller on a simulated rig, against the clock, and time every step."""
+    """Run the two-rate controller on a rig, against the clock, and time every step."""
     from undertow.runtime import Recipe
     from undertow.runtime import Settings as Patience
     from undertow.runtime.session import session
@@ -90,17 +102,19 @@ def run(
         else tuple(inputs.parse_start(belief, start or ()).tolist()),
         swing_up=swing_up,
         objective=objective,
-        rig=rig,
+        rig="realistic" if rig == "realistic" or ".py:" in rig else "ideal",
         seed=seed,
         period=period,
         seconds=float("inf") if simulated else max(0.01, 0.3 * lead),
         settings=Patience(lead=lead),
     )
     console = terminal()
+    plant = _plant(rig, recipe)
     with ExitStack() as stack:
         with progress_bar() as progress:
             ready = session(
                 recipe,
+                rig=plant,
                 log=log,
                 simulated=simulated,
                 processes=3 if worker == "process" else 0,
@@ -108,16 +122,48 @@ def run(
                 progress=progress,
             )
             runtime = stack.enter_context(ready)
+        if ".py:" in rig and sys.stdin.isatty():
+            say(console, f"Ready. Hold {name} at its start, press Enter and let go.")
+            sys.stdin.readline()
         stack.enter_context(_seconds_on_terminal(seconds))
         report = runtime.run(seconds)
     what = "simulated time" if simulated else f"optimiser in another {worker}"
-    say(console, f"{name} on the {rig} rig, {1 / period:g} Hz, {what}")
+    where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
+    console.print(f"{name} on {where}, {1 / period:g} Hz, {what}", markup=False)
     unit = ", ".join(sorted({i.unit for i in belief.inputs}))
     console.print(run_table(report, period, unit, simulated=simulated))
-    if log is not None:
-        say(console, f"Log written to {log}")
+    if (book := runtime.log) is not None:
+        lost = f", {book.dropped:,} rows lost" if book.dropped else ""
+        say(console, f"Log {log}: {book.failure or 'written'}{lost}")
     if not report.stopped_by.startswith("operator"):
         raise typer.Exit(1)
+
+
+def _plant(rig: str, recipe: Recipe) -> Rig | None:
+    """Return the rig that was asked for, or nothing for what the recipe itself makes."""
+    from undertow.rig import MuJoCoRig, rig_from_file
+
+    if rig in ("ideal", "realistic"):
+        return None
+    if ".py:" in rig:
+        plant = rig_from_file(rig, recipe.belief)
+        if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
+            raise InvalidInputError(
+                f"period of '{rig}'",
+                value=f"{plant.period:g} s",
+                limit=f"that of the fast loop, {recipe.period:g} s",
+                remedy=f"Write --period {plant.period:g}",
+            )
+        return plant
+    if rig == "mujoco" or rig.endswith(".xml"):
+        scene = None if rig == "mujoco" else Path(rig)
+        return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, period=recipe.period)
+    raise InvalidInputError(
+        "rig",
+        value=repr(rig),
+        limit="ideal, realistic, mujoco, FILE.xml or FILE.py:NAME",
+        remedy="A driver of your own: see examples/serial_rig.py",
+    )
 
 
 @contextmanager
@@ -178,7 +224,7 @@ def replay(
     epilog=examples(
         "undertow drill",
         "undertow drill --no-live --seed 3",
-        "undertow drill --kills 50",
+        "undertow drill --kills 50 --seed 1",
     )
 )
 @reports_errors
@@ -198,18 +244,22 @@ def drill(
     from undertow.runtime.drill_live import kill_drill, live_drill
 
     console = terminal()
-    console.width = max(console.width, 140)  # rows may wrap, but no cell is cut
     if kills is not None:
         with progress_bar() as progress:
             killed = kill_drill(kills, seed=seed, progress=progress)
-        console.print(tables.kill_table(killed), crop=False, soft_wrap=True)
-        if not all(one.passed for one in killed):
+        console.print(tables.kill_table(killed))
+        sound = sum(one.passed for one in killed if not one.stopped_by)
+        say(
+            console,
+            f"{sound} of {kills} kills of running controllers as they should be, seed {seed}",
+        )
+        if sound < kills or not all(one.passed for one in killed):
             raise typer.Exit(1)
         return
     with progress_bar() as progress:
         outcomes = simulated_drill(seed=seed, progress=progress)
         lived = live_drill(progress) if live else ()
-    console.print(tables.drill_table(outcomes, lived), crop=False, soft_wrap=True)
+    console.print(tables.drill_table(outcomes, lived))
     passed = [*(o.passed for o in outcomes), *(o.passed for o in lived)]
     say(console, f"{sum(passed)} of {len(passed)} as they should be, seed {seed}")
     if not all(passed):

@@ -4,6 +4,7 @@ from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Pu
 from undertow.rig.interface import Measurement, Rig
 from undertow.rig.mujoco_rig import MuJoCoRig
 from undertow.rig.presets import plausible_rig, srv02_rig
+from undertow.rig.python_file import check_rig, rig_from_file
 from undertow.rig.simulated import IdealRig, RealisticRig
 
 __all__ = [
@@ -19,6 +20,8 @@ __all__ = [
     "RealisticRig",
     "Rig",
     "Timing",
+    "check_rig",
     "plausible_rig",
+    "rig_from_file",
     "srv02_rig",
 ]

@@ -15,6 +15,7 @@ from undertow.delay import weakened
 from undertow.errors import InvalidInputError, UndertowError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.modelling import mechanism_from_file
 from undertow.plan import Plan
 from undertow.practice import (
     RESERVE,
@@ -42,7 +43,7 @@ class Recipe:
     Parameters
     ----------
     mechanism
-        Name in the library.
+        Name in the library, or ``FILE.py:NAME`` for one's own.
     parameters
         Values that differ from the library's, SI units.
     start
@@ -86,12 +87,14 @@ class Recipe:
     @cached_property
     def belief(self) -> Mechanism:
         """The controller's model."""
+        if ".py:" in self.mechanism:
+            return mechanism_from_file(self.mechanism).with_parameters(**self.parameters)
         if self.mechanism not in mechanisms.LIBRARY:
             raise InvalidInputError(
                 "mechanism of a run",
                 value=repr(self.mechanism),
                 limit=f"one of {', '.join(mechanisms.LIBRARY)}",
-                remedy="A mechanism of your own is run from Python: undertow.runtime.Runtime",
+                remedy="One of your own is FILE.py:NAME",
             )
         return mechanisms.LIBRARY[self.mechanism]().with_parameters(**self.parameters)
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from typing import Any
 
+from rich import box
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
@@ -23,12 +26,16 @@ __all__ = ["drill_table", "kill_table", "replay_table", "run_table"]
 EDGES = (0.0, 50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, math.inf)
 
 
+#: Look of every table: no frame, as in the trials.
+_PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
+
+
 def _micro(seconds: float) -> str:
     return f"{1e6 * seconds:,.0f}"
 
 
 def _times(rows: Iterable[tuple[str, Histogram]]) -> Table:
-    table = Table("time, µs", "p50", "p99", "p99.9", "max", title_justify="left")
+    table = Table("time, µs", "p50", "p99", "p99.9", "max", **_PLAIN)
     for column in table.columns[1:]:
         column.justify = "right"
     for name, histogram in rows:
@@ -38,7 +45,7 @@ def _times(rows: Iterable[tuple[str, Histogram]]) -> Table:
 
 
 def _histogram(whole: Histogram) -> Table:
-    table = Table("due to written", "steps", "", title_justify="left")
+    table = Table("due to written", "steps", "", **_PLAIN)
     table.columns[1].justify = "right"
     counts = whole.between(EDGES)
     most = max(1, *counts)
@@ -68,11 +75,12 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         Whether the time was simulated: then no times are shown.
     """
     lines = Table.grid(padding=(0, 2))
+    lines.add_column(max_width=24)
     lines.add_row("steps", f"{report.steps:,}")
     if not simulated:
         part = report.missed / max(1, report.steps)
         lines.add_row(
-            f"missed deadlines of {1e3 * period:g} ms",
+            f"missed deadlines, {1e3 * period:g} ms",
             f"{report.missed:,} ({part:.3%}), {report.asleep:,} of them woken too late by the "
             f"system; {report.skipped:,} periods skipped",
         )
@@ -84,7 +92,10 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
     )
     lines.add_row("states", f"IDLE → {path}" if path else "IDLE")
     if report.mode == Mode.SAFE_STOP:
-        lines.add_row("stopped by", report.stopped_by)
+        lines.add_row("stopped by", escape(report.stopped_by))
+    failures = Counter(text for _, what, text in report.events if what == "rig")
+    for text, count in failures.most_common(3):
+        lines.add_row("the rig", escape(f"{count:,} times {text}"))
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in report.answers.most_common())
     lines.add_row("answers of the optimiser", verdicts or "none")
     seconds = max(1, report.steps) * period
@@ -100,7 +111,7 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
             ("woken late", report.late),
         )
     )
-    return Group(lines, Text(), times, Text(), _histogram(report.whole))
+    return Group(lines, times, _histogram(report.whole))
 
 
 def replay_table(result: Replay) -> Table:
@@ -128,41 +139,42 @@ def replay_table(result: Replay) -> Table:
 
 
 def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -> Table:
-    """Return what happened in the drill, a row a fault."""
-    table = Table("what fails", "how", "what happened", "largest |u|", "replay", "")
-    table.columns[0].no_wrap = table.columns[1].no_wrap = True
+    """Return what happened in the drill, a row a fault, under what fails."""
+    table = Table("what fails, and how", "what happened", "|u|/limit", "", **_PLAIN)
+    table.columns[0].ratio, table.columns[1].ratio = 4, 6
+    table.columns[2].justify = "right"
     part = ""
     for outcome in outcomes:
         case = outcome.case
         if case.part != part:
-            table.add_section()
+            part = case.part
+            table.add_row(f"[bold]{part}[/bold]")
+        happened = escape(outcome.happened)
+        if not outcome.replayed:
+            happened += "; [red]its replay differs[/red]"
         table.add_row(
-            case.part if case.part != part else "",
-            case.name,
-            escape(outcome.happened),
-            f"{outcome.largest:.0%} of the limit",
-            "same bits" if outcome.replayed else "[red]differs[/red]",
-            _mark(outcome.passed),
+            f"  {escape(case.name)}", happened, f"{outcome.largest:.0%}", _mark(outcome.passed)
         )
-        part = case.part
-    table.add_section()
-    for one in live:
-        table.add_row(one.part, one.name, escape(one.happened), "", "", _mark(one.passed))
+    for number, one in enumerate(live):
+        if number == 0:
+            table.add_row("[bold]against the clock[/bold]")
+        table.add_row(
+            f"  {escape(f'{one.part}: {one.name}')}", escape(one.happened), "", _mark(one.passed)
+        )
     return table
 
 
-def kill_table(killed: Sequence[Killed]) -> Table:
-    """Return what was left of runs that were killed."""
-    table = Table(
-        "killed at, s", "steps in the log", "missing, ms", "replay", "output zero, ms", ""
-    )
+def kill_table(killed: Sequence[Killed]) -> Group:
+    """Return what was left of runs that were killed, and of those that had stopped before."""
+    table = Table("killed at, s", "steps", "missing, ms", "replay", "zero after, ms", "", **_PLAIN)
     for column in table.columns[:5]:
         column.justify = "right"
+    running = [one for one in killed if not one.stopped_by]
     for one in killed:
         table.add_row(
             f"{one.moment:.3f}",
             f"{one.steps:,}",
-            f"{1e3 * one.missing:.0f}",
+            "had stopped" if one.stopped_by else f"{1e3 * one.missing:.0f}",
             "same bits" if one.identical else "[red]differs[/red]",
             f"{1e3 * one.to_zero:.0f}",
             _mark(one.passed),
@@ -171,12 +183,17 @@ def kill_table(killed: Sequence[Killed]) -> Table:
     table.add_row(
         f"{len(killed)} runs",
         "",
-        f"at most {1e3 * max(one.missing for one in killed):.0f}",
+        f"≤ {1e3 * max((one.missing for one in running), default=math.nan):.0f}",
         f"{sum(one.identical for one in killed)} same",
-        f"at most {1e3 * max(one.to_zero for one in killed):.0f}",
+        f"≤ {1e3 * max(one.to_zero for one in killed):.0f}",
         f"{sum(one.passed for one in killed)} of {len(killed)}",
     )
-    return table
+    reasons = Counter(one.stopped_by for one in killed if one.stopped_by)
+    lines = [
+        Text(f"{count} had stopped safely before the kill, and another was killed: {reason}")
+        for reason, count in reasons.most_common()
+    ]
+    return Group(table, *lines)
 
 
 def _mark(passed: bool) -> str:
