@@ -16,8 +16,9 @@ from undertow.rig import IdealRig
 from undertow.runtime import InlineWorker, Runtime, SimulatedClock, respond
 from undertow.runtime.cases import CASES, Case
 from undertow.runtime.drill import Outcome, drill, drill_recipe, run_case
-from undertow.runtime.drill_live import kill_drill, live_drill
+from undertow.runtime.drill_live import Killed, _ending, kill_drill, live_drill
 from undertow.runtime.faults import Witness
+from undertow.runtime.log import Columns, read_log
 from undertow.runtime.tables import drill_table
 
 RECIPE = replace(drill_recipe(), evaluations=32, horizon=10.0)
@@ -42,8 +43,10 @@ QUICK = [
     ("sensor", "spikes of 1 rad"),
     ("sensor", "sign swapped"),
     ("sensor", "clock goes back once"),
+    ("sensor", "one too many for 10 ms"),
     ("actuator", "sign swapped"),
     ("rig", "fails to write for good"),
+    ("rig", "hangs for 90 ms"),
     ("rig", "hangs for 0.3 s"),
     ("loop", "estimator raises"),
     ("operator", "stops the run"),
@@ -96,7 +99,7 @@ def test_an_outcome_with_one_bad_output_does_not_pass(tmp_path: Path) -> None:
         replace(good, held=False),
     ):
         assert not spoilt.passed
-    assert drill_table([good]).row_count == 1
+    assert drill_table([good]).row_count == 2  # what fails, and how
 
 
 def test_the_drill_looks_at_the_slew_rate(tmp_path: Path) -> None:
@@ -106,6 +109,20 @@ def test_the_drill_looks_at_the_slew_rate(tmp_path: Path) -> None:
     worker = InlineWorker(lambda request: respond(RECIPE.cascade, request))
     Runtime(controller, witness, worker, clock=SimulatedClock()).run(0.1)
     assert any("slew" in fault for fault in witness.faults)
+
+
+def test_a_run_that_stopped_by_itself_is_told_from_one_that_was_killed(tmp_path: Path) -> None:
+    """From its log: the reason of its stop; but a log that is cut off anywhere tells of none."""
+    assert short(case("rig", "fails to read for good"), tmp_path).passed
+    recording, columns = read_log(tmp_path / "log.db"), Columns.of(RECIPE.belief)
+    assert "no answer from the card" in _ending(recording, columns)
+    for rows in (1, 100, len(recording.steps) - 1):
+        assert _ending(replace(recording, steps=recording.steps[:rows]), columns) == ""
+    one = Killed(1.7, 388, 1.3, True, 0.02)
+    assert not one.passed
+    assert replace(one, stopped_by="lost").passed
+    assert not replace(one, stopped_by="lost", identical=False).passed
+    assert not replace(one, stopped_by="lost", to_zero=0.2).passed
 
 
 # -- the whole of it --------------------------------------------------------------------------
@@ -126,6 +143,10 @@ def test_the_live_part_of_the_drill_passes() -> None:
 
 @pytest.mark.slow
 def test_fifty_runs_killed_at_random_moments() -> None:
-    """Every log opens, at most 0.1 s is missing, every replay is identical bit for bit."""
+    """Every log opens, at most 0.1 s is missing, every replay is identical bit for bit.
+
+    All 50 are going on when they are killed: what had stopped by itself comes on top.
+    """
     killed = kill_drill(50)
     assert [one for one in killed if not one.passed] == []
+    assert sum(not one.stopped_by for one in killed) == 50

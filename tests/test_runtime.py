@@ -21,16 +21,20 @@ from undertow.errors import InvalidInputError
 from undertow.plan import Plan
 from undertow.rig import Measurement, Push, RealisticRig
 from undertow.runtime import (
+    Columns,
     Command,
     Controller,
     InlineWorker,
     Inputs,
+    Log,
     Mode,
     Recipe,
     Runtime,
     Settings,
     SimulatedClock,
+    about,
     background_worker,
+    read_log,
     replay,
     respond,
 )
@@ -413,6 +417,116 @@ def test_histogram_quantiles_are_right_to_a_microsecond() -> None:
     assert math.isnan(Histogram().quantile(0.5))
 
 
+class Careless:
+    """A rig that keeps what it is given, changes it, and writes over what it gave."""
+
+    def __init__(self, rig: RealisticRig) -> None:
+        self.rig, self.period = rig, rig.period
+        self.q, self.calls = np.zeros(2), list[str]()
+
+    def read(self) -> Measurement:
+        measurement = self.rig.read()
+        self.q[:] = measurement.q
+        return replace(measurement, q=self.q)
+
+    def write(self, u: np.ndarray) -> None:
+        self.rig.write(u)
+        self.q += 0.1
+        u *= -2.0
+
+    def close(self) -> None:
+        message = "cannot be closed"
+        raise RuntimeError(message)
+
+
+def test_a_careless_rig_changes_neither_the_run_nor_its_log(
+    memory: CascadeState, tmp_path: Path
+) -> None:
+    """The loop owns its readings and its outputs; a rig that cannot be closed ends no run."""
+    outputs = []
+    for careless in (False, True):
+        controller = RECIPE.make_controller(memory)
+        rig = Careless(RECIPE.make_rig()) if careless else RECIPE.make_rig()
+        worker = InlineWorker(RECIPE.respond)
+        path = tmp_path / f"{careless}.db"
+        columns = Columns.of(RECIPE.belief)
+        with Log(path, columns, about(controller, RECIPE), threaded=False) as log:
+            runtime = Runtime(controller, rig, worker, clock=SimulatedClock(), log=log)
+            assert runtime.run(0.3).stopped_by == "operator: stop"
+        assert replay(path).identical
+        outputs.append(read_log(path)["voltage"])
+    np.testing.assert_array_equal(outputs[0], outputs[1])
+
+
+class Broken:
+    """A worker that fails in all it is asked."""
+
+    def ask(self, request: Request) -> None:
+        message = "no line"
+        raise OSError(message)
+
+    def take(self, t: float) -> Answer | None:
+        message = "no line"
+        raise OSError(message)
+
+    def replace(self) -> bool:
+        message = "no line"
+        raise OSError(message)
+
+    def close(self) -> None:
+        """Nothing to stop."""
+
+
+def test_a_worker_that_fails_leaves_the_last_plan(controller: Controller) -> None:
+    report = Runtime(controller, RECIPE.make_rig(), Broken(), clock=SimulatedClock()).run(0.8)
+    assert report.stopped_by == "operator: stop"
+    assert ("optimiser", "OSError: no line") in {(what, text) for _, what, text in report.events}
+
+
+def test_a_stop_before_the_run_is_kept_and_a_second_run_refused(controller: Controller) -> None:
+    runtime = Runtime(
+        controller, RECIPE.make_rig(), InlineWorker(RECIPE.respond), clock=SimulatedClock()
+    )
+    runtime.stop()
+    assert runtime.run(1.0).stopped_by == "operator: stop"
+    assert runtime.report.steps == 1
+    with pytest.raises(InvalidInputError, match="another session"):
+        runtime.run(1.0)
+
+
+def test_a_rig_of_another_period_is_refused(controller: Controller) -> None:
+    rig = replace(RECIPE, period=0.002).make_rig()
+    with pytest.raises(InvalidInputError, match="period of the rig"):
+        Runtime(controller, rig, InlineWorker(RECIPE.respond), clock=SimulatedClock())
+
+
+def test_what_the_watchdog_let_go_of_is_neither_read_nor_written_again(
+    controller: Controller,
+) -> None:
+    """A read that blocks: the run ends in a safe stop whose reason is in its events."""
+
+    class Blocking(Careless):
+        def read(self) -> Measurement:
+            self.calls.append("read")
+            if len(self.calls) == 101:
+                time.sleep(0.4)
+            return self.rig.read()
+
+        def write(self, u: np.ndarray) -> None:
+            self.calls.append("write")
+            self.rig.write(u)
+
+        def close(self) -> None:
+            self.calls.append("close")
+
+    rig = Blocking(RECIPE.make_rig())
+    report = Runtime(controller, rig, background_worker(RECIPE.respond, processes=0)).run(1.0)
+    assert "watchdog" in report.stopped_by
+    assert report.mode == Mode.SAFE_STOP
+    assert any("watchdog" in text for _, what, text in report.events if what == "state")
+    assert set(rig.calls[rig.calls.index("close") :]) == {"close"}
+
+
 # -- processes ------------------------------------------------------------------------------------
 
 
@@ -497,6 +611,75 @@ def test_a_keeper_brings_the_output_to_zero_when_its_controller_falls_silent(
     finally:
         rig.close()
     assert not rig.process.is_alive()
+
+
+def test_a_keeper_that_was_held_up_applies_the_newest_output_alone(tmp_path: Path) -> None:
+    """Not all that has queued in one rush; and what a terminal sends does not reach it."""
+    limits, slew = np.array([15.0]), np.array([7.5])
+    written = tmp_path / "written"
+
+    class Told(Witness):
+        def write(self, u: np.ndarray) -> None:
+            super().write(u)
+            with written.open("a") as file:
+                file.write(f"{float(u[0])}\n")
+
+    rig = KeptRig(lambda: Told(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew)
+    try:
+        pid = rig.process.pid or 0
+        assert os.getsid(pid) != os.getsid(0)
+        os.kill(pid, signal.SIGSTOP)
+        for u in (1.0, 2.0, 3.0, 4.0, 5.0):
+            rig.write(np.array([u]))
+        with pytest.raises(TimeoutError, match="keeper"):
+            rig.read()
+        os.kill(pid, signal.SIGCONT)
+    finally:
+        rig.close()
+    assert [float(line) for line in written.read_text().split()] == [5.0, 0.0]
+
+
+def test_a_keeper_outlives_a_rig_that_fails_and_says_so() -> None:
+    """A failed read or write is the controller's to judge; it comes to zero all the same."""
+    limits, slew = np.array([15.0]), np.array([7.5])
+
+    class Failing(Witness):
+        calls = 0
+
+        def read(self) -> Measurement:
+            self.calls += 1
+            if self.calls == 2:
+                message = "no reading"
+                raise OSError(message)
+            return super().read()
+
+        def write(self, u: np.ndarray) -> None:
+            if self.calls == 2:
+                self.calls += 1
+                message = "no output"
+                raise OSError(message)
+            super().write(u)
+
+    rig = KeptRig(lambda: Failing(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew, silence=9.0)
+
+    def read() -> Measurement:
+        assert rig._pipe.poll(10.0)
+        return rig.read()
+
+    try:
+        rig.write(np.array([5.0]))
+        with pytest.raises(OSError, match="no reading"):
+            read()
+        rig.write(np.array([5.0]))
+        assert read().q.shape == (2,)
+        with pytest.raises(OSError, match="no output"):
+            rig.write(np.array([5.0]))
+        read()
+        rig.write(np.array([5.0]))
+    finally:
+        rig.close()
+    assert not rig.process.is_alive()
+    assert rig.process.exitcode == 0
 
 
 @pytest.mark.slow

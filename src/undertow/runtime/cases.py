@@ -100,14 +100,14 @@ def _nothing(proposal: Proposal) -> Proposal:
     return replace(proposal, plan=None, status="infeasible", cost=math.inf, message="none found")
 
 
-def _text(_: Proposal) -> Any:
+def _text(_: object) -> Any:
     return "a surface, surely"
 
 
 # -- answers on their way ----------------------------------------------------------------------
 
 
-def _arrives(*delays: float, change: Callable[[Answer], Answer] = lambda a: a) -> Any:
+def _arrives(*delays: float, change: Callable[[Answer], Any] = lambda a: a) -> Any:
     """Each answer arrives, changed, after each of the delays, s."""
     return lambda: lambda answer: [(delay, change(answer)) for delay in delays]
 
@@ -191,8 +191,12 @@ def _drift(t: float, q: FloatArray) -> FloatArray:
     return q
 
 
-def _clock(shift: Callable[[float], float]) -> Callable[[], Sense]:
-    return lambda: lambda t, m: replace(m, t=m.t + shift(t))
+def _clock(shift: Callable[[float], float], until: float = math.inf) -> Callable[[], Sense]:
+    return lambda: lambda t, m: replace(m, t=m.t + shift(t)) if t <= until else m
+
+
+def _one_too_many(until: float = math.inf) -> Callable[[], Sense]:
+    return lambda: lambda t, m: replace(m, q=np.append(m.q, 0.0)) if t <= until else m
 
 
 def _read_fails(until: float) -> Callable[[], Sense]:
@@ -261,6 +265,7 @@ CASES: tuple[Case, ...] = (
         "answer", "numbers turned to NaN", True,
         answers=_arrives(0.0, change=lambda a: replace(a, lanes=a.lanes * math.nan)),
     ),
+    Case("answer", "is none at all", True, answers=_arrives(0.0, change=_text)),
     Case(
         "answer", "cut short", True,
         answers=_arrives(0.0, change=lambda a: replace(a, lanes=a.lanes[:, 1:])),
@@ -271,6 +276,8 @@ CASES: tuple[Case, ...] = (
     Case("sensor", "one channel lost for good", False, sensor=_sensor(_lost(-1))),
     Case("sensor", "all channels freeze", False, sensor=_frozen()),
     Case("sensor", "one channel freezes", False, sensor=_frozen(-1)),
+    Case("sensor", "one too many for 10 ms", True, sensor=_one_too_many(0.01)),
+    Case("sensor", "one too many for good", False, sensor=_one_too_many()),
     Case("sensor", "spikes of 1 rad", True, sensor=_sensor(_spikes)),
     Case("sensor", "infinite now and then", True, sensor=_sensor(_infinite)),
     Case("sensor", "sign swapped", False, sensor=_sensor(_flipped)),
@@ -278,6 +285,7 @@ CASES: tuple[Case, ...] = (
     Case("sensor", "drifts by 2 rad/s", False, sensor=_sensor(_drift)),
     Case("sensor", "clock goes back once", True, sensor=_clock(lambda _: -5.0)),
     Case("sensor", "clock runs backwards", False, sensor=_clock(lambda t: -2.0 * t)),
+    Case("sensor", "clock is no number for 10 ms", True, sensor=_clock(lambda _: math.nan, 0.01)),
     Case("sensor", "clock stands still", False, sensor=_clock(lambda t: -t)),
     Case(
         "actuator", "gives 75 % of what is asked", True,
@@ -296,6 +304,8 @@ CASES: tuple[Case, ...] = (
     Case("rig", "fails to read for good", False, sensor=_read_fails(math.inf)),
     Case("rig", "fails to write for 10 ms", True, actuator=_write_fails(0.01)),
     Case("rig", "fails to write for good", False, actuator=_write_fails(math.inf)),
+    Case("rig", "hangs for 25 ms", True, hang=Hang(0.025)),
+    Case("rig", "hangs for 90 ms", True, hang=Hang(0.09)),
     Case("rig", "hangs for 0.3 s", False, hang=Hang(0.3)),
     Case("rig", "is pushed", True, push=0.01),
     Case("rig", "is knocked over", False, push=0.08),

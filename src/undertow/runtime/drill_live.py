@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing.context import ForkProcess
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +22,25 @@ from undertow.rig.interface import Measurement, Rig
 from undertow.runtime.drill import drill_recipe
 from undertow.runtime.faults import Witness
 from undertow.runtime.keeper import KeptRig
-from undertow.runtime.log import read_log
+from undertow.runtime.log import Columns, Recording, read_log
 from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.modes import Mode
 from undertow.runtime.processes import fork
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import replay
 from undertow.runtime.session import session
 from undertow.runtime.slow import BackgroundWorker
 
-__all__ = ["LIVE", "Killed", "LiveOutcome", "kill_drill", "kill_run", "live_drill"]
+__all__ = [
+    "ATTEMPTS",
+    "LIVE",
+    "Killed",
+    "LiveOutcome",
+    "kill_drill",
+    "kill_run",
+    "kill_running",
+    "live_drill",
+]
 
 
 @dataclass(frozen=True)
@@ -107,6 +118,48 @@ def _blocking_read() -> LiveOutcome:
     return LiveOutcome("rig", "a read blocks for 1 s", happened, 0 < after < 0.5)
 
 
+def _keeper() -> LiveOutcome:
+    """Stop the keeper for a while: the controller is blind, and must not go on."""
+    recipe = drill_recipe()
+    limits = recipe.settings.limits(recipe.belief)
+    slew = recipe.settings.slew(recipe.belief) * recipe.period
+    recipe.make_rig().write(np.zeros_like(limits))
+    rig = KeptRig(recipe.make_rig, recipe.period, limits, slew)
+    pid = rig.process.pid or 0
+    with session(recipe, rig=rig, processes=1) as runtime:
+        for after, number in ((0.5, signal.SIGSTOP), (0.9, signal.SIGCONT)):
+            threading.Timer(after, os.kill, (pid, number)).start()
+        report = runtime.run(2.0)
+    told = "keeper does not answer" in report.stopped_by
+    gone = not rig.process.is_alive()
+    return LiveOutcome("keeper", "stands still", report.stopped_by, told and gone)
+
+
+def _process_stands_still() -> LiveOutcome:
+    """Stop controller and clock of a run for 40 ms, as a busy host does."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "run.db"
+        recipe = drill_recipe()
+        victim = fork(_victim, (recipe, log, log.with_suffix(".json")), "victim", daemon=False)
+        first, pid = _first_line(log, victim), victim.pid or 0
+        for moment, number in (
+            (0.5, signal.SIGSTOP),
+            (0.54, signal.SIGCONT),
+            (1.0, signal.SIGTERM),
+        ):
+            time.sleep(max(0.0, first + moment - time.perf_counter()))
+            os.kill(pid, number)
+        victim.join()
+        recording = read_log(log)
+        gap = float(np.diff(recording["clock"]).max())
+        reason = _ending(recording, Columns.of(recipe.belief))
+        same = replay(log).identical
+    held = reason == "operator: stop"
+    happened = f"no step for {1e3 * gap:.0f} ms; {'held to the end' if held else reason}"
+    right = held if gap <= recipe.settings.stall else reason.startswith("no step for")
+    return LiveOutcome("process", "stands still, 40 ms", happened, right and same and gap > 0.03)
+
+
 def _unwritable_log() -> LiveOutcome:
     recipe = drill_recipe()
     with tempfile.TemporaryDirectory() as folder:
@@ -117,6 +170,10 @@ def _unwritable_log() -> LiveOutcome:
                 return LiveOutcome("log", "cannot be made", "the run began", False)
         except ArtefactError as error:
             return LiveOutcome("log", "cannot be made", f"refused before the run: {error}", True)
+
+
+#: Runs that may stop safely by themselves before one can be killed while it goes on.
+ATTEMPTS = 10
 
 
 @dataclass(frozen=True)
@@ -135,6 +192,9 @@ class Killed:
         Whether the log's replay is identical, bit for bit.
     to_zero
         Time from the last output of the controller until the keeper had brought it to zero, s.
+    stopped_by
+        Why the run had ended before the kill, in a safe stop of its own with the output at zero,
+        as its log tells; empty when the kill ended it.
     """
 
     moment: float
@@ -142,11 +202,17 @@ class Killed:
     missing: float
     identical: bool
     to_zero: float
+    stopped_by: str = ""
 
     @property
     def passed(self) -> bool:
-        """Whether at most 0.1 s is missing, the replay identical, and the output at zero soon."""
-        return self.missing <= 0.1 and self.identical and self.to_zero <= 0.1
+        """Whether the log is whole, the replay identical, and the output at zero soon.
+
+        Of a run that was going on at most 0.1 s may be missing; the log of one that had stopped
+        tells of its stop.
+        """
+        whole = bool(self.stopped_by) or self.missing <= 0.1
+        return whole and self.identical and self.to_zero <= 0.1
 
 
 def _victim(recipe: Recipe, log: Path, record: Path) -> None:
@@ -172,63 +238,88 @@ def kill_run(recipe: Recipe, moment: float, folder: Path) -> Killed:
     """
     log, record = folder / "killed.db", folder / "keeper.json"
     victim = fork(_victim, (recipe, log, record), "undertow victim", daemon=False)
-    assert victim.pid is not None  # it has just been started
-    first = _first_line(log)
+    first = _first_line(log, victim)
     time.sleep(max(0.0, first + moment - time.perf_counter()))
-    os.kill(victim.pid, signal.SIGKILL)
+    victim.kill()
     killed = time.perf_counter()
     victim.join()
     recording = read_log(log)
-    last = float(recording["clock"][-1])
     deadline = time.perf_counter() + 5.0
     while not record.exists() and time.perf_counter() < deadline:
         time.sleep(0.01)
     time.sleep(0.01)
     facts = json.loads(record.read_text())
     return Killed(
-        killed - float(recording["clock"][0]),
+        killed - first,
         len(recording.steps),
-        killed - last,
+        killed - float(recording["clock"][-1]),
         replay(log).identical,
         facts["zero"] - facts["heard"] if not any(facts["u"]) else float("inf"),
+        _ending(recording, Columns.of(recipe.belief)),
     )
 
 
-def _first_line(log: Path, patience: float = 120.0) -> float:
+def _ending(recording: Recording, columns: Columns) -> str:
+    """Why the run of a log had ended in a safe stop, its output at zero; empty if it had not."""
+    if recording["mode"][-1] != Mode.SAFE_STOP or recording.steps[-1, columns.u].any():
+        return ""
+    reasons = [text for _, _, kind, text in recording.events if kind == "state"]
+    return reasons[-1].partition("SAFE_STOP: ")[2] or "no reason in the log"
+
+
+def _first_line(log: Path, victim: ForkProcess, patience: float = 120.0) -> float:
     """Wait until the log has its first step; return when that was made, s."""
     deadline = time.perf_counter() + patience
-    while time.perf_counter() < deadline:
+    while time.perf_counter() < deadline and victim.is_alive():
         with contextlib.suppress(ArtefactError):
             recording = read_log(log)
             if len(recording.steps):
                 return float(recording["clock"][0])
         time.sleep(0.02)
-    raise ArtefactError(f"log '{log}'", value="no step within two minutes")
+    value = "no step within two minutes" if victim.is_alive() else "no step: the run has failed"
+    raise ArtefactError(f"log '{log}'", value=value)
 
 
 def _process_killed() -> LiveOutcome:
-    with tempfile.TemporaryDirectory() as folder:
-        killed = kill_run(drill_recipe(), 0.7, Path(folder))
+    *stopped, killed = kill_running(drill_recipe(), 0.7)
     happened = (
         f"killed at {killed.moment:.2f} s: the keeper had the output at zero "
         f"{1e3 * killed.to_zero:.0f} ms after the last one; the log misses "
         f"{1e3 * killed.missing:.0f} ms; replay {'identical' if killed.identical else 'differs'}"
     )
-    return LiveOutcome("process", "controller killed", happened, killed.passed)
+    if stopped:
+        happened += f"; {len(stopped)} had stopped by themselves: {stopped[-1].stopped_by}"
+    passed = not killed.stopped_by and all(one.passed for one in (*stopped, killed))
+    return LiveOutcome("process", "controller killed", happened, passed)
+
+
+def kill_running(recipe: Recipe, moment: float) -> tuple[Killed, ...]:
+    """Kill a run that is going on, see :func:`kill_run`.
+
+    One that had stopped safely by itself is followed by another, to be killed at the same
+    moment: the last of those returned is the one that was going on, if there was any.
+    """
+    killed: list[Killed] = []
+    while not killed or (killed[-1].stopped_by and len(killed) < ATTEMPTS):
+        with tempfile.TemporaryDirectory() as folder:
+            killed.append(kill_run(recipe, moment, Path(folder)))
+    return tuple(killed)
 
 
 def kill_drill(
     count: int, *, seed: int = 0, progress: Callable[[str, float], None] | None = None
 ) -> tuple[Killed, ...]:
-    """Kill ``count`` runs at random moments of their first two seconds."""
+    """Kill ``count`` runs that are going on at random moments of their first two seconds.
+
+    Those that had stopped safely by themselves before are returned with them.
+    """
     recipe, rng = drill_recipe(seed), np.random.default_rng(seed)
     recipe.cascade.start(recipe.x0)  # what the runs share is compiled once
-    killed = []
+    killed: list[Killed] = []
     for number, moment in enumerate(rng.uniform(0.0, 2.0, count)):
         if progress is not None:
             progress(f"kill {number + 1} of {count}, at {moment:.2f} s", number / count)
-        with tempfile.TemporaryDirectory() as folder:
-            killed.append(kill_run(recipe, float(moment), Path(folder)))
+        killed += kill_running(recipe, float(moment))
     return tuple(killed)
 
 
@@ -238,6 +329,8 @@ LIVE: tuple[tuple[str, Callable[[], LiveOutcome]], ...] = (
     ("optimiser: process stands still", lambda: _optimiser(signal.SIGSTOP)),
     ("rig: a read blocks", _blocking_read),
     ("log: cannot be made", _unwritable_log),
+    ("keeper: stands still", _keeper),
+    ("process: stands still, 40 ms", _process_stands_still),
     ("process: controller killed", _process_killed),
 )
 

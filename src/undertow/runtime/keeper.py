@@ -2,7 +2,8 @@
 
 The rig lives in the keeper.  When the controller falls silent, or is killed, the keeper
 brings the output to zero within its slew rate and lets go: the safe stop that a dead
-process cannot make.
+process cannot make.  It has a session of its own, which the signals of a terminal
+(Ctrl-C, Ctrl-Z, a lost connection) do not reach.
 """
 
 from __future__ import annotations
@@ -14,16 +15,28 @@ import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
 from undertow.runtime.clock import prompt
-from undertow.runtime.processes import fork, pipe
+from undertow.runtime.processes import fork, pipe, withdraw
 from undertow.runtime.steps import confine
 
 __all__ = ["KeptRig"]
+
+#: How long a rig that takes no output is asked again to take zero, s.
+INSISTENCE = 1.0
+
+
+class _Reply(NamedTuple):
+    """What the keeper says after an output: the reading, and what failed, in words."""
+
+    measurement: Measurement | None
+    read: str
+    write: str
 
 
 class KeptRig:
@@ -61,8 +74,8 @@ class KeptRig:
             daemon=False,
         )
         theirs.close()
-        self._last: Measurement = self._pipe.recv()
-        self._asked = 0
+        self._said: _Reply = self._pipe.recv()
+        self._asked = False
 
     def read(self) -> Measurement:
         """Return the measurement that the keeper took after the last output.
@@ -73,24 +86,37 @@ class KeptRig:
             When the keeper does not answer within half a period.
         EOFError
             When it is gone.
+        OSError
+            When the rig could not be read.
         """
         if self._asked:
             if not self._pipe.poll(0.5 * self.period):
                 message = "the keeper does not answer"
                 raise TimeoutError(message)
-            while self._asked and self._pipe.poll(0.0):  # late answers too: the newest counts
-                self._last = self._pipe.recv()
-                self._asked -= 1
-        return self._last
+            while self._pipe.poll(0.0):  # late answers too: the newest counts
+                self._said = self._pipe.recv()
+            self._asked = False
+        if self._said.measurement is None:
+            raise OSError(self._said.read)
+        return self._said.measurement
 
     def write(self, u: FloatArray) -> None:
-        """Hand the output to the keeper."""
+        """Hand the output to the keeper.
+
+        Raises
+        ------
+        OSError
+            When the keeper is gone, or the rig did not take the output before.
+        """
         self._pipe.send(u)
-        self._asked += 1
+        self._asked = True
+        if self._said.write:
+            raise OSError(self._said.write)
 
     def close(self) -> None:
         """Let the keeper bring the output to zero and let go."""
         with contextlib.suppress(OSError):
+            self._pipe.send(None)
             self._pipe.close()
         self.process.join(timeout=1.0)
 
@@ -107,7 +133,7 @@ def _keep(
 ) -> None:
     """Apply what comes; once nothing comes, bring the output to zero."""
     theirs.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    withdraw()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with prompt():
         facts = _hold(make(), ours, period, limits, slew, silence)
@@ -123,34 +149,57 @@ def _hold(
     slew: FloatArray,
     silence: float,
 ) -> dict[str, object]:
+    """Return what was done: when an output last came, when it was zero, the largest, the last."""
     u, zero, largest = np.zeros_like(limits), np.zeros_like(limits), 0.0
     heard = at_zero = time.perf_counter()
-    gone = False
-    with contextlib.suppress(OSError):
-        ours.send(rig.read())
-    while not gone or u.any():
+    failure, gone = "", False
+    _reply(ours, rig, failure)
+    while not gone or u.any() or (failure and time.perf_counter() < heard + INSISTENCE):
         wanted = None
         try:
             if gone:
                 time.sleep(period)
-            elif ours.poll(period if u.any() else silence):
+            elif ours.poll(period if u.any() or failure else silence):
                 wanted = ours.recv()
+                while wanted is not None and ours.poll(0.0):
+                    wanted = ours.recv()  # after a stall outputs have queued: the newest counts
+                gone = wanted is None
         except (EOFError, OSError):
             gone = True
         now = time.perf_counter()
         if wanted is not None:
             heard = now
             confine(wanted, u, limits, slew)
-        elif u.any() and (gone or now - heard > silence):
+        elif (u.any() or failure) and (gone or now - heard > silence):
             confine(zero, u, limits, slew)
         else:
             continue
         largest = max(largest, float(np.max(np.abs(u))))
-        rig.write(u)
-        if not u.any():
+        failure = _attempt(rig, u)
+        if not u.any() and not failure:
             at_zero = time.perf_counter()
         if wanted is not None:
-            with contextlib.suppress(OSError):
-                ours.send(rig.read())
-    rig.close()
-    return {"heard": heard, "zero": at_zero, "largest": largest, "u": u.tolist()}
+            _reply(ours, rig, failure)
+    with contextlib.suppress(Exception):  # a rig that failed may fail again
+        rig.close()
+    facts: dict[str, object] = {"heard": heard, "zero": at_zero, "largest": largest}
+    return {**facts, "u": u.tolist(), "failure": failure}
+
+
+def _attempt(rig: Rig, u: FloatArray) -> str:
+    """Write to the rig; return what failed, in words."""
+    try:
+        rig.write(u.copy())
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def _reply(ours: Connection, rig: Rig, failure: str) -> None:
+    """Read the rig, and tell the controller."""
+    try:
+        reply = _Reply(rig.read(), "", failure)
+    except Exception as error:
+        reply = _Reply(None, f"{type(error).__name__}: {error}", failure)
+    with contextlib.suppress(OSError):
+        ours.send(reply)

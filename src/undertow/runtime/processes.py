@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
+import os
+import signal
 import warnings
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
 from typing import Any
 
-__all__ = ["fork", "pipe"]
+__all__ = ["fork", "pipe", "withdraw"]
 
 
 def fork(
@@ -33,3 +36,14 @@ def fork(
 def pipe() -> tuple[Connection, Connection]:
     """Return the two ends of a pipe."""
     return multiprocessing.get_context("fork").Pipe()
+
+
+def withdraw() -> None:
+    """Leave this process to its own: what a terminal sends is for the one that controls.
+
+    Ctrl-C, Ctrl-Z and a lost connection reach every process of a session: a keeper that is
+    stopped or ended with its controller keeps nothing.
+    """
+    with contextlib.suppress(OSError):
+        os.setsid()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -25,6 +25,13 @@ from undertow.runtime.slow import (
 
 __all__ = ["session", "warm_up"]
 
+#: Signals that ask for a safe stop, where the system has them.
+STOPPING = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP", "SIGQUIT")
+    if hasattr(signal, name)
+)
+
 
 @contextlib.contextmanager
 def session(
@@ -110,7 +117,10 @@ def warm_up(recipe: Recipe, memory: CascadeState, compute: Compute) -> None:
 
 @contextlib.contextmanager
 def _operator(runtime: Runtime) -> Iterator[None]:
-    """Let Ctrl-C and a polite kill ask for a safe stop."""
+    """Let Ctrl-C, a polite kill and a lost terminal ask for a safe stop; and Ctrl-Z.
+
+    A process that is suspended leaves its output on.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -118,7 +128,11 @@ def _operator(runtime: Runtime) -> Iterator[None]:
     def stop(_signal: int, _frame: FrameType | None) -> None:
         runtime.stop()
 
-    before = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, stop)
+        for number in STOPPING
+        if signal.getsignal(number) is not signal.SIG_IGN  # `nohup` wants it so
+    }
     try:
         yield
     finally:

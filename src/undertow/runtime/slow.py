@@ -28,7 +28,7 @@ from undertow.inner_loop import lane
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
 from undertow.proposal import Proposal
-from undertow.runtime.processes import fork, pipe
+from undertow.runtime.processes import fork, pipe, withdraw
 from undertow.sliding import SlidingModeLaw
 from undertow.swing_up import SwingUpAndCatch
 
@@ -346,7 +346,7 @@ class _Child(_Computer):
 def _serve(compute: Compute, ours: Connection, theirs: Connection) -> None:
     """Answer requests until the other end is gone."""
     theirs.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the fast loop decides when to end
+    withdraw()  # the fast loop decides when to end
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with contextlib.suppress(OSError, AttributeError):  # Linux: do not outlive the fast loop
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
