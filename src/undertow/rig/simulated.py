@@ -71,7 +71,9 @@ class RealisticRig:
         self._delays = np.array(late, dtype=np.int64)
         self._counts = np.array([0, timing.steps, 0], dtype=np.int64)
         self._drive, self._held = np.zeros((3, m)), np.zeros((late[0] + 1, m))
-        self._past = np.tile(self._x[:n], (late[1] + 1, 1))
+        # Positions, and velocities too where they are measured.
+        seen = self._x[:n] if self._rates is None else self._x
+        self._past = np.tile(seen, (late[1] + 1, 1))
         self._applied, self._u = np.zeros(m), np.zeros(m)
         self._work = np.zeros((8, max(n * n, 2 * n)))
         self._t, self._lateness, self._samples = 0.0, 0.0, 0
@@ -145,7 +147,8 @@ class RealisticRig:
             return Measurement(self._t, self._q.copy())
         n = self.mechanism.n
         noise = self._noise[self._row - 1, 1 + n :]
-        return Measurement(self._t, self._q.copy(), self._x[n:] + self._rates * noise)
+        row = max(0, int(self._counts[0]) - int(self._delays[1])) % len(self._past)
+        return Measurement(self._t, self._q.copy(), self._past[row, n:] + self._rates * noise)
 
     def write(self, u: ArrayLike) -> None:
         """Apply the inputs u, (m,), and advance to the next sample.

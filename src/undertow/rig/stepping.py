@@ -89,7 +89,7 @@ def advance(
             counts[2] += end_stops(x, stops, W)
         t += h
         counts[0] = j + 1
-        for i in range(n):
+        for i in range(past.shape[1]):
             past[(j + 1) % past.shape[0], i] = x[i]
     measure(counts[0], past, delays[1], encoder, phase, noise, q)
     return t
