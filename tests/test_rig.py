@@ -185,6 +185,27 @@ def test_backlash_lets_the_motor_turn_before_the_joint(arm: ut.Mechanism) -> Non
     assert 0 < loose[-1, 0] < tight[-1, 0]
 
 
+def test_a_rotor_that_crosses_the_gap_brings_its_momentum_along() -> None:
+    """Without friction a cart behind a gap has, once taken along, the speed F t/m exactly.
+
+    Rotor and cart share their momentum when the force turns round, too; where dry friction
+    stops the cart meanwhile it does not.
+    """
+    cart = ut.mechanisms.cart_pendulum(b_c=0.0, b_p=0.0, g=1e-9, J_p=1e6)
+    mass, force = 0.5 + 0.2, 3.0
+    bench = Bench(cart, backlash={"x": Backlash(0.01, 0.2)}, timing=Timing(0.001, steps=8))
+    inputs = force * np.where(np.arange(300) < 150, 1.0, -1.0)
+    loose = _run(RealisticRig(bench, cart.state()), inputs)
+    momentum = np.concatenate([[0.0], np.cumsum(inputs)]) * 1e-3
+    crossing = math.ceil(1e3 * math.sqrt(2 * 0.005 * 0.2 / force))
+    assert loose[crossing - 2, 2] == 0.0
+    np.testing.assert_allclose(loose[crossing + 1 : 150, 2], momentum[crossing + 1 : 150] / mass)
+    # The way across the whole gap: the rotor alone is slowed down, the cart goes on.
+    back = math.ceil(1e3 * math.sqrt(2 * 0.01 * 0.2 / force))
+    np.testing.assert_allclose(loose[152 : 150 + back - 1, 2], loose[152, 2])
+    np.testing.assert_allclose(loose[152 + back :, 2], momentum[152 + back :] / mass, atol=1e-9)
+
+
 def test_the_amplifier_counts_clips_and_lags(arm: ut.Mechanism) -> None:
     bench = Bench(arm, amplifiers={"voltage": Amplifier(10.0, 0.5, 0.3, 0.002)})
     rig = RealisticRig(bench, HANGING)
@@ -235,6 +256,10 @@ def test_numbers_carry_their_sources() -> None:
         (lambda m: Timing(0.001, jitter=0.002), "jitter"),
         (lambda m: Timing(0.001, input_delay=3.0), "delay of a rig"),
         (lambda m: Backlash(0.1, 0.0), "inertia"),
+        (
+            lambda m: RealisticRig(Bench(m, backlash={"theta": Backlash(0.1, 1.0)})),
+            "below the joint's own",
+        ),
         (lambda m: RealisticRig(Bench(m), seed=-1), "seed"),
         (lambda m: RealisticRig(Bench(m)).write([math.nan]), "finite"),
     ],

@@ -11,7 +11,7 @@ import math
 from undertow.codegen.machine import numba
 from undertow.mechanism import FloatArray
 
-__all__ = ["dry_friction", "end_stops", "measure", "transmit"]
+__all__ = ["cross_gaps", "dry_friction", "end_stops", "measure", "part_company", "transmit"]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -29,7 +29,10 @@ def transmit(
 ) -> None:
     """Amplifier and gear: what of the inputs u reaches the joints in step j, ``applied``.
 
-    ``drive`` holds the amplifier's output, and the motor's place in the gap and its speed.
+    ``drive`` holds the amplifier's output, the rotor's place in the gap and its speed there,
+    the joint's last acceleration, and whether rotor and joint are apart.  They stay together
+    while the rotor pushes: while what the motor gives and its own inertia does not take,
+    f − J a, presses it on its side of the gap.
     """
     for i in range(u.shape[0]):
         held[j % held.shape[0], i] = u[i]
@@ -45,17 +48,81 @@ def transmit(
         applied[i] = drive[0, i]
         play, inertia = gap[i]
         if play > 0.0:
-            force, side = gain[i] * drive[0, i], 0.5 * play
-            touches = (drive[1, i] >= side and force >= 0.0) or (
-                drive[1, i] <= -side and force <= 0.0
+            pressing = gain[i] * drive[0, i] - inertia * drive[3, i]
+            together = (drive[1, i] >= 0.5 * play and pressing >= 0.0) or (
+                drive[1, i] <= -0.5 * play and pressing <= 0.0
             )
-            if not touches:
-                drive[2, i] += h * force / inertia
-                drive[1, i] += h * drive[2, i]
+            drive[4, i] = 0.0 if together else 1.0
+            if not together:
                 applied[i] = 0.0
-            if abs(drive[1, i]) >= side:
-                drive[1, i] = max(-side, min(side, drive[1, i]))
-                drive[2, i] = 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def part_company(
+    h: float,
+    x: FloatArray,
+    before: FloatArray,
+    drive: FloatArray,
+    gap: FloatArray,
+    mobility: FloatArray,
+) -> None:
+    """Take the rotors that are apart off the step from ``before`` to x, and off the mobility.
+
+    A joint without the rotor's inertia J has, by Sherman and Morrison's formula,
+    W + J W e eᵀ W/(1 − J eᵀ W e) for its mobility W.
+    """
+    n = x.shape[0] // 2
+    for i in range(gap.shape[0]):
+        play, inertia = gap[i]
+        if play > 0.0 and drive[4, i] != 0.0:
+            lighter = inertia / (1.0 - inertia * mobility[i * n + i])
+            change = lighter * (x[n + i] - before[n + i])
+            for k in range(n):
+                x[n + k] += mobility[k * n + i] * change
+                x[k] += 0.5 * h * mobility[k * n + i] * change
+            for k in range(n):
+                for j in range(n):
+                    if i not in (k, j):
+                        more = lighter * mobility[k * n + i] * mobility[i * n + j]
+                        mobility[k * n + j] += more
+            scale = 1.0 + lighter * mobility[i * n + i]
+            for k in range(n):
+                if k != i:
+                    mobility[k * n + i] *= scale
+                    mobility[i * n + k] *= scale
+            mobility[i * n + i] *= scale
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cross_gaps(
+    h: float,
+    x: FloatArray,
+    before: FloatArray,
+    drive: FloatArray,
+    gap: FloatArray,
+    gain: FloatArray,
+    mobility: FloatArray,
+) -> None:
+    """Move the rotors that are apart; who lands shares his momentum, without a rebound.
+
+    The mobility is that of :func:`part_company`: the rotor's speed w relative to the joint
+    ends by the impulse w/(1/J + eᵀ W e).
+    """
+    n = x.shape[0] // 2
+    for i in range(gap.shape[0]):
+        play, inertia = gap[i]
+        if play > 0.0:
+            rise = x[n + i] - before[n + i]
+            drive[3, i] = rise / h
+            if drive[4, i] != 0.0:
+                drive[2, i] += h * gain[i] * drive[0, i] / inertia - rise
+                drive[1, i] += h * drive[2, i]
+                if abs(drive[1, i]) >= 0.5 * play:
+                    drive[1, i] = max(-0.5 * play, min(0.5 * play, drive[1, i]))
+                    knock = drive[2, i] / (1.0 / inertia + mobility[i * n + i])
+                    for k in range(n):
+                        x[n + k] += mobility[k * n + i] * knock
+                    drive[2, i] = 0.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

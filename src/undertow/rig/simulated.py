@@ -70,7 +70,7 @@ class RealisticRig:
         ]
         self._delays = np.array(late, dtype=np.int64)
         self._counts = np.array([0, timing.steps, 0], dtype=np.int64)
-        self._drive, self._held = np.zeros((3, m)), np.zeros((late[0] + 1, m))
+        self._drive, self._held = np.zeros((5, m)), np.zeros((late[0] + 1, m))
         # Positions, and velocities too where they are measured.
         seen = self._x[:n] if self._rates is None else self._x
         self._past = np.tile(seen, (late[1] + 1, 1))
@@ -105,9 +105,24 @@ class RealisticRig:
         self._pushes = np.zeros((len(bench.pushes), 1 + mechanism.n))
         for row, push in zip(self._pushes, bench.pushes, strict=True):
             row[0], row[1 + names.index(push.coordinate)] = push.t, push.impulse
+        self._refuse_heavy_rotors()
         self._rates = None
         if bench.tachometers is not None:
             self._rates = np.array([bench.tachometers.get(name, 0.0) for name in names])
+
+    def _refuse_heavy_rotors(self) -> None:
+        """A rotor behind a gap is part of its joint's inertia, wherever the mechanism is."""
+        places = np.vstack([self._x[: self.mechanism.n], np.zeros(self.mechanism.n)])
+        for i in np.flatnonzero(self._gap[:, 0] > 0):
+            own = 1.0 / np.linalg.inv(self.mechanism.M(places))[:, i, i].max()
+            if not self._gap[i, 1] < own:
+                name = self.mechanism.coordinates[i].name
+                raise InvalidInputError(
+                    f"inertia of the backlash of '{name}'",
+                    value=f"{self._gap[i, 1]:g}",
+                    limit=f"below the joint's own, {own:.3g}",
+                    remedy="The mechanism's inertia must hold its rotor's, felt at the joint",
+                )
 
     def _draw(self) -> FloatArray:
         """Return the random numbers of one period: lateness in [0, 1), noise of positions."""

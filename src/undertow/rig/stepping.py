@@ -64,11 +64,13 @@ def advance(
     h = length / counts[1]
     W, before, impulse, viscous, gain = work[3], work[4], work[5], work[6], work[7]
     gains(parameters, gain)
-    rough, bounded = False, False
+    rough, bounded, loose = False, False, False
     for i in range(n):
         viscous[i] = friction[i, 3]
         rough = rough or friction[i, 1] > 0.0
         bounded = bounded or stops[i, 1] < math.inf or stops[i, 0] > -math.inf
+    for i in range(gap.shape[0]):
+        loose = loose or gap[i, 0] > 0.0
     for _ in range(counts[1]):
         j = counts[0]
         transmit(j, h, u, held, delays[0], amplifier, gap, gain, drive, applied)
@@ -80,13 +82,17 @@ def advance(
                         x[n + i] += W[i * n + l] * pushes[k, 1 + l]
         for i in range(2 * n):
             before[i] = x[i]
-        if rough or bounded:
+        if rough or bounded or loose:
             mobility(x, parameters, W)
         smooth(t, h, x, applied, viscous, parameters, work)
+        if loose:
+            part_company(h, x, before, drive, gap, W)
         if rough:
             dry_friction(h, x, before, friction, W, impulse)
         if bounded:
             counts[2] += end_stops(x, stops, W)
+        if loose:
+            cross_gaps(h, x, before, drive, gap, gain, W)
         t += h
         counts[0] = j + 1
         for i in range(past.shape[1]):
@@ -156,7 +162,8 @@ def stepping(mechanism: Mechanism) -> Any:
     def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
         header = f'"""Rig of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
-        parts = "from undertow.rig.parts import dry_friction, end_stops, measure, transmit\n"
+        names = "cross_gaps, dry_friction, end_stops, measure, part_company, transmit"
+        parts = f"from undertow.rig.parts import {names}\n"
         return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
 
     return generated("rig", mechanism.name, key, write)
