@@ -118,7 +118,7 @@ def test_a_run_that_stopped_by_itself_is_told_from_one_that_was_killed(tmp_path:
     assert "no answer from the card" in _ending(recording, columns)
     for rows in (1, 100, len(recording.steps) - 1):
         assert _ending(replace(recording, steps=recording.steps[:rows]), columns) == ""
-    one = Killed(1.7, 388, 1.3, True, 0.02)
+    one = Killed(1.7, 388, 1.3, 0.0, True, 0.02)
     assert not one.passed
     assert replace(one, stopped_by="lost").passed
     assert not replace(one, stopped_by="lost", identical=False).passed

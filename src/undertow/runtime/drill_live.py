@@ -187,7 +187,10 @@ class Killed:
     steps
         Steps in the log.
     missing
-        Time from the last step in the log to the kill, s.
+        Time from the last step in the log to the last output that the keeper heard, s: the steps
+        that were made and are not in the log.
+    idle
+        Time from that output to the kill, s, in which the controller said nothing.
     identical
         Whether the log's replay is identical, bit for bit.
     to_zero
@@ -200,6 +203,7 @@ class Killed:
     moment: float
     steps: int
     missing: float
+    idle: float
     identical: bool
     to_zero: float
     stopped_by: str = ""
@@ -252,7 +256,8 @@ def kill_run(recipe: Recipe, moment: float, folder: Path) -> Killed:
     return Killed(
         killed - first,
         len(recording.steps),
-        killed - float(recording["clock"][-1]),
+        facts["heard"] - float(recording["clock"][-1]),
+        killed - facts["heard"],
         replay(log).identical,
         facts["zero"] - facts["heard"] if not any(facts["u"]) else float("inf"),
         _ending(recording, Columns.of(recipe.belief)),

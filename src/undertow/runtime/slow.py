@@ -272,7 +272,7 @@ class _Courier(threading.Thread):
         while (request := self.requests.get()) is not None:
             try:
                 self.answers.append(self.compute(request))
-            except (EOFError, OSError):  # the process is gone; the fast loop meets silence
+            except (EOFError, OSError, TypeError):  # gone, or closed while it is asked
                 return
 
 

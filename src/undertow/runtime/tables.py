@@ -166,8 +166,10 @@ def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -
 
 def kill_table(killed: Sequence[Killed]) -> Group:
     """Return what was left of runs that were killed, and of those that had stopped before."""
-    table = Table("killed at, s", "steps", "missing, ms", "replay", "zero after, ms", "", **_PLAIN)
-    for column in table.columns[:5]:
+    table = Table(
+        "killed at, s", "steps", "missing, ms", "idle, ms", "replay", "zero, ms", "", **_PLAIN
+    )
+    for column in table.columns[:6]:
         column.justify = "right"
     running = [one for one in killed if not one.stopped_by]
     for one in killed:
@@ -175,6 +177,7 @@ def kill_table(killed: Sequence[Killed]) -> Group:
             f"{one.moment:.3f}",
             f"{one.steps:,}",
             "had stopped" if one.stopped_by else f"{1e3 * one.missing:.0f}",
+            "" if one.stopped_by else f"{1e3 * one.idle:.0f}",
             "same bits" if one.identical else "[red]differs[/red]",
             f"{1e3 * one.to_zero:.0f}",
             _mark(one.passed),
@@ -184,6 +187,7 @@ def kill_table(killed: Sequence[Killed]) -> Group:
         f"{len(killed)} runs",
         "",
         f"≤ {1e3 * max((one.missing for one in running), default=math.nan):.0f}",
+        f"≤ {1e3 * max((one.idle for one in running), default=math.nan):.0f}",
         f"{sum(one.identical for one in killed)} same",
         f"≤ {1e3 * max(one.to_zero for one in killed):.0f}",
         f"{sum(one.passed for one in killed)} of {len(killed)}",
