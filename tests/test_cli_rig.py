@@ -128,7 +128,7 @@ def test_screens_fit_80_columns() -> None:
     report = Report(steps=60_000, missed=47, asleep=44, stopped_by="sensor 'theta' lost " * 5)
     report.events = [(0.1, "rig", "read: OSError: [Errno 5] Input/output error " * 3)] * 9
     live = [LiveOutcome("optimiser", "a read blocks for 1 s", "what happened, " * 12, True)]
-    killed = [Killed(0.123, 1234, 0.01, True, 0.02)]
+    killed = [Killed(0.123, 1234, 0.01, 0.001, True, 0.02)]
     console = Console(width=80, record=True, file=io.StringIO())
     for shown in (
         tables.run_table(report, 1e-3, "N m", simulated=False),
