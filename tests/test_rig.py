@@ -174,6 +174,16 @@ def test_a_push_changes_the_momentum_by_its_impulse(arm: ut.Mechanism) -> None:
     np.testing.assert_allclose(momentum, [0.0, 0.003], atol=5e-5)
 
 
+@pytest.mark.parametrize("jitter", [0.0, 1e-4])
+def test_every_push_comes_once(arm: ut.Mechanism, jitter: float) -> None:
+    """Also where it falls on the border of two steps, whose times are rounded."""
+    pushes = tuple(Push(k * 1e-3, "theta", 1e-6) for k in range(-1, 600))
+    bench = Bench(arm.with_parameters(d_e=0.0), timing=Timing(0.001, jitter), pushes=pushes)
+    last = _run(RealisticRig(bench, HANGING), np.zeros(601))[-1]
+    momentum = arm.M(last[:2])[0] @ last[2:]
+    assert momentum / 1e-6 == pytest.approx(600, abs=0.1)
+
+
 def test_backlash_lets_the_motor_turn_before_the_joint(arm: ut.Mechanism) -> None:
     tight, loose = (
         _run(RealisticRig(Bench(arm, backlash=backlash), HANGING), np.full(60, 2.0))

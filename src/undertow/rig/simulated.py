@@ -104,7 +104,8 @@ class RealisticRig:
         names = [c.name for c in coordinates]
         self._pushes = np.zeros((len(bench.pushes), 1 + mechanism.n))
         for row, push in zip(self._pushes, bench.pushes, strict=True):
-            row[0], row[1 + names.index(push.coordinate)] = push.t, push.impulse
+            row[0] = push.t if push.t >= 0.0 else math.inf
+            row[1 + names.index(push.coordinate)] = push.impulse
         self._refuse_heavy_rotors()
         self._rates = None
         if bench.tachometers is not None:

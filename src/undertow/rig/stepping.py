@@ -75,7 +75,8 @@ def advance(
         j = counts[0]
         transmit(j, h, u, held, delays[0], amplifier, gap, gain, drive, applied)
         for k in range(pushes.shape[0]):
-            if t <= pushes[k, 0] < t + h:
+            if pushes[k, 0] < t + h:
+                pushes[k, 0] = math.inf  # once, whatever the rounding of t
                 mobility(x, parameters, W)
                 for i in range(n):
                     for l in range(n):
