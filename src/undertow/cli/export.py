@@ -201,10 +201,10 @@ def export_c(
                 held = on_rigs(one, x0, rigs, compiler, progress)
             good &= held == rigs
             words = ", ".join(start or ()) or "its usual start"
-            say(
-                console,
+            console.print(
                 f"{one.mechanism.name}: held on {held} of {rigs} realistic rigs, seeds 0 to "
                 f"{rigs - 1}, from {words}, as a process over a pipe, positions alone measured.",
+                markup=False,
             )
     if report:
         with progress_bar() as progress:

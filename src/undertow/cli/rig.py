@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -110,7 +110,7 @@ def run(
     )
     console = terminal()
     plant = _plant(rig, recipe)
-    with ExitStack() as stack:
+    with ExitStack() as stack, _let_go_of(plant) as kept:
         with progress_bar() as progress:
             ready = session(
                 recipe,
@@ -124,8 +124,10 @@ def run(
             runtime = stack.enter_context(ready)
         if ".py:" in rig and sys.stdin.isatty():
             say(console, f"Ready. Hold {name} at its start, press Enter and let go.")
-            sys.stdin.readline()
+            if not sys.stdin.readline():  # the end of the input is no yes
+                runtime.stop()
         stack.enter_context(_seconds_on_terminal(seconds))
+        kept.clear()  # the run closes it
         report = runtime.run(seconds)
     what = "simulated time" if simulated else f"optimiser in another {worker}"
     where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
@@ -148,6 +150,7 @@ def _plant(rig: str, recipe: Recipe) -> Rig | None:
     if ".py:" in rig:
         plant = rig_from_file(rig, recipe.belief)
         if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
+            plant.close()
             raise InvalidInputError(
                 f"period of '{rig}'",
                 value=f"{plant.period:g} s",
@@ -164,6 +167,18 @@ def _plant(rig: str, recipe: Recipe) -> Rig | None:
         limit="ideal, realistic, mujoco, FILE.xml or FILE.py:NAME",
         remedy="A driver of your own: see examples/serial_rig.py",
     )
+
+
+@contextmanager
+def _let_go_of(plant: Rig | None) -> Iterator[list[Rig]]:
+    """Close a rig that no run has taken over: what fails before may have left it energised."""
+    kept = [] if plant is None else [plant]
+    try:
+        yield kept
+    finally:
+        for rig in kept:
+            with suppress(Exception):  # a driver may do anything
+                rig.close()
 
 
 @contextmanager

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from undertow.errors import ArtefactError, InvalidInputError
+from undertow.errors import ArtefactError, InvalidInputError, UndertowError
 from undertow.mechanism import Mechanism
 from undertow.modelling.python_file import object_from_file
 from undertow.rig.interface import Rig
@@ -28,7 +29,12 @@ def rig_from_file(text: str, mechanism: Mechanism) -> Rig:
         When what is there has not what a rig has, see :class:`undertow.rig.Rig`.
     """
     rig: Rig = object_from_file(text, "rig")
-    check_rig(rig, mechanism, text)
+    try:
+        check_rig(rig, mechanism, text)
+    except UndertowError:
+        with suppress(Exception):  # it may be no rig at all
+            rig.close()
+        raise
     return rig
 
 
