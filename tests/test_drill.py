@@ -13,7 +13,7 @@ import undertow as ut
 from undertow.cascade import CascadeState
 from undertow.plan import Plan
 from undertow.rig import IdealRig
-from undertow.runtime import InlineWorker, Runtime, SimulatedClock, respond
+from undertow.runtime import InlineWorker, Recipe, Runtime, SimulatedClock, respond
 from undertow.runtime.cases import CASES, Case
 from undertow.runtime.drill import Outcome, drill, drill_recipe, run_case
 from undertow.runtime.drill_live import Killed, _ending, kill_drill, live_drill
@@ -133,6 +133,18 @@ def test_a_run_that_stopped_by_itself_is_told_from_one_that_was_killed(tmp_path:
 def test_the_whole_drill_passes(seed: int) -> None:
     outcomes = drill(seed=seed)
     assert [(o.case.name, o.happened) for o in outcomes if not o.passed] == []
+
+
+@pytest.mark.slow
+def test_no_fault_is_unsafe_while_it_swings_up(tmp_path: Path) -> None:
+    """On a cart between its stops: sound outputs, a safe end and an identical replay in all."""
+    recipe = Recipe("cart_pendulum", rig="realistic", evaluations=32, swing_up=True)
+    memory = recipe.first()
+    for number, one in enumerate(CASES):
+        log = tmp_path / f"{number}.db"
+        outcome = run_case(one, recipe, memory, log, since=0.6, seconds=1.5)
+        sound = not outcome.output_faults and outcome.ended_safely and outcome.replayed
+        assert sound, (one.name, outcome.happened, outcome.output_faults)
 
 
 @pytest.mark.slow

@@ -149,7 +149,7 @@ def run_case(
         cascade = spoil_optimiser(cascade, case.optimiser, since)
 
     def compute(request: Request) -> Answer:
-        return respond(cascade, request)
+        return respond(cascade, request, recipe.swing)
 
     inline = InlineWorker(compute, min(case.latency, 0.05))
     worker: Worker = inline
