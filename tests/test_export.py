@@ -28,6 +28,7 @@ from undertow.export import (
     Build,
     DerivativeStep,
     EmbeddedController,
+    KalmanStep,
     Status,
     SuperTwistingStep,
     Twin,
@@ -39,7 +40,7 @@ from undertow.export.loop import run_on_rig
 from undertow.export.vectors import run_positions
 from undertow.mechanisms import LIBRARY
 from undertow.plan import Plan
-from undertow.rig import RealisticRig, srv02_rig
+from undertow.rig import RealisticRig, plausible_rig, srv02_rig
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 
@@ -88,6 +89,7 @@ def gcc(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
         ("rotary_pendulum", "float", SuperTwistingStep()),
         (M, "double", SuperTwistingStep((300.0, 200.0, 100.0))),
         (M, "float", DerivativeStep(0.004)),
+        ("rotary_pendulum", "double", KalmanStep()),
     ],
 )
 def test_strict_c99_without_a_warning_and_its_own_test_passes(
@@ -222,10 +224,12 @@ def unbounded(source: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", M])
-def test_no_unbounded_loop_and_no_recursion(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "step"), [("rotary_pendulum", KalmanStep()), (M, DerivativeStep())]
+)
+def test_no_unbounded_loop_and_no_recursion(name: str, step: object) -> None:
     """Every loop counts to a constant; every function calls only those defined above it."""
-    source = files(exported(name))[f"{name}.c"].decode()
+    source = files(exported(name, differentiator=step))[f"{name}.c"].decode()
     assert len(LOOP.findall(source)) >= 10
     assert unbounded(source) == []
 
@@ -496,6 +500,35 @@ def test_a_process_over_a_pipe_balances_the_realistic_rig(tmp_path: Path) -> Non
     twin = Twin(controller)
     for q, u in zip(loop.q[:500], loop.u[:500], strict=True):
         assert np.abs(twin.step(q)[0] - u).max() <= 1e-12 * 15
+
+
+@pytest.mark.slow
+def test_the_model_knows_velocities_sooner_than_a_filter(tmp_path: Path) -> None:
+    """A wheeled pendulum is lost to the filtered derivative's lag; the observer holds it."""
+    name, held = "wheeled_inverted_pendulum", []
+    bench = plausible_rig(LIBRARY[name]())
+    for number, step in enumerate((DerivativeStep(), KalmanStep())):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        build = Build(exported(name, differentiator=step), folder)
+        for seed in range(2):
+            with build.start() as process:
+                held.append(run_on_rig(process, RealisticRig(bench, seed=seed), 6.0).held)
+    assert held == [False, False, True, True]
+
+
+def test_an_observer_that_is_thrown_off_starts_again(tmp_path: Path) -> None:
+    """Absurd positions leave no estimate that is no number behind; C and Python agree on it."""
+    controller = exported(differentiator=KalmanStep())
+    twin = Twin(controller)
+    rng = np.random.default_rng(0)
+    with Build(controller, tmp_path).start() as process:
+        for k in range(300):
+            q = 1e-3 * rng.standard_normal(2) + (k % 50 == 0) * rng.uniform(-9e8, 9e8, 2)
+            (u, said), (u_twin, said_twin) = process.step(q), twin.step(q)
+            assert said == said_twin
+            assert np.abs(u - u_twin).max() <= 1e-9 * 15
+    assert np.abs(twin.x).max() < 10
 
 
 def test_without_control_the_rig_falls(tmp_path: Path) -> None:

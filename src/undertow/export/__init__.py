@@ -3,6 +3,7 @@
 from undertow.export.controller import EmbeddedController, files
 from undertow.export.differentiators import DerivativeStep, DifferentiatorStep, SuperTwistingStep
 from undertow.export.host import Agreement, Build, Footprint, HostProcess
+from undertow.export.observer import KalmanStep
 from undertow.export.twin import Status, Twin, Verdict
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "EmbeddedController",
     "Footprint",
     "HostProcess",
+    "KalmanStep",
     "Status",
     "SuperTwistingStep",
     "Twin",

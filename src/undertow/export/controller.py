@@ -22,7 +22,9 @@ import sympy as sp
 from undertow.codegen.c99 import C99Emitter, Real, literal
 from undertow.codegen.tape import Tape
 from undertow.errors import InvalidInputError
-from undertow.export.differentiators import DerivativeStep, DifferentiatorStep, StepSymbols
+from undertow.export.differentiators import DerivativeStep
+from undertow.export.estimate import EstimatorStep, estimate_code
+from undertow.export.observer import KalmanStep
 from undertow.export.twin import LARGEST
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plan import Plan
@@ -46,7 +48,8 @@ class EmbeddedController:
     period
         Sample period, s.
     differentiator
-        Where velocities come from when positions alone are measured.
+        Where velocities come from when positions alone are measured: a differentiator, or the
+        model itself, :class:`undertow.export.KalmanStep`.
     slew
         Largest rate of the inputs, their unit per second: one for all or one for each;
         ``None``: no limit.
@@ -80,7 +83,7 @@ class EmbeddedController:
     surface: Surface | Plan
     reaching: ReachingLaw = ReachingLaw()
     period: float = 0.001
-    differentiator: DifferentiatorStep = DerivativeStep()
+    differentiator: EstimatorStep = DerivativeStep()
     slew: float | tuple[float, ...] | None = None
     missed: int = 5
     rows: int = 0
@@ -171,7 +174,8 @@ class EmbeddedController:
             )
         self.starts(self.plan)
         self.slew_rates  # noqa: B018  # refuses what cannot be used
-        self.differentiator.gains(self.mechanism.n)
+        if not isinstance(self.differentiator, KalmanStep):
+            self.differentiator.gains(self.mechanism.n)
 
     @cached_property
     def laws(self) -> tuple[SlidingModeLaw, ...]:
@@ -209,7 +213,7 @@ class EmbeddedController:
 
 
 def _lay(controller: EmbeddedController) -> dict[str, str]:
-    """Return the statements of the law, of det Γ(0) and of the differentiator."""
+    """Return the statements of the law and of det Γ(0), and the estimator."""
     mechanism, switching = controller.mechanism, controller.reaching.switching
     n, m = mechanism.n, mechanism.m
     symbols = LawSymbols.of(n, m)
@@ -238,21 +242,14 @@ def _lay(controller: EmbeddedController) -> dict[str, str]:
     _, determinant = tape.adjugate(tape.matrix(alpha_a - alpha_u * target.X))
     gamma = C99Emitter(tape, names, controller.real).statements({"value": determinant})
 
-    tape, step = Tape(), StepSymbols.new()
-    memory = controller.differentiator.lay(tape, step)
-    names = {
-        step.gain: "gain",
-        step.q: "q",
-        step.position: "filter[0]",
-        step.velocity: "filter[1]",
-        step.period: "UT_PERIOD",
-    }
-    places = {"filter[0]": memory[0], "filter[1]": memory[1]}
-    return {
-        "law": evaluate,
-        "gamma": gamma,
-        "filter": C99Emitter(tape, names, controller.real).statements(places),
-    }
+    estimate = estimate_code(
+        controller.differentiator,
+        mechanism,
+        controller.period,
+        {p.symbol: names[p.symbol] for p in mechanism.parameters},
+        controller.real,
+    )
+    return {"law": evaluate, "gamma": gamma, **estimate}
 
 
 _HELPERS = {
@@ -367,7 +364,6 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     shared = common(controller)
     plan = plan_text(controller, controller.plan)
     code = _lay(controller)
-    gains = controller.differentiator.gains(mechanism.n)
     used = "\n".join(code.values())
     always = ("ut_max", "ut_min")
     sharp = controller.reaching.switching == "sign"
@@ -391,7 +387,6 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         "starts": plan["starts"],
         "plan": plan["rows"],
         "estimator": _ascii(controller.differentiator.description),
-        "gains": _listed(gains, real),
         "gain_meaning": _ascii(controller.differentiator.meaning),
         "limits": ", ".join(controller.limit(v) for v in limits),
         "slews": ", ".join(controller.limit(v) for v in slew),

@@ -8,6 +8,7 @@ import numpy as np
 
 from undertow.codegen.c99 import literal
 from undertow.export.controller import EmbeddedController, plan_text
+from undertow.export.observer import KalmanStep
 from undertow.export.twin import Status, Twin
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plan import Plan
@@ -93,12 +94,14 @@ def vectors(controller: EmbeddedController) -> dict[str, str]:
     positions = _rounded(controller, run_positions(controller))
     next_plan = other_plan(controller)
     twin = Twin(controller)
-    outputs, statuses = [], []
+    outputs, statuses, estimates = [], [], []
+    resync = isinstance(controller.differentiator, KalmanStep)
     for k, q in enumerate(positions):
         if k == OFFER_AT:
             twin.offer(next_plan, controller.number + 1)
         u, status = twin.step(q)
         outputs.append(u)
+        estimates.append(twin.x.copy())
         statuses.append(int(status))
     text = plan_text(controller, next_plan)
 
@@ -130,6 +133,8 @@ def vectors(controller: EmbeddedController) -> dict[str, str]:
         "step_q": table(positions),
         "step_u": table(outputs),
         "step_status": column(statuses),
+        "resync": str(int(resync)),
+        "step_x": table(estimates if resync else [np.zeros(2 * mechanism.n)]),
     }
 
 

@@ -22,8 +22,6 @@
 static const ut_real ut_limit[UT_M] = {${limits}};
 static const ut_real ut_slew[UT_M] = {${slews}}; /* largest change in a period */
 
-static const ut_real ut_gain[UT_N] = {${gains}}; /* ${gain_meaning} */
-
 const ut_plan ut_built_in = {
     ${number}UL,
     ${count},
@@ -54,11 +52,13 @@ ${gamma}
     return value;
 }
 
-/* ${estimator} */
-static void ut_differentiate(ut_real gain, ut_real q, ut_real filter[2])
+static int ut_sound(ut_real value)
 {
-${filter}
+    return value > -UT_LARGEST && value < UT_LARGEST;
 }
+
+/* ${estimator}. The gains are ${gain_meaning}. */
+${estimate}
 
 /* -- the law ---------------------------------------------------------------------------------- */
 
@@ -75,11 +75,6 @@ void ut_law(const ut_row *row, const ut_real x[UT_X], ut_output *out)
 }
 
 /* -- the fast side ---------------------------------------------------------------------------- */
-
-static int ut_sound(ut_real value)
-{
-    return value > -UT_LARGEST && value < UT_LARGEST;
-}
 
 /* Put the last estimate, carried on by its velocity, where a number is missing. */
 static int ut_repair(ut_controller *c, ut_real q[UT_N], ut_real v[UT_N])
@@ -154,15 +149,7 @@ int ut_step(ut_controller *c, const ut_real q[UT_N], ut_real u[UT_M])
     if (status & UT_LOST) {
         c->running = 0;
     } else {
-        for (int i = 0; i < UT_N; i++) {
-            if (!c->running) {
-                c->filter[i][0] = at[i];
-                c->filter[i][1] = 0;
-            }
-            ut_differentiate(ut_gain[i], at[i], c->filter[i]);
-            c->x[i] = c->filter[i][0];
-            c->x[UT_N + i] = c->filter[i][1];
-        }
+        ut_estimate(c, at);
         c->running = 1;
     }
     return ut_control(c, status, u);
@@ -179,8 +166,7 @@ int ut_step_state(ut_controller *c, const ut_real x[UT_X], ut_real u[UT_M])
     if (c->running) {
         for (int i = 0; i < UT_X; i++) {
             c->x[i] = at[i];
-            c->filter[i % UT_N][i / UT_N] = at[i]; /* where ut_step would go on */
-        }
+${remember}        }
     }
     return ut_control(c, status, u);
 }

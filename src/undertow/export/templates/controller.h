@@ -98,8 +98,7 @@ typedef struct {
     int row;                       /* row of the plan in use */
     int missed;                    /* periods since the last whole measurement */
     int running;                   /* 0 until the first whole measurement */
-    ut_real filter[UT_N][2];       /* memory of the estimator, for each coordinate */
-    ut_real x[UT_X];               /* last estimate of the state */
+${memory}    ut_real x[UT_X];               /* last estimate of the state */
     ut_real u[UT_M];               /* last output */
     ut_output law;                 /* what the law said, for logs */
 } ut_controller;

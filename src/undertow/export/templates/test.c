@@ -62,6 +62,14 @@ static void ut_test_run(void)
         for (int i = 0; i < UT_M; i++) {
             ut_compare("output", k, (double)u[i], (double)ut_outputs[k][i], (double)ut_scale[i]);
         }
+        for (int i = 0; UT_RESYNC && i < UT_X; i++) {
+            const ut_real estimate = ut_estimates[UT_RESYNC ? k : 0][i];
+            ut_compare("estimate", k, (double)c.x[i], (double)estimate, 1);
+            c.x[i] = estimate;
+        }
+        for (int i = 0; UT_RESYNC && i < UT_M; i++) {
+            c.u[i] = ut_outputs[k][i];
+        }
         if ((status ^ ut_statuses[k]) & UT_STATUS_MASK) {
             ut_expect("the status of every period", 0);
             printf("  period %d: got %d, expected %d\n", k, status, ut_statuses[k]);

@@ -45,6 +45,12 @@ ${step_q}
 static const ut_real ut_outputs[UT_PERIODS][UT_M] = {
 ${step_u}
 };
+/* Where 1, each period begins at the estimate and the output given for the one before: by itself an
+ * observer under recorded positions may magnify rounding. */
+#define UT_RESYNC ${resync}
+static const ut_real ut_estimates[UT_RESYNC ? UT_PERIODS : 1][UT_X] = {
+${step_x}
+};
 static const int ut_statuses[UT_PERIODS] = {
 ${step_status}
 };
