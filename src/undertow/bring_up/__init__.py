@@ -1,6 +1,6 @@
 """Bring-up of a rig: what is wired wrongly, how late it is, what its parameters are."""
 
-from undertow.bring_up.faults import Miswired, miswired
+from undertow.bring_up.faults import Miswired, miswired, rubbing
 from undertow.bring_up.identify import Estimate, Identification, identify
 from undertow.bring_up.motion import GuardError, Record, doublets, perform
 from undertow.bring_up.rest import rest_state
@@ -23,4 +23,5 @@ __all__ = [
     "miswired",
     "perform",
     "rest_state",
+    "rubbing",
 ]

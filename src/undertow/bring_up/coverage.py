@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,6 +80,9 @@ class CoverageRow:
         Of the quantity.
     count, covered
         Intervals, and those that hold the truth.
+    error
+        Standard error of the share that does: of a quantity, what chance makes of 95 % in so
+        many rigs; of all together, by the spread from rig to rig, whose intervals hang together.
     mean, deviation
         Of (estimate − truth)/(standard error): 0 and 1 where intervals are as they should be.
     """
@@ -88,6 +91,7 @@ class CoverageRow:
     name: str
     count: int
     covered: int
+    error: float
     mean: float
     deviation: float
 
@@ -118,6 +122,7 @@ def coverage(
     rows = []
     for number, noise in enumerate(NOISES):
         every: dict[str, list[float]] = {}
+        shares = []
         for seed in range(seeds):
             progress(f"noise {1e3 * noise:g} mrad", (number + seed / seeds) / len(NOISES))
             if (noise, seed) not in known:
@@ -125,19 +130,30 @@ def coverage(
                 if keep is not None:
                     with keep.open("a", encoding="utf-8") as file:
                         file.write(json.dumps([noise, seed, known[noise, seed]]) + "\n")
-            for name, value in known[noise, seed].items():
+            found = known[noise, seed]
+            shares.append(_covered(found.values()) / len(found))
+            for name, value in found.items():
                 every.setdefault(name, []).append(value)
         together = [value for values in every.values() for value in values]
-        rows += [_row(noise, name, values) for name, values in every.items()]
-        rows.append(_row(noise, "", together))
+        for name, values in every.items():
+            chance = math.sqrt(0.95 * 0.05 / len(values))
+            rows.append(_row(noise, name, values, chance))
+        rows.append(_row(noise, "", together, _deviation(shares) / math.sqrt(seeds)))
     return rows
 
 
-def _row(noise: float, name: str, values: list[float]) -> CoverageRow:
+def _covered(values: Collection[float]) -> int:
     quantile = float(scipy.stats.norm.ppf(0.975))
-    covered = sum(abs(value) <= quantile for value in values)
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
-    return CoverageRow(noise, name, len(values), covered, float(np.mean(values)), spread)
+    return sum(abs(value) <= quantile for value in values)
+
+
+def _deviation(values: list[float]) -> float:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+
+
+def _row(noise: float, name: str, values: list[float], error: float) -> CoverageRow:
+    mean = float(np.mean(values))
+    return CoverageRow(noise, name, len(values), _covered(values), error, mean, _deviation(values))
 
 
 def _kept(path: Path | None) -> dict[tuple[float, int], Mapping[str, float]]:

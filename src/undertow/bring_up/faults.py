@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 
@@ -9,13 +10,14 @@ import numpy as np
 
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.rig.bench import Bench
 from undertow.rig.interface import Measurement, Rig
 
-__all__ = ["Miswired", "miswired"]
+__all__ = ["Miswired", "miswired", "rubbing"]
 
 
 class Miswired:
-    """A rig with factors on its inputs and encoders, and a delay besides its own.
+    """A rig with factors on its inputs and encoders, in another order, and late.
 
     Parameters
     ----------
@@ -25,6 +27,8 @@ class Miswired:
         Factors, (m,) and (n,): −1 is a swapped sign, 0 a cable that is off.
     delay
         Further delay of the inputs, s; whole periods.
+    order
+        Which encoder is plugged in where each coordinate is read; empty: as it should be.
     """
 
     def __init__(
@@ -33,8 +37,10 @@ class Miswired:
         inputs: Sequence[float] | FloatArray,
         encoders: Sequence[float] | FloatArray,
         delay: float = 0.0,
+        order: Sequence[int] = (),
     ) -> None:
         self.rig, self.period = rig, rig.period
+        self._order = list(order) or slice(None)
         self._inputs, self._encoders = np.asarray(inputs), np.asarray(encoders)
         late = round(delay / rig.period)
         self._queue = deque([np.zeros(len(self._inputs))] * late)
@@ -42,8 +48,9 @@ class Miswired:
     def read(self) -> Measurement:
         """Return what the wrong wiring says."""
         measured = self.rig.read()
-        v = None if measured.v is None else measured.v * self._encoders
-        return Measurement(measured.t, measured.q * self._encoders, v)
+        order = self._order
+        v = None if measured.v is None else (measured.v * self._encoders)[order]
+        return Measurement(measured.t, (measured.q * self._encoders)[order], v)
 
     def write(self, u: FloatArray) -> None:
         """Write what the wrong wiring lets through."""
@@ -62,33 +69,62 @@ def miswired(rig: Rig, mechanism: Mechanism, faults: Sequence[str]) -> Rig:
     ----------
     faults
         ``voltage=-1`` (factor of an input), ``theta=2`` (factor of an encoder; 0: cable off),
-        ``delay=0.0015`` (s, besides the rig's own).
+        ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.0015`` (s, besides the rig's
+        own).  Friction is the bench's: see :func:`rubbing`.
 
     Raises
     ------
     InvalidInputError
         For a part that the mechanism does not have, or what is no number.
     """
-    if not faults:
+    factors, order = _read(mechanism, faults)
+    if all(word.startswith("friction=") for word in faults):
         return rig
-    factors = {i.name: 1.0 for i in mechanism.inputs} | {c.name: 1.0 for c in mechanism.coordinates}
-    factors["delay"] = 0.0
-    for word in faults:
-        part, _, value = word.partition("=")
-        try:
-            factors[part] = float(value) if part in factors else np.nan
-        except ValueError:
-            factors[part] = np.nan
-        if not np.isfinite(factors[part]):
-            raise InvalidInputError(
-                "fault",
-                value=repr(word),
-                limit=f"part=number, the part one of {', '.join(f for f in factors if f != part)}",
-                remedy="Write for instance --fault theta=-1",
-            )
     return Miswired(
         rig,
         [factors[i.name] for i in mechanism.inputs],
         [factors[c.name] for c in mechanism.coordinates],
         factors["delay"],
+        order,
     )
+
+
+def rubbing(bench: Bench, faults: Sequence[str]) -> Bench:
+    """Return a bench with as many times the dry friction as faults say: ``friction=10``.
+
+    Raises
+    ------
+    InvalidInputError
+        See :func:`miswired`.
+    """
+    factors, _ = _read(bench.mechanism, faults)
+    return bench.with_friction(factors["friction"])
+
+
+def _read(mechanism: Mechanism, faults: Sequence[str]) -> tuple[dict[str, float], list[int]]:
+    """Return the factors of all parts, and the order of the encoders."""
+    names = [c.name for c in mechanism.coordinates]
+    factors = dict.fromkeys([*(i.name for i in mechanism.inputs), *names], 1.0)
+    factors |= {"delay": 0.0, "friction": 1.0}
+    order = list(range(mechanism.n))
+    for word in faults:
+        part, _, value = word.partition("=")
+        plugs = value.split(",")
+        if part == "swap" and len(plugs) == 2 and set(plugs) <= set(names):
+            i, k = map(names.index, plugs)
+            order[i], order[k] = order[k], order[i]
+            continue
+        try:
+            factors[part] = float(value) if part in factors else math.nan
+        except ValueError:
+            factors[part] = math.nan
+        least = 0.0 if part in ("delay", "friction") else -math.inf
+        if not (math.isfinite(factors[part]) and factors[part] >= least):
+            raise InvalidInputError(
+                "fault",
+                value=repr(word),
+                limit=f"part=number, the part one of {', '.join(f for f in factors if f != part)}"
+                ", or swap=COORDINATE,COORDINATE",
+                remedy="Write for instance --fault theta=-1",
+            )
+    return factors, order

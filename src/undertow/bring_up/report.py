@@ -57,15 +57,17 @@ def coverage_table(rows: Sequence[CoverageRow]) -> Table:
     table = Table(
         title="95 % intervals of the bring-up wizard, SRV02 rigs that its model contains",
         title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
-        caption="mean, deviation: of (estimate − truth)/(standard error)\nnoise: before counting, "
-        "at 1.53 mrad per count", caption_justify="left",
+        caption="hold the truth: ± standard error\nmean, deviation: of (estimate − "
+        "truth)/(standard error of the estimate)\nnoise: before counting, at 1.53 mrad per count",
+        caption_justify="left",
     )  # fmt: skip
     for head in ("", "noise\nmrad", "intervals", "hold the truth", "mean", "deviation"):
         table.add_column(head, justify="right" if head else "left")
     for row in rows:
         table.add_row(
             row.name or "all", f"{1e3 * row.noise:g}", str(row.count),
-            f"{100 * row.covered / row.count:.1f} %", f"{row.mean:+.2f}", f"{row.deviation:.2f}",
+            f"{100 * row.covered / row.count:.1f} ± {100 * row.error:.1f} %",
+            f"{row.mean:+.2f}", f"{row.deviation:.2f}",
         )  # fmt: skip
     return table
 

@@ -17,7 +17,7 @@ import numpy as np
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
 
-__all__ = ["Wiring", "explain", "known_factor"]
+__all__ = ["KNOWN", "Wiring", "explain", "explained", "known_factor"]
 
 #: A factor within this ratio of 1 is within the tolerance of parameters and friction.
 TOLERANCE = 1.45
@@ -43,18 +43,37 @@ KNOWN = {
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """Factors between a rig and the model: 1 where all is well.
+    """What lies between a rig and the model: factors of 1, in order, where all is well.
 
     Attributes
     ----------
     inputs
-        Of each input, (m,); 0: it does nothing.
+        Factor of each input, (m,); 0: it does nothing.
     encoders
-        Of each encoder, (n,); 0: it never moves.
+        Factor of each coordinate's encoder, (n,); 0: it never moves.
+    order
+        Which of the rig's readings is that of each coordinate; empty: as they come.
     """
 
     inputs: FloatArray
     encoders: FloatArray
+    order: tuple[int, ...] = ()
+
+    @property
+    def scaled(self) -> bool:
+        """Whether a factor is another number than 0, 1 and −1."""
+        factors = np.abs(np.concatenate([self.inputs, self.encoders]))
+        return bool(((factors != 0.0) & (factors != 1.0)).any())
+
+    def then(self, other: Wiring) -> Wiring:
+        """Return this wiring and what was found behind it, as one."""
+        first = self.order or tuple(range(len(self.encoders)))
+        second = other.order or tuple(range(len(first)))
+        return Wiring(
+            self.inputs * other.inputs,
+            self.encoders[list(second)] * other.encoders,
+            tuple(first[j] for j in second),
+        )
 
     def corrected(self, rig: Rig) -> Corrected:
         """Return the rig as it were with these factors undone."""
@@ -80,11 +99,12 @@ class Corrected:
     def read(self) -> Measurement:
         """Return the measurement, relative to the first one, in the model's scale."""
         measured = self.rig.read()
-        q = np.asarray(measured.q, dtype=float)
+        order = list(self.wiring.order) or slice(None)
+        q = np.asarray(measured.q, dtype=float)[order]
         if self._home is None:
             self._home = q.copy()
         factors = self._factors(self.wiring.encoders)
-        v = None if measured.v is None else np.asarray(measured.v) / factors
+        v = None if measured.v is None else np.asarray(measured.v)[order] / factors
         return Measurement(measured.t, (q - self._home) / factors + self._home, v)
 
     def write(self, u: FloatArray) -> None:
@@ -113,6 +133,11 @@ def explain(gain: FloatArray, known: FloatArray) -> Wiring:
         Factors within a ratio of 1.45 of ±1 are ±1; scales of encoders near a known one are
         that.
     """
+    return explained(gain, known)[1]
+
+
+def explained(gain: FloatArray, known: FloatArray) -> tuple[float, Wiring]:
+    """Return the number of faults, and parts of one for what they leave, with the wiring."""
     m, n = gain.shape
     dead = np.array([not (np.abs(gain[i][known[i]]) > DEAD).any() for i in range(m)])
     live = known & ~dead[:, None]
@@ -132,14 +157,19 @@ def explain(gain: FloatArray, known: FloatArray) -> Wiring:
             c = float(np.median(ratios))
             encoders[j] = _settled(c) if abs(c) > DEAD else 0.0
             misfit += float(np.abs(ratios - c).sum())
-        faults = sum(_rounded(v) != 1.0 for v in k) + int((encoders != 1.0).sum())
+        faults = sum(map(_faults, (*map(_rounded, k), *encoders)))
         cost = faults + 0.5 * min(misfit, 1.8)
         if best is None or cost < best[0] - 1e-9:
             best = cost, np.array(k), encoders
     assert best is not None  # there is one choice at least
     inputs = np.array([_rounded(v) for v in best[1]])
     inputs[dead] = 0.0
-    return Wiring(inputs, best[2])
+    return best[0], Wiring(inputs, best[2])
+
+
+def _faults(factor: float) -> int:
+    """Return how many faults a factor is: a sign and a scale are two."""
+    return int(abs(factor) != 1.0) + int(factor < 0.0)
 
 
 def _rounded(factor: float) -> float:

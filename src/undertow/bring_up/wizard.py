@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,8 +12,9 @@ import numpy as np
 from undertow.bring_up.identify import Identification, identify
 from undertow.bring_up.motion import GuardError, Record, doublets, perform, ramp
 from undertow.bring_up.predict import Predictor
+from undertow.bring_up.response import Response, Understood, respond, understand
 from undertow.bring_up.rest import rest_state
-from undertow.bring_up.wiring import KNOWN, Wiring, explain, known_factor
+from undertow.bring_up.wiring import KNOWN, Wiring, known_factor
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.rig.interface import Rig
 
@@ -26,8 +27,14 @@ SHARES = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5)
 ENOUGH = {"rad": 0.2, "m": 0.08}
 MOST = {"rad": 2.0, "m": 0.6}
 
+#: A push goes on to so many times of what is enough: what dry friction does is small then.
+FAR = 2.5
+
 #: A parameter is called wrong where it changes the motion by more than this part of it.
 MATTERS = 0.05
+
+#: How long nothing must move before it counts as at rest, s.
+LOOK = 1.0
 
 #: Longest wait for rest between two motions, s: a good joint swings for minutes.
 CALM = 240.0
@@ -143,7 +150,7 @@ class _Wizard:
         self.wiring: Wiring | None = None
         self.identification: Identification | None = None
         self.record: Record | None = None
-        self.share, self.breakaway = np.zeros(belief.m), np.zeros(belief.m)
+        self.share, self.breakaway = np.full(belief.m, SHARES[0]), np.zeros(belief.m)
         self.predictor = Predictor(belief, rest)
         units = [c.unit for c in belief.coordinates]
         room = np.array([c.high - c.low for c in belief.coordinates])
@@ -166,15 +173,15 @@ class _Wizard:
     ) -> None:
         self.findings.append(Finding(check, part, measured, expected, verdict, remedy))
 
-    def _settle(self, seconds: float = CALM) -> FloatArray:
+    def _settle(self, rig: Rig, seconds: float = CALM) -> FloatArray:
         """Leave the inputs at zero until nothing moves, or for so long: the last motion, (n,)."""
-        count = round(0.5 / self.rig.period)
+        count = round(LOOK / self.rig.period)
         moved = np.full(self.belief.n, np.inf)
-        for _ in range(max(1, round(seconds / 0.5))):
+        for _ in range(max(1, round(seconds / LOOK))):
             rows = []
             for _ in range(count):
-                rows.append(np.array(self.rig.read().q, dtype=float))
-                self.rig.write(np.zeros(self.belief.m))
+                rows.append(np.array(rig.read().q, dtype=float))
+                rig.write(np.zeros(self.belief.m))
             moved = np.ptp(np.array(rows), axis=0)
             if not (moved > self.enough / 40).any():
                 break
@@ -186,7 +193,7 @@ class _Wizard:
         """Whether every encoder answers and nothing moves by itself."""
         good = True
         for c, moved, enough in zip(
-            self.belief.coordinates, self._settle(), self.enough, strict=True
+            self.belief.coordinates, self._settle(self.rig), self.enough, strict=True
         ):
             if np.isnan(moved):
                 good = False
@@ -198,7 +205,7 @@ class _Wizard:
             calm = bool(moved < enough / 4)
             good &= calm
             self._add(
-                "at rest", c.name, f"moves by {_quantity(moved, c.unit)} in 0.5 s",
+                "at rest", c.name, f"moves by {_quantity(moved, c.unit)} in {LOOK:g} s",
                 f"below {_quantity(enough / 4, c.unit)}",
                 verdict="right" if calm else "wrong",
                 remedy="" if calm else "Let it come to rest, with the inputs at zero",
@@ -212,57 +219,38 @@ class _Wizard:
         u[:, i] = values
         return u
 
-    def _predicted(self, record: Record, i: int) -> FloatArray:
-        """The motion that the model makes of a push of input i, (N, n), about its start.
-
-        Of some levels of dry friction the one is taken whose motion is most alike in shape,
-        whatever its signs and scales.
-        """
-        belief, n = self.belief, self.belief.n
-        moved = record.moved
-        level = abs(float(belief.input_matrix.subs(belief.substitution)[i, i]))
-        level *= float(np.abs(record.u[:, i]).max())
-        best, likest = np.zeros_like(moved), -1.0
-        for share in (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.75):
-            coulomb = np.zeros((2, n))
-            coulomb[:, : belief.m] = share * level
-            states = self.predictor.states(
-                record, belief.parameter_values, coulomb, np.zeros(n), np.ones(belief.m)
-            )
-            predicted = self.predictor.positions(record, states, 1.5 * self.rig.period)
-            predicted -= self.rest[:n]
-            power = np.sqrt((predicted**2).sum(axis=0) * (moved**2).sum(axis=0))
-            alike = np.abs((predicted * moved).sum(axis=0)) / np.maximum(power, 1e-300)
-            likeness = float(alike.sum())
-            if likeness > likest:
-                best, likest = predicted, likeness
-        return best
+    def _respond(self, rig: Rig, inputs: FloatArray) -> list[Response]:
+        """Push every input, through factors of the inputs, until something moves enough."""
+        belief, responses = self.belief, []
+        driven = np.arange(belief.n) < belief.m
+        for i, channel in enumerate(belief.inputs):
+            most = SHARES[-1] * min(1.0, abs(inputs[i]) or 1.0)
+            response = Response.none(belief.n)
+            for share in [s for s in SHARES if s <= most] or [most]:
+                calm = self._settle(rig)
+                push = doublets(share * channel.limit, [0.1], 0.15, self.rig.period)
+                try:
+                    record = perform(rig, self._one(i, push), 30.0 * self.guard)
+                except GuardError:
+                    break
+                self.share[i] = share
+                response = respond(self.predictor, record, i, calm)
+                far = np.abs(response.moved).max(axis=0) > FAR * self.enough
+                if far[driven].any() or (response.reach > self.guard).any():
+                    break
+            responses.append(response)
+        return responses
 
     def push(self) -> bool:
         """Whether every input moves something and every encoder follows; else what is wrong."""
-        belief = self.belief
-        gain = np.zeros((belief.m, belief.n))
-        known = np.zeros((belief.m, belief.n), dtype=bool)
-        for i, channel in enumerate(belief.inputs):
-            for share in SHARES:
-                self._settle()
-                self.share[i] = share
-                push = doublets(share * channel.limit, [0.1], 0.15, self.rig.period)
-                try:
-                    record = perform(self.rig, self._one(i, push), 30.0 * self.guard)
-                except GuardError:
-                    break
-                predicted, moved = self._predicted(record, i), record.moved
-                size = np.abs(predicted).max(axis=0)
-                known[i] = size > 0.1 * self.enough
-                power = (predicted**2).sum(axis=0)
-                gain[i] = (moved * predicted).sum(axis=0) / np.maximum(power, 1e-300)
-                if (np.abs(moved[:, : belief.m]).max(axis=0) > self.enough[: belief.m]).any() or (
-                    (size > self.guard).any()
-                ):
-                    break
-        self.wiring = explain(gain, known)
-        self._tell(gain, known)
+        found = understand(self._respond(self.rig, np.ones(self.belief.m)), self.enough)
+        if found.wiring.scaled:
+            # A wrong scale also misleads about what is motion enough: once more without it.
+            behind = found.wiring.corrected(self.rig)
+            again = understand(self._respond(behind, found.wiring.inputs), self.enough)
+            found = replace(again, wiring=found.wiring.then(again.wiring))
+        self.wiring = found.wiring
+        self._tell(found)
         whole = bool((self.wiring.inputs != 0).all() and (self.wiring.encoders != 0).all())
         if not whole:
             self._add(
@@ -271,27 +259,36 @@ class _Wizard:
             )  # fmt: skip
         return whole
 
-    def _tell(self, gain: FloatArray, known: FloatArray) -> None:
-        assert self.wiring is not None  # made by the caller
+    def _tell(self, found: Understood) -> None:
+        names = [c.name for c in self.belief.coordinates]
+        moved = [j for j, k in enumerate(found.wiring.order) if j != k]
+        if moved:
+            here, there = (", ".join(names[k] for k in row) for row in
+                           (moved, [found.wiring.order[j] for j in moved]))  # fmt: skip
+            self._add(
+                "encoder order", here, f"come in as {there}", f"as {here}", verdict="wrong",
+                remedy=f"Swap the plugs of {here}, or the readings in the driver",
+            )  # fmt: skip
         parts = [("input", i.name, f, "amplifier and motor") for i, f in
-                 zip(self.belief.inputs, self.wiring.inputs, strict=True)]  # fmt: skip
-        parts += [("encoder", c.name, f, "encoder") for c, f in
-                  zip(self.belief.coordinates, self.wiring.encoders, strict=True)]  # fmt: skip
-        reached = np.asarray(known.any(axis=0))
+                 zip(self.belief.inputs, found.wiring.inputs, strict=True)]  # fmt: skip
+        parts += [("encoder", name, f, "encoder") for name, f in
+                  zip(names, found.wiring.encoders, strict=True)]  # fmt: skip
+        reached = np.asarray(found.known.any(axis=0))
         for index, (kind, name, factor, what) in enumerate(parts):
             j = index - self.belief.m
             if factor == 0.0:
                 verb = "moves nothing" if kind == "input" else "does not move"
                 self._add(
                     kind, name, verb, "moves", verdict="wrong",
-                    remedy=f"Look at cable, supply and enable of the {what}",
+                    remedy=f"Look at cable, supply and enable of the {what}, and for what holds "
+                    "the joint fast",
                 )  # fmt: skip
                 continue
             if j >= 0 and not reached[j]:
                 self._add(kind, name, "nothing reaches it", "moves", verdict="unclear",
                           remedy="No input moves it from rest: check it by hand")  # fmt: skip
                 continue
-            seen = abs(factor) * self._typical(gain, known, index)
+            seen = abs(factor) * self._typical(found, index)
             sign_right, scale_right = factor > 0, abs(factor) == 1.0
             self._add(f"{kind} sign", name, "as the model" if sign_right else "reversed",
                       "as the model", verdict="right" if sign_right else "wrong",
@@ -303,15 +300,11 @@ class _Wizard:
                       verdict="right" if scale_right else "wrong",
                       remedy="" if scale_right else remedy)  # fmt: skip
 
-    def _typical(self, gain: FloatArray, known: FloatArray, index: int) -> float:
+    def _typical(self, found: Understood, index: int) -> float:
         """The measured factor of a part that is within tolerance."""
-        assert self.wiring is not None  # made by the caller
         m = self.belief.m
-        outer = self.wiring.inputs[:, None] * self.wiring.encoders[None, :]
-        ratio = gain / np.where(outer == 0, np.nan, outer)
-        values = (
-            ratio[index][known[index]] if index < m else ratio[:, index - m][known[:, index - m]]
-        )
+        at = (index,) if index < m else (slice(None), index - m)
+        values = found.ratio[at][found.known[at]]
         values = values[np.isfinite(values)]
         return float(np.median(values)) if len(values) else 1.0
 
@@ -324,9 +317,10 @@ class _Wizard:
         until = np.where(np.arange(self.belief.n) < self.belief.m, self.enough / 20, np.inf)
         for i, channel in enumerate(self.belief.inputs):
             levels = []
+            most = 0.3 * channel.limit * min(1.0, abs(self.wiring.inputs[i]))
             for side in (1.0, -1.0):
-                self._settle()
-                rise = ramp(side * 0.3 * channel.limit, 1.5, self.rig.period)
+                self._settle(rig)
+                rise = ramp(side * most, 1.5, self.rig.period)
                 record = perform(rig, self._one(i, rise), 30 * self.guard, until=until)
                 levels.append(abs(float(record.u[-1, i])))
             up, down = levels
@@ -368,12 +362,12 @@ class _Wizard:
         widths = [0.05, 0.1, 0.2, 0.1, 0.05, 0.2, 0.15, 0.3]
         parts = []
         for i, channel in enumerate(self.belief.inputs):
-            factor = min(1.6, 0.6 / self.share[i])
-            level = factor * self.share[i] * channel.limit / max(1.0, abs(self.wiring.inputs[i]))
+            most = 0.6 * min(1.0, abs(self.wiring.inputs[i]))
+            level = min(1.6 * self.share[i], most) * channel.limit
             parts.append(self._one(i, doublets(level, widths, 0.3, self.rig.period)))
         u = self._modest(np.vstack(parts))
         for _ in range(6):
-            self._settle()
+            self._settle(rig)
             try:
                 self.record = perform(rig, u, self.guard)
                 break

@@ -42,7 +42,8 @@ def bench(
         list[str] | None,
         typer.Option(
             help="Wire the simulated rig wrongly: INPUT=-1 or COORDINATE=2 (a factor, 0: cable "
-            "off), delay=0.0015 (s, besides its own). Repeatable.",
+            "off), swap=COORDINATE,COORDINATE (two encoders), delay=0.0015 (s, besides its own), "
+            "friction=12 (times its own). Repeatable.",
             metavar="PART=VALUE",
         ),
     ] = None,
@@ -63,7 +64,7 @@ def bench(
     ] = None,
 ) -> None:
     """Check a rig at rest by small safe motions: signs, scales, delay, friction, parameters."""
-    from undertow.bring_up import bring_up, miswired, rest_state
+    from undertow.bring_up import bring_up, miswired, rest_state, rubbing
     from undertow.bring_up.report import files, findings_table, parameter_table, summary
     from undertow.rig import IdealRig, RealisticRig
     from undertow.rig.presets import bench_for
@@ -73,7 +74,7 @@ def bench(
     rest = rest_state(belief)
     if out is not None:
         results.check_folder(out)
-    flaws = bench_for(inputs.mechanism_named(name))
+    flaws = rubbing(bench_for(inputs.mechanism_named(name)), fault or ())
     plant = (
         RealisticRig(flaws, rest, seed)
         if rig == "realistic"

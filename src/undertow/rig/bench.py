@@ -8,7 +8,7 @@ it and the numbers that a computer reads and writes.  It holds no state: a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
@@ -135,16 +135,16 @@ class Amplifier:
 class Backlash:
     """Play between motor and joint.
 
-    While the motor crosses the gap, the joint feels nothing; it then takes up the load
-    without a rebound.  What the rotor's speed adds on landing is left out, and the rotor
-    keeps counting to the joint's inertia while it is apart from it.
+    Rotor and joint are two bodies.  While the rotor crosses the gap, the joint feels neither
+    the motor nor the rotor's inertia; on landing they share their momentum, without a
+    rebound, and they stay together for as long as the rotor presses.
 
     Parameters
     ----------
     gap
         Whole play at the joint, rad or m.
     inertia
-        Of the motor as felt at the joint, kg m² or kg: sets how fast the gap is crossed.
+        Of the motor as felt at the joint, kg m² or kg; the mechanism's own inertia holds it.
     source
         Where the numbers come from.
     """
@@ -333,6 +333,21 @@ class Bench:
         for name, spread in sorted(self.hand.items()):
             x[self.mechanism.state_names.index(name)] += spread * rng.standard_normal()
         return x
+
+    def with_friction(self, factor: float, joints: Collection[str] | None = None) -> Self:
+        """Return the bench with so many times the friction, in all joints or in these."""
+        changed = {
+            name: replace(
+                f,
+                coulomb=factor * f.coulomb,
+                breakaway=factor * f.F_s,
+                viscous=factor * f.viscous,
+            )
+            if joints is None or name in joints
+            else f
+            for name, f in self.friction.items()
+        }
+        return replace(self, friction=changed)
 
     def with_timing(self, **changes: Any) -> Self:
         """Return the bench with another period, jitter or delay."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ import scipy.linalg
 from undertow.errors import MissingExtraError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.practice import estimator_for, goal_for
-from undertow.rig import Bench, Friction, Push, srv02_rig
+from undertow.rig import Bench, Push, srv02_rig
 from undertow.stability import linearise
 from undertow.trials.balance import controllers
 from undertow.trials.ledger import Ledger
@@ -64,20 +64,6 @@ def clipped_regulator(belief: Mechanism) -> MakeController:
     return lambda _: lambda t, x: np.clip(k @ x, -limit, limit)
 
 
-def _scaled(friction: Friction, factor: float) -> Friction:
-    return replace(
-        friction,
-        coulomb=factor * friction.coulomb,
-        breakaway=factor * friction.F_s,
-        viscous=factor * friction.viscous,
-    )
-
-
-def _with_friction(bench: Bench, factor: float, joints: Sequence[str]) -> Bench:
-    changed = {k: _scaled(f, factor) if k in joints else f for k, f in bench.friction.items()}
-    return replace(bench, friction=changed)
-
-
 def _with_delay(bench: Bench, delay: float) -> Bench:
     return bench.with_timing(input_delay=0.6 * delay, measurement_delay=0.4 * delay)
 
@@ -95,7 +81,7 @@ def _with_push(bench: Bench, impulse: float) -> Bench:
 #: Name to how a bench is changed, the largest change looked for, unit, and its factor.
 FACTORS: dict[str, tuple[Callable[[Bench, float], Bench], float, str, float]] = {
     "Coulomb friction of the arm": (
-        lambda bench, value: _with_friction(bench, value / 0.03, ("theta",)), 1.28, "mN m", 1e3,
+        lambda bench, value: bench.with_friction(value / 0.03, ("theta",)), 1.28, "mN m", 1e3,
     ),
     "delay in all": (_with_delay, 0.032, "ms", 1e3),
     "pendulum and arm heavier": (_with_mass, 3.2, "%", 100.0),
@@ -107,7 +93,7 @@ FACTORS: dict[str, tuple[Callable[[Bench, float], Bench], float, str, float]] = 
 def random_bench(bench: Bench, seed: int) -> Bench:
     """Return a bench that differs from a given one in all respects at once."""
     rng = np.random.default_rng([seed, 2])
-    changed = _with_friction(bench, rng.uniform(0.0, FRICTION), tuple(bench.friction))
+    changed = bench.with_friction(rng.uniform(0.0, FRICTION))
     changed = _with_delay(changed, rng.uniform(0.0, DELAY))
     push = Push(rng.uniform(3.0, 6.0), "phi", IMPULSE * rng.uniform(-1.0, 1.0))
     tolerance = dict(bench.tolerance) | {"m": MASSES, "I_e": MASSES}

@@ -1,0 +1,277 @@
+"""Least squares of a recorded motion: which quantities are free, and ways to the least.
+
+Which parameters are free is decided first: one whose column of the Jacobian is nearly a
+combination of those already chosen is held (subset selection; Brun, Reichert, Künsch, *Water
+Resources Research* 37(4), 2001).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import numpy as np
+import scipy.optimize
+import scipy.signal
+
+from undertow.bring_up.intervals import readings
+from undertow.bring_up.motion import Record
+from undertow.bring_up.predict import Predictor
+from undertow.bring_up.quantities import RATE, START, Quantity, candidates
+from undertow.errors import InvalidInputError
+from undertow.mechanism import FloatArray, Mechanism
+
+__all__ = ["Fit"]
+
+#: Sine of the angle to the chosen columns below which a parameter is held.
+INDEPENDENT = 0.15
+
+#: Stages of a fit: length of the pieces in which the motion is fitted, s; part of it that is;
+#: whether breaking away is fitted, which is sharp and can wait until the rest is nearly right.
+Stage = tuple[float, float, bool]
+
+#: Ways to the least squares.  What swings or sticks comes out of step with a model that is a
+#: little off, so that a long motion has other minima: where the first way leads to one of them,
+#: short pieces of the motion, and then more and more of it, lead past.
+ROUTES: tuple[tuple[Stage, ...], ...] = (
+    ((math.inf, 1.0, False), (math.inf, 1.0, True)),
+    ((0.15, 1.0, False), (0.4, 1.0, False), (math.inf, 0.4, True), (math.inf, 1.0, True)),
+    (
+        (0.15, 1.0, False), *((math.inf, part, True) for part in (0.25, 0.4, 0.6, 0.8, 1.0)),
+    ),
+    ((0.1, 1.0, False), (math.inf, 0.15, False), (math.inf, 0.5, True), (math.inf, 1.0, True)),
+)  # fmt: skip
+
+#: Mean square of the residuals, in standard deviations of a count, at which no other way is
+#: tried: a motion that is followed to a few counts has not come out of step.
+ENOUGH = 10.0
+
+#: Names of what a fit is begun again without begin with.
+SHARP = ("delay", "friction_", "breakaway_")
+
+#: Window of the polynomials that a piece's first state is read from, s.
+WINDOW = 0.02
+
+#: Central differences in scaled variables.
+STEP = 2e-3
+
+
+def _values(free: list[Quantity], z: FloatArray) -> dict[str, float]:
+    return {v.name: float(a) * v.scale for v, a in zip(free, z, strict=True)}
+
+
+def _tell(progress: Callable[[str, float], None], part: float, what: str) -> None:
+    progress(what, part)
+
+
+class Fit:
+    """Residuals and Jacobians of one record."""
+
+    def __init__(self, mechanism: Mechanism, x0: FloatArray, record: Record) -> None:
+        self.mechanism, self.whole = mechanism, record
+        self.predictor = Predictor(mechanism, x0)
+        self.look_at(math.inf, 1.0)
+        if not (np.abs(self.moved).max(axis=0) > 0).any():
+            raise InvalidInputError(
+                "motion to identify from",
+                value="nothing moved",
+                limit="some motion",
+                remedy="Use a larger input",
+            )
+        steps = np.abs(np.diff(record.q, axis=0))
+        counts = [s[s > 0].min() if (s > 0).any() else np.inf for s in steps.T]
+        least = 1e-4 * np.abs(self.moved).max(axis=0)
+        self.sigma = np.maximum(np.array(counts) / math.sqrt(12), least)
+        self.noise = np.zeros(mechanism.n)
+        self.variance = self.sigma[None, :] ** 2
+        passive = float(np.abs(mechanism.forces(0.0, x0 + 0.1, np.zeros(mechanism.n))).max())
+        self.candidates = candidates(mechanism, 0.01 * max(passive, 1e-3), record)
+
+    def look_at(self, piece: float, part: float) -> None:
+        """Fit the first part of the motion from here on, in pieces so long, s.
+
+        A piece begins in a state that is read from the measurement, and what only matters
+        between pieces is held: how the motion begins, the delay, breaking away.
+        """
+        whole = self.whole
+        self.pieces = math.isfinite(piece)
+        period = float(np.median(np.diff(whole.t)))
+        self.length = round(piece / period) if self.pieces else 0
+        if self.pieces:
+            window = 2 * max(3, round(0.5 * WINDOW / period)) + 1
+            q = whole.moved + self.predictor.x0[: self.mechanism.n]
+            smooth = [
+                scipy.signal.savgol_filter(q, window, 3, deriv=d, delta=period, axis=0)
+                for d in (0, 1)
+            ]
+            self.read = np.hstack(smooth)
+        begins = int(np.argmax(np.abs(whole.u).max(axis=1) > 0))
+        count = begins + math.ceil(part * (len(whole) - begins))
+        self.record = Record(whole.t[:count], whole.q[:count], whole.u[:count])
+        self.moved = whole.moved[:count]
+
+    def _simulate(self, values: Mapping[str, float]) -> FloatArray:
+        mechanism = self.mechanism
+        parameters = np.array([values.get(p.name, p.value) for p in mechanism.parameters])
+        coulomb = np.array([values.get(f"friction_{c.name}", 0.0) for c in mechanism.coordinates])
+        excess = [values.get(f"breakaway_{c.name}", 0.0) for c in mechanism.coordinates]
+        gain = np.array([values.get(f"gain_{i.name}", 1.0) for i in mechanism.inputs])
+        viscous = np.array([values.get(f"damping_{c.name}", 0.0) for c in mechanism.coordinates])
+        start = self.predictor.x0.copy()
+        for i, c in enumerate(mechanism.coordinates):
+            start[i] += values.get(f"{START}_{c.name}", 0.0)
+            start[mechanism.n + i] += values.get(f"{RATE}_{c.name}", 0.0)
+        friction = np.stack([coulomb, coulomb + excess])
+        if self.pieces:
+            rows = np.empty((len(self.record), mechanism.n))
+            for first in range(0, len(rows), self.length):
+                few = slice(first, first + self.length)
+                record = Record(self.record.t[few], self.record.q[few], self.record.u[few])
+                states = self.predictor.states(
+                    record, parameters, friction, viscous, gain, self.read[first]
+                )
+                rows[few] = states[:, : mechanism.n]
+            return np.asarray(rows - self.predictor.x0[: mechanism.n])
+        states = self.predictor.states(self.record, parameters, friction, viscous, gain, start)
+        q = self.predictor.positions(self.record, states, values.get("delay", 0.0))
+        return np.asarray(q - self.predictor.x0[: mechanism.n])
+
+    def difference(self, free: list[Quantity], z: FloatArray) -> FloatArray:
+        """Measured less predicted, (N, n), each coordinate about its mean: its zero is free."""
+        away = self.moved - self._simulate(_values(free, z))
+        return np.asarray(away - away.mean(axis=0))
+
+    def residual(self, free: list[Quantity], z: FloatArray) -> FloatArray:
+        """The same, each in its standard deviation, one coordinate after the other."""
+        away = self.difference(free, z)
+        weights = np.broadcast_to(1.0 / self.variance, away.shape)
+        away -= (weights * away).sum(axis=0) / weights.sum(axis=0)
+        away = np.nan_to_num(away * np.sqrt(weights), nan=0.0, posinf=1e6, neginf=-1e6)
+        return np.asarray(np.clip(away, -1e6, 1e6).T.ravel())
+
+    def jacobian(
+        self, free: list[Quantity], z: FloatArray, here: FloatArray | None = None
+    ) -> FloatArray:
+        """Differences in the scaled variables: central, or from the residuals ``here``."""
+        columns = []
+        for k, v in enumerate(free):
+            ahead, behind = z.copy(), z.copy()
+            ahead[k] += STEP
+            up = self.residual(free, ahead)
+            if here is not None:
+                columns.append((up - here) / STEP)
+                continue
+            behind[k] = max(z[k] - STEP, v.low / v.scale + 1e-12)
+            columns.append((up - self.residual(free, behind)) / (ahead[k] - behind[k]))
+        return np.array(columns).T
+
+    def _start(self, variables: list[Quantity], values: Mapping[str, float]) -> FloatArray:
+        start = [values.get(v.name, v.start) / v.scale for v in variables]
+        return np.clip(start, *self._bounds(variables))
+
+    def _bounds(self, variables: list[Quantity]) -> FloatArray:
+        ends = np.array([[v.low / v.scale + 1e-9, v.high / v.scale - 1e-9] for v in variables])
+        return ends.T
+
+    def solve(
+        self, free: list[Quantity], values: Mapping[str, float], tolerance: float
+    ) -> FloatArray:
+        """Return the scaled variables of the least squares, starting from some values."""
+        fine = tolerance < 1e-6
+        low, high = self._bounds(free)
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self.residual(free, z)
+
+        def jacobian(z: FloatArray) -> FloatArray:
+            return self.jacobian(free, z, None if fine else self.residual(free, z))
+
+        # Quantities differ in how sharply they are seen by four decades: without the scale of
+        # the Jacobian's columns the search creeps, and stops short of the least squares by
+        # more than the intervals are wide.
+        found = scipy.optimize.least_squares(
+            residual,
+            self._start(free, values),
+            jac=jacobian,
+            bounds=(low, high),
+            x_scale="jac",
+            ftol=tolerance,
+            xtol=tolerance,
+            max_nfev=60,
+        )
+        return np.asarray(found.x)
+
+    def weigh(self, free: list[Quantity], z: FloatArray) -> FloatArray:
+        """Let every reading count for what it is worth from now on, and fit again."""
+        away = self.difference(free, z)
+        self.noise, self.variance = readings(self.moved - away, away, self.sigma)
+        return self.solve(free, _values(free, z), 1e-9)
+
+    def explained(self, free: list[Quantity], z: FloatArray) -> FloatArray:
+        """Share of each coordinate's motion that is explained, (n,)."""
+        swing = np.maximum(self.moved.std(axis=0), 1e-300)
+        return np.asarray(1.0 - (self.difference(free, z).std(axis=0) / swing) ** 2)
+
+    def search(self, progress: Callable[[str, float], None]) -> tuple[list[Quantity], FloatArray]:
+        """Return the least squares of the best of the ways: of the first, if that will do.
+
+        What is sharp, delay and dry friction, leaves minima beside the least: from each of them
+        at zero the fit is begun again.
+        """
+        best: tuple[float, list[Quantity], FloatArray] | None = None
+        for number, route in enumerate(ROUTES):
+            progress("which quantities the motion tells apart", number / len(ROUTES))
+            free, z = self.follow(route, partial(_tell, progress, number / len(ROUTES)))
+            cost = float((self.residual(free, z) ** 2).sum())
+            if best is None or cost < best[0]:
+                best = cost, free, z
+            if best[0] <= ENOUGH * self.moved.size:
+                break
+        assert best is not None  # there are ways
+        cost, free, z = best
+        progress("beginning again beside it", 1 - 0.5 / len(ROUTES))
+        for v in free:
+            values = _values(free, z)
+            if v.name.startswith(SHARP) and values[v.name] > 0:
+                other = self.solve(free, values | {v.name: 0.0}, 1e-5)
+                lower = float((self.residual(free, other) ** 2).sum())
+                if lower < cost:
+                    cost, z = lower, other
+        return free, z
+
+    def follow(
+        self, route: tuple[Stage, ...], tell: Callable[[str], None]
+    ) -> tuple[list[Quantity], FloatArray]:
+        """Fit stage by stage; what a whole motion told apart once stays free."""
+        values: dict[str, float] = {}
+        free: list[Quantity] = []
+        self.pieces = True
+        for number, (piece, part, sharp) in enumerate(route):
+            first = [] if self.pieces else free
+            self.look_at(piece, part)
+            free = self.choose(values, first, () if sharp else ("breakaway_",))
+            tell(f"identifying {len(free)} quantities")
+            z = self.solve(free, values, 1e-9 if number == len(route) - 1 else 1e-4)
+            values = _values(free, z)
+        return free, z
+
+    def choose(
+        self, values: Mapping[str, float], first: list[Quantity], without: tuple[str, ...]
+    ) -> list[Quantity]:
+        """Return the free variables: each tells something that those before it do not."""
+        held = (*without, "_", "delay") if self.pieces else without
+        rest = [v for v in self.candidates if v not in first and not v.name.startswith(held)]
+        offered = [*first, *rest]
+        J = self.jacobian(offered, self._start(offered, values))
+        free: list[Quantity] = []
+        basis = np.zeros((len(J), 0))
+        for v, column in zip(offered, J.T, strict=True):
+            length = float(np.linalg.norm(column))
+            rest = column - basis @ (basis.T @ column)
+            rest -= basis @ (basis.T @ rest)
+            # A change by its whole size must be seen against one count in every sample.
+            if length > math.sqrt(len(J)) / 3 and np.linalg.norm(rest) > INDEPENDENT * length:
+                free.append(v)
+                basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
+        return free
