@@ -20,7 +20,7 @@ from undertow.runtime import (
     respond,
 )
 from undertow.runtime.faults import Witness
-from undertow.runtime.keeper import KeptRig
+from undertow.runtime.keeper import QUEUE, KeptRig
 from undertow.runtime.slow import Answer, Request
 
 RECIPE = Recipe(parameters={"d_e": 0.025}, evaluations=64, start=(0.0, 0.3, 0.0, 0.0))
@@ -134,7 +134,13 @@ def test_a_keeper_that_was_held_up_applies_the_newest_output_alone(tmp_path: Pat
             rig.write(np.array([u]))
         with pytest.raises(TimeoutError, match="keeper"):
             rig.read()
+        for _ in range(QUEUE - 5):
+            rig.write(np.array([5.0]))
+        with pytest.raises(TimeoutError, match="keeper"):  # it never waits
+            rig.write(np.array([5.0]))
         os.kill(pid, signal.SIGCONT)
+        assert rig._pipe.poll(10.0)
+        rig.read()
     finally:
         rig.close()
     assert [float(line) for line in written.read_text().split()] == [5.0, 0.0]

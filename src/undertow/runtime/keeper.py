@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from undertow.errors import ArtefactError
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
 from undertow.runtime.clock import prompt
@@ -26,6 +27,11 @@ from undertow.runtime.processes import fork, pipe, withdraw
 from undertow.runtime.steps import confine
 
 __all__ = ["KeptRig"]
+
+#: Outputs that wait for the keeper at most.
+QUEUE = 100
+
+SILENT = "the keeper does not answer"
 
 #: How long a rig that takes no output is asked again to take zero, s.
 INSISTENCE = 1.0
@@ -52,6 +58,11 @@ class KeptRig:
         Time without an output after which the keeper takes over, s.
     record
         File for what the keeper did, as JSON, once it has let go.
+
+    Raises
+    ------
+    ArtefactError
+        When the rig cannot be made.
     """
 
     def __init__(
@@ -74,8 +85,16 @@ class KeptRig:
             daemon=False,
         )
         theirs.close()
-        self._said: _Reply = self._pipe.recv()
-        self._asked = False
+        try:
+            self._said: _Reply = self._pipe.recv()
+        except EOFError as error:
+            raise ArtefactError(
+                "rig of a keeper",
+                value="it could not be made",
+                limit="a rig that can be read",
+                remedy="The keeper's own error is printed above",
+            ) from error
+        self._unanswered = 0
 
     def read(self) -> Measurement:
         """Return the measurement that the keeper took after the last output.
@@ -89,13 +108,12 @@ class KeptRig:
         OSError
             When the rig could not be read.
         """
-        if self._asked:
+        if self._unanswered:
             if not self._pipe.poll(0.5 * self.period):
-                message = "the keeper does not answer"
-                raise TimeoutError(message)
+                raise TimeoutError(SILENT)
             while self._pipe.poll(0.0):  # late answers too: the newest counts
                 self._said = self._pipe.recv()
-            self._asked = False
+            self._unanswered = 0
         if self._said.measurement is None:
             raise OSError(self._said.read)
         return self._said.measurement
@@ -107,9 +125,13 @@ class KeptRig:
         ------
         OSError
             When the keeper is gone, or the rig did not take the output before.
+        TimeoutError
+            When so much is unanswered that to send more could block.
         """
+        if self._unanswered >= QUEUE:
+            raise TimeoutError(SILENT)
         self._pipe.send(u)
-        self._asked = True
+        self._unanswered += 1
         if self._said.write:
             raise OSError(self._said.write)
 
