@@ -149,7 +149,8 @@ def _process_stands_still() -> LiveOutcome:
         ):
             time.sleep(max(0.0, first + moment - time.perf_counter()))
             os.kill(pid, number)
-        victim.join()
+        victim.join(10.0)
+        victim.kill()
         recording = read_log(log)
         gap = float(np.diff(recording["clock"]).max())
         reason = _ending(recording, Columns.of(recipe.belief))

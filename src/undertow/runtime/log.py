@@ -14,10 +14,11 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -28,7 +29,7 @@ import numpy as np
 from undertow.errors import ArtefactError
 from undertow.mechanism import FloatArray, Mechanism
 
-__all__ = ["Columns", "Log", "Recording", "read_log"]
+__all__ = ["Columns", "Log", "Recording", "check_log", "read_log"]
 
 #: Columns of ``answers``, with their types.
 ANSWERS = {
@@ -132,20 +133,13 @@ class Log:
         self._insert = f"INSERT INTO steps VALUES ({', '.join('?' * len(columns.names))})"
         self._over = threading.Event()
         self._lock = threading.Lock()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        check_log(path)
+        with _refused(path):
             _move_earlier(path)
             self._file = self._make(meta)
             if most_bytes is not None:
                 (page,) = self._file.execute("PRAGMA page_size").fetchone()
                 self._file.execute(f"PRAGMA max_page_count={max(1, most_bytes // page)}")
-        except (OSError, sqlite3.Error) as error:
-            raise ArtefactError(
-                f"log '{path}'",
-                value=str(error),
-                limit="a file that can be written",
-                remedy="Name another one with --log",
-            ) from error
         self._thread: threading.Thread | None = None
         if threaded:
             self._thread = threading.Thread(target=self._write, name="undertow log", daemon=True)
@@ -267,17 +261,39 @@ def _writable(text: str) -> str:
     return text.encode("utf-8", "replace").decode()
 
 
-def _move_earlier(path: Path) -> None:
-    """Keep an earlier log of the same name, unless a run still writes it.
+@contextlib.contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Say of what the system refuses which log it was for."""
+    try:
+        yield
+    except (OSError, sqlite3.Error) as error:
+        raise ArtefactError(
+            f"log '{path}'",
+            value=str(error),
+            limit="a file that can be written",
+            remedy="Name another one with --log",
+        ) from error
+
+
+def check_log(path: Path) -> None:
+    """Make the folder of a log, and see that no other run and no other file is in its way.
 
     Raises
     ------
-    OSError
-        When something else has that name, or the log is in use: to rename it then would let
-        two runs write to one another's files.
+    ArtefactError
+        When the log could not be made.
     """
-    if not path.exists():
-        return
+    with _refused(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK):
+            message = "its folder cannot be written"
+            raise PermissionError(message)
+        if path.exists():
+            _claim(path)
+
+
+def _claim(path: Path) -> None:
+    """See that an earlier log is nobody's any more: two runs would write to one's files."""
     message = "something else of that name, not a log"
     if not path.is_file():
         raise FileExistsError(message)
@@ -289,6 +305,12 @@ def _move_earlier(path: Path) -> None:
             raise FileExistsError(message) from error
         except sqlite3.DatabaseError as error:
             raise FileExistsError(message) from error
+
+
+def _move_earlier(path: Path) -> None:
+    """Keep an earlier log of the same name."""
+    if not path.exists():
+        return
     number = 1
     while Path(f"{path}.{number}").exists():
         number += 1

@@ -12,7 +12,7 @@ from types import FrameType
 from undertow.cascade import CascadeState
 from undertow.rig.interface import Rig
 from undertow.runtime.clock import SimulatedClock, WallClock
-from undertow.runtime.log import Columns, Log
+from undertow.runtime.log import Columns, Log, check_log
 from undertow.runtime.loop import Runtime
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
@@ -80,6 +80,8 @@ def session(
         if progress is not None:
             progress(what, fraction)
 
+    if log is not None:
+        check_log(log)  # before the first optimum, which takes a while
     compute = recipe.respond
     tell("first optimum", 0.1)
     plant = recipe.make_rig() if rig is None else rig
