@@ -94,8 +94,10 @@ def run(
     from undertow.runtime.tables import run_table
 
     belief = inputs.mechanism_named(name, setting or ())
+    file, colon, model = name.rpartition(":")
     recipe = Recipe(
-        mechanism=name,
+        # A log of it can be replayed from anywhere.
+        mechanism=f"{Path(file).resolve()}:{model}" if colon else name,
         parameters=inputs.parse_values(setting or ()),
         start=()
         if swing_up and not start
