@@ -18,16 +18,16 @@ from undertow.bring_up.wizard import BringUp
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plot import figure_bytes, style
 
-__all__ = ["coverage_table", "files", "findings_table", "parameter_table", "summary"]
+__all__ = ["coverage_table", "files", "findings_table", "parameter_table", "plus_minus", "summary"]
 
 _STYLES = {"right": "green", "wrong": "bold red", "unclear": "yellow"}
 
 
 def findings_table(found: BringUp) -> Table:
     """Return the checks as a table, but for parameters that are right."""
-    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
+    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0), pad_edge=False)
     for head in ("check", "part", "measured", "expected", "verdict"):
-        table.add_column(head, no_wrap=True)
+        table.add_column(head, no_wrap=head in ("check", "part", "verdict"))
     for f in found.findings:
         if f.check != "parameter" or f.verdict != "right":
             row = (f.check, f.part, f.measured, f.expected)
@@ -36,18 +36,14 @@ def findings_table(found: BringUp) -> Table:
 
 
 def parameter_table(found: Identification) -> Table:
-    """Return the identified quantities with their 95 % intervals."""
-    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0))
-    heads = ("identified", "value", "95 % interval", "model", "unit", "what it is")
-    for head in heads:
-        right = head in ("value", "95 % interval", "model")
-        table.add_column(head, no_wrap=True, justify="right" if right else "left")
-    table.title = ""
+    """Return the identified quantities with half the width of their 95 % intervals."""
+    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0), pad_edge=False)
+    for head in ("identified", "value, 95 %", "unit", "model", "what it is"):
+        right = head in ("value, 95 %", "model")
+        table.add_column(head, no_wrap=head != "what it is", justify="right" if right else "left")
     for e in found.estimates.values():
-        digits = _digits(e.value, e.high - e.value)
-        interval = f"{e.low:.{digits}g} … {e.high:.{digits}g}"
         nominal = f"{e.nominal:.4g}" if math.isfinite(e.nominal) else ""
-        row = (e.name, f"{e.value:.{digits}g}", interval, nominal, e.unit, e.description)
+        row = (e.name, plus_minus(e.value, e.high - e.value), e.unit, nominal, e.description)
         table.add_row(*map(Text, row))
     return table
 
@@ -55,9 +51,10 @@ def parameter_table(found: Identification) -> Table:
 def coverage_table(rows: Sequence[CoverageRow]) -> Table:
     """Return how often intervals hold the truth, see :func:`undertow.bring_up.coverage`."""
     table = Table(
-        title="95 % intervals of the bring-up wizard, SRV02 rigs that its model contains",
-        title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
-        caption="hold the truth: ± standard error\nmean, deviation: of (estimate − "
+        title="95 % intervals of the bring-up wizard, SRV02 rigs that its model contains\n",
+        title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
+        pad_edge=False, show_edge=False,
+        caption="\nhold the truth: ± standard error\nmean, deviation: of (estimate − "
         "truth)/(standard error of the estimate)\nnoise: before counting, at 1.53 mrad per count",
         caption_justify="left",
     )  # fmt: skip
@@ -72,11 +69,15 @@ def coverage_table(rows: Sequence[CoverageRow]) -> Table:
     return table
 
 
-def _digits(value: float, half: float) -> int:
-    """Digits that show an interval: two of its half-width, three to six in all."""
-    if not (half > 0 and value):
-        return 4
-    return int(min(6, max(3, math.floor(math.log10(abs(value) / half)) + 3)))
+def plus_minus(value: float, half: float) -> str:
+    """Return value ± half, to two digits of the latter."""
+    if not half > 0 or not math.isfinite(half):
+        return f"{value:.4g}"
+    power = math.floor(math.log10(max(abs(value), half)))
+    shift = power if not -3 <= power < 5 else 0
+    digits = max(0, 1 + shift - math.floor(math.log10(half)))
+    text = f"{value / 10**shift:.{digits}f} ± {half / 10**shift:.{digits}f}"
+    return f"({text})e{shift:+03d}" if shift else text
 
 
 def summary(found: BringUp) -> tuple[str, ...]:

@@ -296,7 +296,8 @@ class _Wizard:
                       " in the driver")  # fmt: skip
             words = known_factor(factor)
             remedy = f"Divide by {abs(factor):.3g}" + f": it looks like {words}" * bool(words)
-            self._add(f"{kind} scale", name, f"{abs(seen):.3g} of the model's", "1 within 45 %",
+            self._add(f"{kind} scale", name, f"{abs(seen):.3g} times the model's",
+                      "1 within 45 %",
                       verdict="right" if scale_right else "wrong",
                       remedy="" if scale_right else remedy)  # fmt: skip
 
@@ -330,7 +331,7 @@ class _Wizard:
             light = level < 0.25 * channel.limit
             self._add(
                 "breakaway", channel.name,
-                f"{up:.3g} one way, {down:.3g} {channel.unit} the other",
+                f"{up:.3g} to, {down:.3g} {channel.unit} fro",
                 f"alike, below {0.25 * channel.limit:.3g} {channel.unit}",
                 verdict="wrong" if not light else "right" if even else "unclear",
                 remedy=""
@@ -392,7 +393,7 @@ class _Wizard:
         for c, part in zip(self.belief.coordinates, found.explained, strict=True):
             good = part > 0.95
             self._add(
-                "model", c.name, f"explains {100 * part:.2f} % of the motion", "95 % or more",
+                "model", c.name, f"explains {100 * part:.2f} %", "95 % or more",
                 verdict="right" if good else "wrong",
                 remedy="" if good else "Something moves that the model does not have",
             )  # fmt: skip

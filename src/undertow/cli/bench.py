@@ -92,10 +92,10 @@ def bench(
             progress=progress,
         )
     console = terminal()
-    console.width = max(console.width, 150)
-    console.print(findings_table(found), crop=False)
+    console.print(findings_table(found))
     if found.identification is not None:
-        console.print(parameter_table(found.identification), crop=False)
+        console.print()
+        console.print(parameter_table(found.identification))
     for line in summary(found):
         say(console, line)
     if out is not None:

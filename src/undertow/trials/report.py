@@ -42,10 +42,14 @@ __all__ = [
 def table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], note: str = ""
 ) -> Table:
-    """Return a table for the terminal, the first column to the left, the rest to the right."""
+    """Return a table for the terminal, the first column to the left, the rest to the right.
+
+    Two spaces between columns, so that seven of them fit a terminal of 80.
+    """
     out = Table(
-        title=title, title_justify="left", title_style="bold",
-        caption=note or None, caption_justify="left", box=box.SIMPLE_HEAD, pad_edge=False,
+        title=title + "\n", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD,
+        caption=f"\n{note}\n" if note else "", caption_justify="left", padding=(0, 1, 0, 0),
+        pad_edge=False, show_edge=False,
     )  # fmt: skip
     for number, column in enumerate(columns):
         out.add_column(column, justify="left" if number == 0 else "right", no_wrap=number == 0)
@@ -281,7 +285,7 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
         rows.append(
             (
                 name,
-                f"{balanced(runs)} of {len(runs)}",
+                f"{balanced(runs)}",
                 f"{sum(run.caught for run in runs)}",
                 *(str(spread(fair, what)) for what in ("cost", "effort", "settled", "chatter")),
             )
@@ -289,9 +293,17 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
     parts: list[RenderableType] = [
         table(
             "Random rigs: masses ±20 %, friction up to twice, delay up to 5 ms, a knock",
-            ("", "balanced", "caught", "cost\nV² s", "∫u² dt\nV² s", "settled\ns", "chatter\nV/s"),
+            (
+                "",
+                f"balanced\nof {len(both)}",
+                "caught",
+                "cost\nV² s",
+                "∫u² dt\nV² s",
+                "settled\ns",
+                "chatter\nV/s",
+            ),
             rows,
-            f"mean ± standard deviation over the {sum(both)} rigs that all of them balanced; "
+            f"mean ± standard deviation over the rigs that all of them balanced: {sum(both)}\n"
             "caught: the pendulum is up, wherever the arm is",
         )
     ]
@@ -302,7 +314,7 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             cells = []
             for name in names:
                 found = result.breaking[name, factor]
-                broken = "" if found.seed is None else f" (seed {found.seed})"
+                broken = "" if found.seed is None else f" ({found.seed})"
                 more = "≥ " if found.seed is None else ""
                 cells.append(f"{more}{scale * found.survived:.3g}{broken}")
             lines.append((f"{factor}, {unit}", *cells))
@@ -310,10 +322,10 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             table(
                 f"Largest single change from which all of {result.seeds} rigs come home in "
                 f"{SINGLE:g} s",
-                ("", *names),
+                ("", *(name.replace(" ", "\n", 1) for name in names)),
                 lines,
-                "in brackets the first seed that a little more breaks: "
-                "1/32 of the largest change looked for",
+                "(n): what the rig of seed n does not survive is larger by 1/32\n"
+                "of the largest change tried; ≥: that was survived",
             )
         )
     return Group(*parts)

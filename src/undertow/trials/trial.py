@@ -173,16 +173,19 @@ def _cost(mechanism: Mechanism, objective: Objective, record: Record) -> float:
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and standard deviation of a number over the balanced runs."""
+    """Mean and standard deviation of a number over the balanced runs; 0 where there is one."""
 
     mean: float
     deviation: float
 
     def __str__(self) -> str:
-        """Show as mean ± deviation, to three digits of the mean."""
+        """Show as mean ± deviation: two digits of it, and no more than three of the mean."""
         if not math.isfinite(self.mean):
             return "—"
-        digits = max(0, 2 - math.floor(math.log10(max(abs(self.mean), 1e-9))))
+        digits = 2 - math.floor(math.log10(max(abs(self.mean), 1e-9)))
+        if not self.deviation > 0:
+            return f"{self.mean:.{max(0, digits)}f}"
+        digits = max(0, min(digits, 1 - math.floor(math.log10(self.deviation))))
         return f"{self.mean:.{digits}f} ± {self.deviation:.{digits}f}"
 
 
