@@ -10,6 +10,7 @@ from typing import Any
 from rich import box
 from rich.console import Group
 from rich.markup import escape
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -119,6 +120,12 @@ def replay_table(result: Replay) -> Table:
     table = Table.grid(padding=(0, 2))
     recording = result.recording
     table.add_row("log", f"{recording.path}: {recording.meta['mechanism']}")
+    stops = [(t, text) for _, t, kind, text in recording.events if kind == "state"]
+    if stops and "SAFE_STOP" in stops[-1][1]:
+        t, text = stops[-1]
+        table.add_row("stopped by", escape(f"{text.partition('SAFE_STOP: ')[2]}, at {t:.3f} s"))
+    else:
+        table.add_row("stopped by", "nothing in the log: it was cut off")
     table.add_row("steps made again", f"{result.steps:,}")
     table.add_row(
         "outputs, estimates, states",
@@ -153,13 +160,13 @@ def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -
         if not outcome.replayed:
             happened += "; [red]its replay differs[/red]"
         table.add_row(
-            f"  {escape(case.name)}", happened, f"{outcome.largest:.0%}", _mark(outcome.passed)
+            _indented(case.name), happened, f"{outcome.largest:.0%}", _mark(outcome.passed)
         )
     for number, one in enumerate(live):
         if number == 0:
             table.add_row("[bold]against the clock[/bold]")
         table.add_row(
-            f"  {escape(f'{one.part}: {one.name}')}", escape(one.happened), "", _mark(one.passed)
+            _indented(f"{one.part}: {one.name}"), escape(one.happened), "", _mark(one.passed)
         )
     return table
 
@@ -198,6 +205,10 @@ def kill_table(killed: Sequence[Killed]) -> Group:
         for reason, count in reasons.most_common()
     ]
     return Group(table, *lines)
+
+
+def _indented(text: str) -> Padding:
+    return Padding(escape(text), (0, 0, 0, 2))
 
 
 def _mark(passed: bool) -> str:
