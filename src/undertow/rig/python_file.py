@@ -60,7 +60,7 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
     """
     lacking = [part for part in ("read", "write", "close") if not callable(getattr(rig, part, 0))]
     period = getattr(rig, "period", None)
-    if not isinstance(period, Real) or not 0 < period < math.inf:
+    if not isinstance(period, Real) or not 0 < float(period) < math.inf:
         lacking.append("period > 0, s")
     if lacking:
         raise InvalidInputError(
