@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -33,7 +35,15 @@ from undertow.cli import app
 from undertow.errors import ArtefactError, InfeasibleError, InvalidInputError
 from undertow.mechanisms import LIBRARY
 from undertow.results import versions
-from undertow.rig import Encoder, IdealRig, RealisticRig, plausible_rig, srv02_rig
+from undertow.rig import (
+    Encoder,
+    IdealRig,
+    Measurement,
+    Paced,
+    RealisticRig,
+    plausible_rig,
+    srv02_rig,
+)
 
 
 @lru_cache(maxsize=16)
@@ -345,3 +355,70 @@ def test_a_reading_is_worth_what_it_adds() -> None:
 def test_how_long_a_motion_dwells() -> None:
     """Samples around each that stay within reach without a break."""
     assert dwell(np.array([0.0, 0.4, 5.0, 5.3, 5.1, 0.0]), 0.5).tolist() == [2, 2, 3, 3, 3, 1]
+
+
+DRIVER = """
+import numpy as np
+from undertow.rig import RealisticRig, srv02_rig
+from undertow.swing_up import hanging
+
+class Driver:
+    def __init__(self):
+        bench = srv02_rig()
+        self.rig = RealisticRig(bench, hanging(bench.mechanism), seed=3)
+        self.period = self.rig.period
+
+    def read(self):
+        return self.rig.read()
+
+    def write(self, u):
+        self.rig.write(-np.asarray(u))
+
+    def close(self):
+        print("let go, at", self.rig.read().q.size, "joints")
+"""
+
+
+def test_the_wizard_meets_a_driver_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the command line; a swapped sign is found, and the rig is let go of."""
+    (tmp_path / "driver.py").write_text(DRIVER)
+    monkeypatch.setattr("undertow.rig.Paced", lambda rig: rig)  # this one needs no clock
+    words = ["bench", "rotary_pendulum", "--rig", f"{tmp_path / 'driver.py'}:Driver"]
+    result = CliRunner().invoke(app, [*words, "--quick"])
+    assert result.exit_code == 1
+    assert "Wrong: input sign of voltage" in result.output
+    assert "let go, at 2 joints" in result.output
+    refused = CliRunner().invoke(app, [*words, "--fault", "voltage=-1"])
+    assert refused.exit_code != 0
+    assert "a simulated rig" in refused.output
+
+
+def test_hardware_is_asked_at_its_own_pace() -> None:
+    rig = Paced(IdealRig(ut.mechanisms.rotary_pendulum(), period=0.002))
+    began = time.perf_counter()
+    for _ in range(20):
+        rig.write(np.zeros(1))
+    assert time.perf_counter() - began > 19 * 0.002  # never ahead of the clock
+    assert rig.read().t == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_a_motion_that_breaks_off_leaves_no_input(error: type[BaseException]) -> None:
+    """Ctrl-C, or a driver that fails: the last thing that is written is zero."""
+    written: list[np.ndarray] = []
+
+    class Breaks(IdealRig):
+        def read(self) -> Measurement:
+            if len(written) == 5:
+                raise error
+            return super().read()
+
+        def write(self, u: ArrayLike) -> None:
+            written.append(np.array(u))
+
+    rig = Breaks(ut.mechanisms.rotary_pendulum())
+    with pytest.raises(error):
+        perform(rig, np.ones((20, 1)), [9.0, 9.0])
+    assert [float(u[0]) for u in written] == [1.0] * 5 + [0.0]

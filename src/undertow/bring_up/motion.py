@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -70,26 +71,30 @@ def perform(
     """
     times, positions = np.empty(len(u)), []
     home: FloatArray | None = None
-    for k, inputs in enumerate(u):
-        measured = rig.read()
-        times[k] = measured.t
-        positions.append(np.array(measured.q, dtype=float))
-        if home is None:
-            home = positions[0]
-        away = np.abs(positions[-1] - home)
-        if not (away <= guard).all():
-            rig.write(np.zeros_like(inputs))
-            worst = int(np.argmax(~(away <= guard)))
-            raise GuardError(
-                f"coordinate {worst} of the rig",
-                value=f"{away[worst]:.3g} from where it began",
-                limit=f"up to {guard[worst]:.3g}",
-                remedy="The inputs are zero now: look at the rig before going on",
-            )
-        if until is not None and (away > until).any():
-            rig.write(np.zeros_like(inputs))
-            break
-        rig.write(inputs)
+    try:
+        for k, inputs in enumerate(u):
+            measured = rig.read()
+            times[k] = measured.t
+            positions.append(np.array(measured.q, dtype=float))
+            if home is None:
+                home = positions[0]
+            away = np.abs(positions[-1] - home)
+            if not (away <= guard).all():
+                worst = int(np.argmax(~(away <= guard)))
+                raise GuardError(
+                    f"coordinate {worst} of the rig",
+                    value=f"{away[worst]:.3g} from where it began",
+                    limit=f"up to {guard[worst]:.3g}",
+                    remedy="The inputs are zero now: look at the rig before going on",
+                )
+            if until is not None and (away > until).any():
+                rig.write(np.zeros_like(inputs))
+                break
+            rig.write(inputs)
+    except BaseException:  # a guard, a driver that fails, Ctrl-C
+        with contextlib.suppress(Exception):
+            rig.write(np.zeros(u.shape[1]))
+        raise
     count = len(positions)
     return Record(times[:count], np.array(positions), np.array(u[:count]))
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,6 +23,11 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
+from undertow.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from undertow.mechanism import FloatArray, Mechanism
+    from undertow.rig import Rig
 
 __all__ = ["bench"]
 
@@ -29,14 +37,19 @@ __all__ = ["bench"]
         "undertow bench rotary_pendulum",
         "undertow bench rotary_pendulum --fault voltage=-1",
         "undertow bench cart_pendulum --fault x=4 --fault delay=0.001 --out findings",
+        "undertow bench my_arm.py:arm --rig my_driver.py:Driver --out findings",
     )
 )
 @reports_errors
 def bench(
     name: Name,
     rig: Annotated[
-        Literal["realistic", "ideal"],
-        typer.Option(help="The simulated plant: a bench with all its flaws, or its model."),
+        str,
+        typer.Option(
+            help="realistic: a simulated bench with all its flaws. ideal: the model. "
+            "FILE.py:NAME: a driver of your own, a class or a function that makes one.",
+            metavar="RIG",
+        ),
     ] = "realistic",
     fault: Annotated[
         list[str] | None,
@@ -51,7 +64,7 @@ def bench(
         float | None,
         typer.Option(
             help="From a write to its effect in a reading, s, as it should be. Default: the "
-            "simulated rig's own."
+            "simulated rig's own; of your own rig it is measured, and compared with nothing."
         ),
     ] = None,
     quick: Annotated[
@@ -64,33 +77,33 @@ def bench(
     ] = None,
 ) -> None:
     """Check a rig at rest by small safe motions: signs, scales, delay, friction, parameters."""
-    from undertow.bring_up import bring_up, miswired, rest_state, rubbing
+    from undertow.bring_up import bring_up, miswired, rest_state
     from undertow.bring_up.report import files, findings_table, parameter_table, summary
-    from undertow.rig import IdealRig, RealisticRig
-    from undertow.rig.presets import bench_for
+    from undertow.rig import RealisticRig
 
     request = {"mechanism": name, "rig": rig, "fault": fault or [], "seed": seed}
     belief = inputs.mechanism_named(name, setting or ())
     rest = rest_state(belief)
     if out is not None:
         results.check_folder(out)
-    flaws = rubbing(bench_for(inputs.mechanism_named(name)), fault or ())
-    plant = (
-        RealisticRig(flaws, rest, seed)
-        if rig == "realistic"
-        else IdealRig(inputs.mechanism_named(name), rest)
-    )
-    timing = plant.bench.timing
-    expected = timing.input_delay + timing.measurement_delay if delay is None else delay
-    with progress_bar() as progress:
-        found = bring_up(
-            miswired(plant, belief, fault or ()),
-            belief,
-            delay=expected,
-            rest=rest,
-            learn=not quick,
-            progress=progress,
-        )
+    faults = fault or ()
+    plant = _plant(rig, name, belief, rest, faults, seed)
+    if delay is None and isinstance(plant, RealisticRig):
+        delay = plant.bench.timing.input_delay + plant.bench.timing.measurement_delay
+    with closing(plant):
+        if ".py:" in rig and sys.stdin.isatty():
+            say(terminal(), f"Ready. Let {name} come to rest, hands off, and press Enter.")
+            if not sys.stdin.readline():  # the end of the input is no yes
+                raise typer.Exit(1)
+        with progress_bar() as progress:
+            found = bring_up(
+                miswired(plant, belief, faults),
+                belief,
+                delay=delay,
+                rest=rest,
+                learn=not quick,
+                progress=progress,
+            )
     console = terminal()
     console.print(findings_table(found))
     if found.identification is not None:
@@ -102,3 +115,33 @@ def bench(
         say(console, write(out, files(request, belief, rest, found)))
     if found.wrong:
         raise typer.Exit(1)
+
+
+def _plant(
+    rig: str, name: str, belief: Mechanism, rest: FloatArray, faults: Sequence[str], seed: int
+) -> Rig:
+    """Return the rig that was asked for; a simulated one moves as the library's numbers say."""
+    from undertow.bring_up import rubbing
+    from undertow.rig import IdealRig, Paced, RealisticRig, rig_from_file
+    from undertow.rig.presets import bench_for
+
+    if ".py:" in rig:
+        if faults:
+            raise InvalidInputError(
+                "--fault",
+                value=", ".join(faults),
+                limit="a simulated rig",
+                remedy="What is wrong with your own is for the wizard to find",
+            )
+        return Paced(rig_from_file(rig, belief))
+    model = inputs.mechanism_named(name)
+    if rig == "realistic":
+        return RealisticRig(rubbing(bench_for(model), faults), rest, seed)
+    if rig == "ideal":
+        return IdealRig(model, rest)
+    raise InvalidInputError(
+        "rig",
+        value=repr(rig),
+        limit="realistic, ideal or FILE.py:NAME",
+        remedy="A driver of your own: see examples/serial_rig.py",
+    )

@@ -71,5 +71,7 @@ def object_from_file(text: str, what: str) -> Any:
         raise
     except Exception as error:  # a user's file may do anything
         raise ArtefactError(
-            f"{what} file '{file}'", value=f"{type(error).__name__}: {error}", limit="a file that runs"
+            f"{what} file '{file}'",
+            value=f"{type(error).__name__}: {error}",
+            limit="a file that runs",
         ) from error

@@ -3,6 +3,7 @@
 from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Push, Timing
 from undertow.rig.interface import Measurement, Rig
 from undertow.rig.mujoco_rig import MuJoCoRig
+from undertow.rig.paced import Paced
 from undertow.rig.presets import plausible_rig, srv02_rig
 from undertow.rig.python_file import check_rig, rig_from_file
 from undertow.rig.simulated import IdealRig, RealisticRig
@@ -16,6 +17,7 @@ __all__ = [
     "IdealRig",
     "Measurement",
     "MuJoCoRig",
+    "Paced",
     "Push",
     "RealisticRig",
     "Rig",
