@@ -678,6 +678,8 @@ def test_bad_requests_are_refused_with_value_and_limit() -> None:
         (lambda: EmbeddedController(rig, three_rows(rig), rows=2), "3 (those of the plan)"),
         (lambda: EmbeddedController(rig, Plan((s, s), (0.0, 1e-4))), "apart"),
         (lambda: EmbeddedController(rig, s, differentiator=DerivativeStep(0.0)), "> 0"),
+        (lambda: EmbeddedController(rig, s, differentiator=KalmanStep(-1.0)), "position_noise"),
+        (lambda: EmbeddedController(rig, Plan((s, s), (0.0, 1e7))), "2^32"),
     )
     for build, words in requests:
         with pytest.raises(InvalidInputError, match=re.escape(words)):

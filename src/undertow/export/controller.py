@@ -174,7 +174,9 @@ class EmbeddedController:
             )
         self.starts(self.plan)
         self.slew_rates  # noqa: B018  # refuses what cannot be used
-        if not isinstance(self.differentiator, KalmanStep):
+        if isinstance(self.differentiator, KalmanStep):
+            self.differentiator.noises(self.mechanism.n)
+        else:
             self.differentiator.gains(self.mechanism.n)
 
     @cached_property

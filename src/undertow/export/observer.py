@@ -53,13 +53,18 @@ class KalmanStep:
         """What the gains are."""
         return "state on position, rows of the state"
 
+    def noises(self, n: int) -> tuple[FloatArray, FloatArray]:
+        """Return the noises of positions and accelerations, (n,) each; both must be positive."""
+        return (
+            positive("position_noise", self.position_noise, n),
+            positive("acceleration_noise", self.acceleration_noise, n),
+        )
+
     def gains(self, mechanism: Mechanism, period: float) -> FloatArray:
         """Return K, (2n, n), settled at the target."""
         n = mechanism.n
-        noise = positive("position_noise", self.position_noise, n)
-        filter_ = KalmanFilter(
-            mechanism, period, position_noise=noise, acceleration_noise=self.acceleration_noise
-        )
+        noise, unknown = self.noises(n)
+        filter_ = KalmanFilter(mechanism, period, position_noise=noise, acceleration_noise=unknown)
         return np.asarray(filter_.settled()[: 2 * n, :n] / noise**2)
 
     def estimator(self, mechanism: Mechanism, period: float) -> Observer:
