@@ -11,7 +11,7 @@ import pytest
 
 import undertow as ut
 from undertow.certify import terminal_sets
-from undertow.certify.ellipsoid_search import ProvedEllipsoid
+from undertow.certify.ellipsoid import ProvedEllipsoid
 from undertow.errors import InvalidInputError, ModelError
 from undertow.rig import Bench, Push, RealisticRig, srv02_rig
 from undertow.swing_up import CatchRegion, Gains, SwingUp, SwingUpAndCatch, designed, hanging

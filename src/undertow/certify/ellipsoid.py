@@ -34,7 +34,7 @@ from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
 from undertow.sliding import LawSymbols, ReachingLaw, Surface, check_surface_shape, lay_law
 
-__all__ = ["ClosedLoopProgram", "TerminalEllipsoid", "verify_ellipsoid"]
+__all__ = ["ClosedLoopProgram", "ProvedEllipsoid", "TerminalEllipsoid", "verify_ellipsoid"]
 
 FloatArray = NDArray[np.float64]
 
@@ -82,6 +82,19 @@ class TerminalEllipsoid:
     def ball(self) -> float:
         """Radius of the largest ball ‖x‖₂ ≤ r inside."""
         return float(self.radius / np.linalg.norm(self.W, 2))
+
+
+@dataclass(frozen=True)
+class ProvedEllipsoid:
+    """A terminal ellipsoid, proved, and the closed loop that it is of."""
+
+    surface: Surface
+    reaching: ReachingLaw
+    ellipsoid: TerminalEllipsoid
+
+    def contains(self, x: ArrayLike) -> bool:
+        """Whether the state is inside for certain."""
+        return self.ellipsoid.contains(x)
 
 
 class ClosedLoopProgram:

@@ -13,11 +13,16 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.certify.ellipsoid import ClosedLoopProgram, TerminalEllipsoid, prove_kernel
+from undertow.certify.ellipsoid import (
+    ClosedLoopProgram,
+    ProvedEllipsoid,
+    TerminalEllipsoid,
+    prove_kernel,
+)
 from undertow.mechanism import Mechanism
 from undertow.sliding import ReachingLaw, Surface
 
-__all__ = ["EllipsoidSearch", "ProvedEllipsoid", "search_for", "terminal_sets"]
+__all__ = ["EllipsoidSearch", "search_for", "terminal_sets"]
 
 FloatArray = NDArray[np.float64]
 
@@ -217,19 +222,6 @@ def search_for(
         np.array(rates),
         np.array(modes),
     )
-
-
-@dataclass(frozen=True)
-class ProvedEllipsoid:
-    """A terminal set and the closed loop that it is proved for."""
-
-    surface: Surface
-    reaching: ReachingLaw
-    ellipsoid: TerminalEllipsoid
-
-    def contains(self, x: ArrayLike) -> bool:
-        """Whether the state is inside for certain."""
-        return self.ellipsoid.contains(x)
 
 
 def terminal_sets(

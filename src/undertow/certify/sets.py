@@ -8,26 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.certify.certificate import ellipsoid_of
-from undertow.certify.ellipsoid import TerminalEllipsoid
+from undertow.certify.ellipsoid import ProvedEllipsoid
 from undertow.certify.loop_claim import LoopClaim
 from undertow.certify.verify import Checked
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.sliding import ReachingLaw, Surface
 
-__all__ = ["ProvedEllipsoid", "ProvedStarts", "proved_sets"]
-
-
-@dataclass(frozen=True)
-class ProvedEllipsoid:
-    """A proved terminal ellipsoid of one closed loop."""
-
-    surface: Surface
-    reaching: ReachingLaw
-    ellipsoid: TerminalEllipsoid
-
-    def contains(self, x: FloatArray) -> bool:
-        """Whether the state is inside for certain."""
-        return self.ellipsoid.contains(x)
+__all__ = ["ProvedStarts", "proved_sets"]
 
 
 @dataclass(frozen=True)
