@@ -185,6 +185,12 @@ def test_a_stop_before_the_run_is_kept_and_a_second_run_refused(controller: Cont
         runtime.run(1.0)
 
 
+@pytest.mark.parametrize("period", [0.0, 0.15, float("nan")])
+def test_a_period_that_is_itself_a_stall_is_refused(period: float) -> None:
+    with pytest.raises(InvalidInputError, match="period of a run"):
+        Recipe(period=period)
+
+
 def test_a_rig_of_another_period_is_refused(controller: Controller) -> None:
     rig = replace(RECIPE, period=0.002).make_rig()
     with pytest.raises(InvalidInputError, match="period of the rig"):

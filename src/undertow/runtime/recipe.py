@@ -84,6 +84,17 @@ class Recipe:
     swing_up: bool = False
     settings: Settings = field(default_factory=Settings)
 
+    def __post_init__(self) -> None:
+        """Refuse a period that is itself a stall."""
+        stall = self.settings.stall
+        if not 0 < self.period < stall:
+            raise InvalidInputError(
+                "period of a run",
+                value=f"{self.period:g} s",
+                limit=f"> 0 and less than the longest gap between two steps, {stall:g} s",
+                remedy="1 ms is usual; a longer one needs Settings(stall=...)",
+            )
+
     @cached_property
     def belief(self) -> Mechanism:
         """The controller's model."""

@@ -88,10 +88,11 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         same = "the same outputs" if not report.disagreed else f"{report.disagreed:,} other outputs"
         if report.shadowed:
             lines.add_row("shadow", f"{report.shadowed:,} steps made again, {same}")
-    path = " → ".join(
-        text.split(":")[0].split(" → ")[-1] for _, what, text in report.events if what == "state"
-    )
-    lines.add_row("states", f"IDLE → {path}" if path else "IDLE")
+    states = ["IDLE"]
+    states += [t.split(":")[0].split(" → ")[-1] for _, what, t in report.events if what == "state"]
+    if len(states) > 10:
+        states[6:-3] = [f"{len(states) - 9} more"]
+    lines.add_row("states", " → ".join(states))
     if report.mode == Mode.SAFE_STOP:
         lines.add_row("stopped by", escape(report.stopped_by))
     failures = Counter(text for _, what, text in report.events if what == "rig")
