@@ -34,6 +34,7 @@ from undertow.runtime import (
 )
 from undertow.runtime.encoding import answer_from, answer_row, memory_from, memory_to
 from undertow.runtime.figures import chatter_figure, latency_figure, motion_figure
+from undertow.runtime.replay import build
 from undertow.runtime.slow import Request
 
 RECIPE = Recipe(rig="realistic", evaluations=64, start=(0.0, 0.2, 0.0, 0.0))
@@ -99,6 +100,16 @@ def test_a_controller_with_another_belief_is_refused(logged: Path) -> None:
     other = Recipe(parameters={"d_e": 0.02})
     with pytest.raises(ArtefactError, match="other equations or numbers"):
         replay_controller(read_log(logged), other.make_controller(MEMORY))
+
+
+def test_a_replay_says_that_the_sources_have_changed(
+    logged: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert replay(logged, decisions=False).build == {}
+    now = build()
+    module = sys.modules["undertow.runtime.replay"]  # the package has a function of that name
+    monkeypatch.setattr(module, "build", lambda: {**now, "sources": "others"})
+    assert replay(logged, decisions=False).build == {"sources": (now["sources"], "others")}
 
 
 def test_same_seed_same_log(logged: Path, tmp_path: Path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -87,9 +89,19 @@ def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> 
         "memory": memory_to(controller.memory),
         "recipe": None if recipe is None else recipe.as_dict(),
         "period": controller.period,
-        "versions": versions(),
+        "versions": build(),
         **more,
     }
+
+
+@lru_cache(maxsize=1)
+def build() -> dict[str, str | None]:
+    """Return what shapes the bits of a run: versions, and a hash of this package's own sources."""
+    package = Path(__file__).parent.parent
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
+    return {**versions(), "sources": digest.hexdigest()[:12]}
 
 
 def replay(path: Path, *, decisions: bool = True) -> Replay:
@@ -168,10 +180,10 @@ def replay_controller(
         if not _same_step(controller, row, columns):
             differing += 1
             first = k if first is None else first
-    then, now = recording.meta.get("versions", {}), versions()
-    build = {name: (then.get(name), now[name]) for name in now if then.get(name) != now[name]}
+    then, now = recording.meta.get("versions", {}), build()
+    changed = {name: (then.get(name), now[name]) for name in now if then.get(name) != now[name]}
     u_all = np.array(outputs).reshape(len(outputs), mechanism.m)
-    return Replay(recording, len(outputs), differing, first, judged, misjudged, gap, u_all, build)
+    return Replay(recording, len(outputs), differing, first, judged, misjudged, gap, u_all, changed)
 
 
 def _measurement(row: FloatArray, columns: Columns) -> Measurement | None:
