@@ -174,6 +174,31 @@ def test_a_worker_that_fails_leaves_the_last_plan(controller: Controller) -> Non
     assert ("optimiser", "OSError: no line") in {(what, text) for _, what, text in report.events}
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"lanes": None}, {"x": [0.0] * 4}, {"sequence": "1"}, {"memory": None}, None]
+)
+def test_what_is_no_whole_answer_is_not_looked_at(
+    wrong: dict[str, object] | None, tmp_path: Path
+) -> None:
+    """Of whatever types a worker's answers are: the last plan stays, and the replay agrees."""
+
+    def compute(request: Request) -> Answer:
+        answer = RECIPE.respond(request)
+        return replace(answer, **wrong) if wrong else "later"  # type: ignore[arg-type, return-value]
+
+    controller = RECIPE.make_controller(RECIPE.first())
+    path = tmp_path / "run.db"
+    meta = about(controller, RECIPE)
+    with Log(path, Columns.of(RECIPE.belief), meta, threaded=False) as log:
+        runtime = Runtime(
+            controller, RECIPE.make_rig(), InlineWorker(compute), clock=SimulatedClock(), log=log
+        )
+        report = runtime.run(0.3)
+    assert report.stopped_by == "operator: stop"
+    assert any("no whole answer" in text for _, _, text in report.events)
+    assert replay(path).identical
+
+
 def test_a_stop_before_the_run_is_kept_and_a_second_run_refused(controller: Controller) -> None:
     runtime = Runtime(
         controller, RECIPE.make_rig(), InlineWorker(RECIPE.respond), clock=SimulatedClock()

@@ -22,7 +22,7 @@ from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import answer_row
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
-from undertow.runtime.slow import Answer, Worker
+from undertow.runtime.slow import Answer, Worker, is_answer
 
 __all__ = ["Report", "Runtime"]
 
@@ -260,9 +260,9 @@ class Runtime:
         except Exception as error:
             self._tell("optimiser", f"{type(error).__name__}: {error}")
             return None
-        if answer is None or isinstance(answer, Answer):
+        if answer is None or is_answer(answer):
             return answer
-        self._tell("optimiser", f"not an answer but a {type(answer).__name__}")
+        self._tell("optimiser", f"no whole answer, a {type(answer).__name__}")
         return None
 
     def _write(self, u: FloatArray) -> str:

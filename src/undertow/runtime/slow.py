@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 import numpy as np
 
@@ -39,6 +39,7 @@ __all__ = [
     "Request",
     "Worker",
     "background_worker",
+    "is_answer",
     "judge",
     "lanes_of",
     "respond",
@@ -100,6 +101,20 @@ class Answer:
 
 
 Compute = Callable[[Request], Answer]
+
+
+def is_answer(said: object) -> TypeGuard[Answer]:
+    """Whether what a worker gave has all that a step reads of an answer, of the right types."""
+    return (
+        isinstance(said, Answer)
+        and isinstance(said.sequence, int)
+        and isinstance(said.use, float)
+        and isinstance(said.admission, Admission)
+        and isinstance(said.memory, CascadeState)
+        and all(
+            isinstance(part, np.ndarray) and part.dtype == float for part in (said.x, said.lanes)
+        )
+    )
 
 
 def lanes_of(cascade: Cascade, plan: Plan) -> FloatArray:
