@@ -51,11 +51,11 @@ def parameter_table(found: Identification) -> Table:
 def coverage_table(rows: Sequence[CoverageRow]) -> Table:
     """Return how often intervals hold the truth, see :func:`undertow.bring_up.coverage`."""
     table = Table(
-        title="95 % intervals of the bring-up wizard, SRV02 rigs that its model contains\n",
+        title="95 % intervals of the bring-up wizard\nSRV02 rigs that its model contains\n",
         title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
         pad_edge=False, show_edge=False,
-        caption="\nhold the truth: ± standard error\nmean, deviation: of (estimate − "
-        "truth)/(standard error of the estimate)\nnoise: before counting, at 1.53 mrad per count",
+        caption="\nhold the truth: ± standard error of the share\nmean, deviation: of (estimate − "
+        "truth)/(standard error)\nnoise: before counting, at 1.53 mrad per count",
         caption_justify="left",
     )  # fmt: skip
     for head in ("", "noise\nmrad", "intervals", "hold the truth", "mean", "deviation"):

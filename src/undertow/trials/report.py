@@ -49,7 +49,7 @@ def table(
     out = Table(
         title=title + "\n", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD,
         caption=f"\n{note}\n" if note else "", caption_justify="left", padding=(0, 1, 0, 0),
-        pad_edge=False, show_edge=False,
+        pad_edge=False, show_edge=False, min_width=max(map(len, title.splitlines())),
     )  # fmt: skip
     for number, column in enumerate(columns):
         out.add_column(column, justify="left" if number == 0 else "right", no_wrap=number == 0)
@@ -245,8 +245,9 @@ def library_report(rows: Sequence[LibraryRow]) -> RenderableType:
             )
             for row in rows
         ],
-        "m: inputs; ε: boundary layer; held: to the end, without a safe stop; admitted:\n"
-        "surfaces; limits/s: total variation of the input that varies most, by its limit",
+        "m: inputs; ε: boundary layer; held: to the end, without a safe stop; "
+        "admitted: surfaces; limits/s: total variation of the input that varies most, by its "
+        "limit",
     )
 
 
