@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
 
-__all__ = ["Clock", "Histogram", "SimulatedClock", "WallClock", "prompt"]
+__all__ = ["YIELD", "Clock", "Histogram", "SimulatedClock", "WallClock", "prompt"]
+
+
+#: After how long a thread that waits for the interpreter's lock asks for it, s: while the fast
+#: loop sleeps, which waits itself when it wakes; and while it works, a period at the usual rate.
+YIELD, KEEP = 2e-5, 1e-3
 
 
 class Clock(Protocol):
@@ -32,7 +38,12 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """The monotonic clock of the machine."""
+    """The monotonic clock of the machine.
+
+    Who sleeps by it gets the interpreter's lock back soon, and is asked for it by other threads
+    only when it sleeps again: to be asked in the middle of a step costs that step more than its
+    own computation.
+    """
 
     simulated = False
     now = staticmethod(time.perf_counter)
@@ -41,7 +52,9 @@ class WallClock:
         """Sleep; the operating system may wake us late, never early."""
         rest = t - time.perf_counter()
         if rest > 0:
+            sys.setswitchinterval(YIELD)
             time.sleep(rest)
+            sys.setswitchinterval(KEEP)
 
     def spin_until(self, t: float) -> None:
         """Wait without sleeping: no wake-up to be late for."""

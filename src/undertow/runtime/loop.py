@@ -17,7 +17,7 @@ import numpy as np
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, Rig
-from undertow.runtime.clock import Clock, Histogram, WallClock, prompt
+from undertow.runtime.clock import YIELD, Clock, Histogram, WallClock, prompt
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import answer_row
 from undertow.runtime.log import Log
@@ -378,14 +378,14 @@ def _own(measurement: Measurement, n: int) -> Measurement:
 def _quiet_interpreter(clock: Clock) -> Iterator[None]:
     """Keep the interpreter from pausing the loop: no collections but those that the loop makes.
 
-    Old objects are frozen, and other threads yield quickly.
+    Old objects are frozen; other threads yield quickly, and wait while the loop works.
     The fast loop also asks for a real-time priority, where the system grants it.
     """
     if clock.simulated:
         yield
         return
     interval, collecting = sys.getswitchinterval(), gc.isenabled()
-    sys.setswitchinterval(2e-5)
+    sys.setswitchinterval(YIELD)  # the clock goes on with it
     gc.collect()
     gc.freeze()
     gc.disable()
