@@ -116,7 +116,9 @@ def understand(responses: Sequence[Response], enough: FloatArray) -> Understood:
     """
     n = len(enough)
     best: tuple[float, Understood] | None = None
-    for order in itertools.permutations(range(n)):
+    seen = all(any(response.moved[:, j].any() for response in responses) for j in range(n))
+    # Where a reading never moves, the others fit in more than one order: theirs is not doubted.
+    for order in itertools.permutations(range(n)) if seen else [tuple(range(n))]:
         gain, unlike = np.zeros((len(responses), n)), 0.0
         known = np.zeros((len(responses), n), dtype=bool)
         for i, response in enumerate(responses):
