@@ -173,10 +173,7 @@ def test_wirings_found_one_behind_the_other_are_one_wiring() -> None:
         (("phi=57.29578",), {("encoder scale", "phi")}),
         (("delay=0.0015",), {("delay", "the loop")}),
         (("theta=-1", "phi=2"), {("encoder sign", "theta"), ("encoder scale", "phi")}),
-        (
-            ("swap=theta,phi", "theta=-1"),
-            {("encoder order", "theta, phi"), ("encoder sign", "theta")},
-        ),
+        (("swap=theta,phi",), {("encoder order", "theta, phi")}),
     ],
 )
 def test_faults_on_other_rigs(
@@ -184,6 +181,14 @@ def test_faults_on_other_rigs(
 ) -> None:
     """Ten wirings on two rigs with other parameters, zeros and noise."""
     assert wrong(wizard(*fault, seed=seed)) == found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_taken_for_less_than_it_is_shows_in_the_fit(seed: int) -> None:
+    """Plugs changed over and a sign reversed at once look like the sign alone: not for long."""
+    found = wrong(wizard("swap=theta,phi", "theta=-1", seed=seed))
+    assert {("model", "theta"), ("model", "phi")} <= found
 
 
 @pytest.mark.slow
@@ -210,6 +215,7 @@ def test_a_healthy_rig_is_called_healthy_and_its_delay_is_measured() -> None:
 # -- identification ------------------------------------------------
 
 
+@pytest.mark.slow
 def test_parameters_come_back_from_noisy_counts() -> None:
     """Inertia, damping, motor constant, friction and delay, from a 10 % wrong guess."""
     belief, rig, known = rig_in_the_class(0)

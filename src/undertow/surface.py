@@ -39,7 +39,7 @@ class Surface:
     Examples
     --------
     >>> base = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
-    >>> float(base.s([0.1, 0.2, 0.0, 0.0])[0])
+    >>> round(float(base.s([0.1, 0.2, 0.0, 0.0])[0]), 12)
     1.95
     """
 

@@ -178,6 +178,8 @@ class Fit:
         self, free: list[Quantity], values: Mapping[str, float], tolerance: float
     ) -> FloatArray:
         """Return the scaled variables of the least squares, starting from some values."""
+        if not free:
+            return np.empty(0)  # a motion that is nothing like the model's tells nothing
         fine = tolerance < 1e-6
         low, high = self._bounds(free)
 
