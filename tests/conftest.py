@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 
 import undertow as ut
+from undertow.cascade import CascadeState
+from undertow.plan import Plan
+
+if TYPE_CHECKING:
+    from undertow.runtime import Controller
 
 # The same examples on every run: a failure on one machine is a failure on all.
 settings.register_profile("undertow", deadline=None, derandomize=True, database=None)
@@ -37,3 +43,17 @@ def base() -> ut.Surface:
 def quick() -> ut.Surface:
     """A surface that brings the rotary pendulum home within a few seconds."""
     return ut.Surface(alpha_a=-1, lambda_a=-1.59, alpha_u=1.96, lambda_u=12.1)
+
+
+@pytest.fixture
+def memory(quick: ut.Surface) -> CascadeState:
+    """What a cascade on that surface remembers."""
+    return CascadeState(Plan.of(quick))
+
+
+@pytest.fixture
+def controller(memory: CascadeState) -> Controller:
+    """The controller of :data:`runs.RECIPE`, idle."""
+    from runs import RECIPE
+
+    return RECIPE.make_controller(memory)

@@ -13,8 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import undertow as ut
+from runs import RECIPE
 from undertow.cascade import Admission, CascadeState
 from undertow.errors import InvalidInputError
+from undertow.inner_loop import law_module
 from undertow.plan import Plan
 from undertow.rig import Measurement, Push, RealisticRig
 from undertow.runtime import (
@@ -34,18 +36,6 @@ from undertow.runtime.faults import Witness
 from undertow.runtime.modes import Reason, successor
 from undertow.runtime.session import session
 from undertow.runtime.slow import Answer, Request
-
-RECIPE = Recipe(parameters={"d_e": 0.025}, evaluations=64, start=(0.0, 0.3, 0.0, 0.0))
-
-
-@pytest.fixture
-def memory(quick: ut.Surface) -> CascadeState:
-    return CascadeState(Plan.of(quick))
-
-
-@pytest.fixture
-def controller(memory: CascadeState) -> Controller:
-    return RECIPE.make_controller(memory)
 
 
 def settled(controller: Controller, steps: int = 30) -> int:
@@ -99,7 +89,8 @@ def test_a_step_never_compiles_anything(controller: Controller) -> None:
     )
     for k, measurement in enumerate(readings):
         controller.step(Inputs(0.03 + 1e-3 * k, measurement))
-    parts = controller._act, controller._law, controller.sensors._check
+    law = law_module(RECIPE.belief, RECIPE.cascade.reaching.switching).step
+    parts = controller._act, law, controller.sensors._check
     assert [len(part.signatures) for part in parts] == [1, 1, 1]
 
 

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import undertow as ut
+from runs import RECIPE
 from undertow.cascade import CascadeState
 from undertow.errors import InvalidInputError
-from undertow.plan import Plan
 from undertow.rig import Measurement, RealisticRig
 from undertow.runtime import (
     Columns,
@@ -32,19 +31,6 @@ from undertow.runtime import (
 )
 from undertow.runtime.clock import Histogram
 from undertow.runtime.slow import Answer, Request
-
-RECIPE = Recipe(parameters={"d_e": 0.025}, evaluations=64, start=(0.0, 0.3, 0.0, 0.0))
-
-
-@pytest.fixture
-def memory(quick: ut.Surface) -> CascadeState:
-    return CascadeState(Plan.of(quick))
-
-
-@pytest.fixture
-def controller(memory: CascadeState) -> Controller:
-    return RECIPE.make_controller(memory)
-
 
 # -- deadlines, by a clock that is told to jump ---------------------------------------------------
 

@@ -10,25 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import undertow as ut
+from runs import RECIPE
 from undertow.cascade import CascadeState
-from undertow.plan import Plan
 from undertow.rig import Measurement
 from undertow.runtime import (
-    Recipe,
     background_worker,
     respond,
 )
 from undertow.runtime.faults import Witness
 from undertow.runtime.keeper import QUEUE, KeptRig
 from undertow.runtime.slow import Answer, Request
-
-RECIPE = Recipe(parameters={"d_e": 0.025}, evaluations=64, start=(0.0, 0.3, 0.0, 0.0))
-
-
-@pytest.fixture
-def memory(quick: ut.Surface) -> CascadeState:
-    return CascadeState(Plan.of(quick))
 
 
 def take(worker, seconds: float = 10.0):  # type: ignore[no-untyped-def]

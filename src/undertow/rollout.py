@@ -20,10 +20,7 @@ from undertow.mechanism import FloatArray
 from undertow.motion import Batch, Event, Trajectory
 from undertow.plan import Plan
 from undertow.room import Room
-from undertow.sliding import (
-    Surface,
-    check_surface_shape,
-)
+from undertow.sliding import Surface, check_surface_shape
 from undertow.unchecked import Probe, UncheckedLoop
 
 __all__ = ["ClosedLoop"]

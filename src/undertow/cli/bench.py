@@ -12,7 +12,7 @@ import typer
 
 from undertow import inputs, results
 from undertow.cli.terminal import (
-    Name,
+    AnyName,
     Seed,
     Settings,
     app,
@@ -42,7 +42,7 @@ __all__ = ["bench"]
 )
 @reports_errors
 def bench(
-    name: Name,
+    name: AnyName,
     rig: Annotated[
         str,
         typer.Option(

@@ -19,7 +19,6 @@ import numpy as np
 
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators.interface import Estimator
-from undertow.inner_loop import law_module
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
@@ -135,7 +134,6 @@ class Controller:
         self.limits, self.slew = fast["limits"], fast["slew"]
         self._turn, self._wanted = fast["turn"], fast["wanted"]
         self._act = step_module(mechanism, cascade.reaching.switching).act
-        self._law = law_module(mechanism, cascade.reaching.switching).step
         self._swings = swing_up is not None
         self.mode, self.stopped_by = Mode.IDLE, ""
         self.memory = memory
