@@ -13,10 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from undertow import mechanisms
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.modelling import mechanism_from_file
+from undertow.mechanisms.named import named
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
 from undertow.surface import Surface
 
@@ -64,18 +63,7 @@ def mechanism_named(
     ArtefactError
         When the file cannot be read or fails.
     """
-    if ".py:" in name:
-        mechanism = mechanism_from_file(name)
-    elif name in mechanisms.LIBRARY:
-        mechanism = mechanisms.LIBRARY[name]()
-    else:
-        raise InvalidInputError(
-            "mechanism",
-            value=repr(name),
-            limit=f"one of {', '.join(mechanisms.LIBRARY)}",
-            remedy="One of your own is FILE.py:NAME",
-        )
-    mechanism = mechanism.with_parameters(**parse_values(settings))
+    mechanism = named(name).with_parameters(**parse_values(settings))
     if not limits:
         return mechanism
     new = parse_values(limits, "limit of input", "voltage=10")

@@ -24,6 +24,7 @@ from undertow.cli.terminal import (
     write,
 )
 from undertow.errors import InvalidInputError
+from undertow.modelling.python_file import in_a_file
 
 if TYPE_CHECKING:
     from undertow.mechanism import FloatArray, Mechanism
@@ -91,7 +92,7 @@ def bench(
     if delay is None and isinstance(plant, RealisticRig):
         delay = plant.bench.timing.input_delay + plant.bench.timing.measurement_delay
     with closing(plant):
-        if ".py:" in rig and sys.stdin.isatty():
+        if in_a_file(rig) and sys.stdin.isatty():
             say(terminal(), f"Ready. Let {name} come to rest, hands off, and press Enter.")
             if not sys.stdin.readline():  # the end of the input is no yes
                 raise typer.Exit(1)
@@ -125,7 +126,7 @@ def _plant(
     from undertow.rig import IdealRig, Paced, RealisticRig, rig_from_file
     from undertow.rig.presets import bench_for
 
-    if ".py:" in rig:
+    if in_a_file(rig):
         if faults:
             raise InvalidInputError(
                 "--fault",

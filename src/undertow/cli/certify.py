@@ -26,6 +26,7 @@ from undertow.cli.terminal import (
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import LIBRARY
+from undertow.modelling.python_file import in_a_file
 from undertow.stability import first_surface
 
 __all__ = ["certify", "verify"]
@@ -245,7 +246,7 @@ def verify(
             remedy="Name its file: --mechanism FILE.py:NAME",
         )
     model = inputs.mechanism_named(mechanism or certificate.name)
-    own = mechanism is not None and ".py:" in mechanism
+    own = mechanism is not None and in_a_file(mechanism)
     console = terminal()
     console.width = max(console.width, 80)
     with progress_bar() as progress:

@@ -29,6 +29,7 @@ from undertow.cli.terminal import (
     write,
 )
 from undertow.errors import InvalidInputError
+from undertow.modelling.python_file import in_a_file
 
 if TYPE_CHECKING:
     from undertow.rig import Rig
@@ -104,7 +105,7 @@ def run(
         else tuple(inputs.parse_start(belief, start or ()).tolist()),
         swing_up=swing_up,
         objective=objective,
-        rig="realistic" if rig == "realistic" or ".py:" in rig else "ideal",
+        rig="realistic" if rig == "realistic" or in_a_file(rig) else "ideal",
         seed=seed,
         period=period,
         seconds=float("inf") if simulated else max(0.01, 0.3 * lead),
@@ -124,7 +125,7 @@ def run(
                 progress=progress,
             )
             runtime = stack.enter_context(ready)
-        if ".py:" in rig and sys.stdin.isatty():
+        if in_a_file(rig) and sys.stdin.isatty():
             say(console, f"Ready. Hold {name} at its start, press Enter and let go.")
             if not sys.stdin.readline():  # the end of the input is no yes
                 runtime.stop()
@@ -149,7 +150,7 @@ def _plant(rig: str, recipe: Recipe) -> Rig | None:
 
     if rig in ("ideal", "realistic"):
         return None
-    if ".py:" in rig:
+    if in_a_file(rig):
         plant = rig_from_file(rig, recipe.belief)
         if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
             plant.close()

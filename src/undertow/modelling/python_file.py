@@ -10,7 +10,12 @@ from typing import Any
 from undertow.errors import ArtefactError, InvalidInputError, UndertowError
 from undertow.mechanism import Mechanism
 
-__all__ = ["mechanism_from_file", "object_from_file"]
+__all__ = ["in_a_file", "mechanism_from_file", "object_from_file"]
+
+
+def in_a_file(text: str) -> bool:
+    """Whether a word of the command line is ``FILE.py:NAME``."""
+    return ".py:" in text
 
 
 def mechanism_from_file(text: str) -> Mechanism:

@@ -9,13 +9,12 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal, Self
 
-from undertow import mechanisms
 from undertow.cascade import Cascade, CascadeState
 from undertow.delay import weakened
 from undertow.errors import InvalidInputError, UndertowError
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.modelling import mechanism_from_file
+from undertow.mechanisms.named import named
 from undertow.plan import Plan
 from undertow.practice import (
     RESERVE,
@@ -98,16 +97,7 @@ class Recipe:
     @cached_property
     def belief(self) -> Mechanism:
         """The controller's model."""
-        if ".py:" in self.mechanism:
-            return mechanism_from_file(self.mechanism).with_parameters(**self.parameters)
-        if self.mechanism not in mechanisms.LIBRARY:
-            raise InvalidInputError(
-                "mechanism of a run",
-                value=repr(self.mechanism),
-                limit=f"one of {', '.join(mechanisms.LIBRARY)}",
-                remedy="One of your own is FILE.py:NAME",
-            )
-        return mechanisms.LIBRARY[self.mechanism]().with_parameters(**self.parameters)
+        return named(self.mechanism).with_parameters(**self.parameters)
 
     @cached_property
     def x0(self) -> FloatArray:

@@ -196,7 +196,6 @@ class SensorWatch:
     """
 
     def __init__(self, mechanism: Mechanism, settings: Settings, period: float) -> None:
-        self.settings, self.period = settings, period
         self.names = [c.name for c in mechanism.coordinates]
         n = mechanism.n
         self._check = _module(mechanism).check
