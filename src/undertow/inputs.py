@@ -217,7 +217,8 @@ def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
 
     Examples
     --------
-    >>> rig = mechanisms.rotary_pendulum()
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
     >>> parse_start(rig, ["phi=90deg"]).round(3).tolist()
     [0.0, 1.571, 0.0, 0.0]
     """
@@ -250,7 +251,8 @@ def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, .
 
     Examples
     --------
-    >>> rig = mechanisms.rotary_pendulum()
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
     >>> [c.name for c in parse_box(rig, ["theta=60deg", "phi_dot=-4rad/s:5rad/s"])]
     ['|theta| ≤ 60°', '-4 rad/s ≤ phi_dot ≤ 5 rad/s']
     """
