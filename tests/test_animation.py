@@ -21,7 +21,7 @@ from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.scenes import mujoco_scene
-from undertow.sketches import Line, sketch
+from undertow.sketches import Label, Line, sketch
 
 NAMES = sorted(LIBRARY)
 
@@ -139,12 +139,14 @@ def test_film_ends_when_the_motion_has_settled() -> None:
 
 
 def test_any_mechanism_has_dials() -> None:
-    """Claim: a mechanism that is not of the library is drawn too: a hand or a bead each."""
+    """Claim: a mechanism that is not of the library is drawn too: a hand or a bead each, named."""
     from support import random_mechanism
 
     one = random_mechanism(3, 1, prismatic=True)
     drawn = sketch(one)
-    assert len(drawn.parts) == 2 * one.n
+    assert len(drawn.parts) == 3 * one.n
+    named = [part.text for part in drawn.parts if isinstance(part, Label)]
+    assert named == [f"{c.name}, {c.unit}" for c in one.coordinates]
     points, _, _ = evaluator(one, drawn)(np.array([[0.5, 0.0, np.pi / 2]]))
     np.testing.assert_allclose(points[1][0, 0], [0.5, 0, 0])
     np.testing.assert_allclose(points[5][0, 1] - points[5][0, 0], [1, 0, 0], atol=1e-12)

@@ -24,7 +24,7 @@ from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.motion import Trajectory
 from undertow.plot import COLOURS, style
-from undertow.sketches import Box, Disc, Line, Sketch, sketch
+from undertow.sketches import Box, Disc, Label, Line, Sketch, sketch
 
 __all__ = ["Film", "gif", "still"]
 
@@ -130,7 +130,7 @@ class Film:
         sizes = [
             max(part.width, part.height) if isinstance(part, Box) else float(angle[:, 1].max())
             for part, angle in zip(self.sketch.parts, self.angles, strict=True)
-            if not isinstance(part, Line)
+            if isinstance(part, Box | Disc)
         ]
         cloud = np.vstack(every)
         low, high = cloud.min(axis=0), cloud.max(axis=0)
@@ -142,24 +142,27 @@ class Film:
         if trace:
             path = self.tip[: frame + 1]
             axes.plot(*path.T, color=COLOURS["orange"], linewidth=1.0, alpha=0.8, zorder=1)
-        for part, points, angles in zip(self.sketch.parts, self.points, self.angles, strict=True):
-            here = points[frame]
+        drawn = zip(self.sketch.parts, self.points, self.angles, strict=True)
+        for index, (part, points, angles) in enumerate(drawn):
+            here, level = points[frame], 2 + index / len(self.sketch.parts)
             if isinstance(part, Line) and part.kind == "ground":
                 axes.axhline(here[0, 1], zorder=0, **_KINDS[part.kind])
             elif isinstance(part, Line):
                 fade = 1.0 if part.kind == "frame" else alpha
-                axes.plot(*here.T, alpha=fade, zorder=2, **_KINDS[part.kind])
+                axes.plot(*here.T, alpha=fade, zorder=level, **_KINDS[part.kind])
                 if part.kind == "link":
                     axes.plot(
                         *here[0], marker="o", markersize=4, color=COLOURS["black"], alpha=fade,
                         zorder=4,
                     )  # fmt: skip
+            elif isinstance(part, Label):
+                axes.text(*here[0], part.text, ha="center", va="top", alpha=alpha)
             elif isinstance(part, Box):
                 corner = here[0] - (part.width, part.height)
                 axes.add_patch(
                     Rectangle(
                         (corner[0], corner[1]), 2 * part.width, 2 * part.height,
-                        facecolor="#d9e6ef", edgecolor=COLOURS["black"], alpha=alpha, zorder=2,
+                        facecolor="#d9e6ef", edgecolor=COLOURS["black"], alpha=alpha, zorder=level,
                     )
                 )  # fmt: skip
             else:
@@ -168,7 +171,7 @@ class Film:
                 axes.add_patch(
                     Circle(
                         (here[0, 0], here[0, 1]), radius, facecolor="#fbe5cf",
-                        edgecolor=COLOURS["black"], alpha=alpha, zorder=3,
+                        edgecolor=COLOURS["black"], alpha=alpha, zorder=level,
                     )
                 )  # fmt: skip
                 if part.angle != 0:

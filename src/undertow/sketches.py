@@ -14,7 +14,7 @@ import sympy as sp
 
 from undertow.mechanism import Mechanism
 
-__all__ = ["Box", "Disc", "Line", "Sketch", "sketch"]
+__all__ = ["Box", "Disc", "Label", "Line", "Sketch", "sketch"]
 
 #: x, y, z as numbers or expressions, m.
 Point = tuple[Any, Any, Any]
@@ -53,6 +53,14 @@ class Box:
 
 
 @dataclass(frozen=True)
+class Label:
+    """Words, centred below a point."""
+
+    centre: Point
+    text: str
+
+
+@dataclass(frozen=True)
 class Sketch:
     """What to draw of a mechanism.
 
@@ -66,7 +74,7 @@ class Sketch:
         From where it is seen.
     """
 
-    parts: tuple[Line | Disc | Box, ...]
+    parts: tuple[Line | Disc | Box | Label, ...]
     tip: Point
     view: View = "front"
 
@@ -74,7 +82,8 @@ class Sketch:
 def sketch(mechanism: Mechanism) -> Sketch:
     """Return the stick figure of a mechanism of the library, or dials for any other.
 
-    A dial is a hand that turns with an angle, or a bead on a rail: one for each coordinate.
+    A dial is a hand that turns with an angle, or a bead on a rail: one for each coordinate,
+    with its name and unit below.
     """
     known = _SKETCHES.get(mechanism.name)
     if known is not None:
@@ -97,6 +106,7 @@ class _Symbols:
 
 def _dials(mechanism: Mechanism) -> Sketch:
     parts: list[Line | Disc | Box] = []
+    labels: list[Label] = []
     hand: Point = (0.0, 0.0, 0.0)
     for index, coordinate in enumerate(mechanism.coordinates):
         o, q = 2.5 * index, coordinate.symbol
@@ -106,7 +116,8 @@ def _dials(mechanism: Mechanism) -> Sketch:
         else:
             hand = (o + q, 0, 0)
             parts += [Line(((o - 1, 0, 0), (o + 1, 0, 0)), "frame"), Box(hand, 0.12, 0.12)]
-    return Sketch(tuple(parts), hand)
+        labels.append(Label((o, 0, -1.1), f"{coordinate.name}, {coordinate.unit}"))
+    return Sketch((*parts, *labels), hand)
 
 
 def _chain(
