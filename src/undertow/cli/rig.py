@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -80,6 +81,14 @@ def run(
     shadow: Annotated[
         bool, typer.Option(help="Make every step again before the next: warm caches, a check.")
     ] = True,
+    keeper: Annotated[
+        bool | None,
+        typer.Option(
+            "--keeper/--no-keeper",
+            help="Hold the rig in a process of its own, which brings the output to zero when this "
+            "one hangs or dies. Default: for FILE.py:NAME, where the system can fork.",
+        ),
+    ] = None,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="In simulated time: as fast as it goes.")
     ] = False,
@@ -88,7 +97,14 @@ def run(
     ] = None,
     seed: Seed = 0,
 ) -> None:
-    """Run the two-rate controller on a rig, against the clock, and time every step."""
+    """Run the two-rate controller on a rig, against the clock, and time every step.
+
+    Ends with a verdict, and its exit code. 0 balanced: held to the end, settled and at home.
+    3 caught: held, but not settled or not at home. 4 lost: thrown out, past its travel, or never
+    caught. 5 stopped: by a fault, or by the operator before the time. 6 degraded: held, but with
+    deadlines missed, rows of the log lost, reads or writes failed, unsound answers. 7: the device
+    did not take an output of zero at the end. 1 and 2: no run, for the reason that is printed.
+    """
     from undertow.runtime import Recipe
     from undertow.runtime import Settings as Patience
     from undertow.runtime.session import session
@@ -112,7 +128,16 @@ def run(
         settings=Patience(lead=lead),
     )
     console = terminal()
-    plant = _plant(rig, recipe)
+    if keeper is None:
+        keeper = in_a_file(rig) and not simulated and hasattr(os, "fork")
+    if keeper and simulated:
+        raise InvalidInputError(
+            "--keeper with --simulated",
+            value="simulated time",
+            limit="the wall clock, by which a keeper goes",
+            remedy="Leave one of them out",
+        )
+    plant = _plant(rig, recipe, keeper=keeper)
     with ExitStack() as stack, _let_go_of(plant) as kept:
         with progress_bar() as progress:
             ready = session(
@@ -133,6 +158,7 @@ def run(
         kept.clear()  # the run closes it
         report = runtime.run(seconds)
     what = "simulated time" if simulated else f"optimiser in another {worker}"
+    what += ", the rig in a keeper" if keeper else ""
     where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
     console.print(f"{name} on {where}, {1 / period:g} Hz, {what}", markup=False)
     unit = ", ".join(sorted({i.unit for i in belief.inputs}))
@@ -140,16 +166,18 @@ def run(
     if (book := runtime.log) is not None:
         lost = f", {book.dropped:,} rows lost" if book.dropped else ""
         say(console, f"Log {log}: {book.failure or 'written'}{lost}")
-    if not report.stopped_by.startswith("operator"):
-        raise typer.Exit(1)
+    verdict = report.verdict  # with the log closed
+    say(console, f"Verdict: {verdict}.")
+    if verdict.exit_code:
+        raise typer.Exit(verdict.exit_code)
 
 
-def _plant(rig: str, recipe: Recipe) -> Rig | None:
+def _plant(rig: str, recipe: Recipe, *, keeper: bool) -> Rig | None:
     """Return the rig that was asked for, or nothing for what the recipe itself makes."""
     from undertow.rig import MuJoCoRig, rig_from_file
 
     if rig in ("ideal", "realistic"):
-        return None
+        return _kept(recipe.make_rig, recipe) if keeper else None
     if in_a_file(rig):
         plant = rig_from_file(rig, recipe.belief)
         if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
@@ -160,16 +188,32 @@ def _plant(rig: str, recipe: Recipe) -> Rig | None:
                 limit=f"that of the fast loop, {recipe.period:g} s",
                 remedy=f"Write --period {plant.period:g}",
             )
-        return plant
+        if not keeper:
+            return plant
+        plant.close()  # it is one; now the keeper makes it, whose process it stays in
+        return _kept(lambda: rig_from_file(rig, recipe.belief), recipe)
     if rig == "mujoco" or rig.endswith(".xml"):
         scene = None if rig == "mujoco" else Path(rig)
-        return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, period=recipe.period)
+
+        def engine() -> Rig:
+            return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, period=recipe.period)
+
+        return _kept(engine, recipe) if keeper else engine()
     raise InvalidInputError(
         "rig",
         value=repr(rig),
         limit="ideal, realistic, mujoco, FILE.xml or FILE.py:NAME",
         remedy="A driver of your own: see examples/serial_rig.py",
     )
+
+
+def _kept(make: Callable[[], Rig], recipe: Recipe) -> Rig:
+    """Return a rig that a process of its own holds."""
+    from undertow.runtime.keeper import KeptRig
+
+    settings, belief = recipe.settings, recipe.belief
+    limits, slew = settings.limits(belief), settings.slew(belief) * recipe.period
+    return KeptRig(make, recipe.period, limits, slew)
 
 
 @contextmanager

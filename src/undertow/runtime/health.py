@@ -86,5 +86,9 @@ class RigClock:
         low, high = min(self._host, self._steps), max(self._host, self._steps)
         if low - self._drift <= self._rig <= high + self._drift:
             return ""
-        rate = self._rig / (high if self._rig > high else low)
-        return f"the rig's clock runs {rate:.2g} times as fast as the host's"
+        off = abs(self._rig - (high if self._rig > high else low))
+        now = (stamp - last[0]) / max(host, steps)
+        return (
+            f"the rig's clock went {1e3 * off:.0f} ms off the host's within a second, "
+            f"it runs {now:.2g} times as fast"
+        )

@@ -76,8 +76,9 @@ class Report:
         State before the stop, and for how long it had been *balance* then, s.
     early
         Whether the operator stopped the run before its time.
-    unread, unwritten
-        Reads and writes of the rig that failed.
+    unread, unwritten, missing
+        Reads and writes of the rig that failed; steps in which a reading was missing, or not
+        believed.
     unsound
         Answers of the slow loop that were none, or refused as unsound: their numbers are not
         those of their plan, or the plan is not stable.
@@ -115,6 +116,7 @@ class Report:
     early: bool = False
     unread: int = 0
     unwritten: int = 0
+    missing: int = 0
     unsound: int = 0
     off: bool = True
     output: str = ""
@@ -490,6 +492,7 @@ class Runtime:
                 report.unsound += UNSOUND in note.text
                 report.answers[note.text.split(": ", 1)[1].split(",")[0].split(" by ")[0]] += 1
 
+        report.missing += controller.sensors.missing > 0
         report.cost += float(self._rate[0]) * (inputs.t - self._since)
         self._since = inputs.t
         self._stage(controller.home, controller.u, self._parameters, self._rate)

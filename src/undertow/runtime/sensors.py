@@ -212,7 +212,7 @@ class SensorWatch:
         self._ages, self._quiet, self._shares = memory["ages"], memory["quiet"], memory["shares"]
         memory["settings"][:] = (
             period, settings.jump, settings.frozen, settings.patience, settings.stall,
-            min(1.0, period / settings.window), settings.failing,
+            min(1.0, period / settings.window), settings.sparse,
         )  # fmt: skip
         memory["parameters"][:] = mechanism.parameter_values
         memory["counts"][:] = 0.01

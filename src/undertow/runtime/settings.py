@@ -57,9 +57,10 @@ class Settings:
         ‖x‖₂ beyond which the mechanism has been thrown out, whatever the predictions' own limit.
     stall
         Longest gap between two steps, s; after a longer one the loop stops safely.
-    window, failing
-        When more than the share ``failing`` of the reads, of the writes, or of the readings of
-        one sensor fail, over a sliding window of this length, s, the loop stops safely.
+    window, failing, sparse
+        When more than the share ``failing`` of the reads or of the writes fail, or more than
+        ``sparse`` of the readings of one sensor are missing, over a sliding window of this
+        length, s, the loop stops safely.
     overrun
         When more than this share of the periods of the last second had no step that ended in
         time, the loop stops safely.
@@ -71,8 +72,8 @@ class Settings:
     insist
         How long a rig that does not take an output of zero is asked again after a safe stop, s.
     home, homing
-        ‖x‖₂ within which a run that ends settled has come home, and how long after it has
-        settled it is given to, s.
+        ‖x‖₂ within which a run that ends settled has come home; and how long after it has
+        settled, s, it is on its way and may be four times as far away.
     """
 
     output_limit: float = math.inf
@@ -94,6 +95,7 @@ class Settings:
     stall: float = 0.1
     window: float = 0.25
     failing: float = 0.2
+    sparse: float = 0.6
     overrun: float = 0.4
     drift: float = 0.1
     bring_up: float = 2.0

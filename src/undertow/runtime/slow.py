@@ -111,6 +111,7 @@ def is_answer(said: object) -> TypeGuard[Answer]:
         and isinstance(said.use, float)
         and isinstance(said.admission, Admission)
         and isinstance(said.memory, CascadeState)
+        and isinstance(said.memory.plan, Plan)
         and all(
             isinstance(part, np.ndarray) and part.dtype == float for part in (said.x, said.lanes)
         )

@@ -124,7 +124,7 @@ def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: f
     memory["slew"][:] = np.where(np.isfinite(slew), slew, np.inf)
     memory["settings"][:] = (
         settings.margin, settings.escape, settings.near, lost, settings.settle, period,
-        period * max(0.0, 1.0 / settings.failing - 1.0),
+        period * max(0.0, 1.0 / settings.sparse - 1.0),
     )  # fmt: skip
     memory["low"][:], memory["high"][:] = settings.travels(mechanism).T
     memory["angles"][m:] = [c.unit == "rad" for c in mechanism.coordinates[m:]]

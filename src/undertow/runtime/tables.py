@@ -88,6 +88,9 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         same = "the same outputs" if not report.disagreed else f"{report.disagreed:,} other outputs"
         if report.shadowed:
             lines.add_row("shadow", f"{report.shadowed:,} steps made again, {same}")
+    for text in report.system:
+        what, _, said = text.partition(": ")
+        lines.add_row(what, escape(said))
     states = ["IDLE"]
     states += [t.split(":")[0].split(" → ")[-1] for _, what, t in report.events if what == "state"]
     if len(states) > 10:
@@ -98,6 +101,8 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
     failures = Counter(text for _, what, text in report.events if what == "rig")
     for text, count in failures.most_common(3):
         lines.add_row("the rig", escape(f"{count:,} times {text}"))
+    if report.missing:
+        lines.add_row("readings missing", f"in {report.missing:,} steps")
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in report.answers.most_common())
     lines.add_row("answers of the optimiser", verdicts or "none")
     seconds = max(1, report.steps) * period

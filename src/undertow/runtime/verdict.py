@@ -22,9 +22,13 @@ EXIT_CODES: dict[str, int] = {
     "balanced": 0, "caught": 3, "lost": 4, "stopped": 5, "degraded": 6, "output on": 7,
 }  # fmt: skip
 
-#: Share of missed and skipped periods, and of failed reads or writes, of a whole run above which
-#: it counts as degraded.
-MISSED, FAILED = 0.05, 0.01
+#: Share of missed and skipped periods, of failed reads or writes, and of steps with a reading
+#: missing, of a whole run above which it counts as degraded.
+MISSED, FAILED, MISSING = 0.05, 0.01, 0.2
+
+#: Shortest time for which a run must have been settled at its end, s; and how many times as far
+#: from home one may be that is on its way there.
+SETTLED, ON_ITS_WAY = 0.1, 4.0
 
 
 @dataclass(frozen=True)
@@ -93,13 +97,13 @@ def _ending(report: Report) -> tuple[Ending, list[str]]:
         return "stopped", [f"{why} before the law took over"]
     if report.early:
         return "stopped", [f"{why} before the end, {last.name.lower()}"]
-    if last == Mode.CATCH:
+    if last == Mode.CATCH or report.settled_for < SETTLED:
         return "caught", ["not settled at the end"]
     if report.error <= report.home:
         return "balanced", []
-    if report.settled_for <= report.homing:
+    if report.settled_for <= report.homing and report.error <= ON_ITS_WAY * report.home:
         return "balanced", [f"settled for {report.settled_for:.1f} s, on its way home"]
-    return "caught", [f"settled, but ‖x‖ is above {report.home:g}"]
+    return "caught", [f"settled for {report.settled_for:.1f} s, but not at home"]
 
 
 def _wrong(report: Report) -> Sequence[str]:
@@ -115,6 +119,10 @@ def _wrong(report: Report) -> Sequence[str]:
         (report.unsound > 0, f"{report.unsound:,} answers of the optimiser were unsound"),
         (report.unread > FAILED * steps, f"{report.unread:,} reads failed"),
         (report.unwritten > FAILED * steps, f"{report.unwritten:,} writes failed"),
+        (
+            report.missing > MISSING * steps,
+            f"readings were missing in {report.missing / steps:.0%} of the steps",
+        ),
         (report.output != "", "the rig was not closed"),
     )
     return [text for true, text in facts if true]
