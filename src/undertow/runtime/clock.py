@@ -121,7 +121,7 @@ def locked_memory() -> Iterator[str]:
             library = ctypes.CDLL(None, use_errno=True)
             flags = CURRENT | ON_FAULT | (FUTURE if endless else 0)
             if library.mlockall(flags) == 0:
-                said = "granted" if endless else "granted for what is there"
+                said = "granted" if endless else "granted, for what is in use at the start"
             else:
                 said = f"refused, {os.strerror(ctypes.get_errno())}: ulimit -l"
                 library = None

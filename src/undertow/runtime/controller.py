@@ -138,6 +138,7 @@ class Controller:
         self.demand, self.margin = fast["demand"], fast["margin"]
         self.limits, self.slew = fast["limits"], fast["slew"]
         self._turn, self._wanted = fast["turn"], fast["wanted"]
+        confine(self._wanted, self.u, self.limits, self.slew)  # compiled before a stop needs it
         self._act = step_module(mechanism, cascade.reaching.switching).act
         self._swings = swing_up is not None
         self.mode, self.stopped_by = Mode.IDLE, ""

@@ -96,7 +96,7 @@ class Settings:
     window: float = 0.25
     failing: float = 0.2
     sparse: float = 0.6
-    overrun: float = 0.4
+    overrun: float = 0.3
     drift: float = 0.1
     bring_up: float = 2.0
     insist: float = 1.0

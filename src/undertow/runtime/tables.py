@@ -153,9 +153,9 @@ def replay_table(result: Replay) -> Table:
 
 def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -> Table:
     """Return what happened in the drill, a row a fault, under what fails."""
-    table = Table("what fails, and how", "what happened", "|u|/limit", "", **_PLAIN)
+    table = Table("what fails, and how", "what happened", "verdict", "|u|/limit", "", **_PLAIN)
     table.columns[0].ratio, table.columns[1].ratio = 4, 6
-    table.columns[2].justify = "right"
+    table.columns[3].justify = "right"
     part = ""
     for outcome in outcomes:
         case = outcome.case
@@ -166,13 +166,17 @@ def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -
         if not outcome.replayed:
             happened += "; [red]its replay differs[/red]"
         table.add_row(
-            _indented(case.name), happened, f"{outcome.largest:.0%}", _mark(outcome.passed)
+            _indented(case.name),
+            happened,
+            f"{outcome.verdict.ending} {outcome.verdict.exit_code}",
+            f"{outcome.largest:.0%}",
+            _mark(outcome.passed),
         )
     for number, one in enumerate(live):
         if number == 0:
             table.add_row("[bold]against the clock[/bold]")
         table.add_row(
-            _indented(f"{one.part}: {one.name}"), escape(one.happened), "", _mark(one.passed)
+            _indented(f"{one.part}: {one.name}"), escape(one.happened), "", "", _mark(one.passed)
         )
     return table
 

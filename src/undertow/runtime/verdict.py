@@ -24,7 +24,7 @@ EXIT_CODES: dict[str, int] = {
 
 #: Share of missed and skipped periods, of failed reads or writes, and of steps with a reading
 #: missing, of a whole run above which it counts as degraded.
-MISSED, FAILED, MISSING = 0.05, 0.01, 0.2
+MISSED, FAILED, MISSING = 0.05, 0.02, 0.2
 
 #: Shortest time for which a run must have been settled at its end, s; and how many times as far
 #: from home one may be that is on its way there.
