@@ -12,6 +12,7 @@ address can be forged: on a network that others share, sign the datagrams.) Agai
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
 import sys
 import threading
@@ -38,7 +39,7 @@ class UdpRig:
     ) -> None:
         self.period, self.timeout = period, 0.4 * period if timeout is None else timeout
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.connect((host, port))
+        self.socket.connect((host, port))  # what others send does not come in
         self.number, self.answered = 0, 0
         self.write([0.0])
 
@@ -46,11 +47,10 @@ class UdpRig:
         """Return the answer to the last write, or the newest that came in time, else NaN."""
         newest, until = LOST, time.monotonic() + self.timeout
         while self.answered < self.number and (left := until - time.monotonic()) > 0:
-            self.socket.settimeout(left)
-            try:
-                number, measurement = parse(self.socket.recv(256))
-            except TimeoutError:
+            # A socket's own timeout would be rounded up to a millisecond.
+            if not select.select([self.socket], [], [], left)[0]:
                 break
+            number, measurement = parse(self.socket.recv(256))
             if self.answered < number <= self.number:
                 self.answered, newest = number, measurement
         return newest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import sqlite3
 from pathlib import Path
@@ -40,6 +41,7 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
     code, out, _ = run("run", "rotary_pendulum", *words)
     assert code == 0
     assert "operator: stop" in out
+    assert "Verdict: balanced, settled for 0.2 s, on its way home; ‖x‖ = " in out
     code, out, _ = run("replay", str(log), "--out", str(tmp_path / "figures"))
     assert code == 0
     assert "identical, bit for bit" in out
@@ -68,6 +70,84 @@ def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -
     assert out == ""
     assert value in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_a_run_ends_with_a_verdict_and_its_exit_code(tmp_path: Path) -> None:
+    """Too short to settle: caught, 3; nothing to hold it with: lost or stopped; help tells all."""
+    words = ("run", "rotary_pendulum", "--start", "phi=15deg", "--simulated")
+    code, out, _ = run(*words, "--seconds", "0.2")
+    assert code == 3
+    assert "Verdict: caught, not settled at the end; ‖x‖ = " in out
+    code, out, _ = run(*words, "--seconds", "8")
+    assert code == 0
+    assert re.search(r"Verdict: balanced; ‖x‖ = 0\.\d+ at the end, cost \d", out)
+    code, out, _ = run(*words, "--seconds", "0.03", "--rig", "realistic")
+    assert code in (3, 5)
+    code, out, _ = run("run", "--help")
+    for number, word in ((3, "caught"), (4, "lost"), (5, "stopped"), (6, "degraded")):
+        assert f"{number} {word}" in " ".join(out.split())
+
+
+def test_a_keeper_is_refused_in_simulated_time() -> None:
+    code, _, err = run("run", "rotary_pendulum", "--simulated", "--keeper")
+    assert code == 2
+    assert "--keeper with --simulated" in err
+
+
+KEPT = """
+import os
+from pathlib import Path
+import numpy as np
+from undertow import mechanisms
+from undertow.rig import IdealRig
+
+class Arm(IdealRig):
+    def __init__(self):
+        m = mechanisms.rotary_pendulum()
+        super().__init__(m, m.state(phi=0.2))
+        self.note("made", os.getpid())
+
+    def note(self, what, number):
+        with open(Path(__file__).parent / "notes", "a") as file:
+            file.write(f"{what} {number}\\n")
+
+    def write(self, u):
+        super().write(u)
+        self.last = float(u[0])
+
+    def close(self):
+        self.note("last", getattr(self, "last", 0.0))
+        self.note("closed", os.getpid())
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a keeper is a forked process")
+@pytest.mark.parametrize("keeper", [None, "--no-keeper"])
+def test_a_rig_of_ones_own_is_kept_by_another_process_unless_told_otherwise(
+    keeper: str | None, tmp_path: Path
+) -> None:
+    """Read once here, then made again where it stays; and closed at zero there."""
+    (tmp_path / "arm.py").write_text(KEPT)
+    words = [
+        "run",
+        "rotary_pendulum",
+        "--rig",
+        f"{tmp_path / 'arm.py'}:Arm",
+        "--start",
+        "phi=0.2rad",
+    ]
+    _, out, _ = run(*words, "--seconds", "0.1", *([keeper] if keeper else []))
+    notes = [line.split() for line in (tmp_path / "notes").read_text().splitlines()]
+    makers = [number for what, number in notes if what == "made"]
+    assert [number for what, number in notes if what == "closed"] == makers
+    assert notes[-2] == ["last", "0.0"]
+    assert makers[0] == str(os.getpid())
+    assert ("the rig in a keeper" in " ".join(out.split())) == (keeper is None)
+    assert len(makers) == (2 if keeper is None else 1)
+    assert makers[-1] != makers[0] or keeper is not None
+    assert "real-time priority" in out
+    assert "memory locked" in out
+    assert re.search(r"(granted|refused), ", out)
 
 
 DRIVERS = """

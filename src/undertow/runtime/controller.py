@@ -276,7 +276,7 @@ class Controller:
             pairs = zip(self._names[m:], self.home[m:], strict=False)
             where = ", ".join(f"{name} = {value:.3g}" for name, value in pairs)
             what = f"not where the law can take over, {where}"
-        lacking = self.sensors.worst()
+        lacking = self.sensors.worst(self._t - self._began)
         return f"bring-up: {what} within {settings.bring_up:g} s{lacking and f'; {lacking}'}"
 
     def _proceed(self, t: float) -> None:

@@ -225,12 +225,12 @@ def _keep(
     theirs.close()
     withdraw()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    try:
-        rig = make()
-    except Exception as error:  # a driver may do anything
-        ours.send(_Refused.of(error))
-        return
-    with prompt():
+    with prompt():  # also for the threads of a driver
+        try:
+            rig = make()
+        except Exception as error:  # a driver may do anything
+            ours.send(_Refused.of(error))
+            return
         facts = _hold(rig, ours, period, limits, slew, silence)
     if record is not None:
         record.write_text(json.dumps(facts))

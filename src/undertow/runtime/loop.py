@@ -279,9 +279,15 @@ class Runtime:
             return
         self._let_go_of, self._reserve = True, b""
         report, controller = self.report, self.controller
-        failure = self._bring_to_zero() if not report.off else ""
+        failure = ""
+        try:
+            failure = self._bring_to_zero() if not report.off else ""
+        except BaseException as error:  # an interrupt: the rig is closed all the same
+            failure = f"{type(error).__name__}: {error}"
         self._beat = float("inf")
         output = [] if report.off else [f"the device did not take an output of zero: {failure}"]
+        if self._silent and report.off:
+            output.append(self._silent)
         try:
             self.rig.close()
         except BaseException as error:  # a rig that failed may fail again
@@ -308,13 +314,12 @@ class Runtime:
             self._beat = clock.now()
             try:
                 self.rig.write(u.copy())
-                report_off = not u.any()
-                failure = ""
             except BaseException as error:  # it must come to zero whatever a driver does
-                report_off, failure = False, f"{type(error).__name__}: {error}"
-            if report_off:
-                self.report.off = True
-                return ""
+                failure = f"{type(error).__name__}: {error}"
+            else:
+                if not u.any():
+                    self.report.off = True
+                    return ""
             if not u.any() and clock.now() - began > controller.settings.insist:
                 break
             due += controller.period
@@ -464,7 +469,10 @@ class Runtime:
         if len(events) < EVENTS:
             events.append((t, what, text))
         if self.log is not None:
-            self.log.event(self.report.steps, t, what, text)
+            try:
+                self.log.event(self.report.steps, t, what, text)
+            except Exception:  # what is said of a fault must not be another one
+                self.log.dropped += 1
 
     def _after(self, k: int, inputs: Inputs) -> None:
         """Hand requests to the slow loop, and keep what happened."""

@@ -217,7 +217,7 @@ class SensorWatch:
         memory["parameters"][:] = mechanism.parameter_values
         memory["counts"][:] = 0.01
         memory["band"][:] = settings.bands(mechanism)
-        self._q, self._v = memory["q"], memory["v"]
+        self._q, self._v, self._window = memory["q"], memory["v"], settings.window
         self._believed = Measurement(0.0, self._q)
         self.forget()
 
@@ -286,13 +286,20 @@ class SensorWatch:
         if found == LOST:
             return f"sensor '{self.names[where]}' lost for {1e3 * self._gaps[where]:.0f} ms"
         if found == SPARSE:
-            return f"sensor {self._missing(where)}"
+            return f"sensor {self._missing(where, self._shares[where])}"
         return f"sensor '{self.names[where]}' frozen" if found == FROZEN else ""
 
-    def worst(self) -> str:
-        """Return in words which sensor was missing most often of late; empty if none was."""
-        where = int(self._shares.argmax())
-        return f"sensor {self._missing(where)}" if self._shares[where] > 0.01 else ""
+    def worst(self, elapsed: float) -> str:
+        """Return in words which sensor was missing most often; empty if none was.
 
-    def _missing(self, where: int) -> str:
-        return f"'{self.names[where]}' missing in {self._shares[where]:.0%} of the readings"
+        Parameters
+        ----------
+        elapsed
+            Time since the watch started afresh, s: of it no more than a window is looked at.
+        """
+        where, looked_at = int(self._shares.argmax()), -math.expm1(-elapsed / self._window)
+        share = min(1.0, self._shares[where] / looked_at)
+        return f"sensor {self._missing(where, share)}" if share > 0.01 else ""
+
+    def _missing(self, where: int, share: float) -> str:
+        return f"'{self.names[where]}' missing in {share:.0%} of the readings"
