@@ -17,7 +17,7 @@ __all__ = ["check_file", "parse_json", "read_file"]
 DIGITS = 40
 
 
-def check_file(path: Path, what: str, *, most: int, remedy: str = "") -> int:
+def check_file(path: Path, what: str, *, most: int = 1 << 40, remedy: str = "") -> int:
     """Return the size of a file, bytes; refuse what is no plain file before it is opened.
 
     To open a pipe waits for whoever writes to it, to read a device may never end, and to open
