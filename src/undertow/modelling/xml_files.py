@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 from xml.parsers import expat
 
@@ -14,7 +15,7 @@ from undertow.errors import ArtefactError, InvalidInputError, ModelError
 from undertow.files import read_file
 from undertow.mechanism import FloatArray
 
-__all__ = ["numbers_of", "parse_xml", "rotation_from_quaternion", "rotation_from_rpy"]
+__all__ = ["computable", "numbers_of", "parse_xml", "rotation_from_quaternion", "rotation_from_rpy"]
 
 #: Largest file, bytes; deepest nesting, and most elements, of one that is read.
 LARGEST, DEEPEST, MOST = 1 << 24, 64, 20_000
@@ -95,6 +96,26 @@ def _check_size(text: str, root: str) -> None:
     parser.StartElementHandler, parser.EndElementHandler = begin, end
     with contextlib.suppress(expat.ExpatError):  # the parser of the tree says where
         parser.Parse(text, True)
+
+
+@contextlib.contextmanager
+def computable(what: str) -> Iterator[None]:
+    """Refuse numbers of a file from which no mechanism can be computed.
+
+    Raises
+    ------
+    InvalidInputError
+        Where arithmetic overflows or has no result.
+    """
+    try:
+        yield
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise InvalidInputError(
+            f"numbers of the {what}",
+            value=f"{type(error).__name__}: {error}",
+            limit="those of a mechanism, SI units",
+            remedy="Look for one that is far too large or too small",
+        ) from error
 
 
 def numbers_of(
