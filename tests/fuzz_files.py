@@ -649,13 +649,14 @@ class Summary:
     refused: Counter[str] = field(default_factory=Counter)
     failures: list[str] = field(default_factory=list)
     longest: float = 0.0
+    slowest: int = 0
     seconds: float = 0.0
 
     def __str__(self) -> str:
         refusals = ", ".join(f"{n} {name}" for name, n in self.refused.most_common())
         return (
             f"{self.kind}: {self.count} files, {self.read} read, {refusals or 'none refused'}; "
-            f"{len(self.failures)} failures; longest {self.longest:.2f} s, all {self.seconds:.0f} s"
+            f"{len(self.failures)} failures; longest {self.longest:.2f} s (#{self.slowest}), all {self.seconds:.0f} s"
         )
 
 
@@ -676,7 +677,10 @@ def fuzz(kind: str, count: int, seed: int = 0, first: int = 0) -> Summary:
                 "/dev/null", os.path.abspath(os.devnull),
             )  # fmt: skip
             for number in range(first, first + count):
+                before_it = summary.longest
                 _one(samples, folder / "case", random.Random(f"{kind} {seed} {number}"), summary)
+                if summary.longest > before_it:
+                    summary.slowest = number
                 if (folder / MARK).exists():
                     summary.failures.append("a file's text was run")
                     (folder / MARK).unlink()

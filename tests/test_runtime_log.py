@@ -404,8 +404,11 @@ def test_an_earlier_log_is_kept_with_its_parts(tmp_path: Path) -> None:
     assert len(read_log(path).steps) == len(read_log(tmp_path / "run.db.1").steps) == 750
 
 
-def test_a_killed_log_is_read_where_nothing_can_be_written(tmp_path: Path) -> None:
-    """Reading changes nothing: neither the file nor what lies beside it."""
+@pytest.mark.parametrize("writable", [True, False])
+def test_to_read_a_killed_log_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writable: bool
+) -> None:
+    """Neither the file nor what lies beside it; also where nothing can be written."""
     path = tmp_path / "run.db"
     with Log(path, COLUMNS, {}, threaded=False) as log:
         fill(log, 1000)
@@ -414,8 +417,37 @@ def test_a_killed_log_is_read_where_nothing_can_be_written(tmp_path: Path) -> No
         for end in ("", "-wal"):
             shutil.copy(f"{path}{end}", left / f"run.db{end}")
     before = {p.name: p.read_bytes() for p in left.iterdir()}
+    if not writable:
+        monkeypatch.setattr(os, "access", lambda *_: False)
     assert len(read_log(left / "run.db").steps) == 1000
     assert {n: (left / n).read_bytes() for n in before} == before
+    if not writable:
+        assert {p.name for p in left.iterdir()} == set(before)
+
+
+def test_companions_that_others_left_are_not_used(tmp_path: Path) -> None:
+    """Anybody may have made them, in a folder that all can write, to read what is logged."""
+    path = tmp_path / "run.db"
+    theirs = tmp_path / "theirs"
+    theirs.touch(mode=0o666)
+    for end in ("-wal", "-shm", "-journal"):
+        Path(f"{path}{end}").symlink_to(theirs)
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        fill(log, 500)
+    assert theirs.stat().st_size == 0
+    assert len(read_log(path).steps) == 500
+
+
+def test_a_file_in_the_way_of_a_part_is_moved_aside(tmp_path: Path) -> None:
+    path = tmp_path / "run.db"
+    with Log(path, COLUMNS, {}, threaded=False, part_bytes=1) as log:
+        log._keep_safe = _always(log)  # type: ignore[method-assign]
+        with contextlib.closing(sqlite3.connect(part_path(path, 2))) as file:
+            file.execute("CREATE TABLE mine (a)")
+        fill(log, 750)
+    assert log.failure == ""
+    assert len(read_log(path).steps) == 750
+    assert Path(f"{path}-2.1").exists()
 
 
 @pytest.mark.parametrize("what", ["full", "no handles", "no threads"])

@@ -147,7 +147,7 @@ def load_module(name: str, source: str) -> ModuleType:
     if module_name in sys.modules:
         return sys.modules[module_name]
     path = private_folder() / f"{module_name}.py"
-    if not path.exists() or path.read_text(encoding="utf-8") != source:
+    if not path.exists() or path.read_bytes() != source.encode():
         _write(path, source)
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None  # a plain .py file always has a spec and a loader

@@ -20,7 +20,6 @@ import errno
 import itertools
 import json
 import os
-import re
 import shutil
 import sqlite3
 import tempfile
@@ -192,6 +191,11 @@ class Log:
     def _make(self, part: int) -> sqlite3.Connection:
         """Begin a file; it is whole, and on the disk, before it has its name."""
         path = part_path(self.path, part)
+        if part > 1 and os.path.lexists(path):
+            _claim(path)
+            _move_earlier(path)
+        for companion in ("-wal", "-shm", "-journal"):  # of a log that was removed, or anybody's
+            Path(f"{path}{companion}").unlink(missing_ok=True)
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))  # nobody else's
         draft = path
         try:
@@ -387,9 +391,9 @@ def part_path(path: Path, part: int) -> Path:
 
 
 def _parts(path: Path) -> list[Path]:
-    """Return what there is of a log and its further parts, also where some are missing."""
-    name = re.compile(re.escape(path.name) + r"(-\d+)?")
-    return sorted(found for found in path.parent.iterdir() if name.fullmatch(found.name))
+    """Return what there is of a log: its first file, and those that it goes on in."""
+    further = itertools.takewhile(os.path.lexists, (part_path(path, n) for n in itertools.count(2)))
+    return [*([path] if os.path.lexists(path) else []), *further]
 
 
 def _size(path: Path) -> int:
@@ -525,7 +529,9 @@ def _read_part(path: Path) -> Recording:
             steps = _numbers(file, len(columns), most)
             events = _lines_of(file, "events", EVENTS, most)
             answers = _lines_of(file, "answers", ANSWERS, most)
-    except (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError) as error:
+    except ArtefactError:
+        raise
+    except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise ArtefactError(
             f"log '{path}'",
             value=str(error) or type(error).__name__,
@@ -543,15 +549,22 @@ def _opened(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
     beside = Path(f"{path}-wal")
     if beside.exists():
         size += check_file(beside, "log")
-    place = path.absolute().as_uri()
-    try:
-        file = _connected(f"{place}?mode=ro")
-    except sqlite3.OperationalError:
-        if beside.exists() and beside.stat().st_size:
-            raise
-        file = _connected(f"{place}?immutable=1")  # a folder that cannot be written
-    with contextlib.closing(file):
-        yield file, size
+    with contextlib.ExitStack() as stack:
+        if beside.exists() and not os.access(path.parent, os.W_OK):
+            # SQLite puts the log together beside it, or not at all.
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undertow-"))
+            for part in (path, beside):
+                shutil.copyfile(part, Path(folder) / part.name)
+            path = Path(folder) / path.name
+        place = path.absolute().as_uri()
+        try:
+            file = _connected(f"{place}?mode=ro")
+        except sqlite3.OperationalError:
+            if os.access(path.parent, os.W_OK):
+                raise
+            file = _connected(f"{place}?immutable=1")
+        with contextlib.closing(file):
+            yield file, size
 
 
 def _connected(place: str) -> sqlite3.Connection:
