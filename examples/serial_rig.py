@@ -12,6 +12,7 @@ POSIX only.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
 import sys
@@ -30,11 +31,21 @@ from undertow.rig import Measurement, RealisticRig, srv02_rig
 
 
 class SerialRig:
-    """A driver: all that Undertow needs of hardware."""
+    """A driver: all that Undertow needs of hardware.
 
-    def __init__(self, port: str, period: float = 0.001, timeout: float = 0.004) -> None:
-        self.period, self.timeout = period, timeout
+    The port is its own: a second program that opened it would take half of the answers, and could
+    move the motor.  A read waits for at most ``timeout``, s, by default less than half a period.
+    """
+
+    def __init__(self, port: str, period: float = 0.001, timeout: float | None = None) -> None:
+        self.period, self.timeout = period, 0.4 * period if timeout is None else timeout
         self.line = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            fcntl.flock(self.line, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as all that keep to it do
+            fcntl.ioctl(self.line, termios.TIOCEXCL)  # and against those that do not
+        except OSError as error:
+            os.close(self.line)
+            raise OSError(error.errno, f"{port} is in use by another program") from error
         tty.setraw(self.line)
         termios.tcflush(self.line, termios.TCIOFLUSH)
         self.number, self.answered, self.rest = 0, 0, b""
@@ -60,10 +71,20 @@ class SerialRig:
         os.write(self.line, command(self.number, u[0]))
 
     def close(self) -> None:
-        """Leave the motor without voltage."""
+        """Leave the motor without voltage: ask for zero until the device answers, five times."""
         with contextlib.suppress(OSError):  # the device may be gone
-            self.write([0.0])
+            for _ in range(5):
+                self.write([0.0])
+                self.read()
+                if self.answered == self.number:
+                    break
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(self.line, termios.TIOCNXCL)
         os.close(self.line)
+
+
+#: How long an answer is waited for where no clock drives the loop, s.
+PATIENCE = 0.004
 
 
 def emulate(rig: RealisticRig) -> str:
@@ -86,16 +107,18 @@ def emulate(rig: RealisticRig) -> str:
     return os.ttyname(theirs)
 
 
-def emulated() -> SerialRig:
+def emulated(timeout: float | None = None) -> SerialRig:
     """Return a driver of an emulated device, for ``undertow run --rig``."""
     bench = srv02_rig()
-    return SerialRig(emulate(RealisticRig(bench, bench.mechanism.state(phi=ut.deg(20)), seed=1)))
+    simulated = RealisticRig(bench, bench.mechanism.state(phi=ut.deg(20)), seed=1)
+    return SerialRig(emulate(simulated), timeout=timeout)
 
 
 def main(port: str | None = None, seconds: float = 5.0) -> float:
     """Balance the pendulum for a while; return the largest |φ̂| of the last second, rad."""
     arm = srv02_rig().mechanism
-    rig = SerialRig(port) if port else emulated()
+    # As fast as it goes nothing is late: each answer is waited for.
+    rig = SerialRig(port, timeout=PATIENCE) if port else emulated(PATIENCE)
     estimator = KalmanFilter(arm, delay=0.0025, disturbance_drift=5.0)
     estimator.reset(arm.state(phi=ut.deg(20)))
     law = InnerLoop(arm, ut.first_surface(arm))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import sqlite3
 from pathlib import Path
@@ -40,6 +41,7 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
     code, out, _ = run("run", "rotary_pendulum", *words)
     assert code == 0
     assert "operator: stop" in out
+    assert "Verdict: balanced, settled for 0.2 s, on its way home; ‖x‖ = " in out
     code, out, _ = run("replay", str(log), "--out", str(tmp_path / "figures"))
     assert code == 0
     assert "identical, bit for bit" in out
@@ -68,6 +70,84 @@ def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -
     assert out == ""
     assert value in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_a_run_ends_with_a_verdict_and_its_exit_code(tmp_path: Path) -> None:
+    """Too short to settle: caught, 3; nothing to hold it with: lost or stopped; help tells all."""
+    words = ("run", "rotary_pendulum", "--start", "phi=15deg", "--simulated")
+    code, out, _ = run(*words, "--seconds", "0.2")
+    assert code == 3
+    assert "Verdict: caught, not settled at the end; ‖x‖ = " in out
+    code, out, _ = run(*words, "--seconds", "8")
+    assert code == 0
+    assert re.search(r"Verdict: balanced; ‖x‖ = 0\.\d+ at the end, cost \d", out)
+    code, out, _ = run(*words, "--seconds", "0.03", "--rig", "realistic")
+    assert code in (3, 5)
+    code, out, _ = run("run", "--help")
+    for number, word in ((3, "caught"), (4, "lost"), (5, "stopped"), (6, "degraded")):
+        assert f"{number} {word}" in " ".join(out.split())
+
+
+def test_a_keeper_is_refused_in_simulated_time() -> None:
+    code, _, err = run("run", "rotary_pendulum", "--simulated", "--keeper")
+    assert code == 2
+    assert "--keeper with --simulated" in err
+
+
+KEPT = """
+import os
+from pathlib import Path
+import numpy as np
+from undertow import mechanisms
+from undertow.rig import IdealRig
+
+class Arm(IdealRig):
+    def __init__(self):
+        m = mechanisms.rotary_pendulum()
+        super().__init__(m, m.state(phi=0.2))
+        self.note("made", os.getpid())
+
+    def note(self, what, number):
+        with open(Path(__file__).parent / "notes", "a") as file:
+            file.write(f"{what} {number}\\n")
+
+    def write(self, u):
+        super().write(u)
+        self.last = float(u[0])
+
+    def close(self):
+        self.note("last", getattr(self, "last", 0.0))
+        self.note("closed", os.getpid())
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a keeper is a forked process")
+@pytest.mark.parametrize("keeper", [None, "--no-keeper"])
+def test_a_rig_of_ones_own_is_kept_by_another_process_unless_told_otherwise(
+    keeper: str | None, tmp_path: Path
+) -> None:
+    """Read once here, then made again where it stays; and closed at zero there."""
+    (tmp_path / "arm.py").write_text(KEPT)
+    words = [
+        "run",
+        "rotary_pendulum",
+        "--rig",
+        f"{tmp_path / 'arm.py'}:Arm",
+        "--start",
+        "phi=0.2rad",
+    ]
+    _, out, _ = run(*words, "--seconds", "0.1", *([keeper] if keeper else []))
+    notes = [line.split() for line in (tmp_path / "notes").read_text().splitlines()]
+    makers = [number for what, number in notes if what == "made"]
+    assert [number for what, number in notes if what == "closed"] == makers
+    assert notes[-2] == ["last", "0.0"]
+    assert makers[0] == str(os.getpid())
+    assert ("the rig in a keeper" in " ".join(out.split())) == (keeper is None)
+    assert len(makers) == (2 if keeper is None else 1)
+    assert makers[-1] != makers[0] or keeper is not None
+    assert "real-time priority" in out
+    assert "memory locked" in out
+    assert re.search(r"(granted|refused), ", out)
 
 
 DRIVERS = """
@@ -123,23 +203,47 @@ def test_screens_fit_80_columns() -> None:
     """Tables of made-up runs, whose words are long, at the usual width of a terminal."""
     from undertow.runtime import tables
     from undertow.runtime.drill_live import Killed, LiveOutcome
+    from undertow.runtime.failing import Fault
     from undertow.runtime.loop import Report
+    from undertow.runtime.systematic import Case
 
     report = Report(steps=60_000, missed=47, asleep=44, stopped_by="sensor 'theta' lost " * 5)
     report.events = [(0.1, "rig", "read: OSError: [Errno 5] Input/output error " * 3)] * 9
     live = [LiveOutcome("optimiser", "a read blocks for 1 s", "what happened, " * 12, True)]
     killed = [Killed(0.123, 1234, 0.01, 0.001, True, 0.02)]
+    fault = Fault("write-taken", 12345, True, "realistic")
+    hard = [Case(fault, ("the output stays at [-1.234], and nothing says so",), "long " * 30)]
     console = Console(width=80, record=True, file=io.StringIO())
     for shown in (
         tables.run_table(report, 1e-3, "N m", simulated=False),
         tables.drill_table([], live),
         tables.kill_table(killed),
+        tables.systematic_table(hard),
     ):
         console.print(shown)
     text = console.export_text()
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
     assert "9 times read: OSError" in text
+
+
+def test_a_systematic_fault_that_is_none_is_refused() -> None:
+    code, _, err = run("drill", "--only", "write:17:twice:ideal")
+    assert code == 2
+    assert "OPERATION:N:once|always:RIG" in err
+
+
+@pytest.mark.slow
+def test_single_systematic_faults_are_made_again() -> None:
+    """Each says what happened; a rig that there is none of is refused."""
+    code, out, err = run("drill", "--only", "write:60:always:ideal", "--only", "fork:1:once:kept")
+    assert code == 0
+    assert "2 of 2 cases as they should be, seed 0" in out
+    assert "the device did not take an output of zero" in out
+    assert "fork:1:once:kept: refused: process 'undertow" in out
+    code, _, err = run("drill", "--only", "write:60:always:mine")
+    assert code == 2
+    assert "ideal or realistic or kept" in err
 
 
 def test_a_missing_log_is_refused(tmp_path: Path) -> None:

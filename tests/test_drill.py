@@ -39,23 +39,35 @@ QUICK = [
     ("optimiser", "raises"),
     ("optimiser", "gives an unstable surface"),
     ("answer", "twice"),
+    ("answer", "forged, λ flipped"),
+    ("answer", "numbers not of its plan"),
+    ("answer", "is none at all"),
     ("sensor", "one channel lost for good"),
     ("sensor", "spikes of 1 rad"),
     ("sensor", "sign swapped"),
     ("sensor", "clock goes back once"),
+    ("sensor", "clock stands still"),
+    ("sensor", "clock at twice the speed"),
+    ("sensor", "one reading in 19 missing"),
     ("sensor", "one too many for 10 ms"),
     ("actuator", "sign swapped"),
     ("rig", "fails to write for good"),
+    ("rig", "fails in every second write"),
+    ("rig", "takes 1.5 ms for each read"),
+    ("rig", "takes 8 ms for each read"),
     ("rig", "hangs for 90 ms"),
     ("rig", "hangs for 0.3 s"),
     ("loop", "estimator raises"),
+    ("loop", "has no memory left"),
+    ("optimiser", "has no memory left"),
+    ("log", "disk full"),
     ("operator", "stops the run"),
 ]
 
 
 @pytest.mark.parametrize(("part", "name"), QUICK)
 def test_a_fault_ends_as_it_should(part: str, name: str, tmp_path: Path) -> None:
-    """Sound outputs, a safe end, an identical replay, and held where that is possible."""
+    """Sound outputs, a safe end, an identical replay, held where possible, and its verdict."""
     outcome = short(case(part, name), tmp_path, 1.5 if part == "actuator" else 1.0)
     assert outcome.passed, outcome.happened
     if not outcome.case.holds:
@@ -97,6 +109,9 @@ def test_an_outcome_with_one_bad_output_does_not_pass(tmp_path: Path) -> None:
         replace(good, ended_safely=False),
         replace(good, replayed=False),
         replace(good, held=False),
+        replace(good, verdict=replace(good.verdict, off=False)),
+        replace(good, verdict=replace(good.verdict, ending="degraded")),
+        replace(good, verdict=replace(good.verdict, ending="stopped")),
     ):
         assert not spoilt.passed
     assert drill_table([good]).row_count == 2  # what fails, and how
@@ -145,6 +160,23 @@ def test_no_fault_is_unsafe_while_it_swings_up(tmp_path: Path) -> None:
         outcome = run_case(one, recipe, memory, log, since=0.6, seconds=1.5)
         sound = not outcome.output_faults and outcome.ended_safely and outcome.replayed
         assert sound, (one.name, outcome.happened, outcome.output_faults)
+
+
+@pytest.mark.parametrize(
+    ("name", "ending", "code"),
+    [
+        ("takes 1.5 ms for each read", "stopped", 5),
+        ("fails in every second write", "stopped", 5),
+        ("fails to write for good", "stopped", 7),
+        ("is knocked over", "lost", 4),
+        ("hangs for 25 ms", "balanced", 0),
+    ],
+)
+def test_a_rig_that_fails_gives_the_verdict_and_exit_code_it_should(
+    name: str, ending: str, code: int, tmp_path: Path
+) -> None:
+    outcome = short(case("rig", name), tmp_path, 0.9)
+    assert (outcome.verdict.ending, outcome.verdict.exit_code) == (ending, code)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import os
 import re
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -119,6 +120,60 @@ def test_datagrams_that_are_lost_late_or_of_others(example: Callable[[str], Modu
     with pytest.raises(ConnectionError):
         rig.read()
     rig.close()
+
+
+@POSIX
+def test_a_serial_port_is_one_drivers_alone(
+    line: tuple[int, str], example: Callable[[str], ModuleType]
+) -> None:
+    """A second one is refused by name while the first is open, and takes over when it is closed."""
+    _, port = line
+    serial_rig = example("serial_rig")
+    first = serial_rig.SerialRig(port)
+    with pytest.raises(OSError, match="in use by another program"):
+        serial_rig.SerialRig(port)
+    first.close()
+    serial_rig.SerialRig(port).close()
+
+
+def test_a_lost_datagram_costs_less_than_a_period(example: Callable[[str], ModuleType]) -> None:
+    """The median of reads without an answer, on a machine that may be busy."""
+    silent = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    silent.bind(("127.0.0.1", 0))
+    rig = example("udp_rig").UdpRig(*silent.getsockname())
+    times = []
+    for _ in range(21):
+        rig.write([1.0])
+        began = time.perf_counter()
+        assert math.isnan(rig.read().t)
+        times.append(time.perf_counter() - began)
+    assert np.median(times) < rig.period
+    assert rig.timeout < 0.5 * rig.period
+    rig.close()
+    assert example("serial_rig").SerialRig.__init__.__defaults__[-1] is None
+    silent.close()
+
+
+def test_an_emulated_device_obeys_one_sender(example: Callable[[str], ModuleType]) -> None:
+    """What another socket sends is neither applied nor answered; nor does the driver hear it."""
+    udp_rig = example("udp_rig")
+    bench = udp_rig.srv02_rig()
+    device = udp_rig.RealisticRig(bench, seed=1)
+    host, port = udp_rig.emulate(device)
+    rig = udp_rig.UdpRig(host, port, timeout=1.0)
+    assert rig.read().t > 0
+    other = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    other.settimeout(0.1)
+    before = device.t
+    other.sendto(b"u 1 15.000000\n", (host, port))
+    with pytest.raises(TimeoutError):
+        other.recvfrom(256)
+    assert device.t == before
+    rig.write([0.0])
+    other.sendto(b"q 2 9.0 0 0\n", rig.socket.getsockname())
+    assert rig.read().t != 9.0
+    rig.close()
+    other.close()
 
 
 def test_the_driver_of_the_page_is_a_rig(monkeypatch: pytest.MonkeyPatch) -> None:

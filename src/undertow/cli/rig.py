@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -80,6 +81,14 @@ def run(
     shadow: Annotated[
         bool, typer.Option(help="Make every step again before the next: warm caches, a check.")
     ] = True,
+    keeper: Annotated[
+        bool | None,
+        typer.Option(
+            "--keeper/--no-keeper",
+            help="Hold the rig in a process of its own, which brings the output to zero when this "
+            "one hangs or dies. Default: for FILE.py:NAME, where the system can fork.",
+        ),
+    ] = None,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="In simulated time: as fast as it goes.")
     ] = False,
@@ -88,9 +97,17 @@ def run(
     ] = None,
     seed: Seed = 0,
 ) -> None:
-    """Run the two-rate controller on a rig, against the clock, and time every step."""
+    """Run the two-rate controller on a rig, against the clock, and time every step.
+
+    Ends with a verdict, and its exit code. 0 balanced: held to the end, settled and at home.
+    3 caught: held, but not settled or not at home. 4 lost: thrown out, past its travel, or never
+    caught. 5 stopped: by a fault, or by the operator before the time. 6 degraded: held, but with
+    deadlines missed, rows of the log lost, reads or writes failed, unsound answers. 7: the device
+    did not take an output of zero at the end. 1 and 2: no run, for the reason that is printed.
+    """
     from undertow.runtime import Recipe
     from undertow.runtime import Settings as Patience
+    from undertow.runtime.processes import check_resources
     from undertow.runtime.session import session
     from undertow.runtime.tables import run_table
 
@@ -112,7 +129,18 @@ def run(
         settings=Patience(lead=lead),
     )
     console = terminal()
-    plant = _plant(rig, recipe)
+    if keeper is None:
+        keeper = in_a_file(rig) and not simulated and hasattr(os, "fork")
+    if keeper and simulated:
+        raise InvalidInputError(
+            "--keeper with --simulated",
+            value="simulated time",
+            limit="the wall clock, by which a keeper goes",
+            remedy="Leave one of them out",
+        )
+    forked = 0 if simulated else 3 * (worker == "process") + keeper
+    check_resources(processes=forked, log=log is not None)  # before a driver is opened
+    plant = _plant(rig, recipe, keeper=keeper)
     with ExitStack() as stack, _let_go_of(plant) as kept:
         with progress_bar() as progress:
             ready = session(
@@ -133,6 +161,7 @@ def run(
         kept.clear()  # the run closes it
         report = runtime.run(seconds)
     what = "simulated time" if simulated else f"optimiser in another {worker}"
+    what += ", the rig in a keeper" if keeper else ""
     where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
     console.print(f"{name} on {where}, {1 / period:g} Hz, {what}", markup=False)
     unit = ", ".join(sorted({i.unit for i in belief.inputs}))
@@ -140,16 +169,18 @@ def run(
     if (book := runtime.log) is not None:
         lost = f", {book.dropped:,} rows lost" if book.dropped else ""
         say(console, f"Log {log}: {book.failure or 'written'}{lost}")
-    if not report.stopped_by.startswith("operator"):
-        raise typer.Exit(1)
+    verdict = report.verdict  # with the log closed
+    say(console, f"Verdict: {verdict}.")
+    if verdict.exit_code:
+        raise typer.Exit(verdict.exit_code)
 
 
-def _plant(rig: str, recipe: Recipe) -> Rig | None:
+def _plant(rig: str, recipe: Recipe, *, keeper: bool) -> Rig | None:
     """Return the rig that was asked for, or nothing for what the recipe itself makes."""
     from undertow.rig import MuJoCoRig, rig_from_file
 
     if rig in ("ideal", "realistic"):
-        return None
+        return _kept(recipe.make_rig, recipe) if keeper else None
     if in_a_file(rig):
         plant = rig_from_file(rig, recipe.belief)
         if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
@@ -160,16 +191,32 @@ def _plant(rig: str, recipe: Recipe) -> Rig | None:
                 limit=f"that of the fast loop, {recipe.period:g} s",
                 remedy=f"Write --period {plant.period:g}",
             )
-        return plant
+        if not keeper:
+            return plant
+        plant.close()  # it is one; now the keeper makes it, whose process it stays in
+        return _kept(lambda: rig_from_file(rig, recipe.belief), recipe)
     if rig == "mujoco" or rig.endswith(".xml"):
         scene = None if rig == "mujoco" else Path(rig)
-        return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, period=recipe.period)
+
+        def engine() -> Rig:
+            return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, period=recipe.period)
+
+        return _kept(engine, recipe) if keeper else engine()
     raise InvalidInputError(
         "rig",
         value=repr(rig),
         limit="ideal, realistic, mujoco, FILE.xml or FILE.py:NAME",
         remedy="A driver of your own: see examples/serial_rig.py",
     )
+
+
+def _kept(make: Callable[[], Rig], recipe: Recipe) -> Rig:
+    """Return a rig that a process of its own holds."""
+    from undertow.runtime.keeper import KeptRig
+
+    settings, belief = recipe.settings, recipe.belief
+    limits, slew = settings.limits(belief), settings.slew(belief) * recipe.period
+    return KeptRig(make, recipe.period, limits, slew)
 
 
 @contextmanager
@@ -187,15 +234,16 @@ def _let_go_of(plant: Rig | None) -> Iterator[list[Rig]]:
 @contextmanager
 def _seconds_on_terminal(seconds: float) -> Iterator[None]:
     """Count the seconds on a terminal; a progress bar would cost the fast loop time."""
+    from undertow.runtime.processes import Background
+
     over, began = threading.Event(), time.monotonic()
 
     def count() -> None:
         while not over.wait(1.0):
             sys.stderr.write(f"\r… running, {time.monotonic() - began:.0f} of {seconds:g} s ")
 
-    thread = threading.Thread(target=count, daemon=True)
     if sys.stderr.isatty():
-        thread.start()
+        Background(count, "undertow seconds")
     try:
         yield
     finally:
@@ -204,10 +252,24 @@ def _seconds_on_terminal(seconds: float) -> Iterator[None]:
             sys.stderr.write("\r\033[K")
 
 
-@app.command(epilog=examples("undertow replay run.db", "undertow replay run.db --out figures"))
+@app.command(
+    epilog=examples(
+        "undertow replay run.db",
+        "undertow replay run.db --out figures",
+        "undertow replay run.db --mechanism my_arm.py:arm",
+    )
+)
 @reports_errors
 def replay(
     log: Annotated[Path, typer.Argument(help="Log of a run.", metavar="FILE")],
+    mechanism: Annotated[
+        str | None,
+        typer.Option(
+            help="A mechanism of your own, FILE.py:NAME, whose run it is. The file that a log "
+            "names is not run by itself.",
+            metavar="MECHANISM",
+        ),
+    ] = None,
     decisions: Annotated[
         bool, typer.Option(help="Also let the gate judge the recorded answers again.")
     ] = True,
@@ -224,7 +286,7 @@ def replay(
         results.check_folder(out)
     with progress_bar() as progress:
         progress("replaying", 0.0)
-        result = runtime.replay(log, decisions=decisions)
+        result = runtime.replay(log, mechanism=mechanism, decisions=decisions)
     console = terminal()
     console.print(replay_table(result))
     if out is not None:
@@ -243,6 +305,8 @@ def replay(
         "undertow drill",
         "undertow drill --no-live --seed 3",
         "undertow drill --kills 50 --seed 1",
+        "undertow drill --systematic",
+        "undertow drill --only write:17:always:ideal",
     )
 )
 @reports_errors
@@ -254,6 +318,20 @@ def drill(
         int | None,
         typer.Option(help="Instead: kill -9 so many runs at random moments, and replay.", min=1),
     ] = None,
+    systematic: Annotated[
+        bool,
+        typer.Option(
+            "--systematic",
+            help="Instead: the n-th call of every kind fails, once and from then on, for every n.",
+        ),
+    ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Instead: these systematic faults alone. Repeatable.",
+            metavar="OPERATION:N:once|always:RIG",
+        ),
+    ] = None,
     seed: Seed = 0,
 ) -> None:
     """Put faults into runs on the realistic rig, one at a time, and say what happened."""
@@ -262,6 +340,9 @@ def drill(
     from undertow.runtime.drill_live import kill_drill, live_drill
 
     console = terminal()
+    if systematic or only:
+        _systematic(only or (), seed)
+        return
     if kills is not None:
         with progress_bar() as progress:
             killed = kill_drill(kills, seed=seed, progress=progress)
@@ -281,4 +362,27 @@ def drill(
     passed = [*(o.passed for o in outcomes), *(o.passed for o in lived)]
     say(console, f"{sum(passed)} of {len(passed)} as they should be, seed {seed}")
     if not all(passed):
+        raise typer.Exit(1)
+
+
+def _systematic(only: Sequence[str], seed: int) -> None:
+    """Run systematic faults, all of them or those that are named."""
+    from undertow.runtime import tables
+    from undertow.runtime.failing import Fault, intercepts_sqlite
+    from undertow.runtime.systematic import Systematic
+
+    faults = [Fault.parse(text) for text in only]
+    console = terminal()
+    with progress_bar() as progress:
+        progress("a run without a fault", 0.0)
+        cases = Systematic(seed).drill(faults or None, progress)
+    console.print(tables.systematic_table(cases))
+    if not intercepts_sqlite():
+        say(console, "The library of SQLite is out of reach: its own calls were left alone")
+    if faults:
+        for case in cases:
+            say(console, f"{case.fault}: {case.happened}, after {case.steps:,} steps")
+    passed = sum(case.passed for case in cases)
+    say(console, f"{passed:,} of {len(cases):,} cases as they should be, seed {seed}")
+    if passed < len(cases):
         raise typer.Exit(1)

@@ -168,6 +168,13 @@ class Tree:
                         limit=f"one of {', '.join(sorted(known))}",
                         remedy="Declare the link, or correct its name",
                     )
+            if joint.child == WORLD:
+                raise ModelError(
+                    f"joint '{joint.name}' of '{self.name}'",
+                    value=f"the fixed frame '{WORLD}' as its child",
+                    limit="a link that moves",
+                    remedy=f"Give the link another name than '{WORLD}'",
+                )
             if joint.child in parents:
                 raise ModelError(
                     f"link '{joint.child}' of '{self.name}' closes a loop",

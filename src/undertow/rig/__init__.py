@@ -1,7 +1,7 @@
 """Rigs, plants to meet: the ideal model, a realistic bench, MuJoCo, hardware of one's own."""
 
 from undertow.rig.bench import Amplifier, Backlash, Bench, Encoder, Friction, Push, Timing
-from undertow.rig.interface import Measurement, Rig
+from undertow.rig.interface import Measurement, OutputOnError, Rig
 from undertow.rig.mujoco_rig import MuJoCoRig
 from undertow.rig.paced import Paced
 from undertow.rig.presets import plausible_rig, srv02_rig
@@ -17,6 +17,7 @@ __all__ = [
     "IdealRig",
     "Measurement",
     "MuJoCoRig",
+    "OutputOnError",
     "Paced",
     "Push",
     "RealisticRig",

@@ -7,7 +7,11 @@ from typing import Protocol
 
 from undertow.mechanism import FloatArray
 
-__all__ = ["Measurement", "Rig"]
+__all__ = ["Measurement", "OutputOnError", "Rig"]
+
+
+class OutputOnError(OSError):
+    """Raised by a rig that is closed and knows that its inputs are not at zero."""
 
 
 @dataclass(slots=True, eq=False)
@@ -52,5 +56,11 @@ class Rig(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the rig; inputs go to zero."""
+        """Let go of the rig; inputs go to zero.
+
+        Raises
+        ------
+        OutputOnError
+            When it is known that they did not.
+        """
         ...

@@ -9,6 +9,7 @@ from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import Replay, about, replay, replay_controller
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import InlineWorker, Worker, background_worker, respond
+from undertow.runtime.verdict import RunVerdict
 
 __all__ = [
     "Columns",
@@ -22,6 +23,7 @@ __all__ = [
     "Recording",
     "Replay",
     "Report",
+    "RunVerdict",
     "Runtime",
     "Settings",
     "SimulatedClock",

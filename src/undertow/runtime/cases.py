@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from undertow.cascade import Admission
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
 from undertow.proposal import Proposal
 from undertow.rig.interface import Measurement
 from undertow.runtime.faults import Change, Drive, Hang, Sense, Spoil
 from undertow.runtime.slow import Answer
+from undertow.runtime.verdict import Ending
 from undertow.sliding import Surface
 
 __all__ = ["CASES", "Case"]
@@ -38,8 +40,16 @@ class Case:
         Of the optimiser, s.
     push
         Impulse on the last coordinate, N m s or N s.
+    slow
+        How long each read takes from then on, s.
     operator, disk_full
         The operator stops the run; the disk takes no more of the log.
+    since
+        When the fault begins, s, if not with the others.
+    ends
+        How the run may end; by default balanced or caught where it holds, else stopped or lost.
+    off
+        Whether the device can take an output of zero at the end.
     """
 
     part: str
@@ -55,6 +65,15 @@ class Case:
     push: float = 0.0
     operator: bool = False
     disk_full: bool = False
+    slow: float = 0.0
+    since: float | None = None
+    ends: tuple[Ending, ...] = ()
+    off: bool = True
+
+    @property
+    def endings(self) -> tuple[Ending, ...]:
+        """How the run may end."""
+        return self.ends or (("balanced", "caught") if self.holds else ("stopped", "lost"))
 
 
 # -- optimisers ------------------------------------------------------------------------------
@@ -63,6 +82,10 @@ class Case:
 def _raises(_: Proposal) -> Proposal:
     message = "the optimiser broke"
     raise RuntimeError(message)
+
+
+def _no_memory(_: object) -> Any:
+    raise MemoryError
 
 
 def _with_surface(change: Callable[[Surface], Surface]) -> Spoil:
@@ -123,6 +146,23 @@ def _old_first() -> Change:
     return change
 
 
+def _forged(answer: Answer) -> Answer:
+    """Flip λ in plan and numbers alike, and have it admitted."""
+    s = answer.memory.plan.surfaces[0]
+    flipped = Surface(s.alpha_a, -s.lambda_a, s.alpha_u, -s.lambda_u)
+    lanes = answer.lanes.copy()
+    lanes[:, : flipped.vector.size] = flipped.vector
+    memory = replace(answer.memory, plan=Plan.of(flipped), since=answer.use)
+    return replace(answer, admission=Admission(True, "forged", 0.0), memory=memory, lanes=lanes)
+
+
+def _other_numbers(answer: Answer) -> Answer:
+    """Flip the sign of all numbers of the surface, and not of the plan; have it admitted."""
+    lanes = answer.lanes * np.where(np.arange(answer.lanes.shape[1]) < 4, -1.0, 1.0)
+    memory = replace(answer.memory, since=answer.use)
+    return replace(answer, admission=Admission(True, "forged", 0.0), memory=memory, lanes=lanes)
+
+
 # -- sensors -------------------------------------------------------------------------------------
 
 
@@ -167,6 +207,12 @@ def _frozen(channel: int | None = None) -> Callable[[], Sense]:
 def _spikes(t: float, q: FloatArray) -> FloatArray:
     if round(1000 * t) % 37 == 0:
         q += 1.0
+    return q
+
+
+def _one_in_19(t: float, q: FloatArray) -> FloatArray:
+    if round(1000 * t) % 19 == 0:
+        q[:] = math.nan
     return q
 
 
@@ -232,6 +278,16 @@ def _write_fails(until: float) -> Callable[[], Drive]:
     return lambda: drive
 
 
+def _every_second_write_fails() -> Drive:
+    def drive(t: float, u: FloatArray) -> FloatArray:
+        if round(1000 * t) % 2:
+            message = "no answer from the card"
+            raise OSError(message)
+        return u
+
+    return drive
+
+
 def _estimator_raises(_: FloatArray) -> FloatArray:
     message = "the estimator broke"
     raise ZeroDivisionError(message)
@@ -249,6 +305,7 @@ CASES: tuple[Case, ...] = (
     Case("optimiser", "gives huge parameters", True, optimiser=_scaled(lambda_a=1e9)),
     Case("optimiser", "gives the wrong shape", True, optimiser=_with_surface(_wrong_shape)),
     Case("optimiser", "gives a text", True, optimiser=_text),
+    Case("optimiser", "has no memory left", True, optimiser=_no_memory),
     Case("answer", "late by 80 ms", True, answers=_arrives(0.08)),
     Case("answer", "late by 3 s", True, answers=_arrives(3.0)),
     Case("answer", "twice", True, answers=_arrives(0.0, 0.001)),
@@ -264,14 +321,27 @@ CASES: tuple[Case, ...] = (
     Case(
         "answer", "numbers turned to NaN", True,
         answers=_arrives(0.0, change=lambda a: replace(a, lanes=a.lanes * math.nan)),
+        ends=("degraded",),
     ),
-    Case("answer", "is none at all", True, answers=_arrives(0.0, change=_text)),
+    Case(
+        "answer", "is none at all", True, answers=_arrives(0.0, change=_text), ends=("degraded",)
+    ),
     Case(
         "answer", "cut short", True,
         answers=_arrives(0.0, change=lambda a: replace(a, lanes=a.lanes[:, 1:])),
+        ends=("degraded",),
+    ),
+    Case(
+        "answer", "forged, λ flipped", True,
+        answers=_arrives(0.0, change=_forged), ends=("degraded",),
+    ),
+    Case(
+        "answer", "numbers not of its plan", True,
+        answers=_arrives(0.0, change=_other_numbers), ends=("degraded",),
     ),
     Case("sensor", "drops out for 10 ms", True, sensor=_sensor(_lost(), 0.01)),
     Case("sensor", "one channel out for 10 ms", True, sensor=_sensor(_lost(-1), 0.01)),
+    Case("sensor", "one reading in 19 missing", True, sensor=_sensor(_one_in_19), since=0.0),
     Case("sensor", "lost for good", False, sensor=_sensor(_lost())),
     Case("sensor", "one channel lost for good", False, sensor=_sensor(_lost(-1))),
     Case("sensor", "all channels freeze", False, sensor=_frozen()),
@@ -286,7 +356,8 @@ CASES: tuple[Case, ...] = (
     Case("sensor", "clock goes back once", True, sensor=_clock(lambda _: -5.0)),
     Case("sensor", "clock runs backwards", False, sensor=_clock(lambda t: -2.0 * t)),
     Case("sensor", "clock is no number for 10 ms", True, sensor=_clock(lambda _: math.nan, 0.01)),
-    Case("sensor", "clock stands still", True, sensor=_clock(lambda t: -t)),
+    Case("sensor", "clock stands still", False, sensor=_clock(lambda t: -t)),
+    Case("sensor", "clock at twice the speed", False, sensor=_clock(lambda t: t)),
     Case(
         "actuator", "gives 75 % of what is asked", True,
         actuator=lambda: lambda _, u: 0.75 * u,
@@ -303,15 +374,21 @@ CASES: tuple[Case, ...] = (
     Case("rig", "fails to read for 10 ms", True, sensor=_read_fails(0.01)),
     Case("rig", "fails to read for good", False, sensor=_read_fails(math.inf)),
     Case("rig", "fails to write for 10 ms", True, actuator=_write_fails(0.01)),
-    Case("rig", "fails to write for good", False, actuator=_write_fails(math.inf)),
+    Case("rig", "fails to write for good", False, actuator=_write_fails(math.inf), off=False),
+    Case("rig", "fails in every second write", False, actuator=_every_second_write_fails),
+    Case("rig", "takes 1.5 ms for each read", False, slow=0.0015),
+    Case("rig", "takes 8 ms for each read", False, slow=0.008),
     Case("rig", "hangs for 25 ms", True, hang=Hang(0.025)),
-    Case("rig", "hangs for 90 ms", True, hang=Hang(0.09)),
+    Case(
+        "rig", "hangs for 90 ms", True, hang=Hang(0.09), ends=("balanced", "caught", "degraded")
+    ),
     Case("rig", "hangs for 0.3 s", False, hang=Hang(0.3)),
     Case("rig", "is pushed", True, push=0.01),
     Case("rig", "is knocked over", False, push=0.08),
     Case("loop", "one step takes 10 ms", True, hang=Hang(0.01)),
     Case("loop", "estimator raises", False, estimator=_estimator_raises),
+    Case("loop", "has no memory left", False, estimator=_no_memory),
     Case("loop", "estimate is NaN", False, estimator=lambda x: x * math.nan),
-    Case("log", "disk full", True, disk_full=True),
-    Case("operator", "stops the run", False, operator=True),
+    Case("log", "disk full", True, disk_full=True, ends=("degraded",)),
+    Case("operator", "stops the run", False, operator=True, ends=("stopped",)),
 )  # fmt: skip

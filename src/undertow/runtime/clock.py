@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import sys
 import time
@@ -11,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-__all__ = ["YIELD", "Clock", "Histogram", "SimulatedClock", "WallClock", "prompt"]
+__all__ = ["YIELD", "Clock", "Histogram", "SimulatedClock", "WallClock", "locked_memory", "prompt"]
 
 
 #: After how long a thread that waits for the interpreter's lock asks for it, s: while the fast
@@ -82,20 +83,53 @@ class SimulatedClock:
 
 
 @contextlib.contextmanager
-def prompt() -> Iterator[bool]:
-    """Ask for a real-time priority for this thread; yields whether the system granted it."""
-    before: int | None = None
+def prompt() -> Iterator[str]:
+    """Ask for a real-time priority for this thread; yields what the system said to that."""
+    before, said = None, "refused, the system has none"
     if hasattr(os, "sched_setscheduler"):
-        with contextlib.suppress(OSError):
+        try:
             policy = os.sched_getscheduler(0)
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-            before = policy
+            before, said = policy, "granted, SCHED_FIFO 1"
+        except OSError as error:
+            said = f"refused, {error.strerror}: ulimit -r"
     try:
-        yield before is not None
+        yield f"real-time priority: {said}"
     finally:
         if before is not None:
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(0, before, os.sched_param(0))
+
+
+#: Of mlockall: what is there, what will come, and each page once it is first used.
+CURRENT, FUTURE, ON_FAULT = 1, 2, 4
+
+
+@contextlib.contextmanager
+def locked_memory() -> Iterator[str]:
+    """Ask that this process is not paged out; yields what the system said to that.
+
+    What comes later is locked only where there is no limit: else memory would end at the limit.
+    """
+    library: ctypes.CDLL | None = None
+    said = "refused, the system has none"
+    if sys.platform == "linux":
+        import resource
+
+        endless = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+        with contextlib.suppress(OSError, AttributeError):
+            library = ctypes.CDLL(None, use_errno=True)
+            flags = CURRENT | ON_FAULT | (FUTURE if endless else 0)
+            if library.mlockall(flags) == 0:
+                said = "granted" if endless else "granted, for what is in use at the start"
+            else:
+                said = f"refused, {os.strerror(ctypes.get_errno())}: ulimit -l"
+                library = None
+    try:
+        yield f"memory locked: {said}"
+    finally:
+        if library is not None:
+            library.munlockall()
 
 
 class Histogram:

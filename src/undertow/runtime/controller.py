@@ -22,6 +22,7 @@ from undertow.estimators.interface import Estimator
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
+from undertow.runtime.routh import PlanTest
 from undertow.runtime.sensors import LAST_HARMLESS, SensorWatch
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import Answer, Request, lanes_of
@@ -34,11 +35,14 @@ from undertow.runtime.steps import (
 )
 from undertow.swing_up import SwingUpAndCatch
 
-__all__ = ["Controller", "Inputs", "Note"]
+__all__ = ["UNSOUND", "Controller", "Inputs", "Note"]
 
 #: Least time from asking for a catch to its use, s; and how far the state may be off the one
 #: it was made for, in units of 1 + |entry|.
 CATCH_LEAD, CATCH_SURPRISE = 0.02, 0.1
+
+#: How the reason begins for which an answer is refused that no sound slow loop gives.
+UNSOUND = "unsound: "
 
 
 @dataclass(slots=True)
@@ -56,7 +60,8 @@ class Inputs:
     command
         The operator's wish.
     alarm
-        What the runtime itself found wrong (a stall, a failed write); stops the run.
+        What the runtime itself found wrong (a stall, failed writes, deadlines missed, a clock
+        that runs wrong); stops the run.
     """
 
     t: float
@@ -133,6 +138,7 @@ class Controller:
         self.demand, self.margin = fast["demand"], fast["margin"]
         self.limits, self.slew = fast["limits"], fast["slew"]
         self._turn, self._wanted = fast["turn"], fast["wanted"]
+        confine(self._wanted, self.u, self.limits, self.slew)  # compiled before a stop needs it
         self._act = step_module(mechanism, cascade.reaching.switching).act
         self._swings = swing_up is not None
         self.mode, self.stopped_by = Mode.IDLE, ""
@@ -142,16 +148,19 @@ class Controller:
         self.gives_up = False
         self.sensors = SensorWatch(mechanism, settings, period)
         self._names = [c.name for c in mechanism.coordinates]
+        self._plans = PlanTest(mechanism, cascade.reaching)
         self._lanes, self._times = lanes_of(cascade, memory.plan), memory.plan.times
         self._segment, self._lane = 0, self._lanes[0]
         self._next = memory, self._lanes, self._times
+        self._packed = self._lanes
+        self._since = fast["since"]
         self._expected, self._off, self._most, self._due = fast["expected"], fast["off"], 0.0, 0.0
         self._asked: Request | None = None
         self._pending: Answer | None = None
         self._arrived: Answer | None = None
         self._used: Answer | None = None
         self._followed, self._free, self._t = True, False, 0.0
-        self._sequence, self._swinging = memory.sequence, 0.0
+        self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
         self._lead = settings.lead
         self._catch_lead = CATCH_LEAD
 
@@ -216,6 +225,9 @@ class Controller:
             new, most = self._next[1][0], self._most
             if mode is Mode.SWING_UP and self.swing_up is not None:
                 self._turn[:] = self.swing_up.region.turns(estimate)
+        waited = ""
+        if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up:
+            waited = self._waiting()
         used, number, why, wrong, place = self._act(
             estimate,
             self.estimator.disturbance,
@@ -225,7 +237,7 @@ class Controller:
             self._block,
             mode.value,
             inputs.command.value,
-            found > LAST_HARMLESS or inputs.alarm != "",
+            found > LAST_HARMLESS or waited != "" or inputs.alarm != "",
             sensors.missing > 0,
             self._swings,
             sensors.probe,
@@ -240,7 +252,7 @@ class Controller:
             reason = Reason(why).text
             if why == Reason.FAULT:
                 reason = inputs.alarm or sensors.describe(found, sensor)
-                reason = reason or self._describe(wrong, place)
+                reason = reason or waited or self._describe(wrong, place)
             self._change(t, Mode(number), reason)
             mode = self.mode
         if mode is Mode.SWING_UP:
@@ -256,6 +268,17 @@ class Controller:
             return f"'{self._names[place]}' at {self.x[place]:.3g}, past its travel"
         return "the estimate is not finite"
 
+    def _waiting(self) -> str:
+        """Return in words what a bring-up waited for in vain."""
+        settings, m = self.settings, len(self.u)
+        what = f"no {1e3 * settings.settle:g} ms of sound readings"
+        if self._since[0] >= settings.settle:
+            pairs = zip(self._names[m:], self.home[m:], strict=False)
+            where = ", ".join(f"{name} = {value:.3g}" for name, value in pairs)
+            what = f"not where the law can take over, {where}"
+        lacking = self.sensors.worst(self._t - self._began)
+        return f"bring-up: {what} within {settings.bring_up:g} s{lacking and f'; {lacking}'}"
+
     def _proceed(self, t: float) -> None:
         """Go on to the surface of a schedule that is in force at the time t."""
         elapsed, times = t - self.memory.since + 1e-9, self._times
@@ -269,6 +292,8 @@ class Controller:
         self.notes.append(Note("state", f"{self.mode.name} → {mode.name}: {reason}"))
         if mode is Mode.SAFE_STOP:
             self.stopped_by = reason
+        elif mode is Mode.BRING_UP:
+            self._began = t
         elif mode is Mode.SWING_UP:
             self._swinging, self._pending = t, None
         elif mode is Mode.CATCH and self.mode is Mode.BRING_UP:
@@ -322,7 +347,10 @@ class Controller:
 
     def _receive(self, t: float, answer: Answer) -> None:
         """Keep an answer for its time of use, or refuse it: the first line of defence."""
-        fault = self._unfit(t, answer)
+        try:
+            fault = self._unfit(t, answer) or self._unsound(answer)
+        except Exception as error:  # what came may be anything
+            fault = f"{UNSOUND}{type(error).__name__}: {error}"
         if fault:
             self.notes.append(Note("answer", f"{answer.sequence}: refused, {fault}"))
             if self._asked is not None and answer.sequence == self._asked.sequence:
@@ -340,7 +368,7 @@ class Controller:
         """Bring what the step of its use needs of an answer to where that step finds it."""
         memory, surprise = answer.memory, self.settings.surprise
         self._due = answer.use - 0.5 * self.period
-        self._next = memory, np.array(answer.lanes, dtype=float), memory.plan.times
+        self._next = memory, self._packed, memory.plan.times
         self._expected[:] = answer.x
         most = CATCH_SURPRISE if answer.swing >= 0 else surprise
         self._most = most if answer.admission.accepted else -1.0
@@ -355,12 +383,29 @@ class Controller:
         plan = answer.memory.plan
         shape = len(plan.times), self._lanes.shape[1]
         if lanes.shape != shape or answer.x.shape != self.x.shape or not sound(lanes):
-            return "not a plan for this mechanism"
+            return f"{UNSOUND}not a plan for this mechanism"
         if answer.use != self._asked.use or answer.memory.sequence != answer.sequence:
-            return "not what was asked for"
+            return f"{UNSOUND}not what was asked for"
         if (answer.swing < 0) != (self.mode is not Mode.SWING_UP):
             return "for another state"
         return ""
+
+    def _unsound(self, answer: Answer) -> str:
+        """Pack the law's numbers anew from the plan that was judged, and test its stability.
+
+        What runs are these numbers: those that came must be the same.  det Γ(0), their last,
+        is not compared, for it is not taken from the answer at all.
+        """
+        if not answer.admission.accepted:
+            return ""  # its plan is not used
+        if answer.memory.since != answer.use:
+            return f"{UNSOUND}its plan is of another time"
+        plan = answer.memory.plan
+        self._packed = self._plans.pack(plan)
+        if not np.array_equal(self._packed[:, :-1], answer.lanes[:, :-1]):
+            return f"{UNSOUND}its numbers are not those of its plan"
+        fault = self._plans.fault(self._packed)
+        return fault and f"{UNSOUND}{fault}"
 
     def _tell(self, answer: Answer) -> None:
         """Note what became of an answer at its time of use."""

@@ -27,6 +27,7 @@ from undertow.runtime.modes import Mode
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about, replay_controller
 from undertow.runtime.slow import Answer, InlineWorker, Request, Worker, respond
+from undertow.runtime.verdict import RunVerdict
 
 __all__ = ["Outcome", "drill", "drill_recipe", "run_case"]
 
@@ -59,6 +60,8 @@ class Outcome:
         Verdicts on the answers of the optimiser, in words.
     replayed
         Whether the replay of the log was identical, bit for bit.
+    verdict
+        How the run ended, with its exit code.
     note
         What else is worth knowing.
     """
@@ -72,6 +75,7 @@ class Outcome:
     ended_safely: bool
     answers: str
     replayed: bool
+    verdict: RunVerdict
     note: str = ""
 
     @property
@@ -88,9 +92,15 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Sound outputs, a safe end, an identical replay, and held where that is possible."""
+        """Sound outputs, a safe end, an identical replay, and held where that is possible.
+
+        And the verdict says how it ended, with an exit code that is 0 for what balanced alone.
+        """
         sound = not self.output_faults and self.ended_safely and self.replayed
         stopped = not math.isnan(self.after)
+        sound = sound and self.verdict.off == self.case.off
+        sound = sound and self.verdict.ending in self.case.endings
+        sound = sound and (self.verdict.exit_code == 0) == (self.verdict.ending == "balanced")
         return sound and (self.held or (stopped and not self.case.holds))
 
 
@@ -144,6 +154,7 @@ def run_case(
         Length of the run, s.
     """
     clock = SimulatedClock()
+    since = since if case.since is None else case.since
     cascade = recipe.cascade
     if case.optimiser is not None:
         cascade = spoil_optimiser(cascade, case.optimiser, since)
@@ -163,6 +174,7 @@ def run_case(
         drive=None if case.actuator is None else case.actuator(),
         hang=case.hang,
         clock=clock,
+        slow=case.slow,
     )
 
     def make_controller() -> Controller:
@@ -198,6 +210,7 @@ def run_case(
         report.mode == Mode.SAFE_STOP and not witness.last.any(),
         answers,
         not replay_controller(read_log(log), make_controller(), decisions=False).differing,
+        report.verdict,
         f"log: {book.failure}" if book.failure else "",
     )
 

@@ -30,6 +30,7 @@ from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import replay
 from undertow.runtime.session import session
 from undertow.runtime.slow import BackgroundWorker
+from undertow.runtime.verdict import EXIT_CODES
 
 __all__ = [
     "ATTEMPTS",
@@ -286,6 +287,72 @@ def _first_line(log: Path, victim: ForkProcess, patience: float = 120.0) -> floa
     raise ArtefactError(f"log '{log}'", value=value)
 
 
+class _Hungry:
+    """A rig that takes all memory that there is, half a second into a run, and keeps it."""
+
+    def __init__(self, rig: Rig, after: float) -> None:
+        self.rig, self.period, self.left = rig, rig.period, round(after / rig.period)
+        self.taken: list[bytearray] = []
+        self.u = np.zeros(1)
+
+    def read(self) -> Measurement:
+        self.left -= 1
+        if self.left == 0:
+            self._eat()
+        return self.rig.read()
+
+    def _eat(self) -> None:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + (1 << 20)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+        size = 1 << 20
+        while size > 32:
+            try:
+                self.taken.append(bytearray(size))
+            except MemoryError:
+                size //= 2
+
+    def write(self, u: FloatArray) -> None:
+        self.rig.write(u)
+        self.u[:] = u
+
+    def close(self) -> None:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        self.taken.clear()
+        self.rig.close()
+
+
+def _starved(recipe: Recipe, record: Path) -> None:
+    rig = _Hungry(recipe.make_rig(), 0.5)
+    with session(recipe, rig=rig, processes=1) as runtime:
+        report = runtime.run(1.5)
+    verdict = report.verdict
+    facts = {"text": str(verdict), "code": verdict.exit_code, "off": verdict.off}
+    record.write_text(json.dumps({**facts, "u": rig.u.tolist()}))
+
+
+def _no_memory() -> LiveOutcome:
+    """Leave no memory in a process of its own: held or stopped, and the output off."""
+    name = "takes all memory"
+    if not Path("/proc/self/statm").exists():
+        return LiveOutcome("process", name, "left out: needs /proc", True)
+    with tempfile.TemporaryDirectory() as folder:
+        record = Path(folder) / "facts.json"
+        child = fork(_starved, (drill_recipe(), record), "undertow starved", daemon=False)
+        child.join(60.0)
+        child.kill()
+        if not record.exists():
+            return LiveOutcome("process", name, "it ended without a word", False)
+        facts = json.loads(record.read_text())
+    off = facts["off"] and not any(facts["u"])
+    happened = f"{facts['text']}; exit code {facts['code']}"
+    return LiveOutcome("process", name, happened, off and facts["code"] != EXIT_CODES["output on"])
+
+
 def _process_killed() -> LiveOutcome:
     *stopped, killed = kill_running(drill_recipe(), 0.7)
     happened = (
@@ -337,6 +404,7 @@ LIVE: tuple[tuple[str, Callable[[], LiveOutcome]], ...] = (
     ("log: cannot be made", _unwritable_log),
     ("keeper: stands still", _keeper),
     ("process: stands still, 40 ms", _process_stands_still),
+    ("process: takes all memory", _no_memory),
     ("process: controller killed", _process_killed),
 )
 

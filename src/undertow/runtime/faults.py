@@ -134,6 +134,8 @@ class FaultyRig:
         What happens to measurements and to inputs; either may raise.
     hang
         One call of ``write`` that takes long, with ``clock`` to show it.
+    slow
+        How long each ``read`` takes from then on, s, while the world goes on.
     """
 
     def __init__(
@@ -145,8 +147,10 @@ class FaultyRig:
         drive: Drive | None = None,
         hang: Hang | None = None,
         clock: SimulatedClock | None = None,
+        slow: float = 0.0,
     ) -> None:
         self.rig, self.period, self.since = rig, rig.period, since
+        self.slow, self._behind, self._last = slow, 0.0, np.zeros(0)
         self.sense, self.drive, self.hang, self.clock = sense, drive, hang, clock
         self._steps = 0
 
@@ -157,6 +161,12 @@ class FaultyRig:
 
     def read(self) -> Measurement:
         """Return what the sensors seem to say."""
+        if self.slow and self.clock is not None and self._elapsed >= 0:
+            self.clock.t += self.slow
+            self._behind += max(0.0, self.slow - self.period)
+            while self._behind >= self.period:
+                self.rig.write(self._last)
+                self._behind -= self.period
         measurement = self.rig.read()
         if self.sense is not None and self._elapsed >= 0:
             return self.sense(self._elapsed, measurement)
@@ -170,6 +180,7 @@ class FaultyRig:
         if self.drive is not None and elapsed >= 0:
             applied = self.drive(elapsed, applied)
         self.rig.write(applied)
+        self._last = applied
         if self.hang is not None and self.clock is not None and elapsed >= 0:
             periods = round(self.hang.seconds / self.period)
             for _ in range(periods):

@@ -2,8 +2,9 @@
 
 The rig lives in the keeper.  When the controller falls silent, or is killed, the keeper
 brings the output to zero within its slew rate and lets go: the safe stop that a dead
-process cannot make.  It has a session of its own, which the signals of a terminal
-(Ctrl-C, Ctrl-Z, a lost connection) do not reach.
+process cannot make.  A rig that does not take zero is asked again for a while, and what came
+of that is the last thing that it says.  It has a session of its own, which the signals of a
+terminal (Ctrl-C, Ctrl-Z, a lost connection) do not reach.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undertow.errors import ArtefactError
+from undertow import errors
+from undertow.errors import ArtefactError, UndertowError
 from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement, Rig
+from undertow.rig.interface import Measurement, OutputOnError, Rig
 from undertow.runtime.clock import prompt
 from undertow.runtime.processes import fork, pipe, withdraw
 from undertow.runtime.steps import confine
@@ -33,8 +35,12 @@ QUEUE = 100
 
 SILENT = "the keeper does not answer"
 
-#: How long a rig that takes no output is asked again to take zero, s.
-INSISTENCE = 1.0
+#: How long a rig that takes no output is asked again to take zero, s; and how long the keeper is
+#: waited for besides.
+INSISTENCE, FAREWELL = 1.0, 2.0
+
+#: Asks for a new reading without an output; and how long that is waited for, s.
+AGAIN, ANSWER = "read", 0.05
 
 
 class _Reply(NamedTuple):
@@ -43,6 +49,37 @@ class _Reply(NamedTuple):
     measurement: Measurement | None
     read: str
     write: str
+
+
+class _Refused(NamedTuple):
+    """The condition for which a rig could not be made: its class and what it says."""
+
+    kind: str
+    what: str
+    value: str | None
+    limit: str | None
+    remedy: str
+
+    @classmethod
+    def of(cls, error: Exception) -> _Refused:
+        if isinstance(error, UndertowError):
+            value, limit = (None if f is None else str(f) for f in (error.value, error.limit))
+            return cls(type(error).__name__, error.what, value, limit, error.remedy)
+        return cls(
+            "ArtefactError", "rig of a keeper", f"{type(error).__name__}: {error}",
+            "a rig that can be made and read", "",
+        )  # fmt: skip
+
+    def error(self) -> UndertowError:
+        kind: type[UndertowError] = getattr(errors, self.kind, ArtefactError)
+        return kind(self.what, value=self.value, limit=self.limit, remedy=self.remedy)
+
+
+class _Farewell(NamedTuple):
+    """The last that the keeper says: why the output is not at zero, and why closing failed."""
+
+    output: str
+    close: str
 
 
 class KeptRig:
@@ -61,8 +98,8 @@ class KeptRig:
 
     Raises
     ------
-    ArtefactError
-        When the rig cannot be made.
+    UndertowError
+        When the rig cannot be made: what was raised in the keeper.
     """
 
     def __init__(
@@ -86,34 +123,43 @@ class KeptRig:
         )
         theirs.close()
         try:
-            self._said: _Reply = self._pipe.recv()
+            said: _Reply | _Refused = self._pipe.recv()
         except EOFError as error:
             raise ArtefactError(
                 "rig of a keeper",
-                value="it could not be made",
+                value="its process ended",
                 limit="a rig that can be read",
                 remedy="The keeper's own error is printed above",
             ) from error
+        if isinstance(said, _Refused):
+            raise said.error()
+        self._said, self._closed, self._heard = said, False, time.perf_counter()
         self._unanswered = 0
 
     def read(self) -> Measurement:
         """Return the measurement that the keeper took after the last output.
 
+        After a while without outputs, as before a run, it takes a new one.
+
         Raises
         ------
         TimeoutError
-            When the keeper does not answer within half a period.
+            When the keeper does not answer within half a period, or 50 ms for a new one.
         EOFError
             When it is gone.
         OSError
             When the rig could not be read.
         """
+        patience = 0.5 * self.period
+        if not self._unanswered and time.perf_counter() - self._heard > ANSWER:
+            self._pipe.send(AGAIN)
+            self._unanswered, patience = 1, ANSWER
         if self._unanswered:
-            if not self._pipe.poll(0.5 * self.period):
+            if not self._pipe.poll(patience):
                 raise TimeoutError(SILENT)
             while self._pipe.poll(0.0):  # late answers too: the newest counts
                 self._said = self._pipe.recv()
-            self._unanswered = 0
+            self._unanswered, self._heard = 0, time.perf_counter()
         if self._said.measurement is None:
             raise OSError(self._said.read)
         return self._said.measurement
@@ -136,11 +182,33 @@ class KeptRig:
             raise OSError(self._said.write)
 
     def close(self) -> None:
-        """Let the keeper bring the output to zero and let go."""
-        with contextlib.suppress(OSError):
+        """Let the keeper bring the output to zero and let go.
+
+        Raises
+        ------
+        OutputOnError
+            When the rig did not take zero, or the keeper does not say whether it did.
+        OSError
+            When the rig took it, but could not be closed.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        last = _Farewell(f"{SILENT}: whether the output is at zero is not known", "")
+        until = time.perf_counter() + INSISTENCE + FAREWELL
+        with contextlib.suppress(OSError, EOFError):
             self._pipe.send(None)
+            while self._pipe.poll(max(0.0, until - time.perf_counter())):
+                if isinstance(said := self._pipe.recv(), _Farewell):
+                    last = said
+                    break
+        with contextlib.suppress(OSError):
             self._pipe.close()
         self.process.join(timeout=1.0)
+        if last.output:
+            raise OutputOnError(last.output)
+        if last.close:
+            raise OSError(last.close)
 
 
 def _keep(
@@ -157,8 +225,13 @@ def _keep(
     theirs.close()
     withdraw()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    with prompt():
-        facts = _hold(make(), ours, period, limits, slew, silence)
+    with prompt():  # also for the threads of a driver
+        try:
+            rig = make()
+        except Exception as error:  # a driver may do anything
+            ours.send(_Refused.of(error))
+            return
+        facts = _hold(rig, ours, period, limits, slew, silence)
     if record is not None:
         record.write_text(json.dumps(facts))
 
@@ -189,6 +262,9 @@ def _hold(
         except (EOFError, OSError):
             gone = True
         now = time.perf_counter()
+        if isinstance(wanted, str):
+            _reply(ours, rig, failure)
+            continue
         if wanted is not None:
             heard = now
             confine(wanted, u, limits, slew)
@@ -202,10 +278,17 @@ def _hold(
             at_zero = time.perf_counter()
         if wanted is not None:
             _reply(ours, rig, failure)
-    with contextlib.suppress(Exception):  # a rig that failed may fail again
+    output = "" if not failure else f"the device did not take an output of zero: {failure}"
+    close = ""
+    try:
         rig.close()
+    except Exception as error:  # a rig that failed may fail again
+        close = f"close: {type(error).__name__}: {error}"
+        output = output or (close if isinstance(error, OutputOnError) else "")
+    with contextlib.suppress(OSError):
+        ours.send(_Farewell(output, close))
     facts: dict[str, object] = {"heard": heard, "zero": at_zero, "largest": largest}
-    return {**facts, "u": u.tolist(), "failure": failure}
+    return {**facts, "u": u.tolist(), "failure": failure, "close": close}
 
 
 def _attempt(rig: Rig, u: FloatArray) -> str:

@@ -16,13 +16,18 @@ import numpy as np
 
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement, Rig
-from undertow.runtime.clock import YIELD, Clock, Histogram, WallClock, prompt
-from undertow.runtime.controller import Controller, Inputs
+from undertow.rig.interface import Measurement, OutputOnError, Rig
+from undertow.runtime.clock import YIELD, Clock, Histogram, WallClock, locked_memory, prompt
+from undertow.runtime.controller import UNSOUND, Controller, Inputs
 from undertow.runtime.encoding import answer_row
+from undertow.runtime.health import SECOND, RigClock, Share
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
+from undertow.runtime.processes import Background, refused_by_the_system
 from undertow.runtime.slow import Answer, Worker, is_answer
+from undertow.runtime.stage import stage_module
+from undertow.runtime.steps import confine
+from undertow.runtime.verdict import RunVerdict
 
 __all__ = ["Report", "Runtime"]
 
@@ -35,6 +40,9 @@ COLLECT = 10_000
 
 #: Events that are kept at most.
 EVENTS = 10_000
+
+#: Memory that is held back for the way to zero, bytes.
+RESERVE = 4 << 20
 
 
 @dataclass(eq=False)
@@ -65,6 +73,27 @@ class Report:
         Everything that happened: (t, what, text).
     variation
         Total variation of the inputs, Σ|u_k − u_{k−1}|, (m,).
+    last, settled_for
+        State before the stop, and for how long it had been *balance* then, s.
+    early
+        Whether the operator stopped the run before its time.
+    unread, unwritten, missing
+        Reads and writes of the rig that failed; steps in which a reading was missing, or not
+        believed.
+    unsound
+        Answers of the slow loop that were none, or refused as unsound: their numbers are not
+        those of their plan, or the plan is not stable.
+    off, output
+        Whether the device took an output of zero at the end; what went wrong with that, or with
+        closing it.
+    error, cost
+        ‖x‖₂ of the last estimate, and ∫ Φ dt over the run, in the objective's unit.
+    home, homing
+        Of the settings: what a run that ends settled is measured by.
+    system
+        What the loop asked of the system, and what it got, in words.
+    log
+        Where everything went.
     """
 
     steps: int = 0
@@ -83,6 +112,36 @@ class Report:
     answers: Counter[str] = field(default_factory=Counter)
     events: list[tuple[float, str, str]] = field(default_factory=list)
     variation: FloatArray = field(default_factory=lambda: np.zeros(0))
+    last: Mode = Mode.IDLE
+    settled_for: float = 0.0
+    early: bool = False
+    unread: int = 0
+    unwritten: int = 0
+    missing: int = 0
+    unsound: int = 0
+    off: bool = True
+    output: str = ""
+    error: float = math.nan
+    cost: float = 0.0
+    home: float = math.inf
+    homing: float = 0.0
+    system: tuple[str, ...] = ()
+    log: Log | None = field(default=None, repr=False)
+
+    @property
+    def lost_rows(self) -> int:
+        """Rows of the log that were lost, also by its closing."""
+        return 0 if self.log is None else self.log.dropped
+
+    @property
+    def log_failure(self) -> str:
+        """Why the log could not be written to its end; empty where it could."""
+        return "" if self.log is None else self.log.failure
+
+    @property
+    def verdict(self) -> RunVerdict:
+        """How the run ended; ask again once the log is closed, which may lose rows."""
+        return RunVerdict.of(self)
 
 
 class Runtime:
@@ -133,9 +192,23 @@ class Runtime:
         self.controller, self.rig, self.worker = controller, rig, worker
         self.clock = WallClock() if clock is None else clock
         self.log = log
-        self.report = Report(variation=np.zeros_like(controller.u))
+        settings, period = controller.settings, controller.period
+        self.report = Report(
+            variation=np.zeros_like(controller.u),
+            home=settings.home,
+            homing=settings.homing,
+            log=log,
+        )
         self._stopping, self._silent = False, ""
         self._unread = self._unwritten = 0.0
+        self._reads, self._writes = (Share(settings.window, period) for _ in range(2))
+        self._overruns, self._rig_clock = Share(SECOND, period), RigClock(settings, period)
+        self._written, self._let_go_of, self._lost = np.zeros_like(controller.u), False, 0
+        mechanism = controller.cascade.mechanism
+        self._stage = stage_module(mechanism, controller.cascade.objective).stage
+        self._parameters = np.array(mechanism.parameter_values, dtype=float)
+        self._rate, self._since, self._balanced = np.zeros(1), 0.0, 0.0
+        self._reserve = b""
         self._beat = self._origin = self.clock.now()
 
     def stop(self) -> None:
@@ -145,30 +218,116 @@ class Runtime:
     def run(self, seconds: float) -> Report:
         """Run from start to a safe stop; the operator's stop comes after ``seconds``.
 
-        The loop ends once a safe stop has brought the output to zero.
+        The run ends once a safe stop has brought the output to zero: the device is asked to take
+        zero until it does, for ``Settings.insist`` at most, and is closed.  Whether it did is in
+        the report and in its verdict.  An interrupt that a driver lets through counts as the
+        operator's stop; other ways out of the interpreter are taken after the safe stop.
 
         Raises
         ------
         InvalidInputError
             When it has run already: its rig has been let go of.
+        ResourceError
+            When the system has no thread or memory left for the run.
         """
-        if self.report.steps:
+        if self.report.steps or self._let_go_of:
             raise InvalidInputError(
                 "second run of a runtime",
                 value=f"stopped by {self.report.stopped_by}",
                 limit="one run: the rig has been let go of",
                 remedy="Make another session",
             )
-        with _quiet_interpreter(self.clock), self._watchdog():
-            try:
-                self._loop(seconds)
-            finally:
-                self._beat = float("inf")
-                with contextlib.suppress(Exception):  # a rig that failed may fail again
-                    self.rig.close()
+        try:
+            with (
+                refused_by_the_system("a run"),
+                _quiet_interpreter(self.clock) as self.report.system,
+                self._watchdog(),
+            ):
+                self._reserve = bytes(RESERVE)
+                try:
+                    self._say_system()
+                    self._loop(seconds)
+                except BaseException as error:
+                    self._broke(error)
+                    if not isinstance(error, Exception | KeyboardInterrupt):
+                        raise
+                finally:
+                    self._let_go()
+        finally:
+            self._let_go()
+        return self.report
+
+    def _say_system(self) -> None:
+        for text in self.report.system:
+            self._tell("system", text)
+
+    def _broke(self, error: BaseException) -> None:
+        """Take down what ended the loop itself: its output comes to zero without it."""
+        self._reserve = b""
         report, controller = self.report, self.controller
+        reason = f"loop: {type(error).__name__}: {error}"
+        if isinstance(error, KeyboardInterrupt):
+            reason = "operator: interrupt"
+        if controller.mode is not Mode.SAFE_STOP:
+            report.last = controller.mode
+            controller.mode, controller.stopped_by = Mode.SAFE_STOP, reason
+            self._tell("state", f"{report.last.name} → SAFE_STOP: {reason}")
+
+    def _let_go(self) -> None:
+        """Bring the output to zero, insist on it for a while, close the rig, and take down how.
+
+        Also after the loop has failed, without its memory: nothing here needs much.
+        """
+        if self._let_go_of:
+            return
+        self._let_go_of, self._reserve = True, b""
+        report, controller = self.report, self.controller
+        failure = ""
+        try:
+            failure = self._bring_to_zero() if not report.off else ""
+        except BaseException as error:  # an interrupt: the rig is closed all the same
+            failure = f"{type(error).__name__}: {error}"
+        self._beat = float("inf")
+        output = [] if report.off else [f"the device did not take an output of zero: {failure}"]
+        if self._silent and report.off:
+            output.append(self._silent)
+        try:
+            self.rig.close()
+        except BaseException as error:  # a rig that failed may fail again
+            output.append(f"close: {type(error).__name__}: {error}")
+            report.off = report.off and not isinstance(error, OutputOnError)
+        report.output = "; ".join(output)
         report.mode, report.stopped_by = controller.mode, controller.stopped_by
-        return report
+        report.error = float(np.linalg.norm(controller.home))
+        if report.output:
+            self._tell("output", report.output)
+
+    def _bring_to_zero(self) -> str:
+        """Write outputs down to zero within the slew rate until the device has taken zero.
+
+        Returns what failed at last, once it was asked for ``Settings.insist`` in vain.
+        """
+        controller, clock, u = self.controller, self.clock, self._written
+        zero, failure = np.zeros_like(u), ""
+        due = began = clock.now()
+        for _ in range(math.ceil(controller.settings.insist / controller.period) + 1000):
+            if self._silent:
+                return self._silent
+            confine(zero, u, controller.limits, controller.slew)
+            self._beat = clock.now()
+            try:
+                self.rig.write(u.copy())
+            except BaseException as error:  # it must come to zero whatever a driver does
+                failure = f"{type(error).__name__}: {error}"
+            else:
+                if not u.any():
+                    self.report.off = True
+                    return ""
+            if not u.any() and clock.now() - began > controller.settings.insist:
+                break
+            due += controller.period
+            clock.sleep_until(due)
+        return f"asked for {controller.settings.insist:g} s, {failure}"
 
     def _loop(self, seconds: float) -> None:
         clock, period, report = self.clock, self.controller.period, self.report
@@ -176,6 +335,7 @@ class Runtime:
         stall = self.controller.settings.stall
         origin = self._origin = clock.now()
         k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
+        limits = self.controller.settings
         while True:
             due = origin + slot * period
             self._wait(due)
@@ -187,6 +347,7 @@ class Runtime:
             command = Command.START if k == 0 else Command.NONE
             if (self._stopping or t >= seconds) and self.controller.mode != Mode.SAFE_STOP:
                 command = Command.STOP
+                report.early = t < seconds
             measurement, alarm = self._read(alarm)
             read = clock.now()
             inputs = Inputs(t, measurement, self._take(t), command, alarm)
@@ -216,14 +377,21 @@ class Runtime:
             if k % COLLECT == 0 and not clock.simulated:
                 gc.collect(0)  # what an exception leaves behind; some microseconds
             if self.controller.mode == Mode.SAFE_STOP and (self._silent or not u.any()):
-                break
+                break  # and insist on zero, if the device has not taken it
             slot += 1
             over = (ended - origin) / period - slot
+            skipped = int(over) if over > 0 else 0
             if over > 0:
                 report.missed += 1
                 report.asleep += ended - began < period
-                report.skipped += int(over)
-                slot += int(over)
+                report.skipped += skipped
+                slot += skipped
+            self._overruns.add((over > 0) + skipped, 1 + skipped)
+            if self._overruns.value > limits.overrun:
+                alarm = alarm or (
+                    f"deadlines missed in {self._overruns.value:.0%} of the last second, "
+                    f"the last step took {1e3 * (ended - began):.2g} ms of {1e3 * period:g} ms"
+                )
 
     def _wait(self, due: float) -> None:
         """Wait for the next step; shortly before, let the shadow make the last one again."""
@@ -239,19 +407,27 @@ class Runtime:
         clock.spin_until(due)
 
     def _read(self, alarm: str) -> tuple[Measurement | None, str]:
-        """Read the rig; one that fails gives nothing, and one that keeps failing is an alarm."""
-        if not self._silent:  # else the watchdog has let go of it
-            try:
-                measurement = _own(self.rig.read(), self.controller.x.shape[0] // 2)
-                self._unread = 0.0
-                return measurement, self._silent or alarm
-            except Exception as error:
-                what = f"read: {type(error).__name__}: {error}"
-            self._unread += self.controller.period
+        """Read the rig; one that fails gives nothing, and one that fails much is an alarm."""
+        if self._silent:  # the watchdog has let go of it
+            return None, self._silent
+        settings, measurement, what = self.controller.settings, None, ""
+        try:
+            measurement = _own(self.rig.read(), self.controller.x.shape[0] // 2)
+        except Exception as error:
+            what = f"read: {type(error).__name__}: {error}"
             self._tell("rig", what)
-            if self._unread > self.controller.settings.patience:
-                alarm = alarm or f"the rig gave nothing for {1e3 * self._unread:.0f} ms, {what}"
-        return None, self._silent or alarm
+        if measurement is not None:
+            self._unread = 0.0
+            alarm = alarm or self._rig_clock.check(measurement.t, self._beat, self.report.steps)
+        else:
+            self._unread += self.controller.period
+            self.report.unread += 1
+        self._reads.add(measurement is None)
+        if self._unread > settings.patience:
+            alarm = alarm or f"the rig gave nothing for {1e3 * self._unread:.0f} ms, {what}"
+        elif self._reads.value > settings.failing and measurement is None:
+            alarm = alarm or f"{self._reads.value:.0%} of the reads failed, {what}"
+        return measurement, self._silent or alarm
 
     def _take(self, t: float) -> Answer | None:
         """Take an answer of the slow loop; what is none is not looked at."""
@@ -262,21 +438,33 @@ class Runtime:
             return None
         if answer is None or is_answer(answer):
             return answer
+        self.report.unsound += 1
         self._tell("optimiser", f"no whole answer, a {type(answer).__name__}")
         return None
 
     def _write(self, u: FloatArray) -> str:
-        """Write to the rig; one that keeps failing is an alarm for the next step."""
+        """Write to the rig; one that fails much is an alarm for the next step."""
         if self._silent:
             return self._silent
+        report, settings, zero = self.report, self.controller.settings, not u.any()
+        self._written[:] = u
+        report.off = report.off and zero  # one that fails may have taken it all the same
         try:
             self.rig.write(u.copy())  # the rig may keep it, or change it
         except Exception as error:
-            self._unwritten += self.controller.period
             what = f"write: {type(error).__name__}: {error}"
-            self._tell("rig", what)
-            return what if self._unwritten > self.controller.settings.patience else ""
-        self._unwritten = 0.0
+        else:
+            self._unwritten, report.off = 0.0, zero
+            self._writes.add(0)
+            return ""
+        self._unwritten += self.controller.period
+        self._writes.add(1)
+        report.unwritten += 1
+        self._tell("rig", what)
+        if self._unwritten > settings.patience:
+            return what
+        if self._writes.value > settings.failing:
+            return f"{self._writes.value:.0%} of the writes failed, {what}"
         return ""
 
     def _tell(self, what: str, text: str) -> None:
@@ -284,7 +472,10 @@ class Runtime:
         if len(events) < EVENTS:
             events.append((t, what, text))
         if self.log is not None:
-            self.log.event(self.report.steps, t, what, text)
+            try:
+                self.log.event(self.report.steps, t, what, text)
+            except Exception:  # what is said of a fault must not be another one
+                self.log.dropped += 1
 
     def _after(self, k: int, inputs: Inputs) -> None:
         """Hand requests to the slow loop, and keep what happened."""
@@ -307,8 +498,28 @@ class Runtime:
             self._tell(note.kind, note.text)
             if note.kind == "state":
                 report.entered[controller.mode.name] += 1
+                self._account(note.text, inputs.t)
             else:
+                report.unsound += UNSOUND in note.text
                 report.answers[note.text.split(": ", 1)[1].split(",")[0].split(" by ")[0]] += 1
+
+        report.missing += controller.sensors.missing > 0
+        report.cost += float(self._rate[0]) * (inputs.t - self._since)
+        self._since = inputs.t
+        self._stage(controller.home, controller.u, self._parameters, self._rate)
+        if log is not None and log.dropped > self._lost:
+            if not self._lost:
+                self._tell("log", f"rows are lost: {log.failure or 'too slow a disk'}")
+            self._lost = log.dropped
+
+    def _account(self, change: str, t: float) -> None:
+        """Keep from a change of state what the verdict needs."""
+        report, mode = self.report, self.controller.mode
+        if mode is Mode.BALANCE:
+            self._balanced = t
+        elif mode is Mode.SAFE_STOP:
+            report.last = Mode[change.partition(" → ")[0]]
+            report.settled_for = t - self._balanced if report.last is Mode.BALANCE else 0.0
 
     def _record(
         self,
@@ -354,9 +565,8 @@ class Runtime:
                         self.rig.close()
                     return
 
-        thread = threading.Thread(target=watch, name="undertow watchdog", daemon=True)
         self._beat = self.clock.now()
-        thread.start()
+        Background(watch, "undertow watchdog")
         try:
             yield
         finally:
@@ -375,14 +585,15 @@ def _own(measurement: Measurement, n: int) -> Measurement:
 
 
 @contextlib.contextmanager
-def _quiet_interpreter(clock: Clock) -> Iterator[None]:
+def _quiet_interpreter(clock: Clock) -> Iterator[tuple[str, ...]]:
     """Keep the interpreter from pausing the loop: no collections but those that the loop makes.
 
     Old objects are frozen; other threads yield quickly, and wait while the loop works.
-    The fast loop also asks for a real-time priority, where the system grants it.
+    The fast loop also asks for a real-time priority and for its memory to stay where it is;
+    yields what the system said to that.
     """
     if clock.simulated:
-        yield
+        yield ()
         return
     interval, collecting = sys.getswitchinterval(), gc.isenabled()
     sys.setswitchinterval(YIELD)  # the clock goes on with it
@@ -390,8 +601,8 @@ def _quiet_interpreter(clock: Clock) -> Iterator[None]:
     gc.freeze()
     gc.disable()
     try:
-        with prompt():
-            yield
+        with prompt() as priority, locked_memory() as memory:
+            yield priority, memory
     finally:
         gc.unfreeze()
         if collecting:

@@ -34,16 +34,19 @@ REST = 0.3
 PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
 
 #: What :meth:`SensorWatch.check` found: nothing wrong; no sound reading yet; none for too long; a
-#: sensor lost for too long; one that stands still.  What comes after the second is a fault.
-SOUND, NOT_YET, NEVER, LOST, FROZEN = range(5)
+#: sensor lost for too long; one that stands still; one that is missing too often.  What comes
+#: after the second is a fault.
+SOUND, NOT_YET, NEVER, LOST, FROZEN, SPARSE = range(6)
 LAST_HARMLESS = NOT_YET
 
-#: What the watch remembers; settings: period, jump, frozen, patience, stall; clock: the rig's at
-#: the last reading, ours, time waited, whether there was a sound reading at all.
+#: What the watch remembers; settings: period, jump, frozen, patience, stall, weight of a step in a
+#: share, largest share; clock: the rig's at the last reading, ours, time waited, whether there was
+#: a sound reading at all; shares: part of the readings that was missing of late.
 _LAYOUT = {
-    "settings": "5", "clock": "4", "q": "n", "v": "n", "band": "m", "gain": "n",
+    "settings": "7", "clock": "4", "q": "n", "v": "n", "band": "m", "gain": "n",
     "parameters": "p", "viscous": "n", "W": "n * n", "last": "n", "gaps": "n", "ages": "n",
-    "counts": "n", "quiet": "1", "expected": "2 * n", "free": "n, 2 * n", "work": "3, 2 * n",
+    "counts": "n", "shares": "n", "quiet": "1", "expected": "2 * n",
+    "free": "n, 2 * n", "work": "3, 2 * n",
 }  # fmt: skip
 
 _BODY = f"""
@@ -89,9 +92,11 @@ def believe(x, u, block):
     for i in range(n):
         if abs(q[i] - expected[i]) <= jump + 2.0 * h * abs(expected[n + i]):
             gaps[i] = 0.0
+            shares[i] -= settings[5] * shares[i]
         else:
             q[i] = v[i] = math.nan
             gaps[i] += h
+            shares[i] += settings[5] * (1.0 - shares[i])
             missing += 1
         if gaps[i] > gaps[worst]:
             worst = i
@@ -155,6 +160,9 @@ def check(stamp, x, u, block):
         return {LOST}, worst, missing, False, clock[1], probe
     if still >= 0:
         return {FROZEN}, still, missing, False, clock[1], probe
+    for i in range(n):
+        if shares[i] > settings[6]:
+            return {SPARSE}, i, missing, False, clock[1], probe
     return {SOUND}, 0, missing, False, clock[1], probe
 """
 
@@ -201,14 +209,15 @@ class SensorWatch:
         self._check = _module(mechanism).check
         memory = Memory(_LAYOUT, n=n, m=mechanism.m, p=len(mechanism.parameters))
         self._block, self._clock, self._gaps = memory.block, memory["clock"], memory["gaps"]
-        self._ages, self._quiet = memory["ages"], memory["quiet"]
+        self._ages, self._quiet, self._shares = memory["ages"], memory["quiet"], memory["shares"]
         memory["settings"][:] = (
             period, settings.jump, settings.frozen, settings.patience, settings.stall,
+            min(1.0, period / settings.window), settings.sparse,
         )  # fmt: skip
         memory["parameters"][:] = mechanism.parameter_values
         memory["counts"][:] = 0.01
         memory["band"][:] = settings.bands(mechanism)
-        self._q, self._v = memory["q"], memory["v"]
+        self._q, self._v, self._window = memory["q"], memory["v"], settings.window
         self._believed = Measurement(0.0, self._q)
         self.forget()
 
@@ -216,7 +225,7 @@ class SensorWatch:
         """Start afresh: the next sound reading is the first."""
         self.missing, self.first, self.probe = 0, False, 0.0
         self._clock[:] = -math.inf, 0.0, 0.0, 0.0
-        self._gaps[:] = self._ages[:] = self._quiet[:] = 0.0
+        self._gaps[:] = self._ages[:] = self._quiet[:] = self._shares[:] = 0.0
 
     def check(
         self, measurement: Measurement | None, x: FloatArray, u: FloatArray
@@ -276,4 +285,21 @@ class SensorWatch:
             return "no sound reading yet"
         if found == LOST:
             return f"sensor '{self.names[where]}' lost for {1e3 * self._gaps[where]:.0f} ms"
+        if found == SPARSE:
+            return f"sensor {self._missing(where, self._shares[where])}"
         return f"sensor '{self.names[where]}' frozen" if found == FROZEN else ""
+
+    def worst(self, elapsed: float) -> str:
+        """Return in words which sensor was missing most often; empty if none was.
+
+        Parameters
+        ----------
+        elapsed
+            Time since the watch started afresh, s: of it no more than a window is looked at.
+        """
+        where, looked_at = int(self._shares.argmax()), -math.expm1(-elapsed / self._window)
+        share = min(1.0, self._shares[where] / looked_at)
+        return f"sensor {self._missing(where, share)}" if share > 0.01 else ""
+
+    def _missing(self, where: int, share: float) -> str:
+        return f"'{self.names[where]}' missing in {share:.0%} of the readings"

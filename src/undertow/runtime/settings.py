@@ -57,6 +57,23 @@ class Settings:
         ‖x‖₂ beyond which the mechanism has been thrown out, whatever the predictions' own limit.
     stall
         Longest gap between two steps, s; after a longer one the loop stops safely.
+    window, failing, sparse
+        When more than the share ``failing`` of the reads or of the writes fail, or more than
+        ``sparse`` of the readings of one sensor are missing, over a sliding window of this
+        length, s, the loop stops safely.
+    overrun
+        When more than this share of the periods of the last second had no step that ended in
+        time, the loop stops safely.
+    drift
+        The rig's clock may go wrong against the host's, or against the steps made, by this much
+        in a second, s; beyond that the loop stops safely.
+    bring_up
+        Longest bring-up, s; when the law cannot take over by then the loop stops safely.
+    insist
+        How long a rig that does not take an output of zero is asked again after a safe stop, s.
+    home, homing
+        ‖x‖₂ within which a run that ends settled has come home; and how long after it has
+        settled, s, it is on its way and may be four times as far away.
     """
 
     output_limit: float = math.inf
@@ -76,6 +93,15 @@ class Settings:
     lost: float = math.pi / 2
     escape: float = 500.0
     stall: float = 0.1
+    window: float = 0.25
+    failing: float = 0.2
+    sparse: float = 0.6
+    overrun: float = 0.3
+    drift: float = 0.1
+    bring_up: float = 2.0
+    insist: float = 1.0
+    home: float = 0.35
+    homing: float = 5.0
 
     def __post_init__(self) -> None:
         """Refuse what is not positive."""

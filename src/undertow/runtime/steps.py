@@ -25,10 +25,11 @@ __all__ = ["PAST", "UNSOUND", "confine", "off_by", "settle", "sound", "step_memo
 UNSOUND, PAST = 1, 2
 
 #: What a step remembers, after what the law does; settings: margin, escape, near, lost, settle,
-#: period; off: by how much the state is off the expected one, and the margin of a new law there.
+#: period, what a missing reading takes off the time that the sensors were sound; off: by how
+#: much the state is off the expected one, and the margin of a new law there.
 _LAYOUT = LAYOUT | {
     "x": "2 * n", "home": "2 * n", "turn": "2 * n", "wanted": "m", "output": "m", "slew": "m",
-    "settings": "6", "low": "n", "high": "n", "angles": "n", "band": "m", "since": "1",
+    "settings": "7", "low": "n", "high": "n", "angles": "n", "band": "m", "since": "1",
     "expected": "2 * n", "off": "2",
 }  # fmt: skip
 
@@ -69,7 +70,12 @@ def act(
             part += square
         if i < n and angles[i] > 0.0:
             away = max(away, abs(home[i]))
-    since[0] = 0.0 if fault or missing else since[0] + settings[5]
+    if missing:
+        since[0] = max(0.0, since[0] - settings[6])
+    else:
+        since[0] = min(since[0], settings[4]) + settings[5]
+    if fault:
+        since[0] = 0.0
     allowed = margin[0] > settings[0]
     inside = used if swings else allowed
     lost = not allowed or not math.sqrt(whole) < settings[1] or away > settings[3]
@@ -118,6 +124,7 @@ def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: f
     memory["slew"][:] = np.where(np.isfinite(slew), slew, np.inf)
     memory["settings"][:] = (
         settings.margin, settings.escape, settings.near, lost, settings.settle, period,
+        period * max(0.0, 1.0 / settings.sparse - 1.0),
     )  # fmt: skip
     memory["low"][:], memory["high"][:] = settings.travels(mechanism).T
     memory["angles"][m:] = [c.unit == "rad" for c in mechanism.coordinates[m:]]

@@ -17,11 +17,13 @@ from rich.text import Text
 from undertow.runtime.clock import Histogram
 from undertow.runtime.drill import Outcome
 from undertow.runtime.drill_live import Killed, LiveOutcome
+from undertow.runtime.failing import OPERATIONS
 from undertow.runtime.loop import Report
 from undertow.runtime.modes import Mode
 from undertow.runtime.replay import Replay
+from undertow.runtime.systematic import RIGS, Case
 
-__all__ = ["drill_table", "kill_table", "replay_table", "run_table"]
+__all__ = ["drill_table", "kill_table", "replay_table", "run_table", "systematic_table"]
 
 #: Edges of the histogram of response times, s.
 EDGES = (0.0, 50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, math.inf)
@@ -29,6 +31,15 @@ EDGES = (0.0, 50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, math.inf)
 
 #: Look of every table: no frame, as in the trials.
 _PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
+
+
+#: What a replay compares of the processor.
+PROCESSOR = ("processor", "target", "features")
+
+
+def _shown(text: str) -> str:
+    """Return what a log says as a terminal may show it: it may be anybody's."""
+    return escape("".join(c if c.isprintable() else "?" for c in text))
 
 
 def _micro(seconds: float) -> str:
@@ -88,6 +99,9 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         same = "the same outputs" if not report.disagreed else f"{report.disagreed:,} other outputs"
         if report.shadowed:
             lines.add_row("shadow", f"{report.shadowed:,} steps made again, {same}")
+    for text in report.system:
+        what, _, said = text.partition(": ")
+        lines.add_row(what, escape(said))
     states = ["IDLE"]
     states += [t.split(":")[0].split(" → ")[-1] for _, what, t in report.events if what == "state"]
     if len(states) > 10:
@@ -98,6 +112,8 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
     failures = Counter(text for _, what, text in report.events if what == "rig")
     for text, count in failures.most_common(3):
         lines.add_row("the rig", escape(f"{count:,} times {text}"))
+    if report.missing:
+        lines.add_row("readings missing", f"in {report.missing:,} steps")
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in report.answers.most_common())
     lines.add_row("answers of the optimiser", verdicts or "none")
     seconds = max(1, report.steps) * period
@@ -120,11 +136,11 @@ def replay_table(result: Replay) -> Table:
     """Return what came of a replay."""
     table = Table.grid(padding=(0, 2))
     recording = result.recording
-    table.add_row("log", f"{recording.path}: {recording.meta['mechanism']}")
+    table.add_row("log", _shown(f"{recording.path}: {recording.meta['mechanism']}"))
     stops = [(t, text) for _, t, kind, text in recording.events if kind == "state"]
     if stops and "SAFE_STOP" in stops[-1][1]:
         t, text = stops[-1]
-        table.add_row("stopped by", escape(f"{text.partition('SAFE_STOP: ')[2]}, at {t:.3f} s"))
+        table.add_row("stopped by", _shown(f"{text.partition('SAFE_STOP: ')[2]}, at {t:.3f} s"))
     else:
         table.add_row("stopped by", "nothing in the log: it was cut off")
     table.add_row("steps made again", f"{result.steps:,}")
@@ -142,15 +158,18 @@ def replay_table(result: Replay) -> Table:
     if result.gap is not None:
         table.add_row("gap", f"the log lost step {result.gap}: the replay ends there")
     for name, (then, now) in result.build.items():
-        table.add_row("another build", f"{name} {then} then, {now} now")
+        what = "another processor" if name in PROCESSOR else "another build"
+        table.add_row(what, _shown(f"{name} {then or 'unknown'} then, {now or 'none'} now"))
+    for remark in result.remarks:
+        table.add_row("mechanism", _shown(remark))
     return table
 
 
 def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -> Table:
     """Return what happened in the drill, a row a fault, under what fails."""
-    table = Table("what fails, and how", "what happened", "|u|/limit", "", **_PLAIN)
+    table = Table("what fails, and how", "what happened", "verdict", "|u|/limit", "", **_PLAIN)
     table.columns[0].ratio, table.columns[1].ratio = 4, 6
-    table.columns[2].justify = "right"
+    table.columns[3].justify = "right"
     part = ""
     for outcome in outcomes:
         case = outcome.case
@@ -161,13 +180,17 @@ def drill_table(outcomes: Sequence[Outcome], live: Sequence[LiveOutcome] = ()) -
         if not outcome.replayed:
             happened += "; [red]its replay differs[/red]"
         table.add_row(
-            _indented(case.name), happened, f"{outcome.largest:.0%}", _mark(outcome.passed)
+            _indented(case.name),
+            happened,
+            f"{outcome.verdict.ending} {outcome.verdict.exit_code}",
+            f"{outcome.largest:.0%}",
+            _mark(outcome.passed),
         )
     for number, one in enumerate(live):
         if number == 0:
             table.add_row("[bold]against the clock[/bold]")
         table.add_row(
-            _indented(f"{one.part}: {one.name}"), escape(one.happened), "", _mark(one.passed)
+            _indented(f"{one.part}: {one.name}"), escape(one.happened), "", "", _mark(one.passed)
         )
     return table
 
@@ -204,6 +227,27 @@ def kill_table(killed: Sequence[Killed]) -> Group:
     lines = [
         Text(f"{count} had stopped safely before the kill, and another was killed: {reason}")
         for reason, count in reasons.most_common()
+    ]
+    return Group(table, *lines)
+
+
+def systematic_table(cases: Sequence[Case]) -> Group:
+    """Return how many systematic faults passed, by operation and rig, and which did not."""
+    table = Table("what fails", *RIGS, "cases", "passed", "", **_PLAIN)
+    for column in table.columns[1:-1]:
+        column.justify = "right"
+    for operation in OPERATIONS:
+        here = [case for case in cases if case.fault.operation == operation]
+        if not here:
+            continue
+        by_rig = [sum(case.fault.rig == rig for case in here) for rig in RIGS]
+        passed = sum(case.passed for case in here)
+        counts = [f"{n:,}" for n in (*by_rig, len(here), passed)]
+        table.add_row(operation, *counts, _mark(passed == len(here)))
+    lines = [
+        Text(f"{case.fault}: {'; '.join(case.wrong)} ({case.happened})")
+        for case in cases
+        if not case.passed
     ]
     return Group(table, *lines)
 

@@ -1,0 +1,128 @@
+"""How a run ended, in one word with its reasons, and the exit code that goes with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from undertow.runtime.modes import Mode, Reason
+
+if TYPE_CHECKING:
+    from undertow.runtime.loop import Report
+
+__all__ = ["EXIT_CODES", "Ending", "RunVerdict"]
+
+#: How a run may end.
+Ending = Literal["balanced", "caught", "lost", "stopped", "degraded"]
+
+#: Exit codes of ``undertow run``; 1 and 2 are those of all commands: it failed, or was asked for
+#: what cannot be.  7 comes before the others: the device did not take an output of zero.
+EXIT_CODES: dict[str, int] = {
+    "balanced": 0, "caught": 3, "lost": 4, "stopped": 5, "degraded": 6, "output on": 7,
+}  # fmt: skip
+
+#: Share of missed and skipped periods, of failed reads or writes, and of steps with a reading
+#: missing, of a whole run above which it counts as degraded.
+MISSED, FAILED, MISSING = 0.05, 0.02, 0.2
+
+#: Shortest time for which a run must have been settled at its end, s; and how many times as far
+#: from home one may be that is on its way there.
+SETTLED, ON_ITS_WAY = 0.1, 4.0
+
+
+@dataclass(frozen=True)
+class RunVerdict:
+    """How a run ended.
+
+    Attributes
+    ----------
+    ending
+        ``balanced``: the law held the mechanism to the end, settled and at home.  ``caught``:
+        the law held it to the end, but it was not settled, or not at home.  ``degraded``: one of
+        both, but something was wrong on the way.  ``lost``: thrown out, past its travel, or never
+        caught.  ``stopped``: by the operator before its time, or by a fault.
+    reasons
+        Why, in words.
+    error
+        ‖x‖₂ of the last estimate, whole turns of free joints taken off.
+    cost
+        ∫ Φ dt of the estimates and outputs over the run, in the objective's unit.
+    output
+        What is not known to be off: empty when the device took an output of zero at the end,
+        and could be closed.
+    off
+        Whether the device took an output of zero at the end.
+    """
+
+    ending: Ending
+    reasons: tuple[str, ...]
+    error: float
+    cost: float
+    output: str = ""
+    off: bool = True
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code of ``undertow run``: 0 for ``balanced`` alone."""
+        return EXIT_CODES[self.ending if self.off else "output on"]
+
+    def __str__(self) -> str:
+        """Return the verdict in one line."""
+        reasons = "; ".join(filter(None, (*self.reasons, self.output)))
+        numbers = f"‖x‖ = {self.error:.3g} at the end, cost {self.cost:.4g}"
+        return f"{self.ending}{reasons and f', {reasons}'}; {numbers}"
+
+    @classmethod
+    def of(cls, report: Report) -> RunVerdict:
+        """Judge a run by its report."""
+        ending, reasons = _ending(report)
+        if ending in ("balanced", "caught") and (wrong := _wrong(report)):
+            ending, reasons = "degraded", [f"{ending}, but {wrong[0]}", *wrong[1:]]
+        if not report.off and ending not in ("lost", "stopped"):
+            ending = "stopped"
+        return cls(ending, tuple(reasons), report.error, report.cost, report.output, report.off)
+
+
+def _ending(report: Report) -> tuple[Ending, list[str]]:
+    """Return how the motion ended, before what went wrong on the way is looked at."""
+    why, last = report.stopped_by, report.last
+    if why == Reason.THROWN_OUT.text or why.endswith("past its travel"):
+        return "lost", [why]
+    if why != Reason.STOP.text:
+        return "stopped", [why]
+    if last == Mode.SWING_UP:
+        return "lost", ["not caught by the end"]
+    if last not in (Mode.CATCH, Mode.BALANCE):
+        return "stopped", [f"{why} before the law took over"]
+    if report.early:
+        return "stopped", [f"{why} before the end, {last.name.lower()}"]
+    if last == Mode.CATCH or report.settled_for < SETTLED:
+        return "caught", ["not settled at the end"]
+    if report.error <= report.home:
+        return "balanced", []
+    if report.settled_for <= report.homing and report.error <= ON_ITS_WAY * report.home:
+        return "balanced", [f"settled for {report.settled_for:.1f} s, on its way home"]
+    return "caught", [f"settled for {report.settled_for:.1f} s, but not at home"]
+
+
+def _wrong(report: Report) -> Sequence[str]:
+    """Return what was wrong with a run that was held to its end."""
+    steps = max(1, report.steps)
+    missed = (report.missed + report.skipped) / (steps + report.skipped)
+    lost = report.lost_rows
+    facts = (
+        (missed > MISSED, f"{missed:.0%} of the deadlines were missed"),
+        (lost > 0, f"{lost:,} rows of the log were lost"),
+        (report.log_failure != "", f"the log: {report.log_failure}"),
+        (report.disagreed > 0, f"the shadow disagreed in {report.disagreed:,} steps"),
+        (report.unsound > 0, f"{report.unsound:,} answers of the optimiser were unsound"),
+        (report.unread > FAILED * steps, f"{report.unread:,} reads failed"),
+        (report.unwritten > FAILED * steps, f"{report.unwritten:,} writes failed"),
+        (
+            report.missing > MISSING * steps,
+            f"readings were missing in {report.missing / steps:.0%} of the steps",
+        ),
+        (report.output != "", "the rig was not closed"),
+    )
+    return [text for true, text in facts if true]

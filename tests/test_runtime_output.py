@@ -1,0 +1,575 @@
+"""The output is off when a run says so; what fails too often, too slowly or too fast stops it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runs import RECIPE
+from undertow.cascade import CascadeState
+from undertow.errors import ArtefactError, ResourceError
+from undertow.rig import Measurement, OutputOnError
+from undertow.runtime import (
+    Columns,
+    Controller,
+    InlineWorker,
+    Log,
+    Mode,
+    Report,
+    Runtime,
+    RunVerdict,
+    SimulatedClock,
+    about,
+    background_worker,
+    replay,
+)
+from undertow.runtime.health import RigClock, Share
+from undertow.runtime.keeper import KeptRig
+from undertow.runtime.settings import Settings
+from undertow.runtime.verdict import EXIT_CODES
+
+
+class Device:
+    """A simulated rig whose calls may fail, and which remembers what it took last."""
+
+    def __init__(
+        self,
+        *,
+        write: Callable[[int, np.ndarray], None] = lambda k, u: None,
+        read: Callable[[int, Measurement], Measurement] = lambda k, m: m,
+        close: Exception | None = None,
+    ) -> None:
+        self.rig = RECIPE.make_rig()
+        self.period = self.rig.period
+        self.writing, self.reading, self.closing = write, read, close
+        self.writes, self.reads, self.closed = 0, 0, 0
+        self.accepted = np.zeros(1)
+
+    def read(self) -> Measurement:
+        self.reads += 1
+        return self.reading(self.reads, self.rig.read())
+
+    def write(self, u: np.ndarray) -> None:
+        self.writes += 1
+        try:
+            self.writing(self.writes, u)
+        except BaseException:
+            self.rig.write(self.accepted)  # the device goes on with what it has
+            raise
+        self.rig.write(u)
+        self.accepted = np.array(u)
+
+    def close(self) -> None:
+        self.closed += 1
+        if self.closing is not None:
+            raise self.closing
+
+
+def driven(
+    controller: Controller, device: Device, seconds: float = 0.6, log: Path | None = None
+) -> Runtime:
+    worker, clock = InlineWorker(RECIPE.respond), SimulatedClock()
+    if log is None:
+        runtime = Runtime(controller, device, worker, clock=clock)
+        runtime.run(seconds)
+        return runtime
+    meta = about(controller, RECIPE)
+    with Log(log, Columns.of(RECIPE.belief), meta, threaded=False) as book:
+        runtime = Runtime(controller, device, worker, clock=clock, log=book)
+        runtime.run(seconds)
+    return runtime
+
+
+def fails(when: Callable[[int], bool], error: BaseException) -> Callable[[int, object], None]:
+    def call(k: int, _: object) -> None:
+        if when(k):
+            raise error
+
+    return call
+
+
+# -- zero is written until the device has taken it -------------------------------------------------
+
+
+@pytest.mark.parametrize("every", [2, 10, 20])
+def test_the_output_is_off_after_a_run_in_which_writes_fail(
+    every: int, controller: Controller, tmp_path: Path
+) -> None:
+    """One of two, ten, twenty writes is taken: the run stops, and goes on until zero is taken."""
+    device = Device(write=fails(lambda k: k > 300 and k % every != 0, OSError("bus")))
+    report = driven(controller, device, log=tmp_path / "run.db").report
+    assert "of the writes failed" in report.stopped_by
+    assert not device.accepted.any()
+    assert device.closed == 1
+    verdict = report.verdict
+    assert (verdict.ending, verdict.off, verdict.output) == ("stopped", True, "")
+    assert verdict.exit_code == EXIT_CODES["stopped"]
+    assert replay(tmp_path / "run.db").identical
+
+
+def test_zero_is_insisted_on_for_a_stated_time(controller: Controller) -> None:
+    """A device that takes no zero for 0.5 s: off within the second; one that never does: told."""
+
+    def stubborn(until: float) -> Device:
+        refused = count(1)
+
+        def write(_: int, u: np.ndarray) -> None:
+            if not u.any() and device.accepted.any() and next(refused) < until:
+                message = "not now"
+                raise OSError(message)
+
+        device = Device(write=write)
+        return device
+
+    late = stubborn(500)
+    report = driven(controller, late).report
+    assert report.off
+    assert not late.accepted.any()
+    never = stubborn(math.inf)
+    verdict = driven(RECIPE.make_controller(controller.memory), never).report.verdict
+    assert never.accepted.any()
+    assert not verdict.off
+    assert "did not take an output of zero: asked for 1 s, OSError: not now" in verdict.output
+    assert verdict.exit_code == EXIT_CODES["output on"]
+    assert "did not take" in str(verdict)
+    assert never.closed == 1
+
+
+def test_a_close_that_fails_is_told(controller: Controller) -> None:
+    """Also where it is known by the driver that its inputs are not at zero."""
+    report = driven(controller, Device(close=OSError("bus"))).report
+    assert report.off
+    assert "close: OSError: bus" in report.verdict.output
+    assert report.verdict.exit_code == EXIT_CODES["degraded"]
+    known = Device(close=OutputOnError("relay stuck"))
+    verdict = driven(RECIPE.make_controller(controller.memory), known).report.verdict
+    assert not verdict.off
+    assert verdict.exit_code == EXIT_CODES["output on"]
+
+
+@pytest.mark.parametrize("where", ["read", "write", "take", "follow_up", "decide"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3), MemoryError()])
+def test_whatever_ends_the_loop_the_output_comes_to_zero_within_its_slew(
+    where: str, error: BaseException, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An interrupt inside a driver, a way out of the interpreter, no memory: anywhere in a step."""
+    outputs = [0.0]
+
+    def write(k: int, u: np.ndarray) -> None:
+        if where == "write" and k == 100:
+            raise error
+        outputs.append(float(u[0]))
+
+    def read(k: int, m: Measurement) -> Measurement:
+        if where == "read" and k == 100:
+            raise error
+        return m
+
+    device = Device(write=write, read=read)
+    runtime = Runtime(controller, device, InlineWorker(RECIPE.respond), clock=SimulatedClock())
+    if where in ("follow_up", "decide"):
+        honest, calls = getattr(controller, where), count(1)
+
+        def part(*arguments: object) -> object:
+            if next(calls) == 100:
+                raise error
+            return honest(*arguments)
+
+        monkeypatch.setattr(controller, where, part)
+    elif where == "take":
+        honest_take, takes = runtime.worker.take, count(1)
+
+        def take(t: float) -> object:
+            if next(takes) == 100:
+                raise error
+            return honest_take(t)
+
+        monkeypatch.setattr(runtime.worker, "take", take)
+    if isinstance(error, SystemExit):
+        with pytest.raises(SystemExit):
+            runtime.run(0.3)
+    else:
+        runtime.run(0.3)
+    report = runtime.report
+    assert max(map(abs, outputs)) > 1.0
+    assert not device.accepted.any()
+    assert device.closed == 1
+    assert report.off
+    assert report.mode == Mode.SAFE_STOP
+    # A write that failed may have been taken: two steps of the slew rate from what was before.
+    assert np.abs(np.diff(outputs)).max() <= controller.slew[0] * (2 if where == "write" else 1)
+    survives = isinstance(error, MemoryError) and where in ("read", "write", "take")
+    assert report.verdict.ending in (("balanced", "caught") if survives else ("stopped",))
+    if isinstance(error, KeyboardInterrupt):
+        assert report.stopped_by == "operator: interrupt"
+
+
+def test_a_zero_write_that_hangs_is_left_to_the_watchdog(controller: Controller) -> None:
+    """The rig is let go of from outside, and the verdict says that zero was not taken."""
+    hung: list[float] = []
+
+    def write(_: int, u: np.ndarray) -> None:
+        if not u.any() and device.accepted.any():
+            hung.append(time.perf_counter())
+            time.sleep(0.5)
+            message = "timed out"
+            raise OSError(message)
+
+    closed: list[float] = []
+
+    class Timed(Device):
+        def close(self) -> None:
+            closed.append(time.perf_counter())
+            super().close()
+
+    device = Timed(write=write)
+    worker = background_worker(RECIPE.respond, processes=0)
+    report = Runtime(controller, device, worker).run(0.2)
+    assert len(hung) == 1
+    assert 0.1 < closed[0] - hung[0] < 0.5
+    assert not report.verdict.off
+    assert "watchdog" in report.verdict.output
+    assert report.verdict.exit_code == EXIT_CODES["output on"]
+
+
+def test_a_rig_is_closed_when_the_run_cannot_begin(
+    controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No thread for the watchdog: a condition before the rig moves, and the rig is let go of."""
+
+    def start(_: object) -> None:
+        message = "can't start new thread"
+        raise RuntimeError(message)
+
+    device = Device()
+    runtime = Runtime(controller, device, InlineWorker(RECIPE.respond))
+    monkeypatch.setattr("undertow.runtime.loop.threading.Thread.start", start)
+    with pytest.raises(ResourceError, match="thread 'undertow watchdog'"):
+        runtime.run(0.1)
+    assert (device.writes, device.closed) == (0, 1)
+
+
+# -- shares ----------------------------------------------------------------------------------------
+
+
+def test_a_share_is_that_of_the_last_window() -> None:
+    share = Share(0.1, 0.001)
+    for k in range(1000):
+        share.add(int(k % 3 == 0))
+    assert share.value == pytest.approx(1 / 3, abs=0.01)
+    for _ in range(500):
+        share.add(0)
+    assert share.value < 0.01
+    whole, parts = Share(0.1, 0.001), Share(0.1, 0.001)
+    whole.add(7, 7)
+    for _ in range(7):
+        parts.add(1)
+    assert whole.value == pytest.approx(parts.value)
+
+
+def test_reads_that_fail_too_often_stop_the_run(controller: Controller) -> None:
+    """One in three raises, and no gap is as long as the patience; one in ten is bridged."""
+
+    def failing(every: int) -> Device:
+        def read(k: int, m: Measurement) -> Measurement:
+            if k > 100 and k % every == 0:
+                message = "no answer"
+                raise OSError(message)
+            return m
+
+        return Device(read=read)
+
+    report = driven(controller, failing(3)).report
+    assert "of the reads failed, read: OSError: no answer" in report.stopped_by
+    rare = driven(RECIPE.make_controller(controller.memory), failing(10)).report
+    assert rare.stopped_by == "operator: stop"
+    assert rare.verdict.ending == "degraded"
+    assert "reads failed" in str(rare.verdict)
+
+
+@pytest.mark.parametrize(("channels", "stops"), [((0, 1), True), ((1,), True), ((), False)])
+def test_a_sensor_that_is_mostly_missing_stops_the_run(
+    channels: tuple[int, ...], stops: bool, controller: Controller
+) -> None:
+    """Nineteen readings of twenty are missing: no gap of 20 ms, and no run either."""
+
+    def read(k: int, m: Measurement) -> Measurement:
+        if k > 100 and k % 20:
+            m.q[list(channels)] = np.nan
+        return m
+
+    report = driven(controller, Device(read=read)).report
+    assert ("missing in" in report.stopped_by) == stops
+    if stops:
+        name = RECIPE.belief.coordinates[channels[0]].name
+        assert f"sensor '{name}' missing in 60% of the readings" in report.stopped_by
+
+
+@pytest.mark.parametrize("every", [19, 7, 3])
+def test_a_reading_that_is_missing_now_and_then_does_not_keep_the_law_from_taking_over(
+    every: int, controller: Controller
+) -> None:
+    """One in nineteen from the start: bring-up bridges it; the mechanism does not fall."""
+
+    def read(k: int, m: Measurement) -> Measurement:
+        if k % every == 0:
+            m.q[:] = np.nan
+        return m
+
+    device = Device(read=read)
+    report = driven(controller, device).report
+    assert report.entered["CATCH"] >= 1
+    assert abs(device.rig.truth[1]) < 0.3
+    assert report.stopped_by == "operator: stop"
+
+
+def test_bring_up_ends_after_a_stated_time_with_what_is_missing(memory: CascadeState) -> None:
+    """One sensor gives seven readings of ten too few; nobody brings the mechanism near."""
+
+    def read(k: int, m: Measurement) -> Measurement:
+        if k > 1 and k % 10 < 7:
+            m.q[1] = np.nan
+        return m
+
+    patient = replace(RECIPE, settings=Settings(window=5.0, bring_up=0.5))
+    device = Device(read=read)
+    report = driven(patient.make_controller(memory), device, 2.0).report
+    assert report.stopped_by == (
+        "bring-up: no 20 ms of sound readings within 0.5 s; "
+        "sensor 'phi' missing in 70% of the readings"
+    )
+    assert report.verdict.exit_code == EXIT_CODES["stopped"]
+    assert (report.entered["CATCH"], device.writes) == (0, report.steps)
+
+    far = replace(RECIPE, start=(0.0, 3.0, 0.0, 0.0))
+    device = Device()
+    device.rig = far.make_rig()
+    report = driven(far.make_controller(memory), device, 5.0).report
+    assert report.stopped_by.startswith("bring-up: not where the law can take over, phi = ")
+    assert "within 2 s" in report.stopped_by
+
+
+# -- deadlines and clocks --------------------------------------------------------------------------
+
+
+class Slow(Device):
+    """A rig whose reads cost time, while the world goes on or stands still."""
+
+    def __init__(self, clock: SimulatedClock, cost: Callable[[int], float]) -> None:
+        super().__init__()
+        self.clock, self.cost = clock, cost
+
+    def read(self) -> Measurement:
+        self.clock.t += self.cost(self.reads)
+        return super().read()
+
+
+@pytest.mark.parametrize(
+    ("cost", "stops"),
+    [
+        (lambda k: 1.5e-3 if k > 100 else 0.0, True),
+        (lambda k: 8e-3 if k > 100 else 0.0, True),
+        (lambda k: 3e-3 if k > 100 and k % 4 == 0 else 0.0, True),
+        (lambda k: 0.9e-3, False),
+        (lambda k: 0.05 if k == 200 else 0.0, False),  # a host that stands still for once
+        (lambda k: 0.02 if k % 200 == 100 else 0.0, False),
+    ],
+)
+def test_deadlines_missed_beyond_a_share_of_a_second_stop_the_run(
+    cost: Callable[[int], float], stops: bool, controller: Controller, tmp_path: Path
+) -> None:
+    clock = SimulatedClock()
+    device = Slow(clock, cost)
+    meta = about(controller, RECIPE)
+    with Log(tmp_path / "run.db", Columns.of(RECIPE.belief), meta, threaded=False) as book:
+        worker = InlineWorker(RECIPE.respond)
+        runtime = Runtime(controller, device, worker, clock=clock, log=book)
+        report = runtime.run(1.5)
+    verdict = report.verdict
+    if stops:
+        assert report.stopped_by.startswith("deadlines missed in 30% of the last second")
+        assert verdict.exit_code == EXIT_CODES["stopped"]
+    else:
+        assert report.stopped_by == "operator: stop"
+        assert verdict.ending in ("balanced", "caught", "degraded")
+    assert not device.accepted.any()
+    assert replay(tmp_path / "run.db").identical
+
+
+@pytest.mark.parametrize("rate", [0.5, 1.2, 2.0, 5.0, 50.0])
+def test_a_rig_whose_clock_runs_at_another_rate_stops_the_run(
+    rate: float, controller: Controller, tmp_path: Path
+) -> None:
+    device = Device(read=lambda k, m: replace(m, t=rate * m.t))
+    report = driven(controller, device, 1.5, tmp_path / "run.db").report
+    assert "the rig's clock went" in report.stopped_by
+    assert f"runs {rate:.2g} times as fast" in report.stopped_by
+    assert replay(tmp_path / "run.db").identical
+
+
+def test_a_rigs_clock_may_jump_jitter_and_stop_with_the_host() -> None:
+    """Started late, off by an hour, jittering by half a period, jumping once: it is the same."""
+    rng, settings = np.random.default_rng(0), Settings()
+    clock, host = RigClock(settings, 0.001), 0.0
+    for k in range(5000):
+        gap = 0.09 if k % 1000 == 500 else 0.0
+        host += 0.001 + gap
+        stamp = 3600.0 + host + rng.uniform(0, 5e-4) - (5.0 if k > 2500 else 0.0)
+        assert clock.check(stamp, host, k) == ""
+    simulated, host = RigClock(settings, 0.001), 0.0
+    for k in range(5000):  # a simulated rig knows of no gap
+        host += 0.001 + (0.09 if k % 300 == 100 else 0.0)
+        assert simulated.check(0.001 * k, host, k) == ""
+    fast = RigClock(settings, 0.001)
+    texts = [fast.check(5.0 + 0.002 * k, 0.001 * k, k) for k in range(300)]
+    first = next(k for k, text in enumerate(texts) if text)
+    assert 90 < first < 120
+    assert "runs 2 times as fast" in texts[first]
+
+
+# -- how it ended ----------------------------------------------------------------------------------
+
+
+GOOD = Report(
+    steps=10_000, stopped_by="operator: stop", last=Mode.BALANCE, settled_for=8.0, error=0.01,
+    home=0.35, homing=5.0, cost=3.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "ending", "code", "words"),
+    [
+        ({}, "balanced", 0, "‖x‖ = 0.01"),
+        ({"error": 1.0, "settled_for": 0.5}, "balanced", 0, "on its way home"),
+        ({"error": 3.0, "settled_for": 0.5}, "caught", 3, "not at home"),
+        ({"error": 1.0}, "caught", 3, "not at home"),
+        ({"settled_for": 0.01}, "caught", 3, "not settled"),
+        ({"last": Mode.CATCH}, "caught", 3, "not settled"),
+        ({"error": math.nan}, "caught", 3, "not at home"),
+        ({"last": Mode.SWING_UP}, "lost", 4, "not caught"),
+        ({"stopped_by": "thrown out"}, "lost", 4, "thrown out"),
+        ({"stopped_by": "'phi' at 3, past its travel"}, "lost", 4, "travel"),
+        ({"last": Mode.BRING_UP}, "stopped", 5, "before the law took over"),
+        ({"early": True}, "stopped", 5, "before the end"),
+        ({"stopped_by": "sensor 'phi' frozen"}, "stopped", 5, "frozen"),
+        ({"missed": 900}, "degraded", 6, "9% of the deadlines"),
+        ({"disagreed": 1}, "degraded", 6, "shadow"),
+        ({"unsound": 1}, "degraded", 6, "unsound"),
+        ({"unwritten": 300}, "degraded", 6, "300 writes failed"),
+        ({"missing": 3000}, "degraded", 6, "missing in 30%"),
+        ({"output": "close: OSError: bus"}, "degraded", 6, "bus"),
+        ({"off": False, "output": "not taken"}, "stopped", 7, "not taken"),
+        ({"off": False, "stopped_by": "thrown out"}, "lost", 7, "thrown out"),
+    ],
+)
+def test_a_verdict_says_how_a_run_ended(
+    change: dict[str, object], ending: str, code: int, words: str
+) -> None:
+    verdict = replace(GOOD, **change).verdict  # type: ignore[arg-type]
+    assert isinstance(verdict, RunVerdict)
+    assert (verdict.ending, verdict.exit_code) == (ending, code)
+    assert words in str(verdict)
+    with pytest.raises(AttributeError):
+        verdict.ending = "balanced"  # type: ignore[misc]
+
+
+def test_rows_lost_from_the_log_are_told_and_degrade_the_run(
+    controller: Controller, tmp_path: Path
+) -> None:
+    """While it runs as an event, at the end in the verdict; the mechanism is held all the same."""
+    meta = about(controller, RECIPE)
+    columns = Columns.of(RECIPE.belief)
+    with Log(tmp_path / "run.db", columns, meta, threaded=False, most_bytes=40_000) as book:
+        runtime = Runtime(
+            controller, Device(), InlineWorker(RECIPE.respond), clock=SimulatedClock(), log=book
+        )
+        report = runtime.run(1.0)
+    assert report.stopped_by == "operator: stop"
+    assert any(kind == "log" and "rows are lost" in text for _, kind, text in report.events)
+    assert report.lost_rows > 0
+    assert report.verdict.ending == "degraded"
+    assert f"{report.lost_rows:,} rows of the log were lost" in str(report.verdict)
+
+
+def test_the_cost_of_a_run_is_the_integral_of_its_stage_cost(
+    controller: Controller, tmp_path: Path
+) -> None:
+    """Against the log: Φ = u² + 0.05 xᵀx, and ‖x‖ of the last estimate."""
+    from undertow.runtime import read_log
+
+    report = driven(controller, Device(), 1.0, tmp_path / "run.db").report
+    recording = read_log(tmp_path / "run.db")
+    x = np.column_stack([recording[name] for name in RECIPE.belief.state_names])
+    stage = recording["voltage"] ** 2 + 0.05 * (x**2).sum(axis=1)
+    assert report.cost == pytest.approx(float(stage[:-1] @ np.diff(recording["t"])), rel=1e-9)
+    assert report.error == pytest.approx(float(np.linalg.norm(x[-1])))
+
+
+# -- the keeper ------------------------------------------------------------------------------------
+
+
+LIMITS, SLEW = np.array([15.0]), np.array([7.5])
+
+
+def test_a_keeper_says_that_its_rig_did_not_take_zero() -> None:
+    """What it writes itself has nobody who sees it fail: closing says so."""
+    never = Device(write=fails(lambda k: k > 1, OSError("bus")))
+    rig = KeptRig(lambda: never, 1e-3, LIMITS, SLEW)
+    rig.write(np.array([5.0]))
+    time.sleep(0.05)
+    with pytest.raises(OutputOnError, match="did not take an output of zero: OSError: bus"):
+        rig.close()
+    rig.close()  # once is enough
+    shut = KeptRig(lambda: Device(close=OSError("stuck")), 1e-3, LIMITS, SLEW)
+    with pytest.raises(OSError, match="close: OSError: stuck") as told:
+        shut.close()
+    assert not isinstance(told.value, OutputOnError)
+
+
+def test_a_keeper_that_is_gone_leaves_the_output_unknown(controller: Controller) -> None:
+    """Killed from outside: the run says that nobody knows whether the output is at zero."""
+    rig = KeptRig(RECIPE.make_rig, 1e-3, LIMITS, SLEW)
+    worker = background_worker(RECIPE.respond, processes=0)
+    runtime = Runtime(controller, rig, worker)
+    honest, calls = rig.write, count(1)
+
+    def write(u: np.ndarray) -> None:
+        if next(calls) == 200:
+            rig.process.kill()
+        honest(u)
+
+    rig.write = write  # type: ignore[method-assign]
+    verdict = runtime.run(2.0).verdict
+    assert verdict.exit_code == EXIT_CODES["output on"]
+    assert "did not take an output of zero" in verdict.output
+
+
+def test_a_rig_that_cannot_be_made_is_refused_with_its_own_condition() -> None:
+    def make() -> Device:
+        raise ArtefactError("port", value="no such port", remedy="Plug it in")
+
+    with pytest.raises(ArtefactError, match=r"port: got no such port\. Plug it in"):
+        KeptRig(make, 1e-3, LIMITS, SLEW)
+
+
+def test_the_first_reading_of_a_keeper_is_not_an_old_one() -> None:
+    """The mechanism was moved by hand between the making of the rig and the run."""
+
+    class Moving(Device):
+        def read(self) -> Measurement:
+            return Measurement(time.perf_counter(), np.zeros(2))
+
+    rig = KeptRig(Moving, 1e-3, LIMITS, SLEW)
+    try:
+        time.sleep(0.2)
+        now = time.perf_counter()
+        assert rig.read().t >= now
+    finally:
+        rig.close()
