@@ -656,7 +656,8 @@ class Summary:
         refusals = ", ".join(f"{n} {name}" for name, n in self.refused.most_common())
         return (
             f"{self.kind}: {self.count} files, {self.read} read, {refusals or 'none refused'}; "
-            f"{len(self.failures)} failures; longest {self.longest:.2f} s (#{self.slowest}), all {self.seconds:.0f} s"
+            f"{len(self.failures)} failures; longest {self.longest:.2f} s (#{self.slowest}), "
+            f"all {self.seconds:.0f} s"
         )
 
 
