@@ -36,7 +36,7 @@ def shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("mode", [0o777, 0o707, 0o702])
 def test_a_cache_that_others_can_write_is_not_used(
-    shared: Path, monkeypatch: pytest.MonkeyPatch, mode: int
+    shared: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, mode: int
 ) -> None:
     """Nor is one inside a folder that others can write: they could put another in its place."""
     open_to_all = shared / "cache"
@@ -47,6 +47,7 @@ def test_a_cache_that_others_can_write_is_not_used(
         found = private_folder()
         assert open_to_all not in (found, *found.parents)
         assert found.stat().st_mode & 0o777 == 0o700
+    assert [str(open_to_all) in record.getMessage() for record in caplog.records] == [True, True]
     monkeypatch.setenv("UNDERTOW_CACHE", str(open_to_all))
     (open_to_all / "planted_x.txt").write_text("x")
     assert store.recall("planted", "x") is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -11,10 +12,13 @@ from typing import Any
 
 from undertow.errors import ArtefactError
 
-__all__ = ["check_file", "parse_json", "read_file"]
+__all__ = ["check_file", "file_hash", "parse_json", "read_file"]
 
 #: Longest whole number in JSON, digits.
 DIGITS = 40
+
+#: Largest file that is hashed, bytes.
+HASHED = 1 << 24
 
 
 def check_file(path: Path, what: str, *, most: int = 1 << 40, remedy: str = "") -> int:
@@ -98,6 +102,17 @@ def read_file(path: Path, what: str, *, most: int, remedy: str = "") -> bytes:
     if len(content) > most:
         raise ArtefactError(f"{what} '{path}'", value="still growing", limit=f"at most {most}")
     return content
+
+
+def file_hash(path: Path, what: str) -> str:
+    """Return SHA-256 of a file's content, in hexadecimal digits.
+
+    Raises
+    ------
+    ArtefactError
+        As for :func:`read_file`.
+    """
+    return hashlib.sha256(read_file(path, what, most=HASHED)).hexdigest()
 
 
 def parse_json(content: str | bytes, *, finite: bool = True) -> Any:

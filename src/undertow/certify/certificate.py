@@ -255,7 +255,7 @@ def _parse(content: bytes) -> dict[str, Any]:
         document = parse_json(content)
         if not isinstance(document, dict):
             raise ValueError("no JSON object")
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CertificateError(
             "certificate",
             value=str(error) or type(error).__name__,

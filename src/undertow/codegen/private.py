@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import logging
 import os
 import shutil
 import stat
@@ -54,9 +55,19 @@ def private_folder() -> Path:
             resolved = folder.resolve()
         except (OSError, RuntimeError):
             continue
-        if os.access(resolved, os.W_OK | os.X_OK) and is_private(resolved):
-            return resolved
+        if os.access(resolved, os.W_OK | os.X_OK):
+            if is_private(resolved):
+                return resolved
+            _say(resolved)
     return _own_temporary()
+
+
+@lru_cache(maxsize=8)
+def _say(folder: Path) -> None:
+    """Say once why a cache is not used: without it everything is compiled again and again."""
+    logging.getLogger("undertow").warning(
+        "the cache %s is not used: others can write there, or in a folder above it", folder
+    )
 
 
 def _candidates() -> Iterator[Path]:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from undertow.errors import ArtefactError, InvalidInputError, UndertowError
-from undertow.files import read_file
 from undertow.mechanism import Mechanism
 
-__all__ = ["in_a_file", "mechanism_from_file", "object_from_file", "source_hash"]
-
-#: Largest file of a mechanism, bytes.
-LARGEST = 1 << 24
+__all__ = ["in_a_file", "mechanism_from_file", "object_from_file"]
 
 
 def in_a_file(text: str) -> bool:
@@ -42,18 +37,6 @@ def mechanism_from_file(text: str) -> Mechanism:
             limit="undertow.Mechanism, or a function without arguments that returns one",
         )
     return found
-
-
-def source_hash(text: str) -> str:
-    """Return SHA-256 of the file of ``FILE.py:NAME``.
-
-    Raises
-    ------
-    ArtefactError
-        When the file cannot be read.
-    """
-    file = text.rpartition(":")[0]
-    return hashlib.sha256(read_file(Path(file), "mechanism file", most=LARGEST)).hexdigest()
 
 
 def object_from_file(text: str, what: str) -> Any:

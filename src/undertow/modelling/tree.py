@@ -171,9 +171,9 @@ class Tree:
             if joint.child == WORLD:
                 raise ModelError(
                     f"joint '{joint.name}' of '{self.name}'",
-                    value=f"the fixed frame '{WORLD}' as its child",
-                    limit="a link that moves",
-                    remedy=f"Give the link another name than '{WORLD}'",
+                    value=f"child {WORLD!r}, the fixed frame",
+                    limit="a link that can move",
+                    remedy="The fixed frame carries the tree: turn the joint round, or rename it",
                 )
             if joint.child in parents:
                 raise ModelError(

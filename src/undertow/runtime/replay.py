@@ -20,8 +20,9 @@ import numpy as np
 
 from undertow.codegen.machine import processor
 from undertow.errors import ArtefactError, UndertowError
+from undertow.files import file_hash
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.modelling.python_file import in_a_file, source_hash
+from undertow.modelling.python_file import in_a_file
 from undertow.results import versions
 from undertow.rig.interface import Measurement
 from undertow.runtime.controller import Controller, Inputs
@@ -95,7 +96,7 @@ def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> 
     own = recipe is not None and in_a_file(recipe.mechanism)
     return {
         "mechanism": mechanism.name,
-        "source": source_hash(recipe.mechanism) if recipe is not None and own else None,
+        "source": _source_hash(recipe.mechanism) if recipe is not None and own else None,
         "fingerprint": mechanism.fingerprint,
         "units": {i.name: i.unit for i in mechanism.inputs},
         "memory": memory_to(controller.memory),
@@ -176,6 +177,11 @@ def _legible(path: Path) -> Iterator[None]:
         ) from error
 
 
+def _source_hash(name: str) -> str:
+    """Return the hash of the file of ``FILE.py:NAME``."""
+    return file_hash(Path(name.rpartition(":")[0]), "mechanism file")
+
+
 def _compare_source(recording: Recording, mechanism: str | None) -> tuple[str, ...]:
     """Compare the file of a mechanism of one's own with the one of the run; say what differs."""
     written = str(recording.meta["recipe"]["mechanism"])
@@ -188,7 +194,7 @@ def _compare_source(recording: Recording, mechanism: str | None) -> tuple[str, .
         )
     if not in_a_file(mechanism):
         return ()
-    then, now = recording.meta.get("source"), source_hash(mechanism)
+    then, now = recording.meta.get("source"), _source_hash(mechanism)
     if then is None:
         return (f"the log has no hash of its mechanism's file: {mechanism} may be another",)
     if then != now:
