@@ -17,6 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 import sympy as sp
+from sympy.core.function import Application
 from numpy.typing import ArrayLike
 
 from undertow.codegen.store import content_key, recall, remember
@@ -29,6 +30,7 @@ from undertow.errors import (
 from undertow.mechanism import TIME, FloatArray, Mechanism, numbers
 from undertow.sliding import check_surface_shape, coupling, gamma_determinant, singularity
 from undertow.surface import Surface
+from undertow.validity import kinks, require_smooth
 
 __all__ = [
     "Linearisation",
@@ -36,6 +38,7 @@ __all__ = [
     "check_surface",
     "controllability",
     "first_surface",
+    "has_linear_model",
     "linearise",
     "placed_surface",
     "sliding_matrix",
@@ -78,9 +81,12 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     Raises
     ------
     ModelError
-        When the target is no equilibrium for u = 0.
+        When the target is no equilibrium for u = 0, or f has no derivative there.
     """
     n = mechanism.n
+    require_smooth(
+        f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
+    )
     rest, jacobian = _force_at_target(mechanism)
     if np.abs(rest[mechanism.m :]).max() > 1e-9:
         raise ModelError(
@@ -97,6 +103,16 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     )
 
 
+def has_linear_model(mechanism: Mechanism) -> bool:
+    """Whether f has a derivative at the target: :func:`linearise` refuses where it has none."""
+    return next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
+
+
+def _target(mechanism: Mechanism) -> dict[sp.Symbol, float]:
+    """All symbols of f to their values at the target, at t = 0."""
+    return mechanism.substitution | dict.fromkeys((*mechanism.x, TIME), 0.0)
+
+
 #: Functions that NumPy continues analytically to complex arguments.
 _ANALYTIC = (
     sp.sin, sp.cos, sp.tan, sp.exp, sp.log, sp.sinh, sp.cosh, sp.tanh, sp.atan, sp.asinh,
@@ -106,11 +122,10 @@ _ANALYTIC = (
 def _force_at_target(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
     """Return f, (n,), and ∂f/∂x, (n, 2n), at x = 0 and t = 0.
 
-    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives,
-    which know what becomes of |x| and √x² at zero.
+    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives.
     """
     force, size = mechanism.force, 2 * mechanism.n
-    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(sp.Function)) and all(
+    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(Application)) and all(
         power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*mechanism.x)
     )
     if analytic:

@@ -9,6 +9,7 @@ from collections.abc import Set as AbstractSet
 
 import numpy as np
 import sympy as sp
+from sympy.core.function import Application
 from sympy.core.relational import Relational
 
 from undertow.errors import ModelError
@@ -19,6 +20,7 @@ __all__ = [
     "check_names",
     "check_symbols",
     "check_symmetric",
+    "is_smooth",
     "kinks",
     "require_smooth",
 ]
@@ -123,7 +125,7 @@ def require_smooth(
         By which they are differentiated.
     at
         The point where, all symbols to numbers: a kink elsewhere, as that of |x − 1| at 0, does
-        no harm.  Without it the derivative is wanted everywhere.
+        no harm.  Without it the derivative is wanted everywhere.  x |x| has one, too.
 
     Raises
     ------
@@ -142,6 +144,11 @@ def require_smooth(
         )
 
 
+def is_smooth(expression: sp.Basic) -> bool:
+    """Whether an expression is made of smooth functions only, roots and the like left aside."""
+    return all(isinstance(f, _SMOOTH + _SINGULAR) for f in expression.atoms(Application))
+
+
 def kinks(
     expressions: Iterable[sp.Expr] | sp.MatrixBase,
     variables: Iterable[sp.Symbol],
@@ -155,22 +162,32 @@ def kinks(
     """
     moving = set(variables)
     values = None if at is None else {s: sp.Rational(float(v)) for s, v in at.items()}
-    waiting = [sp.sympify(e) for e in expressions][::-1]
+    waiting: list[tuple[sp.Basic, tuple[sp.Expr, ...]]]
+    waiting = [(sp.sympify(e), ()) for e in expressions][::-1]
     while waiting:
-        part = waiting.pop()
-        if not part.free_symbols & moving:
-            continue
+        part, factors = waiting.pop()
         if not isinstance(part, _SMOOTH):
+            if not part.free_symbols & moving:
+                continue
             edges = _edges(part)
-            if (
-                edges is None
-                or (values is None and not isinstance(part, _SINGULAR))
-                or (values is not None and any(_meets(part, e, values) for e in edges))
-            ):
+            if edges is None or any(_breaks(part, edge, factors, values) for edge in edges):
                 yield part
                 continue
-        branches = isinstance(part, sp.Piecewise)
-        waiting += [arg.expr if branches else arg for arg in part.args][::-1]
+        waiting += _inside(part, factors)[::-1]
+
+
+def _inside(
+    part: sp.Basic, factors: tuple[sp.Expr, ...]
+) -> list[tuple[sp.Basic, tuple[sp.Expr, ...]]]:
+    """Return the arguments of an expression, each with the factors that it is multiplied by."""
+    if isinstance(part, sp.Mul):
+        others = [(*part.args[:i], *part.args[i + 1 :]) for i in range(len(part.args))]
+        return [(arg, (*factors, *rest)) for arg, rest in zip(part.args, others, strict=True)]
+    if isinstance(part, sp.Pow) and part.exp.is_number and part.exp > 1:
+        return [(part.base, (*factors, part.base))]
+    if isinstance(part, sp.Piecewise):
+        return [(branch.expr, ()) for branch in part.args]
+    return [(arg, factors) for arg in part.args]
 
 
 #: What has no derivative at isolated points, and none there that is a number.
@@ -198,12 +215,32 @@ def _edges(part: sp.Basic) -> list[sp.Expr] | None:
     return None
 
 
-def _meets(part: sp.Basic, edge: sp.Expr, values: Mapping[sp.Symbol, sp.Rational]) -> bool:
-    """Whether a point lies on an edge, or where that is no real number."""
-    exact = {number: sp.Rational(number) for number in edge.atoms(sp.Float)}
+def _breaks(
+    part: sp.Basic,
+    edge: sp.Expr,
+    factors: Sequence[sp.Expr],
+    values: Mapping[sp.Symbol, sp.Rational] | None,
+) -> bool:
+    """Whether a function that is not smooth where an edge is zero has no derivative for it.
+
+    A continuous one has, times a factor that is zero there: (g h)' = g' h where g = 0.
+    """
+    if values is None:
+        if isinstance(part, _SINGULAR):
+            return False
+        zeros = (edge.is_Symbol and f.subs(edge, 0) == 0 for f in factors)
+    else:
+        # Of a root the base is asked for, e² in √(x² + e²): only zero itself is refused.
+        if not _zero(edge, values, 1e-25 if isinstance(part, _SINGULAR) else _NEAR):
+            return False
+        zeros = (_zero(f, values, _NEAR) for f in factors)
+    return not (isinstance(part, sp.Abs | sp.Max | sp.Min) and any(zeros))
+
+
+def _zero(expression: sp.Expr, values: Mapping[sp.Symbol, sp.Rational], tolerance: float) -> bool:
+    """Whether an expression is zero, or no real number, at a point."""
+    exact = {number: sp.Rational(number) for number in expression.atoms(sp.Float)}
     try:
-        distance = abs(float(edge.xreplace(exact | dict(values)).evalf(30)))
+        return not abs(float(expression.xreplace(exact | dict(values)).evalf(30))) > tolerance
     except (TypeError, ValueError):  # zoo, complex, or symbols that are left
         return True
-    # Of a root the base is asked for, e² in √(x² + e²): only zero itself is refused.
-    return not distance > (1e-25 if isinstance(part, _SINGULAR) else _NEAR)
