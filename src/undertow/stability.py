@@ -17,8 +17,8 @@ from functools import lru_cache
 
 import numpy as np
 import sympy as sp
-from sympy.core.function import Application
 from numpy.typing import ArrayLike
+from sympy.core.function import Application
 
 from undertow.codegen.store import content_key, recall, remember
 from undertow.errors import (

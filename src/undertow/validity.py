@@ -5,24 +5,36 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 
 import numpy as np
 import sympy as sp
-from sympy.core.function import Application
+from sympy.core.function import Application, AppliedUndef
 from sympy.core.relational import Relational
 
-from undertow.errors import ModelError
-from undertow.quantities import TIME, Coordinate, FloatArray
+from undertow.errors import InvalidInputError, ModelError, near
+from undertow.quantities import (
+    TIME,
+    Coordinate,
+    FloatArray,
+    Input,
+    Parameter,
+    code_points,
+    normal_name,
+)
 
 __all__ = [
     "check_definite",
     "check_names",
+    "check_parts",
     "check_symbols",
     "check_symmetric",
+    "expression_of",
     "is_smooth",
     "kinks",
     "require_smooth",
+    "shortened",
+    "twins",
+    "vocabulary",
 ]
 
 #: Functions that are smooth wherever they are finite: a derivative of theirs is never wrong.
@@ -37,17 +49,25 @@ _NEAR = 1e-9
 
 
 def check_names(owner: str, names: Sequence[str]) -> None:
-    """Refuse names that meet each other, the time's, or those of generated code."""
+    """Refuse names that meet each other, the time's, or those of generated code.
+
+    Parameters
+    ----------
+    owner
+        Whose names.
+    names
+        As they were spelt: two that Python takes for one, of the same form NFKC, meet.
+    """
     every = [*names, TIME.name]
-    repeated = sorted({name for name in every if every.count(name) > 1})
+    repeated = twins(every)
     if repeated:
         raise ModelError(
             f"a name of '{owner}' is used twice",
-            value=", ".join(repeated),
+            value=repeated,
             limit="unique among coordinates, inputs, parameters and the time t",
             remedy="Rename one of them",
         )
-    private = sorted(name for name in every if name.startswith("_"))
+    private = sorted(name for name in map(normal_name, every) if name.startswith("_"))
     if private:
         raise ModelError(
             f"a name of '{owner}' starts with an underscore",
@@ -57,16 +77,182 @@ def check_names(owner: str, names: Sequence[str]) -> None:
         )
 
 
-def check_symbols(what: str, matrix: sp.Matrix, allowed: AbstractSet[sp.Symbol]) -> None:
-    """Refuse symbols that nobody declared."""
-    unknown = sorted(str(s) for s in matrix.free_symbols - allowed)
+def twins(names: Sequence[str]) -> str:
+    """Return the names that occur twice, or that Python takes for one; empty where none do.
+
+    >>> twins(["x", "y", "x"])
+    'x'
+    >>> twins(["µ", "x", "μ"])
+    "µ (U+00B5) and μ (U+03BC), which are one name in Unicode's form NFKC"
+    """
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(normal_name(name), []).append(name)
+    said = []
+    for _, group in sorted(groups.items()):
+        spelt = sorted(set(group))
+        if len(spelt) > 1:
+            shown = " and ".join(code_points(name) for name in spelt)
+            said.append(f"{shown}, which are one name in Unicode's form NFKC")
+        elif len(group) > 1:
+            said.append(group[0])
+    return ", ".join(said)
+
+
+def check_parts(
+    owner: str,
+    coordinates: Sequence[Coordinate],
+    inputs: Sequence[Input],
+    parameters: Sequence[Parameter],
+) -> None:
+    """Refuse what are no coordinates, inputs and parameters, and names that meet.
+
+    Raises
+    ------
+    InvalidInputError
+        For a part of another kind, text for instance.
+    ModelError
+        For names that are one, see :func:`check_names`.
+    """
+    for what, kind, parts in (
+        ("coordinates", Coordinate, coordinates),
+        ("inputs", Input, inputs),
+        ("parameters", Parameter, parameters),
+    ):
+        several = isinstance(parts, Sequence) and not isinstance(parts, str)
+        wrong = [p for p in parts if not isinstance(p, kind)] if several else [parts]
+        if wrong:
+            raise InvalidInputError(
+                f"{what} of '{owner}'",
+                value=f"{wrong[0]!r}, a {type(wrong[0]).__name__}",
+                limit=f"a sequence of undertow.{kind.__name__}",
+                remedy=f"Write {_EXAMPLES[what]}",
+            )
+    spelt = [c.spelling for c in coordinates]
+    channels = [i.spelling for i in inputs]
+    data = [p.spelling for p in parameters]
+    check_names(owner, [*spelt, *(f"{name}_dot" for name in spelt), *channels, *data])
+
+
+_EXAMPLES = {
+    "coordinates": '[Coordinate("x", "m"), Coordinate("phi", "rad")]',
+    "inputs": '[Input("force", "N", 10.0)]',
+    "parameters": '[Parameter("mass", 0.5, "kg")]',
+}
+
+
+def vocabulary(
+    coordinates: Sequence[Coordinate] = (),
+    inputs: Sequence[Input] = (),
+    parameters: Sequence[Parameter] = (),
+    *,
+    velocities: bool = True,
+    time: bool = True,
+) -> dict[sp.Symbol, str]:
+    """Return the symbols that an expression may hold, each with how to write it."""
+    known = {c.symbol: "coordinate.symbol" for c in coordinates}
+    if velocities:
+        known |= {c.velocity: "coordinate.velocity" for c in coordinates}
+    known |= {i.symbol: "input.symbol" for i in inputs}
+    known |= {p.symbol: "parameter.symbol" for p in parameters}
+    return known | ({TIME: "undertow.mechanism.TIME"} if time else {})
+
+
+def expression_of(what: str, value: object) -> sp.Expr:
+    """Return a number or an expression as SymPy's; refuse all else, text too: SymPy would run it.
+
+    Raises
+    ------
+    ModelError
+        For what is no expression.
+    """
+    try:
+        expression = sp.sympify(value, strict=True)
+    except (sp.SympifyError, TypeError, AttributeError, ValueError):
+        expression = None
+    if isinstance(expression, sp.MatrixBase) and expression.shape == (1, 1):
+        expression = expression[0, 0]
+    if not isinstance(expression, sp.Expr) or isinstance(expression, sp.MatrixBase):
+        raise ModelError(
+            what,
+            value=f"{shortened(value)}, a {type(value).__name__}",
+            limit="a SymPy expression, or a number",
+            remedy="Build it of coordinate.symbol, coordinate.velocity and parameter.symbol",
+        )
+    return expression
+
+
+def check_symbols(
+    what: str, expressions: Iterable[sp.Expr] | sp.MatrixBase, known: Mapping[sp.Symbol, str]
+) -> None:
+    """Refuse symbols that nobody declared, undefined functions, and what is no real number.
+
+    SymPy takes ``Symbol("a")`` and ``Symbol("a", real=True)`` for two: the derivative of one by
+    the other is zero, and what holds the wrong one would drop out of the equations.
+
+    Parameters
+    ----------
+    what
+        Whose expressions, for the message.
+    expressions
+        Expressions, or a matrix of them.
+    known
+        What they may hold, see :func:`vocabulary`.
+
+    Raises
+    ------
+    ModelError
+        With what is unknown, and what may have been meant.
+    """
+    unknown: set[sp.Basic] = set()
+    for expression in expressions:
+        odd = expression.atoms(AppliedUndef, sp.Derivative, sp.Integral)
+        inside = set().union(*(part.free_symbols for part in odd))
+        unknown |= odd | ((expression.free_symbols - set(known)) - inside)
+        strange = expression.atoms(sp.nan.func, sp.zoo.func, sp.oo.func, type(-sp.oo), type(sp.I))
+        if strange:
+            raise ModelError(
+                what,
+                value=f"{', '.join(sorted(map(str, strange)))} in {shortened(expression)}",
+                limit="real and finite",
+                remedy="Something was divided by zero, or a root taken of a negative number",
+            )
     if unknown:
         raise ModelError(
             f"{what} has unknown symbols",
-            value=", ".join(unknown),
-            limit=f"among {', '.join(sorted(str(s) for s in allowed))}",
-            remedy="Declare them as parameters, or as coordinates, with real symbols",
+            value=", ".join(sorted(code_points(str(s)) for s in unknown)),
+            limit=f"among {', '.join(sorted(str(s) for s in known))}",
+            remedy=_meant(unknown, known),
         )
+
+
+def shortened(value: object) -> str:
+    """Return a value as text on one line, cut after 60 characters."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _meant(unknown: Iterable[sp.Basic], known: Mapping[sp.Symbol, str]) -> str:
+    """Return a remedy: the symbol of the same name, a near name, or to declare it."""
+    by_name = {s.name: way for s, way in known.items()}
+    for symbol in sorted(unknown, key=str):
+        name = normal_name(_plain(symbol))
+        if name in by_name:
+            return (
+                f"Did you mean {by_name[name]} of '{name}'? It is Symbol({name!r}, real=True): to "
+                "SymPy every other one is another variable"
+            )
+        hint = near(name, by_name)
+        if hint:
+            return f"{hint} Else declare it as a parameter"
+    return "Declare them as parameters, or as coordinates, with real symbols"
+
+
+def _plain(part: sp.Basic) -> str:
+    """Name of a symbol, a function of time, or the velocity of one."""
+    if isinstance(part, sp.Derivative):
+        return f"{_plain(part.expr)}_dot"
+    return str(part.func) if isinstance(part, AppliedUndef) else str(part)
 
 
 def check_symmetric(what: str, matrix: sp.Matrix) -> None:
