@@ -276,7 +276,10 @@ def check_definite(
     spread = np.array([math.pi if c.unit == "rad" else 1.0 for c in coordinates])
     for trial in range(16):
         q = trial * rng.uniform(-spread, spread) / 15
-        smallest = float(np.linalg.eigvalsh(mass(q))[0])
+        try:
+            smallest = float(np.linalg.eigvalsh(mass(q))[0])
+        except np.linalg.LinAlgError:  # of a matrix that holds no numbers
+            smallest = math.nan
         if not smallest > 0:
             where = ", ".join(
                 f"{c.name} = {v:.3g} {c.unit}" for c, v in zip(coordinates, q, strict=True)
