@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from contextlib import suppress
 from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any
@@ -32,6 +33,9 @@ FloatArray = NDArray[np.float64]
 #: The symbol of time in disturbances, s.
 TIME = sp.Symbol("t", real=True)
 
+
+#: Longest name.
+LONGEST = 200
 
 #: Names of symbols that derivations make up.
 _RESERVED = re.compile(r"_(v|y|cse_|viscous_)\d+")
@@ -73,13 +77,14 @@ def _name(what: str, given: object) -> str:
     """
     name = normal_name(given) if isinstance(given, str) else ""
     unseen = _UNSEEN.search(name)
-    if not name.isidentifier() or unseen or _RESERVED.fullmatch(name):
+    if not name.isidentifier() or unseen or _RESERVED.fullmatch(name) or len(name) > LONGEST:
         raise InvalidInputError(
             what,
             value=f"{given!r} with U+{ord(unseen[0]):04X}, which is not seen"
             if unseen
-            else repr(given),
-            limit="a Python identifier; not _v0, _y0, _cse_0 or the like",
+            else repr(given)[: LONGEST + 2],
+            limit="a Python identifier; not _v0, _y0, _cse_0 or the like; "
+            f"at most {LONGEST} characters",
             remedy="Use letters, digits and underscores, a letter first",
         )
     return name
@@ -97,14 +102,15 @@ def number_of(what: str, value: object, *, limit: str = "a number", remedy: str 
         return float(value)
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-        raise InvalidInputError(
-            what,
-            value=f"{value!r}, a {type(value).__name__}",
-            limit=limit,
-            remedy=remedy or "Give a number in SI units: undertow.deg(10) for an angle of 10°",
-        )
-    return float(value)
+    with suppress(OverflowError):  # whole numbers of more digits than a float has
+        if isinstance(value, Real) and not isinstance(value, bool | np.bool_):
+            return float(value)
+    raise InvalidInputError(
+        what,
+        value=f"{value!r}, a {type(value).__name__}",
+        limit=limit,
+        remedy=remedy or "Give a number in SI units: undertow.deg(10) for an angle of 10°",
+    )
 
 
 @dataclass(frozen=True)

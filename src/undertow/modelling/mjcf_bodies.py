@@ -38,6 +38,7 @@ class Frame:
                 f"orientation of <{element.tag} name={element.get('name', '')!r}>",
                 value=" and ".join(given),
                 limit="one of them",
+                remedy="Leave the others out",
             )
         if not given:
             return np.eye(3)
@@ -115,6 +116,13 @@ def _from_geoms(geoms: Sequence[ET.Element], name: str, frame: Frame) -> Link:
     parts: list[tuple[float, FloatArray, FloatArray]] = []
     for geom in geoms:
         mass, centre, tensor = _geom(geom, name, frame)
+        if mass < 0:
+            raise ModelError(
+                f"mass of a geom of body '{name}'",
+                value=f"{mass:g} kg",
+                limit="≥ 0",
+                remedy="Check the signs of mass and density",
+            )
         if mass > 0:
             parts.append((mass, centre, tensor))
             total += mass
@@ -145,10 +153,23 @@ def _geom(geom: ET.Element, name: str, frame: Frame) -> tuple[float, FloatArray,
     size = numbers_of(geom, "size", "0 0 0")
     centre = np.array(numbers_of(geom, "pos", "0 0 0", 3))
     R = frame.rotation(geom)
+    needed = 1 if kind == "sphere" else 2 if kind in ("capsule", "cylinder") else 3
     ends = geom.get("fromto")
+    if len(size) < (1 if ends is not None else needed) or min(size) < 0:
+        raise InvalidInputError(
+            f"size of a {kind} of body '{name}'",
+            value=size,
+            limit=f"{needed} numbers ≥ 0" if ends is None else "its radius, ≥ 0",
+            remedy="Give half-sizes or radii, m, as MuJoCo has them",
+        )
     if ends is not None:
         if kind not in ("capsule", "cylinder", "box", "ellipsoid"):
-            raise InvalidInputError("fromto of a geom", value=kind, limit="an elongated shape")
+            raise InvalidInputError(
+                "fromto of a geom",
+                value=kind,
+                limit="an elongated shape",
+                remedy="A sphere has a pos= and a size=",
+            )
         values = np.array(numbers_of(geom, "fromto", None, 6))
         along = values[3:] - values[:3]
         centre, half = (values[3:] + values[:3]) / 2, float(np.linalg.norm(along)) / 2
@@ -207,7 +228,12 @@ def _unit(vector: Sequence[float]) -> FloatArray:
     array = np.asarray(vector, dtype=float)
     length = float(np.linalg.norm(array))
     if not length > 0:
-        raise InvalidInputError("a direction of the file", value=list(vector), limit="not zero")
+        raise InvalidInputError(
+            "a direction of the file",
+            value=list(vector),
+            limit="not zero",
+            remedy="Give an axis, or two ends that differ",
+        )
     return np.asarray(array / length)
 
 
