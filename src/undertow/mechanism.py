@@ -50,7 +50,10 @@ __all__ = [
     "Mechanism",
     "Parameter",
     "Partition",
+    "energies",
+    "matrix_of",
     "numbers",
+    "require_mechanism",
 ]
 
 #: Stands for the identity of the right size until ``__post_init__`` knows m.
@@ -117,6 +120,14 @@ class Mechanism:
 
     def __post_init__(self) -> None:
         """Check shapes, names, symbols and the definiteness of M; freeze the matrices."""
+        for what, given, kind in (("name", self.name, str), ("start", self.start, Mapping)):
+            if not isinstance(given, kind):
+                raise InvalidInputError(
+                    f"{what} of a mechanism",
+                    value=f"{given!r}, a {type(given).__name__}",
+                    limit=f"a {'text' if kind is str else 'mapping of state names to numbers'}",
+                    remedy='Write Mechanism("my_rig", ..., start={"phi": 0.1})',
+                )
         check_parts(self.name, self.coordinates, self.inputs, self.parameters)
         for parts in ("coordinates", "inputs", "parameters"):
             object.__setattr__(self, parts, tuple(getattr(self, parts)))
@@ -615,6 +626,24 @@ def _floats(what: str, values: ArrayLike) -> FloatArray:
             limit="numbers, in SI units",
             remedy="Set states by name: mechanism.state(name=value)",
         ) from error
+
+
+def require_mechanism(what: str, value: object) -> None:
+    """Refuse what is no mechanism, a name of one for instance.
+
+    Raises
+    ------
+    InvalidInputError
+        With how to make one.
+    """
+    if not isinstance(value, Mechanism):
+        raise InvalidInputError(
+            what,
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="an undertow.Mechanism",
+            remedy="Make one: undertow.mechanisms.rotary_pendulum(), or of one's own with "
+            "undertow.Mechanism.from_energies",
+        )
 
 
 @lru_cache(maxsize=64)

@@ -25,6 +25,7 @@ __all__ = [
     "MinimumTime",
     "Names",
     "Objective",
+    "require_objective",
     "state_box",
 ]
 
@@ -285,6 +286,24 @@ class Objective:
                 remedy=f"Take symbols from the argument: lambda v: v.phi**2. {error.remedy}",
             ) from error
         return expression
+
+
+def require_objective(value: object) -> None:
+    """Refuse what is no objective, a word for one for instance.
+
+    Raises
+    ------
+    InvalidInputError
+        With how to make one.
+    """
+    if not isinstance(value, Objective):
+        raise InvalidInputError(
+            "objective",
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="an undertow.Objective",
+            remedy="Make one: undertow.MinimumTime(), undertow.MinimumEnergy(), or "
+            'undertow.Objective("my cost", lambda v: v.phi**2)',
+        )
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from undertow.errors import (
     SingularSurfaceError,
     UnstableSurfaceError,
 )
-from undertow.mechanism import TIME, FloatArray, Mechanism, numbers
+from undertow.mechanism import TIME, FloatArray, Mechanism, numbers, require_mechanism
 from undertow.sliding import check_surface_shape, coupling, gamma_determinant, singularity
 from undertow.surface import Surface
 from undertow.validity import kinks, require_smooth
@@ -376,6 +376,7 @@ def first_surface(
     -----
     A design is kept on disk beside the kernels, so that a second start need not repeat it.
     """
+    require_mechanism("mechanism of a first surface", mechanism)
     n, m = mechanism.n, mechanism.m
     if weights is None:
         weights = [1.0] * m + [10.0] * (n - m) + [0.1] * n

@@ -67,6 +67,14 @@ def check_names(owner: str, names: Sequence[str]) -> None:
             limit="unique among coordinates, inputs, parameters and the time t",
             remedy="Rename one of them",
         )
+    vectors = sorted({"states", "inputs"} & {normal_name(name) for name in names})
+    if vectors:
+        raise ModelError(
+            f"a name of '{owner}' is that of a vector",
+            value=", ".join(vectors),
+            limit="another one: v.states and v.inputs are all of them in a stage cost",
+            remedy="Rename it",
+        )
     private = sorted(name for name in map(normal_name, every) if name.startswith("_"))
     if private:
         raise ModelError(

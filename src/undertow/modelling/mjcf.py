@@ -81,6 +81,7 @@ def from_mjcf(
     )
 
 
+@np.errstate(all="ignore")  # what overflows is refused with the tree
 def read_mjcf(source: str | Path, *, motors: bool = True) -> Tree:
     """Read an MJCF file as a tree; ``motors=False`` leaves its actuators out.
 

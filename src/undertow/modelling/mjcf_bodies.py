@@ -11,7 +11,7 @@ import numpy as np
 
 from undertow.errors import InvalidInputError, ModelError
 from undertow.mechanism import FloatArray
-from undertow.modelling.tree import Link
+from undertow.modelling.tree import LARGEST, Link
 from undertow.modelling.xml_files import numbers_of, rotation_from_quaternion
 
 __all__ = ["Frame", "link_of"]
@@ -155,11 +155,12 @@ def _geom(geom: ET.Element, name: str, frame: Frame) -> tuple[float, FloatArray,
     R = frame.rotation(geom)
     needed = 1 if kind == "sphere" else 2 if kind in ("capsule", "cylinder") else 3
     ends = geom.get("fromto")
-    if len(size) < (1 if ends is not None else needed) or min(size) < 0:
+    used = size[: needed if ends is None else 1]
+    if len(used) < (needed if ends is None else 1) or not 0 < min(used) <= max(used) <= LARGEST:
         raise InvalidInputError(
             f"size of a {kind} of body '{name}'",
             value=size,
-            limit=f"{needed} numbers ≥ 0" if ends is None else "its radius, ≥ 0",
+            limit=f"{needed} numbers > 0" if ends is None else "its radius, a number > 0",
             remedy="Give half-sizes or radii, m, as MuJoCo has them",
         )
     if ends is not None:
@@ -227,11 +228,11 @@ _SHAPES: dict[str, Callable[[Sequence[float]], tuple[float, tuple[float, float, 
 def _unit(vector: Sequence[float]) -> FloatArray:
     array = np.asarray(vector, dtype=float)
     length = float(np.linalg.norm(array))
-    if not length > 0:
+    if not 0 < length < math.inf:
         raise InvalidInputError(
             "a direction of the file",
             value=list(vector),
-            limit="not zero",
+            limit="not zero, and finite",
             remedy="Give an axis, or two ends that differ",
         )
     return np.asarray(array / length)

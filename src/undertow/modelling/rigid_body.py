@@ -32,7 +32,7 @@ from undertow.quantities import code_points, normal_name
 __all__ = ["identifier", "mechanism_from_tree"]
 
 #: Longest mass matrix, in operations of its upper half: deriving f from it takes some 10 s.
-MOST_OPERATIONS = 12_000
+MOST_OPERATIONS = 8_000
 
 
 def mechanism_from_tree(
@@ -71,6 +71,16 @@ def mechanism_from_tree(
     InvalidInputError
         For an actuated joint that does not exist or is named twice.
     """
+    if actuated is not None:
+        actuated = [actuated] if isinstance(actuated, str) else list(actuated)
+        odd = [joint for joint in actuated if not isinstance(joint, str)]
+        if odd:
+            raise InvalidInputError(
+                f"actuated joints of '{tree.name}'",
+                value=repr(odd[0]),
+                limit="names of joints",
+                remedy="Write actuated=['shoulder']",
+            )
     joints = tree.moving
     names = _distinct([joint.name for joint in joints])
     coordinates = [
@@ -278,7 +288,7 @@ def _energies(
             raise ModelError(
                 f"mass matrix of '{tree.name}', {n} moving joints",
                 value=f"more than {size} operations, '{joint.child}' included",
-                limit=f"at most {MOST_OPERATIONS}: about six joints in a chain, or four with "
+                limit=f"at most {MOST_OPERATIONS}: about six joints in a plane, or four with "
                 "axes askew",
                 remedy="Fix joints that do not matter, or give a planar mechanism's M, f and B",
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -246,7 +246,14 @@ class Tree:
 
     def _check_sizes(self) -> None:
         """Refuse numbers that are none, or beyond any machine: their products would overflow."""
-        named: list[tuple[str, str, object]] = [("gravity", self.name, self.gravity)]
+        named: list[tuple[str, str, Any]] = [("gravity", self.name, self.gravity)]
+        if np.shape(self.gravity) != (3,):
+            raise ModelError(
+                f"gravity of '{self.name}'",
+                value=self.gravity,
+                limit="three numbers, m/s²",
+                remedy="Write gravity=(0, 0, -9.81)",
+            )
         for link in self.links:
             named += [(what, link.name, getattr(link, what)) for what in ("mass", "com", "inertia")]
         for joint in self.joints:
@@ -262,11 +269,14 @@ class Tree:
             gains = [*actuator.coefficients.values(), actuator.gain]
             named.append(("actuator", actuator.name, gains))
         for what, name, value in named:
-            size = np.abs(np.asarray(value, dtype=float)).max(initial=0.0)
+            try:
+                size = np.abs(np.asarray(value, dtype=float)).max(initial=0.0)
+            except (TypeError, ValueError):  # no numbers at all
+                size = math.nan
             if not size <= LARGEST:
                 raise ModelError(
                     f"{what} of '{name}'",
-                    value=f"{size:g}",
+                    value=f"{size:g} among {value}",
                     limit=f"numbers up to {LARGEST:g} in SI units",
                     remedy="Check the units",
                 )

@@ -84,6 +84,7 @@ def from_urdf(
     )
 
 
+@np.errstate(all="ignore")  # what overflows is refused with the tree
 def read_urdf(
     source: str | Path, gravity: Vector = (0.0, 0.0, -9.81)
 ) -> tuple[Tree, tuple[str, ...]]:

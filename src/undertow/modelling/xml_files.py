@@ -120,9 +120,12 @@ def rotation_from_rpy(rpy: list[float]) -> FloatArray:
 def rotation_from_quaternion(quaternion: list[float]) -> FloatArray:
     """Rotation matrix of a quaternion (w, x, y, z) of any length but zero, (3, 3)."""
     length = float(np.linalg.norm(quaternion))
-    if not length > 0:
+    if not 0 < length < math.inf:
         raise InvalidInputError(
-            "quaternion", value=quaternion, limit="not zero", remedy="1 0 0 0 turns nothing"
+            "quaternion",
+            value=quaternion,
+            limit="not zero, and finite",
+            remedy="1 0 0 0 turns nothing",
         )
     w, x, y, z = np.asarray(quaternion) / length
     return np.array(
