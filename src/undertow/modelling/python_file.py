@@ -112,12 +112,13 @@ def _nameless(
     names: Mapping[str, object], name: str, file: str, suits: Callable[[object], bool]
 ) -> InvalidInputError:
     """A name that a file has not, with those that it has."""
+    # A function or class has the name of the module where it was made, an object that of its class.
+    made = {k: v for k, v in names.items() if inspect.isfunction(v) or inspect.isclass(v)}
+    brought = {k for k, v in made.items() if v.__module__ != names["__name__"]}
     here = [
         key
         for key, value in names.items()
-        if not key.startswith("_")
-        and suits(value)
-        and getattr(value, "__module__", names["__name__"]) == names["__name__"]
+        if not key.startswith("_") and key not in brought and suits(value)
     ]
     return InvalidInputError(
         f"'{file}'",
