@@ -235,9 +235,9 @@ def test_text_is_no_expression_and_is_never_run() -> None:
     """Claim: SymPy would evaluate text as Python; what is given as text is refused unread."""
     harm = "__import__('sys').exit(3)"
     for attempt in (
-        lambda: ut.Mechanism.from_energies("own", [x_, a_], [force_], harm, 0),  # type: ignore[arg-type]
-        lambda: ut.Mechanism("own", (x_, a_), (force_,), sp.eye(2), [harm, "0"]),  # type: ignore[arg-type]
-        lambda: energies().disturbed({"a": harm}),  # type: ignore[dict-item]
+        lambda: ut.Mechanism.from_energies("own", [x_, a_], [force_], harm, 0),
+        lambda: ut.Mechanism("own", (x_, a_), (force_,), sp.eye(2), [harm, "0"]),
+        lambda: energies().disturbed({"a": harm}),
         lambda: ut.Objective("o", lambda v: harm).stage_cost(energies()),
     ):
         with pytest.raises(UndertowError, match="str"):
