@@ -103,6 +103,7 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     )
 
 
+@lru_cache(maxsize=128)
 def has_linear_model(mechanism: Mechanism) -> bool:
     """Whether f has a derivative at the target: :func:`linearise` refuses where it has none."""
     return next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
