@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,12 @@ import pytest
 import undertow as ut
 from undertow import modelling
 from undertow.check import check_mechanism
-from undertow.errors import ArtefactError, InvalidInputError, ModelError
+from undertow.errors import ArtefactError, InvalidInputError, ModelError, UndertowError
 from undertow.mechanism import FloatArray
 from undertow.mechanisms import LIBRARY
+from undertow.mechanisms.named import named
 from undertow.mechanisms.scenes import mujoco_scene
+from undertow.rig.python_file import rig_from_file
 
 TIGHT = 1e-10
 
@@ -458,3 +462,252 @@ def test_meshes_without_inertia_are_refused() -> None:
     text = changed(CART_MJCF, bare, '<geom type="mesh" mesh="rod"/>')
     with pytest.raises(ModelError, match="mesh"):
         modelling.from_mjcf(text)
+
+
+# -- what cannot be a body, and what nobody could wait for ---------------------------------------
+
+ROD = '<inertial mass="0.2" pos="0 0 0.3" diaginertia="1 0.006 1"/>'
+
+
+@pytest.mark.parametrize(
+    ("moments", "whole"),
+    [((1, 0.006, 1.1), False), ((1, 1, 3), False), ((0, 0, 1), False), ((0, 1, 1), True),
+     ((0.5, 0.5, 1.004), True), ((1, 1, 2), True), ((1e-9, 1e-9, 2.2e-9), False)],
+)  # fmt: skip
+def test_principal_moments_that_no_body_has_are_refused(
+    moments: tuple[float, float, float], whole: bool
+) -> None:
+    """Claim: none exceeds the sum of the others, but for what files round; in both formats and
+    any axes."""
+    a, b, c = moments
+    rotated = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    tensor = rotated @ np.diag(moments) @ rotated.T
+    tilted = " ".join(
+        repr(float(tensor[i])) for i in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    )
+    inertia = f'<inertia ixx="{a}" iyy="{b}" izz="{c}"/>'
+    texts = (
+        (
+            modelling.from_urdf,
+            changed(CART_URDF, '<inertia ixx="1" iyy="0.006" izz="1"/>', inertia),
+        ),
+        (modelling.from_mjcf, changed(CART_MJCF, "1 0.006 1", f"{a} {b} {c}")),
+        (
+            modelling.from_mjcf,
+            changed(CART_MJCF, 'diaginertia="1 0.006 1"', f'fullinertia="{tilted}"'),
+        ),
+    )
+    for read, text in texts:
+        if whole:
+            assert read(text).n == 2
+        else:
+            with pytest.raises(ModelError, match=r"link 'rod'.*sum of the others"):
+                read(text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("1 0.006 1", "1 -0.006 1", "no negative moment"),
+        (ROD, '<geom type="box" size="0.1"/>', "3 numbers > 0"),
+        (ROD, '<geom type="capsule" size="0 0"/>', "2 numbers > 0"),
+        (ROD, '<geom type="sphere" size="1e308"/>', "size of a sphere"),
+        (ROD, '<geom type="sphere" size="0.1" density="-1000"/>', "mass of a geom"),
+        (ROD, '<geom type="sphere" size="0.1" mass="-1"/>', "mass of a geom"),
+        ('<body name="rod">', '<body name="rod" quat="1e308 1e308 0 0">', "quaternion"),
+        ('<body name="rod">', '<body name="world">', "fixed frame"),
+        ('mass="0.2"', 'mass="1e300"', "up to 1e"),
+        ('mass="0.2"', 'mass="1_0"', "numbers"),
+        ('mass="0.2"', 'mass="\u0663"', "numbers"),
+        ('joint="x" ctrl', 'joint="x" gear="" ctrl', "gear"),
+        ('joint="x" ctrl', 'joint="x" gear="0" ctrl', "gear"),
+        ("<option", '<compiler eulerseq="xyq"/><option', "eulerseq"),
+        ('axis="0 1 0" damp', 'axis="0 0 0" damp', "axis of joint 'phi'"),
+        ('axis="0 1 0" damp', 'axis="nan 0 0" damp', "finite"),
+        ('name="phi"', 'name="\uff58"', r"named twice.*x and .*U\+FF58"),
+        ('name="rod"', 'name="\u03d5"', "parameter|named twice|identifier"),
+    ],
+)
+def test_mjcf_that_cannot_be_is_refused(old: str, new: str, match: str) -> None:
+    """Claim: numbers that no body has, and names that Python takes for one, are refused."""
+    text = changed(CART_MJCF, old, new)
+    if "\u03d5" in new:  # a second link of that name, in another spelling
+        text = changed(text, 'name="cart"', 'name="\u03c6"')
+    with pytest.raises(UndertowError, match=match) as refusal:
+        modelling.from_mjcf(text)
+    assert refusal.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ('effort="20"', 'effort="-20"', "effort of joint 'x'"),
+        ('lower="-1.5" upper="1.5"', 'lower="1.5" upper="-1.5"', "limits of joint 'x'"),
+        ('izz="1"/>\n    </inertial>', 'izz="1e308"/>\n    </inertial>', "up to 1e"),
+        ('<axis xyz="0 1 0"/>', '<axis xyz="1e200 0 0"/>', "axis of 'phi'"),
+        ('name="phi"', 'name="x "', "identifiers"),
+        ('<parent link="cart"/>', '<parent link="cat"/>', "Did you mean cart"),
+    ],
+)
+def test_urdf_that_cannot_be_is_refused(old: str, new: str, match: str) -> None:
+    text = changed(CART_URDF, old, new)
+    if new == 'name="x "':
+        text = changed(text, 'name="x" type', 'name="x_" type').replace(
+            'joint name="x"/>', 'joint name="x_"/>'
+        )
+    with pytest.raises(UndertowError, match=match) as refusal:
+        modelling.from_urdf(text)
+    assert refusal.value.remedy
+
+
+def test_a_lone_name_in_another_spelling_works() -> None:
+    """Claim: a joint µ of a file is the coordinate μ, by both spellings."""
+    read = modelling.from_urdf(changed(CART_URDF, 'name="phi"', 'name="\u00b5"'))
+    assert read.coordinates[1].name == "\u03bc"
+    assert read.state(**{"\u00b5": 0.1})[1] == 0.1
+
+
+def test_an_input_that_nothing_limits_is_said() -> None:
+    """Claim: a file without a limit gives an infinite one, and the mechanism says so."""
+    for read in (
+        modelling.from_urdf(changed(CART_URDF, 'effort="20" ', "")),
+        modelling.from_mjcf(changed(CART_MJCF, ' ctrlrange="-20 20"', "")),
+    ):
+        assert read.input_limits.tolist() == [math.inf]
+        (name,) = (i.name for i in read.inputs)
+        assert f"{name} without limit" in read.description
+        check = check_mechanism(read)["inputs without a limit"]
+        assert name in check.name
+        assert check.passed
+    with pytest.raises(StopIteration):
+        _ = check_mechanism(modelling.from_urdf(CART_URDF))["inputs without a limit"]
+
+
+def chain(count: int, axes: tuple[str, ...] = ("0 1 0",), tilt: str = "0 0 0") -> str:
+    links = "".join(link(f"l_{i}") for i in range(count))
+    ends = [("base", "l_0"), *((f"l_{i - 1}", f"l_{i}") for i in range(1, count))]
+    joints = "".join(
+        f'<joint name="j_{i}" type="continuous"><origin xyz="0.1 0.02 0.2" rpy="{tilt}"/>'
+        f'<parent link="{a}"/><child link="{b}"/><axis xyz="{axes[i % len(axes)]}"/></joint>'
+        for i, (a, b) in enumerate(ends)
+    )
+    return robot('<link name="base"/>', links, joints)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (chain(12), "12 moving joints.*at most 8000"),
+        (chain(12, ("1 0 0", "0 1 0", "0 0 1"), "0.3 0.2 0.1"), "12 moving joints.*at most 8000"),
+        (chain(17), "moving joints of 'bad'.*got 17.*at most 16"),
+        (robot('<link name="base"/>', *(link(f"l_{i}") for i in range(300)), *(
+            joint(f"j_{i}", "base", f"l_{i}", "fixed") for i in range(300))), "links.*at most 200"),
+    ],
+    ids=["a chain", "askew", "too many", "links"],
+)  # fmt: skip
+def test_what_nobody_could_wait_for_is_refused_before_the_work(text: str, match: str) -> None:
+    """Claim: the mass matrix of a long chain is refused while it grows, in a second or two."""
+    start = time.process_time()
+    with pytest.raises(ModelError, match=match):
+        modelling.from_urdf(text, actuated=["j_0"])
+    assert time.process_time() - start < 8.0
+
+
+@pytest.mark.parametrize(
+    "attempt",
+    [
+        lambda: modelling.from_urdf(3),  # type: ignore[arg-type]
+        lambda: modelling.from_urdf(b"<robot/>"),  # type: ignore[arg-type]
+        lambda: modelling.from_urdf(CART_URDF, gravity=9.81),  # type: ignore[arg-type]
+        lambda: modelling.from_urdf(CART_URDF, gravity=(0, 0, "a")),  # type: ignore[arg-type]
+        lambda: modelling.from_urdf(CART_URDF, actuated=[3]),  # type: ignore[list-item]
+        lambda: modelling.from_urdf(CART_URDF, actuated=["x"], effort={"x": "a"}),  # type: ignore[dict-item]
+        lambda: modelling.from_urdf(CART_URDF, equilibrium={"phi": "0"}),  # type: ignore[dict-item]
+    ],
+)
+def test_arguments_of_another_kind_are_refused(attempt: Callable[[], object]) -> None:
+    with pytest.raises(UndertowError) as refusal:
+        attempt()
+    assert refusal.value.remedy
+
+
+# -- Python files of one's own -------------------------------------------------------------------
+
+OWN = """
+import undertow as ut
+from undertow.mechanisms import tora
+
+mine = ut.mechanisms.cart_pendulum()
+def make():
+    return ut.mechanisms.rotary_pendulum()
+def refused():
+    return ut.Coordinate("a b")
+def fails():
+    return 1 / 0
+class Silent:
+    period = 0.001
+    def read(self):
+        raise OSError("no such port")
+    def write(self, u): ...
+    def close(self): ...
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "facts"),
+    [
+        ("mak", InvalidInputError, ("one of mine, make", "Did you mean make")),
+        ("zzz", InvalidInputError, ("no name 'zzz'", "mine, make")),
+        (
+            "tora_",
+            InvalidInputError,
+            ("no name", "one of mine"),
+        ),  # what was imported is not offered
+        ("refused", InvalidInputError, ("own.py line 9", "'a b'", "identifier")),
+        ("fails", ArtefactError, ("own.py line 11", "ZeroDivisionError")),
+    ],
+)
+def test_errors_of_ones_own_file_name_file_and_line(
+    name: str, error: type[Exception], facts: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Claim: a wrong name lists the right ones; what fails inside says where."""
+    path = tmp_path / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    assert modelling.mechanism_from_file(f"{path}:mine").name == "cart_pendulum"
+    assert modelling.mechanism_from_file(f"{path}:make").name == "rotary_pendulum"
+    with pytest.raises(error) as refusal:
+        modelling.mechanism_from_file(f"{path}:{name}")
+    for fact in facts:
+        assert fact in str(refusal.value)
+    assert "tora," not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "fact"),
+    [
+        ("x = (\n", "line 1"),
+        ("raise SystemExit(0)", "SystemExit"),
+        ("import numppy", "line 1"),
+    ],
+)
+def test_files_that_do_not_run_say_where(text: str, fact: str, tmp_path: Path) -> None:
+    path = tmp_path / "own.py"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ArtefactError, match=fact) as refusal:
+        modelling.mechanism_from_file(f"{path}:mine")
+    assert refusal.value.remedy
+
+
+def test_a_driver_that_fails_says_where(tmp_path: Path) -> None:
+    path = tmp_path / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    rig = ut.mechanisms.rotary_pendulum()
+    with pytest.raises(ArtefactError, match=r"no such port.*own\.py line 15"):
+        rig_from_file(f"{path}:Silent", rig)
+    with pytest.raises(InvalidInputError, match="Did you mean Silent"):
+        rig_from_file(f"{path}:Silnt", rig)
+
+
+def test_a_wrong_name_of_the_library_lists_the_near_ones() -> None:
+    with pytest.raises(InvalidInputError, match="Did you mean rotary_pendulum"):
+        named("rotary_pendlum")

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from undertow.decision import Freedom
 from undertow.errors import InvalidInputError
-from undertow.mechanism import TIME, FloatArray, Mechanism
+from undertow.mechanism import TIME, FloatArray, Mechanism, require_mechanism
 from undertow.motion import INADMISSIBLE, Event, Trajectory
-from undertow.objective import MinimumEnergy, Objective
+from undertow.objective import MinimumEnergy, Objective, require_objective
 from undertow.optimiser import Optimiser
 from undertow.plan import Plan
 from undertow.proposal import Budget, Proposal
@@ -258,6 +258,8 @@ class Cascade:
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
+        require_mechanism("mechanism of a cascade", self.mechanism)
+        require_objective(self.objective)
         if TIME in self.mechanism.force.free_symbols:
             raise InvalidInputError(
                 f"belief '{self.mechanism.name}' of a cascade",

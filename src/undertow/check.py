@@ -15,8 +15,8 @@ import sympy as sp
 
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import ModelError
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.stability import controllability, linearise
+from undertow.mechanism import FloatArray, Mechanism, require_mechanism
+from undertow.stability import controllability, has_linear_model, linearise
 
 __all__ = ["Check", "MechanismReport", "check_mechanism"]
 
@@ -123,6 +123,7 @@ def check_mechanism(
     >>> check_mechanism(ut.mechanisms.rotary_pendulum()).passed
     True
     """
+    require_mechanism("mechanism to check", mechanism)
     rng = np.random.default_rng(seed)
     q = _positions(mechanism, rng, samples)
     qd = rng.uniform(-3.0, 3.0, q.shape)
@@ -131,6 +132,7 @@ def check_mechanism(
         *_forces(mechanism, q, qd),
         _inverse(mechanism, q, qd, rng),
         *_target(mechanism),
+        *_limits(mechanism),
         *_start(mechanism),
     )
     report = MechanismReport(mechanism.name, checks)
@@ -312,6 +314,16 @@ def _target(mechanism: Mechanism) -> tuple[Check, ...]:
     ]
     if left > _ROUNDING:
         return tuple(checks)
+    if not has_linear_model(mechanism):
+        kink = Check(
+            "forces have a derivative at the target, kinks",
+            False,
+            1.0,
+            "0",
+            "Abs, sign, Max, Min and the like: without a linear model no surface is designed or "
+            "tested; simulate with a surface of your own, or put smooth functions in their place",
+        )
+        return (*checks, kink)
     return (*checks, _equilibria(mechanism), _controllable(mechanism))
 
 
@@ -355,6 +367,21 @@ def _controllable(mechanism: Mechanism) -> Check:
         distance,
         f"> {_ROUNDING:g} of ‖[A, B]‖",
         "No linear surface stabilises it: choose another target or actuate another joint",
+    )
+
+
+def _limits(mechanism: Mechanism) -> tuple[Check, ...]:
+    """Say which inputs nothing limits: no failure, but minimum time has no meaning with them."""
+    endless = [i.name for i in mechanism.inputs if math.isinf(i.limit)]
+    if not endless:
+        return ()
+    return (
+        Check(
+            f"inputs without a limit ({', '.join(endless)}), number",
+            True,
+            float(len(endless)),
+            "0 of a real actuator: with_input_limit gives one",
+        ),
     )
 
 

@@ -349,13 +349,13 @@ def polynomial_matrix(mechanism: Mechanism, *, symbolic: bool) -> sp.Matrix:
     """
     n, m = mechanism.n, mechanism.m
     y = Symbols.of(mechanism)
+    lin = linearise(mechanism)  # refuses what has no derivative at the target
     if symbolic:
         at_target = dict.fromkeys(mechanism.x, 0)
         M = mechanism.mass_matrix.subs(at_target)
         slope = mechanism.force.jacobian(list(mechanism.x)).subs(at_target)
         F, D = slope[:, :n], slope[:, n:]
     else:
-        lin = linearise(mechanism)
         M, F, D = (sp.Matrix(a) for a in (lin.M, lin.F, lin.D))
     top = sp.Matrix.hstack(y.alpha_a * _s + y.lambda_a, y.alpha_u * _s + y.lambda_u)
     return sp.Matrix.vstack(top, (M * _s**2 - D * _s - F)[m:, :])

@@ -6,6 +6,11 @@ One root, :class:`UndertowError`; a few conditions below it. Every message reads
 
 from __future__ import annotations
 
+import os
+import traceback
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 __all__ = [
     "ArtefactError",
     "CertificateError",
@@ -17,6 +22,8 @@ __all__ = [
     "SingularSurfaceError",
     "UndertowError",
     "UnstableSurfaceError",
+    "near",
+    "raised_at",
 ]
 
 
@@ -85,3 +92,37 @@ class ArtefactError(UndertowError, OSError):
 
 class ResourceError(UndertowError, OSError):
     """The system refuses memory, a thread, a process, a descriptor or room on its disk."""
+
+
+def near(name: str, names: Iterable[str]) -> str:
+    """Return "Did you mean …?" with the names that are like a wrong one; nothing where none is.
+
+    >>> near("rotary_pendlum", ["cart_pendulum", "rotary_pendulum", "tora"])
+    'Did you mean rotary_pendulum or cart_pendulum?'
+    """
+    found = get_close_matches(name, list(names), n=3)
+    return f"Did you mean {' or '.join(found)}?" if found else ""
+
+
+def raised_at(error: BaseException, file: str = "") -> str:
+    """Return ", FILE line N" of the innermost line of a user's own that an error went through.
+
+    Parameters
+    ----------
+    error
+        With its traceback.
+    file
+        The user's file; where it is left out, any outside of Undertow and of installed packages.
+
+    Returns
+    -------
+    str
+        Empty where there is no such line.
+    """
+    if isinstance(error, SyntaxError) and error.lineno and error.filename == file:
+        return f", {file} line {error.lineno}"
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        ours = frame.filename.startswith(os.path.dirname(__file__))
+        if frame.filename == file if file else not ours and "-packages" not in frame.filename:
+            return f", {frame.filename} line {frame.lineno}"
+    return ""

@@ -19,11 +19,28 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from undertow.codegen import Tape, compile_numpy
-from undertow.errors import InvalidInputError, ModelError
+from undertow.errors import InvalidInputError, ModelError, near
 from undertow.lagrange import derived
 from undertow.partition import Partition, compiled
-from undertow.quantities import TIME, Coordinate, FloatArray, Input, Parameter, numbers
-from undertow.validity import check_definite, check_names, check_symbols, check_symmetric
+from undertow.quantities import (
+    TIME,
+    Coordinate,
+    FloatArray,
+    Input,
+    Parameter,
+    normal_name,
+    number_of,
+    numbers,
+)
+from undertow.validity import (
+    check_definite,
+    check_parts,
+    check_symbols,
+    check_symmetric,
+    expression_of,
+    require_smooth,
+    vocabulary,
+)
 
 __all__ = [
     "TIME",
@@ -33,7 +50,10 @@ __all__ = [
     "Mechanism",
     "Parameter",
     "Partition",
+    "energies",
+    "matrix_of",
     "numbers",
+    "require_mechanism",
 ]
 
 #: Stands for the identity of the right size until ``__post_init__`` knows m.
@@ -100,6 +120,17 @@ class Mechanism:
 
     def __post_init__(self) -> None:
         """Check shapes, names, symbols and the definiteness of M; freeze the matrices."""
+        for what, given, kind in (("name", self.name, str), ("start", self.start, Mapping)):
+            if not isinstance(given, kind):
+                raise InvalidInputError(
+                    f"{what} of a mechanism",
+                    value=f"{given!r}, a {type(given).__name__}",
+                    limit=f"a {'text' if kind is str else 'mapping of state names to numbers'}",
+                    remedy='Write Mechanism("my_rig", ..., start={"phi": 0.1})',
+                )
+        check_parts(self.name, self.coordinates, self.inputs, self.parameters)
+        for parts in ("coordinates", "inputs", "parameters"):
+            object.__setattr__(self, parts, tuple(getattr(self, parts)))
         n, m = len(self.coordinates), len(self.inputs)
         if not 0 < m < n:
             raise ModelError(
@@ -114,7 +145,7 @@ class Mechanism:
             ("force", self.force, (n, 1)),
             ("input_matrix", given, (m, m)),
         ):
-            matrix = sp.ImmutableDenseMatrix(value)
+            matrix = matrix_of(f"{attribute} of '{self.name}'", value)
             if matrix.shape != shape:
                 raise ModelError(
                     f"shape of {attribute} of '{self.name}'",
@@ -123,7 +154,13 @@ class Mechanism:
                     remedy="Give one row per coordinate, the actuated ones first",
                 )
             object.__setattr__(self, attribute, matrix)
-        bounds = tuple(float(b) for b in self.disturbance_bounds) or (0.0,) * n
+        given_bounds: Any = self.disturbance_bounds
+        if not isinstance(given_bounds, Iterable):
+            given_bounds = (given_bounds,)
+        bounds = (
+            tuple(number_of(f"disturbance_bounds of '{self.name}'", b) for b in given_bounds)
+            or (0.0,) * n
+        )
         if len(bounds) != n or not all(math.isfinite(b) and b >= 0 for b in bounds):
             raise InvalidInputError(
                 f"disturbance_bounds of '{self.name}'",
@@ -136,15 +173,18 @@ class Mechanism:
         self.state(**self.start)
 
     def _check(self) -> None:
-        states, parameters = {*self.x}, {*self.parameter_symbols}
-        channels = [i.name for i in self.inputs]
-        check_names(self.name, [*self.state_names, *channels, *(p.name for p in self.parameters)])
-        for what, allowed in (
-            ("mass_matrix", {*self.q} | parameters),
-            ("input_matrix", parameters),
-            ("force", states | parameters | {TIME}),
+        data = vocabulary(parameters=self.parameters, time=False)
+        places = vocabulary(self.coordinates, velocities=False, time=False) | data
+        for what, known in (
+            ("mass_matrix", places),
+            ("input_matrix", data),
+            ("force", vocabulary(self.coordinates, parameters=self.parameters)),
         ):
-            check_symbols(f"{what} of '{self.name}'", getattr(self, what), allowed)
+            check_symbols(f"{what} of '{self.name}'", getattr(self, what), known)
+        if self.potential is not None:
+            what = f"potential of '{self.name}'"
+            object.__setattr__(self, "potential", expression_of(what, self.potential))
+            check_symbols(what, [self.potential], places | {TIME: "undertow.mechanism.TIME"})
         check_symmetric(f"mass_matrix of '{self.name}'", self.mass_matrix)
         check_definite(f"mass_matrix of '{self.name}'", self.coordinates, self.M)
         gain = numbers(self.input_matrix.subs(self.substitution))
@@ -186,9 +226,12 @@ class Mechanism:
         Raises
         ------
         ModelError
-            When T is not a quadratic form in the velocities, or as for the class.
+            When T is not a quadratic form in the velocities; for symbols that are not of this
+            mechanism, and kinks, whose derivatives are not what SymPy says; or as for the class.
         """
-        T, V, D = sp.sympify(kinetic), sp.sympify(potential), sp.sympify(dissipation)
+        T, V, D = energies(
+            name, coordinates, inputs, rest.get("parameters", ()), kinetic, potential, dissipation
+        )
         q, qd = [c.symbol for c in coordinates], [c.velocity for c in coordinates]
         mass, force = derived(name, q, qd, T, V, D)
         return cls(
@@ -201,7 +244,7 @@ class Mechanism:
             **rest,
         )
 
-    def with_parameters(self, **values: float) -> Self:
+    def with_parameters(self, /, **values: float) -> Self:
         """Return the mechanism with some parameter values replaced, SI units.
 
         Raises
@@ -212,16 +255,19 @@ class Mechanism:
         if not values:
             return self
         known = {p.name: p for p in self.parameters}
+        values = {normal_name(name): value for name, value in values.items()}
         for name in values:
             if name not in known:
                 raise InvalidInputError(
                     f"unknown parameter of '{self.name}'",
                     value=repr(name),
                     limit=f"one of {', '.join(known)}",
-                    remedy="Use a declared name; values are in SI units",
+                    remedy=near(name, known) or "Use a declared name; values are in SI units",
                 )
         changed = tuple(
-            replace(p, value=float(values[p.name])) if p.name in values else p
+            replace(p, value=number_of(f"parameter '{p.name}', {p.unit}", values[p.name]))
+            if p.name in values
+            else p
             for p in self.parameters
         )
         return replace(self, parameters=changed)
@@ -235,7 +281,10 @@ class Mechanism:
                 limit=f"{self.m} numbers",
                 remedy="Give one limit per input",
             )
-        inputs = tuple(replace(i, limit=float(v)) for i, v in zip(self.inputs, limits, strict=True))
+        inputs = tuple(
+            replace(i, limit=number_of(f"limit of input '{i.name}'", v))
+            for i, v in zip(self.inputs, limits, strict=True)
+        )
         return replace(self, inputs=inputs)
 
     def with_disturbance_bounds(self, *bounds: float) -> Self:
@@ -254,15 +303,17 @@ class Mechanism:
         parameters
             Further parameters that the expressions use.
         """
-        unknown = set(force) - {c.name for c in self.coordinates}
+        force = {normal_name(name): value for name, value in force.items()}
+        names = [c.name for c in self.coordinates]
+        unknown = sorted(set(force) - set(names))
         if unknown:
             raise InvalidInputError(
                 f"unknown coordinate of '{self.name}'",
-                value=", ".join(sorted(unknown)),
-                limit=f"one of {', '.join(c.name for c in self.coordinates)}",
-                remedy="Forces act on coordinates, by their names",
+                value=", ".join(unknown),
+                limit=f"one of {', '.join(names)}",
+                remedy=near(unknown[0], names) or "Forces act on coordinates, by their names",
             )
-        g = sp.Matrix([sp.sympify(force.get(c.name, 0)) for c in self.coordinates])
+        g = sp.Matrix([expression_of(f"force on '{name}'", force.get(name, 0)) for name in names])
         return replace(
             self,
             force=sp.ImmutableDenseMatrix(self.force + g),
@@ -344,7 +395,7 @@ class Mechanism:
         values = [p.value for p in self.parameters]
         return hashlib.sha256(f"{self.structure} {values} {limits}".encode()).hexdigest()
 
-    def state(self, **values: float) -> FloatArray:
+    def state(self, /, **values: float) -> FloatArray:
         """Return the state with the named entries set and all others zero, SI units.
 
         Raises
@@ -353,15 +404,19 @@ class Mechanism:
             For an unknown state name or a value that is not finite.
         """
         x = np.zeros(2 * self.n)
-        for name, value in values.items():
+        for given, value in values.items():
+            name = normal_name(given)
             if name not in self.state_names:
                 raise InvalidInputError(
                     f"unknown state of '{self.name}'",
-                    value=repr(name),
+                    value=repr(given),
                     limit=f"one of {', '.join(self.state_names)}",
-                    remedy="Use a coordinate's name, or its velocity's",
+                    remedy=near(name, self.state_names)
+                    or "Use a coordinate's name, or its velocity's",
                 )
-            x[self.state_names.index(name)] = value
+            x[self.state_names.index(name)] = number_of(
+                f"state '{name}' of '{self.name}'", value, limit="a number, in rad or m, per second"
+            )
         return self.check_state(x)
 
     def check_state(self, x: ArrayLike) -> FloatArray:
@@ -372,7 +427,7 @@ class Mechanism:
         InvalidInputError
             With the offending entry.
         """
-        state = np.asarray(x, dtype=float)
+        state = _floats(f"state of '{self.name}'", x)
         if state.ndim == 0 or state.shape[-1] != 2 * self.n:
             raise InvalidInputError(
                 f"state of '{self.name}'",
@@ -389,6 +444,19 @@ class Mechanism:
                 remedy="A sensor or an earlier computation gave NaN or infinity",
             )
         return state
+
+    def _columns(self, what: str, values: ArrayLike, names: Sequence[str]) -> FloatArray:
+        """Return values as floats, (…, len(names)), or refuse them."""
+        what = f"{what} of '{self.name}'"
+        array = _floats(what, values)
+        if array.ndim == 0 or array.shape[-1] != len(names):
+            raise InvalidInputError(
+                what,
+                value=f"shape {array.shape}",
+                limit=f"(…, {len(names)}), in the order {', '.join(names)}",
+                remedy=f"Of a state x = (q, q̇) the positions are x[:{self.n}]",
+            )
+        return array
 
     # -- equations on a tape ------------------------------------------------------------
 
@@ -423,8 +491,14 @@ class Mechanism:
         return compiled(matrix, (*states, *self.parameter_symbols))
 
     def M(self, q: ArrayLike) -> FloatArray:
-        """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like."""
-        q = np.asarray(q, dtype=np.float64)
+        """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like.
+
+        Raises
+        ------
+        InvalidInputError
+            For positions of another shape, a state (…, 2n) for instance.
+        """
+        q = self._columns("positions", q, [c.name for c in self.coordinates])
         x = np.concatenate([q, np.zeros_like(q)], axis=-1)
         values = self._evaluate("mass", 0.0, x)
         return values.reshape(*values.shape[:-1], self.n, self.n)
@@ -445,17 +519,19 @@ class Mechanism:
         u
             Inputs, (…, m), not clipped here.
         """
-        state, inputs = self.check_state(x), np.asarray(u, dtype=float)
+        state = self.check_state(x)
+        inputs = self._columns("inputs", u, [i.name for i in self.inputs])
         return self._evaluate("dynamics", t, state, *np.moveaxis(inputs, -1, 0))
 
     def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
         """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
         state = self.check_state(x)
-        inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), np.asarray(qdd))
+        qdd = self._columns("accelerations", qdd, [c.name for c in self.coordinates])
+        inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), qdd)
         return np.asarray(inertial - self.f(state, t))
 
-    def energy(self, x: ArrayLike) -> FloatArray:
-        """Return T + V at the states x, (…,), J.
+    def energy(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
+        """Return T + V at the states x, (…,), J, at the time t, s.
 
         Raises
         ------
@@ -474,10 +550,100 @@ class Mechanism:
         kinetic = 0.5 * np.einsum("...i,...ij,...j->...", qd, self.M(q), qd)
         tape = Tape()
         potential = compile_numpy(
-            tape, [*self.q, *self.parameter_symbols], [tape.let(self.potential)]
+            tape, [TIME, *self.q, *self.parameter_symbols], [tape.let(self.potential)]
         )
-        (value,) = potential(*np.moveaxis(q, -1, 0), *self.parameter_values)
+        (value,) = potential(t, *np.moveaxis(q, -1, 0), *self.parameter_values)
         return np.asarray(kinetic + value)
+
+
+def energies(
+    name: str,
+    coordinates: Sequence[Coordinate],
+    inputs: Sequence[Input],
+    parameters: Sequence[Parameter],
+    kinetic: sp.Expr,
+    potential: sp.Expr,
+    dissipation: sp.Expr | float,
+) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
+    """Return T, V and D as expressions, refused before anything is derived from what is wrong.
+
+    Raises
+    ------
+    ModelError
+        For symbols that are not of this mechanism, and what has no derivative where the
+        equations of motion need one.
+    InvalidInputError
+        For coordinates, inputs or parameters that are none.
+    """
+    check_parts(name, coordinates, inputs, parameters)
+    data = vocabulary(parameters=parameters, time=False)
+    q, qd = {c.symbol for c in coordinates}, {c.velocity for c in coordinates}
+    places = vocabulary(coordinates, velocities=False) | data
+    motion = vocabulary(coordinates, time=False) | data
+    found = []
+    for what, given, known, variables in (
+        ("kinetic energy", kinetic, motion, q | qd),
+        ("potential energy", potential, places, q),
+        ("dissipation", dissipation, motion | places, qd),
+    ):
+        whose = f"{what} of '{name}'"
+        expression = expression_of(whose, given)
+        check_symbols(whose, [expression], known)
+        require_smooth(whose, [expression], variables)
+        found.append(expression)
+    T, V, D = found
+    return T, V, D
+
+
+def matrix_of(what: str, value: object) -> sp.ImmutableDenseMatrix:
+    """Return a matrix of expressions; refuse text, which SymPy would run, and what is none."""
+    try:
+        if not isinstance(value, sp.MatrixBase):
+            rows = np.array(value, dtype=object)
+            value = sp.Matrix(*rows.shape, rows.ravel().tolist()) if rows.ndim == 2 else rows
+            for entry in rows.ravel():
+                expression_of(what, entry)
+        return sp.ImmutableDenseMatrix(value)
+    except ModelError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise ModelError(
+            what,
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="a matrix of SymPy expressions",
+            remedy="Write sympy.Matrix([[...], [...]])",
+        ) from error
+
+
+def _floats(what: str, values: ArrayLike) -> FloatArray:
+    """Return values as an array of floats, or refuse them."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(
+            what,
+            value=f"{values!r}, a {type(values).__name__}",
+            limit="numbers, in SI units",
+            remedy="Set states by name: mechanism.state(name=value)",
+        ) from error
+
+
+def require_mechanism(what: str, value: object) -> None:
+    """Refuse what is no mechanism, a name of one for instance.
+
+    Raises
+    ------
+    InvalidInputError
+        With how to make one.
+    """
+    if not isinstance(value, Mechanism):
+        raise InvalidInputError(
+            what,
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="an undertow.Mechanism",
+            remedy="Make one: undertow.mechanisms.rotary_pendulum(), or of one's own with "
+            "undertow.Mechanism.from_energies",
+        )
 
 
 @lru_cache(maxsize=64)

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from undertow.errors import InvalidInputError
+from undertow.errors import InvalidInputError, ModelError, UndertowError, near, raised_at
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.quantities import normal_name, number_of
+from undertow.validity import check_symbols, expression_of, shortened, vocabulary
 
 __all__ = [
     "Constraint",
@@ -23,6 +25,7 @@ __all__ = [
     "MinimumTime",
     "Names",
     "Objective",
+    "require_objective",
     "state_box",
 ]
 
@@ -47,9 +50,11 @@ class Names:
     def __getattr__(self, name: str) -> Any:
         """Return the symbol of that name."""
         symbols = self.__dict__.get("_symbols", {})
+        name = normal_name(name)
         if name in symbols:
             return symbols[name]
-        message = f"no state, input or parameter '{name}'; there are {', '.join(symbols)}"
+        hint = near(name, symbols)
+        message = f"no state, input or parameter '{name}'; there are {', '.join(symbols)}. {hint}"
         raise AttributeError(message, name=name, obj=self)
 
 
@@ -177,9 +182,16 @@ class Objective:
     hard_input: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse a horizon or terminal radius that is not positive and finite."""
+        """Refuse a stage cost that is no function, and a horizon or radius that is not positive."""
+        if not callable(self.stage):
+            raise InvalidInputError(
+                f"stage cost of '{self.name}'",
+                value=f"{self.stage!r}, a {type(self.stage).__name__}",
+                limit="a function of the mechanism's names that returns an expression",
+                remedy="Write lambda v: v.inputs[0]**2, or lambda v: 1 for a constant",
+            )
         for field in ("horizon", "terminal_radius"):
-            value = getattr(self, field)
+            value = number_of(f"{field} of objective '{self.name}'", getattr(self, field))
             if not (math.isfinite(value) and value > 0):
                 raise InvalidInputError(
                     f"{field} of objective '{self.name}'",
@@ -244,31 +256,54 @@ class Objective:
 
     @staticmethod
     def _expression(mechanism: Mechanism, what: str, formula: Formula) -> sp.Expr:
+        names = Names(mechanism)
         try:
-            value = formula(Names(mechanism))
+            value = formula(names)
+        except UndertowError:
+            raise
         except AttributeError as error:
+            if error.obj is not names:
+                raise _failed(what, error) from error
             raise InvalidInputError(
                 f"{what} for '{mechanism.name}'",
                 value=f"'{error.name}'",
-                limit=f"among {', '.join(Names(mechanism))}",
-                remedy="Use the mechanism's own names",
+                limit=f"among {', '.join(names)}",
+                remedy=near(str(error.name), names) or "Use the mechanism's own names",
             ) from error
-        if isinstance(value, sp.MatrixBase) and value.shape == (1, 1):
-            value = value[0, 0]
-        expression = sp.sympify(value)
-        allowed = {*mechanism.x, *mechanism.u, *mechanism.parameter_symbols}
-        if (
-            not isinstance(expression, sp.Expr)
-            or isinstance(expression, sp.MatrixBase)  # which SymPy counts as an expression
-            or expression.free_symbols - allowed
-        ):
+        except Exception as error:  # a user's function may do anything
+            raise _failed(what, error) from error
+        try:
+            expression = expression_of(what, value)
+            known = vocabulary(
+                mechanism.coordinates, mechanism.inputs, mechanism.parameters, time=False
+            )
+            check_symbols(what, [expression], known)
+        except ModelError as error:
             raise InvalidInputError(
                 what,
-                value=expression,
+                value=f"{shortened(value)}, with {error.value}",
                 limit="one expression in the mechanism's states and inputs",
-                remedy="Take symbols from the argument: lambda v: v.phi**2",
-            )
+                remedy=f"Take symbols from the argument: lambda v: v.phi**2. {error.remedy}",
+            ) from error
         return expression
+
+
+def require_objective(value: object) -> None:
+    """Refuse what is no objective, a word for one for instance.
+
+    Raises
+    ------
+    InvalidInputError
+        With how to make one.
+    """
+    if not isinstance(value, Objective):
+        raise InvalidInputError(
+            "objective",
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="an undertow.Objective",
+            remedy="Make one: undertow.MinimumTime(), undertow.MinimumEnergy(), or "
+            'undertow.Objective("my cost", lambda v: v.phi**2)',
+        )
 
 
 @dataclass(frozen=True)
@@ -309,6 +344,17 @@ class MinimumTime(Objective):
     name: str = "time"
     stage: Formula = lambda v: sp.Integer(1)
     unit: str = "s"
+
+
+def _failed(what: str, error: Exception) -> InvalidInputError:
+    """A formula of the user's that raised, with what it said and where."""
+    return InvalidInputError(
+        what,
+        value=f"{type(error).__name__}: {error}{raised_at(error)}",
+        limit="a function that returns a SymPy expression of its argument's names",
+        remedy="Write it with SymPy's functions, sympy.sin(v.phi) for math.sin or numpy.sin, and "
+        "sympy.Piecewise for conditions",
+    )
 
 
 def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:

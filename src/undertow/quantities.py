@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+import unicodedata
+from contextlib import suppress
+from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,17 @@ from numpy.typing import NDArray
 
 from undertow.errors import InvalidInputError
 
-__all__ = ["TIME", "Coordinate", "FloatArray", "Input", "Parameter", "numbers"]
+__all__ = [
+    "TIME",
+    "Coordinate",
+    "FloatArray",
+    "Input",
+    "Parameter",
+    "code_points",
+    "normal_name",
+    "number_of",
+    "numbers",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -21,19 +34,83 @@ FloatArray = NDArray[np.float64]
 TIME = sp.Symbol("t", real=True)
 
 
+#: Longest name.
+LONGEST = 200
+
 #: Names of symbols that derivations make up.
 _RESERVED = re.compile(r"_(v|y|cse_|viscous_)\d+")
 
 
-def _check_name(what: str, name: str) -> None:
-    """Refuse what is no identifier, and what a derivation could take for a symbol of its own."""
-    if not name.isidentifier() or _RESERVED.fullmatch(name):
+#: Letters that nobody sees, besides those whose category says so: fillers, joiners, selectors.
+_UNSEEN = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+)
+
+
+def normal_name(name: str) -> str:
+    """Return a name as Python spells it, in Unicode's normal form NFKC.
+
+    Python takes ``µ`` (U+00B5, on keyboards) for ``μ`` (U+03BC, Greek) wherever it is written as
+    an identifier, SymPy does not: there is one spelling here, Python's.
+
+    >>> normal_name("µ") == "μ"
+    True
+    """
+    return unicodedata.normalize("NFKC", name)
+
+
+def code_points(name: str) -> str:
+    """Return a name with the code points of what is not ASCII in it, which tell look-alikes apart.
+
+    >>> code_points("k_µ")
+    'k_µ (U+00B5)'
+    """
+    points = [f"U+{ord(c):04X}" for c in name if not c.isascii()]
+    return f"{name} ({' '.join(points)})" if points else name
+
+
+def _name(what: str, given: object) -> str:
+    """Return a name in its normal form; refuse what is no name that Python's code could bear.
+
+    Refused is also what a derivation could take for a symbol of its own, and letters that cannot
+    be seen.
+    """
+    name = normal_name(given) if isinstance(given, str) else ""
+    unseen = _UNSEEN.search(name)
+    if not name.isidentifier() or unseen or _RESERVED.fullmatch(name) or len(name) > LONGEST:
         raise InvalidInputError(
             what,
-            value=repr(name),
-            limit="a Python identifier; not _v0, _y0, _cse_0 or the like",
+            value=f"{given!r} with U+{ord(unseen[0]):04X}, which is not seen"
+            if unseen
+            else repr(given)[: LONGEST + 2],
+            limit="a Python identifier; not _v0, _y0, _cse_0 or the like; "
+            f"at most {LONGEST} characters",
             remedy="Use letters, digits and underscores, a letter first",
         )
+    return name
+
+
+def number_of(what: str, value: object, *, limit: str = "a number", remedy: str = "") -> float:
+    """Return a real number as a float, and refuse all else: text, None, arrays, truth values.
+
+    Raises
+    ------
+    InvalidInputError
+        With what was given instead.
+    """
+    if isinstance(value, sp.Expr) and value.is_number and value.is_real:
+        return float(value)
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    with suppress(OverflowError):  # whole numbers of more digits than a float has
+        if isinstance(value, Real) and not isinstance(value, bool | np.bool_):
+            return float(value)
+    raise InvalidInputError(
+        what,
+        value=f"{value!r}, a {type(value).__name__}",
+        limit=limit,
+        remedy=remedy or "Give a number in SI units: undertow.deg(10) for an angle of 10°",
+    )
 
 
 @dataclass(frozen=True)
@@ -43,7 +120,9 @@ class Parameter:
     Parameters
     ----------
     name
-        Identifier; also the name of the SymPy symbol.
+        Identifier; also the name of the SymPy symbol.  Names are kept in Python's own spelling,
+        NFKC: ``µ`` from a keyboard (U+00B5) is the Greek ``μ`` (U+03BC).  ``spelling`` is what
+        was given.
     value
         The value, in ``unit``.
     unit
@@ -63,10 +142,22 @@ class Parameter:
     low: float = -math.inf
     high: float = math.inf
     source: str = ""
+    spelling: str = field(default="", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Refuse a value that is not finite or not inside its interval."""
-        _check_name("parameter name", self.name)
+        object.__setattr__(self, "spelling", self.name)
+        object.__setattr__(self, "name", _name("parameter name", self.name))
+        for end in ("value", "low", "high"):
+            given = getattr(self, end)
+            number = number_of(
+                f"{end} of parameter '{self.name}'",
+                given,
+                limit=f"a number, in {self.unit}" if self.unit else "a number",
+                remedy=f"Write Parameter({self.name!r}, 1.5, unit): a number, then its SI unit",
+            )
+            if not isinstance(given, float | int):
+                object.__setattr__(self, end, number)
         if not math.isfinite(self.value) or not self.low < self.value < self.high:
             interval = f"finite and inside ({self.low:g}, {self.high:g}) {self.unit}".rstrip()
             raise InvalidInputError(
@@ -104,10 +195,14 @@ class Coordinate:
     description: str = ""
     low: float = -math.inf
     high: float = math.inf
+    spelling: str = field(default="", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Refuse a name or unit of another kind, and an empty range of travel."""
-        _check_name("coordinate name", self.name)
+        object.__setattr__(self, "spelling", self.name)
+        object.__setattr__(self, "name", _name("coordinate name", self.name))
+        for end in ("low", "high"):
+            number_of(f"{end} end of coordinate '{self.name}'", getattr(self, end))
         if self.unit not in ("rad", "m"):
             raise InvalidInputError(
                 f"unit of coordinate '{self.name}'",
@@ -151,10 +246,17 @@ class Input:
     name: str
     unit: str
     limit: float = math.inf
+    spelling: str = field(default="", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Refuse a name that is no identifier and a limit that is not positive."""
-        _check_name("input name", self.name)
+        object.__setattr__(self, "spelling", self.name)
+        object.__setattr__(self, "name", _name("input name", self.name))
+        number_of(
+            f"limit of input '{self.name}'",
+            self.limit,
+            remedy="Give the largest magnitude that the actuator can deliver, in its unit",
+        )
         if not self.limit > 0:
             raise InvalidInputError(
                 f"limit of input '{self.name}'",

@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from undertow.codegen.rows import LANES
 from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
+from undertow.mechanism import FloatArray, require_mechanism
 from undertow.motion import Batch, Event, Trajectory
+from undertow.objective import require_objective
 from undertow.plan import Plan
 from undertow.room import Room
 from undertow.sliding import Surface, check_surface_shape
@@ -71,6 +72,10 @@ class ClosedLoop(UncheckedLoop):
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
+        require_mechanism("mechanism of a closed loop", self.mechanism)
+        if self.plant is not None:
+            require_mechanism("plant of a closed loop", self.plant)
+        require_objective(self.objective)
         for name, low in (("escape", 0.0), ("tail", 0.0)):
             value = getattr(self, name)
             if not value >= low:

@@ -18,6 +18,7 @@ from functools import lru_cache
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
+from sympy.core.function import Application
 
 from undertow.codegen.store import content_key, recall, remember
 from undertow.errors import (
@@ -26,9 +27,10 @@ from undertow.errors import (
     SingularSurfaceError,
     UnstableSurfaceError,
 )
-from undertow.mechanism import TIME, FloatArray, Mechanism, numbers
+from undertow.mechanism import TIME, FloatArray, Mechanism, numbers, require_mechanism
 from undertow.sliding import check_surface_shape, coupling, gamma_determinant, singularity
 from undertow.surface import Surface
+from undertow.validity import kinks, require_smooth
 
 __all__ = [
     "Linearisation",
@@ -36,6 +38,7 @@ __all__ = [
     "check_surface",
     "controllability",
     "first_surface",
+    "has_linear_model",
     "linearise",
     "placed_surface",
     "sliding_matrix",
@@ -78,9 +81,12 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     Raises
     ------
     ModelError
-        When the target is no equilibrium for u = 0.
+        When the target is no equilibrium for u = 0, or f has no derivative there.
     """
     n = mechanism.n
+    require_smooth(
+        f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
+    )
     rest, jacobian = _force_at_target(mechanism)
     if np.abs(rest[mechanism.m :]).max() > 1e-9:
         raise ModelError(
@@ -97,6 +103,17 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     )
 
 
+@lru_cache(maxsize=128)
+def has_linear_model(mechanism: Mechanism) -> bool:
+    """Whether f has a derivative at the target: :func:`linearise` refuses where it has none."""
+    return next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
+
+
+def _target(mechanism: Mechanism) -> dict[sp.Symbol, float]:
+    """All symbols of f to their values at the target, at t = 0."""
+    return mechanism.substitution | dict.fromkeys((*mechanism.x, TIME), 0.0)
+
+
 #: Functions that NumPy continues analytically to complex arguments.
 _ANALYTIC = (
     sp.sin, sp.cos, sp.tan, sp.exp, sp.log, sp.sinh, sp.cosh, sp.tanh, sp.atan, sp.asinh,
@@ -106,11 +123,10 @@ _ANALYTIC = (
 def _force_at_target(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
     """Return f, (n,), and ∂f/∂x, (n, 2n), at x = 0 and t = 0.
 
-    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives,
-    which know what becomes of |x| and √x² at zero.
+    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives.
     """
     force, size = mechanism.force, 2 * mechanism.n
-    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(sp.Function)) and all(
+    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(Application)) and all(
         power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*mechanism.x)
     )
     if analytic:
@@ -361,6 +377,7 @@ def first_surface(
     -----
     A design is kept on disk beside the kernels, so that a second start need not repeat it.
     """
+    require_mechanism("mechanism of a first surface", mechanism)
     n, m = mechanism.n, mechanism.m
     if weights is None:
         weights = [1.0] * m + [10.0] * (n - m) + [0.1] * n

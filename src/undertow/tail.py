@@ -24,6 +24,7 @@ from undertow.codegen.store import load_module
 from undertow.mechanism import FloatArray, Mechanism, numbers
 from undertow.objective import Objective
 from undertow.stability import linearise
+from undertow.validity import is_smooth
 
 __all__ = ["LinearEnd", "QuadraticStage", "quadratic_stage"]
 
@@ -49,7 +50,7 @@ def quadratic_stage(mechanism: Mechanism, objective: Objective) -> QuadraticStag
     symbols = [*mechanism.x, *mechanism.u]
     origin = dict.fromkeys(symbols, 0)
     stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
-    if stage.atoms(sp.Abs, sp.Max, sp.Min, sp.sign, sp.Piecewise):
+    if not is_smooth(stage):
         return None
     slope = sp.Matrix([stage]).jacobian(symbols).subs(origin)
     hessian = sp.hessian(stage, symbols).subs(origin)

@@ -23,6 +23,7 @@ from undertow.motion import Batch
 from undertow.objective import MinimumEnergy, Objective
 from undertow.room import NOTHING, Room, Shape
 from undertow.sliding import ReachingLaw, coupling, gains_at_target
+from undertow.stability import has_linear_model
 from undertow.tail import LinearEnd, Prepared
 
 __all__ = ["Probe", "UncheckedLoop"]
@@ -90,6 +91,8 @@ class UncheckedLoop:
     def linear_end(self) -> LinearEnd | None:
         """The linear model of this loop at the target, where it has one."""
         if self.hold or self.reaching.switching == "sign" or self.plant is not None:
+            return None
+        if not has_linear_model(self.mechanism):
             return None
         return LinearEnd(self.mechanism, self.objective)
 

@@ -24,6 +24,7 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.memory import BRIEF, Memory, unpacked
 from undertow.rig.interface import Measurement
 from undertow.rig.stepping import dynamics_source
+from undertow.validity import require_smooth
 
 __all__ = ["KalmanFilter"]
 
@@ -163,6 +164,8 @@ class KalmanFilter:
     ------
     InvalidInputError
         For noises that are not positive.
+    ModelError
+        For a model that is not smooth: the covariance moves by its derivatives.
 
     Examples
     --------
@@ -182,6 +185,11 @@ class KalmanFilter:
         disturbance_drift: float = 0.0,
         delay: float = 0.0,
     ) -> None:
+        require_smooth(
+            f"a Kalman filter's model, the force of '{mechanism.name}',",
+            mechanism.force,
+            mechanism.x,
+        )
         n, m = mechanism.n, mechanism.m
         if not (0 <= disturbance_drift < math.inf and 0 <= delay < math.inf):
             raise InvalidInputError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from undertow.errors import InvalidInputError
+from undertow.errors import InvalidInputError, near
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import LIBRARY
 from undertow.modelling.python_file import in_a_file, mechanism_from_file
@@ -27,6 +27,6 @@ def named(name: str) -> Mechanism:
             "mechanism",
             value=repr(name),
             limit=f"one of {', '.join(LIBRARY)}",
-            remedy="One of your own is FILE.py:NAME",
+            remedy=near(name, LIBRARY) or "One of your own is FILE.py:NAME",
         )
     return LIBRARY[name]()

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import sympy as sp
 
-from undertow.errors import InvalidInputError, ModelError
+from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import Input, Mechanism, Parameter
 
 __all__ = ["DCMotor", "voltage_driven"]
@@ -148,6 +148,7 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
                 f"motor of '{mechanism.name}'",
                 value=f"on {name!r}",
                 limit=f"one of the inputs {', '.join(names)}",
+                remedy=near(name, names) or "Name inputs of the mechanism",
             )
     m = mechanism.m
     a, b, J = sp.eye(m), sp.zeros(m), sp.zeros(m)

@@ -14,9 +14,11 @@ import numpy as np
 import sympy as sp
 
 from undertow.codegen import Tape, compile_numpy
-from undertow.errors import InvalidInputError, ModelError
-from undertow.mechanism import TIME, Coordinate, Input, Mechanism, Parameter
+from undertow.errors import InvalidInputError, ModelError, near
+from undertow.mechanism import TIME, Coordinate, Input, Mechanism, Parameter, energies, matrix_of
 from undertow.modelling.coordinates import actuate, exact_angle, tidy
+from undertow.quantities import normal_name, number_of
+from undertow.validity import check_parts, check_symbols, expression_of, vocabulary
 
 #: |f_u| at an equilibrium, relative to the largest force that gravity and springs exert.
 BALANCE = 1e-9
@@ -80,8 +82,20 @@ def from_matrices(
     InvalidInputError
         For an equilibrium of unknown coordinates.
     """
+    check_parts(name, coordinates, inputs, parameters)
     coordinates = tuple(coordinates)
     values = {p.symbol: p.value for p in parameters}
+    data = vocabulary(parameters=parameters, time=False)
+    places = vocabulary(coordinates, velocities=False, time=False) | data
+    for what, matrix, known in (
+        ("mass_matrix", mass_matrix, places | {TIME: "undertow.mechanism.TIME"}),
+        ("force", force, vocabulary(coordinates, parameters=parameters)),
+        ("input_matrix", input_matrix, vocabulary(coordinates, parameters=parameters)),
+    ):
+        check_symbols(f"{what} of '{name}'", matrix_of(f"{what} of '{name}'", matrix), known)
+    if potential is not None:
+        potential = expression_of(f"potential of '{name}'", potential)
+        check_symbols(f"potential of '{name}'", [potential], places)
     M = _symmetric(name, sp.Matrix(mass_matrix), coordinates, values)
     f = sp.Matrix(force)
     V = None if potential is None else sp.sympify(potential)
@@ -175,10 +189,15 @@ def from_energies(
     Raises
     ------
     ModelError
-        When T is not a quadratic form in the velocities, or as for :func:`from_matrices`.
+        When T is not a quadratic form in the velocities; for symbols that are not of this
+        mechanism, and kinks, whose derivatives are not what SymPy says; or as for
+        :func:`from_matrices`.
     """
+    kinetic, potential, dissipation = energies(
+        name, coordinates, inputs, rest.get("parameters", ()), kinetic, potential, dissipation
+    )
     velocities = [c.velocity for c in coordinates]
-    kinetic = sp.expand(sp.sympify(kinetic))
+    kinetic = sp.expand(kinetic)
     mass = sp.hessian(kinetic, velocities).applyfunc(tidy)
     qd = sp.Matrix(velocities)
     rest_of_kinetic = tidy(kinetic - (qd.T * mass * qd)[0, 0] / 2)
@@ -232,7 +251,7 @@ def unit_inputs(coordinates: Sequence[Coordinate], actuated: Sequence[str]) -> s
                 "actuated coordinate",
                 value=repr(joint),
                 limit=f"one of {', '.join(names)}",
-                remedy="Check the spelling, and that the joint moves",
+                remedy=near(joint, names) or "Check the spelling, and that the joint moves",
             )
         if list(actuated).count(joint) > 1:
             raise InvalidInputError(
@@ -255,15 +274,16 @@ def shifted(
 ) -> tuple[tuple[Coordinate, ...], list[Any]]:
     """Replace q by q* + e; the errors e keep the coordinates' names."""
     known = {c.name: c for c in coordinates}
+    equilibrium = {normal_name(joint): value for joint, value in equilibrium.items()}
     for joint, value in equilibrium.items():
         if joint not in known:
             raise InvalidInputError(
                 f"equilibrium of '{name}'",
                 value=repr(joint),
                 limit=f"one of {', '.join(known)}",
-                remedy="Name the coordinates as the equations do",
+                remedy=near(joint, known) or "Name the coordinates as the equations do",
             )
-        if not np.isfinite(value):
+        if not np.isfinite(number_of(f"equilibrium of '{name}', {joint}", value)):
             raise InvalidInputError(
                 f"equilibrium of '{name}', {joint}", value=value, limit="a finite number"
             )

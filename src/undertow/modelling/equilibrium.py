@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 import sympy as sp
 
-from undertow.errors import InvalidInputError, ModelError
+from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.modelling.equations import BALANCE, check_balanced, force_scale, shifted
+from undertow.quantities import normal_name, number_of
 
 __all__ = ["find_equilibrium", "holding_input", "move_target"]
 
@@ -134,14 +135,16 @@ def move_target(mechanism: Mechanism, **equilibrium: float) -> Mechanism:
 
 def _positions(mechanism: Mechanism, values: Mapping[str, float]) -> FloatArray:
     names = [c.name for c in mechanism.coordinates]
+    values = {normal_name(name): value for name, value in values.items()}
     for name in values:
         if name not in names:
             raise InvalidInputError(
                 f"coordinate of '{mechanism.name}'",
                 value=repr(name),
                 limit=f"one of {', '.join(names)}",
+                remedy=near(name, names) or "Name the coordinates of the mechanism",
             )
-    q = np.array([float(values.get(name, 0.0)) for name in names])
+    q = np.array([number_of(f"coordinate '{name}'", values.get(name, 0.0)) for name in names])
     if not np.isfinite(q).all():
         raise InvalidInputError(
             f"coordinates of '{mechanism.name}'", value=dict(values), limit="finite numbers"

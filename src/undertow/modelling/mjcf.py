@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.errors import ModelError
+from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import Mechanism
 from undertow.modelling.mjcf_bodies import Frame, link_of
 from undertow.modelling.rigid_body import mechanism_from_tree
@@ -82,6 +82,7 @@ def from_mjcf(
         )
 
 
+@np.errstate(all="ignore")  # what overflows is refused with the tree
 def read_mjcf(source: str | Path, *, motors: bool = True) -> Tree:
     """Read an MJCF file as a tree; ``motors=False`` leaves its actuators out.
 
@@ -140,9 +141,15 @@ class _Reader:
             raise _unread("compiler inertiagrouprange", "Give the bodies an <inertial>")
         if settings.get("balanceinertia", "false") == "true":
             raise _unread("compiler balanceinertia", "Write the inertias out as they are meant")
-        self.frame = Frame(
-            settings.get("angle", "degree") == "degree", settings.get("eulerseq", "xyz")
-        )
+        sequence = settings.get("eulerseq", "xyz")
+        if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
+            raise InvalidInputError(
+                "compiler eulerseq",
+                value=repr(sequence),
+                limit="three of x, y, z, X, Y, Z",
+                remedy="Leave it out for MuJoCo's usual one, xyz",
+            )
+        self.frame = Frame(settings.get("angle", "degree") == "degree", sequence)
         self.autolimits = settings.get("autolimits", "true") == "true"
         self.infer = settings.get("inertiafromgeom", "auto")
         self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
@@ -169,7 +176,10 @@ class _Reader:
         name = element.get("class") or childclass or "main"
         if name not in self.classes:
             raise ModelError(
-                f"class of <{element.tag}>", value=repr(name), limit="declared in <default>"
+                f"class of <{element.tag}>",
+                value=repr(name),
+                limit="declared in <default>",
+                remedy=near(name, self.classes) or "Declare it, or leave class= out",
             )
         filled = copy.copy(element)
         defaults = self.classes[name].get(tag or element.tag, {})
@@ -306,6 +316,7 @@ class _Reader:
                         f"tendon '{element.get('name', '')}'",
                         value=f"joint {joint!r}",
                         limit=f"one of {', '.join(kinds)}",
+                        remedy=near(joint, kinds) or "Declare the joint, or correct its name",
                     )
                 coefficients[joint] = numbers_of(part, "coef", None, 1)[0]
             yield Coupling(
@@ -341,7 +352,15 @@ class _Reader:
                     "Use <motor>, or name the actuated joints: actuated=['...']",
                 )
             motor = self._filled(element, None)
-            gear = numbers_of(motor, "gear", "1")[0]
+            gears = numbers_of(motor, "gear", "1")
+            if not gears or gears[0] == 0:
+                raise ModelError(
+                    f"gear of motor '{name}'",
+                    value=motor.get("gear"),
+                    limit="a first number that is not zero",
+                    remedy="A motor that moves nothing is no input: leave it out",
+                )
+            gear = gears[0]
             joint, tendon = motor.get("joint"), motor.get("tendon")
             if joint is not None:
                 coefficients = {joint: 1.0}
@@ -356,7 +375,7 @@ class _Reader:
             for switch, values in (("ctrllimited", "ctrlrange"), ("forcelimited", "forcerange")):
                 if self._limited(motor, switch, values):
                     limits.append(min(abs(v) for v in numbers_of(motor, values, None, 2)))
-            if joint is not None and gear != 0:
+            if joint is not None:
                 limits.append(efforts.get(joint, math.inf) / abs(gear))
             yield Actuator(
                 name, coefficients, gear, min(limits), unit if gear == 1 else "", tendon or ""

@@ -11,7 +11,7 @@ import numpy as np
 
 from undertow.errors import InvalidInputError, ModelError
 from undertow.mechanism import FloatArray
-from undertow.modelling.tree import Link
+from undertow.modelling.tree import LARGEST, Link
 from undertow.modelling.xml_files import numbers_of, rotation_from_quaternion
 
 __all__ = ["Frame", "link_of"]
@@ -38,6 +38,7 @@ class Frame:
                 f"orientation of <{element.tag} name={element.get('name', '')!r}>",
                 value=" and ".join(given),
                 limit="one of them",
+                remedy="Leave the others out",
             )
         if not given:
             return np.eye(3)
@@ -115,6 +116,13 @@ def _from_geoms(geoms: Sequence[ET.Element], name: str, frame: Frame) -> Link:
     parts: list[tuple[float, FloatArray, FloatArray]] = []
     for geom in geoms:
         mass, centre, tensor = _geom(geom, name, frame)
+        if mass < 0:
+            raise ModelError(
+                f"mass of a geom of body '{name}'",
+                value=f"{mass:g} kg",
+                limit="≥ 0",
+                remedy="Check the signs of mass and density",
+            )
         if mass > 0:
             parts.append((mass, centre, tensor))
             total += mass
@@ -147,15 +155,22 @@ def _geom(geom: ET.Element, name: str, frame: Frame) -> tuple[float, FloatArray,
     R = frame.rotation(geom)
     ends = geom.get("fromto")
     needed = 1 if ends is not None else _SIZES.get(kind, 3)
-    if len(size) < needed or not min(size[:needed]) > 0:
+    used = size[:needed]
+    if len(used) < needed or not 0 < min(used) <= max(used) <= LARGEST:
         raise InvalidInputError(
             f"size of a {kind} of body '{name}'",
-            value=geom.get("size", "missing"),
-            limit=f"{needed} numbers > 0",
+            value=size,
+            limit=f"{needed} numbers > 0" if ends is None else "its radius, a number > 0",
+            remedy="Give half-sizes or radii, m, as MuJoCo has them",
         )
     if ends is not None:
         if kind not in ("capsule", "cylinder", "box", "ellipsoid"):
-            raise InvalidInputError("fromto of a geom", value=kind, limit="an elongated shape")
+            raise InvalidInputError(
+                "fromto of a geom",
+                value=kind,
+                limit="an elongated shape",
+                remedy="A sphere has a pos= and a size=",
+            )
         values = np.array(numbers_of(geom, "fromto", None, 6))
         along = values[3:] - values[:3]
         centre, half = (values[3:] + values[:3]) / 2, float(np.linalg.norm(along)) / 2
@@ -217,8 +232,13 @@ _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2}
 def _unit(vector: Sequence[float]) -> FloatArray:
     array = np.asarray(vector, dtype=float)
     length = float(np.linalg.norm(array))
-    if not length > 0:
-        raise InvalidInputError("a direction of the file", value=list(vector), limit="not zero")
+    if not 0 < length < math.inf:
+        raise InvalidInputError(
+            "a direction of the file",
+            value=list(vector),
+            limit="not zero, and finite",
+            remedy="Give an axis, or two ends that differ",
+        )
     return np.asarray(array / length)
 
 

@@ -22,13 +22,17 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from undertow.errors import InvalidInputError, ModelError
+from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.modelling.coordinates import number, tidy
 from undertow.modelling.equations import from_matrices, lagrange_force, unit_inputs
 from undertow.modelling.tree import WORLD, Joint, Link, Tree
+from undertow.quantities import code_points, normal_name
 
 __all__ = ["identifier", "mechanism_from_tree"]
+
+#: Longest mass matrix, in operations of its upper half: deriving f from it takes some 10 s.
+MOST_OPERATIONS = 8_000
 
 
 def mechanism_from_tree(
@@ -67,8 +71,18 @@ def mechanism_from_tree(
     InvalidInputError
         For an actuated joint that does not exist or is named twice.
     """
+    if actuated is not None:
+        actuated = [actuated] if isinstance(actuated, str) else list(actuated)
+        odd = [joint for joint in actuated if not isinstance(joint, str)]
+        if odd:
+            raise InvalidInputError(
+                f"actuated joints of '{tree.name}'",
+                value=repr(odd[0]),
+                limit="names of joints",
+                remedy="Write actuated=['shoulder']",
+            )
     joints = tree.moving
-    names = [identifier(joint.name) for joint in joints]
+    names = _distinct([joint.name for joint in joints])
     coordinates = [
         Coordinate(
             name,
@@ -109,15 +123,39 @@ def mechanism_from_tree(
         equilibrium={identifier(k): v for k, v in (equilibrium or {}).items()},
         disturbance_bounds=friction if any(friction) else (),
         start=start,
-        description=description or f"rigid-body tree '{tree.name}'",
+        description=description or f"rigid-body tree '{tree.name}'" + _unlimited(inputs),
         source=source,
     )
 
 
 def identifier(name: str) -> str:
-    """Return the name as a Python identifier: what is no letter or digit becomes ``_``."""
-    text = re.sub(r"\W", "_", name)
-    return text if text.isidentifier() else f"_{text}"
+    """Return the name as a Python identifier: what is no letter or digit becomes ``_``.
+
+    >>> identifier("joint 1"), identifier("1")
+    ('joint_1', 'n1')
+    """
+    text = re.sub(r"\W", "_", normal_name(name))
+    return text if text.isidentifier() and not text.startswith("_") else f"n{text}"
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Return names as identifiers; refuse those that differ in punctuation only."""
+    made: dict[str, str] = {}
+    for name in names:
+        text = identifier(name)
+        if text in made:
+            raise _alike(f"{code_points(made[text])!r} and {code_points(name)!r} are {text!r}")
+        made[text] = name
+    return list(made)
+
+
+def _alike(value: str) -> ModelError:
+    return ModelError(
+        "links or joints whose names differ in punctuation only",
+        value=value,
+        limit="names that stay different as identifiers",
+        remedy="Rename one of them",
+    )
 
 
 class _Book:
@@ -130,12 +168,7 @@ class _Book:
         self, name: str, value: float, unit: str, description: str, positive: bool = False
     ) -> sp.Symbol:
         if name in self.parameters:
-            raise ModelError(
-                "links or joints whose names differ in punctuation only",
-                value=f"both give the parameter {name!r}",
-                limit="names that stay different as identifiers",
-                remedy="Rename one of them",
-            )
+            raise _alike(f"both give the parameter {name!r}")
         low = -1e-12 if positive else -math.inf
         self.parameters[name] = Parameter(name, float(value), unit, description, low)
         return self.parameters[name].symbol
@@ -159,6 +192,7 @@ def _inputs(
                 f"effort of '{tree.name}'",
                 value=", ".join(unknown),
                 limit=f"actuated joints {', '.join(actuated)}",
+                remedy=near(unknown[0], actuated) or "Limit joints that are actuated",
             )
         chosen = {identifier(j.name): j for j in joints}
         units = {"hinge": "N m", "slide": "N"}
@@ -186,7 +220,7 @@ def _inputs(
                     f"actuator '{actuator.name}' of '{tree.name}'",
                     value=f"joint {joint!r}",
                     limit=f"one of {', '.join(index)}",
-                    remedy="Check the spelling, and that the joint moves",
+                    remedy=near(joint, index) or "Check the spelling, and that the joint moves",
                 )
             B[index[joint], k] += number(actuator.gain) * number(coefficient)
     taken = {c.name for c in coordinates} | {c.velocity.name for c in coordinates}
@@ -197,6 +231,12 @@ def _inputs(
         Input(f"{name}_motor" if name in taken else name, a.unit, a.limit)
         for name, a in zip(names, tree.actuators, strict=True)
     ], B
+
+
+def _unlimited(inputs: Sequence[Input]) -> str:
+    """Return words about the inputs that nothing limits."""
+    names = [i.name for i in inputs if math.isinf(i.limit)]
+    return f"; {', '.join(names)} without limit: the file gives none" if names else ""
 
 
 def _strokes(tree: Tree) -> tuple[list[Coordinate | None], list[sp.Expr | None]]:
@@ -227,7 +267,7 @@ def _energies(
             np.asarray(tree.gravity) / strength
         )
     frames = {WORLD: _Frame(sp.zeros(3, n), sp.zeros(3, n), gravity, sp.Integer(0))}
-    mass, potential = sp.zeros(n), sp.Integer(0)
+    mass, potential, size = sp.zeros(n), sp.Integer(0), 0
     for joint in tree.ordered():
         frame = _outwards(frames[joint.parent], joint, coordinates, index)
         frames[joint.child] = frame
@@ -243,6 +283,15 @@ def _energies(
                 spring = book.take(f"{name}_stiffness", joint.stiffness, unit, "spring", True)
                 potential += spring * (q - number(joint.rest)) ** 2 / 2
         body_mass, body_potential = _body(links[joint.child], frame, book)
+        size += sum(int(sp.count_ops(body_mass[j, k])) for j in range(n) for k in range(j, n))
+        if size > MOST_OPERATIONS:
+            raise ModelError(
+                f"mass matrix of '{tree.name}', {n} moving joints",
+                value=f"more than {size} operations, '{joint.child}' included",
+                limit=f"at most {MOST_OPERATIONS}: about six joints in a plane, or four with "
+                "axes askew",
+                remedy="Fix joints that do not matter, or give a planar mechanism's M, f and B",
+            )
         mass += body_mass
         potential += body_potential
     for coupling in tree.couplings:

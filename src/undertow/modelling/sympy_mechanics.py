@@ -16,6 +16,7 @@ from undertow.errors import InvalidInputError, ModelError
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.modelling.coordinates import tidy
 from undertow.modelling.equations import from_matrices
+from undertow.validity import require_smooth
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import KanesMethod, LagrangesMethod
@@ -84,7 +85,11 @@ def from_lagrange(
     q = list(method.q)
     resting = dict.fromkeys((c.diff(_time()) for c in q), 0)
     # The only place where SymPy keeps the Lagrangian, as a (1, 1) matrix.
-    potential = -sp.Matrix([method._L])[0].subs(resting)
+    lagrangian = sp.Matrix([method._L])[0]
+    states = {c.diff(_time()): sp.Dummy(f"{_plain(c)}_dot", real=True) for c in q}
+    states |= {c: sp.Dummy(_plain(c), real=True) for c in q}
+    require_smooth(f"Lagrangian of '{name}'", [lagrangian.subs(states)], states.values())
+    potential = -lagrangian.subs(resting)
     return _build(
         name, q, method.mass_matrix, method.forcing, potential, inputs, parameters, units, rest
     )

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from undertow.errors import ModelError
+from undertow.errors import ModelError, near
 from undertow.mechanism import FloatArray
+from undertow.validity import twins
 
 __all__ = ["WORLD", "Actuator", "Coupling", "Joint", "Link", "Tree", "Vector"]
 
@@ -18,6 +19,16 @@ __all__ = ["WORLD", "Actuator", "Coupling", "Joint", "Link", "Tree", "Vector"]
 WORLD = "world"
 
 Vector = tuple[float, float, float]
+
+#: Most moving joints, and most links or joints, of a tree: beyond, nothing could be derived of it.
+MOST_MOVING, MOST_PARTS = 16, 200
+
+#: Largest number of a tree, SI units; efforts and ranges may be infinite.
+LARGEST = 1e9
+
+#: By how much, of the largest one, a principal moment may exceed the sum of the other two: files
+#: give two or three digits.
+ROUNDED = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,20 +154,36 @@ class Tree:
     actuators: tuple[Actuator, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse repeated names, dangling ends, loops, and links that carry no inertia."""
+        """Refuse repeated names, dangling ends, loops, and links that cannot be bodies."""
+        moving = sum(joint.kind != "fixed" for joint in self.joints)
+        for what, count, most in (
+            ("moving joints", moving, MOST_MOVING),
+            ("links", len(self.links), MOST_PARTS),
+            ("joints", len(self.joints), MOST_PARTS),
+            ("actuators and couplings", len(self.actuators) + len(self.couplings), MOST_PARTS),
+        ):
+            if count > most:
+                raise ModelError(
+                    f"{what} of '{self.name}'",
+                    value=count,
+                    limit=f"at most {most}",
+                    remedy="Keep the bodies that the mechanism is about; make the others fixed, "
+                    "or lump them together",
+                )
         for what, names in (
             ("link", [link.name for link in self.links]),
             ("joint", [joint.name for joint in self.joints]),
             ("actuator", [actuator.name for actuator in self.actuators]),
         ):
-            repeated = sorted({n for n in names if names.count(n) > 1})
+            repeated = twins(names)
             if repeated:
                 raise ModelError(
                     f"a {what} of '{self.name}' is named twice",
-                    value=", ".join(repeated),
+                    value=repeated,
                     limit="unique names",
                     remedy=f"Rename one {what}",
                 )
+        self._check_sizes()
         known = {WORLD, *(link.name for link in self.links)}
         parents: dict[str, str] = {}
         for joint in self.joints:
@@ -166,7 +193,7 @@ class Tree:
                         f"joint '{joint.name}' of '{self.name}'",
                         value=f"link {end!r}",
                         limit=f"one of {', '.join(sorted(known))}",
-                        remedy="Declare the link, or correct its name",
+                        remedy=near(end, known) or "Declare the link, or correct its name",
                     )
             if joint.child == WORLD:
                 raise ModelError(
@@ -194,11 +221,16 @@ class Tree:
             )
         self._check_inertia()
 
-    def ordered(self) -> list[Joint]:
-        """Return the joints from the root outwards."""
+    def _hanging(self) -> dict[str, list[Joint]]:
+        """Links to the joints that hang on them."""
         children: dict[str, list[Joint]] = {}
         for joint in self.joints:
             children.setdefault(joint.parent, []).append(joint)
+        return children
+
+    def ordered(self) -> list[Joint]:
+        """Return the joints from the root outwards."""
+        children = self._hanging()
         order: list[Joint] = []
         frontier = [WORLD]
         while frontier:
@@ -212,25 +244,71 @@ class Tree:
         """The hinge and slide joints, from the root outwards: the coordinates."""
         return [joint for joint in self.ordered() if joint.kind != "fixed"]
 
+    def _check_sizes(self) -> None:
+        """Refuse numbers that are none, or beyond any machine: their products would overflow."""
+        named: list[tuple[str, str, Any]] = [("gravity", self.name, self.gravity)]
+        if np.shape(self.gravity) != (3,):
+            raise ModelError(
+                f"gravity of '{self.name}'",
+                value=self.gravity,
+                limit="three numbers, m/s²",
+                remedy="Write gravity=(0, 0, -9.81)",
+            )
+        for link in self.links:
+            named += [(what, link.name, getattr(link, what)) for what in ("mass", "com", "inertia")]
+        for joint in self.joints:
+            for what in (
+                "rotation", "position", "axis", "anchor", "damping", "stiffness", "rest",
+                "armature", "friction", "reference",
+            ):  # fmt: skip
+                named.append((what, joint.name, getattr(joint, what)))
+        for coupling in self.couplings:
+            values = [*coupling.coefficients.values(), coupling.damping, coupling.stiffness]
+            named.append(("coupling", coupling.name, [*values, coupling.rest, coupling.armature]))
+        for actuator in self.actuators:
+            gains = [*actuator.coefficients.values(), actuator.gain]
+            named.append(("actuator", actuator.name, gains))
+        for what, name, value in named:
+            try:
+                size = np.abs(np.asarray(value, dtype=float)).max(initial=0.0)
+            except (TypeError, ValueError):  # no numbers at all
+                size = math.nan
+            if not size <= LARGEST:
+                raise ModelError(
+                    f"{what} of '{name}'",
+                    value=f"{size:g} among {value}",
+                    limit=f"numbers up to {LARGEST:g} in SI units",
+                    remedy="Check the units",
+                )
+
     def _check_inertia(self) -> None:
         links = {link.name: link for link in self.links}
         for link in self.links:
             inertia = np.asarray(link.inertia, dtype=float)
             values = np.linalg.eigvalsh(inertia)
-            sound = np.isfinite([link.mass, *link.com, *inertia.ravel()]).all()
-            if not sound or link.mass < 0 or values[0] < -1e-9 * max(1e-12, values[-1]):
+            what, moments = f"inertia of link '{link.name}'", values.round(9).tolist()
+            if link.mass < 0 or values[0] < -1e-9 * max(1e-12, values[-1]):
                 raise ModelError(
-                    f"inertia of link '{link.name}'",
-                    value=f"mass {link.mass:g} kg, principal moments {values.round(9).tolist()}",
+                    what,
+                    value=f"mass {link.mass:g} kg, principal moments {moments}",
                     limit="mass ≥ 0 and no negative moment of inertia",
                     remedy="Check the units and the signs of the products of inertia",
                 )
+            if values[2] - values[1] - values[0] > ROUNDED * values[2]:
+                raise ModelError(
+                    what,
+                    value=f"principal moments {moments} kg m²: {values[2]:.4g} > "
+                    f"{values[0]:.4g} + {values[1]:.4g}",
+                    limit=f"none larger than the sum of the others, to {ROUNDED:.0%}: no body has",
+                    remedy="Check the units, and that the moments are about the centre of mass; a "
+                    "thin rod has one that is zero and two that are equal",
+                )
+        hanging = self._hanging()
         armed = {j for c in self.couplings if c.armature > 0 for j in c.coefficients}
         for joint in self.moving:
             beyond, frontier = [joint.child], [joint.child]
             while frontier:
-                end = frontier.pop()
-                ends = [j.child for j in self.joints if j.parent == end]
+                ends = [j.child for j in hanging.get(frontier.pop(), [])]
                 beyond += ends
                 frontier += ends
             carried = [links[name] for name in beyond]

@@ -85,6 +85,7 @@ def from_urdf(
         )
 
 
+@np.errstate(all="ignore")  # what overflows is refused with the tree
 def read_urdf(
     source: str | Path, gravity: Vector = (0.0, 0.0, -9.81)
 ) -> tuple[Tree, tuple[str, ...]]:
@@ -100,7 +101,12 @@ def read_urdf(
     links = [_link(element) for element in robot.findall("link")]
     joints = [_joint(element) for element in robot.findall("joint")]
     if not links:
-        raise ModelError(f"URDF '{name}'", value="no link", limit="at least one")
+        raise ModelError(
+            f"URDF '{name}'",
+            value="no link",
+            limit="at least one",
+            remedy="Give the bodies as <link>, the way they move as <joint>",
+        )
     children = {joint.child for joint in joints}
     roots = [link.name for link in links if link.name not in children]
     if len(roots) > 1:
@@ -129,14 +135,24 @@ def _pose(element: ET.Element, of: str) -> tuple[FloatArray, Vector]:
 def _name(element: ET.Element) -> str:
     name = element.get("name")
     if not name:
-        raise ModelError(f"a <{element.tag}> of the URDF", value="no name", limit="a name")
+        raise ModelError(
+            f"a <{element.tag}> of the URDF",
+            value="no name",
+            limit="a name",
+            remedy="Give every link and joint a name=",
+        )
     return name
 
 
 def _child(element: ET.Element, tag: str, of: str) -> ET.Element:
     found = element.find(tag)
     if found is None:
-        raise ModelError(f"<{element.tag}> of '{of}'", value=f"no <{tag}>", limit="one")
+        raise ModelError(
+            f"<{element.tag}> of '{of}'",
+            value=f"no <{tag}>",
+            limit="one",
+            remedy=f"URDF wants a <{tag}> there",
+        )
     return found
 
 
@@ -201,11 +217,25 @@ def _joint(element: ET.Element) -> Joint:
     limit = element.find("limit")
     if limit is not None:
         (effort,) = numbers_of(limit, "effort", "0", 1, of=name)
+        if effort < 0:
+            raise ModelError(
+                f"effort of joint '{name}'",
+                value=effort,
+                limit="≥ 0",
+                remedy="Give the largest magnitude, N m or N; 0 where it is not known",
+            )
         # URDF demands an effort and writes 0 for "not known".
         joint = replace(joint, effort=effort if effort > 0 else math.inf)
         if kind != "continuous":
             (low,) = numbers_of(limit, "lower", "0", 1, of=name)
             (high,) = numbers_of(limit, "upper", "0", 1, of=name)
+            if low > high:
+                raise ModelError(
+                    f"limits of joint '{name}'",
+                    value=f"lower {low:g}, upper {high:g}",
+                    limit="lower ≤ upper",
+                    remedy="Give the lower end first; equal ends say that there is no limit",
+                )
             if low < high:
                 joint = replace(joint, low=low, high=high)
     return joint

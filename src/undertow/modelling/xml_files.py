@@ -33,6 +33,13 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
     ModelError
         For another root element.
     """
+    if not isinstance(source, str | Path):
+        raise InvalidInputError(
+            f"<{root}> file",
+            value=f"a {type(source).__name__}",
+            limit="a path, or XML text",
+            remedy="Give pathlib.Path('model.xml'), or the text itself",
+        )
     text = source if isinstance(source, str) and source.lstrip().startswith("<") else None
     if text is None:
         try:
@@ -63,7 +70,12 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
             remedy="Correct the file there",
         ) from error
     if element.tag != root:
-        raise ModelError("model file", value=f"root <{element.tag}>", limit=f"<{root}>")
+        raise ModelError(
+            "model file",
+            value=f"root <{element.tag}>",
+            limit=f"<{root}>",
+            remedy="URDF has <robot>: from_urdf; MJCF <mujoco>: from_mjcf",
+        )
     return element
 
 
@@ -138,15 +150,20 @@ def numbers_of(
     owner = of or element.get("name", "")
     label = f"{attribute} of <{element.tag}>" + f" of '{owner}'" * bool(owner)
     if text is None:
-        raise InvalidInputError(label, value="missing", limit="given")
+        raise InvalidInputError(
+            label, value="missing", limit="given", remedy="The format has no default for it"
+        )
+    wanted, shown = "Write numbers, 0.5 or 1e-3, with spaces between", repr(text[:60])
     try:
+        if not text.isascii() or "_" in text:  # of which Python, but no XML reader, makes numbers
+            raise ValueError(text)
         values = [float(word) for word in text.split()]
     except ValueError as error:
-        raise InvalidInputError(label, value=repr(text), limit="numbers") from error
+        raise InvalidInputError(label, value=shown, limit="numbers", remedy=wanted) from error
     if not all(math.isfinite(v) for v in values):
-        raise InvalidInputError(label, value=repr(text), limit="finite numbers")
+        raise InvalidInputError(label, value=shown, limit="finite numbers", remedy=wanted)
     if count is not None and len(values) != count:
-        raise InvalidInputError(label, value=repr(text), limit=f"{count} numbers")
+        raise InvalidInputError(label, value=shown, limit=f"{count} numbers", remedy=wanted)
     return values
 
 
@@ -162,8 +179,13 @@ def rotation_from_rpy(rpy: list[float]) -> FloatArray:
 def rotation_from_quaternion(quaternion: list[float]) -> FloatArray:
     """Rotation matrix of a quaternion (w, x, y, z) of any length but zero, (3, 3)."""
     length = float(np.linalg.norm(quaternion))
-    if not length > 0:
-        raise InvalidInputError("quaternion", value=quaternion, limit="not zero")
+    if not 0 < length < math.inf:
+        raise InvalidInputError(
+            "quaternion",
+            value=quaternion,
+            limit="not zero, and finite",
+            remedy="1 0 0 0 turns nothing",
+        )
     w, x, y, z = np.asarray(quaternion) / length
     return np.array(
         [

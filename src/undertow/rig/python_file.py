@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.errors import ArtefactError, InvalidInputError, UndertowError
+from undertow.errors import ArtefactError, InvalidInputError, UndertowError, raised_at
 from undertow.mechanism import Mechanism
 from undertow.modelling.python_file import object_from_file
 from undertow.rig.interface import Rig
@@ -29,7 +29,7 @@ def rig_from_file(text: str, mechanism: Mechanism) -> Rig:
     InvalidInputError
         When what is there has not what a rig has, see :class:`undertow.rig.Rig`.
     """
-    rig: Rig = object_from_file(text, "rig")
+    rig: Rig = object_from_file(text, "rig", lambda v: callable(v) or hasattr(v, "read"))
     try:
         check_rig(rig, mechanism, text)
     except UndertowError:
@@ -74,7 +74,7 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
     except Exception as error:  # a driver may do anything
         raise ArtefactError(
             f"first reading of '{name}'",
-            value=f"{type(error).__name__}: {error}",
+            value=f"{type(error).__name__}: {error}{raised_at(error)}",
             limit="an undertow.rig.Measurement",
             remedy="Is it connected, and switched on?",
         ) from error
