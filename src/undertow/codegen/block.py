@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import sympy as sp
 
 from undertow.codegen import settle
-from undertow.codegen.names import docstring
+from undertow.codegen.names import distinct, docstring
 from undertow.codegen.rows import LANES, LoopProgram, Rows, entrance, total
 from undertow.codegen.scalar import Emitter
 
@@ -33,6 +33,7 @@ class _Writer:
 
     def __init__(self, program: LoopProgram) -> None:
         self.program = program
+        distinct((*program.state, *program.plant_parameters, program.time))
         self.emit = Emitter(program.tape)
         self.time = self.emit.text(program.time)
         self.limits = [self.emit.text(limit) for limit in program.limits]

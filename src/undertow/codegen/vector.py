@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 from sympy.printing.numpy import NumPyPrinter
 
-from undertow.codegen.names import Names
+from undertow.codegen.names import Names, distinct
 from undertow.codegen.tape import Tape
 from undertow.errors import ModelError
 
@@ -41,19 +41,19 @@ def compile_numpy(
     ModelError
         For a symbol that is neither an input nor on the tape.
     """
-    given = {s: sp.Symbol(f"a{i}", real=True) for i, s in enumerate(inputs)}
+    given = {s: sp.Symbol(f"a{i}", real=True) for i, s in enumerate(distinct(inputs))}
     lines = tape.live(outputs)
     results = [sp.sympify(o) for o in outputs]
     needed: set[sp.Basic] = set().union(*(e.free_symbols for e in results))
     needed |= set().union(*(line.expression.free_symbols for line in lines))
     _refuse(needed - given.keys() - {line.symbol for line in lines})
     printer = _Printer(Names(tape, {s: s.name for s in given.values()}))
-    body = [f"{line.symbol} = {printer.doprint(line.expression.xreplace(given))}" for line in lines]
-    return _function(
-        [s.name for s in given.values()],
-        body,
-        [printer.doprint(e.xreplace(given)) for e in results],
-    )
+
+    def text(expression: sp.Expr) -> str:
+        return str(printer.doprint(expression.xreplace(given)))
+
+    body = [f"{line.symbol} = {text(line.expression)}" for line in lines]
+    return _function([s.name for s in given.values()], body, [text(e) for e in results])
 
 
 def compile_expressions(
@@ -71,7 +71,7 @@ def compile_expressions(
     """
     results = [sp.sympify(o) for o in outputs]
     _refuse(set().union(*(e.free_symbols for e in results)) - set(inputs))
-    given = {s: f"a{i}" for i, s in enumerate(inputs)}
+    given = {s: f"a{i}" for i, s in enumerate(distinct(inputs))}
     printer = _Printer(Names(Tape(), given))
     return _function(list(given.values()), [], [printer.doprint(e) for e in results])
 
