@@ -9,6 +9,7 @@ from undertow.decision import Freedom
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.motion import Event, Trajectory
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
+from undertow.objectives import objective_for
 from undertow.optimiser import Optimiser
 from undertow.plan import Plan
 from undertow.proposal import Budget, Proposal
@@ -46,6 +47,7 @@ __all__ = [
     "first_surface",
     "mechanisms",
     "modelling",
+    "objective_for",
     "placed_surface",
     "state_box",
     "surface_margins",

@@ -61,7 +61,7 @@ def library_picture(progress: Callable[[str, float], None] | None = None) -> byt
                 progress(name, index / len(LIBRARY))
             mechanism = build()
             loop = ClosedLoop(mechanism, MinimumEnergy())
-            x0 = mechanism.state(**mechanism.start)
+            x0 = mechanism.usual_start
             plan = Optimiser(loop).require(x0).plan
             assert plan is not None  # require() raises otherwise
             film = Film.of(loop.simulate(x0, plan), longest=loop.objective.horizon)

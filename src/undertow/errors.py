@@ -6,6 +6,9 @@ One root, :class:`UndertowError`; a few conditions below it. Every message reads
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 __all__ = [
     "ArtefactError",
     "CertificateError",
@@ -16,6 +19,7 @@ __all__ = [
     "SingularSurfaceError",
     "UndertowError",
     "UnstableSurfaceError",
+    "near",
 ]
 
 
@@ -80,3 +84,13 @@ class MissingExtraError(UndertowError, ImportError):
 
 class ArtefactError(UndertowError, OSError):
     """A file or folder could not be read or written."""
+
+
+def near(name: str, names: Iterable[str]) -> str:
+    """Return "Did you mean …?" with the names that are like a wrong one; nothing where none is.
+
+    >>> near("rotary_pendlum", ["cart_pendulum", "rotary_pendulum", "tora"])
+    'Did you mean rotary_pendulum or cart_pendulum?'
+    """
+    found = get_close_matches(name, list(names), n=3)
+    return f"Did you mean {' or '.join(found)}?" if found else ""

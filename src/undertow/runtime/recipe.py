@@ -7,20 +7,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 from undertow.cascade import Cascade, CascadeState
 from undertow.delay import weakened
-from undertow.errors import InvalidInputError, UndertowError
+from undertow.errors import InvalidInputError, UndertowError, near
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms.named import named
+from undertow.objectives import Goal, objective_for
 from undertow.plan import Plan
 from undertow.practice import (
     RESERVE,
+    default_gate,
     estimator_for,
-    gate_for,
-    goal_for,
     provable,
     reaching_for,
 )
@@ -34,6 +34,10 @@ from undertow.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 
 __all__ = ["Recipe"]
 
+#: Which words a recipe's objective is written in.  Logs before had no such number: their
+#: "energy" and "time" are "bench-energy" and "bench-time" now.
+WORDS = 2
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -46,9 +50,9 @@ class Recipe:
     parameters
         Values that differ from the library's, SI units.
     start
-        Initial state, (2n,); the mechanism's usual one by default.
+        Initial state, (2n,); the mechanism's usual one by default, where it has one.
     objective
-        ``"energy"`` or ``"time"``.
+        A word of :func:`undertow.objective_for`; ``"bench-energy"`` suits a rig.
     horizon
         Longest prediction, s.
     rig
@@ -73,7 +77,7 @@ class Recipe:
     mechanism: str = "rotary_pendulum"
     parameters: Mapping[str, float] = field(default_factory=dict)
     start: tuple[float, ...] = ()
-    objective: Literal["energy", "time"] = "energy"
+    objective: Goal = "bench-energy"
     horizon: float = 20.0
     rig: Literal["ideal", "realistic"] = "ideal"
     seed: int = 0
@@ -84,7 +88,14 @@ class Recipe:
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
-        """Refuse a period that is itself a stall."""
+        """Refuse an unknown objective, and a period that is itself a stall."""
+        if self.objective not in get_args(Goal):
+            raise InvalidInputError(
+                "objective of a run",
+                value=repr(self.objective),
+                limit=f"one of {', '.join(get_args(Goal))}",
+                remedy=near(str(self.objective), get_args(Goal)),
+            )
         stall = self.settings.stall
         if not 0 < self.period < stall:
             raise InvalidInputError(
@@ -106,7 +117,7 @@ class Recipe:
             return self.belief.check_state(self.start)
         if self.swing_up:
             return hanging(self.belief)
-        return self.belief.state(**self.belief.start)
+        return self.belief.usual_start
 
     @cached_property
     def cascade(self) -> Cascade:
@@ -114,10 +125,10 @@ class Recipe:
         estimator = self.make_estimator()
         return Cascade(
             self.belief,
-            goal_for(self.belief, self.objective, horizon=self.horizon),
+            objective_for(self.belief, self.objective, horizon=self.horizon),
             reaching_for(estimator),
             warm=Budget(self.evaluations, self.seconds),
-            gate=gate_for(estimator),
+            gate=default_gate(estimator),
             seed=self.seed,
         )
 
@@ -190,14 +201,17 @@ class Recipe:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values from which :meth:`from_dict` makes the recipe again."""
-        return asdict(self)
+        return asdict(self) | {"words": WORDS}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the recipe that was written to a log."""
+        """Return the recipe that was written to a log, an older one's words as they are now."""
+        known = dict(values)
+        if known.pop("words", None) is None and "objective" in known:
+            known["objective"] = f"bench-{known['objective']}"
         return cls(
             **{
-                **values,
+                **known,
                 "start": tuple(values["start"]),
                 "settings": Settings(**values["settings"]),
             }

@@ -19,7 +19,8 @@ from undertow.errors import InfeasibleError
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Objective
-from undertow.practice import Goal, estimator_for, gate_for, goal_for
+from undertow.objectives import Goal, objective_for
+from undertow.practice import default_gate, estimator_for
 from undertow.proposal import Budget
 from undertow.rig import Bench, srv02_rig
 from undertow.sliding import Surface
@@ -34,7 +35,7 @@ Progress = Callable[[str, float], None]
 BASE = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
 
 #: The two objectives of the paper, as they suit a bench.
-GOALS: tuple[Goal, ...] = ("energy", "time")
+GOALS: tuple[Goal, ...] = ("bench-energy", "bench-time")
 
 ROWS = ("base", "one-time", "cascade")
 
@@ -87,7 +88,7 @@ def controllers(
     re-optimisations may spend ``budget`` rollouts each.  Of the bench the gate knows what its
     estimator does.
     """
-    gate = gate_for(estimator_for(belief, bench))
+    gate = default_gate(estimator_for(belief, bench))
     cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate, seed=seed)
     start = cascade.start(x0)
     once = start[1].surface
@@ -175,10 +176,10 @@ def balance(
     parts = len(GOALS) * len(ROWS) + limits * 2 * len(ROWS)
     done = 0
     for goal in GOALS:
-        objective = goal_for(belief, goal)
+        objective = objective_for(belief, goal)
         made = controllers(belief, bench, objective, x0, budget=budget)
         for row in ROWS:
-            what = f"minimum {goal}, {row}"
+            what = f"{goal}, {row}"
             ideal[goal, row] = trial(
                 belief, ideal_bench, made[row], x0, seconds, 0, objective=objective
             )
@@ -191,7 +192,7 @@ def balance(
     found: dict[str, Limits] = {}
     for row in ROWS if limits else ():
         progress(f"catch limit, {row}", done / parts)
-        goal_objective = goal_for(belief, "energy")
+        goal_objective = objective_for(belief, "bench-energy")
         alone = catch_limit(belief, ideal_bench, row, goal_objective, seeds=1)
         progress(f"catch limit on the bench, {row}", (done + 1) / parts)
         real = catch_limit(belief, bench, row, goal_objective, seeds=seeds)

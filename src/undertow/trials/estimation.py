@@ -75,7 +75,7 @@ def _cost(estimator: Estimator, belief: Mechanism, calls: int = 5000) -> float:
 def compared(
     *, seeds: int = 5, angle: float = math.radians(20), seconds: float = 8.0
 ) -> list[EstimatorRow]:
-    """Balance the SRV02 with the first surface and each of the estimators.
+    """Balance the SRV02 with the designed surface and each of the estimators.
 
     The first row is what nothing but exact states would give: the model itself, sampled.
     """

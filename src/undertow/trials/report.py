@@ -15,9 +15,11 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow import results
+from undertow.cascade import problem_words
 from undertow.motion import Trajectory
+from undertow.objectives import objective_for
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
-from undertow.practice import ENERGY_PRICE, STATE_WEIGHT, TERMINAL
+from undertow.practice import default_gate, estimator_for
 from undertow.trials.balance import ROWS, BalanceResult
 from undertow.trials.estimation import EstimatorRow
 from undertow.trials.library import LibraryRow
@@ -60,10 +62,12 @@ def table(
 
 def balance_report(result: BalanceResult) -> RenderableType:
     """Return the tables of :func:`undertow.trials.balance.balance` for the terminal."""
-    units = {"energy": "V² s", "time": "s"}
+    belief = result.bench.mechanism
+    gate = default_gate(estimator_for(belief, result.bench))
+    titles = {"bench-energy": "Minimum energy", "bench-time": "Minimum time"}
     parts: list[RenderableType] = []
-    for goal, unit in units.items():
-        rows = []
+    for goal, title in titles.items():
+        objective, rows = objective_for(belief, goal), []
         for row in ROWS:
             runs, alone = result.outcomes[goal, row], result.ideal[goal, row]
             rows.append(
@@ -74,22 +78,18 @@ def balance_report(result: BalanceResult) -> RenderableType:
                     *(str(spread(runs, w)) for w in ("cost", "effort", "settled", "chatter")),
                 )
             )
-        formula = (
-            f"Φ = u² + {STATE_WEIGHT:g} xᵀx"
-            if goal == "energy"
-            else f"Φ = 1 + {ENERGY_PRICE:g} (u/u_max)²"
-        )
         parts.append(
             table(
-                f"Minimum {goal}, {formula}\nSRV02, φ(0) = {degrees(result.x0[1]):g}° at rest, "
+                f"{title}\nSRV02, φ(0) = {degrees(result.x0[1]):g}° at rest, "
                 f"{1e3 * result.bench.timing.period:g} ms, positions only",
                 (
-                    "", f"ideal\n{unit}", "balanced", f"cost\n{unit}", "∫u² dt\nV² s",
+                    "", f"ideal\n{objective.unit}", "balanced", f"cost\n{objective.unit}",
+                    "∫u² dt\nV² s",
                     "settled\ns", "chatter\nV/s",
                 ),
                 rows,
-                "mean ± standard deviation over the balanced runs; "
-                f"costs until ‖x‖ ≤ {TERMINAL:g}",
+                "mean ± standard deviation over the balanced runs\n"
+                f"{problem_words(belief, objective, gate)}",
             )
         )  # fmt: skip
     if result.limits:
@@ -153,9 +153,9 @@ def repeats_figure(result: BalanceResult) -> Figure:
             motion(mechanism, outcome.record, 2),
             {"color": colour, "linewidth": 0.8, "label": f"rig of seed {outcome.seed}"},
         )
-        for outcome, colour in zip(result.outcomes["time", "one-time"], colours, strict=False)
+        for outcome, colour in zip(result.outcomes["bench-time", "one-time"], colours, strict=False)
     ]
-    ideal = motion(mechanism, result.ideal["time", "one-time"].record, 2)
+    ideal = motion(mechanism, result.ideal["bench-time", "one-time"].record, 2)
     motions.append((ideal, {"color": "black", "linestyle": (0, (4, 2)), "label": "ideal rig"}))
     with style():
         figure = Figure(figsize=(6.4, 5.2), layout="constrained")
@@ -180,7 +180,7 @@ def comparison_figure(result: BalanceResult) -> Figure:
     }
     motions = []
     for row, look in looks.items():
-        outcome = result.outcomes["energy", row][0]
+        outcome = result.outcomes["bench-energy", row][0]
         ended = "" if outcome.balanced else ", lost"
         run = _until_fallen(motion(result.bench.mechanism, outcome.record, 2))
         motions.append((run, {**look, "label": row + ended}))
@@ -339,7 +339,7 @@ def estimator_report(rows: Sequence[EstimatorRow]) -> RenderableType:
         return f"{value:.{digits}f}" if np.isfinite(value) else "—"
 
     return table(
-        "Estimators on the SRV02 bench, first surface, positions measured only",
+        "Estimators on the SRV02 bench, designed surface, positions measured only",
         (
             "",
             "balanced",
