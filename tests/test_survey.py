@@ -127,7 +127,7 @@ def test_table_and_files_say_what_was_found() -> None:
     entries = [
         made("a", 0.05),
         made("b", 0.50, trials={survey.TRIALS[0].name: 1.02}),
-        made("c", first=math.inf, time=math.inf, cascade=math.inf, bound=math.nan),
+        made("c", designed=math.inf, time=math.inf, cascade=math.inf, bound=math.nan),
         made("d", 0.2),
     ]
     assert survey.median_gap(entries) == pytest.approx(0.2)
