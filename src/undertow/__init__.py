@@ -1,5 +1,10 @@
 """Undertow: optimal sliding-mode cascade control of underactuated mechanisms."""
 
+from undertow.interrupt import at_once
+
+at_once()
+
+# ruff: noqa: E402 - what follows takes a second to import
 from math import radians as deg
 
 from undertow import mechanisms, modelling

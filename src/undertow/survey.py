@@ -142,6 +142,7 @@ def survey(
     seed: int = 0,
     bounds: bool = True,
     progress: Callable[[str, float], None] | None = None,
+    done: Callable[[Entry], None] | None = None,
 ) -> tuple[Entry, ...]:
     """Bring every mechanism from its listed start to its target.
 
@@ -160,21 +161,27 @@ def survey(
         trials.
     progress
         Called with what is being done and the part that is done.
+    done
+        Called with each line as it is finished: what an interrupted survey leaves.
 
     Raises
     ------
     InvalidInputError
-        For an unknown mechanism or goal, before any work.
+        For an unknown mechanism or goal, or one without a usual start, before any work.
     MissingExtraError
         When bounds are asked for without CasADi.
     """
     chosen = [named(name) for name in (LIBRARY if names is None else names)]
+    objectives = [objective_for(mechanism, goal, horizon=horizon) for mechanism in chosen]
+    for mechanism, objective in zip(chosen, objectives, strict=True):
+        objective.check_start(mechanism, mechanism.usual_start)
     entries = []
-    for index, mechanism in enumerate(chosen):
+    for index, (mechanism, objective) in enumerate(zip(chosen, objectives, strict=True)):
         if progress is not None:
             progress(mechanism.name, index / len(chosen))
-        objective = objective_for(mechanism, goal, horizon=horizon)
         entries.append(survey_one(mechanism, objective, seed=seed, bounds=bounds))
+        if done is not None:
+            done(entries[-1])
     return tuple(entries)
 
 

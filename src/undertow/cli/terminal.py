@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,13 +12,14 @@ from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
 from undertow import results
 from undertow.errors import InvalidInputError, UndertowError, near
+from undertow.interrupt import INTERRUPTED
 
 __all__ = [
     "AnyName",
@@ -32,6 +34,7 @@ __all__ = [
     "Settings",
     "Start",
     "app",
+    "as_text",
     "check_control",
     "examples",
     "progress_bar",
@@ -132,7 +135,7 @@ def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
             return command(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None
         except UndertowError as error:
             typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
             typer.echo(" ".join(str(error).split()), err=True)
@@ -184,6 +187,13 @@ def check_control(word: str | None, words: Sequence[str]) -> None:
         limit=f"one of {', '.join(words)}",
         remedy=both if word == "first" else near(word, words),
     )
+
+
+def as_text(shown: RenderableType) -> bytes:
+    """Return what a terminal of 100 columns would show, as plain text."""
+    console = Console(width=100, highlight=False, file=io.StringIO())
+    console.print(shown)
+    return str(console.file.getvalue()).encode()  # type: ignore[attr-defined]
 
 
 def say(console: Console, text: str) -> None:

@@ -206,13 +206,19 @@ class Recipe:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Return the recipe that was written to a log, an older one's words as they are now."""
-        known = dict(values)
-        if known.pop("words", None) is None and "objective" in known:
-            known["objective"] = f"bench-{known['objective']}"
+        values = _in_words_of_now(values)
         return cls(
             **{
-                **known,
+                **values,
                 "start": tuple(values["start"]),
                 "settings": Settings(**values["settings"]),
             }
         )
+
+
+def _in_words_of_now(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a recipe's values, the objective of an older one by the word that it has now."""
+    known = dict(values)
+    if known.pop("words", None) is None and "objective" in known:
+        known["objective"] = f"bench-{known['objective']}"
+    return known

@@ -147,6 +147,7 @@ def balance(
     budget: int = 256,
     limits: bool = True,
     progress: Progress = lambda _what, _fraction: None,
+    begun: Callable[[BalanceResult], None] = lambda _result: None,
 ) -> BalanceResult:
     """Run the three controllers for both objectives on every rig.
 
@@ -166,6 +167,9 @@ def balance(
         Whether to search for the catch limits.
     progress
         Called with what is being done and the part done.
+    begun
+        Called once, with the result that fills as the runs are made: what is left of it where
+        they are interrupted.
     """
     bench = srv02_rig() if bench is None else bench
     belief = bench.mechanism
@@ -173,6 +177,9 @@ def balance(
     ideal_bench = undisturbed(belief, bench.timing.period)
     outcomes: dict[tuple[str, str], list[Outcome]] = {}
     ideal: dict[tuple[str, str], Outcome] = {}
+    found: dict[str, Limits] = {}
+    result = BalanceResult(bench, np.asarray(x0), seconds, seeds, outcomes, ideal, found)
+    begun(result)
     parts = len(GOALS) * len(ROWS) + limits * 2 * len(ROWS)
     done = 0
     for goal in GOALS:
@@ -189,7 +196,6 @@ def balance(
                 runs.append(trial(belief, bench, made[row], x0, seconds, seed, objective=objective))
             outcomes[goal, row] = runs
             done += 1
-    found: dict[str, Limits] = {}
     for row in ROWS if limits else ():
         progress(f"catch limit, {row}", done / parts)
         goal_objective = objective_for(belief, "bench-energy")
@@ -198,4 +204,4 @@ def balance(
         real = catch_limit(belief, bench, row, goal_objective, seeds=seeds)
         found[row] = Limits(alone, real)
         done += 2
-    return BalanceResult(bench, np.asarray(x0), seconds, seeds, outcomes, ideal, found)
+    return result

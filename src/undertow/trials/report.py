@@ -17,10 +17,12 @@ from rich.text import Text
 from undertow import results
 from undertow.cascade import problem_words
 from undertow.motion import Trajectory
-from undertow.objectives import objective_for
+from undertow.objectives import Goal, objective_for
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
 from undertow.practice import default_gate, estimator_for
-from undertow.trials.balance import ROWS, BalanceResult
+from undertow.rig import Bench, srv02_rig
+from undertow.runtime import Recipe
+from undertow.trials.balance import GOALS, ROWS, BalanceResult
 from undertow.trials.estimation import EstimatorRow
 from undertow.trials.library import LibraryRow
 from undertow.trials.robustness import FACTORS, SINGLE, RobustnessResult
@@ -60,6 +62,16 @@ def table(
     return out
 
 
+def _problem(word: Goal, bench: Bench | None = None, horizon: float = 60.0) -> str:
+    """Return what was minimised and who admitted surfaces, for a table of several mechanisms."""
+    bench = srv02_rig() if bench is None else bench
+    belief = bench.mechanism
+    objective = replace(objective_for(belief, word, horizon=horizon), unit="")
+    gate = default_gate(estimator_for(belief, bench))
+    words = problem_words(belief, objective, gate)
+    return f"{words}; each within 95 % of the travel that it declares"
+
+
 def balance_report(result: BalanceResult) -> RenderableType:
     """Return the tables of :func:`undertow.trials.balance.balance` for the terminal."""
     belief = result.bench.mechanism
@@ -68,7 +80,7 @@ def balance_report(result: BalanceResult) -> RenderableType:
     parts: list[RenderableType] = []
     for goal, title in titles.items():
         objective, rows = objective_for(belief, goal), []
-        for row in ROWS:
+        for row in (row for row in ROWS if (goal, row) in result.outcomes):
             runs, alone = result.outcomes[goal, row], result.ideal[goal, row]
             rows.append(
                 (
@@ -78,6 +90,8 @@ def balance_report(result: BalanceResult) -> RenderableType:
                     *(str(spread(runs, w)) for w in ("cost", "effort", "settled", "chatter")),
                 )
             )
+        if not rows:  # interrupted before
+            continue
         parts.append(
             table(
                 f"{title}\nSRV02, φ(0) = {degrees(result.x0[1]):g}° at rest, "
@@ -123,11 +137,11 @@ def balance_files(result: BalanceResult) -> dict[str, bytes]:
         for (goal, row), runs in result.outcomes.items()
         for o in runs
     ]
-    return {
-        "balance.csv": results.to_csv(header, rows),
-        "figure-3-bench.png": figure_bytes(repeats_figure(result)),
-        "figure-4-bench.png": figure_bytes(comparison_figure(result)),
-    }
+    files = {"balance.csv": results.to_csv(header, rows)}
+    if len(result.outcomes) == len(GOALS) * len(ROWS):  # not interrupted
+        files["figure-3-bench.png"] = figure_bytes(repeats_figure(result))
+        files["figure-4-bench.png"] = figure_bytes(comparison_figure(result))
+    return files
 
 
 def _finite(*values: float) -> list[float | None]:
@@ -247,7 +261,7 @@ def library_report(rows: Sequence[LibraryRow]) -> RenderableType:
         ],
         "m: inputs; ε: boundary layer; held: to the end, without a safe stop; "
         "admitted: surfaces; limits/s: total variation of the input that varies most, by its "
-        "limit",
+        f"limit\n{_problem('bench-energy', horizon=Recipe.horizon)}",
     )
 
 
@@ -273,6 +287,7 @@ def engine_report(found: Sequence[EngineResult]) -> RenderableType:
         "MuJoCo as the truth: the cascade from the listed starts, no retuning",
         ("", "balanced", "settled\ns", "positions at the end", "surfaces\nadmitted"),
         rows,
+        _problem("effort", Bench(found[0].mechanism)) if found else "",
     )
 
 
@@ -305,7 +320,7 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             ),
             rows,
             f"mean ± standard deviation over the rigs that all of them balanced: {sum(both)}\n"
-            "caught: the pendulum is up, wherever the arm is",
+            f"caught: the pendulum is up, wherever the arm is\n{_problem('bench-energy')}",
         )
     ]
     if result.breaking:
