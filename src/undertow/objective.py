@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -172,10 +172,11 @@ def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
     return tuple(bounded(name, bound) for name, bound in bounds.items())
 
 
-def travel_box(mechanism: Mechanism) -> tuple[Constraint, ...]:
+def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constraint, ...]:
     """Return the ranges of travel that a mechanism declares, as constraints: 95 % of each side.
 
-    The equations know no end stop; what is planned keeps clear of it all the same.
+    The equations know no end stop; what is planned keeps clear of it all the same.  ``but`` names
+    coordinates to leave out.
 
     Raises
     ------
@@ -190,13 +191,13 @@ def travel_box(mechanism: Mechanism) -> tuple[Constraint, ...]:
     """
     found = []
     for index, c in enumerate(mechanism.coordinates):
-        if math.isinf(c.low) and math.isinf(c.high):
+        if c.name in but or (math.isinf(c.low) and math.isinf(c.high)):
             continue
-        if not c.low < 0 < c.high:
+        if not c.low <= 0 <= c.high:
             raise InvalidInputError(
                 f"travel of '{c.name}' that '{mechanism.name}' declares",
                 value=f"[{c.low:g}, {c.high:g}] {c.unit}",
-                limit="around the target, low < 0 < high",
+                limit="around the target, low ≤ 0 ≤ high",
                 remedy="Move the target into it, or let the objective have travel=False",
             )
         low, high = TRAVEL * c.low, TRAVEL * c.high
@@ -281,9 +282,8 @@ class Objective:
             For a declared range that does not hold the target.
         """
         own = tuple(c for c in self.constraints if not c.source)
-        bounded = {c.state for c in own}
-        declared = travel_box(mechanism) if self.travel else ()
-        constraints = own + tuple(c for c in declared if c.state not in bounded)
+        declared = travel_box(mechanism, {c.state for c in own}) if self.travel else ()
+        constraints = own + declared
         return self if constraints == self.constraints else replace(self, constraints=constraints)
 
     def meaning(self, mechanism: Mechanism) -> str:
