@@ -120,7 +120,7 @@ def test_version_and_bare_call() -> None:
         (("simulate", RIG, "--surface", "lambda_a=0.5 alpha_u=5 lambda_u=10"), "-0.5", "> 0"),
         (("simulate", RIG, "--surface", "lambda_a=-5 alpha_u=5 lambda_u=10"), "-3", "> 0"),
         (
-            ("simulate", RIG, "--start", "phi=60deg", "--control", "first"),
+            ("simulate", RIG, "--start", "phi=60deg", "--control", "designed"),
             "-0.2",
             "> 0",
         ),

@@ -66,7 +66,7 @@ def test_costs_fall_from_first_surface_to_cascade(name: str) -> None:
     """Claim: optimising once never costs more than the first surface, the cascade not more yet."""
     line = entry(name)
     assert line.cascade <= line.one_time * (1 + 1e-3)
-    assert line.one_time <= line.first
+    assert line.one_time <= line.designed
     assert math.isfinite(line.time)
     assert line.radius <= 0.01 + 1e-9
     assert math.isnan(line.bound)
@@ -115,7 +115,7 @@ def test_large_gaps_are_looked_into() -> None:
 
 def made(name: str = "a", gap: float = 0.05, **more: object) -> survey.Entry:
     values: dict[str, object] = {
-        "name": name, "n": 2, "m": 1, "start": "x = 1 m", "unit": "N² s", "first": 3.0,
+        "name": name, "n": 2, "m": 1, "start": "x = 1 m", "unit": "N² s", "designed": 3.0,
         "one_time": 2.0, "cascade": 1.0 + gap, "time": 4.0, "radius": 0.01, "bound": 1.0,
         "seconds": 0.5, "trials": {},
     }  # fmt: skip
@@ -127,7 +127,7 @@ def test_table_and_files_say_what_was_found() -> None:
     entries = [
         made("a", 0.05),
         made("b", 0.50, trials={survey.TRIALS[0].name: 1.02}),
-        made("c", first=math.inf, time=math.inf, cascade=math.inf, bound=math.nan),
+        made("c", designed=math.inf, time=math.inf, cascade=math.inf, bound=math.nan),
         made("d", 0.2),
     ]
     assert survey.median_gap(entries) == pytest.approx(0.2)

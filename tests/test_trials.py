@@ -16,7 +16,8 @@ from undertow.errors import ArtefactError
 from undertow.estimators import Record
 from undertow.estimators.compensation import take_off
 from undertow.inner_loop import InnerLoop
-from undertow.practice import estimator_for, goal_for
+from undertow.objectives import objective_for
+from undertow.practice import estimator_for
 from undertow.rig import Friction, srv02_rig
 from undertow.trials.balance import controllers
 from undertow.trials.ledger import Ledger
@@ -34,7 +35,7 @@ def arm() -> ut.Mechanism:
 
 def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
     """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
-    x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
+    x0, goal = arm.state(phi=ut.deg(35)), objective_for(arm, "bench-energy")
     made = controllers(arm, undisturbed(arm), goal, x0, budget=128)
     costs = {
         row: trial(arm, undisturbed(arm), made[row], x0, 8.0, 0, objective=goal).cost
@@ -44,7 +45,7 @@ def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mecha
 
 
 def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism) -> None:
-    x0, goal = arm.state(phi=ut.deg(35)), goal_for(arm, "energy")
+    x0, goal = arm.state(phi=ut.deg(35)), objective_for(arm, "bench-energy")
     made = controllers(arm, srv02_rig(), goal, x0, budget=128)
     runs = {
         row: [trial(arm, srv02_rig(), made[row], x0, 8.0, s, objective=goal) for s in range(3)]
@@ -56,7 +57,9 @@ def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism)
 
 def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None:
     x0 = arm.state(phi=0.4)
-    cascade = ut.Cascade(arm, goal_for(arm, "energy"), warm=ut.Budget(64), cold=ut.Budget(256))
+    cascade = ut.Cascade(
+        arm, objective_for(arm, "bench-energy"), warm=ut.Budget(64), cold=ut.Budget(256)
+    )
     start = cascade.start(x0)
     records = [
         trial(arm, srv02_rig(), lambda _: CascadeSteering(cascade, start), x0, 1.0, 7).record
@@ -133,7 +136,7 @@ def test_a_clipped_regulator_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
 
 def test_predictive_control_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
     pytest.importorskip("casadi")
-    make = predictive(arm, goal_for(arm, "energy"))
+    make = predictive(arm, objective_for(arm, "bench-energy"))
     run = trial(arm, undisturbed(arm), make, arm.state(phi=ut.deg(30)), 4.0, 0)
     assert run.caught
     assert np.abs(run.record.u).max() <= 15.0

@@ -1,5 +1,10 @@
 """Undertow: optimal sliding-mode cascade control of underactuated mechanisms."""
 
+from undertow.interrupt import at_once
+
+at_once()
+
+# ruff: noqa: E402 - what follows takes a second to import
 from math import radians as deg
 
 from undertow import mechanisms, modelling
@@ -9,6 +14,7 @@ from undertow.decision import Freedom
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.motion import Event, Trajectory
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
+from undertow.objectives import objective_for
 from undertow.optimiser import Optimiser
 from undertow.plan import Plan
 from undertow.proposal import Budget, Proposal
@@ -46,6 +52,7 @@ __all__ = [
     "first_surface",
     "mechanisms",
     "modelling",
+    "objective_for",
     "placed_surface",
     "state_box",
     "surface_margins",

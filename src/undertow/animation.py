@@ -63,6 +63,8 @@ class Film:
         Angle and radius of each disc, (F, 2); empty for other parts.
     tip
         The tip in the plane of the view, (F, 2), m.
+    whole
+        How long the motion takes until it has settled, s: longer than the film where that is cut.
     """
 
     mechanism: Mechanism
@@ -73,6 +75,7 @@ class Film:
     points: tuple[FloatArray, ...]
     angles: tuple[FloatArray, ...]
     tip: FloatArray
+    whole: float
 
     @classmethod
     def of(
@@ -111,7 +114,8 @@ class Film:
         mechanism = trajectory.mechanism
         drawn = sketch(mechanism) if figure is None else figure
         start = trajectory.t[0]
-        end = min(_settled(trajectory) - start, longest * speed)
+        whole = float(_settled(trajectory) - start)
+        end = min(whole, longest * speed)
         count = max(2, math.ceil(end * fps / speed) + 1)
         t = start + np.arange(count) * speed / fps
         x = np.stack([np.interp(t, trajectory.t, column) for column in trajectory.x.T], axis=1)
@@ -121,8 +125,19 @@ class Film:
         points, angles, tip = place(q)
         flat = tuple(_project(p, drawn.view) for p in points)
         return cls(
-            mechanism, drawn, t, q, trajectory.u[index], flat, angles, _project(tip, drawn.view)
-        )
+            mechanism, drawn, t, q, trajectory.u[index], flat, angles,
+            _project(tip, drawn.view), whole,
+        )  # fmt: skip
+
+    @property
+    def span(self) -> str:
+        """Which part of the motion is shown, in words.
+
+        What settles sooner than it ends is shown until then.
+        """
+        shown = float(self.t[-1] - self.t[0])
+        cut = self.whole - shown > self.t[1] - self.t[0]
+        return f"0 to {shown:.3g} s" + (f" of {self.whole:.3g} s" if cut else "")
 
     @property
     def window(self) -> tuple[float, float, float, float]:
@@ -189,7 +204,7 @@ class Film:
         axes.set_aspect("equal")
         axes.axis("off")
         if words:
-            axes.set_title(self.mechanism.name.replace("_", " "))
+            axes.set_title(f"{self.mechanism.name.replace('_', ' ')}, {self.span}")
 
 
 #: Positions (F, n) to points of each part (F, k, 3), angle and radius (F, 2), tip (F, 3).
@@ -276,8 +291,9 @@ def gif(film: Film, *, width: float = 4.2, dpi: int = 72) -> bytes:
             film.draw(scene, k)
             film.frame(scene, words=False)
             scene.text(
-                0.02, 0.98, f"{film.t[k] - film.t[0]:5.2f} s", transform=scene.transAxes, va="top"
-            )
+                0.02, 0.98, f"{film.t[k] - film.t[0]:5.2f} s ({film.span})",
+                transform=scene.transAxes, va="top",
+            )  # fmt: skip
             gauge.clear()
             _gauge(gauge, film, k, bar)
             canvas.draw()

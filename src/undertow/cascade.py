@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +30,17 @@ from undertow.stability import check_surface, stability_margin
 from undertow.surface import ReachingLaw, Surface
 from undertow.verdict import Verdict
 
-__all__ = ["Admission", "Cascade", "CascadeState", "Gate", "Run", "Update", "cost_gate"]
+__all__ = [
+    "Admission",
+    "Cascade",
+    "CascadeState",
+    "Gate",
+    "Run",
+    "Update",
+    "cost_gate",
+    "gate_words",
+    "problem_words",
+]
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,11 @@ TAIL = 2e-3
 
 #: Largest step times rate of the boundary layer in the optimiser's rollouts.
 RESOLVED = 1.0
+
+#: How far positions may be off what the plan in use predicted for them before an admission says
+#: so: this much, rad or m, and this part of how far the plan was to move them meanwhile.  A target
+#: that jumps shows in positions at once; what a model does not know shows in velocities first.
+JUMP, PART = 0.1, 0.5
 
 Gate = Callable[[ClosedLoop, Plan, Plan, FloatArray, float], Admission]
 
@@ -90,13 +106,35 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
     return Admission(True, "stable, feasible, cost not raised", float(new_cost))
 
 
+def gate_words(gate: Gate) -> str:
+    """Return what a gate asks for, in words: its own ``words``, or else its name.
+
+    >>> gate_words(cost_gate)
+    'stable, feasible, cost not raised'
+    """
+    if gate is cost_gate:
+        return "stable, feasible, cost not raised"
+    return getattr(gate, "words", "") or getattr(gate, "__name__", type(gate).__name__)
+
+
+def problem_words(mechanism: Mechanism, objective: Objective, gate: Gate | None = None) -> str:
+    """Return in one line what a word for an objective meant, and who admits what is found.
+
+    >>> import undertow as ut
+    >>> print(problem_words(ut.mechanisms.pendubot(), ut.MinimumTime(), cost_gate))
+    objective time: ∫ 1 dt, s, to ‖x‖ ≤ 0.01 within 60 s; gate: stable, feasible, cost not raised
+    """
+    asked = "" if gate is None else f"; gate: {gate_words(gate)}"
+    return f"objective {objective.meaning(mechanism)}{asked}"
+
+
 @dataclass(frozen=True)
 class CascadeState:
     """What the cascade remembers between steps.
 
     ``plan`` is in use since the time ``since``; ``sequence`` is the number of the last
     proposal considered; ``predicted`` is the predicted cost J̃_k at the last decision;
-    ``scale`` that of the first.
+    ``scale`` that of the first; ``x`` the state at ``since``, empty where it is not known.
     """
 
     plan: Plan
@@ -104,6 +142,7 @@ class CascadeState:
     predicted: float = math.inf
     scale: float = 0.0
     since: float = 0.0
+    x: tuple[float, ...] = ()
 
     @property
     def surface(self) -> Surface:
@@ -136,6 +175,11 @@ class Update:
         """The surface in use after the decision."""
         return self.plan.surfaces[0]
 
+    def __repr__(self) -> str:
+        """Show when, what was decided and why."""
+        decided = "admitted" if self.admission.accepted else "kept"
+        return f"Update(t={self.t:g} s, {decided}: {self.admission.reason})"
+
 
 @dataclass(frozen=True, eq=False)
 class Run:
@@ -152,9 +196,18 @@ class Run:
     trajectory: Trajectory
     updates: tuple[Update, ...]
 
+    def __repr__(self) -> str:
+        """Show how it ended."""
+        admitted = sum(update.admission.accepted for update in self.updates)
+        return (
+            f"Run({self.trajectory.mechanism.name}, {self.trajectory.event.name.lower()} at "
+            f"{self.time:.4g} s, cost {self.cost:.6g}, {len(self.updates)} decisions, "
+            f"{admitted} admitted)"
+        )
+
     @property
     def cost(self) -> float:
-        """Total cost of the motion."""
+        """Total cost of the motion; that of its trajectory is ``trajectory.total``."""
         return self.trajectory.total
 
     @property
@@ -202,7 +255,8 @@ class Cascade:
     mechanism
         The controller's belief.
     objective
-        What is best.
+        What is best; the travel that the mechanism declares joins its constraints, see
+        :meth:`undertow.Objective.on`.
     reaching
         Reaching law of the inner loop.
     period
@@ -222,7 +276,8 @@ class Cascade:
         Differences in predicted cost below this part of the first one are not worth a
         search.
     gate
-        Admission gate.
+        Admission gate: with exact states :func:`cost_gate`, the default everywhere.  For a rig,
+        its estimator and its delays :func:`undertow.practice.default_gate` adds margins.
     seed
         Seed of the optimiser.
 
@@ -260,6 +315,7 @@ class Cascade:
         """Check all settings before any work starts."""
         require_mechanism("mechanism of a cascade", self.mechanism)
         require_objective(self.objective)
+        object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         if TIME in self.mechanism.force.free_symbols:
             raise InvalidInputError(
                 f"belief '{self.mechanism.name}' of a cascade",
@@ -323,10 +379,23 @@ class Cascade:
             loop = replace(loop, step=2 * self.step)
         return Optimiser(loop, self.first, self.cold, self.warm, self.freedom, seed=self.seed)
 
+    def __repr__(self) -> str:
+        """Show what is controlled, for what, and how often it is planned anew."""
+        return f"Cascade({self.mechanism.name}, {self.objective.name}, period={self.period:g} s)"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it was made from: a copy compiles, or finds, the same kernels."""
+        made = {field.name: getattr(self, field.name) for field in fields(self)}
+        return made | {"objective": self.objective.written(self.mechanism)}
+
     # -- the state machine ----------------------------------------------------------------
 
     def start(self, x: ArrayLike) -> tuple[CascadeState, Proposal]:
-        """Run the first, global optimisation.
+        """Run the first, global optimisation from x: at the start, and again after a jump.
+
+        A target of one's own is moved by taking it off the state: x is always the way to the
+        target.  When it jumps, so does x, and what was planned is for another task: call this
+        again.
 
         Raises
         ------
@@ -337,7 +406,8 @@ class Cascade:
         if not math.isfinite(cost):  # large steps were too hopeful: small ones throughout
             exact = replace(self.optimiser, loop=self.loop)
             proposal, plan, cost = self._global(exact, x)
-        return CascadeState(plan, 0, cost, cost), proposal
+        begun = CascadeState(plan, 0, cost, cost, x=_kept(self.mechanism.check_state(x)))
+        return begun, proposal
 
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
         """Put the first plan before the gate: there is no other, so it is used all the same.
@@ -361,14 +431,37 @@ class Cascade:
         return score if score < INADMISSIBLE else math.inf
 
     def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
-        """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits."""
+        """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits.
+
+        It follows the plan in use wherever x is: after a jump of the target, too, which asks for
+        :meth:`start`.
+        """
         surface, law = state.plan.at(t - state.since)
         return SlidingModeLaw(self.mechanism, surface, law or self.reaching)(t, x)
 
     def propose(
         self, state: CascadeState, x: ArrayLike, t: float = 0.0, horizon: float | None = None
     ) -> Proposal:
-        """Slow step: re-optimise from x, warm-started; an exception becomes a status."""
+        """Slow step: re-optimise from x, warm-started; an exception becomes a status.
+
+        Parameters
+        ----------
+        state
+            Memory of the cascade.
+        x
+            State that the plan is for, (2n,).
+        t
+            When that is, s.
+        horizon
+            Time that is left, s.  Without it the plan looks the whole of the objective's horizon
+            ahead, each time anew: a task that is to be done by a time needs what is left until
+            then, or its end recedes for ever and least energy puts off arriving.
+
+        Notes
+        -----
+        The search is warm: it looks near the plan in use.  Where the state has jumped, or the
+        target, the optimum may be far from it: :meth:`consider` says so, :meth:`start` finds it.
+        """
         sequence = state.sequence + 1
         try:
             return self.optimiser.propose(
@@ -392,7 +485,13 @@ class Cascade:
     ) -> tuple[CascadeState, Admission]:
         """Pass a proposal through the gate; the last good surface stays unless it is admitted.
 
-        Proposals that are not newer than the last one considered are refused.
+        Proposals that are not newer than the last one considered are refused.  ``horizon`` is
+        the time that is left, s, as for :meth:`propose`.
+
+        Where the positions of x are farther from those that the plan in use predicted for this
+        moment than ``JUMP`` = 0.1 rad or m and ``PART`` = half of the way that it was to move them
+        since, the admission's reason says so: after a jump the cost is compared with that of a plan
+        for another task, and "cost not raised" is little.
         """
         span = self.objective.horizon if horizon is None else horizon
         current = self.mechanism.check_state(x)
@@ -401,20 +500,35 @@ class Cascade:
             return state, Admission(False, stale, state.predicted)
         t = proposal.computed_for
         old = state.at(t)
-        state = replace(state, plan=old, since=t, sequence=proposal.sequence)
+        jump = self._jump(state, t, current)
+        state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
         if proposal.plan is None:
             kept = self.gate(self.loop, old, old, current, span)
-            reason = f"{proposal.status}: {proposal.message or 'no surface'}"
+            reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
             admission = replace(kept, accepted=False, reason=reason)
             return replace(state, predicted=kept.cost), admission
         admission = self.gate(self.loop, old, proposal.plan, current, span)
+        admission = replace(admission, reason=f"{admission.reason}{jump}")
         plan = proposal.plan if admission.accepted else old
         return replace(state, plan=plan, predicted=admission.cost), admission
+
+    def _jump(self, state: CascadeState, t: float, x: FloatArray) -> str:
+        """Say how far a state is off what the plan in use predicted for it, where it is far."""
+        if not state.x or not 0 <= t - state.since <= self.objective.horizon:
+            return ""
+        span = round((t - state.since) / self.step) * self.step
+        ahead = self.loop.batch(state.x, state.plan, duration=span, terminal=0.0).x[0]
+        n = self.mechanism.n
+        off = float(np.linalg.norm((x - ahead)[:n]))
+        moved = float(np.linalg.norm((ahead - state.x)[:n]))
+        if not off > JUMP + PART * moved:  # a prediction that ended in NaN says nothing
+            return ""
+        return f"; the state is {off:.3g} off the plan's prediction: after a jump, call start again"
 
     def _start_state(self, x0: ArrayLike | None, names: dict[str, float]) -> FloatArray:
         """Return the initial state that was given one way or the other."""
         if x0 is None:
-            return self.mechanism.state(**(names or self.mechanism.start))
+            return self.mechanism.state(**names) if names else self.mechanism.usual_start
         if names:
             raise InvalidInputError(
                 "initial state",
@@ -449,7 +563,7 @@ class Cascade:
         ----------
         x0
             Initial state, (2n,); or give its non-zero entries by name (``phi=0.7``).
-            With neither, the mechanism's usual ``start``.
+            With neither, the mechanism's usual ``start``, where it has one.
         plant
             The truth; the belief by default.
         duration
@@ -462,7 +576,7 @@ class Cascade:
         InfeasibleError
             When the first optimisation finds no admissible surface.
         InvalidInputError
-            For an unknown state name or a state that is not finite.
+            For an unknown state name, a state that is not finite, or no start at all.
         """
         x = self._start_state(x0, state)
         total = self.objective.horizon if duration is None else duration
@@ -498,3 +612,8 @@ class Cascade:
             if pieces[-1].event != Event.HORIZON:
                 break
         return Run(Trajectory.join(pieces), tuple(updates))
+
+
+def _kept(x: FloatArray) -> tuple[float, ...]:
+    """Return a state as plain numbers; several of them are none."""
+    return tuple(x.tolist()) if x.ndim == 1 else ()

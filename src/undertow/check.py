@@ -77,6 +77,12 @@ class MechanismReport:
         """Return the first condition whose name starts with ``name``."""
         return next(check for check in self.checks if check.name.startswith(name))
 
+    def __repr__(self) -> str:
+        """Show how many conditions hold, and those that fail; ``print`` shows all of them."""
+        failed = "".join(f"; fails: {check.name}" for check in self.failures)
+        held = len(self.checks) - len(self.failures)
+        return f"MechanismReport({self.mechanism}, {held} of {len(self.checks)} hold{failed})"
+
     def __str__(self) -> str:
         """One line for each condition."""
         return "\n".join([f"{self.mechanism}:", *(f"  {check}" for check in self.checks)])

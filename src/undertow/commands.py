@@ -17,7 +17,6 @@ from undertow.animation import Film, gif, still
 from undertow.derivation import derivation
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import LIBRARY
-from undertow.motion import Trajectory
 from undertow.objective import MinimumEnergy
 from undertow.optimiser import Optimiser
 from undertow.plot import figure_bytes, style
@@ -61,7 +60,7 @@ def library_picture(progress: Callable[[str, float], None] | None = None) -> byt
                 progress(name, index / len(LIBRARY))
             mechanism = build()
             loop = ClosedLoop(mechanism, MinimumEnergy())
-            x0 = mechanism.state(**mechanism.start)
+            x0 = mechanism.usual_start
             plan = Optimiser(loop).require(x0).plan
             assert plan is not None  # require() raises otherwise
             film = Film.of(loop.simulate(x0, plan), longest=loop.objective.horizon)
@@ -80,21 +79,19 @@ def derivation_files(mechanism: Mechanism) -> dict[str, bytes]:
     }
 
 
-def animation_files(
-    request: Mapping[str, object], motion: Trajectory, *, speed: float = 1.0, longest: float = 8.0
-) -> dict[str, bytes]:
-    """Return a motion as ``<name>.gif`` and ``<name>.png``, with ``<name>.json``."""
-    film = Film.of(motion, speed=speed, longest=longest)
+def animation_files(request: Mapping[str, object], film: Film) -> dict[str, bytes]:
+    """Return a film as ``<name>.gif`` and ``<name>.png``, with ``<name>.json``."""
     with style():
         figure = Figure(figsize=(4.5, 4.5))
         still(figure.add_subplot(), film)
         picture = figure_bytes(figure)
-    name = motion.mechanism.name
+    name = film.mechanism.name
     manifest = {
         "what": "undertow animate",
         "versions": results.versions(),
         "request": {k: str(v) if isinstance(v, Path) else v for k, v in request.items()},
         "frames": len(film.t),
+        "shows": film.span,
     }
     return {
         f"{name}.gif": gif(film),

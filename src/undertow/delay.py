@@ -12,13 +12,13 @@ encoder, into input: of a near-singular surface more than the actuator has.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
 
-from undertow.cascade import Admission, Gate, cost_gate
+from undertow.cascade import Admission, cost_gate, gate_words
 from undertow.errors import InvalidInputError
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
@@ -28,7 +28,16 @@ from undertow.rollout import ClosedLoop
 from undertow.stability import linearise
 from undertow.surface import ReachingLaw, Surface
 
-__all__ = ["bench_gate", "delay_gate", "delay_margin", "feedback", "noise_share", "weakened"]
+__all__ = [
+    "BenchGate",
+    "DelayGate",
+    "bench_gate",
+    "delay_gate",
+    "delay_margin",
+    "feedback",
+    "noise_share",
+    "weakened",
+]
 
 
 def feedback(law: InnerLoop) -> FloatArray:
@@ -152,7 +161,42 @@ def noise_share(
     return float((np.sqrt(np.maximum(variances, 0.0)) / mechanism.input_limits).max())
 
 
-def delay_gate(least: float, period: float = 0.001) -> Gate:
+@dataclass(frozen=True)
+class DelayGate:
+    """The gate that :func:`delay_gate` returns; a plain record, so it can be pickled."""
+
+    least: float
+    period: float
+
+    @property
+    def words(self) -> str:
+        """What it asks for."""
+        return f"{gate_words(cost_gate)}, bears {1e3 * self.least:.3g} ms of delay"
+
+    def __call__(
+        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float
+    ) -> Admission:
+        """Decide on a plan, as :func:`undertow.cascade.cost_gate` does."""
+        laws = new.reaching or (loop.reaching,) * len(new.surfaces)
+        if new is not old and new != old:
+            for surface, law in zip(new.surfaces, laws, strict=True):
+                margin = delay_margin(
+                    loop.mechanism, surface, law, period=self.period, longest=self.least
+                )
+                if margin < self.least - 1e-9:
+                    wanted = f"wanted {1e3 * self.least:.3g} ms"
+                    reason = f"bears {1e3 * margin:.3g} ms of delay, {wanted}"
+                    return _refused(loop, old, x, horizon, reason)
+        return cost_gate(loop, old, new, x, horizon)
+
+
+def _refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: str) -> Admission:
+    """Return a refusal with the cost of the plan that stays."""
+    score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
+    return Admission(False, why, score if score < INADMISSIBLE else math.inf)
+
+
+def delay_gate(least: float, period: float = 0.001) -> DelayGate:
     """Return a gate that, besides the cost, asks every surface to bear a delay.
 
     Parameters
@@ -163,26 +207,59 @@ def delay_gate(least: float, period: float = 0.001) -> Gate:
     period
         Sampling period of the inner loop, s.
     """
-
-    def gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
-        laws = new.reaching or (loop.reaching,) * len(new.surfaces)
-        if new is not old and new != old:
-            for surface, law in zip(new.surfaces, laws, strict=True):
-                margin = delay_margin(loop.mechanism, surface, law, period=period, longest=least)
-                if margin < least - 1e-9:
-                    score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
-                    cost = score if score < INADMISSIBLE else math.inf
-                    reason = f"bears {1e3 * margin:.3g} ms of delay, wanted {1e3 * least:.3g} ms"
-                    return Admission(False, reason, cost)
-        return cost_gate(loop, old, new, x, horizon)
-
-    return gate
+    return DelayGate(least, period)
 
 
 def weakened(loop: ClosedLoop, reserve: float) -> ClosedLoop:
     """Return the loop on a plant whose input limits are lower by a part of them."""
     limits = (1.0 - reserve) * loop.mechanism.input_limits
     return replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BenchGate:
+    """The gate that :func:`bench_gate` returns; a plain record, so it can be pickled."""
+
+    late: DelayGate
+    reserve: float
+    seconds: float
+    covariance: FloatArray | None
+    noise: float
+
+    @property
+    def words(self) -> str:
+        """What it asks for."""
+        quiet = f", at most {100 * self.noise:g} % of the input is noise"
+        return (
+            f"{self.late.words}, does with {100 * self.reserve:g} % less input"
+            f"{'' if self.covariance is None else quiet}"
+        )
+
+    def _noisiest(self, loop: ClosedLoop, plan: Plan) -> float:
+        if self.covariance is None:
+            return 0.0
+        laws = plan.reaching or (loop.reaching,) * len(plan.surfaces)
+        pairs = zip(plan.surfaces, laws, strict=True)
+        return max(noise_share(loop.mechanism, s, self.covariance, law) for s, law in pairs)
+
+    def __call__(
+        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float
+    ) -> Admission:
+        """Decide on a plan, as :func:`undertow.cascade.cost_gate` does."""
+        admission = self.late(loop, old, new, x, horizon)
+        if not admission.accepted or new == old:
+            return admission
+        share = self._noisiest(loop, new)
+        if share > max(self.noise, self._noisiest(loop, old)):
+            most = f"{100 * self.noise:g} % at most"
+            why = f"{100 * share:.3g} % of the input would be noise, {most}"
+            return _refused(loop, old, x, horizon, why)
+        weak = weakened(loop, self.reserve)
+        event = Event(int(weak.batch(x, new, duration=min(self.seconds, horizon)).event[0]))
+        if event in (Event.HORIZON, Event.REACHED):
+            return admission
+        why = f"with {100 * self.reserve:g} % less input: {event.name.lower()}"
+        return _refused(loop, old, x, horizon, why)
 
 
 def bench_gate(
@@ -193,7 +270,7 @@ def bench_gate(
     seconds: float = 4.0,
     covariance: FloatArray | None = None,
     noise: float = 0.2,
-) -> Gate:
+) -> BenchGate:
     """Return a gate that asks for a delay margin, little noise, and a reserve of the actuator.
 
     Parameters
@@ -212,32 +289,4 @@ def bench_gate(
     noise
         Largest :func:`noise_share` that this may cause, where the old plan causes less.
     """
-    late = delay_gate(least, period)
-
-    def refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: str) -> Admission:
-        score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
-        return Admission(False, why, score if score < INADMISSIBLE else math.inf)
-
-    def noisiest(loop: ClosedLoop, plan: Plan) -> float:
-        if covariance is None:
-            return 0.0
-        laws = plan.reaching or (loop.reaching,) * len(plan.surfaces)
-        pairs = zip(plan.surfaces, laws, strict=True)
-        return max(noise_share(loop.mechanism, s, covariance, law) for s, law in pairs)
-
-    def gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
-        admission = late(loop, old, new, x, horizon)
-        if not admission.accepted or new == old:
-            return admission
-        share = noisiest(loop, new)
-        if share > max(noise, noisiest(loop, old)):
-            why = f"{100 * share:.3g} % of the input would be noise, {100 * noise:g} % at most"
-            return refused(loop, old, x, horizon, why)
-        weak = weakened(loop, reserve)
-        event = Event(int(weak.batch(x, new, duration=min(seconds, horizon)).event[0]))
-        if event in (Event.HORIZON, Event.REACHED):
-            return admission
-        why = f"with {100 * reserve:g} % less input: {event.name.lower()}"
-        return refused(loop, old, x, horizon, why)
-
-    return gate
+    return BenchGate(delay_gate(least, period), reserve, seconds, covariance, noise)

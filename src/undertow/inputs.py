@@ -13,10 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from undertow.errors import InvalidInputError
+from undertow.errors import InvalidInputError, near
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms.named import named
-from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
+from undertow.objective import Constraint, Objective, state_box
+from undertow.objectives import objective_for
 from undertow.surface import Surface
 
 __all__ = [
@@ -74,7 +75,7 @@ def mechanism_named(
                 f"input of '{mechanism.name}'",
                 value=repr(channel),
                 limit=f"one of {', '.join(known)}",
-                remedy=f"Write for instance --limit {next(iter(known))}=10",
+                remedy=near(channel, known) or f"Write for instance --limit {next(iter(known))}=10",
             )
     return mechanism.with_input_limit(*(known | new).values())
 
@@ -87,12 +88,12 @@ def objective_named(
     *,
     hard_input: bool = False,
 ) -> Objective:
-    """Return the objective called ``energy`` or ``time``, its unit that of the inputs.
+    """Return the objective that a word means, within bounds that are words too.
 
     Parameters
     ----------
     name
-        ``energy`` or ``time``.
+        A word of :func:`undertow.objective_for`.
     mechanism
         Whose inputs and states are meant.
     horizon
@@ -108,17 +109,8 @@ def objective_named(
         For an unknown name, a bound that cannot be, or a horizon that is not positive.
     """
     constraints = parse_box(mechanism, box)
-    if name == "time":
-        return MinimumTime(horizon=horizon, constraints=constraints, hard_input=hard_input)
-    if name != "energy":
-        raise InvalidInputError("objective", value=repr(name), limit="one of energy, time")
-    units = {channel.unit for channel in mechanism.inputs}
-    unit = units.pop() if len(units) == 1 else "mixed units"
-    return MinimumEnergy(
-        horizon=horizon,
-        unit=f"({unit})² s" if " " in unit else f"{unit}² s",
-        constraints=constraints,
-        hard_input=hard_input,
+    return objective_for(
+        mechanism, name, horizon=horizon, constraints=constraints, hard_input=hard_input
     )
 
 
@@ -171,6 +163,7 @@ def _units_of(mechanism: Mechanism, name: str, what: str) -> tuple[str, ...]:
             f"{what} of '{mechanism.name}'",
             value=repr(name),
             limit=f"one of {', '.join(mechanism.state_names)}",
+            remedy=near(name, mechanism.state_names),
         )
     index = mechanism.state_names.index(name)
     kind = (mechanism.coordinates[index % mechanism.n].unit, index >= mechanism.n)
@@ -213,7 +206,8 @@ def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
     Raises
     ------
     InvalidInputError
-        For an unknown state, a missing or wrong unit, or what is no number.
+        For an unknown state, a missing or wrong unit, or what is no number; and for no word at
+        all where the mechanism has no usual start.
 
     Examples
     --------
@@ -223,7 +217,7 @@ def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
     [0.0, 1.571, 0.0, 0.0]
     """
     if not words:
-        return mechanism.state(**mechanism.start)
+        return mechanism.usual_start
     values: dict[str, float] = {}
     for name, text in _pairs(words, f"{mechanism.coordinates[-1].name}=40deg").items():
         units = _units_of(mechanism, name, "initial state")
@@ -241,13 +235,14 @@ def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, .
     mechanism
         Whose states they are.
     words
-        Like ``theta=60deg``, which is |theta| ≤ 60°, or ``x=-0.2m:0.5m``.
+        Like ``theta=60deg``, which is |theta| ≤ 60°, or ``x=-0.2m:0.5m``.  What they bound, the
+        mechanism's declared travel bounds no more; they cannot reach beyond it.
 
     Raises
     ------
     InvalidInputError
-        For an unknown state, a missing or wrong unit, bounds that exclude the target, or two
-        pairs of bounds on one state.
+        For an unknown state, a missing or wrong unit, bounds that exclude the target or reach
+        beyond the declared travel, or two pairs of bounds on one state.
 
     Examples
     --------
@@ -271,11 +266,25 @@ def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, .
                 remedy=f"Write for instance {example}",
             )
         si, rate, _ = UNITS[units[0]]
+        _check_travel(mechanism, name, text, low, high)
         shown = [_shown(*part) for part in parts]
         (bound,) = state_box(**{name: (low, high)})
         label = f"|{name}| ≤ {shown[0]}" if len(ends) == 1 else f"{shown[0]} ≤ {name} ≤ {shown[1]}"
         found.append(replace(bound, name=label, unit=f"{si}/s" if rate else si))
     return tuple(found)
+
+
+def _check_travel(mechanism: Mechanism, name: str, text: str, low: float, high: float) -> None:
+    """Refuse a box that reaches beyond the travel of its coordinate."""
+    for c in mechanism.coordinates:
+        if c.name == name and (low < c.low or high > c.high):
+            raise InvalidInputError(
+                f"box of '{name}'",
+                value=repr(text),
+                limit=f"within the travel that {mechanism.name} declares, "
+                f"{c.low:g} to {c.high:g} {c.unit}",
+                remedy="A longer one is a mechanism of your own, with other ends: FILE.py:NAME",
+            )
 
 
 def parse_surface(mechanism: Mechanism, text: str) -> Surface:

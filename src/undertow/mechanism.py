@@ -116,6 +116,13 @@ class Mechanism:
     description: str = ""
     source: str = ""
 
+    def __repr__(self) -> str:
+        """Show its name, its states and its inputs."""
+        return (
+            f"Mechanism({self.name!r}, coordinates={[c.name for c in self.coordinates]}, "
+            f"inputs={[i.name for i in self.inputs]})"
+        )
+
     # -- construction -------------------------------------------------------------------
 
     def __post_init__(self) -> None:
@@ -394,6 +401,27 @@ class Mechanism:
         limits = [i.limit for i in self.inputs]
         values = [p.value for p in self.parameters]
         return hashlib.sha256(f"{self.structure} {values} {limits}".encode()).hexdigest()
+
+    @property
+    def usual_start(self) -> FloatArray:
+        """The usual initial state, (2n,).
+
+        Raises
+        ------
+        InvalidInputError
+            Where the mechanism has none: a run from the target would show nothing.
+        """
+        if not self.start:
+            angle = self.coordinates[-1]
+            raise InvalidInputError(
+                f"start of '{self.name}'",
+                value="none, and the mechanism has no usual one",
+                limit="a state away from the target",
+                remedy=f"Give one, for instance {angle.name}=0.1 {angle.unit} "
+                f"(--start {angle.name}=0.1{angle.unit} on the command line), or give the "
+                "mechanism a start=",
+            )
+        return self.state(**self.start)
 
     def state(self, /, **values: float) -> FloatArray:
         """Return the state with the named entries set and all others zero, SI units.

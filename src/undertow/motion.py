@@ -58,6 +58,15 @@ class Batch:
     x: FloatArray
     steps: FloatArray
 
+    def __repr__(self) -> str:
+        """Show how many there are, and how they ended."""
+        codes, counts = np.unique(self.event, return_counts=True)
+        ends = [
+            f"{count} {Event(int(code)).name.lower()}"
+            for code, count in zip(codes, counts, strict=True)
+        ]
+        return f"Batch({len(self.cost)} rollouts: {', '.join(ends)})"
+
     @property
     def reached(self) -> NDArray[np.bool_]:
         """Whether the terminal set was reached without breaking any constraint."""
@@ -119,9 +128,16 @@ class Trajectory:
     margin: FloatArray
     event: Event
 
+    def __repr__(self) -> str:
+        """Show whose it is, how long it is and how it ended."""
+        return (
+            f"Trajectory({self.mechanism.name}, {len(self.t)} rows, {self.t[0]:g} to "
+            f"{self.t[-1]:.4g} s, {self.event.name.lower()}, cost {self.total:.6g})"
+        )
+
     @property
     def total(self) -> float:
-        """Total cost."""
+        """Total cost; that of a cascade's run is also ``run.cost``."""
         return float(self.cost[-1])
 
     @property

@@ -7,9 +7,10 @@ own names, so they are compiled into the kernel with the rest of the loop.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+import pickle
+from collections.abc import Callable, Container, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import sympy as sp
@@ -28,7 +29,12 @@ __all__ = [
     "Objective",
     "require_objective",
     "state_box",
+    "travel_box",
 ]
+
+#: Part of a coordinate's declared travel that a motion may use: the rest is for what no model
+#: knows of, before the end stop.
+TRAVEL = 0.95
 
 
 class Names:
@@ -79,6 +85,10 @@ class Constraint:
         Function of :class:`Names` that returns w as a SymPy expression.
     unit
         Unit of w, for people.
+    state
+        Name of the state that it bounds, where it is one's range.
+    source
+        Where it comes from, where it is not the user's own.
 
     Notes
     -----
@@ -102,6 +112,30 @@ class Constraint:
     name: str
     formula: Formula
     unit: str = ""
+    state: str = ""
+    source: str = ""
+
+    @property
+    def words(self) -> str:
+        """Its name, and where it comes from."""
+        return f"{self.name}: {self.source}" if self.source else self.name
+
+
+@dataclass(frozen=True)
+class _Within:
+    """w of low ≤ x_i ≤ high, for a state by its name or number; one end may be infinite."""
+
+    state: str | int
+    low: float
+    high: float
+
+    def __call__(self, v: Names) -> sp.Expr:
+        x = v.states[self.state] if isinstance(self.state, int) else getattr(v, self.state)
+        if not math.isfinite(self.low):
+            return x - self.high
+        if not math.isfinite(self.high):
+            return self.low - x
+        return sp.Abs(x - (self.low + self.high) / 2) - (self.high - self.low) / 2
 
 
 def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
@@ -138,11 +172,51 @@ def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
                 remedy="The box is |state| ≤ bound, or low ≤ state ≤ high around the target; leave "
                 "out states without a bound",
             )
-        middle, half = (low + high) / 2, (high - low) / 2
-        words = f"|{name}| ≤ {high:g}" if middle == 0 else f"{low:g} ≤ {name} ≤ {high:g}"
-        return Constraint(words, lambda v: sp.Abs(getattr(v, name) - middle) - half)
+        words = f"|{name}| ≤ {high:g}" if low == -high else f"{low:g} ≤ {name} ≤ {high:g}"
+        return Constraint(words, _Within(name, low, high), state=name)
 
     return tuple(bounded(name, bound) for name, bound in bounds.items())
+
+
+def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constraint, ...]:
+    """Return the ranges of travel that a mechanism declares, as constraints: 95 % of each side.
+
+    The equations know no end stop; what is planned keeps clear of it all the same.  ``but`` names
+    coordinates to leave out.
+
+    Raises
+    ------
+    InvalidInputError
+        For a range that does not hold the target.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> [c.words for c in travel_box(ut.mechanisms.cart_pendulum())]
+    ['|x| ≤ 1.425 m: 95 % of the travel that cart_pendulum declares']
+    """
+    found = []
+    for index, c in enumerate(mechanism.coordinates):
+        if c.name in but or (math.isinf(c.low) and math.isinf(c.high)):
+            continue
+        if not c.low <= 0 <= c.high:
+            raise InvalidInputError(
+                f"travel of '{c.name}' that '{mechanism.name}' declares",
+                value=f"[{c.low:g}, {c.high:g}] {c.unit}",
+                limit="around the target, low ≤ 0 ≤ high",
+                remedy="Move the target into it, or let the objective have travel=False",
+            )
+        low, high = TRAVEL * c.low, TRAVEL * c.high
+        factor, unit = (180 / math.pi, "°") if c.unit == "rad" else (1.0, f" {c.unit}")
+        ends = [f"{factor * end:.4g}{unit}" for end in (low, high)]
+        if low == -high:
+            name = f"|{c.name}| ≤ {ends[1]}"
+        else:
+            name = f"{ends[0]} ≤ " * math.isfinite(low) + c.name
+            name += f" ≤ {ends[1]}" * math.isfinite(high)
+        source = f"{100 * TRAVEL:g} % of the travel that {mechanism.name} declares"
+        found.append(Constraint(name, _Within(index, low, high), c.unit, c.name, source))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -168,6 +242,12 @@ class Objective:
         False: the actuator clips (38).  True: |u| ≤ u_max is a constraint on the
         *unclipped* law, and a motion that would saturate is not admissible.  It is tested where
         the others are; in a sampled loop at the samples.
+    travel
+        True: the ranges of travel that the mechanism declares are constraints too, 95 % of each
+        side, but for a coordinate that a :func:`state_box` among the constraints bounds anew.
+        False: only what ``constraints`` say.
+    formula
+        What is integrated, in words; by default the expression itself.
 
     Examples
     --------
@@ -181,6 +261,8 @@ class Objective:
     terminal_radius: float = 0.01
     constraints: tuple[Constraint, ...] = ()
     hard_input: bool = False
+    travel: bool = True
+    formula: str = ""
 
     def __post_init__(self) -> None:
         """Refuse a stage cost that is no function, and a horizon or radius that is not positive."""
@@ -200,6 +282,90 @@ class Objective:
                     limit="finite and > 0",
                     remedy=_REMEDIES[field],
                 )
+
+    def on(self, mechanism: Mechanism) -> Self:
+        """Return the problem as it is for a mechanism: with the travel that it declares.
+
+        The one rule for ranges of travel: :class:`undertow.ClosedLoop`, the cascade and the bound
+        all apply it to what they are given, and applying it twice changes nothing.
+
+        Raises
+        ------
+        InvalidInputError
+            For a declared range that does not hold the target.
+        """
+        own = tuple(c for c in self.constraints if not c.source)
+        declared = travel_box(mechanism, {c.state for c in own}) if self.travel else ()
+        constraints = own + declared
+        return self if constraints == self.constraints else replace(self, constraints=constraints)
+
+    def meaning(self, mechanism: Mechanism) -> str:
+        """Return in one line what is minimised, until when, and within which bounds.
+
+        Examples
+        --------
+        >>> import undertow as ut
+        >>> ut.MinimumEnergy(unit="N² s").meaning(ut.mechanisms.cart_pendulum())
+        ... # doctest: +NORMALIZE_WHITESPACE
+        'energy: ∫ uᵀu dt, N² s, to ‖x‖ ≤ 0.01 within 60 s;
+         |x| ≤ 1.425 m: 95 % of the travel that cart_pendulum declares'
+        """
+        problem = self.on(mechanism)
+        unit = f", {self.unit}" if self.unit else ""
+        bounds = [c.words for c in problem.constraints]
+        if self.hard_input:
+            bounds += [
+                f"|{i.name}| ≤ {i.limit:g} {i.unit} before clipping" for i in mechanism.inputs
+            ]
+        return "; ".join(
+            (
+                f"{self.name}: {self._formula(mechanism)}{unit}, "
+                f"to ‖x‖ ≤ {self.terminal_radius:g} within {self.horizon:g} s",
+                *bounds,
+            )
+        )
+
+    def _formula(self, mechanism: Mechanism) -> str:
+        return self.formula or f"∫ ({self.stage_cost(mechanism)}) dt"
+
+    def written(self, mechanism: Mechanism) -> Self:
+        """Return the same objective with what no other process can import as expressions.
+
+        A lambda cannot be pickled; its expression in a mechanism's own names can.
+        """
+        stage = self.stage
+        if not _importable(stage):
+            stage = _Written(self._expression(mechanism, "stage cost", stage))
+        constraints = tuple(
+            c
+            if _importable(c.formula)
+            else replace(c, formula=_Written(self._expression(mechanism, c.name, c.formula)))
+            for c in self.constraints
+        )
+        if stage is self.stage and constraints == self.constraints:
+            return self
+        return replace(self, stage=stage, constraints=constraints)
+
+    def __getstate__(self) -> dict[str, Any]:
+        for what, formula in (
+            ("stage cost", self.stage),
+            *((c.name, c.formula) for c in self.constraints),
+        ):
+            if not _importable(formula):
+                raise InvalidInputError(
+                    f"'{what}' of objective '{self.name}' for another process or a file",
+                    value=getattr(formula, "__qualname__", type(formula).__name__),
+                    limit="a function that can be imported there",
+                    remedy="Write it as a def at the top of a module, or send the ClosedLoop or "
+                    "the Cascade, which take its expression along",
+                )
+        return dict(vars(self))
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, _memo: object) -> Self:
+        return self
 
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
         """Return Φ(x, u) as an expression.
@@ -244,12 +410,14 @@ class Objective:
         InvalidInputError
             With the constraint and its margin.
         """
+        problem = self.on(mechanism)
         values = mechanism.substitution | dict(zip(mechanism.x, x.tolist(), strict=True))
-        for constraint, margin in zip(self.constraints, self.path_margins(mechanism), strict=True):
+        margins = zip(problem.constraints, problem.path_margins(mechanism), strict=True)
+        for constraint, margin in margins:
             at_start = margin.subs(values)
             if at_start.is_number and float(at_start) < 0:
                 raise InvalidInputError(
-                    f"initial state of '{mechanism.name}' breaks '{constraint.name}'",
+                    f"initial state of '{mechanism.name}' breaks '{constraint.words}'",
                     value=f"margin {float(at_start):.4g} {constraint.unit}".rstrip(),
                     limit="≥ 0",
                     remedy="Start inside the constraints, or widen them",
@@ -308,6 +476,35 @@ def require_objective(value: object) -> None:
 
 
 @dataclass(frozen=True)
+class _Written:
+    """A formula that was written down as an expression in a mechanism's own names."""
+
+    expression: sp.Expr
+
+    def __call__(self, _v: Names) -> sp.Expr:
+        return self.expression
+
+
+def _importable(formula: Formula) -> bool:
+    """Whether another process can have a formula by its name, or as data."""
+    try:
+        pickle.dumps(formula)
+    except Exception:  # pickle raises what it likes
+        return False
+    return True
+
+
+def _squares(v: Names) -> sp.Expr:
+    """Return uᵀu."""
+    return (v.inputs.T * v.inputs)[0]
+
+
+def _one(_v: Names) -> sp.Expr:
+    """Return 1."""
+    return sp.Integer(1)
+
+
+@dataclass(frozen=True)
 class MinimumEnergy(Objective):
     """Minimum control energy ∫ uᵀu dt, (40), plus optional state weights.
 
@@ -317,7 +514,7 @@ class MinimumEnergy(Objective):
     """
 
     name: str = "energy"
-    stage: Formula = lambda v: (v.inputs.T * v.inputs)[0]
+    stage: Formula = _squares
     unit: str = "V² s"
     state_weight: float = 0.0
 
@@ -337,14 +534,21 @@ class MinimumEnergy(Objective):
         x = sp.Matrix(mechanism.x)
         return super().stage_cost(mechanism) + self.state_weight * (x.T * x)[0]
 
+    def _formula(self, mechanism: Mechanism) -> str:
+        if self.formula or self.stage is not _squares:
+            return super()._formula(mechanism)
+        weight = self.state_weight
+        return f"∫ (uᵀu + {weight:g} xᵀx) dt" if weight else "∫ uᵀu dt"
+
 
 @dataclass(frozen=True)
 class MinimumTime(Objective):
     """Minimum time to the terminal set, ∫ 1 dt = t_f, (29) and (41)."""
 
     name: str = "time"
-    stage: Formula = lambda v: sp.Integer(1)
+    stage: Formula = _one
     unit: str = "s"
+    formula: str = "∫ 1 dt"
 
 
 def _failed(what: str, error: Exception) -> InvalidInputError:

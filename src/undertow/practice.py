@@ -1,45 +1,27 @@
 """What a controller is set to where it meets a rig: one home for runs, drills and trials.
 
-Nothing here is fitted to a rig.  Estimator, gate and objectives follow from the limits and
-ranges of the mechanism, from the sampling period, and from what a bench tells of its sensors
-and of its delays.
+Nothing here is fitted to a rig.  Estimator, gate and reaching law follow from the limits of the
+mechanism, from the sampling period, and from what a bench tells of its sensors and of its delays.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
-from typing import Literal
+from collections.abc import Sequence
 
-import numpy as np
-import sympy as sp
-
-from undertow.cascade import Gate
+from undertow.cascade import Gate, cost_gate
 from undertow.delay import bench_gate, noise_share
 from undertow.errors import MissingExtraError
 from undertow.estimators import KalmanFilter
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.objective import MinimumEnergy, Names, Objective, state_box
+from undertow.mechanism import Mechanism
+from undertow.objectives import finite_limits
 from undertow.rig import Bench, Encoder
 from undertow.sliding import ReachingLaw
 from undertow.stability import first_surface
 from undertow.surface import ProvedSet, Surface
 
-__all__ = ["Goal", "estimator_for", "gate_for", "goal_for", "provable", "reaching_for"]
-
-#: ``energy``: Φ = uᵀu + w xᵀx.  ``time``: Φ = 1 + r Σ (u_i/u_max,i)².  ``effort``: the same for
-#: every mechanism, Φ = Σ (u_i/u_max,i)² + 0.01 xᵀx.
-Goal = Literal["energy", "time", "effort"]
-
-#: w of minimum energy: Theorem 1 holds and the driven coordinates come home.
-STATE_WEIGHT = 0.05
-#: r of minimum time, 0.01/V² at 15 V: keeps surfaces from asking what no sampled, delayed loop
-#: can do.
-ENERGY_PRICE = 2.25
-#: Radius of the ball in which a motion ends: a rig with stiction and counting encoders stays
-#: in no smaller one.
-TERMINAL = 0.05
+__all__ = ["default_gate", "estimator_for", "provable", "reaching_for"]
 
 #: What every admitted surface must bear: periods of delay, and so much less of the input; and
 #: the part of the input that noise of the sensors may take, standard deviation.
@@ -54,12 +36,6 @@ DRIFT = 0.1
 
 #: Standard deviation of a position that is read as it is, rad or m.
 EXACT = 1e-6
-
-
-def _limits(mechanism: Mechanism) -> FloatArray:
-    """Input limits, 1 where there is none, (m,)."""
-    limits = mechanism.input_limits
-    return np.where(np.isfinite(limits), limits, 1.0)
 
 
 def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -> KalmanFilter:
@@ -84,19 +60,27 @@ def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -
         belief,
         timing.period,
         position_noise=sigmas,
-        disturbance_drift=DRIFT * float(_limits(belief).min()) if drift is None else drift,
+        disturbance_drift=DRIFT * float(finite_limits(belief).min()) if drift is None else drift,
         delay=timing.input_delay + timing.measurement_delay,
     )
 
 
-def gate_for(estimator: KalmanFilter) -> Gate:
-    """Return the gate that a surface must pass before a rig may meet it.
+def default_gate(estimator: KalmanFilter | None = None) -> Gate:
+    """Return the gate that a surface must pass where nobody asks for another: everywhere.
+
+    With exact states, :func:`undertow.cascade.cost_gate`: stable, feasible from here, the cost
+    not raised.  Before a rig may meet a surface the same, and the surface must bear ``BEARS`` = 6
+    periods of delay, do with ``RESERVE`` = 15 % less input, and spend no more than ``NOISE`` = 20 %
+    of the input on noise.
 
     Parameters
     ----------
     estimator
         That of the rig: its period, and what it does not know of the state at the target.
+        ``None``: states are exact, as in a simulation.
     """
+    if estimator is None:
+        return cost_gate
     period, size = estimator.period, 2 * estimator.mechanism.n
     covariance = estimator.settled()[:size, :size]
     return bench_gate(BEARS * period, RESERVE, period=period, covariance=covariance, noise=NOISE)
@@ -113,56 +97,6 @@ def reaching_for(estimator: KalmanFilter) -> ReachingLaw:
     laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
     quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)
     return next(quiet, laws[-1])
-
-
-def goal_for(mechanism: Mechanism, goal: Goal, *, horizon: float = 60.0) -> Objective:
-    """Return an objective that suits a bench; finite ranges of travel are kept to 95 %.
-
-    Parameters
-    ----------
-    mechanism
-        The controller's model.
-    goal
-        See :data:`Goal`.
-    horizon
-        Longest prediction, s.
-    """
-    ranges = _ranges(mechanism)
-    if goal == "energy":
-        return MinimumEnergy(
-            horizon=horizon,
-            terminal_radius=TERMINAL,
-            state_weight=STATE_WEIGHT,
-            constraints=state_box(**ranges),
-        )
-    limits = _limits(mechanism).tolist()
-
-    def effort(v: Names) -> sp.Expr:
-        return sum((u / limit) ** 2 for u, limit in zip(v.inputs, limits, strict=True))
-
-    if goal == "time":
-        return Objective(
-            "time",
-            lambda v: 1 + ENERGY_PRICE * effort(v),
-            "s",
-            horizon,
-            TERMINAL,
-            state_box(**ranges),
-        )
-    return Objective(
-        "effort and error",
-        lambda v: effort(v) + 0.01 * (v.states.T * v.states)[0],
-        "s",
-        horizon,
-        0.02,
-        state_box(**ranges),
-    )
-
-
-def _ranges(mechanism: Mechanism) -> Mapping[str, float]:
-    """Return 95 % of the nearer end of each coordinate's range, where it has one around 0."""
-    nearest = {c.name: min(-c.low, c.high) for c in mechanism.coordinates}
-    return {name: 0.95 * end for name, end in nearest.items() if 0 < end < math.inf}
 
 
 def provable(

@@ -89,6 +89,13 @@ class Proposal:
     message: str = ""
     remedy: str = ""
 
+    def __repr__(self) -> str:
+        """Show the answer: the plan, its cost, how it was found."""
+        plan = self.message if self.plan is None else self.plan
+        return (
+            f"Proposal({self.status}, cost {self.cost:.6g}, {self.evaluations} evaluations, {plan})"
+        )
+
     @property
     def surface(self) -> Surface | None:
         """The first surface of the plan."""

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow import results
-from undertow.cascade import Run, Update
+from undertow.cascade import Gate, Run, Update, problem_words
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.motion import Event, Trajectory
 from undertow.objective import Objective
@@ -21,7 +21,13 @@ from undertow.proposal import Proposal
 from undertow.stability import Margin
 from undertow.surface import Surface
 
-__all__ = ["ended", "motion_files", "motion_report", "proposal_files", "proposal_report"]
+__all__ = [
+    "ended",
+    "motion_files",
+    "motion_report",
+    "proposal_files",
+    "proposal_report",
+]
 
 _ENDINGS = {
     Event.REACHED: "reached the target, ‖x‖ ≤ {radius:g}",
@@ -58,20 +64,23 @@ def _surface_words(surface: Surface) -> str:
     return repr(surface).removeprefix("Surface(").removesuffix(")")
 
 
-def _head(mechanism: Mechanism, objective: Objective, start: FloatArray) -> list[tuple[str, str]]:
-    kept = [constraint.name for constraint in objective.constraints]
-    if objective.hard_input:
-        kept += [f"|{i.name}| ≤ {i.limit:g} {i.unit} before clipping" for i in mechanism.inputs]
+def _head(
+    mechanism: Mechanism, objective: Objective, start: FloatArray, gate: Gate | None = None
+) -> list[tuple[str, str]]:
+    problem = problem_words(mechanism, objective, gate).removeprefix("objective ")
     return [
         ("mechanism", f"{mechanism.name}: {mechanism.description}".removesuffix(": ")),
-        ("objective", f"minimum {objective.name}, {objective.unit}"),
-        *([("constraints", ", ".join(kept))] if kept else []),
+        ("objective", problem),
         ("start", _state_words(mechanism, start)),
     ]
 
 
 def ended(motion: Trajectory, objective: Objective) -> str:
     """Say in words how a motion ended."""
+    if motion.event == Event.REACHED and motion.duration == motion.t[0]:
+        return (
+            f"started at the target, ‖x‖ ≤ {objective.terminal_radius:g}: there was nothing to do"
+        )
     broken = _broken(motion, objective) if motion.event == Event.CONSTRAINT else ""
     words = _ENDINGS[motion.event].format(
         radius=objective.terminal_radius, norm=float(np.linalg.norm(motion.x[-1])), broken=broken
@@ -83,9 +92,10 @@ def _broken(motion: Trajectory, objective: Objective) -> str:
     """Return the constraints that the last state of a motion breaks, whatever the input is."""
     mechanism = motion.mechanism
     at_end = mechanism.substitution | dict(zip(mechanism.x, motion.x[-1].tolist(), strict=True))
+    objective = objective.on(mechanism)
     margins = [margin.subs(at_end) for margin in objective.path_margins(mechanism)]
     names = [
-        constraint.name
+        constraint.words
         for constraint, margin in zip(objective.constraints, margins, strict=True)
         if margin.is_number and margin < 0
     ]
@@ -100,6 +110,7 @@ def motion_report(
     motion: Trajectory,
     surface: Surface,
     run: Run | None = None,
+    gate: Gate | None = None,
 ) -> RenderableType:
     """Return a simulated motion for the terminal.
 
@@ -113,27 +124,23 @@ def motion_report(
         The (first) surface.
     run
         The cascade's record, where a cascade was run.
+    gate
+        Who admitted its surfaces.
     """
-    rows = _head(mechanism, objective, start)
+    rows = _head(mechanism, objective, start, gate)
     if run is None:
         rows.append(("surface", _surface_words(surface)))
     else:
         admitted = sum(update.admission.accepted for update in run.updates)
         rows += [
-            ("first surface", _surface_words(surface)),
+            ("first optimum", _surface_words(surface)),
             ("last surface", _surface_words(run.surfaces[-1])),
             ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
         ]
         if any(verdict is not None for verdict in run.verdicts):
             rows.append(("evidence", _evidence(run)))
         if len(run.descent):
-            rows.append(
-                (
-                    "Lemma 3",
-                    f"smallest slack {run.descent.min():.1e} {objective.unit} "
-                    "(≥ 0 wanted, to rounding)",
-                )
-            )
+            rows.append(("Lemma 3", _slack_words(run, objective)))
     rows += [
         ("cost", f"{motion.total:.6g} {objective.unit}"),
         (
@@ -146,8 +153,23 @@ def motion_report(
         ),
     ]
     good = motion.event == Event.REACHED
+    if good and motion.duration == motion.t[0]:
+        return Group(_facts(rows), Text(ended(motion, objective)))
     mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
     return Group(_facts(rows), mark + Text(ended(motion, objective)))
+
+
+def _slack_words(run: Run, objective: Objective) -> str:
+    """Say the smallest slack of Lemma 3, and of how many decisions none is known."""
+    slack = run.descent
+    known = slack[np.isfinite(slack)]
+    unknown = len(slack) - len(known)
+    without = (
+        f"; {unknown} of {len(slack)} decisions without a finite prediction" if unknown else ""
+    )
+    if not len(known):
+        return f"no slack is known{without}"
+    return f"smallest slack {known.min():.1e} {objective.unit} (≥ 0 wanted, to rounding){without}"
 
 
 def _evidence(run: Run) -> str:
@@ -252,7 +274,8 @@ def proposal_report(
     table.add_column("margin (≥ 0 is satisfied)")
     table.add_column("value", justify="right")
     table.add_column("")
-    units = {constraint.name: constraint.unit for constraint in objective.constraints}
+    bounds = objective.on(mechanism).constraints
+    units = {constraint.name: constraint.unit for constraint in bounds}
     for margin in proposal.margins:
         unit = margin.unit or units.get(margin.name, "")
         factor, shown = 1.0, unit

@@ -42,7 +42,8 @@ class ClosedLoop(UncheckedLoop):
     mechanism
         The controller's belief, from which the law is derived.
     objective
-        Stage cost, terminal set, constraints.
+        Stage cost, terminal set, constraints; the travel that the belief declares joins them, see
+        :meth:`undertow.Objective.on`.
     reaching
         Reaching law; its gains can be overridden for each rollout.
     plant
@@ -76,6 +77,7 @@ class ClosedLoop(UncheckedLoop):
         if self.plant is not None:
             require_mechanism("plant of a closed loop", self.plant)
         require_objective(self.objective)
+        object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         for name, low in (("escape", 0.0), ("tail", 0.0)):
             value = getattr(self, name)
             if not value >= low:
@@ -113,6 +115,13 @@ class ClosedLoop(UncheckedLoop):
                 value=f"n = {plant.n}, m = {plant.m}",
                 limit=f"n = {self.mechanism.n}, m = {self.mechanism.m} like the belief",
             )
+
+    def __repr__(self) -> str:
+        """Show belief, truth where it is another one, and objective."""
+        plant = "" if self.plant is None else f", plant={self.plant.name}"
+        return (
+            f"ClosedLoop({self.mechanism.name}, {self.objective.name}{plant}, step={self.step:g} s)"
+        )
 
     def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:
         """Return the steps at which surfaces take over; the kernel meets them one by one."""

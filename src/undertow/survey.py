@@ -1,6 +1,6 @@
 """Every mechanism of the library brought to its target: cost, time, bound and gap in one table.
 
-Nothing is chosen by hand: first surface, optimisation and cascade are those of
+Nothing is chosen by hand: designed surface, optimisation and cascade are those of
 ``undertow simulate NAME``, from the mechanism's listed start.  The bound is a local optimum of
 the same task over *all* inputs, see :mod:`undertow.bounds`; the gap is what the cascade spends
 beyond it.  Where the gap is large, :data:`TRIALS` look for its cause: each removes one
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -21,13 +21,14 @@ from rich.text import Text
 
 from undertow import results
 from undertow.bounds import bound
-from undertow.cascade import Cascade, Run
+from undertow.cascade import Cascade, Run, gate_words
 from undertow.decision import Freedom
 from undertow.errors import InfeasibleError
-from undertow.inputs import mechanism_named, objective_named
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms import LIBRARY
-from undertow.objective import Objective
+from undertow.mechanisms.named import named
+from undertow.objective import TRAVEL, Objective
+from undertow.objectives import objective_for
 from undertow.plan import Plan
 from undertow.plot import display
 from undertow.proposal import Budget
@@ -90,8 +91,8 @@ class Entry:
     ----------
     name, n, m, start, unit
         The mechanism, its start in words, and the unit of cost.
-    first, one_time, cascade
-        Cost of the designed first surface, of the surface optimised once, and of the cascade;
+    designed, one_time, cascade
+        Cost of the designed surface, of the surface optimised once, and of the cascade;
         ``inf`` where the target was not reached.
     time
         When the cascade reached ‖x‖ ≤ ν, s; ``inf`` where it did not.
@@ -103,6 +104,8 @@ class Entry:
         Wall time of all of it, s.
     trials
         Name of each trial made to its cost.
+    problem, travel
+        What was minimised and who admitted surfaces, and the bounds of travel, in words.
     """
 
     name: str
@@ -110,7 +113,7 @@ class Entry:
     m: int
     start: str
     unit: str
-    first: float
+    designed: float
     one_time: float
     cascade: float
     time: float
@@ -118,6 +121,8 @@ class Entry:
     bound: float
     seconds: float
     trials: Mapping[str, float]
+    problem: str = ""
+    travel: str = ""
 
     @property
     def gap(self) -> float:
@@ -137,6 +142,7 @@ def survey(
     seed: int = 0,
     bounds: bool = True,
     progress: Callable[[str, float], None] | None = None,
+    done: Callable[[Entry], None] | None = None,
 ) -> tuple[Entry, ...]:
     """Bring every mechanism from its listed start to its target.
 
@@ -145,7 +151,7 @@ def survey(
     names
         Which; all of the library by default.
     goal
-        ``"energy"`` or ``"time"``.
+        A word of :func:`undertow.objective_for`.
     horizon
         Longest motion, s.
     seed
@@ -155,21 +161,27 @@ def survey(
         trials.
     progress
         Called with what is being done and the part that is done.
+    done
+        Called with each line as it is finished: what an interrupted survey leaves.
 
     Raises
     ------
     InvalidInputError
-        For an unknown mechanism or goal, before any work.
+        For an unknown mechanism or goal, or one without a usual start, before any work.
     MissingExtraError
         When bounds are asked for without CasADi.
     """
-    chosen = [mechanism_named(name) for name in (LIBRARY if names is None else names)]
+    chosen = [named(name) for name in (LIBRARY if names is None else names)]
+    objectives = [objective_for(mechanism, goal, horizon=horizon) for mechanism in chosen]
+    for mechanism, objective in zip(chosen, objectives, strict=True):
+        objective.check_start(mechanism, mechanism.usual_start)
     entries = []
-    for index, mechanism in enumerate(chosen):
+    for index, (mechanism, objective) in enumerate(zip(chosen, objectives, strict=True)):
         if progress is not None:
             progress(mechanism.name, index / len(chosen))
-        objective = objective_named(goal, mechanism, horizon)
         entries.append(survey_one(mechanism, objective, seed=seed, bounds=bounds))
+        if done is not None:
+            done(entries[-1])
     return tuple(entries)
 
 
@@ -178,7 +190,7 @@ def survey_one(
 ) -> Entry:
     """Bring one mechanism from its listed start to its target; the line of the survey."""
     began = time.perf_counter()
-    x0 = mechanism.state(**mechanism.start)
+    x0 = mechanism.usual_start
     cascade = Cascade(mechanism, objective, seed=seed)
     loop = cascade.loop
     proposal = cascade.optimiser.require(x0)
@@ -194,6 +206,7 @@ def survey_one(
         limit = _bound(mechanism, objective, x0, run)
         if run.cost / limit - 1.0 > LARGE:
             trials = _trials(mechanism, objective, x0, seed)
+    bare = replace(objective, unit="", constraints=(), travel=False)
     reached = [
         float(cost) if ok else math.inf for cost, ok in zip(costs.cost, costs.reached, strict=True)
     ]
@@ -203,7 +216,7 @@ def survey_one(
         m=mechanism.m,
         start=start_words(mechanism),
         unit=objective.unit,
-        first=reached[0],
+        designed=reached[0],
         one_time=reached[1],
         cascade=run.cost if run.reached else math.inf,
         time=run.time if run.reached else math.inf,
@@ -211,6 +224,8 @@ def survey_one(
         bound=limit,
         seconds=time.perf_counter() - began,
         trials=trials,
+        problem=f"{bare.meaning(mechanism)}; gate: {gate_words(cascade.gate)}",
+        travel=", ".join(constraint.name for constraint in loop.objective.constraints),
     )
 
 
@@ -265,7 +280,7 @@ def median_gap(entries: Sequence[Entry]) -> float:
 
 # -- what is shown and kept ----------------------------------------------------------------------
 
-_HEAD = ("mechanism", "n, m", "start", "first", "one-time", "cascade", "bound", "gap", "time")
+_HEAD = ("mechanism", "n, m", "start", "designed", "one-time", "cascade", "bound", "gap", "time")
 
 
 def _cells(entry: Entry) -> tuple[str, ...]:
@@ -274,7 +289,7 @@ def _cells(entry: Entry) -> tuple[str, ...]:
 
     gap = f"{100 * entry.gap:.1f} %" if math.isfinite(entry.gap) else "—"
     when = f"{entry.time:.2f} s" if math.isfinite(entry.time) else "not reached"
-    costs = (entry.first, entry.one_time)
+    costs = (entry.designed, entry.one_time)
     return (
         entry.name,
         f"{entry.n}, {entry.m}",
@@ -301,11 +316,11 @@ def table(entries: Sequence[Entry]) -> Table:
             head, justify="right" if index else "left", no_wrap=index > 0, ratio=not index or None
         )
     for entry in entries:
-        name, _, start, first, one_time, cascade, bound, gap, when = _cells(entry)
+        name, _, start, designed, one_time, cascade, bound, gap, when = _cells(entry)
         cost, _, unit = cascade.partition(" ")
         grid.add_row(
             Text(name).append(f"\n{start}", "dim"),
-            *map(Text, (first, one_time, cost)),
+            *map(Text, (designed, one_time, cost)),
             Text(bound).append(f"\n{unit}", "dim"),
             *(Text(cell.removesuffix(" %").removesuffix(" s")) for cell in (gap, when)),
         )
@@ -321,6 +336,16 @@ def summary(entries: Sequence[Entry]) -> list[str]:
     if any(entry.trials for entry in entries):
         lines.append("Gap of a one-time optimum where a restriction is taken away:")
         lines += [f"  {_trial_words(entry)}" for entry in entries if entry.trials]
+    return lines + _problems(entries)
+
+
+def _problems(entries: Sequence[Entry]) -> list[str]:
+    """Return what was minimised, and within which travel."""
+    lines = [f"objective {words}" for words in dict.fromkeys(e.problem for e in entries) if words]
+    bounded = [f"{entry.name} {entry.travel}" for entry in entries if entry.travel]
+    if bounded:
+        part = f"{100 * TRAVEL:g} % of the travel that each declares"
+        lines.append(f"Within {part}: {'; '.join(bounded)}.")
     return lines
 
 
@@ -339,13 +364,13 @@ def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, 
         return value if math.isfinite(value) else None
 
     header = (
-        "mechanism", "n", "m", "start", "unit", "first", "one_time", "cascade", "bound",
+        "mechanism", "n", "m", "start", "unit", "designed", "one_time", "cascade", "bound",
         "gap", "time_s", "radius", "seconds", *(trial.name for trial in TRIALS),
     )  # fmt: skip
     rows = [
         (
             e.name, e.n, e.m, e.start, e.unit,
-            *map(cell, (e.first, e.one_time, e.cascade, e.bound, e.gap)),
+            *map(cell, (e.designed, e.one_time, e.cascade, e.bound, e.gap)),
             *map(cell, (e.time, e.radius)),
             round(e.seconds, 2),
             *(cell(e.trials.get(trial.name, math.nan)) for trial in TRIALS),

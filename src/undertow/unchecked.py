@@ -8,7 +8,7 @@ linear model, in large ones (:mod:`undertow.codegen.settle`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -53,6 +53,11 @@ class UncheckedLoop:
     hold: int = 0
     escape: float = 200.0
     tail: float = 0.0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it was made from: a copy compiles, or finds, the same kernels."""
+        made = {field.name: getattr(self, field.name) for field in fields(self)}
+        return made | {"objective": self.objective.written(self.mechanism)}
 
     @property
     def truth(self) -> Mechanism:

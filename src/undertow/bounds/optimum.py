@@ -175,6 +175,7 @@ def bound(
     0.51
     """
     began = time.perf_counter()
+    objective = objective.on(mechanism)
     start, longest = _check(mechanism, objective, x0, horizon, intervals)
     given = recorded(mechanism, guess)
     if float(np.linalg.norm(start)) <= objective.terminal_radius:

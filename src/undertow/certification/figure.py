@@ -13,8 +13,9 @@ from undertow.certify.motion import SurfaceMotion
 from undertow.certify.region_search import ProvedRegion
 from undertow.mechanism import FloatArray
 from undertow.plot import COLOURS, display, style
+from undertow.sliding import SlidingModeLaw
 
-__all__ = ["region_figure", "simulated"]
+__all__ = ["held", "region_figure", "simulated"]
 
 #: Points a side of the picture of the simulated region.
 GRID = 101
@@ -46,6 +47,26 @@ def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> Fl
     return home
 
 
+def held(motion: SurfaceMotion, y: FloatArray) -> FloatArray:
+    """Return what the actuators have to spare at points y (…, N) of the surface, (…,).
+
+    On the surface the law asks for what keeps the motion there; the smallest 1 − |u_i|/u_max,i is
+    below 0 where that is more than an actuator gives: no motion stays on the surface there.
+    """
+    mechanism, surface = motion.mechanism, motion.surface
+    m, free = mechanism.m, mechanism.n - mechanism.m
+    flat = y.reshape(-1, motion.size)
+    q_u, v_u, w = flat[:, :free], flat[:, free : 2 * free], flat[:, 2 * free :]
+    q_a = w - q_u @ np.linalg.solve(surface.lambda_a, surface.lambda_u).T
+    pull = w @ surface.lambda_a.T + v_u @ surface.alpha_u.T
+    v_a = -np.linalg.solve(surface.alpha_a, pull.T).T
+    x = np.hstack([q_a[:, :m], q_u, v_a, v_u])
+    with np.errstate(all="ignore"):
+        demand = SlidingModeLaw(mechanism, surface)(0.0, x).demand
+    spare = (1.0 - np.abs(demand) / mechanism.input_limits).min(axis=-1)
+    return np.asarray(np.where(np.isnan(spare), -np.inf, spare)).reshape(y.shape[:-1])
+
+
 def _hurry(y: FloatArray, ratio: FloatArray) -> FloatArray:
     """Parts of a step, (B, 1), shorter near the singularity and at speed.
 
@@ -70,6 +91,9 @@ def region_figure(region: ProvedRegion, title: str) -> Figure:
     slow coordinate w = q_a + λ_a⁻¹ λ_u q_u; all others zero.  The motions start on the edge of
     the proved set in the slice, leave the slice, and are seen from the side.
 
+    The motion on the surface knows no input limit.  Where what is drawn has states that the
+    actuators cannot hold there, the title says so and a line shows where they end.
+
     Parameters
     ----------
     region
@@ -83,21 +107,29 @@ def region_figure(region: ProvedRegion, title: str) -> Figure:
     with style():
         figure = Figure(figsize=(8.6, 4.3), layout="constrained")
         left, right = figure.subplots(1, 2)
-        _slice(left, region, free)
-        _slice(right, region, 2 * free)
+        within = _slice(left, region, free) & _slice(right, region, 2 * free)
         handles = [
             Patch(color=to_rgba(COLOURS["sky"], 0.28), label="simulated: enters the proved set"),
             Patch(color=to_rgba(COLOURS["blue"], 0.55), label="proved region of attraction"),
             Line2D([], [], color=COLOURS["vermilion"], lw=0.9, label="motions on the surface"),
             Line2D([], [], color=COLOURS["black"], lw=1, ls=(0, (4, 2)), label="law singular (37)"),
         ]
-        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+        if not within:
+            limits = ", ".join(f"{i.limit:g} {i.unit}" for i in motion.mechanism.inputs)
+            line = Line2D([], [], color=COLOURS["green"], lw=1.2, ls=":")
+            line.set_label(f"beyond: more than {limits} needed")
+            handles.append(line)
+            title = f"{title}\ninput limit ignored: not all of this can be held with {limits}"
+        figure.legend(handles=handles, loc="outside lower center", ncols=3 if not within else 4)
         figure.suptitle(title, fontsize=10)
     return figure
 
 
-def _slice(axes: Axes, region: ProvedRegion, other: int) -> None:
-    """Draw the plane of coordinates 0 and ``other``."""
+def _slice(axes: Axes, region: ProvedRegion, other: int) -> bool:
+    """Draw the plane of coordinates 0 and ``other``; whether the actuators hold all that is filled.
+
+    Both the proved and the simulated set count.
+    """
     motion = region.motion
     assert isinstance(motion, SurfaceMotion)
     wide, high = _extents(region, other)
@@ -135,10 +167,18 @@ def _slice(axes: Axes, region: ProvedRegion, other: int) -> None:
         axes.contour(
             fa * a, fb * b, ratio, [0.0], colors=COLOURS["black"], linewidths=1.0, linestyles="--"
         )
+    spare = held(motion, points)
+    within = bool((spare[home | (inside <= 1.0)] >= 0).all())
+    if not within:
+        shown = np.where(ratio > 0, np.maximum(spare, -10.0), np.nan)
+        axes.contour(
+            fa * a, fb * b, shown, [0.0], colors=COLOURS["green"], linewidths=1.2, linestyles=":"
+        )
     axes.set_xlim(-fa * wide, fa * wide)
     axes.set_ylim(-fb * high, fb * high)
     axes.set_xlabel(ua)
     axes.set_ylabel(ub)
+    return within
 
 
 def _extents(region: ProvedRegion, other: int) -> tuple[float, float]:

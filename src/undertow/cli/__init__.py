@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import suppress
 from typing import Annotated
 
 import typer
@@ -9,6 +11,7 @@ import typer
 from undertow import results
 from undertow.cli import bench, certify, control, export, library, paper, rig, trials
 from undertow.cli.terminal import app, examples
+from undertow.interrupt import at_once, by_exception
 
 __all__ = [
     "app",
@@ -55,4 +58,10 @@ def root(
 
 def main() -> None:
     """Run the command line."""
-    app(prog_name="undertow")
+    by_exception()
+    try:
+        app(prog_name="undertow")
+    finally:  # what is left is to end
+        with suppress(OSError, ValueError):  # a pipe may be closed
+            sys.stdout.flush()
+        at_once()

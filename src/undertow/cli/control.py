@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 from undertow import inputs, results
-from undertow.cascade import Cascade
+from undertow.cascade import Cascade, Gate
 from undertow.cli.terminal import (
     AnyName,
     Box,
@@ -20,6 +20,7 @@ from undertow.cli.terminal import (
     Settings,
     Start,
     app,
+    check_control,
     examples,
     progress_bar,
     reports_errors,
@@ -29,6 +30,7 @@ from undertow.cli.terminal import (
 )
 from undertow.errors import InvalidInputError
 from undertow.optimiser import Optimiser
+from undertow.practice import default_gate
 from undertow.proposal import Budget
 from undertow.rollout import ClosedLoop
 from undertow.stability import check_surface, first_surface
@@ -55,10 +57,11 @@ def simulate(
     start: Start = None,
     objective: Goal = "energy",
     control: Annotated[
-        Literal["cascade", "one-time", "first"] | None,
+        str | None,
         typer.Option(
             help="cascade, the default: re-optimised every period. one-time: optimised at the "
-            "start. first: the designed surface."
+            "start. designed: the surface that is designed, not optimised.",
+            metavar="WORD",
         ),
     ] = None,
     surface: Annotated[
@@ -86,10 +89,10 @@ def simulate(
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Evidence that a new surface of the cascade needs at the present state. region: "
+            help="Evidence that a new surface of the cascade needs at the present state, besides "
+            "what the default gate asks for: stable, feasible, cost not raised. region: "
             "it is in a proved region. dual: its predicted motion enters one. sampled: states "
-            "nearby arrive. local: stability near the target. Repeatable. Default: region, dual "
-            "or local.",
+            "nearby arrive. local: stability near the target. Repeatable. Default: none.",
             metavar="EVIDENCE",
         ),
     ] = None,
@@ -102,6 +105,7 @@ def simulate(
     from undertow import report
 
     request = {k: v for k, v in locals().items() if k not in ("report", "out")}
+    check_control(control, ("cascade", "one-time", "designed"))
     belief = inputs.mechanism_named(name, setting or (), limit or ())
     truth = belief.with_parameters(**inputs.parse_values(plant)) if plant else None
     x0 = inputs.parse_start(belief, start or ())
@@ -120,11 +124,9 @@ def simulate(
     if out is not None:
         results.check_folder(out)
     run = None
+    gate = None
     if steering == "cascade":
-        from undertow.certify.gate import Policy, certified_gate
-
-        accepted: Any = tuple(accept or ("region", "dual", "local"))
-        gate = certified_gate(Policy(accepted))
+        gate = default_gate() if accept is None else _evidence_gate(accept)
         cascade = Cascade(belief, goal, period=period, gate=gate, seed=seed)
         with progress_bar() as progress:
             run = cascade.simulate(
@@ -140,12 +142,20 @@ def simulate(
         motion = ClosedLoop(belief, goal, plant=truth).simulate(x0, given)
         surfaces = (given,)
     console = terminal()
-    console.print(report.motion_report(belief, goal, x0, motion, surfaces[0], run))
+    console.print(report.motion_report(belief, goal, x0, motion, surfaces[0], run, gate))
     if out is not None:
         files = report.motion_files(request, motion, motion.total, surfaces, run)
         say(console, write(out, files))
     if motion.event.name != "REACHED":
         raise typer.Exit(1)
+
+
+def _evidence_gate(accept: list[str]) -> Gate:
+    """Return the gate that asks for evidence of these kinds."""
+    from undertow.certify.gate import Policy, certified_gate
+
+    kinds: Any = tuple(accept)
+    return certified_gate(Policy(kinds))
 
 
 @app.command(

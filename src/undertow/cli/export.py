@@ -18,6 +18,7 @@ from undertow.cli.terminal import (
     Settings,
     Start,
     app,
+    check_control,
     examples,
     progress_bar,
     reports_errors,
@@ -95,8 +96,12 @@ def export_c(
         ),
     ] = 0,
     control: Annotated[
-        Literal["first", "one-time"] | None,
-        typer.Option(help="first, the default: the designed surface. one-time: optimised."),
+        str | None,
+        typer.Option(
+            help="designed, the default: the surface that is designed. one-time: optimised at the "
+            "start.",
+            metavar="WORD",
+        ),
     ] = None,
     surface: Annotated[
         str | None,
@@ -136,6 +141,8 @@ def export_c(
 ) -> None:
     """Write the inner loop in C99: no heap, no dependencies, limits, estimator, surface table."""
     from undertow.export.report import csv, measure, tables
+
+    check_control(control, ("designed", "one-time"))
 
     if every == (name is not None):
         raise InvalidInputError(

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from undertow import inputs, results
+from undertow.cascade import problem_words
 from undertow.cli.terminal import (
     AnyName,
     Box,
@@ -27,6 +28,8 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
+from undertow.interrupt import INTERRUPTED
+from undertow.mechanisms import LIBRARY
 from undertow.optimiser import Optimiser
 from undertow.rollout import ClosedLoop
 
@@ -105,11 +108,23 @@ def survey(
     request = {k: v for k, v in locals().items() if k not in ("study", "out")}
     if out is not None:
         results.check_folder(out)
-    began = time.perf_counter()
-    with progress_bar() as progress:
-        entries = study.survey(
-            only, goal=objective, horizon=horizon, seed=seed, bounds=bounds, progress=progress
-        )
+    began, entries, interrupted = time.perf_counter(), list[study.Entry](), False
+    names = only or list(LIBRARY)
+    try:
+        with progress_bar() as progress:
+            study.survey(
+                names,
+                goal=objective,
+                horizon=horizon,
+                seed=seed,
+                bounds=bounds,
+                progress=progress,
+                done=entries.append,
+            )
+    except KeyboardInterrupt:
+        if not entries:
+            raise
+        interrupted = True
     console = terminal()
     written = None if out is None else write(out, study.files(request, entries))
     console.width = max(console.width, 80)
@@ -119,6 +134,11 @@ def survey(
     if written is not None:
         say(console, written)
     say(console, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
+    if interrupted:
+        left = " ".join(f"--only {name}" for name in names[len(entries) :])
+        words = f"interrupted: {len(entries)} of {len(names)} are done. The others: undertow survey"
+        say(terminal(stderr=True), f"{words} {left} and the options as before")
+        raise typer.Exit(INTERRUPTED)
 
 
 @app.command(
@@ -138,13 +158,21 @@ def animate(
     box: Box = None,
     horizon: Horizon = 20.0,
     speed: Annotated[float, typer.Option(help="Motion seconds in a second of film.")] = 1.0,
+    longest: Annotated[
+        float, typer.Option(help="Longest film, s: a longer motion is cut there, and it is said.")
+    ] = 8.0,
     seed: Seed = 0,
     out: Annotated[Path, typer.Option(help="Folder for NAME.gif and NAME.png.")] = Path("."),
 ) -> None:
-    """Draw a mechanism on its way to the target, under a surface optimised at the start."""
-    from undertow import commands
+    """Draw a mechanism on its way to the target, under a surface optimised at the start.
 
-    request = {k: v for k, v in locals().items() if k not in ("commands", "out")}
+    The film ends where the motion has settled, or after 8 s, see --longest.
+    """
+    from undertow import commands
+    from undertow.animation import Film
+    from undertow.report import ended
+
+    request = {k: v for k, v in locals().items() if k not in ("commands", "out", "Film", "ended")}
     belief = inputs.mechanism_named(name, setting or (), limit or ())
     x0 = inputs.parse_start(belief, start or ())
     goal = inputs.objective_named(objective, belief, horizon, box or (), hard_input=hard_input)
@@ -154,5 +182,13 @@ def animate(
     plan = Optimiser(loop, seed=seed).require(x0).plan
     assert plan is not None  # require() raises otherwise
     motion = loop.simulate(x0, plan)
-    files = commands.animation_files(request, motion, speed=speed)
-    say(terminal(), write(out, files))
+    film = Film.of(motion, speed=speed, longest=longest)
+    files = commands.animation_files(request, film)
+    console = terminal()
+    say(console, problem_words(belief, goal))
+    say(console, f"{ended(motion, goal)}. Shown: {film.span}")
+    if " of " in film.span:
+        say(
+            console, "The film is cut: --longest shows more of the motion, --speed all of it faster"
+        )
+    say(console, write(out, files))

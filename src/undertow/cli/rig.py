@@ -10,11 +10,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
 from undertow import inputs, results
+from undertow.cascade import problem_words
 from undertow.cli.terminal import (
     AnyName,
     Goal,
@@ -30,7 +31,9 @@ from undertow.cli.terminal import (
     write,
 )
 from undertow.errors import InvalidInputError
+from undertow.mechanisms.named import from_anywhere
 from undertow.modelling.python_file import in_a_file
+from undertow.objectives import Goal as OneGoal
 
 if TYPE_CHECKING:
     from undertow.rig import Rig
@@ -62,7 +65,7 @@ def run(
             metavar="RIG",
         ),
     ] = "ideal",
-    objective: Goal = "energy",
+    objective: Goal = "bench-energy",
     swing_up: Annotated[
         bool, typer.Option("--swing-up", help="Begin hanging at rest: swing up, catch, balance.")
     ] = False,
@@ -112,16 +115,14 @@ def run(
     from undertow.runtime.tables import run_table
 
     belief = inputs.mechanism_named(name, setting or ())
-    file, colon, model = name.rpartition(":")
     recipe = Recipe(
-        # A log of it can be replayed from anywhere.
-        mechanism=f"{Path(file).resolve()}:{model}" if colon else name,
+        mechanism=from_anywhere(name),  # a log of it can be replayed from anywhere
         parameters=inputs.parse_values(setting or ()),
         start=()
         if swing_up and not start
         else tuple(inputs.parse_start(belief, start or ()).tolist()),
         swing_up=swing_up,
-        objective=objective,
+        objective=cast(OneGoal, objective),  # the recipe refuses what is none
         rig="realistic" if rig == "realistic" or in_a_file(rig) else "ideal",
         seed=seed,
         period=period,
@@ -164,6 +165,7 @@ def run(
     what += ", the rig in a keeper" if keeper else ""
     where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
     console.print(f"{name} on {where}, {1 / period:g} Hz, {what}", markup=False)
+    say(console, problem_words(belief, recipe.cascade.objective, recipe.cascade.gate))
     unit = ", ".join(sorted({i.unit for i in belief.inputs}))
     console.print(run_table(report, period, unit, simulated=simulated))
     if (book := runtime.log) is not None:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, Literal, ParamSpec, TypeVar
+from typing import Annotated, Any, ParamSpec, TypeVar
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
 from undertow import results
-from undertow.errors import UndertowError
+from undertow.errors import InvalidInputError, UndertowError, near
+from undertow.interrupt import INTERRUPTED
 
 __all__ = [
     "AnyName",
@@ -32,6 +34,8 @@ __all__ = [
     "Settings",
     "Start",
     "app",
+    "as_text",
+    "check_control",
     "examples",
     "progress_bar",
     "reports_errors",
@@ -74,7 +78,12 @@ class _Command(_Plain, TyperCommand):
 
 
 class _Group(_Plain, TyperGroup):
-    pass
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Name the commands that are like a wrong one."""
+        if args and args[0] not in self.commands and not args[0].startswith("-"):
+            like = near(args[0], self.commands) or f"There are {', '.join(self.commands)}"
+            ctx.fail(f"No such command '{args[0]}'. {like}")
+        return super().resolve_command(ctx, args)
 
 
 class Application(typer.Typer):
@@ -115,12 +124,18 @@ def _folded(line: str) -> str:
 
 
 def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
-    """Turn a condition into one line on standard error; exit 2 for bad input, else 1."""
+    """Turn a condition into one line on standard error; exit 2 for bad input, else 1.
+
+    Ctrl-C is one line as well, exit 130.
+    """
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
             return command(*args, **kwargs)
+        except KeyboardInterrupt:
+            typer.echo("interrupted", err=True)
+            raise typer.Exit(INTERRUPTED) from None
         except UndertowError as error:
             typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
             words = " ".join(str(error).split())  # some may be a file's, and anything
@@ -162,6 +177,26 @@ def write(out: Path, files: Mapping[str, bytes]) -> str:
     return f"{moved}Written to {out}/: {', '.join(files)}"
 
 
+def check_control(word: str | None, words: Sequence[str]) -> None:
+    """Refuse a word of ``--control`` that is none of these."""
+    if word is None or word in words:
+        return
+    both = "The surface that is designed is 'designed', the first optimum is 'one-time'"
+    raise InvalidInputError(
+        "--control",
+        value=repr(word),
+        limit=f"one of {', '.join(words)}",
+        remedy=both if word == "first" else near(word, words),
+    )
+
+
+def as_text(shown: RenderableType) -> bytes:
+    """Return what a terminal of 100 columns would show, as plain text."""
+    console = Console(width=100, highlight=False, file=io.StringIO())
+    console.print(shown)
+    return str(console.file.getvalue()).encode()  # type: ignore[attr-defined]
+
+
 def say(console: Console, text: str) -> None:
     """Print plain text, as long as it is."""
     console.print(text, soft_wrap=True, markup=False)
@@ -171,14 +206,16 @@ Name = Annotated[str, typer.Argument(help="Mechanism, e.g. rotary_pendulum.", me
 AnyName = Annotated[
     str,
     typer.Argument(
-        help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME.", metavar="NAME"
+        help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME, FILE.urdf or FILE.xml; "
+        "with :JOINT,JOINT behind the last two where they do not say what is actuated.",
+        metavar="NAME",
     ),
 ]
 Start = Annotated[
     list[str] | None,
     typer.Option(
         help="Initial state, with its unit: phi=40deg, theta_dot=10deg/s, x=0.2m. Repeatable; "
-        "what is not named is zero. Default: the mechanism's usual start.",
+        "what is not named is zero. Default: the mechanism's usual start, where it has one.",
         metavar="STATE=VALUE",
     ),
 ]
@@ -206,10 +243,20 @@ Box = Annotated[
     list[str] | None,
     typer.Option(
         help="Bounds that a state must keep on its way, with units: theta=60deg for both sides, "
-        "or x=-0.2m:0.5m. Repeatable. Tested every 2 ms.",
+        "or x=-0.2m:0.5m. Repeatable. Tested every 2 ms. Default: 95 % of the travel that the "
+        "mechanism declares.",
         metavar="STATE=LOW:HIGH",
     ),
 ]
-Goal = Annotated[Literal["energy", "time"], typer.Option(help="What is minimised.")]
+Goal = Annotated[
+    str,
+    typer.Option(
+        "--objective",
+        help="What is minimised. energy: ∫uᵀu dt, and time: as the paper has them, to a radius of "
+        "0.01. bench-energy, bench-time: ∫(uᵀu + 0.05 xᵀx)dt and ∫(1 + 2.25 Σ(u/u_max)²)dt, to "
+        "0.05. effort: ∫(Σ(u/u_max)² + 0.01 xᵀx)dt, to 0.02.",
+        metavar="WORD",
+    ),
+]
 Horizon = Annotated[float, typer.Option(help="Longest motion, s.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]

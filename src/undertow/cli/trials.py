@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
+from rich.console import RenderableType
 
 from undertow import results
 from undertow.cli.terminal import (
     app,
+    as_text,
     examples,
     progress_bar,
     reports_errors,
@@ -18,6 +21,7 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
+from undertow.interrupt import INTERRUPTED
 
 __all__ = ["trials"]
 
@@ -76,8 +80,8 @@ def trials(
         typer.Option(
             help="balance: folder for balance.csv and the figures. robustness: folder for "
             "robustness.jsonl, every run as it is made: called again, it goes on from there. "
-            "coverage: the same, coverage.jsonl. swing-up --fresh: folder for gains.json, what "
-            "the search found, as the library keeps it."
+            "coverage: the same, coverage.jsonl. swing-up: folder for gains.json, the gains as the "
+            "library keeps them. The tables of the others as text."
         ),
     ] = None,
 ) -> None:
@@ -95,49 +99,76 @@ def trials(
         results.check_folder(out)
     seeds = min(seeds, 3) if quick else seeds
     console = terminal()
-    with progress_bar() as progress:
-        if what == "balance":
-            result = experiment.balance(
-                angle=math.radians(angle),
-                seeds=seeds,
-                limits=limits and not quick,
-                progress=progress,
-            )
-            shown = report.balance_report(result)
-        elif what == "swing-up":
-            searched = upright.searched(upright.SWINGING, fresh, progress)
-            runs_up = []
-            for i, (mechanism, found) in enumerate(searched.items()):
-                progress(mechanism.name, i / len(searched))
-                swing = SwingUp(mechanism, tuple(one.gains for one in found))
-                runs_up.append(upright.swing_trials(mechanism, swing=swing, seeds=seeds))
-            shown = report.swing_report(runs_up, upright.SWING_SECONDS)
-        elif what == "estimators":
-            progress("estimators", 0.0)
-            shown = report.estimator_report(estimation.compared(seeds=min(seeds, 5)))
-        elif what == "coverage":
-            file = None if out is None else out / "coverage.jsonl"
-            shown = coverage_table(coverage(seeds, keep=file, progress=progress))
-        elif what == "library":
-            few = min(seeds, 5)
-            shown = report.library_report(through_the_runtime(seeds=few, progress=progress))
-        elif what == "robustness":
-            shown = report.robustness_report(
-                stress.robustness(
-                    rigs=min(rigs, 10) if quick else rigs,
-                    seeds=3 if single and not quick else 0,
-                    ledger=None if out is None else out / "robustness.jsonl",
+    rows: list[Any] = []  # what is finished, of experiments that are shown row by row
+    by_rows: dict[str, Callable[[list[Any]], RenderableType]] = {
+        "balance": lambda made: report.balance_report(made[0]),
+        "swing-up": lambda made: report.swing_report(made, upright.SWING_SECONDS),
+        "estimators": report.estimator_report,
+        "library": report.library_report,
+        "mujoco": report.engine_report,
+    }
+    shown: RenderableType | None = None
+    files: dict[str, bytes] = {}
+    interrupted = False
+    try:
+        with progress_bar() as progress:
+            if what == "balance":
+                experiment.balance(
+                    angle=math.radians(angle),
+                    seeds=seeds,
+                    limits=limits and not quick,
                     progress=progress,
+                    begun=rows.append,
                 )
-            )
-        else:
-            runs = []
-            for i, mechanism in enumerate(upright.all_of(upright.ENGINES)):
-                progress(mechanism.name, i / len(upright.ENGINES))
-                runs.append(upright.engine_trial(mechanism))
-            shown = report.engine_report(runs)
-    console.print(shown)
-    if out is not None and what == "balance":
-        say(console, write(out, report.balance_files(result)))
-    if out is not None and what == "swing-up":
-        say(console, write(out, {KEPT.name: as_kept(searched).encode()}))
+            elif what == "swing-up":
+                searched = upright.searched(upright.SWINGING, fresh, progress)
+                files[KEPT.name] = as_kept(searched).encode()
+                for i, (mechanism, found) in enumerate(searched.items()):
+                    progress(mechanism.name, i / len(searched))
+                    swing = SwingUp(mechanism, tuple(one.gains for one in found))
+                    rows.append(upright.swing_trials(mechanism, swing=swing, seeds=seeds))
+            elif what == "estimators":
+                progress("estimators", 0.0)
+                estimation.compared(seeds=min(seeds, 5), done=rows.append)
+            elif what == "coverage":
+                file = None if out is None else out / "coverage.jsonl"
+                shown = coverage_table(coverage(seeds, keep=file, progress=progress))
+            elif what == "library":
+                through_the_runtime(seeds=min(seeds, 5), progress=progress, done=rows.append)
+            elif what == "robustness":
+                shown = report.robustness_report(
+                    stress.robustness(
+                        rigs=min(rigs, 10) if quick else rigs,
+                        seeds=3 if single and not quick else 0,
+                        ledger=None if out is None else out / "robustness.jsonl",
+                        progress=progress,
+                    )
+                )
+            else:
+                for i, mechanism in enumerate(upright.all_of(upright.ENGINES)):
+                    progress(mechanism.name, i / len(upright.ENGINES))
+                    rows.append(upright.engine_trial(mechanism))
+    except KeyboardInterrupt:
+        interrupted = True
+    if what in by_rows and rows:
+        shown = by_rows[what](rows)
+    if shown is not None:
+        console.print(shown)
+        if out is not None and what in by_rows:
+            files[f"{what}.txt"] = as_text(shown)
+    if what == "balance" and rows:
+        files |= report.balance_files(rows[0])
+    if out is not None and files:
+        say(console, write(out, files))
+    if interrupted:
+        say(terminal(stderr=True), _how_to_go_on(what, out))
+        raise typer.Exit(INTERRUPTED)
+
+
+def _how_to_go_on(what: str, out: Path | None) -> str:
+    """Say what an interrupted experiment left, and how it is finished."""
+    if what not in ("robustness", "coverage"):
+        return "interrupted: what is shown is finished; the same command begins again"
+    if out is None:
+        return "interrupted: nothing was kept; with --out every run is, as it is made"
+    return f"interrupted: finished runs are in {out / what}.jsonl; the same command goes on there"

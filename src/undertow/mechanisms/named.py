@@ -1,32 +1,73 @@
-"""Mechanisms by name: the library's, and one's own in a Python file."""
+"""Mechanisms by name: the library's, and one's own in a Python, URDF or MJCF file."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from undertow.errors import InvalidInputError, near
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import LIBRARY
+from undertow.modelling.mjcf import from_mjcf
 from undertow.modelling.python_file import in_a_file, mechanism_from_file
+from undertow.modelling.urdf import from_urdf
 
-__all__ = ["named"]
+__all__ = ["from_anywhere", "named"]
+
+#: Ends of the names of files that are data.
+_FILES = {".urdf": from_urdf, ".xml": from_mjcf, ".mjcf": from_mjcf}
 
 
 def named(name: str) -> Mechanism:
-    """Return a mechanism by its name in the library, or one's own by ``FILE.py:NAME``.
+    """Return a mechanism by its name in the library, or one's own from a file.
+
+    Parameters
+    ----------
+    name
+        A name of the library; ``FILE.py:NAME``, which runs the file; or ``FILE.urdf`` or
+        ``FILE.xml``, which are data, with ``:JOINT,JOINT`` behind for the actuated joints where
+        the file does not say which they are.  The target of a file is all joints at zero.
 
     Raises
     ------
     InvalidInputError
         For an unknown name.
+    ModelError
+        When the file describes no such mechanism.
     ArtefactError
         When the file cannot be read or fails.
     """
     if in_a_file(name):
         return mechanism_from_file(name)
+    file, joints = _in_data(name)
+    if file is not None:
+        return _FILES[file.suffix](file, actuated=joints)
     if name not in LIBRARY:
+        own = "One of your own is FILE.py:NAME, FILE.urdf or FILE.xml"
         raise InvalidInputError(
             "mechanism",
             value=repr(name),
             limit=f"one of {', '.join(LIBRARY)}",
-            remedy=near(name, LIBRARY) or "One of your own is FILE.py:NAME",
+            remedy=f"{near(name, LIBRARY)} {own}".strip(),
         )
     return LIBRARY[name]()
+
+
+def from_anywhere(name: str) -> str:
+    """Return the name of a mechanism as it holds in any folder: paths of files are whole."""
+    if in_a_file(name):
+        path, _, inside = name.rpartition(":")
+        return f"{Path(path).resolve()}:{inside}"
+    file, joints = _in_data(name)
+    if file is None:
+        return name
+    return f"{file.resolve()}:{','.join(joints)}" if joints else str(file.resolve())
+
+
+def _in_data(name: str) -> tuple[Path | None, list[str] | None]:
+    """Return the file that holds a mechanism as data, and its actuated joints where given."""
+    if Path(name).suffix in _FILES:
+        return Path(name), None
+    path, _, joints = name.rpartition(":")
+    if Path(path).suffix in _FILES and joints:
+        return Path(path), joints.split(",")
+    return None, None

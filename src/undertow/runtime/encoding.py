@@ -51,12 +51,14 @@ def memory_to(memory: CascadeState) -> dict[str, Any]:
         "predicted": memory.predicted,
         "scale": memory.scale,
         "since": memory.since,
+        "x": list(memory.x),
     }
 
 
 def memory_from(value: Mapping[str, Any]) -> CascadeState:
     """Return the memory that was encoded."""
-    return CascadeState(**{**value, "plan": _plan_from(value["plan"])})
+    x = tuple(value.get("x", ()))  # logs before this one have none
+    return CascadeState(**{**value, "plan": _plan_from(value["plan"]), "x": x})
 
 
 def _is_sound(plan: object) -> TypeGuard[Plan]:

@@ -7,20 +7,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 from undertow.cascade import Cascade, CascadeState
 from undertow.delay import weakened
-from undertow.errors import InvalidInputError, UndertowError
+from undertow.errors import InvalidInputError, UndertowError, near
 from undertow.estimators import KalmanFilter
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms.named import named
+from undertow.objectives import Goal, objective_for
 from undertow.plan import Plan
 from undertow.practice import (
     RESERVE,
+    default_gate,
     estimator_for,
-    gate_for,
-    goal_for,
     provable,
     reaching_for,
 )
@@ -37,6 +37,10 @@ __all__ = ["Recipe"]
 #: Shortest period, and longest prediction, of a run, s.
 SHORTEST, FARTHEST = 1e-5, 3600.0
 
+#: Which words a recipe's objective is written in.  Logs before had no such number: their
+#: "energy" and "time" are "bench-energy" and "bench-time" now.
+WORDS = 2
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -49,9 +53,9 @@ class Recipe:
     parameters
         Values that differ from the library's, SI units.
     start
-        Initial state, (2n,); the mechanism's usual one by default.
+        Initial state, (2n,); the mechanism's usual one by default, where it has one.
     objective
-        ``"energy"`` or ``"time"``.
+        A word of :func:`undertow.objective_for`; ``"bench-energy"`` suits a rig.
     horizon
         Longest prediction, s.
     rig
@@ -76,7 +80,7 @@ class Recipe:
     mechanism: str = "rotary_pendulum"
     parameters: Mapping[str, float] = field(default_factory=dict)
     start: tuple[float, ...] = ()
-    objective: Literal["energy", "time"] = "energy"
+    objective: Goal = "bench-energy"
     horizon: float = 20.0
     rig: Literal["ideal", "realistic"] = "ideal"
     seed: int = 0
@@ -87,7 +91,14 @@ class Recipe:
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
-        """Refuse a period that is itself a stall, or that no loop keeps, and other horizons."""
+        """Refuse unknown objectives, periods that no loop keeps or that are stalls, far horizons."""
+        if self.objective not in get_args(Goal):
+            raise InvalidInputError(
+                "objective of a run",
+                value=repr(self.objective),
+                limit=f"one of {', '.join(get_args(Goal))}",
+                remedy=near(str(self.objective), get_args(Goal)),
+            )
         stall = self.settings.stall
         if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
@@ -116,7 +127,7 @@ class Recipe:
             return self.belief.check_state(self.start)
         if self.swing_up:
             return hanging(self.belief)
-        return self.belief.state(**self.belief.start)
+        return self.belief.usual_start
 
     @cached_property
     def cascade(self) -> Cascade:
@@ -124,10 +135,10 @@ class Recipe:
         estimator = self.make_estimator()
         return Cascade(
             self.belief,
-            goal_for(self.belief, self.objective, horizon=self.horizon),
+            objective_for(self.belief, self.objective, horizon=self.horizon),
             reaching_for(estimator),
             warm=Budget(self.evaluations, self.seconds),
-            gate=gate_for(estimator),
+            gate=default_gate(estimator),
             seed=self.seed,
         )
 
@@ -200,18 +211,18 @@ class Recipe:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values from which :meth:`from_dict` makes the recipe again."""
-        return asdict(self)
+        return asdict(self) | {"words": WORDS}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the recipe that was written to a log.
+        """Return the recipe that was written to a log, an older one's words as they are now.
 
         Raises
         ------
         InvalidInputError
             For fields that a recipe has not, or values that are none for them.
         """
-        taken = _of_types(cls, values)
+        taken = _of_types(cls, _in_words_of_now(values))
         for name, kind in (("start", taken["start"]), ("parameters", taken["parameters"].values())):
             if not all(isinstance(v, int | float) for v in kind):
                 raise InvalidInputError(f"{name} of a recipe", value=kind, limit="numbers")
@@ -248,3 +259,11 @@ def _of_types(made: type, values: Mapping[str, Any]) -> dict[str, Any]:
 _KINDS: Mapping[type, tuple[type, ...]] = {
     bool: (bool,), int: (int,), float: (int, float), str: (str,), tuple: (list, tuple),
 }  # fmt: skip
+
+
+def _in_words_of_now(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a recipe's values, the objective of an older one by the word that it has now."""
+    known = dict(values)
+    if known.pop("words", None) is None and "objective" in known:
+        known["objective"] = f"bench-{known['objective']}"
+    return known

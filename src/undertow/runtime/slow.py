@@ -194,7 +194,7 @@ def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began:
         proposal,
         Admission(surface is not None, words, math.inf),
         memory,
-        replace(memory, plan=plan, since=request.use, sequence=request.sequence),
+        replace(memory, plan=plan, since=request.use, sequence=request.sequence, x=()),
         lanes_of(cascade, plan),
         time.perf_counter() - began,
         request.swing,
@@ -211,7 +211,8 @@ def judge(
     except Exception as error:  # an optimiser's answer may be anything
         reason = f"gate: {type(error).__name__}: {error}"
         admission = Admission(False, reason, memory.predicted)
-        after = replace(memory, plan=memory.at(use), since=use, sequence=memory.sequence + 1)
+        number = memory.sequence + 1
+        after = replace(memory, plan=memory.at(use), since=use, sequence=number, x=())
         return after, admission, lanes_of(cascade, after.plan)
 
 

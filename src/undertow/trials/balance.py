@@ -19,7 +19,8 @@ from undertow.errors import InfeasibleError
 from undertow.inner_loop import InnerLoop
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Objective
-from undertow.practice import Goal, estimator_for, gate_for, goal_for
+from undertow.objectives import Goal, objective_for
+from undertow.practice import default_gate, estimator_for
 from undertow.proposal import Budget
 from undertow.rig import Bench, srv02_rig
 from undertow.sliding import Surface
@@ -34,7 +35,7 @@ Progress = Callable[[str, float], None]
 BASE = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
 
 #: The two objectives of the paper, as they suit a bench.
-GOALS: tuple[Goal, ...] = ("energy", "time")
+GOALS: tuple[Goal, ...] = ("bench-energy", "bench-time")
 
 ROWS = ("base", "one-time", "cascade")
 
@@ -87,7 +88,7 @@ def controllers(
     re-optimisations may spend ``budget`` rollouts each.  Of the bench the gate knows what its
     estimator does.
     """
-    gate = gate_for(estimator_for(belief, bench))
+    gate = default_gate(estimator_for(belief, bench))
     cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate, seed=seed)
     start = cascade.start(x0)
     once = start[1].surface
@@ -146,6 +147,7 @@ def balance(
     budget: int = 256,
     limits: bool = True,
     progress: Progress = lambda _what, _fraction: None,
+    begun: Callable[[BalanceResult], None] = lambda _result: None,
 ) -> BalanceResult:
     """Run the three controllers for both objectives on every rig.
 
@@ -165,6 +167,9 @@ def balance(
         Whether to search for the catch limits.
     progress
         Called with what is being done and the part done.
+    begun
+        Called once, with the result that fills as the runs are made: what is left of it where
+        they are interrupted.
     """
     bench = srv02_rig() if bench is None else bench
     belief = bench.mechanism
@@ -172,13 +177,16 @@ def balance(
     ideal_bench = undisturbed(belief, bench.timing.period)
     outcomes: dict[tuple[str, str], list[Outcome]] = {}
     ideal: dict[tuple[str, str], Outcome] = {}
+    found: dict[str, Limits] = {}
+    result = BalanceResult(bench, np.asarray(x0), seconds, seeds, outcomes, ideal, found)
+    begun(result)
     parts = len(GOALS) * len(ROWS) + limits * 2 * len(ROWS)
     done = 0
     for goal in GOALS:
-        objective = goal_for(belief, goal)
+        objective = objective_for(belief, goal)
         made = controllers(belief, bench, objective, x0, budget=budget)
         for row in ROWS:
-            what = f"minimum {goal}, {row}"
+            what = f"{goal}, {row}"
             ideal[goal, row] = trial(
                 belief, ideal_bench, made[row], x0, seconds, 0, objective=objective
             )
@@ -188,13 +196,12 @@ def balance(
                 runs.append(trial(belief, bench, made[row], x0, seconds, seed, objective=objective))
             outcomes[goal, row] = runs
             done += 1
-    found: dict[str, Limits] = {}
     for row in ROWS if limits else ():
         progress(f"catch limit, {row}", done / parts)
-        goal_objective = goal_for(belief, "energy")
+        goal_objective = objective_for(belief, "bench-energy")
         alone = catch_limit(belief, ideal_bench, row, goal_objective, seeds=1)
         progress(f"catch limit on the bench, {row}", (done + 1) / parts)
         real = catch_limit(belief, bench, row, goal_objective, seeds=seeds)
         found[row] = Limits(alone, real)
         done += 2
-    return BalanceResult(bench, np.asarray(x0), seconds, seeds, outcomes, ideal, found)
+    return result

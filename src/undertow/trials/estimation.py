@@ -73,11 +73,16 @@ def _cost(estimator: Estimator, belief: Mechanism, calls: int = 5000) -> float:
 
 
 def compared(
-    *, seeds: int = 5, angle: float = math.radians(20), seconds: float = 8.0
+    *,
+    seeds: int = 5,
+    angle: float = math.radians(20),
+    seconds: float = 8.0,
+    done: Callable[[EstimatorRow], None] = lambda _row: None,
 ) -> list[EstimatorRow]:
-    """Balance the SRV02 with the first surface and each of the estimators.
+    """Balance the SRV02 with the designed surface and each of the estimators.
 
     The first row is what nothing but exact states would give: the model itself, sampled.
+    ``done`` is called with each row as it is finished.
     """
     bench = srv02_rig()
     belief = bench.mechanism
@@ -105,6 +110,7 @@ def compared(
                 math.nan if name in made else _cost(make(), belief),
             )
         )
+        done(rows[-1])
     return rows
 
 

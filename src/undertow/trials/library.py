@@ -54,6 +54,7 @@ def through_the_runtime(
     seconds: float = 10.0,
     evaluations: int = 256,
     progress: Callable[[str, float], None] = lambda _what, _part: None,
+    done: Callable[[LibraryRow], None] = lambda _row: None,
 ) -> list[LibraryRow]:
     """Run mechanisms from their usual starts, each on its realistic rigs.
 
@@ -69,6 +70,8 @@ def through_the_runtime(
         Rollouts that one re-optimisation may spend.
     progress
         Called with what is being done and the part done.
+    done
+        Called with each row as it is finished.
     """
     rows = []
     for number, name in enumerate(names):
@@ -97,4 +100,5 @@ def through_the_runtime(
                 float(np.mean(chatter)) if chatter else float("nan"),
             )
         )
+        done(rows[-1])
     return rows

@@ -15,10 +15,14 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow import results
+from undertow.cascade import problem_words
 from undertow.motion import Trajectory
+from undertow.objectives import Goal, objective_for
 from undertow.plot import COLOURS, figure_bytes, input_series, state_series, style
-from undertow.practice import ENERGY_PRICE, STATE_WEIGHT, TERMINAL
-from undertow.trials.balance import ROWS, BalanceResult
+from undertow.practice import default_gate, estimator_for
+from undertow.rig import Bench, srv02_rig
+from undertow.runtime import Recipe
+from undertow.trials.balance import GOALS, ROWS, BalanceResult
 from undertow.trials.estimation import EstimatorRow
 from undertow.trials.library import LibraryRow
 from undertow.trials.robustness import FACTORS, SINGLE, RobustnessResult
@@ -58,13 +62,25 @@ def table(
     return out
 
 
+def _problem(word: Goal, bench: Bench | None = None, horizon: float = 60.0) -> str:
+    """Return what was minimised and who admitted surfaces, for a table of several mechanisms."""
+    bench = srv02_rig() if bench is None else bench
+    belief = bench.mechanism
+    objective = replace(objective_for(belief, word, horizon=horizon), unit="")
+    gate = default_gate(estimator_for(belief, bench))
+    words = problem_words(belief, objective, gate)
+    return f"{words}; each within 95 % of the travel that it declares"
+
+
 def balance_report(result: BalanceResult) -> RenderableType:
     """Return the tables of :func:`undertow.trials.balance.balance` for the terminal."""
-    units = {"energy": "V² s", "time": "s"}
+    belief = result.bench.mechanism
+    gate = default_gate(estimator_for(belief, result.bench))
+    titles = {"bench-energy": "Minimum energy", "bench-time": "Minimum time"}
     parts: list[RenderableType] = []
-    for goal, unit in units.items():
-        rows = []
-        for row in ROWS:
+    for goal, title in titles.items():
+        objective, rows = objective_for(belief, goal), []
+        for row in (row for row in ROWS if (goal, row) in result.outcomes):
             runs, alone = result.outcomes[goal, row], result.ideal[goal, row]
             rows.append(
                 (
@@ -74,22 +90,20 @@ def balance_report(result: BalanceResult) -> RenderableType:
                     *(str(spread(runs, w)) for w in ("cost", "effort", "settled", "chatter")),
                 )
             )
-        formula = (
-            f"Φ = u² + {STATE_WEIGHT:g} xᵀx"
-            if goal == "energy"
-            else f"Φ = 1 + {ENERGY_PRICE:g} (u/u_max)²"
-        )
+        if not rows:  # interrupted before
+            continue
         parts.append(
             table(
-                f"Minimum {goal}, {formula}\nSRV02, φ(0) = {degrees(result.x0[1]):g}° at rest, "
+                f"{title}\nSRV02, φ(0) = {degrees(result.x0[1]):g}° at rest, "
                 f"{1e3 * result.bench.timing.period:g} ms, positions only",
                 (
-                    "", f"ideal\n{unit}", "balanced", f"cost\n{unit}", "∫u² dt\nV² s",
+                    "", f"ideal\n{objective.unit}", "balanced", f"cost\n{objective.unit}",
+                    "∫u² dt\nV² s",
                     "settled\ns", "chatter\nV/s",
                 ),
                 rows,
-                "mean ± standard deviation over the balanced runs; "
-                f"costs until ‖x‖ ≤ {TERMINAL:g}",
+                "mean ± standard deviation over the balanced runs\n"
+                f"{problem_words(belief, objective, gate)}",
             )
         )  # fmt: skip
     if result.limits:
@@ -123,11 +137,11 @@ def balance_files(result: BalanceResult) -> dict[str, bytes]:
         for (goal, row), runs in result.outcomes.items()
         for o in runs
     ]
-    return {
-        "balance.csv": results.to_csv(header, rows),
-        "figure-3-bench.png": figure_bytes(repeats_figure(result)),
-        "figure-4-bench.png": figure_bytes(comparison_figure(result)),
-    }
+    files = {"balance.csv": results.to_csv(header, rows)}
+    if len(result.outcomes) == len(GOALS) * len(ROWS):  # not interrupted
+        files["figure-3-bench.png"] = figure_bytes(repeats_figure(result))
+        files["figure-4-bench.png"] = figure_bytes(comparison_figure(result))
+    return files
 
 
 def _finite(*values: float) -> list[float | None]:
@@ -153,9 +167,9 @@ def repeats_figure(result: BalanceResult) -> Figure:
             motion(mechanism, outcome.record, 2),
             {"color": colour, "linewidth": 0.8, "label": f"rig of seed {outcome.seed}"},
         )
-        for outcome, colour in zip(result.outcomes["time", "one-time"], colours, strict=False)
+        for outcome, colour in zip(result.outcomes["bench-time", "one-time"], colours, strict=False)
     ]
-    ideal = motion(mechanism, result.ideal["time", "one-time"].record, 2)
+    ideal = motion(mechanism, result.ideal["bench-time", "one-time"].record, 2)
     motions.append((ideal, {"color": "black", "linestyle": (0, (4, 2)), "label": "ideal rig"}))
     with style():
         figure = Figure(figsize=(6.4, 5.2), layout="constrained")
@@ -180,7 +194,7 @@ def comparison_figure(result: BalanceResult) -> Figure:
     }
     motions = []
     for row, look in looks.items():
-        outcome = result.outcomes["energy", row][0]
+        outcome = result.outcomes["bench-energy", row][0]
         ended = "" if outcome.balanced else ", lost"
         run = _until_fallen(motion(result.bench.mechanism, outcome.record, 2))
         motions.append((run, {**look, "label": row + ended}))
@@ -247,7 +261,7 @@ def library_report(rows: Sequence[LibraryRow]) -> RenderableType:
         ],
         "m: inputs; ε: boundary layer; held: to the end, without a safe stop; "
         "admitted: surfaces; limits/s: total variation of the input that varies most, by its "
-        "limit",
+        f"limit\n{_problem('bench-energy', horizon=Recipe.horizon)}",
     )
 
 
@@ -273,6 +287,7 @@ def engine_report(found: Sequence[EngineResult]) -> RenderableType:
         "MuJoCo as the truth: the cascade from the listed starts, no retuning",
         ("", "balanced", "settled\ns", "positions at the end", "surfaces\nadmitted"),
         rows,
+        _problem("effort", Bench(found[0].mechanism)) if found else "",
     )
 
 
@@ -305,7 +320,7 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             ),
             rows,
             f"mean ± standard deviation over the rigs that all of them balanced: {sum(both)}\n"
-            "caught: the pendulum is up, wherever the arm is",
+            f"caught: the pendulum is up, wherever the arm is\n{_problem('bench-energy')}",
         )
     ]
     if result.breaking:
@@ -339,7 +354,7 @@ def estimator_report(rows: Sequence[EstimatorRow]) -> RenderableType:
         return f"{value:.{digits}f}" if np.isfinite(value) else "—"
 
     return table(
-        "Estimators on the SRV02 bench, first surface, positions measured only",
+        "Estimators on the SRV02 bench, designed surface, positions measured only",
         (
             "",
             "balanced",

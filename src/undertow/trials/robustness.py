@@ -21,7 +21,8 @@ import scipy.linalg
 
 from undertow.errors import MissingExtraError
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.practice import estimator_for, goal_for
+from undertow.objectives import objective_for
+from undertow.practice import estimator_for
 from undertow.rig import Bench, Push, srv02_rig
 from undertow.stability import linearise
 from undertow.trials.balance import controllers
@@ -163,7 +164,7 @@ def _makers(
     belief: Mechanism, bench: Bench, x0: FloatArray, budget: int
 ) -> dict[str, MakeController]:
     """Return the controllers by name; NMPC where CasADi is there."""
-    objective = goal_for(belief, "energy")
+    objective = objective_for(belief, "bench-energy")
     made = controllers(belief, bench, objective, x0, budget=budget)
     makers = dict(
         zip(NAMES, (made["cascade"], made["one-time"], clipped_regulator(belief)), strict=False)
@@ -210,7 +211,7 @@ def robustness(
     bench = srv02_rig()
     belief = bench.mechanism
     x0: FloatArray = belief.state(phi=angle)
-    objective = goal_for(belief, "energy")
+    objective = objective_for(belief, "bench-energy")
     makers = _makers(belief, bench, x0, budget)
     settings = {"angle": angle, "seconds": [seconds, SINGLE], "budget": budget}
     book = Ledger(ledger, settings | {"fingerprint": belief.fingerprint})

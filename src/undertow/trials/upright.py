@@ -11,7 +11,8 @@ import numpy as np
 from undertow.cascade import Cascade
 from undertow.estimators import Controller, compensated, drive
 from undertow.mechanism import FloatArray, Mechanism
-from undertow.practice import estimator_for, gate_for, goal_for
+from undertow.objectives import objective_for
+from undertow.practice import default_gate, estimator_for
 from undertow.proposal import Budget
 from undertow.rig import Bench, MuJoCoRig, plausible_rig, srv02_rig
 from undertow.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
@@ -174,9 +175,9 @@ def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 2
     """
     x0 = mechanism.state(**mechanism.start)
     rig = MuJoCoRig(mechanism, x0)
-    objective = goal_for(mechanism, "effort")
+    objective = objective_for(mechanism, "effort")
     kalman = estimator_for(mechanism, Bench(mechanism))
-    cascade = Cascade(mechanism, objective, gate=gate_for(kalman), warm=Budget(budget))
+    cascade = Cascade(mechanism, objective, gate=default_gate(kalman), warm=Budget(budget))
     steering = CascadeSteering(cascade, cascade.start(x0))
     kalman.reset(x0)
     controller = compensated(steering, kalman, mechanism.input_limits)
