@@ -46,7 +46,8 @@ def seals(
     kind, unsigned = (np.float32, np.uint32) if real == "float" else (np.float64, np.uint64)
 
     def folded(value: int) -> int:
-        return (value ^ value >> 32) & mask
+        both: int = value ^ value >> 32
+        return both & mask
 
     words = []
     for k, ((start, following), (surface, eta, layer)) in enumerate(

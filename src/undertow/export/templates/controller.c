@@ -413,5 +413,6 @@ void ut_init(ut_controller *c)
     *c = blank;
     (void)ut_offer(c, &ut_built_in);
     c->taken = c->offered;
+    c->slot[1 - (c->offered & 1)] = c->slot[c->offered & 1];
     ut_arm(c);
 }
