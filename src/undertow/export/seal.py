@@ -42,12 +42,12 @@ def seals(
     real
         Floating-point type of the C.
     """
-    width, mask = WIDTH[real], 2 ** WIDTH[real] - 1
+    width = WIDTH[real]
+    mask = (1 << width) - 1
     kind, unsigned = (np.float32, np.uint32) if real == "float" else (np.float64, np.uint64)
 
     def folded(value: int) -> int:
-        both: int = value ^ value >> 32
-        return both & mask
+        return (value ^ value >> 32) & mask
 
     words = []
     for k, ((start, following), (surface, eta, layer)) in enumerate(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import ctypes
+import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -113,11 +114,14 @@ class _Library:
         self._kind = np.float32 if controller.real == "float" else np.float64
         self._m = controller.mechanism.m
         self.memory = np.zeros(-(-size() // 8), dtype=np.uint64).view(np.uint8)
-        self.bits = 8 * size()
+        self.bits, self._at = 8 * size(), self.memory.ctypes.data
+        self._q = np.zeros(controller.mechanism.n, dtype=self._kind)
+        self._u = np.zeros(self._m, dtype=self._kind)
+        self._row = self._q.ctypes.data, self._u.ctypes.data
 
     def begin(self) -> None:
         """Start, with another plan offered than the built-in one."""
-        self._begin(self.memory.ctypes.data)
+        self._begin(self._at)
 
     def flip(self, bit: int) -> None:
         """Upset one bit."""
@@ -125,10 +129,16 @@ class _Library:
 
     def steps(self, q: FloatArray) -> FloatArray:
         """Return the outputs to measured positions, (N, n) to (N, m)."""
-        held = np.ascontiguousarray(np.atleast_2d(q), dtype=self._kind)
+        held = q.astype(self._kind)
         u = np.full((len(held), self._m), np.nan, dtype=self._kind)
-        self._replay(self.memory.ctypes.data, held.ctypes.data, u.ctypes.data, len(held))
+        self._replay(self._at, held.ctypes.data, u.ctypes.data, len(held))
         return u.astype(float)
+
+    def step(self, q: FloatArray) -> list[float]:
+        """Return the output to one measurement, (n,) to (m,)."""
+        self._q[:] = q
+        self._replay(self._at, *self._row, 1)
+        return [float(u) for u in self._u]
 
 
 def _copied(rig: RealisticRig) -> RealisticRig:
@@ -145,10 +155,11 @@ def _run(library: _Library, rig: RealisticRig, periods: int) -> tuple[FloatArray
     positions, outputs = [], []
     for _ in range(periods):
         positions.append(rig.read().q)
-        outputs.append(library.steps(positions[-1])[0])
-        if not np.isfinite(outputs[-1]).all():
+        u = library.step(positions[-1])
+        outputs.append(u)
+        if not all(map(math.isfinite, u)):
             break
-        rig.write(outputs[-1])
+        rig.write(u)
     return np.array(positions), np.array(outputs)
 
 
