@@ -257,6 +257,7 @@ def _lay(controller: EmbeddedController) -> dict[str, str]:
     )
     tape = Tape()
     powers = tape.let_all(lay_polynomial(mechanism, symbols.surface))
+    powers += [sp.Integer(0)] * (2 * n + 2 - len(powers))
     polynomial = C99Emitter(tape, names, controller.real).statements(
         {f"a[{k}]": a for k, a in enumerate(powers)}
     )
@@ -349,16 +350,17 @@ def plan_text(controller: EmbeddedController, plan: Plan, number: int) -> dict[s
 _WORDS = {"name", "title", "coordinates", "inputs", "estimator", "gain_meaning"}
 
 
+def prefixed(text: str, prefix: str) -> str:
+    """Give the names of C their prefix."""
+    text = re.sub(r"\but_", f"{prefix}_", text)
+    return re.sub(r"\bUT_", f"{prefix.upper()}_", text)
+
+
 def render(name: str, values: dict[str, str], prefix: str) -> bytes:
     """Fill a template and give its names their prefix."""
-
-    def prefixed(text: str) -> str:
-        text = re.sub(r"\but_", f"{prefix}_", text)
-        return re.sub(r"\bUT_", f"{prefix.upper()}_", text)
-
     source = resources.files("undertow.export") / "templates" / name
-    text = Template(prefixed(source.read_text(encoding="ascii"))).substitute(
-        {key: value if key in _WORDS else prefixed(value) for key, value in values.items()}
+    text = Template(prefixed(source.read_text(encoding="ascii"), prefix)).substitute(
+        {key: value if key in _WORDS else prefixed(value, prefix) for key, value in values.items()}
     )
     return re.sub(r"[ \t]+$", "", text, flags=re.MULTILINE).encode("ascii")
 

@@ -18,6 +18,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from undertow.export.controller import prefixed
 from undertow.export.host import Build
 from undertow.export.loop import HELD
 from undertow.mechanism import FloatArray
@@ -100,8 +101,7 @@ class _Library:
     def __init__(self, build: Build) -> None:
         controller = build.controller
         prefix, name = controller.prefix, controller.stem
-        source = _HARNESS.format(name=name).replace("ut_", f"{prefix}_")
-        source = source.replace("UT_", f"{prefix.upper()}_")
+        source = prefixed(_HARNESS, prefix).format(name=name)
         (build.folder / "harness.c").write_text(source, encoding="ascii")
         path = build.compile([f"{name}.c", "harness.c"], "harness.so", "-shared", "-fPIC")
         library = ctypes.CDLL(str(path))
@@ -232,7 +232,7 @@ def upset_every_bit(
 def upsets_table(upsets: Upsets) -> Table:
     """Return for a terminal what became of the runs, by the member that was upset."""
     table = Table(
-        title=f"{upsets.name}, {upsets.real}: one bit upset in each run", title_justify="left",
+        title=f"{upsets.name}, {upsets.real}", title_justify="left",
         title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0),
     )  # fmt: skip
     for head in ("member", "runs", "beyond a limit", "still balanced"):

@@ -123,7 +123,7 @@ ${gamma}
     return value;
 }
 
-/* Coefficients of the motion on s = 0 at the target, the highest power first. */
+/* Coefficients of the motion on s = 0 at the target, the highest power first; then zeros. */
 static void ut_polynomial(const ut_row *row, ut_real a[UT_X + 2])
 {
 ${polynomial}
@@ -308,7 +308,7 @@ static int ut_positive(ut_real value)
 /* Routh's criterion: whether the motion on the surface dies out. */
 static int ut_stable(const ut_row *row)
 {
-    ut_real a[UT_X + 2] = {0};
+    ut_real a[UT_X + 2];
     int good = 1;
     ut_polynomial(row, a);
     for (int k = 0; k < UT_X; k++) {
