@@ -23,7 +23,13 @@ import undertow as ut
 from undertow.cli import app
 from undertow.codegen import Tape
 from undertow.codegen.c99 import C99Emitter, literal
-from undertow.errors import ArtefactError, InvalidInputError, MissingExtraError, ModelError
+from undertow.errors import (
+    ArtefactError,
+    InvalidInputError,
+    MissingExtraError,
+    ModelError,
+    UnstableSurfaceError,
+)
 from undertow.export import (
     Build,
     DerivativeStep,
@@ -35,12 +41,17 @@ from undertow.export import (
     Verdict,
     files,
 )
+from undertow.export.controller import plan_numbers
 from undertow.export.host import FLAGS, tool
 from undertow.export.loop import run_on_rig
+from undertow.export.routh import lay_polynomial
+from undertow.export.seal import seals
+from undertow.export.upsets import upset_every_bit
 from undertow.export.vectors import run_positions
 from undertow.mechanisms import LIBRARY
 from undertow.plan import Plan
 from undertow.rig import RealisticRig, plausible_rig, srv02_rig
+from undertow.stability import sliding_matrix, stability_margin
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 
@@ -55,6 +66,9 @@ STRICT = (
     "-Wvla",
 )
 M = "two_motor_three_link"
+
+#: Mechanisms whose offers are tried by default: one of each shape.
+QUICK = {("rotary_pendulum", "double"), (M, "float"), ("gantry_crane", "double")}
 
 
 @lru_cache(maxsize=16)
@@ -298,19 +312,25 @@ def test_whatever_comes_in_the_output_is_a_number_within_limit_and_slew(tmp_path
         check()
 
 
-def test_a_lost_sensor_is_bridged_then_the_output_goes_to_zero_then_it_starts_again(
+def test_a_lost_sensor_is_bridged_then_latched_at_zero_until_it_is_armed_again(
     tmp_path: Path,
 ) -> None:
-    """The estimate is carried on for ``missed`` periods; after that the input is switched off."""
+    """The estimate is carried on for ``missed`` periods; after that the input is switched off.
+
+    It stays off when readings return, until it is let on again.
+    """
     controller = exported(missed=4)
     q = np.array([0.02, 0.1])
     with Build(controller, tmp_path).start() as process:
         before = [process.step(q) for _ in range(50)][-1]
         lost = [process.step([0.02, math.nan]) for _ in range(8)]
+        returned = [process.step(q) for _ in range(20)]
+        process.arm()
         after = process.step(q)
     assert before[1] in (Status.OK, Status.CLIPPED)
     assert all(s & Status.BRIDGED and u == before[0] for u, s in lost[:4])
     assert all(s & Status.LOST and u == 0.0 for u, s in lost[4:])
+    assert all(s & Status.LOST and u == 0.0 for u, s in returned)
     assert not after[1] & (Status.LOST | Status.BRIDGED)
     assert after[0] != 0.0
 
@@ -322,6 +342,334 @@ def test_limits_are_rounded_towards_zero_in_single_precision() -> None:
         shown = np.float32(controller.limit(value).rstrip("f"))
         assert float(shown) <= value
         assert float(shown) > value * (1 - 1e-6)
+
+
+# -- memory that is upset ------------------------------------------------------------------------
+
+#: Steps from nonsense and sense, plans offered, whole and damaged; between steps the memory is
+#: overwritten anywhere: with numbers of every kind, small integers, single bits.
+FUZZ = r"""
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include "NAME_vectors.h"
+
+static uint64_t seed = 88172645463325252ULL;
+
+static uint64_t any(void)
+{
+    seed ^= seed << 13;
+    seed ^= seed >> 7;
+    seed ^= seed << 17;
+    return seed;
+}
+
+static ut_real number(void)
+{
+    const ut_real kinds[] = {(ut_real)NAN, (ut_real)INFINITY, -(ut_real)INFINITY, (ut_real)1e30,
+                             (ut_real)-1e9, (ut_real)9.99e8, (ut_real)1e-38, 0, -0.0f};
+    const uint64_t kind = any() % 24;
+    ut_real value;
+    if (kind < sizeof kinds / sizeof kinds[0]) {
+        return kinds[kind];
+    }
+    if (kind == 23) {
+        const ut_word word = (ut_word)any();
+        memcpy(&value, &word, sizeof value);
+        return value;
+    }
+    return (ut_real)((double)(any() % 2000001) / 1e6 - 1.0);
+}
+
+static void upset(ut_controller *c)
+{
+    unsigned char *bytes = (unsigned char *)c;
+    const size_t at = any() % (sizeof *c - sizeof(uint64_t) + 1);
+    const uint64_t word = any() % 3 ? any() : any() % 9 - 4;
+    const ut_real value = number();
+    switch (any() % 4) {
+    case 0:
+        bytes[at] = (unsigned char)(bytes[at] ^ (1u << any() % 8));
+        break;
+    case 1:
+        memcpy(bytes + at, &word, 1 + any() % sizeof word);
+        break;
+    case 2:
+        memcpy(bytes + at / sizeof value * sizeof value, &value, sizeof value);
+        break;
+    default:
+        memcpy(bytes + at / 4 * 4, &word, 4);
+        break;
+    }
+}
+
+static ut_plan made(const ut_controller *c)
+{
+    ut_plan p = ut_next_plan;
+    p.number = any() % 3 ? c->newest + 1 : (unsigned long)any();
+    p.count = any() % 8 ? 1 + (int)(any() % UT_ROWS) : (int)(any() % 9) - 4;
+    for (int k = 0; k < UT_ROWS; k++) {
+        p.row[k] = ut_next_plan.row[0];
+        p.start[k] = any() % 8 ? 20UL * (unsigned long)k : any() % 100;
+    }
+    if (any() % 4 == 0) {
+        p.row[0].surface[any() % UT_SURFACE] = number();
+        p.row[0].eta[any() % UT_M] = number();
+    }
+    if (any() % 8) {
+        ut_plan_seal(&p);
+    }
+    return p;
+}
+
+int main(int argc, char **argv)
+{
+    const long steps = argc > 1 ? atol(argv[1]) : 1;
+    static ut_controller c;
+    long bad = 0, accepted = 0, faults = 0, fallbacks = 0, given = 0;
+    ut_init(&c);
+    for (long k = 0; k < steps; k++) {
+        ut_real q[UT_X], u[UT_M];
+        for (int i = 0; i < UT_X; i++) {
+            q[i] = any() % 16 ? (ut_real)((double)(any() % 2001) / 1e5 - 0.01) : number();
+        }
+        const int status = any() % 2 ? ut_step(&c, q, u) : ut_step_state(&c, q, u);
+        for (int i = 0; i < UT_M; i++) {
+            bad += !(fabs((double)u[i]) <= (double)ut_scale[i]);
+            given += u[i] < 0 || u[i] > 0;
+        }
+        faults += (status & UT_FAULT) != 0;
+        fallbacks += (status & UT_FALLBACK) != 0;
+        if (any() % 7 == 0) {
+            const ut_plan p = made(&c);
+            accepted += ut_offer(&c, &p) == UT_ACCEPTED;
+        }
+        if (any() % 5 == 0) {
+            for (uint64_t n = any() % 3 ? 1 : any() % 9; n > 0; n--) {
+                upset(&c);
+            }
+        }
+        if (any() % 1009 == 0) {
+            memset(&c, any() % 2 ? 0xff : 0, sizeof c);
+        }
+        if (any() % 16 == 0) {
+            ut_arm(&c);
+        }
+    }
+    printf("%ld %ld %ld %ld %ld\n", bad, accepted, faults, fallbacks, given);
+    return bad != 0;
+}
+"""
+
+
+def fuzzed(controller: EmbeddedController, folder: Path, steps: int) -> list[int]:
+    """Return outputs beyond a limit, plans accepted, faults, fallbacks, outputs other than 0."""
+    build = Build(controller, folder)
+    (folder / "fuzz.c").write_text(FUZZ.replace("NAME", controller.stem))
+    sanitised = ("-fsanitize=undefined,address", "-fno-sanitize-recover=all")
+    program = build.compile([f"{controller.stem}.c", "fuzz.c"], "fuzz", *sanitised)
+    done = subprocess.run(
+        [program, str(steps)], capture_output=True, text=True, check=False, timeout=600
+    )
+    assert not done.stderr, done.stderr
+    return [int(word) for word in done.stdout.split()]
+
+
+@pytest.mark.parametrize(
+    ("name", "real", "step", "steps"),
+    [
+        ("rotary_pendulum", "double", DerivativeStep(), 60_000),
+        (M, "float", DerivativeStep(), 60_000),
+        ("rotary_pendulum", "float", KalmanStep(), 60_000),
+        *(
+            pytest.param(name, real, step, 3_000_000, marks=pytest.mark.slow)
+            for name, real, step in (
+                ("rotary_pendulum", "double", DerivativeStep()),
+                ("rotary_pendulum", "float", SuperTwistingStep()),
+                (M, "double", KalmanStep()),
+            )
+        ),
+    ],
+)
+def test_no_output_is_beyond_a_limit_whatever_words_of_the_memory_are_upset(
+    name: str, real: str, step: object, steps: int, tmp_path: Path
+) -> None:
+    """Under the sanitisers: nothing read or written out of bounds, nothing undefined."""
+    controller = exported(name, real=real, differentiator=step, rows=3, slew=4000.0)
+    bad, accepted, faults, fallbacks, given = fuzzed(controller, tmp_path, steps)
+    assert bad == 0
+    # It is no test of a controller that is always off.
+    assert min(accepted, faults, fallbacks, given) > steps / 1000
+
+
+#: What becomes of the controller when words of its memory are overwritten, a line for each case:
+#: the first output, the outputs beyond the limit in 200 steps, the statuses or-ed, the last status.
+WORDS = r"""
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+#include "rotary_pendulum_vectors.h"
+
+static ut_controller c;
+
+static void report(const char *name)
+{
+    const ut_real q[UT_N] = {0.01, 0.02};
+    ut_real u[UT_M], first = 0;
+    int beyond = 0, status = 0, all = 0;
+    for (int k = 0; k < 200; k++) {
+        status = ut_step(&c, q, u);
+        all |= status;
+        first = k ? first : u[0];
+        beyond += !(fabs((double)u[0]) <= 15.0);
+    }
+    printf("%s %.17g %d %d %d\n", name, (double)first, beyond, all, status);
+}
+
+static void start(void)
+{
+    const ut_real q[UT_N] = {0.01, 0.02};
+    ut_real u[UT_M];
+    ut_init(&c);
+    for (int k = 0; k < 20; k++) {
+        (void)ut_step(&c, q, u);
+    }
+}
+
+int main(void)
+{
+    const double values[] = {100, 1e30, (double)INFINITY, (double)NAN, -1e30, 3};
+    const int indices[] = {1, -1, 7, 64, -2147483647, 2147483647};
+    for (int k = 0; k < 6; k++) {
+        start();
+        c.u[0] = (ut_real)values[k];
+        report("output");
+        ut_arm(&c);
+        report("armed");
+    }
+    for (int k = 0; k < 6; k++) {
+        start();
+        c.row = indices[k];
+        report("row");
+        start();
+        c.taken = (sig_atomic_t)indices[k];
+        report("taken");
+        start();
+        c.offered = (sig_atomic_t)indices[k];
+        report("offered");
+        start();
+        c.missed = indices[k];
+        report("missed");
+    }
+    for (int k = 0; k < UT_SURFACE; k++) {
+        start();
+        c.slot[c.taken].row[0].surface[k] *= -1;
+        report("plan");
+    }
+    start();
+    for (int k = 0; k < UT_SURFACE; k++) {
+        c.slot[c.taken].row[0].surface[k] *= k & 1 ? -1 : 1;
+    }
+    report("plan");
+    start();
+    c.slot[c.taken].count = 1 << 20;
+    report("plan");
+    start();
+    c.guard ^= 1u;
+    report("latch");
+    for (int k = 0; k < 6; k++) {
+        start();
+        c.filter[1][1] = (ut_real)values[k];
+        report("estimate");
+    }
+    memset(&c, 0, sizeof c);
+    report("blank");
+    memset(&c, 0xff, sizeof c);
+    report("ones");
+    ut_arm(&c);
+    report("begun");
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_each_word_of_the_memory_is_checked_where_it_is_used(real: str, tmp_path: Path) -> None:
+    """The output, its mirror, indices, counters, plan, latch, estimate, memory never begun.
+
+    A damaged output is off at once and stays off until it is let on again; a damaged plan is
+    replaced by the built-in one, here the same, bit for bit; damaged indices and counters change
+    nothing.
+    """
+    build = Build(exported(real=real, slew=4000.0), tmp_path)
+    (tmp_path / "words.c").write_text(WORDS)
+    program = build.compile(
+        ["rotary_pendulum.c", "words.c"], "words", "-fsanitize=undefined,address"
+    )
+    done = subprocess.run([program], capture_output=True, text=True, check=True)
+    assert not done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert len(rows) == 6 * 2 + 6 * 4 + 5 + 1 + 1 + 6 + 3
+    healthy = Twin(exported(slew=4000.0))
+    expected = [healthy.step([0.01, 0.02])[0][0] for _ in range(21)][-1]
+    assert expected != 0
+    for name, first, beyond, seen, last in rows:
+        assert beyond == "0"
+        statuses, end, u = Status(int(seen)), Status(int(last)), float(first)
+        off = name in ("output", "latch", "blank", "ones")
+        assert bool(statuses & Status.FAULT) == bool(end & Status.FAULT) == off
+        assert not statuses & Status.LOST
+        assert bool(statuses & Status.FALLBACK) == (name in ("plan", "blank", "ones", "begun"))
+        if off:
+            assert u == 0.0
+        elif name not in ("estimate", "armed", "begun"):
+            assert u == pytest.approx(expected, rel=1e-12 if real == "double" else 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("real", "every"), [("double", 37), pytest.param("float", 7, marks=pytest.mark.slow)]
+)
+def test_bits_of_the_memory_upset_on_the_rig_leave_the_output_within_its_limits(
+    real: str, every: int, tmp_path: Path
+) -> None:
+    """A sample of ``--bit-flips``: all but the output, its mirror and the latch are ridden out."""
+    controller = exported(real=real)
+    start = controller.mechanism.state(phi=math.radians(35))
+    rig = RealisticRig(srv02_rig(), start, seed=0)
+    upsets = upset_every_bit(Build(controller, tmp_path), rig, moments=(0.05,), every=every)
+    assert upsets.undisturbed
+    assert sum(upsets.runs.values()) == -(-upsets.bits // every) >= 70
+    assert sum(upsets.beyond.values()) == 0
+    off = {"u", "mirror", "guard"}
+    assert all(upsets.held[k] == upsets.runs[k] for k in upsets.runs if k not in off)
+    assert all(upsets.held[k] == 0 for k in off)
+    assert sum(upsets.runs[k] for k in off) > 0
+
+
+@pytest.mark.slow
+def test_bits_upset_under_two_motors_and_a_plan_of_three_surfaces(tmp_path: Path) -> None:
+    """Limits hold for both inputs while surfaces take over one after another."""
+    rig = LIBRARY["gantry_crane"]()
+    controller = EmbeddedController(rig, three_rows(rig), slew=4000.0)
+    bench = RealisticRig(plausible_rig(rig), seed=0)
+    upsets = upset_every_bit(Build(controller, tmp_path), bench, moments=(0.03, 1.0), every=19)
+    assert sum(upsets.beyond.values()) == 0
+    assert sum(upsets.held.values()) > 0.8 * sum(upsets.runs.values())
+
+
+def test_an_output_beyond_its_limit_is_counted(tmp_path: Path) -> None:
+    """The search for them finds one: a controller that clips too late."""
+    controller = exported(prefix="other")
+    build = Build(controller, tmp_path)
+    source = tmp_path / "rotary_pendulum.c"
+    text = source.read_text()
+    text = text.replace("next = other_within(next, other_limit[i]);", "")
+    text = text.replace("if (c->mirror[i] != (other_word)~other_bits(c->u[i])) {", "if (0) {")
+    source.write_text(text)
+    rig = RealisticRig(srv02_rig(), controller.mechanism.state(phi=0.3), seed=0)
+    upsets = upset_every_bit(build, rig, moments=(0.05,), after=0.05, every=3)
+    assert upsets.beyond["u"] > 0
 
 
 # -- plans ---------------------------------------------------------------------------------------
@@ -384,6 +732,148 @@ def test_offers_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
         assert offer(row(eta=199.0), number=8) is Verdict.ACCEPTED
 
 
+def test_a_plan_is_sealed_by_its_sender_and_damage_on_the_way_is_noticed(tmp_path: Path) -> None:
+    """One bit of any word of a row, or of its check word: refused; whole: taken."""
+    rig = LIBRARY["rotary_pendulum"]()
+    controller = EmbeddedController(rig, three_rows(rig))
+    starts, rows = controller.starts(controller.plan), plan_numbers(controller, controller.plan)
+    checks = seals(2, starts, rows, "double")
+    flat = [np.concatenate(row) for row in rows]
+    rng = np.random.default_rng(0)
+    with Build(controller, tmp_path).start() as process:
+
+        def offer(
+            number: int, starts: list[int], rows: list[ut.mechanism.FloatArray], checks: list[int]
+        ) -> Verdict:
+            words = ["p", str(number), str(len(rows))]
+            for start, row in zip(starts, rows, strict=True):
+                words += [str(start), *map(repr, row.tolist())]
+            return Verdict(int(process._ask(" ".join([*words, *map(str, checks)]))[0]))
+
+        for k in range(3):
+            for i in range(6):
+                for bit in rng.choice(64, 8, replace=False).tolist():
+                    damaged = [row.copy() for row in flat]
+                    damaged[k].view(np.uint64)[i] ^= np.uint64(1) << np.uint64(bit)
+                    if np.isfinite(damaged[k]).all():
+                        assert offer(2, starts, damaged, checks) is Verdict.CORRUPT
+            for bit in range(64):
+                wrong = [c ^ (1 << bit) * (j == k) for j, c in enumerate(checks)]
+                assert offer(2, starts, flat, wrong) is Verdict.CORRUPT
+        both = [row.copy() for row in flat]
+        both[0][[1, 3]] *= -1  # two signs at once
+        assert offer(2, starts, both, checks) is Verdict.CORRUPT
+        assert offer(3, starts, flat, checks) is Verdict.CORRUPT
+        assert offer(2, [0, starts[1] + 1, starts[2]], flat, checks) is Verdict.CORRUPT
+        assert offer(2, starts[:2], flat[:2], checks[:2]) is Verdict.CORRUPT
+        assert offer(2, starts, [flat[0], flat[2], flat[1]], checks) is Verdict.CORRUPT
+        assert offer(2, starts, flat, checks) is Verdict.ACCEPTED
+
+
+def test_no_number_of_a_plan_locks_out_the_next(tmp_path: Path) -> None:
+    """Numbers of every size, one after another; only the last and those just behind are stale."""
+    controller = exported()
+    twin = Twin(controller)
+    plan = controller.plan
+    with Build(controller, tmp_path).start() as process:
+
+        def offer(number: int) -> Verdict:
+            verdict = process.offer(plan, number)
+            assert verdict == twin.offer(plan, number)
+            for side in (process, twin):
+                side.step([0.0, 0.0])
+            return verdict
+
+        assert offer(2**64 - 1) is Verdict.STALE  # two behind 1
+        for number in (5, 2**31 - 1, 5, 2**31 + 5, 6, 2**63 + 10**6, 2**32 - 1, 2**32, 1, 2):
+            assert offer(number) is Verdict.ACCEPTED
+            assert offer(number) is Verdict.STALE
+            assert offer((number - 1) % 2**64) is Verdict.STALE
+        assert offer(2 + 2**16) is Verdict.ACCEPTED
+        assert offer(3) is Verdict.STALE
+        assert offer(2) is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", M, "triple_pendulum_on_a_cart"])
+def test_the_polynomial_has_the_eigenvalues_of_the_motion_on_the_surface(name: str) -> None:
+    """Its roots are the eigenvalues that the stability margin is taken from."""
+    mechanism = LIBRARY[name]()
+    n, m = mechanism.n, mechanism.m
+    symbols = sp.symbols(f"c:{2 * m * n}")
+    coefficients = sp.lambdify(symbols, lay_polynomial(mechanism, symbols))
+    rng = np.random.default_rng(0)
+    vector = ut.first_surface(mechanism).vector
+    for _ in range(20):
+        changed = vector * rng.uniform(0.7, 1.3, len(vector))
+        roots = np.sort_complex(np.roots(np.array(coefficients(*changed), dtype=float)))
+        expected = np.sort_complex(np.linalg.eigvals(sliding_matrix(mechanism, changed)))
+        assert np.abs(roots - expected).max() <= 1e-4 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "real"),
+    [
+        pytest.param(name, real, marks=() if (name, real) in QUICK else pytest.mark.slow)
+        for name in LIBRARY
+        for real in ("double", "float")
+    ],
+)
+def test_a_plan_whose_motion_does_not_die_out_is_refused(
+    name: str, real: str, tmp_path: Path
+) -> None:
+    """Signs flipped and numbers changed at random: taken if and only if all eigenvalues are left.
+
+    Eigenvalues near the axis are left out: there the criterion is rounding.
+    """
+    controller = exported(name, real=real)
+    mechanism = controller.mechanism
+    rng = np.random.default_rng(0)
+    vector = ut.first_surface(mechanism).vector
+    number, stable, unstable = 1, 0, 0
+    rest = np.zeros(mechanism.n)
+    with Build(controller, tmp_path).start() as process:
+        for k in range(200):
+            flips = np.where(rng.random(len(vector)) < 0.15 * (k % 2), -1.0, 1.0)
+            spread = 0.05 if k % 3 else 0.4
+            changed = vector * flips * rng.uniform(1 - spread, 1 + spread, len(vector))
+            surface = ut.Surface.from_vector(changed, mechanism.n, mechanism.m)
+            margin = float(stability_margin(mechanism, surface))
+            speed = np.abs(np.linalg.eigvals(sliding_matrix(mechanism, changed))).max()
+            if abs(margin) < (1e-9 if real == "double" else 1e-3) * speed:
+                continue
+            number += 1
+            verdict = process.offer(Plan.of(surface), number)
+            assert verdict is (Verdict.ACCEPTED if margin > 0 else Verdict.INVALID), margin
+            process.step(rest)
+            stable, unstable = stable + (margin > 0), unstable + (margin <= 0)
+    assert min(stable, unstable) >= 15
+
+
+def test_an_unstable_surface_is_not_exported() -> None:
+    """What would be refused as a plan is not built in either."""
+    rig = LIBRARY["rotary_pendulum"]()
+    s = ut.first_surface(rig)
+    with pytest.raises(UnstableSurfaceError, match="margin"):
+        EmbeddedController(rig, ut.Surface(s.alpha_a, -s.lambda_a, s.alpha_u, -s.lambda_u))
+
+
+def test_a_sensor_that_is_lost_from_the_start_latches_as_later(tmp_path: Path) -> None:
+    """Up to ``missed`` periods are waited for; after that the output stays off."""
+    controller = exported(missed=4)
+    gone, q = [math.nan, 0.1], [0.02, 0.1]
+    for wait, latched in ((4, False), (5, True)):
+        folder = tmp_path / str(wait)
+        folder.mkdir()
+        with Build(controller, folder).start() as process:
+            before = [process.step(gone) for _ in range(wait)]
+            assert all(u == 0.0 and status & Status.LOST for u, status in before)
+            u, status = process.step(q)
+            assert bool(status & Status.LOST) == (u[0] == 0.0) == latched
+            assert bool(process.step_state([*q, 0.0, 0.0])[1] & Status.LOST) == latched
+            process.arm()
+            assert not process.step(q)[1] & Status.LOST
+
+
 INTERRUPTED = r"""
 #include <signal.h>
 #include <stdio.h>
@@ -400,8 +890,12 @@ static void fast(void)
 {
     static const ut_real q[UT_N] = {0.0, 0.01};
     ut_real u[UT_M];
-    if (ut_step(&c, q, u) & UT_SWITCHED) {
+    const int status = ut_step(&c, q, u);
+    if (status & UT_SWITCHED) {
         changes++;
+    }
+    if (status & UT_FALLBACK) {
+        torn++;
     }
     const ut_plan *used = &c.slot[c.taken];
     for (int k = 0; k < UT_ROWS; k++) {
@@ -421,6 +915,7 @@ static void slow(void)
         plan.row[k].eta[0] = 10 * size;
     }
     plan.number++;
+    ut_plan_seal(&plan);
     const int verdict = ut_offer(&c, &plan);
     accepted += verdict == UT_ACCEPTED;
     refused += verdict == UT_BUSY;
@@ -653,7 +1148,7 @@ def test_the_example_of_the_page_compiles(tmp_path: Path) -> None:
     needs = (
         "#include <math.h>\nextern double read_arm(void), read_pendulum(void);\n"
         "extern void write_voltage(double u), brake(void), start_timer(void), reply(int verdict);\n"
-        "extern int receive(void *plan);\nvoid timer_interrupt(void);\n"
+        "extern int receive(void *plan), restart_pressed(void);\nvoid timer_interrupt(void);\n"
     )
     (tmp_path / "example.c").write_text(needs + code)
     done = gcc(tmp_path, *FLAGS, *STRICT, "-c", "example.c")

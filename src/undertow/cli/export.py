@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from rich.console import Console
 
 from undertow import inputs, results
 from undertow.cli.terminal import (
@@ -26,6 +29,7 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
+from undertow.codegen.c99 import Real
 from undertow.errors import InvalidInputError
 from undertow.export import (
     DerivativeStep,
@@ -62,6 +66,7 @@ app.add_typer(export, name="export")
         "undertow export c gantry_crane --check --rigs 3",
         "undertow export c bar.py:bar --velocity super-twisting --acceleration 80 --out firmware",
         "undertow export c --all --report",
+        "undertow export c rotary_pendulum --start phi=35deg --bit-flips",
     ),
 )
 @reports_errors
@@ -95,6 +100,14 @@ def export_c(
             min=0,
         ),
     ] = 0,
+    bit_flips: Annotated[
+        bool,
+        typer.Option(
+            "--bit-flips",
+            help="Also upset every bit of its memory, one in each run on a realistic rig, double "
+            "and float: minutes.",
+        ),
+    ] = False,
     control: Annotated[
         str | None,
         typer.Option(
@@ -151,10 +164,10 @@ def export_c(
             limit="one of them",
             remedy="Write for instance: undertow export c rotary_pendulum --out firmware",
         )
-    if out is None and not (check or report or rigs):
+    if out is None and not (check or report or rigs or bit_flips):
         raise InvalidInputError(
             "what to do with the C",
-            value="none of --out, --check, --rigs, --report",
+            value="none of --out, --check, --rigs, --bit-flips, --report",
             limit="one of them at least",
             remedy="Write for instance --out firmware",
         )
@@ -229,6 +242,10 @@ def export_c(
                 f"{rigs - 1}, from {words}, as a process over a pipe, positions alone measured.",
                 markup=False,
             )
+    if bit_flips:
+        for one in chosen:
+            x0 = inputs.parse_start(one.mechanism, start or ())
+            good &= flip_bits(one, x0, compiler, console)
     if report:
         with progress_bar() as progress:
             entries = measure(chosen, states=states, compiler=compiler, progress=progress)
@@ -263,6 +280,27 @@ def on_rigs(
             with build.start() as process:
                 held += run_on_rig(process, RealisticRig(bench, x0, seed), SECONDS).held
     return held
+
+
+def flip_bits(one: EmbeddedController, x0: FloatArray, compiler: str, console: Console) -> bool:
+    """Upset every bit of the controller's memory, say what came of it: whether limits held."""
+    from undertow.export.upsets import upset_every_bit, upsets_table
+    from undertow.rig import RealisticRig
+
+    bench = bench_for(one.mechanism).with_timing(period=one.period)
+    beyond = 0
+    precisions: tuple[Real, ...] = ("double", "float")
+    for real in precisions:
+        with tempfile.TemporaryDirectory(prefix="undertow-") as folder, progress_bar() as progress:
+            upsets = upset_every_bit(
+                Build(replace(one, real=real), Path(folder), compiler),
+                RealisticRig(bench, x0, seed=0),
+                progress=partial(progress, f"bits of {one.mechanism.name}, {real}"),
+            )
+        console.print(upsets_table(upsets))
+        console.print(str(upsets), markup=False)
+        beyond += sum(upsets.beyond.values())
+    return beyond == 0
 
 
 def notes(one: EmbeddedController, states: int, compiler: str) -> tuple[str, ...]:

@@ -25,10 +25,13 @@ from undertow.errors import InvalidInputError
 from undertow.export.differentiators import DerivativeStep
 from undertow.export.estimate import EstimatorStep, estimate_code
 from undertow.export.observer import KalmanStep
+from undertow.export.routh import lay_polynomial
+from undertow.export.seal import FACTOR, WIDTH, as_held, seals
 from undertow.export.twin import LARGEST
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plan import Plan
 from undertow.sliding import LawSymbols, ReachingLaw, SlidingModeLaw, Surface, lay_law
+from undertow.stability import check_surface
 
 __all__ = ["EmbeddedController", "files"]
 
@@ -67,8 +70,8 @@ class EmbeddedController:
     InvalidInputError
         When a number cannot be used, an input has no limit, or the boundary layer is too thin
         for the period.
-    SingularSurfaceError
-        When Γ is singular at the target.
+    SingularSurfaceError, UnstableSurfaceError
+        When Γ is singular at the target, or the motion on a surface does not die out there.
 
     Examples
     --------
@@ -154,6 +157,7 @@ class EmbeddedController:
                 remedy="Name what the actuators can deliver: mechanism.with_input_limit",
             )
         for law in self.laws:
+            check_surface(self.mechanism, law.surface)
             layer = law.reaching.vector(self.mechanism.m)[self.mechanism.m :]
             gains = law(0.0, np.zeros(2 * self.mechanism.n)).gains
             fast = self.period * gains >= 2 * layer
@@ -243,7 +247,13 @@ def _lay(controller: EmbeddedController) -> dict[str, str]:
         {p.symbol: names[p.symbol] for p in mechanism.parameters},
         controller.real,
     )
-    return {"law": evaluate, "gamma": gamma, **estimate}
+    tape = Tape()
+    powers = tape.let_all(lay_polynomial(mechanism, symbols.surface))
+    powers += [sp.Integer(0)] * (2 * n + 2 - len(powers))
+    polynomial = C99Emitter(tape, names, controller.real).statements(
+        {f"a[{k}]": a for k, a in enumerate(powers)}
+    )
+    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **estimate}
 
 
 _HELPERS = {
@@ -302,18 +312,33 @@ def _listed(values: Iterable[float], real: Real) -> str:
     return ", ".join(literal(v, real) for v in values)
 
 
-def plan_text(controller: EmbeddedController, plan: Plan) -> dict[str, str]:
-    """Return the C initialisers of a plan: count, starts and rows."""
-    whole = controller if plan is controller.plan else replace(controller, surface=plan)
+def plan_numbers(
+    controller: EmbeddedController, plan: Plan
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Return what the C holds of each row of a plan: surface (2mn,), η (m,) and ε (m,)."""
+    m = controller.mechanism.m
     rows = []
-    for law in whole.laws:
-        eta, layer = np.split(law.reaching.vector(controller.mechanism.m), 2)
-        parts = [f"{{{_listed(v, controller.real)}}}" for v in (law.surface.vector, eta, layer)]
+    for surface, t in zip(plan.surfaces, plan.times, strict=True):
+        law = plan.at(t)[1] or controller.reaching
+        values = np.concatenate([surface.vector, law.vector(m)])
+        held = np.array([as_held(v, controller.real) for v in values.tolist()])
+        rows.append((held[: -2 * m], held[-2 * m : -m], held[-m:]))
+    return rows
+
+
+def plan_text(controller: EmbeddedController, plan: Plan, number: int) -> dict[str, str]:
+    """Return the C initialisers of a plan: count, starts and rows, sealed."""
+    whole = controller if plan is controller.plan else replace(controller, surface=plan)
+    starts, numbers = whole.starts(plan), plan_numbers(whole, plan)
+    checks = seals(number, starts, numbers, controller.real)
+    rows = []
+    for law, row, check in zip(whole.laws, numbers, checks, strict=True):
+        parts = [f"{{{_listed(v, controller.real)}}}" for v in row]
         gamma = literal(law.gamma_target, controller.real)
-        rows.append(f"        {{{', '.join([*parts, gamma])}}},")
+        rows.append(f"        {{{', '.join([*parts, gamma, f'{check:#x}u'])}}},")
     return {
         "count": str(len(rows)),
-        "starts": ", ".join(f"{k}UL" for k in whole.starts(plan)),
+        "starts": ", ".join(f"{k}UL" for k in starts),
         "rows": "\n".join(rows),
     }
 
@@ -322,16 +347,17 @@ def plan_text(controller: EmbeddedController, plan: Plan) -> dict[str, str]:
 _WORDS = {"name", "title", "coordinates", "inputs", "estimator", "gain_meaning"}
 
 
+def prefixed(text: str, prefix: str) -> str:
+    """Give the names of C their prefix."""
+    text = re.sub(r"\but_", f"{prefix}_", text)
+    return re.sub(r"\bUT_", f"{prefix.upper()}_", text)
+
+
 def render(name: str, values: dict[str, str], prefix: str) -> bytes:
     """Fill a template and give its names their prefix."""
-
-    def prefixed(text: str) -> str:
-        text = re.sub(r"\but_", f"{prefix}_", text)
-        return re.sub(r"\bUT_", f"{prefix.upper()}_", text)
-
     source = resources.files("undertow.export") / "templates" / name
-    text = Template(prefixed(source.read_text(encoding="ascii"))).substitute(
-        {key: value if key in _WORDS else prefixed(value) for key, value in values.items()}
+    text = Template(prefixed(source.read_text(encoding="ascii"), prefix)).substitute(
+        {key: value if key in _WORDS else prefixed(value, prefix) for key, value in values.items()}
     )
     return re.sub(r"[ \t]+$", "", text, flags=re.MULTILINE).encode("ascii")
 
@@ -361,15 +387,17 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     mechanism, real = controller.mechanism, controller.real
     name, prefix = controller.stem, controller.prefix
     shared = common(controller)
-    plan = plan_text(controller, controller.plan)
+    plan = plan_text(controller, controller.plan, controller.number)
     code = _lay(controller)
     used = "\n".join(code.values())
-    always = ("ut_max", "ut_min")
     sharp = controller.reaching.switching == "sign"
     limits = mechanism.input_limits
     slew = np.minimum(controller.slew_rates * controller.period, 2 * limits)
     values = shared | {
         "real": real,
+        "word": f"uint{WIDTH[real]}_t",
+        "turn": str(WIDTH[real] - 5),
+        "factor": f"{FACTOR[real]:#x}",
         "fingerprint": mechanism.fingerprint[:16],
         "coordinates": _coordinates(mechanism),
         "inputs": _inputs(controller),
@@ -393,7 +421,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         "tiny": literal(1e-12, real),
         "fabs": "fabsf" if real == "float" else "fabs",
         "rate_check": "1" if sharp else "UT_PERIOD * out.gain[i] < 2 * row->layer[i]",
-        "helpers": "\n".join(v for k, v in _HELPERS.items() if k in always or k in used),
+        "helpers": "\n".join(v for k, v in _HELPERS.items() if k in used),
         **code,
     }
     return {
@@ -401,7 +429,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         f"{name}.c": render("controller.c", values, prefix),
         f"{name}_vectors.h": render("vectors.h", shared | vectors(controller), prefix),
         f"{name}_test.c": render("test.c", shared, prefix),
-        f"{name}_pipe.c": render("pipe.c", shared, prefix),
+        f"{name}_pipe.c": render("pipe.c", shared | {"place": code["place"]}, prefix),
     }
 
 

@@ -26,11 +26,17 @@ static void ut_differentiate(ut_real gain, ut_real q, ut_real filter[2])
 static void ut_estimate(ut_controller *c, const ut_real q[UT_N])
 {{
     for (int i = 0; i < UT_N; i++) {{
-        if (!c->running) {{
+        /* The estimate is the memory: where they differ, one was upset. */
+        const int same = c->filter[i][0] == c->x[i] && c->filter[i][1] == c->x[UT_N + i];
+        if (!c->running || !same) {{
             c->filter[i][0] = q[i];
             c->filter[i][1] = 0;
         }}
         ut_differentiate(ut_gain[i], q[i], c->filter[i]);
+        if (!ut_sound(c->filter[i][0]) || !ut_sound(c->filter[i][1])) {{
+            c->filter[i][0] = q[i];
+            c->filter[i][1] = 0;
+        }}
         c->x[i] = c->filter[i][0];
         c->x[UT_N + i] = c->filter[i][1];
     }}
@@ -111,7 +117,7 @@ def estimate_code(
         body = C99Emitter(tape, {**names, **parameters}, real).statements(rates)
         rows = [f"    {{{row(r)}}}," for r in step.gains(mechanism, period).tolist()]
         text = _OBSERVER.format(gains="\n".join(rows), step=body, half=literal(0.5, real))
-        return {"estimate": text, "memory": "", "remember": ""}
+        return {"estimate": text, "memory": "", "place": "", "remember": ""}
     symbols = StepSymbols.new()
     position, velocity = step.lay(tape, symbols)
     names = {
@@ -127,6 +133,7 @@ def estimate_code(
         "estimate": _DIFFERENTIATOR.format(gains=row(step.gains(mechanism.n).tolist()), step=body),
         "memory": "    ut_real filter[UT_N][2];       "
         "/* memory of the estimator, for each coordinate */\n",
+        "place": "UT_PLACE(filter), ",
         "remember": "            c->filter[i % UT_N][i / UT_N] = at[i]; "
         "/* where ut_step would go on */\n",
     }

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.errors import ArtefactError, MissingExtraError
-from undertow.export.controller import EmbeddedController, files
+from undertow.export.controller import EmbeddedController, files, plan_numbers
+from undertow.export.seal import seals
 from undertow.export.twin import Status, Verdict
 from undertow.export.vectors import random_states
 from undertow.mechanism import FloatArray
@@ -305,20 +306,27 @@ class HostProcess:
 
     def offer(self, plan: Plan, number: int) -> Verdict:
         """Offer another plan; it is in use from the next step on."""
-        m = self.controller.mechanism.m
-        words = ["p", str(number), str(len(plan.surfaces))]
-        for surface, start, t in zip(
-            plan.surfaces, self.controller.starts(plan), plan.times, strict=True
-        ):
-            law = plan.at(t)[1] or self.controller.reaching
-            numbers = [*surface.vector.tolist(), *law.vector(m).tolist()]
-            words += [str(start), *map(repr, numbers)]
+        starts, rows = self.controller.starts(plan), plan_numbers(self.controller, plan)
+        words = ["p", str(number), str(len(rows))]
+        for start, row in zip(starts, rows, strict=True):
+            words += [str(start), *map(repr, np.concatenate(row).tolist())]
+        words += map(str, seals(number, starts, rows, self.controller.real))
         return Verdict(int(self._ask(" ".join(words))[0]))
+
+    def arm(self) -> None:
+        """Let the output on again after a lost sensor or a fault."""
+        self._ask("a")
 
     @property
     def memory(self) -> int:
         """Bytes of the controller's state."""
         return int(self._ask("m")[0])
+
+    @property
+    def places(self) -> dict[str, int]:
+        """Where each member of the controller's state begins, bytes."""
+        _, *words = self._ask("m")
+        return {name: int(at) for name, at in zip(words[::2], words[1::2], strict=True)}
 
     def close(self) -> None:
         """End the process."""

@@ -16,10 +16,14 @@ from undertow.sliding import Control, SlidingModeLaw
 if TYPE_CHECKING:
     from undertow.export.controller import EmbeddedController
 
-__all__ = ["LARGEST", "Status", "Twin", "Verdict"]
+__all__ = ["LARGEST", "STALE_SPAN", "Status", "Twin", "Verdict"]
 
 #: A measurement beyond is no number either.
 LARGEST = 1e9
+
+#: So many numbers up to the last accepted plan's are stale; every other one is a later one's, so
+#: that none locks out the next. Numbers count modulo 2³².
+STALE_SPAN = 2**16
 
 
 class Status(IntFlag):
@@ -32,6 +36,8 @@ class Status(IntFlag):
     LOST = 8
     SINGULAR = 16
     SWITCHED = 32
+    FAULT = 64
+    FALLBACK = 128
 
 
 class Verdict(IntEnum):
@@ -41,6 +47,7 @@ class Verdict(IntEnum):
     BUSY = 1
     STALE = 2
     INVALID = 3
+    CORRUPT = 4
 
 
 class Twin:
@@ -60,7 +67,7 @@ class Twin:
         self._estimator = controller.differentiator.estimator(mechanism, controller.period)
         self.x = np.zeros(2 * self._n)
         self.u = np.zeros(mechanism.m)
-        self._missed, self._running = 0, False
+        self._missed, self._running, self._waiting = 0, False, False
         self._use(controller.plan)
         self._offered: Plan | None = None
         self._newest = controller.number
@@ -83,22 +90,26 @@ class Twin:
         """Offer another plan; it is in use from the next step on."""
         if self._offered is not None:
             return Verdict.BUSY
-        if number <= self._newest:
+        if (self._newest - number) % 2**32 < STALE_SPAN:
             return Verdict.STALE
         self._newest, self._offered = number, plan
         return Verdict.ACCEPTED
 
+    def arm(self) -> None:
+        """Let the output on again after ``LOST``; the estimator starts anew."""
+        self._missed, self._running, self._waiting = 0, False, False
+
     def step(self, q: ArrayLike) -> tuple[FloatArray, Status]:
         """One period from measured positions, (n,): the inputs, (m,), and the status."""
         at = np.array(q, dtype=float)
-        status = self._repair(at, self.x[self._n :].copy())
+        status = self._repair(at, np.zeros(self._n))
         if status & Status.LOST:
             self._running = False
         else:
             if not self._running:
                 self._estimator.reset(np.concatenate([at, np.zeros(self._n)]))
             # One instant for all, so that the estimator takes its usual period.
-            self.x = self._estimator.estimate(Measurement(0.0, at), self.u).copy()
+            self.x = self._sound(self._estimator.estimate(Measurement(0.0, at), self.u), at)
             self._running = True
         return self._control(status)
 
@@ -112,6 +123,14 @@ class Twin:
             self._estimator.reset(self.x)
         return self._control(status)
 
+    def _sound(self, x: FloatArray, q: FloatArray) -> FloatArray:
+        """Return an estimate, begun anew for each coordinate of which it is no number."""
+        bad = ~(np.abs(x.reshape(2, -1)) < LARGEST).all(axis=0)
+        if bad.any():
+            x = np.where(np.tile(bad, 2), np.concatenate([q, np.zeros(self._n)]), x)
+            self._estimator.reset(x)
+        return x.copy()
+
     def _repair(self, q: FloatArray, velocity: FloatArray) -> Status:
         rate = ~(np.abs(velocity) < LARGEST)
         velocity[rate] = self.x[self._n :][rate]
@@ -119,10 +138,12 @@ class Twin:
         q[place] = (self.x[: self._n] + self.controller.period * self.x[self._n :])[place]
         if not (rate.any() or place.any()):
             self._missed = 0
-            return Status.OK
+            return Status.LOST if self._waiting else Status.OK
         self._missed = min(self._missed + 1, self.controller.missed + 1)
-        bridged = self._running and self._missed <= self.controller.missed
-        return Status.BRIDGED if bridged else Status.LOST
+        long = self._missed > self.controller.missed
+        self._waiting |= long
+        good = self._running and not long and (np.abs([q, velocity]) < LARGEST).all()
+        return Status.BRIDGED if good and not self._waiting else Status.LOST
 
     def _control(self, status: Status) -> tuple[FloatArray, Status]:
         if self._offered is not None:

@@ -22,8 +22,8 @@ TOLERANCE = {"double": 1e-12, "float": 1e-3}
 #: States of the law's test, and periods of the run's.
 STATES, PERIODS = 100, 240
 
-#: Where the new plan is offered and where measurements are lost: first, a few, many.
-OFFER_AT = 40
+#: Where the new plan is offered, the output let on again, and measurements lost: a few, many.
+OFFER_AT, ARM_AT = 40, 180
 SHORT, LONG = slice(80, 83), slice(150, 165)
 
 
@@ -99,11 +99,13 @@ def vectors(controller: EmbeddedController) -> dict[str, str]:
     for k, q in enumerate(positions):
         if k == OFFER_AT:
             twin.offer(next_plan, controller.number + 1)
+        if k == ARM_AT:
+            twin.arm()
         u, status = twin.step(q)
         outputs.append(u)
         estimates.append(twin.x.copy())
         statuses.append(int(status))
-    text = plan_text(controller, next_plan)
+    text = plan_text(controller, next_plan, controller.number + 1)
 
     def table(rows: Iterable[Iterable[float]]) -> str:
         cells = (
@@ -118,7 +120,7 @@ def vectors(controller: EmbeddedController) -> dict[str, str]:
         "tolerance": literal(TOLERANCE[real], real),
         "scale": ", ".join(controller.limit(v) for v in mechanism.input_limits),
         # In single precision a demand at a limit may fall on either side of it.
-        "status_mask": str(~(Status.CLIPPED | Status.SLEWED) & 63 if real == "float" else 63),
+        "status_mask": str(~(Status.CLIPPED | Status.SLEWED) & 255 if real == "float" else 255),
         "law_count": str(len(states)),
         "law_x": table(states),
         "law_demand": table(said.demand),
@@ -126,6 +128,7 @@ def vectors(controller: EmbeddedController) -> dict[str, str]:
         "law_margin": column(literal(v, real) for v in said.margin),
         "step_count": str(len(positions)),
         "offer_at": str(OFFER_AT),
+        "arm_at": str(ARM_AT),
         "next_number": str(controller.number + 1),
         "next_count": text["count"],
         "next_starts": text["starts"],

@@ -5,6 +5,7 @@
 #include "${name}.h"
 
 #include <math.h>
+#include <string.h>
 
 #if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
 #error "without NaN the controller cannot notice a lost sensor: compile without -ffast-math"
@@ -18,6 +19,14 @@
 #endif
 
 #define UT_LARGEST ${largest} /* a measurement beyond is no number either */
+#define UT_ORDER (UT_X - UT_M) /* of the motion on a surface */
+
+/* Words of the latch: far from each other, from zeros and from ones. */
+#define UT_ARMED ((uint32_t)0x3A96C55AUL)
+#define UT_WAITING ((uint32_t)0xC5693AA5UL)
+#define UT_FAULTY ((uint32_t)0x96A35C69UL)
+
+typedef char ut_real_fills_a_word[sizeof(ut_real) == sizeof(ut_word) ? 1 : -1];
 
 static const ut_real ut_limit[UT_M] = {${limits}};
 static const ut_real ut_slew[UT_M] = {${slews}}; /* largest change in a period */
@@ -37,6 +46,68 @@ static ut_real ut_clip(ut_real value, ut_real low, ut_real high)
     return value < low ? low : value > high ? high : value;
 }
 
+/* A number within a limit, whatever comes in: zero for what is no number. */
+static ut_real ut_within(ut_real value, ut_real limit)
+{
+    if (value >= -limit && value <= limit) {
+        return value;
+    }
+    return value > limit ? limit : value < -limit ? -limit : 0;
+}
+
+/* -- check words ------------------------------------------------------------------------------ */
+
+static ut_word ut_bits(ut_real value)
+{
+    ut_word word;
+    memcpy(&word, &value, sizeof word);
+    return word;
+}
+
+/* Every word that is changed by itself changes the sum: each step can be undone. */
+static ut_word ut_mix(ut_word sum, ut_word word)
+{
+    const ut_word turned = (ut_word)((sum << 5) | (sum >> ${turn}));
+    return (ut_word)((turned ^ word) * ${factor}u);
+}
+
+static ut_word ut_fold(unsigned long value)
+{
+    return (ut_word)(value ^ (value >> 16 >> 16));
+}
+
+/* Check word of a row as it is sent: its numbers, its place, the plan's number, its times. */
+static ut_word ut_sum(const ut_plan *plan, int k, const ut_row *row)
+{
+    const int more = k + 1 < plan->count && k + 1 < UT_ROWS;
+    ut_word sum = ut_mix(ut_fold(plan->number), (ut_word)plan->count);
+    sum = ut_mix(sum, (ut_word)k);
+    sum = ut_mix(sum, ut_fold(plan->start[k]));
+    sum = ut_mix(sum, more ? ut_fold(plan->start[k + 1]) : 0);
+    for (int i = 0; i < UT_SURFACE; i++) {
+        sum = ut_mix(sum, ut_bits(row->surface[i]));
+    }
+    for (int i = 0; i < UT_M; i++) {
+        sum = ut_mix(sum, ut_bits(row->eta[i]));
+        sum = ut_mix(sum, ut_bits(row->layer[i]));
+    }
+    return sum;
+}
+
+/* Whether a row that ut_offer stored is still what it was; gamma is in its check word too. */
+static int ut_whole(const ut_plan *plan, int k)
+{
+    const ut_row *row = &plan->row[k];
+    return k < plan->count && row->check == ut_mix(ut_sum(plan, k, row), ut_bits(row->gamma));
+}
+
+void ut_plan_seal(ut_plan *plan)
+{
+    for (int k = 0; k < UT_ROWS; k++) {
+        plan->row[k].check = k < plan->count ? ut_sum(plan, k, &plan->row[k]) : 0;
+    }
+}
+
 /* -- generated from the model ---------------------------------------------------------------- */
 
 static void ut_evaluate(const ut_row *row, const ut_real x[UT_X], ut_output *out)
@@ -50,6 +121,12 @@ static ut_real ut_gamma(const ut_row *row)
     ut_real value;
 ${gamma}
     return value;
+}
+
+/* Coefficients of the motion on s = 0 at the target, the highest power first; then zeros. */
+static void ut_polynomial(const ut_row *row, ut_real a[UT_X + 2])
+{
+${polynomial}
 }
 
 static int ut_sound(ut_real value)
@@ -70,16 +147,38 @@ void ut_law(const ut_row *row, const ut_real x[UT_X], ut_output *out)
             out->demand[i] = 0;
             out->margin = 0;
         }
-        out->u[i] = ut_clip(out->demand[i], -ut_limit[i], ut_limit[i]);
+        out->u[i] = ut_within(out->demand[i], ut_limit[i]);
     }
 }
 
 /* -- the fast side ---------------------------------------------------------------------------- */
 
+/* What the latch says. Any other word than the two that are known is a fault, and so is a last
+ * output that does not fit its mirror image. */
+static int ut_latched(ut_controller *c)
+{
+    for (int i = 0; i < UT_M; i++) {
+        if (c->mirror[i] != (ut_word)~ut_bits(c->u[i])) {
+            c->guard = UT_FAULTY;
+        }
+    }
+    if (c->guard == UT_ARMED) {
+        return UT_OK;
+    }
+    if (c->guard == UT_WAITING) {
+        return UT_LOST;
+    }
+    for (int i = 0; i < UT_M; i++) {
+        c->u[i] = 0;
+    }
+    return UT_FAULT;
+}
+
 /* Put the last estimate, carried on by its velocity, where a number is missing. */
 static int ut_repair(ut_controller *c, ut_real q[UT_N], ut_real v[UT_N])
 {
     int bad = 0;
+    int good = c->running;
     for (int i = 0; i < UT_N; i++) {
         if (!ut_sound(v[i])) {
             v[i] = c->x[UT_N + i];
@@ -89,49 +188,75 @@ static int ut_repair(ut_controller *c, ut_real q[UT_N], ut_real v[UT_N])
             q[i] = c->x[i] + UT_PERIOD * c->x[UT_N + i];
             bad = 1;
         }
+        good = good && ut_sound(q[i]) && ut_sound(v[i]);
     }
     if (!bad) {
         c->missed = 0;
         return UT_OK;
     }
-    if (c->missed <= UT_MISSED) {
-        c->missed++;
+    c->missed = c->missed >= 0 && c->missed <= UT_MISSED ? c->missed + 1 : UT_MISSED + 1;
+    if (c->missed > UT_MISSED && c->guard == UT_ARMED) {
+        c->guard = UT_WAITING;
     }
-    return c->running && c->missed <= UT_MISSED ? UT_BRIDGED : UT_LOST;
+    return good && c->missed <= UT_MISSED ? UT_BRIDGED : UT_LOST;
+}
+
+/* The row of a plan at the present time; one that cannot be is sought from the first. */
+static int ut_row_now(const ut_controller *c, const ut_plan *plan)
+{
+    int row = c->row;
+    if (row < 0 || row >= UT_ROWS || row >= plan->count || c->clock < plan->start[row]) {
+        row = 0;
+    }
+    if (row + 1 < UT_ROWS && row + 1 < plan->count && c->clock >= plan->start[row + 1]) {
+        row++;
+    }
+    return row;
 }
 
 static int ut_control(ut_controller *c, int status, ut_real u[UT_M])
 {
-    const sig_atomic_t slot = c->offered;
+    const sig_atomic_t slot = c->offered & 1;
     const ut_plan *plan = &c->slot[slot];
     UT_BARRIER();
-    if (slot != c->taken) {
-        c->taken = slot;
+    if (slot != (c->taken & 1)) {
         c->clock = 0;
         c->row = 0;
         status |= UT_SWITCHED;
     }
-    if (c->row + 1 < plan->count && c->clock >= plan->start[c->row + 1]) {
-        c->row++;
+    c->taken = slot;
+    int row = ut_row_now(c, plan);
+    if (!ut_whole(plan, row)) {
+        plan = &ut_built_in;
+        row = ut_row_now(c, plan);
+        status |= UT_FALLBACK;
+    }
+    if (row != c->row) {
+        c->row = row;
         status |= UT_SWITCHED;
     }
-    c->clock++;
-    ut_law(&plan->row[c->row], c->x, &c->law);
+    if (c->clock + 1 != 0) {
+        c->clock++;
+    }
+    ut_law(&plan->row[row], c->x, &c->law);
     if (!(c->law.margin > 0)) {
         status |= UT_SINGULAR;
     }
     for (int i = 0; i < UT_M; i++) {
-        const ut_real wanted = (status & UT_LOST) ? 0 : c->law.u[i];
-        const ut_real low = ut_max(-ut_limit[i], c->u[i] - ut_slew[i]);
-        const ut_real high = ut_min(ut_limit[i], c->u[i] + ut_slew[i]);
-        const ut_real next = ut_clip(wanted, low, high);
+        const ut_real wanted = (status & (UT_LOST | UT_FAULT)) ? 0 : c->law.u[i];
+        ut_real next = ut_clip(wanted, c->u[i] - ut_slew[i], c->u[i] + ut_slew[i]);
+        if (status & UT_FAULT) {
+            next = 0;
+        }
         if (c->law.u[i] != c->law.demand[i]) {
             status |= UT_CLIPPED;
         }
         if (next != wanted) {
             status |= UT_SLEWED;
         }
+        next = ut_within(next, ut_limit[i]);
         c->u[i] = next;
+        c->mirror[i] = (ut_word)~ut_bits(next);
         u[i] = next;
     }
     return status;
@@ -141,11 +266,12 @@ int ut_step(ut_controller *c, const ut_real q[UT_N], ut_real u[UT_M])
 {
     ut_real at[UT_N];
     ut_real rate[UT_N];
+    int status = ut_latched(c);
     for (int i = 0; i < UT_N; i++) {
         at[i] = q[i];
-        rate[i] = c->x[UT_N + i];
+        rate[i] = 0;
     }
-    const int status = ut_repair(c, at, rate);
+    status |= ut_repair(c, at, rate);
     if (status & UT_LOST) {
         c->running = 0;
     } else {
@@ -158,10 +284,11 @@ int ut_step(ut_controller *c, const ut_real q[UT_N], ut_real u[UT_M])
 int ut_step_state(ut_controller *c, const ut_real x[UT_X], ut_real u[UT_M])
 {
     ut_real at[UT_X];
+    int status = ut_latched(c);
     for (int i = 0; i < UT_X; i++) {
         at[i] = x[i];
     }
-    const int status = ut_repair(c, at, at + UT_N);
+    status |= ut_repair(c, at, at + UT_N);
     c->running = !(status & UT_LOST);
     if (c->running) {
         for (int i = 0; i < UT_X; i++) {
@@ -178,6 +305,24 @@ static int ut_positive(ut_real value)
     return isfinite(value) && value > 0;
 }
 
+/* Routh's criterion: whether the motion on the surface dies out. */
+static int ut_stable(const ut_row *row)
+{
+    ut_real a[UT_X + 2];
+    int good = 1;
+    ut_polynomial(row, a);
+    for (int k = 0; k < UT_X; k++) {
+        if (k < UT_ORDER) {
+            const ut_real ratio = a[0] / a[1];
+            good &= ut_positive(ratio);
+            for (int i = 0; i < UT_X; i++) {
+                a[i] = a[i + 1] - ((i & 1) ? ratio * a[i + 2] : 0);
+            }
+        }
+    }
+    return good;
+}
+
 /* Fill in what is computed and say whether the row can be used. */
 static int ut_prepare(ut_row *row)
 {
@@ -192,6 +337,7 @@ static int ut_prepare(ut_row *row)
     }
     row->gamma = ut_gamma(row);
     good &= isfinite(row->gamma) && !(${fabs}(row->gamma) < ${tiny});
+    good &= ut_stable(row);
     ut_evaluate(row, target, &out);
     for (int i = 0; i < UT_M; i++) {
         good &= ${rate_check};
@@ -201,22 +347,28 @@ static int ut_prepare(ut_row *row)
 
 int ut_offer(ut_controller *c, const ut_plan *plan)
 {
-    if (c->taken != c->offered) {
+    const ut_plan *last = &c->slot[c->offered & 1];
+    if ((c->taken ^ c->offered) & 1) {
         return UT_BUSY;
     }
     UT_BARRIER();
-    if (plan->number <= c->newest) {
-        return UT_STALE;
-    }
     if (plan->count < 1 || plan->count > UT_ROWS || plan->start[0] != 0) {
         return UT_INVALID;
+    }
+    for (int k = 0; k < UT_ROWS; k++) {
+        if (k < plan->count && plan->row[k].check != ut_sum(plan, k, &plan->row[k])) {
+            return UT_CORRUPT;
+        }
+    }
+    if (ut_whole(last, 0) && ((last->number - plan->number) & 0xFFFFFFFFUL) < UT_STALE_SPAN) {
+        return UT_STALE;
     }
     for (int k = 0; k < UT_ROWS; k++) {
         if (0 < k && k < plan->count && plan->start[k] <= plan->start[k - 1]) {
             return UT_INVALID;
         }
     }
-    const sig_atomic_t free_slot = (sig_atomic_t)(1 - c->offered);
+    const sig_atomic_t free_slot = (sig_atomic_t)(1 - (c->offered & 1));
     volatile ut_plan *slot = &c->slot[free_slot];
     for (int k = 0; k < UT_ROWS; k++) {
         ut_row row = plan->row[k < plan->count ? k : 0];
@@ -232,6 +384,7 @@ int ut_offer(ut_controller *c, const ut_plan *plan)
             slot->row[k].layer[i] = row.layer[i];
         }
         slot->row[k].gamma = row.gamma;
+        slot->row[k].check = ut_mix(row.check, ut_bits(row.gamma));
     }
     slot->number = plan->number;
     slot->count = plan->count;
@@ -241,10 +394,25 @@ int ut_offer(ut_controller *c, const ut_plan *plan)
     return UT_ACCEPTED;
 }
 
+void ut_arm(ut_controller *c)
+{
+    for (int i = 0; i < UT_M; i++) {
+        if (c->mirror[i] != (ut_word)~ut_bits(c->u[i])) {
+            c->u[i] = 0;
+            c->mirror[i] = (ut_word)~ut_bits(c->u[i]);
+        }
+    }
+    c->missed = 0;
+    c->running = 0;
+    c->guard = UT_ARMED;
+}
+
 void ut_init(ut_controller *c)
 {
     static const ut_controller blank;
     *c = blank;
     (void)ut_offer(c, &ut_built_in);
     c->taken = c->offered;
+    c->slot[1 - (c->offered & 1)] = c->slot[c->offered & 1];
+    ut_arm(c);
 }

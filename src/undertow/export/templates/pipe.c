@@ -4,16 +4,31 @@
  *   q <n positions>                    one period: answers "<status> <m inputs>"
  *   x <2n states>                      one period from a whole state: the same answer
  *   l <2n states>                      the law alone: "<m demands> <m s> <margin>"
- *   p <number> <count> <rows>          offer a plan, each row "<start> <surface> <eta> <layer>":
+ *   p <number> <count> <rows>          offer a plan, each row "<start> <surface> <eta> <layer>",
+ *                                      sealed here or by a check word for each row at the end:
  *                                      answers "<verdict>"
- *   m                                  the bytes of a controller's state
+ *   a                                  let the output on again: answers "0"
+ *   m                                  the bytes of a controller's state, and of what it holds in
+ *                                      order: where each begins
  */
+#include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 
 #include "${name}.h"
 
 static char ut_line[65536];
+
+#define UT_PLACE(member) {#member, offsetof(ut_controller, member)}
+static const struct {
+    const char *name;
+    size_t offset;
+} ut_places[] = {
+    UT_PLACE(slot[0]), UT_PLACE(slot[1]), UT_PLACE(offered), UT_PLACE(taken),
+    UT_PLACE(newest), UT_PLACE(clock), UT_PLACE(row), UT_PLACE(missed),
+    UT_PLACE(guard), UT_PLACE(running), ${place}UT_PLACE(x), UT_PLACE(u),
+    UT_PLACE(mirror), UT_PLACE(law),
+};
 
 static int ut_numbers(char **text, ut_real *values, int count)
 {
@@ -41,6 +56,15 @@ static int ut_read_plan(char *text, ut_plan *plan)
             !ut_numbers(&text, row->layer, UT_M)) {
             return 0;
         }
+    }
+    ut_plan_seal(plan);
+    for (int k = 0; k < plan->count && k < UT_ROWS; k++) {
+        char *end;
+        const ut_word check = (ut_word)strtoull(text, &end, 10);
+        if (end != text) {
+            plan->row[k].check = check;
+        }
+        text = end;
     }
     return 1;
 }
@@ -87,8 +111,15 @@ int main(void)
                 printf("%d", ut_offer(&c, &plan));
             }
             break;
+        case 'a':
+            ut_arm(&c);
+            answered = printf("0") > 0;
+            break;
         case 'm':
             answered = printf("%lu", (unsigned long)sizeof c) > 0;
+            for (size_t i = 0; i < sizeof ut_places / sizeof ut_places[0]; i++) {
+                printf(" %s %lu", ut_places[i].name, (unsigned long)ut_places[i].offset);
+            }
             break;
         default:
             break;

@@ -5,6 +5,7 @@
  */
 #include <math.h>
 #include <stdio.h>
+#include <string.h>
 
 #include "${name}_vectors.h"
 
@@ -34,6 +35,15 @@ static void ut_expect(const char *what, int holds)
     }
 }
 
+/* Write an output into the memory as a step does. */
+static void ut_remember(ut_controller *c, int i, ut_real value)
+{
+    ut_word word;
+    memcpy(&word, &value, sizeof word);
+    c->u[i] = value;
+    c->mirror[i] = (ut_word)~word;
+}
+
 static void ut_test_law(void)
 {
     for (int k = 0; k < UT_STATES; k++) {
@@ -58,6 +68,9 @@ static void ut_test_run(void)
             ut_expect("a new plan is accepted", ut_offer(&c, &ut_next_plan) == UT_ACCEPTED);
             ut_expect("no second one at once", ut_offer(&c, &ut_next_plan) == UT_BUSY);
         }
+        if (k == UT_ARM_AT) {
+            ut_arm(&c);
+        }
         const int status = ut_step(&c, ut_positions[k], u);
         for (int i = 0; i < UT_M; i++) {
             ut_compare("output", k, (double)u[i], (double)ut_outputs[k][i], (double)ut_scale[i]);
@@ -68,7 +81,7 @@ static void ut_test_run(void)
             c.x[i] = estimate;
         }
         for (int i = 0; UT_RESYNC && i < UT_M; i++) {
-            c.u[i] = ut_outputs[k][i];
+            ut_remember(&c, i, ut_outputs[k][i]);
         }
         if ((status ^ ut_statuses[k]) & UT_STATUS_MASK) {
             ut_expect("the status of every period", 0);
@@ -99,11 +112,47 @@ static void ut_test_nonsense(void)
     }
 }
 
+/* Whatever bit of the memory is upset, at rest or in motion, the output is within the limits. */
+static void ut_test_upset(void)
+{
+    static ut_controller c;
+    unsigned char *bytes = (unsigned char *)&c;
+    for (size_t bit = 0; bit < 8 * sizeof c; bit++) {
+        ut_init(&c);
+        for (int k = 0; k < 8; k++) {
+            ut_real u[UT_M];
+            if (k == 4) {
+                bytes[bit / 8] = (unsigned char)(bytes[bit / 8] ^ (1u << bit % 8));
+            }
+            (void)ut_step(&c, ut_positions[k], u);
+            for (int i = 0; i < UT_M; i++) {
+                ut_expect("an output within its limits", fabs((double)u[i]) <= (double)ut_scale[i]);
+            }
+        }
+    }
+}
+
+/* Memory that was never begun gives zero and says so. */
+static void ut_test_blank(void)
+{
+    static ut_controller c;
+    for (int k = 0; k < 2; k++) {
+        ut_real u[UT_M];
+        memset(&c, k ? 0xff : 0, sizeof c);
+        ut_expect("a fault where ut_init was not called", ut_step(&c, ut_positions[0], u) & UT_FAULT);
+        for (int i = 0; i < UT_M; i++) {
+            ut_expect("no output where ut_init was not called", !(u[i] < 0) && !(u[i] > 0));
+        }
+    }
+}
+
 int main(void)
 {
     ut_test_law();
     ut_test_run();
     ut_test_nonsense();
+    ut_test_upset();
+    ut_test_blank();
     printf("${name}: %ld checks, %ld failed, largest error %.3g (tolerance %.3g)\n", ut_checked,
            ut_failed, ut_worst, (double)UT_TOLERANCE);
     return ut_failed != 0;

@@ -27,9 +27,10 @@ ${law_margin}
 };
 
 /* A run: measured positions (some lost), outputs and status, with a plan offered before one of
- * the periods. */
+ * the periods, and let on again before another. */
 #define UT_PERIODS ${step_count}
 #define UT_OFFER_AT ${offer_at}
+#define UT_ARM_AT ${arm_at}
 #define UT_GONE ((ut_real)NAN)
 static const ut_plan ut_next_plan = {
     ${next_number}UL,
