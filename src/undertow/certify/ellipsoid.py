@@ -25,6 +25,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
+from undertow.certify.exact_model import exact_mechanism, vanishes
 from undertow.certify.outward import add, down, magnitude, mul, up
 from undertow.certify.program import Program, run
 from undertow.certify.verdict import Verdict
@@ -105,6 +106,7 @@ class ClosedLoopProgram:
     """
 
     def __init__(self, mechanism: Mechanism, switching: str = "saturation") -> None:
+        mechanism = exact_mechanism(mechanism)
         n, m = mechanism.n, mechanism.m
         tape = Tape()
         part = mechanism.partition(tape)
@@ -132,10 +134,8 @@ class ClosedLoopProgram:
         others = [*symbols.surface, *symbols.eta, *symbols.layer, *mechanism.parameter_symbols]
         self.n, self.m = n, m
         self.program = Program.of(tape, mechanism.x, others, [*q_dd, *demand, determinant])
-        rest = mechanism.force.subs(dict.fromkeys(mechanism.x, 0))
-        still = [sp.simplify(e) == 0 for e in rest]
-        self.at_rest = all(still[m:])
-        self.needs_no_input = all(still)
+        self.at_rest = vanishes(mechanism.force[m:, :], mechanism.x)
+        self.needs_no_input = self.at_rest and vanishes(mechanism.force[:m, :], mechanism.x)
 
     @classmethod
     def of(cls, mechanism: Mechanism, switching: str = "saturation") -> ClosedLoopProgram:
@@ -145,6 +145,8 @@ class ClosedLoopProgram:
         ------
         InvalidInputError
             For a force that depends on time, or a switching function that is not smooth at 0.
+        ModelError
+            For a model that is not smooth.
         """
         if TIME in mechanism.force.free_symbols:
             raise InvalidInputError(
