@@ -35,6 +35,7 @@ from undertow.certify.verdict import Verdict
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
 from undertow.sliding import Surface
+from undertow.verdict import inward
 
 __all__ = [
     "CASES",
@@ -325,7 +326,7 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
         the witness is an angle (and, within R, a direction) where it fails.
     """
     width = float(half_width)
-    claim = f"P ≻ 0 and R(y₁) ≻ 0 for |y₁| ≤ {width:.6g} rad"
+    claim = f"P ≻ 0 and R(y₁) ≻ 0 for |y₁| ≤ {inward(width, 6)} rad"
     method = f"R is affine in ξ: two vertices, Sylvester minors in {BITS}-bit balls"
     with flint().ctx.workprec(BITS):
         if not ball(Fraction(half_width)).cos() > ball(reduced.epsilon):
@@ -397,7 +398,7 @@ def paper_rate(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
 
     A statement about the quadratic part only (see the module's text).
     """
-    claim = f"(A27) with σ > 0 for |y₁| ≤ {float(half_width):.6g} rad, velocity term aside"
+    claim = f"(A27) with σ > 0 for |y₁| ≤ {inward(float(half_width), 6)} rad, velocity term aside"
     test = two_vertex(reduced, P, half_width)
     if not test:
         return Verdict(claim, test.kind, math.nan, "1/s", test.witness, test.method)
@@ -418,7 +419,7 @@ def decay_rate(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
     statement about the quadratic part only (see the module's text).
     """
     width = float(half_width)
-    claim = f"R(y₁) ⪰ σ P̃ with σ > 0 for |y₁| ≤ {width:.6g} rad, velocity term aside"
+    claim = f"R(y₁) ⪰ σ P̃ with σ > 0 for |y₁| ≤ {inward(width, 6)} rad, velocity term aside"
     test = two_vertex(reduced, P, half_width)
     if not test:
         return Verdict(claim, test.kind, math.nan, "1/s", test.witness, test.method)

@@ -34,8 +34,15 @@ from undertow.codegen.machine import numba
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
 from undertow.sliding import LawSymbols, ReachingLaw, Surface, check_surface_shape, lay_law
+from undertow.verdict import inward
 
-__all__ = ["ClosedLoopProgram", "ProvedEllipsoid", "TerminalEllipsoid", "verify_ellipsoid"]
+__all__ = [
+    "ClosedLoopProgram",
+    "ProvedEllipsoid",
+    "TerminalEllipsoid",
+    "limits_in_words",
+    "verify_ellipsoid",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -96,6 +103,12 @@ class ProvedEllipsoid:
     def contains(self, x: ArrayLike) -> bool:
         """Whether the state is inside for certain."""
         return self.ellipsoid.contains(x)
+
+
+def limits_in_words(mechanism: Mechanism) -> str:
+    """Return the input limits, each as it is."""
+    parts = [f"|{i.name}| ≤ {float(i.limit)!r} {i.unit}".rstrip() for i in mechanism.inputs]
+    return ", ".join(parts)
 
 
 class ClosedLoopProgram:
@@ -243,8 +256,9 @@ def verify_ellipsoid(
         raise InvalidInputError("radius of a terminal set", value=found.radius, limit="> 0")
     program = ClosedLoopProgram.of(mechanism, reaching.switching)
     claim = (
-        "every motion of the full closed loop from {|W x| ≤ ρ}, which holds the ball "
-        f"‖x‖ ≤ {found.ball:.3g}, converges inside the layer and the input limits"
+        "every motion of the full closed loop, its input renewed at every instant, from "
+        f"{{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inward(found.ball * (1 - 1e-12), 3)}, "
+        f"converges, inside the layer and {limits_in_words(mechanism)}"
     )
     method = "interval Jacobian over the ellipsoid's box, diagonal dominance, float64 outward"
     if not program.at_rest:

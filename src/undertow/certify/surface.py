@@ -31,6 +31,7 @@ from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
 from undertow.sliding import Surface, check_surface_shape
 from undertow.stability import sliding_matrix
+from undertow.verdict import inward, within
 
 __all__ = [
     "CriticalMode",
@@ -41,6 +42,7 @@ __all__ = [
     "hurwitz",
     "nonsingular",
     "region_box",
+    "region_words",
     "singular_distance",
 ]
 
@@ -337,6 +339,20 @@ def region_box(mechanism: Mechanism, region: Region) -> list[tuple[float, float]
     return box
 
 
+def region_words(mechanism: Mechanism, region: Region) -> str:
+    """Return a region of positions in words, its ends rounded inwards."""
+    units = {c.name: c.unit for c in mechanism.coordinates}
+    parts = [
+        f"|{k}| ≤ {inward(b, 6)} {units[k]}" if a == -b else f"{k} in {within(a, b)} {units[k]}"
+        for k, (a, b) in region.items()
+        if (a, b) != (0.0, 0.0)
+    ]
+    if not parts:
+        return "at the target"
+    rest = len(parts) < mechanism.n
+    return f"for {', '.join(parts)}" + (", the other coordinates at the target" if rest else "")
+
+
 def _gamma(mechanism: Mechanism, surface: Surface) -> tuple[BallFunction, BallFunction]:
     """Return det Γ(q)/det Γ(0) and a lower bound of Γ's smallest singular value."""
     tape = Tape()
@@ -392,8 +408,8 @@ def nonsingular(
     check_surface_shape(mechanism, surface)
     box = region_box(mechanism, region)
     names = [c.name for c in mechanism.coordinates]
-    text = ", ".join(f"{k} in [{a:.6g}, {b:.6g}]" for k, (a, b) in region.items())
-    claim = f"α_a − α_u M_uu⁻¹ M_auᵀ is non-singular for {text or 'the target'}"
+    words = region_words(mechanism, region)
+    claim = f"the law exists {words}: α_a − α_u M_uu⁻¹ M_auᵀ is non-singular"
     method = "ball arithmetic, branch and bound"
     ratio, distance = _gamma(mechanism, surface)
     found = minimise_proved(ratio, box, stop_below=0.0, max_boxes=max_boxes)
