@@ -418,7 +418,7 @@ def _all_larger(forged: Document, claim: Document, factor: float) -> Document:
             V["coefficients"] = [c / factor**2 for c in V["coefficients"]]
     elif kind == "closed loop":
         data["edges"] = [factor * e for e in data["edges"]]
-        data["hold"] = int(factor)
+        data["hold"] = 20 if factor > 2 else 0  # at 20 ms the layer is past its stable period
     else:
         data["half_width"] = _times(data["half_width"], factor)
     return forged
