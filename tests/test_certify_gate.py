@@ -144,7 +144,7 @@ FAR = RIG.state(phi=0.3)
         (("region",), FAR, "undecided"),
         (("dual",), FAR, "sampled"),
         (("sampled",), FAR, "sampled"),
-        (("local",), FAR, "proved"),
+        (("local",), FAR, "sampled"),
         (("region", "dual", "sampled", "local"), NEAR, "proved"),
     ],
 )

@@ -5,14 +5,42 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from decimal import ROUND_CEILING, ROUND_DOWN, ROUND_FLOOR, Context, Decimal
 from typing import Any, Literal
 
-__all__ = ["Kind", "Verdict"]
+__all__ = ["Kind", "Verdict", "inward", "within"]
 
 #: ``proved``: exact or outward-rounded arithmetic over the whole set.  ``sampled``: a
 #: statement about random trials with its confidence.  ``refuted``: a counterexample.
 #: ``undecided``: the method gave up; the witness says where.
 Kind = Literal["proved", "sampled", "refuted", "undecided"]
+
+
+def inward(value: float, digits: int = 4) -> str:
+    """Return a margin or extent as text, rounded towards 0: no more is said than was shown.
+
+    Examples
+    --------
+    >>> inward(3.71689), inward(0.5), inward(1e-9 / 3)
+    ('3.716', '0.5', '3.333e-10')
+    """
+    return _rounded(value, digits, ROUND_DOWN)
+
+
+def within(low: float, high: float, digits: int = 6) -> str:
+    """Return an interval as text, its ends rounded inwards, or exactly where it has no room."""
+    ends = _rounded(low, digits, ROUND_CEILING), _rounded(high, digits, ROUND_FLOOR)
+    if not low <= float(ends[0]) <= float(ends[1]) <= high:
+        ends = repr(float(low)), repr(float(high))
+    return f"[{ends[0]}, {ends[1]}]"
+
+
+def _rounded(value: float, digits: int, rounding: str) -> str:
+    """A decimal of so many digits; what has no more of them in its shortest form stays."""
+    if not math.isfinite(value):
+        return f"{value:g}"
+    shortest = Decimal(repr(float(value)))
+    return f"{float(Context(prec=digits, rounding=rounding).plus(shortest)):.{digits}g}"
 
 
 @dataclass(frozen=True)
@@ -61,7 +89,7 @@ class Verdict:
         """One line for people."""
         text = f"{self.kind}: {self.claim}"
         if not math.isnan(self.margin):
-            text += f" (margin {f'{self.margin:.4g} {self.unit}'.rstrip()})"
+            text += f" (margin {f'{inward(self.margin)} {self.unit}'.rstrip()})"
         if self.witness and self.kind != "proved":
             text += " at " + ", ".join(f"{k} = {v:.6g}" for k, v in self.witness.items())
         return text

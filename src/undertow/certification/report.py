@@ -13,10 +13,10 @@ from rich.text import Text
 from undertow import results
 from undertow.cascade import Run
 from undertow.certification.subjects import Certified
-from undertow.certify.certificate import Certificate
+from undertow.certify.certificate import Certificate, Subject
 from undertow.certify.verify import Checked
 from undertow.mechanism import Mechanism
-from undertow.verdict import Verdict
+from undertow.verdict import Verdict, inward
 
 __all__ = [
     "appendix_report",
@@ -43,7 +43,7 @@ def _kind(verdict: Verdict) -> Text:
 def _margin(verdict: Verdict) -> str:
     if not math.isfinite(verdict.margin):
         return ""
-    return f"{verdict.margin:.4g} {verdict.unit}".rstrip()
+    return f"{inward(verdict.margin)} {verdict.unit}".rstrip()
 
 
 def _witness(verdict: Verdict) -> str:
@@ -86,7 +86,9 @@ def appendix_report(cases: Sequence[Certified]) -> RenderableType:
             return Text(f"proved, {_margin(known[kind])}", style="green")
 
         ellipsoid = known.get("terminal ellipsoid")
-        ball = "not proved" if ellipsoid is None else f"‖x‖ ≤ {ellipsoid.details['ball']:.4f}"
+        ball = "not proved"
+        if ellipsoid is not None:
+            ball = f"‖x‖ ≤ {inward(ellipsoid.details['ball'] * (1 - 1e-12), 2)}"
         region = cell("surface region") if case.region is not None else Text("not asked for")
         table.add_row(case.title, cell("stability"), cell("appendix interval"), ball, region)
     return table
@@ -130,17 +132,28 @@ def run_report(run: Run) -> RenderableType:
     return Group(*lines)
 
 
+def _law(subject: Subject) -> str:
+    """Surface and reaching law with every digit."""
+    surface, law = subject.surface, subject.reaching
+    blocks = {
+        k: getattr(surface, k).tolist() for k in ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
+    }
+    return ", ".join(f"{k} = {v!r}" for k, v in blocks.items()) + (
+        f"; eta = {law.eta!r}, layer = {law.layer!r}, {law.switching}"
+    )
+
+
 def verification_report(certificate: Certificate, checked: Sequence[Checked]) -> RenderableType:
     """Return every claim of a certificate as it was decided again, and the sum."""
     table = _table("verdict", "claim", "margin")
     table.columns[0].no_wrap = True
     table.columns[2].max_width = 24
-    surface = None
+    law = ""
     for item in checked:
-        if item.subject.surface != surface:
-            surface = item.subject.surface
-            table.add_row("", Text(str(surface), style="bold"), "")
-        words = Text(item.claim.verdict.claim)
+        if _law(item.subject) != law:
+            law = _law(item.subject)
+            table.add_row("", Text(law, style="bold"), "")
+        words = Text(item.verdict.claim)
         words.append(f"\n{item.claim.kind}", style="dim")
         if not item.verdict:
             words.append(f"\n{item.verdict.method}", style="red")
@@ -148,13 +161,17 @@ def verification_report(certificate: Certificate, checked: Sequence[Checked]) ->
     held = sum(bool(item.verdict) for item in checked)
     good = held == len(checked)
     mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
-    values = ", ".join(f"{k} = {v:g}" for k, v in certificate.parameters.items())
+    values = ", ".join(f"{k} = {v!r}" for k, v in certificate.parameters.items())
+    others = sum(item.reworded for item in checked)
     remarks = sum(len(s.remarks) for s in certificate.subjects)
     lines: list[RenderableType] = [
         table,
         Text(f"{certificate.name} with {values}", style="dim"),
         mark + Text(f"{held} of {len(checked)} claims proved again"),
     ]
+    if others:
+        note = f"the file words {others} of them otherwise: what is said here was decided"
+        lines.append(Text(note, style="yellow"))
     if remarks:
         lines.append(Text(f"{remarks} remarks that are no proofs were not checked", style="dim"))
     return Group(*lines)

@@ -20,13 +20,13 @@ from undertow.certify.motion import SurfaceMotion
 from undertow.certify.reaching import reaching
 from undertow.certify.region_search import ProvedRegion, prove_region
 from undertow.certify.surface import hurwitz, nonsingular, singular_distance
-from undertow.certify.verify import reaches
+from undertow.certify.verify import reaches, region_words
 from undertow.errors import UndertowError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.plan import Plan
 from undertow.rollout import ClosedLoop
 from undertow.sliding import ReachingLaw, Surface
-from undertow.verdict import Verdict
+from undertow.verdict import Verdict, inward
 
 __all__ = [
     "Certified",
@@ -122,8 +122,7 @@ def certify_surface(
             remarks.append(verdict)
 
     tell("stability", 0.0)
-    stable = "motions on the surface near the target converge exponentially"
-    keep("stability", {}, replace(hurwitz(mechanism, surface), claim=stable))
+    keep("stability", {}, hurwitz(mechanism, surface))
     region = None
     if claims:
         tell("terminal set", 0.03)
@@ -184,7 +183,7 @@ def _nonsingular(
         return verdict
     factor, _ = singular_distance(mechanism, surface, box, tolerance=1e-3)
     details = {**verdict.details, "may grow by": factor}
-    method = f"{verdict.method}; the box may grow {factor:.4g} times"
+    method = f"{verdict.method}; the box may grow {inward(factor)} times"
     return replace(verdict, method=method, details=details)
 
 
@@ -204,12 +203,10 @@ def _disturbances(
         load = [size if k == j else 0.0 for k in range(mechanism.n)]
         data = {"region": _lists(box), "eta": [0.0] * mechanism.m, "disturbance": load}
         verdict = reaching(mechanism, surface, box, law, eta=0.0, disturbance=load).verdict
-        kind = "a matched" if bound.matched else "an unmatched"
-        words = f"the law overcomes {kind} disturbance on {bound.coordinate} up to "
-        words += f"{size:.4g} {bound.unit}"
         if bound.input_unit:
-            words += f" ({bound.as_input * CLAIMED:.4g} {bound.input_unit} at the input)"
-        rows.append((data, replace(verdict, claim=words)))
+            most = f"{inward(bound.as_input * CLAIMED)} {bound.input_unit}"
+            verdict = replace(verdict, method=f"{verdict.method}; {most} at the input")
+        rows.append((data, verdict))
     return rows
 
 
@@ -240,9 +237,8 @@ def _region(
     else:
         return proved, {}, Verdict(claim, "undecided", method="no start is shown inside")
     data = {"functions": [function_data(V) for V in proved.chain], "start": point.tolist()}
-    words = ", ".join(f"{n} = {v:.4g}" for n, v in zip(motion.names, point, strict=True) if v)
     verdict = Verdict(
-        f"a region of attraction on the surface contains {words}",
+        region_words(motion, point.tolist(), {}),
         "proved",
         float(np.linalg.norm(point)) * (1 - 1e-12),
         mechanism.coordinates[mechanism.m].unit,

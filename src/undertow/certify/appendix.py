@@ -35,6 +35,7 @@ from undertow.certify.verdict import Verdict
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
 from undertow.sliding import Surface
+from undertow.verdict import inward
 
 __all__ = [
     "CASES",
@@ -316,7 +317,7 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
     Parameters
     ----------
     half_width
-        Half-width of Ĩ, rad; a fraction or float is taken as it is.
+        Half-width of Ĩ, rad, ≥ 0; a fraction or float is taken as it is.
 
     Returns
     -------
@@ -325,10 +326,15 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
         the witness is an angle (and, within R, a direction) where it fails.
     """
     width = float(half_width)
-    claim = f"P ≻ 0 and R(y₁) ≻ 0 for |y₁| ≤ {width:.6g} rad"
+    if not width >= 0:
+        raise InvalidInputError("half-width of Ĩ", value=width, limit="≥ 0 rad")
+    if Fraction(width) > half_width:
+        width = math.nextafter(width, 0.0)
+    claim = f"P ≻ 0 and R(y₁) ≻ 0 for |y₁| ≤ {inward(width, 6)} rad"
     method = f"R is affine in ξ: two vertices, Sylvester minors in {BITS}-bit balls"
     with flint().ctx.workprec(BITS):
-        if not ball(Fraction(half_width)).cos() > ball(reduced.epsilon):
+        # The cosine falls up to π alone: beyond 3 the interval holds 3, where R does not exist.
+        if not ball(Fraction(min(half_width, 3))).cos() > ball(reduced.epsilon):
             return Verdict(
                 claim, "refuted", -math.inf, "", {"y1": reduced.limit}, "R does not exist there"
             )
@@ -397,7 +403,7 @@ def paper_rate(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
 
     A statement about the quadratic part only (see the module's text).
     """
-    claim = f"(A27) with σ > 0 for |y₁| ≤ {float(half_width):.6g} rad, velocity term aside"
+    claim = f"(A27) with σ > 0 for |y₁| ≤ {inward(float(half_width), 6)} rad, velocity term aside"
     test = two_vertex(reduced, P, half_width)
     if not test:
         return Verdict(claim, test.kind, math.nan, "1/s", test.witness, test.method)
@@ -418,7 +424,7 @@ def decay_rate(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
     statement about the quadratic part only (see the module's text).
     """
     width = float(half_width)
-    claim = f"R(y₁) ⪰ σ P̃ with σ > 0 for |y₁| ≤ {width:.6g} rad, velocity term aside"
+    claim = f"R(y₁) ⪰ σ P̃ with σ > 0 for |y₁| ≤ {inward(width, 6)} rad, velocity term aside"
     test = two_vertex(reduced, P, half_width)
     if not test:
         return Verdict(claim, test.kind, math.nan, "1/s", test.witness, test.method)

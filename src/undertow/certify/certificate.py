@@ -12,8 +12,10 @@ One JSON document, ``undertow-certificate`` version 1:
 ``versions``, ``checksum``
     What made the file, and SHA-256 of the canonical JSON of everything else.
 
-Nothing in the file is believed: :mod:`undertow.certify.verify` decides every claim again.  The
-checksum is against accidents and careless edits, not against forgers; those meet the proof.
+Nothing in the file is believed: :mod:`undertow.certify.verify` decides every claim again, and says
+in words of its own what it decided; those of a claim in the file are for readers and never shown.
+Texts that hold anything but printable characters are refused.  The checksum is against accidents
+and careless edits, not against forgers; those meet the proof.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -52,6 +54,9 @@ FORMAT, VERSION = "undertow-certificate", 1
 
 #: Largest file that is read, bytes; a certificate of the appendix has some ten thousand.
 LARGEST = 4_000_000
+
+#: Longest name of a mechanism, a parameter or a kind of claim that is read.
+LONGEST_NAME = 64
 
 
 @dataclass(frozen=True)
@@ -215,9 +220,9 @@ class Certificate:
         model = document["mechanism"]
         limits = tuple(math.inf if v is None else float(v) for v in model["input_limits"])
         return cls(
-            str(model["name"]),
+            _name(model["name"]),
             str(model["structure"]),
-            {str(k): float(v) for k, v in model["parameters"].items()},
+            {_name(k): float(v) for k, v in model["parameters"].items()},
             limits,
             tuple(_subject_of(s) for s in document["subjects"]),
             dict(document["versions"]),
@@ -255,6 +260,8 @@ def _parse(content: bytes) -> dict[str, Any]:
         document = parse_json(content)
         if not isinstance(document, dict):
             raise ValueError("no JSON object")
+        if not all(text.isprintable() for text in _texts(document)):
+            raise ValueError("a text with characters that cannot be printed")
     except (ValueError, RecursionError) as error:
         raise CertificateError(
             "certificate",
@@ -263,6 +270,31 @@ def _parse(content: bytes) -> dict[str, Any]:
             remedy="The file is damaged or something else; certify again",
         ) from error
     return document
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield all texts of a JSON value, keys too."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, list):
+        for item in value:
+            yield from _texts(item)
+    elif isinstance(value, dict):
+        yield from value
+        yield from _texts(list(value.values()))
+
+
+def _name(text: Any) -> str:
+    """A name of a mechanism, a parameter or a kind: no room for a sentence."""
+    name = str(text)
+    if len(name) > LONGEST_NAME:
+        raise ValueError(f"a name of {len(name)} characters")
+    return name
+
+
+def _printable(text: str) -> str:
+    """Return a text on one line without what cannot be printed."""
+    return "".join(c for c in " ".join(text.split()) if c.isprintable())
 
 
 def _on_one_line(found: re.Match[str]) -> str:
@@ -318,7 +350,7 @@ def _subject_of(data: Mapping[str, Any]) -> Subject:
             law["switching"],
         ),
         tuple(
-            Claim(str(c["kind"]), dict(c["data"]), _verdict_of(c["verdict"]))
+            Claim(_name(c["kind"]), dict(c["data"]), _verdict_of(c["verdict"]))
             for c in data["claims"]
         ),
         tuple(_verdict_of(v) for v in data["remarks"]),
@@ -328,12 +360,12 @@ def _subject_of(data: Mapping[str, Any]) -> Subject:
 def _verdict_data(verdict: Verdict) -> dict[str, Any]:
     margin = verdict.margin if math.isfinite(verdict.margin) else None
     return {
-        "claim": verdict.claim,
+        "claim": _printable(verdict.claim),
         "kind": verdict.kind,
         "margin": margin,
         "unit": verdict.unit,
         "witness": {k: float(v) for k, v in verdict.witness.items() if math.isfinite(v)},
-        "method": verdict.method,
+        "method": _printable(verdict.method),
     }
 
 

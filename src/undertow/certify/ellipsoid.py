@@ -25,6 +25,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
+from undertow.certify.exact_model import exact_mechanism, vanishes
 from undertow.certify.outward import add, down, magnitude, mul, up
 from undertow.certify.program import Program, run
 from undertow.certify.verdict import Verdict
@@ -33,8 +34,15 @@ from undertow.codegen.machine import numba
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
 from undertow.sliding import LawSymbols, ReachingLaw, Surface, check_surface_shape, lay_law
+from undertow.verdict import inward
 
-__all__ = ["ClosedLoopProgram", "ProvedEllipsoid", "TerminalEllipsoid", "verify_ellipsoid"]
+__all__ = [
+    "ClosedLoopProgram",
+    "ProvedEllipsoid",
+    "TerminalEllipsoid",
+    "limits_in_words",
+    "verify_ellipsoid",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -97,6 +105,12 @@ class ProvedEllipsoid:
         return self.ellipsoid.contains(x)
 
 
+def limits_in_words(mechanism: Mechanism) -> str:
+    """Return the input limits, each as it is."""
+    parts = [f"|{i.name}| ≤ {float(i.limit)!r} {i.unit}".rstrip() for i in mechanism.inputs]
+    return ", ".join(parts)
+
+
 class ClosedLoopProgram:
     """Interval code of the unsaturated closed loop inside the layer, for any surface.
 
@@ -105,6 +119,7 @@ class ClosedLoopProgram:
     """
 
     def __init__(self, mechanism: Mechanism, switching: str = "saturation") -> None:
+        mechanism = exact_mechanism(mechanism)
         n, m = mechanism.n, mechanism.m
         tape = Tape()
         part = mechanism.partition(tape)
@@ -132,10 +147,8 @@ class ClosedLoopProgram:
         others = [*symbols.surface, *symbols.eta, *symbols.layer, *mechanism.parameter_symbols]
         self.n, self.m = n, m
         self.program = Program.of(tape, mechanism.x, others, [*q_dd, *demand, determinant])
-        rest = mechanism.force.subs(dict.fromkeys(mechanism.x, 0))
-        still = [sp.simplify(e) == 0 for e in rest]
-        self.at_rest = all(still[m:])
-        self.needs_no_input = all(still)
+        self.at_rest = vanishes(mechanism.force[m:, :], mechanism.x)
+        self.needs_no_input = self.at_rest and vanishes(mechanism.force[:m, :], mechanism.x)
 
     @classmethod
     def of(cls, mechanism: Mechanism, switching: str = "saturation") -> ClosedLoopProgram:
@@ -145,6 +158,8 @@ class ClosedLoopProgram:
         ------
         InvalidInputError
             For a force that depends on time, or a switching function that is not smooth at 0.
+        ModelError
+            For a model that is not smooth.
         """
         if TIME in mechanism.force.free_symbols:
             raise InvalidInputError(
@@ -241,8 +256,9 @@ def verify_ellipsoid(
         raise InvalidInputError("radius of a terminal set", value=found.radius, limit="> 0")
     program = ClosedLoopProgram.of(mechanism, reaching.switching)
     claim = (
-        "every motion of the full closed loop from {|W x| ≤ ρ}, which holds the ball "
-        f"‖x‖ ≤ {found.ball:.3g}, converges inside the layer and the input limits"
+        "every motion of the full closed loop, its input renewed at every instant, from "
+        f"{{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inward(found.ball * (1 - 1e-12), 3)}, "
+        f"converges, inside the layer and {limits_in_words(mechanism)}"
     )
     method = "interval Jacobian over the ellipsoid's box, diagonal dominance, float64 outward"
     if not program.at_rest:

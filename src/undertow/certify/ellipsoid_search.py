@@ -19,6 +19,7 @@ from undertow.certify.ellipsoid import (
     TerminalEllipsoid,
     prove_kernel,
 )
+from undertow.errors import ModelError
 from undertow.mechanism import Mechanism
 from undertow.sliding import ReachingLaw, Surface
 
@@ -185,9 +186,13 @@ def search_for(
     Returns
     -------
     EllipsoidSearch or None
-        ``None`` where the linear closed loop is not stable or has no full set of modes.
+        ``None`` where the model is not smooth, or the linear closed loop is not stable or has
+        no full set of modes.
     """
-    loop = ClosedLoopProgram.of(mechanism, reaching.switching)
+    try:
+        loop = ClosedLoopProgram.of(mechanism, reaching.switching)
+    except ModelError:  # not smooth: nothing is proved of it
+        return None
     if not loop.at_rest:
         return None
     numbers = loop.numbers(mechanism, surface, reaching)

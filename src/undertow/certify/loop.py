@@ -26,6 +26,7 @@ import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.certify.batch import Interval
+from undertow.certify.exact_model import exact_mechanism, vanishes
 from undertow.certify.loop_parts import LoopEquations
 from undertow.certify.loop_pieces import excess, put_boxes, saturation, stacked, zeros
 from undertow.certify.loop_program import LoopProgram
@@ -88,6 +89,8 @@ class LoopMotion:
         other than saturation, gains that vary with the state (declared disturbance bounds),
         a parameter that is unknown or whose own value is outside its range, or a period that is
         no time.
+    ModelError
+        For a model that is not smooth.
     """
 
     mechanism: Mechanism
@@ -98,7 +101,8 @@ class LoopMotion:
 
     def __post_init__(self) -> None:
         """Refuse what this model of the loop does not cover."""
-        mechanism = self.mechanism
+        mechanism = exact_mechanism(self.mechanism)
+        object.__setattr__(self, "mechanism", mechanism)
         check_surface_shape(mechanism, self.surface)
         if TIME in mechanism.force.free_symbols:
             raise InvalidInputError(
@@ -173,8 +177,7 @@ class LoopMotion:
     @cached_property
     def at_rest(self) -> bool:
         """Whether the target is an equilibrium without input, decided symbolically."""
-        origin = dict.fromkeys(self.mechanism.x, 0)
-        return all(sp.simplify(e.subs(origin)) == 0 for e in self.mechanism.force)
+        return vanishes(self.mechanism.force, self.mechanism.x)
 
     # -- equations -----------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.certify.batch import Interval
+from undertow.certify.ellipsoid import limits_in_words
 from undertow.certify.loop import LoopMotion, LoopRates
 from undertow.certify.loop_held import HeldLoop
 from undertow.certify.loop_terminal import TerminalSet, exact_inverse, verify_terminal
@@ -29,6 +30,7 @@ from undertow.certify.verdict import Kind, Verdict
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
 from undertow.sliding import ReachingLaw, Surface
+from undertow.verdict import inward, within
 
 __all__ = ["LoopClaim", "TubeEnd", "run_tubes", "start_tubes", "verify_loop"]
 
@@ -85,7 +87,7 @@ class LoopClaim:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InvalidInputError(f"{name} of a claim", value=value, limit="finite, > 0 s")
-        if self.hold < 0 or self.hold != int(self.hold):
+        if isinstance(self.hold, bool) or not isinstance(self.hold, int) or self.hold < 0:
             raise InvalidInputError("hold of a claim", value=self.hold, limit="a whole number ≥ 0")
 
     @property
@@ -112,7 +114,7 @@ class LoopClaim:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild from :meth:`to_dict`."""
+        """Rebuild from :meth:`to_dict`; a hold that is no whole number is refused."""
         return cls(
             str(data["coordinate"]),
             tuple(float(v) for v in data["edges"]),
@@ -120,7 +122,7 @@ class LoopClaim:
             float(data["step"]),
             float(data["horizon"]),
             {str(k): (float(v[0]), float(v[1])) for k, v in data.get("uncertain", {}).items()},
-            int(data.get("hold", 0)),
+            data.get("hold", 0),
         )
 
 
@@ -288,13 +290,14 @@ def verify_loop(
     where = next((c for c in mechanism.coordinates if c.name == claim.coordinate), None)
     unit = where.unit if where is not None else ""
     text = (
-        f"every start at rest with |{claim.coordinate}| ≤ {claim.extent:.6g} {unit} converges "
-        "under the law with its boundary layer and clipped input"
+        f"every start at rest with |{claim.coordinate}| ≤ {inward(claim.extent, 6)} {unit}, the "
+        "other coordinates at the target, converges under the law with its boundary layer, its "
+        f"input clipped to {limits_in_words(mechanism)} and "
     )
-    if claim.period:
-        text += f", its input held for {claim.hold * claim.step:.6g} s"
+    held = f"held for {claim.hold * claim.step!r} s" if claim.hold else "renewed at every instant"
+    text += held
     if claim.uncertain:
-        box = ", ".join(f"{k} in [{a:.6g}, {b:.6g}]" for k, (a, b) in claim.uncertain.items())
+        box = ", ".join(f"{k} in {within(a, b)}" for k, (a, b) in claim.uncertain.items())
         text += f", for every plant with {box}"
     method = "validated tubes (Lohner, outward-rounded float64) into a proved terminal set"
     tubes = start_tubes(motion, claim.coordinate, claim.edges)

@@ -12,6 +12,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
+from undertow.certify.exact_model import exact_mechanism, exact_rates, vanishes
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism, Parameter
@@ -122,14 +123,17 @@ class SurfaceMotion(Motion):
     ------
     InvalidInputError
         For a surface of another size, with a singular λ_a, or a force that depends on time.
+    ModelError
+        For a model that is not smooth.
     """
 
     mechanism: Mechanism
     surface: Surface
 
     def __post_init__(self) -> None:
-        """Check sizes and that w exists."""
+        """Check sizes and that w exists; make the model exact."""
         check_surface_shape(self.mechanism, self.surface)
+        object.__setattr__(self, "mechanism", exact_mechanism(self.mechanism))
         if TIME in self.mechanism.force.free_symbols:
             raise InvalidInputError(
                 f"force of '{self.mechanism.name}'",
@@ -198,9 +202,7 @@ class SurfaceMotion(Motion):
     @cached_property
     def at_rest(self) -> bool:
         """Whether f_u(0, 0) = 0 for all parameter values, decided symbolically."""
-        origin = dict.fromkeys(self.mechanism.x, 0)
-        rest = self.mechanism.force[self.mechanism.m :, :].subs(origin)
-        return all(sp.simplify(e) == 0 for e in rest)
+        return vanishes(self.mechanism.force[self.mechanism.m :, :], self.mechanism.x)
 
     @cached_property
     def slow(self) -> FloatArray:
@@ -232,6 +234,8 @@ class VectorField(Motion):
     InvalidInputError
         For another number of rates than states, or a symbol that is neither state nor
         parameter.
+    ModelError
+        For rates that are not smooth.
 
     Examples
     --------
@@ -246,7 +250,7 @@ class VectorField(Motion):
     parameters: tuple[Parameter, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that the expressions are closed."""
+        """Check that the expressions are closed; make them exact."""
         if len(self.states) != len(self.rates):
             raise InvalidInputError(
                 "vector field",
@@ -262,6 +266,8 @@ class VectorField(Motion):
                 limit="states and parameters alone",
                 remedy="Give every other symbol as a Parameter, or its value",
             )
+        values = {p.symbol: p.value for p in self.parameters}
+        object.__setattr__(self, "rates", exact_rates(self.rates, self.states, values))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -271,16 +277,15 @@ class VectorField(Motion):
     def lay(self, tape: Tape, y: Sequence[sp.Expr]) -> tuple[list[sp.Expr], sp.Expr]:
         """Lay ẋ on a tape; nothing is singular but where an expression is."""
         rename = dict(zip(self.states, y, strict=True))
-        return tape.let_all([sp.sympify(e).xreplace(rename) for e in self.rates]), sp.Integer(1)
+        return tape.let_all([e.xreplace(rename) for e in self.rates]), sp.Integer(1)
 
     @cached_property
     def odd(self) -> bool:
         """Whether ẋ(−x) = −ẋ(x)."""
         flip = {s: -s for s in self.states}
-        return all(sp.expand(e + sp.sympify(e).xreplace(flip)) == 0 for e in self.rates)
+        return all(sp.expand(e + e.xreplace(flip)) == 0 for e in self.rates)
 
     @cached_property
     def at_rest(self) -> bool:
         """Whether f(0) = 0 for all parameter values."""
-        origin = dict.fromkeys(self.states, 0)
-        return all(sp.simplify(sp.sympify(e).subs(origin)) == 0 for e in self.rates)
+        return vanishes(self.rates, self.states)

@@ -8,8 +8,9 @@ which is (8)-(9) put into α_a g̃_a + α_u g̃_u.  (16), V̇ ≤ −Σ η_i |s_
 disturbance |g_j| ≤ ḡ_j iff Σ_j |W_ij(q)| ḡ_j ≤ k_i(q) − η_i for all i and all positions.
 The gains (13)-(14) use norms instead and are therefore larger than need be.
 
-Not covered: an error in M (it makes g depend on u), saturation of the input, and the
-boundary layer, inside of which |s_i| ≤ ε_s · (bound/k_i) is what remains.
+Where the law does not exist there is nothing that it could overcome, so a region is proved
+non-singular first.  Not covered: an error in M (it makes g depend on u), saturation of the input,
+and the boundary layer, inside of which |s_i| ≤ ε_s · (bound/k_i) is what remains.
 """
 
 from __future__ import annotations
@@ -24,13 +25,15 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from undertow.certify.branch import BallFunction, Minimum, minimise_proved
+from undertow.certify.exact_model import exact_mechanism
 from undertow.certify.interval import ball, compile_outward
-from undertow.certify.surface import Region, region_box
+from undertow.certify.surface import Region, nonsingular, region_box, region_words
 from undertow.certify.verdict import Verdict
 from undertow.codegen import Tape
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Mechanism
 from undertow.sliding import LawSymbols, ReachingLaw, Surface, check_surface_shape, lay_law
+from undertow.verdict import inward
 
 __all__ = ["DisturbanceBound", "ReachingCertificate", "reaching"]
 
@@ -130,7 +133,10 @@ def reaching(
     ------
     InvalidInputError
         For gains, rates or bounds that are negative or have the wrong length.
+    ModelError
+        For a model that is not smooth.
     """
+    mechanism = exact_mechanism(mechanism)
     check_surface_shape(mechanism, surface)
     n, m = mechanism.n, mechanism.m
     box = region_box(mechanism, region)
@@ -161,10 +167,17 @@ def reaching(
     worst = min(rows, key=lambda r: r.value)
     lower = min(r.lower for r in rows)
     units = [_unit(c.unit) for c in mechanism.coordinates]
-    verdict = _verdict(names, units, bounds, rate, worst, lower, method)
+    claim = _claim(names, units, bounds, rate, region_words(mechanism, region))
+    verdict = _verdict(claim, names, worst, lower, method)
+    exists = nonsingular(mechanism, surface, region, max_boxes=max_boxes)
     largest = tuple(
         _alone(mechanism, j, spare, weights, box, tolerance, max_boxes) for j in range(n)
     )
+    if not exists:
+        why = f"the law is not shown to exist there: {exists.method}"
+        verdict = replace(exists, claim=claim, unit="", method=why)
+        none = [replace(b, proved=0.0, as_input=0.0 * b.as_input) for b in largest]
+        return ReachingCertificate(verdict, tuple(none), 0.0)
     if verdict.kind == "refuted":
         does = "; ".join(str(bound) for bound in largest)
         short = f"K falls short by {-verdict.margin:.4g} 1/s; alone it overcomes: {does}"
@@ -231,19 +244,18 @@ def _balance(
     return spare, weights
 
 
-def _verdict(
-    names: list[str],
-    units: list[str],
-    bounds: list[float],
-    rate: list[float],
-    worst: Minimum,
-    lower: float,
-    method: str,
-) -> Verdict:
+def _claim(
+    names: list[str], units: list[str], bounds: list[float], rate: list[float], where: str
+) -> str:
     loads = ", ".join(
-        f"{k}: {v:.6g} {unit}" for k, v, unit in zip(names, bounds, units, strict=True)
+        f"{k}: {inward(v, 6)} {unit}" for k, v, unit in zip(names, bounds, units, strict=True) if v
     )
-    claim = f"K guarantees (16) with η = {rate} for disturbances |g| ≤ {{{loads}}}"
+    what = f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
+    left = ", ".join(inward(r, 6) for r in rate)
+    return f"the law {what} {where}: (16) with η = {left}"
+
+
+def _verdict(claim: str, names: list[str], worst: Minimum, lower: float, method: str) -> Verdict:
     witness = dict(zip(names, worst.point, strict=True))
     details = {"boxes": worst.boxes}
     if lower >= 0:

@@ -6,8 +6,8 @@ On a surface the motion, in y = (q_u, q̇_u, w) with w = q_a + λ_a⁻¹ λ_u q_
     E q̈_u = f_u + M_auᵀ α_a⁻¹ λ_a ẇ,     E = M_uu − M_auᵀ α_a⁻¹ α_u,
 
 from the mechanism's own expressions (:class:`undertow.certify.motion.SurfaceMotion`).  The
-claim: the component K of {V ≤ 1} that contains 0 is compact, inside the non-singular set,
-positively invariant, and every motion from it converges to 0.
+claim: the component K of {V ≤ 1} that contains 0 is compact, inside the non-singular set, and
+every motion from it converges to 0 and stays in K, or for a chain (below) in the union of its sets.
 
 The proof, in outward-rounded arithmetic over a box D around 0:
 
@@ -23,7 +23,8 @@ all over K but 0, V has its minimum over K there: V > 0 elsewhere, and the motio
 V_1, V_2, … only V_1 is asked for all of the above; V_k has to fall on {V_k ≤ 1} without
 {V_(k-1) ≤ 1}.  A motion from {V_k ≤ 1} cannot leave it before it enters {V_(k-1) ≤ 1}, and does
 that in finite time, because V̇_k is bounded away from 0 on a compact set.  So by induction
-{V_k ≤ 1} is a region of attraction too.
+{V_k ≤ 1} is a region of attraction too.  It need not be invariant by itself: a motion may leave it
+within {V_(k-1) ≤ 1}.  The union of the chain's sets is.
 
 D is a guard {U ≤ 1}, |y_0| < L, inside a box: a quadratic U in the coordinates of V, around its
 set.  U > 1 is shown on the faces of the box, so that D, which is connected, is inside; and
@@ -118,8 +119,9 @@ def verify_region(
     Returns
     -------
     Verdict
-        ``proved``: every motion from the set stays in it, avoids the singularity and
-        converges.  ``refuted``: at the witness V ≤ 1 and V̇ > 0, proved in intervals.
+        ``proved``: every motion from the set avoids the singularity and converges.  With one
+        function it stays in the set; with a chain only the union of the chain's sets is
+        invariant.  ``refuted``: at the witness V ≤ 1 and V̇ > 0, proved in intervals.
         ``undecided``: the witness is the box where it got stuck, or where {V ≤ 1} meets the
         boundary of the box D, so that it may be unbounded or reach the singularity.
         ``details["stage"]`` counts the function that it is about, from 1.
@@ -131,7 +133,7 @@ def verify_region(
     """
     chain = [V] if isinstance(V, LyapunovFunction) else list(V)
     started, used = time.monotonic(), time.process_time()
-    claim = "{V ≤ 1} is a region of attraction on the surface, non-singular and compact"
+    claim = "{V ≤ 1} is a region of attraction, non-singular and compact"
     method = "branch and bound, outward-rounded quadratic Taylor models in float64"
     box_parameters = dict(parameters or {})
     _check(motion, chain, box_parameters)

@@ -23,18 +23,15 @@ import numpy as np
 import sympy as sp
 
 from undertow.certify.branch import BallFunction, Minimum, minimise_proved
-from undertow.certify.interval import (
-    ball,
-    compile_outward,
-    exact_fraction,
-    flint,
-)
+from undertow.certify.exact_model import exact_mechanism, vanishes
+from undertow.certify.interval import ball, compile_outward, flint
 from undertow.certify.verdict import Verdict
 from undertow.codegen import Tape
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
 from undertow.sliding import Surface, check_surface_shape
 from undertow.stability import sliding_matrix
+from undertow.verdict import inward, within
 
 __all__ = [
     "CriticalMode",
@@ -45,6 +42,7 @@ __all__ = [
     "hurwitz",
     "nonsingular",
     "region_box",
+    "region_words",
     "singular_distance",
 ]
 
@@ -67,12 +65,17 @@ def exact_linearisation(mechanism: Mechanism) -> tuple[list[list[Any]], bool]:
     ``M q̈ = F q + D q̇`` near x = 0; entries are rationals (fmpq) where the model is rational
     at the target with its float parameters taken as the binary numbers that they are, else
     all are balls (arb) of 300 bits.
+
+    Raises
+    ------
+    ModelError
+        For a model that is not smooth.
     """
-    values = {p.symbol: sp.Rational(*p.value.as_integer_ratio()) for p in mechanism.parameters}
-    origin = dict.fromkeys(mechanism.x, sp.Integer(0)) | {TIME: sp.Integer(0)}
-    jacobian = sp.Matrix(mechanism.force).jacobian(list(mechanism.x))
-    symbolic = sp.Matrix.hstack(sp.Matrix(mechanism.mass_matrix), jacobian)
-    entries = [_rational(e).subs(origin).subs(values) for e in symbolic]
+    model = exact_mechanism(mechanism)
+    origin = dict.fromkeys(model.x, sp.Integer(0)) | {TIME: sp.Integer(0)}
+    jacobian = sp.Matrix(model.force).jacobian(list(model.x))
+    symbolic = sp.Matrix.hstack(sp.Matrix(model.mass_matrix), jacobian)
+    entries = [e.subs(origin).subs(_exact_values(model)) for e in symbolic]
     exact = all(e.is_Rational for e in entries)
     module = flint()
     if exact:
@@ -86,11 +89,17 @@ def exact_linearisation(mechanism: Mechanism) -> tuple[list[list[Any]], bool]:
     return [numbers[i : i + columns] for i in range(0, len(numbers), columns)], exact
 
 
-def _rational(expression: sp.Expr) -> sp.Expr:
-    """Replace floats by the rational numbers that they are."""
-    floats = expression.atoms(sp.Float)
-    exact = {f: sp.Rational(*exact_fraction(f).as_integer_ratio()) for f in floats}
-    return expression.xreplace(exact)
+def _exact_values(mechanism: Mechanism) -> dict[sp.Symbol, sp.Rational]:
+    return {p.symbol: sp.Rational(*p.value.as_integer_ratio()) for p in mechanism.parameters}
+
+
+def _no_equilibrium(mechanism: Mechanism) -> str:
+    """Why the target is not shown to be an equilibrium on the surface, or nothing."""
+    model = exact_mechanism(mechanism)
+    if TIME in model.force.free_symbols:
+        return "the force depends on time"
+    rows = [e.subs(_exact_values(model)) for e in model.force[model.m :, :]]
+    return "" if vanishes(rows, model.x) else "f_u(0, 0) = 0 is not shown exactly"
 
 
 def _sliding_matrix_exact(mechanism: Mechanism, surface: Surface) -> tuple[Any, bool]:
@@ -200,18 +209,23 @@ def hurwitz(mechanism: Mechanism, surface: Surface) -> Verdict:
     -------
     Verdict
         ``proved`` with a proved decay rate (every eigenvalue left of −margin, 1/s),
-        ``refuted`` with the offending eigenvalue as witness, or ``undecided`` (only
-        where the model is not rational at the target and balls cannot tell).
+        ``refuted`` with the offending eigenvalue as witness, or ``undecided`` (where the
+        target is not shown to be an equilibrium, or the model is not rational there and balls
+        cannot tell).
 
     Raises
     ------
     InvalidInputError
         When the surface has another n or m than the mechanism.
+    ModelError
+        For a model that is not smooth.
     MissingExtraError
         Without python-flint.
     """
     check_surface_shape(mechanism, surface)
-    claim = f"{surface} is exponentially stable on the surface near the target"
+    claim = "motions on the surface near the target converge to it exponentially"
+    if why := _no_equilibrium(mechanism):
+        return Verdict(claim, "undecided", unit="1/s", method=why)
     with _precision():
         try:
             matrix, exact = _sliding_matrix_exact(mechanism, surface)
@@ -325,9 +339,24 @@ def region_box(mechanism: Mechanism, region: Region) -> list[tuple[float, float]
     return box
 
 
+def region_words(mechanism: Mechanism, region: Region) -> str:
+    """Return a region of positions in words, its ends rounded inwards."""
+    units = {c.name: c.unit for c in mechanism.coordinates}
+    parts = [
+        f"|{k}| ≤ {inward(b, 6)} {units[k]}" if a == -b else f"{k} in {within(a, b)} {units[k]}"
+        for k, (a, b) in region.items()
+        if (a, b) != (0.0, 0.0)
+    ]
+    if not parts:
+        return "at the target"
+    rest = len(parts) < mechanism.n
+    return f"for {', '.join(parts)}" + (", the other coordinates at the target" if rest else "")
+
+
 def _gamma(mechanism: Mechanism, surface: Surface) -> tuple[BallFunction, BallFunction]:
     """Return det Γ(q)/det Γ(0) and a lower bound of Γ's smallest singular value."""
     tape = Tape()
+    mechanism = exact_mechanism(mechanism)
     part = mechanism.partition(tape)
     exact = {
         name: sp.Matrix(*b.shape, [sp.Rational(*float(v).as_integer_ratio()) for v in b.ravel()])
@@ -379,8 +408,8 @@ def nonsingular(
     check_surface_shape(mechanism, surface)
     box = region_box(mechanism, region)
     names = [c.name for c in mechanism.coordinates]
-    text = ", ".join(f"{k} in [{a:.6g}, {b:.6g}]" for k, (a, b) in region.items())
-    claim = f"α_a − α_u M_uu⁻¹ M_auᵀ is non-singular for {text or 'the target'}"
+    words = region_words(mechanism, region)
+    claim = f"the law exists {words}: α_a − α_u M_uu⁻¹ M_auᵀ is non-singular"
     method = "ball arithmetic, branch and bound"
     ratio, distance = _gamma(mechanism, surface)
     found = minimise_proved(ratio, box, stop_below=0.0, max_boxes=max_boxes)

@@ -14,9 +14,15 @@ One step h, for a right-hand side f that need only be Lipschitz:
    a fast linear mode is resolved by the series, not by small steps.
 3. Likewise m(h) ∈ m + Σ_{k≥1} h^k/k! J^{k−1} f(m).
 4. The first R rows of f are smooth and dA/dt lies in G over Y.  There A(t) ∈ J₀ + t G with J₀
-   the slopes over X alone, so the first term of Φ is h J₀ + h²/2 G, and the second term of 3.
-   is h²/2 (J(m) + h/3 G) f(m): the slopes between m and m(t) change at half the rate of those
-   at m(t).  This wins an order in h.
+   the slopes over X alone, so the first term of Φ is h J₀ + h²/2 G.  In 3. the slopes between m
+   and m(t) are in J(m) + t/2 G: they change at half the rate of those at m(t).  The second term
+   up to time t is therefore in t²/2 J(m) f(m) + t³/6 G f(m), and what follows integrates each
+   part by its own power of t:
+
+       m(h) ∈ m + h f(m) + Σ_{k≥2} (h^k/k! J^{k−2} J(m) + h^{k+1}/(k+1)! J^{k−2} G) f(m).
+
+   The two are added after the products with J, never before: J a + J b is more than J (a + b), and
+   the slopes that multiply a are not those that multiply b.  This wins an order in h.
 
 Everything is outward-rounded.
 """
@@ -245,7 +251,7 @@ class Tubes:
         numpy.ndarray
             Which sets moved; the others found no such box, and their numbers mean nothing.
         """
-        step, third = Interval(h), 1 / Interval(3.0)
+        step = Interval(h)
         begin, outer, rates, good = self._enclose(h)
         size = len(self.middle)
         here = self.field.over(Interval(self.middle), middle=True, brief=True)
@@ -256,22 +262,30 @@ class Tubes:
         J = stack(rates.slope[:smooth].intersect(drawn), kinked)
         J_z = J[:, :size]
         mean = stack(begin.slope[:smooth] + 0.5 * step * G, kinked)
-        along = stack(here.slope[:smooth] + third * step * G, kinked)[:, :size]
-        # Ordered integrals of A…A for [Φ Ψ], and of A…A f(m) for the middle.
-        flow, drift = mean * step, (here.rate * step)[:, None]
-        term, move = J * step, drift
+        # Ordered integrals of A…A for [Φ Ψ], and of A…A f(m) for the middle: there the second
+        # factor from the right is J(m) in ``move``, of order h^k, and G in ``turn``, h^(k+1).
+        flow, term = mean * step, J * step
+        f = here.rate[:, None]
+        half, sixth = step * step * 0.5, step * step * step * (1 / Interval(6.0))
+        move = matmul(stack(here.slope[:smooth], kinked)[:, :size], f) * half
+        turn = matmul(_with_zero_rows(G[:, :size], size), f) * sixth
+        drift = f * step + move + turn
         for k in range(2, TERMS + 1):
-            part = step * (1 / Interval(float(k)))
-            term = matmul(J_z, term) * part
-            move = matmul(along if k == 2 else J_z, move) * part
-            flow, drift = flow + term, drift + move
+            term = matmul(J_z, term) * (step * (1 / Interval(float(k))))
+            flow = flow + term
+        for k in range(3, TERMS + 1):
+            move = matmul(J_z, move) * (step * (1 / Interval(float(k))))
+            turn = matmul(J_z, turn) * (step * (1 / Interval(float(k + 1))))
+            drift = drift + move + turn
         # The tail of both series in the maximum norm, Σ_{k≥1} (h‖J‖)^k ≤ h‖J‖/(1 − h‖J‖).
         ratio = step * Interval(_row_sum(_size(J_z))) * (1 / Interval(float(TERMS + 1)))
         good &= ratio.hi < 0.9
         factor = ratio * (1 / (1 - ratio))
         tail = _ball(factor * Interval(_row_sum(_size(term))))
         flow = flow + tail[None, None]
-        drift = drift + _ball(factor * Interval(_size(move).max(axis=(0, 1))))[None, None]
+        # The next of ``turn`` is over the last by less than ``ratio`` too.
+        last = Interval(_size(move).max(axis=(0, 1))) + Interval(_size(turn).max(axis=(0, 1)))
+        drift = drift + _ball(factor * last)[None, None]
         Phi = flow[:, :size] + Interval(np.eye(size)[:, :, None])
         return self._assemble(Phi, flow[:, size:], drift[:, 0]), outer, rates, good
 
@@ -326,6 +340,12 @@ class Tubes:
         rest = rest + _ball(error)[None]
         zero = Interval(np.minimum(rest.lo, 0.0), np.maximum(rest.hi, 0.0))
         return Tubes(self.field, middle, spread, basis, zero)
+
+
+def _with_zero_rows(a: Interval, rows: int) -> Interval:
+    """Add rows of zeros below, up to so many."""
+    nothing = np.zeros((rows - len(a.lo), *a.lo.shape[1:]))
+    return stack(a, Interval(nothing))
 
 
 def _ball(radius: Interval) -> Interval:

@@ -3,14 +3,16 @@
 Every claim is decided afresh by its checker; nothing of the search that found it is imported
 here, directly or through others (``pyproject.toml`` and the tests see to it): no linear program,
 no semidefinite solver, no optimiser.  What is proved is proved for the equations of the
-mechanism that is passed in; the file only brings the numbers to try.
+mechanism that is passed in; the file only brings the numbers to try.  So the sentence of a verdict
+is the checker's, made from the numbers that it decided on; the file's own words do not count.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -20,9 +22,10 @@ import sympy as sp
 from undertow.certify.appendix import CASES, Constants, Lyapunov, two_vertex
 from undertow.certify.certificate import Certificate, Claim, Subject, ellipsoid_of, function_of
 from undertow.certify.ellipsoid import verify_ellipsoid
+from undertow.certify.exact_model import exact_mechanism
 from undertow.certify.loop_claim import LoopClaim, verify_loop
 from undertow.certify.lyapunov import LyapunovFunction
-from undertow.certify.motion import SurfaceMotion
+from undertow.certify.motion import Motion, SurfaceMotion
 from undertow.certify.reaching import reaching
 from undertow.certify.region import verify_region
 from undertow.certify.surface import hurwitz, nonsingular
@@ -31,9 +34,9 @@ from undertow.certify.taylor_kernel import bounds
 from undertow.codegen import Tape
 from undertow.errors import CertificateError, UndertowError
 from undertow.mechanism import Mechanism
-from undertow.verdict import Verdict
+from undertow.verdict import Verdict, inward, within
 
-__all__ = ["CHECKS", "Checked", "check_settings", "match", "verify"]
+__all__ = ["CHECKS", "Checked", "check_settings", "match", "region_words", "verify"]
 
 Box = dict[str, tuple[float, float]]
 
@@ -47,14 +50,19 @@ class Checked:
     subject
         Whose claim it is.
     claim
-        As the file has it.
+        As the file has it; its words say nothing.
     verdict
-        As it was decided now.
+        As it was decided now, with the sentence that was decided.
     """
 
     subject: Subject
     claim: Claim
     verdict: Verdict
+
+    @property
+    def reworded(self) -> bool:
+        """Whether the file says something else than what was decided."""
+        return self.claim.verdict.claim != self.verdict.claim
 
 
 def match(
@@ -80,7 +88,7 @@ def match(
     if certificate.name != mechanism.name:
         raise CertificateError(
             "certificate of another mechanism",
-            value=certificate.name,
+            value=repr(certificate.name),
             limit=f"'{mechanism.name}'",
             remedy="Name the mechanism that it is about",
         )
@@ -89,7 +97,7 @@ def match(
             f"equations of '{mechanism.name}'",
             value=f"hash {mechanism.structure[:12]}…",
             limit=f"{certificate.structure[:12]}…, those of the certificate "
-            f"(SymPy {certificate.versions.get('sympy')})",
+            f"(SymPy {str(certificate.versions.get('sympy'))[:12]!r})",
             remedy="The model has changed since: certify again",
         )
     present = {p.name: p.value for p in mechanism.parameters}
@@ -97,7 +105,7 @@ def match(
         raise CertificateError(
             f"parameters of '{mechanism.name}'",
             value=", ".join(sorted(present)),
-            limit=", ".join(sorted(certificate.parameters)),
+            limit=", ".join(repr(name) for name in sorted(certificate.parameters)),
         )
     changed = {k: v for k, v in certificate.parameters.items() if present[k] != v}
     if changed and own_parameters:
@@ -135,7 +143,7 @@ def check_settings(certificate: Certificate, settings: Mapping[str, float]) -> N
         stated = certificate.parameters.get(name)
         if stated != value:
             raise CertificateError(
-                f"parameter '{name}' of '{certificate.name}'",
+                f"parameter '{name}' of the certificate",
                 value=f"{value:.17g}",
                 limit="one of the certificate's" if stated is None else f"{stated:.17g}, as proved",
                 remedy="The proof is for that value: certify again with --set",
@@ -172,10 +180,12 @@ def verify(
     ------
     CertificateError
         For another mechanism, a claim of an unknown kind, or one without claims.
+    ModelError
+        For a mechanism that is not smooth.
     MissingExtraError
         Without python-flint.
     """
-    model = match(certificate, mechanism, own_parameters=own_parameters)
+    model = exact_mechanism(match(certificate, mechanism, own_parameters=own_parameters))
     tasks = [(s, c) for s in certificate.subjects for c in s.claims]
     if not tasks:
         raise CertificateError("certificate", value="no claim", limit="at least one")
@@ -183,7 +193,7 @@ def verify(
     if unknown:
         raise CertificateError(
             "claim of a certificate",
-            value=", ".join(unknown),
+            value=", ".join(repr(kind) for kind in unknown),
             limit=f"one of {', '.join(CHECKS)}",
             remedy="It was made by a later version of Undertow",
         )
@@ -204,12 +214,11 @@ def _decide(mechanism: Mechanism, subject: Subject, claim: Claim, seconds: float
         ) from error
     stated = claim.verdict.margin
     if verdict and math.isfinite(stated) and not verdict.margin >= stated - 1e-9 * abs(stated):
-        return Verdict(
-            claim.verdict.claim,
-            "undecided",
-            verdict.margin,
-            verdict.unit,
-            method=f"the file states a margin of {stated:.6g}, proved is {verdict.margin:.6g}",
+        return replace(
+            verdict,
+            kind="undecided",
+            method=f"the file states a margin of {stated:.6g}, "
+            f"proved is {inward(verdict.margin, 6)}",
         )
     return verdict
 
@@ -256,21 +265,32 @@ def _region(m: Mechanism, s: Subject, data: Mapping[str, Any], seconds: float) -
     for name, (low, high) in box.items():
         if not low <= own[name] <= high:
             raise ValueError(f"a box [{low:g}, {high:g}] of {name} without its {own[name]:g}")
-    verdict = verify_region(motion, chain, parameters=box, max_seconds=seconds)
+    claim = region_words(motion, start, box)
+    verdict = replace(
+        verify_region(motion, chain, parameters=box, max_seconds=seconds), claim=claim
+    )
     if not verdict:
         return verdict
     if not reaches(chain[-1], start):
-        return Verdict(verdict.claim, "undecided", method="the stated start is not shown inside")
-    names = ", ".join(f"{n} = {v:.6g}" for n, v in zip(motion.names, start, strict=True) if v)
-    ranges = "".join(f", for every {n} in [{a:.6g}, {b:.6g}]" for n, (a, b) in box.items())
-    return Verdict(
-        f"{verdict.claim}, that contains {names}{ranges}",
-        "proved",
-        float(np.linalg.norm(start)),
-        "",
-        dict(zip(motion.names, start, strict=True)),
-        verdict.method,
-        verdict.details,
+        return Verdict(claim, "undecided", method="the stated start is not shown inside")
+    return replace(
+        verdict,
+        margin=float(np.linalg.norm(start)),
+        witness=dict(zip(motion.names, start, strict=True)),
+    )
+
+
+def region_words(motion: Motion, start: Sequence[float], parameters: Box) -> str:
+    """Return in words that a region on the surface holds a start, for parameters in a box.
+
+    The line from 0 to the start is inside: with one entry it may be rounded towards 0.
+    """
+    away = {n: v for n, v in zip(motion.names, start, strict=True) if v}
+    points = [f"{n} = {inward(v, 6) if len(away) == 1 else repr(v)}" for n, v in away.items()]
+    ranges = "".join(f", for every {n} in {within(a, b)}" for n, (a, b) in parameters.items())
+    return (
+        "a region of attraction on the surface, non-singular and compact, contains "
+        f"{', '.join(points) or 'the target'}{ranges}"
     )
 
 
@@ -314,8 +334,16 @@ def _interval(m: Mechanism, s: Subject, data: Mapping[str, Any], _seconds: float
     if case is None:
         raise ValueError("a surface that is none of the appendix's")
     constants = Constants.of(m)
-    P = Lyapunov.of(*(str(v) for v in data["P"]))
-    return two_vertex(case.reduced(constants), P, Fraction(str(data["half_width"])))
+    P = Lyapunov.of(*(_exact(v) for v in data["P"]))
+    return two_vertex(case.reduced(constants), P, Fraction(_exact(data["half_width"])))
+
+
+def _exact(value: Any) -> str:
+    """A number as text, digits alone: an exponent may stand for more of them than there are."""
+    text = str(value)
+    if not re.fullmatch(r"-?[0-9]{1,40}(/[0-9]{1,40}|\.[0-9]{1,40})?", text):
+        raise ValueError("a number that is neither a decimal nor a fraction of up to 40 digits")
+    return text
 
 
 Check = Callable[[Mechanism, Subject, Mapping[str, Any], float], Verdict]
