@@ -136,6 +136,7 @@ def test_a_mechanism_that_is_named_is_run_and_its_hash_compared(own: tuple[Path,
     answer = CliRunner().invoke(app, ["replay", str(path), "--mechanism", name])
     assert "has changed since" in " ".join(answer.output.split())
     assert answer.exit_code == 0
+    assert replay(path, mechanism=ut.mechanisms.rotary_pendulum()).identical
     model.write_text(MODEL.replace("pendulum()", "pendulum(d_e=0.02)"))
     with pytest.raises(ArtefactError, match="other equations or numbers"):
         replay(path, mechanism=name)

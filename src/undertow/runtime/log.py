@@ -376,7 +376,8 @@ def check_log(path: Path) -> None:
         if not os.access(path.parent, os.W_OK):
             message = "its folder cannot be written"
             raise PermissionError(message)
-        if shutil.disk_usage(path.parent).free < LEAST:
+        disk = shutil.disk_usage(path.parent)
+        if disk.total and disk.free < LEAST:
             raise OSError(errno.ENOSPC, f"less than {LEAST >> 20} MiB are free on its disk")
         for earlier in _parts(path):
             _claim(earlier)

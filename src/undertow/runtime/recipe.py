@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
 
@@ -119,6 +119,12 @@ class Recipe:
     def belief(self) -> Mechanism:
         """The controller's model."""
         return named(self.mechanism).with_parameters(**self.parameters)
+
+    def of(self, mechanism: Mechanism) -> Self:
+        """Return the same recipe for a mechanism that is at hand, whatever its name says."""
+        other = replace(self)
+        vars(other)["belief"] = mechanism.with_parameters(**self.parameters)
+        return other
 
     @cached_property
     def x0(self) -> FloatArray:

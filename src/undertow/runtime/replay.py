@@ -117,7 +117,9 @@ def build() -> dict[str, str | None]:
     return {**versions(), **processor(), "sources": digest.hexdigest()[:12]}
 
 
-def replay(path: Path, *, mechanism: str | None = None, decisions: bool = True) -> Replay:
+def replay(
+    path: Path, *, mechanism: str | Mechanism | None = None, decisions: bool = True
+) -> Replay:
     """Replay a log that carries its recipe.
 
     Parameters
@@ -125,8 +127,8 @@ def replay(path: Path, *, mechanism: str | None = None, decisions: bool = True) 
     path
         The log.
     mechanism
-        A mechanism of one's own, ``FILE.py:NAME``, whose run it is.  The file that the log
-        names is not run: say which one is.
+        A mechanism of one's own, ``FILE.py:NAME`` or itself, whose run it is.  The file that
+        the log names is not run: say which one is.
     decisions
         Also let the gate judge each recorded answer again.
 
@@ -149,8 +151,11 @@ def replay(path: Path, *, mechanism: str | None = None, decisions: bool = True) 
         remarks: tuple[str, ...] = ()
         if in_a_file(str(values["mechanism"])) or mechanism is not None:
             remarks = _compare_source(recording, mechanism)
+        if isinstance(mechanism, str):
             values = {**values, "mechanism": mechanism}
         recipe = Recipe.from_dict(values)
+        if isinstance(mechanism, Mechanism):
+            recipe = recipe.of(mechanism)
         _check_mechanism(recording, recipe.belief)  # before anything is designed for it
         memory = memory_from(recording.meta["memory"])
         controller = recipe.make_controller(memory)
@@ -182,7 +187,7 @@ def _source_hash(name: str) -> str:
     return file_hash(Path(name.rpartition(":")[0]), "mechanism file")
 
 
-def _compare_source(recording: Recording, mechanism: str | None) -> tuple[str, ...]:
+def _compare_source(recording: Recording, mechanism: str | Mechanism | None) -> tuple[str, ...]:
     """Compare the file of a mechanism of one's own with the one of the run; say what differs."""
     written = str(recording.meta["recipe"]["mechanism"])
     if mechanism is None:
@@ -192,7 +197,7 @@ def _compare_source(recording: Recording, mechanism: str | None) -> tuple[str, .
             limit="a mechanism that you name: what a log names is not run",
             remedy=f"Look into that file, and write --mechanism {written}",
         )
-    if not in_a_file(mechanism):
+    if isinstance(mechanism, Mechanism) or not in_a_file(mechanism):
         return ()
     then, now = recording.meta.get("source"), _source_hash(mechanism)
     if then is None:
