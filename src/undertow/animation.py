@@ -172,7 +172,7 @@ class Film:
                         zorder=4,
                     )  # fmt: skip
             elif isinstance(part, Label):
-                axes.text(*here[0], part.text, ha="center", va="top", alpha=alpha)
+                axes.text(here[0, 0], here[0, 1], part.text, ha="center", va="top", alpha=alpha)
             elif isinstance(part, Box):
                 corner = here[0] - (part.width, part.height)
                 axes.add_patch(

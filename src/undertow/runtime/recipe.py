@@ -91,7 +91,7 @@ class Recipe:
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
-        """Refuse unknown objectives, periods that no loop keeps or that are stalls, far horizons."""
+        """Refuse an unknown objective, a period that no loop keeps, and a horizon too far."""
         if self.objective not in get_args(Goal):
             raise InvalidInputError(
                 "objective of a run",
