@@ -306,6 +306,7 @@ def require_smooth(
     variables: Iterable[sp.Symbol],
     *,
     at: Mapping[sp.Symbol, float] | None = None,
+    orders: int = 1,
 ) -> None:
     """Refuse expressions that have no derivative where one is about to be taken.
 
@@ -322,14 +323,16 @@ def require_smooth(
         By which they are differentiated.
     at
         The point where, all symbols to numbers: a kink elsewhere, as that of |x − 1| at 0, does
-        no harm.  Without it the derivative is wanted everywhere.  x |x| has one, too.
+        no harm.  Without it the derivative is wanted everywhere.
+    orders
+        How many derivatives are taken one after the other: x |x| has one, and no second.
 
     Raises
     ------
     ModelError
         With the first expression that is not smooth.
     """
-    found = next(kinks(expressions, variables, at=at), None)
+    found = next(kinks(expressions, variables, at=at, orders=orders), None)
     if found is not None:
         raise ModelError(
             f"{what} is not smooth",
@@ -351,6 +354,7 @@ def kinks(
     variables: Iterable[sp.Symbol],
     *,
     at: Mapping[sp.Symbol, float] | None = None,
+    orders: int = 1,
 ) -> Iterator[sp.Basic]:
     """Yield the parts of expressions that have no derivative, as :func:`require_smooth` says.
 
@@ -367,7 +371,8 @@ def kinks(
             if not part.free_symbols & moving:
                 continue
             edges = _edges(part)
-            if edges is None or any(_breaks(part, edge, factors, values) for edge in edges):
+            helped = factors if orders == 1 else ()
+            if edges is None or any(_breaks(part, edge, helped, values) for edge in edges):
                 yield part
                 continue
         waiting += _inside(part, factors)[::-1]

@@ -42,8 +42,8 @@ def exact_mechanism(mechanism: Mechanism) -> Mechanism:
     exact = {name: getattr(mechanism, name).applyfunc(exact_expression) for name in blocks}
     for name, matrix in exact.items():
         what = f"{name} of '{mechanism.name}'"
-        require_smooth(what, matrix, mechanism.x)
-        require_smooth(what, matrix, mechanism.x, at=target)
+        require_smooth(what, matrix, mechanism.x, orders=2)
+        require_smooth(what, matrix, mechanism.x, at=target, orders=2)
     changed = {k: v for k, v in exact.items() if v != getattr(mechanism, k)}
     return replace(mechanism, **changed) if changed else mechanism
 
@@ -59,8 +59,9 @@ def exact_rates(
         For expressions that are not smooth, everywhere or at 0.
     """
     exact = tuple(exact_expression(sp.sympify(e)) for e in rates)
-    require_smooth("vector field", exact, states)
-    require_smooth("vector field", exact, states, at=dict.fromkeys(states, 0.0) | values)
+    require_smooth("vector field", exact, states, orders=2)
+    target = dict.fromkeys(states, 0.0) | values
+    require_smooth("vector field", exact, states, at=target, orders=2)
     return exact
 
 
