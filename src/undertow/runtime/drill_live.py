@@ -343,10 +343,12 @@ def _no_memory() -> LiveOutcome:
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "facts.json"
         child = fork(_starved, (drill_recipe(), record), "undertow starved", daemon=False)
-        child.join(60.0)
+        child.join(120.0)
+        code = child.exitcode
         child.kill()
         if not record.exists():
-            return LiveOutcome("process", name, "it ended without a word", False)
+            happened = f"no word from it, exit code {code}"
+            return LiveOutcome("process", name, happened, False)
         facts = json.loads(record.read_text())
     off = facts["off"] and not any(facts["u"])
     happened = f"{facts['text']}; exit code {facts['code']}"

@@ -259,7 +259,7 @@ def _hold(
                 while wanted is not None and ours.poll(0.0):
                     wanted = ours.recv()  # after a stall outputs have queued: the newest counts
                 gone = wanted is None
-        except (EOFError, OSError):
+        except Exception:  # the other end is gone, or what came cannot be read
             gone = True
         now = time.perf_counter()
         if isinstance(wanted, str):
@@ -282,7 +282,7 @@ def _hold(
     close = ""
     try:
         rig.close()
-    except Exception as error:  # a rig that failed may fail again
+    except BaseException as error:  # a rig that failed may fail again
         close = f"close: {type(error).__name__}: {error}"
         output = output or (close if isinstance(error, OutputOnError) else "")
     with contextlib.suppress(OSError):
@@ -295,7 +295,7 @@ def _attempt(rig: Rig, u: FloatArray) -> str:
     """Write to the rig; return what failed, in words."""
     try:
         rig.write(u.copy())
-    except Exception as error:
+    except BaseException as error:  # a driver may do anything; the keeper stays
         return f"{type(error).__name__}: {error}"
     return ""
 
@@ -304,7 +304,7 @@ def _reply(ours: Connection, rig: Rig, failure: str) -> None:
     """Read the rig, and tell the controller."""
     try:
         reply = _Reply(rig.read(), "", failure)
-    except Exception as error:
+    except BaseException as error:
         reply = _Reply(None, f"{type(error).__name__}: {error}", failure)
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(Exception):  # who listens no more is found out by what comes
         ours.send(reply)

@@ -83,10 +83,12 @@ class Report:
     unsound
         Answers of the slow loop that were none, or refused as unsound: their numbers are not
         those of their plan, or the plan is not stable.
+    unreached
+        How often the slow loop could not be asked, or nobody was left to take over.
     off, output
         Whether the device took an output of zero at the end; what went wrong with that, or with
         closing it.
-    error, cost
+    error, cost, unit
         ‖x‖₂ of the last estimate, and ∫ Φ dt over the run, in the objective's unit.
     home, homing
         Of the settings: what a run that ends settled is measured by.
@@ -119,10 +121,12 @@ class Report:
     unwritten: int = 0
     missing: int = 0
     unsound: int = 0
+    unreached: int = 0
     off: bool = True
     output: str = ""
     error: float = math.nan
     cost: float = 0.0
+    unit: str = ""
     home: float = math.inf
     homing: float = 0.0
     system: tuple[str, ...] = ()
@@ -197,6 +201,7 @@ class Runtime:
             variation=np.zeros_like(controller.u),
             home=settings.home,
             homing=settings.homing,
+            unit=controller.cascade.objective.unit,
             log=log,
         )
         self._stopping, self._silent = False, ""
@@ -434,7 +439,7 @@ class Runtime:
         try:
             answer = self.worker.take(t)
         except Exception as error:
-            self._tell("optimiser", f"{type(error).__name__}: {error}")
+            self._unreached(f"{type(error).__name__}: {error}")
             return None
         if answer is None or is_answer(answer):
             return answer
@@ -467,6 +472,10 @@ class Runtime:
             return f"{self._writes.value:.0%} of the writes failed, {what}"
         return ""
 
+    def _unreached(self, text: str) -> None:
+        self.report.unreached += 1
+        self._tell("optimiser", text)
+
     def _tell(self, what: str, text: str) -> None:
         t, events = self._beat - self._origin, self.report.events
         if len(events) < EVENTS:
@@ -482,11 +491,11 @@ class Runtime:
         controller, report, log = self.controller, self.report, self.log
         try:
             if controller.gives_up and not self.worker.replace():
-                self._tell("optimiser", "nobody is left to take over: the last plan stays")
+                self._unreached("nobody is left to take over: the last plan stays")
             if controller.request is not None:
                 self.worker.ask(controller.request)
         except Exception as error:
-            self._tell("optimiser", f"{type(error).__name__}: {error}")
+            self._unreached(f"{type(error).__name__}: {error}")
         if log is not None:
             if inputs.command:
                 log.event(k, inputs.t, "command", inputs.command.name)

@@ -53,6 +53,8 @@ class RunVerdict:
         and could be closed.
     off
         Whether the device took an output of zero at the end.
+    unit
+        Of the cost.
     """
 
     ending: Ending
@@ -61,6 +63,7 @@ class RunVerdict:
     cost: float
     output: str = ""
     off: bool = True
+    unit: str = ""
 
     @property
     def exit_code(self) -> int:
@@ -70,7 +73,8 @@ class RunVerdict:
     def __str__(self) -> str:
         """Return the verdict in one line."""
         reasons = "; ".join(filter(None, (*self.reasons, self.output)))
-        numbers = f"‖x‖ = {self.error:.3g} at the end, cost {self.cost:.4g}"
+        cost = f"{self.cost:.4g} {self.unit}".rstrip()
+        numbers = f"‖x‖ = {self.error:.3g} at the end, cost {cost}"
         return f"{self.ending}{reasons and f', {reasons}'}; {numbers}"
 
     @classmethod
@@ -81,7 +85,8 @@ class RunVerdict:
             ending, reasons = "degraded", [f"{ending}, but {wrong[0]}", *wrong[1:]]
         if not report.off and ending not in ("lost", "stopped"):
             ending = "stopped"
-        return cls(ending, tuple(reasons), report.error, report.cost, report.output, report.off)
+        numbers = report.error, report.cost
+        return cls(ending, tuple(reasons), *numbers, report.output, report.off, report.unit)
 
 
 def _ending(report: Report) -> tuple[Ending, list[str]]:
@@ -117,6 +122,7 @@ def _wrong(report: Report) -> Sequence[str]:
         (report.log_failure != "", f"the log: {report.log_failure}"),
         (report.disagreed > 0, f"the shadow disagreed in {report.disagreed:,} steps"),
         (report.unsound > 0, f"{report.unsound:,} answers of the optimiser were unsound"),
+        (report.unreached > 0, f"{report.unreached:,} times the optimiser could not be reached"),
         (report.unread > FAILED * steps, f"{report.unread:,} reads failed"),
         (report.unwritten > FAILED * steps, f"{report.unwritten:,} writes failed"),
         (
