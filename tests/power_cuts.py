@@ -154,12 +154,24 @@ def recorded(folder: Path, seconds: float, part_bytes: int) -> tuple[list[Note],
 
 
 def _notes(content: bytes) -> Iterator[Note]:
-    at = 0
+    """Yield what was noted; a number that the system gives to another file becomes a new one."""
+    at, fresh = 0, 1 << 62
+    numbers: dict[int, int] = {}
+    names: dict[str, int] = {}
     while at < len(content):
-        t, op, file, offset, length = NOTE.unpack_from(content, at)
+        t, op, inode, offset, length = NOTE.unpack_from(content, at)
         at += NOTE.size
-        yield Note(t, op, file, offset, content[at : at + length])
+        data = content[at : at + length]
         at += length
+        paths = [Path(part.decode()).name for part in data.split(b"\0")[:-1]] if op >= NAME else []
+        if op == NAME and names.get(paths[0]) != inode:
+            numbers[inode] = fresh = fresh + 1
+            names[paths[0]] = inode
+        elif op == UNNAME:
+            names.pop(paths[0], None)
+        elif op == RENAME and paths[0] in names:
+            names[paths[1]] = names.pop(paths[0])
+        yield Note(t, op, numbers.get(inode, inode), offset, data)
 
 
 @dataclass

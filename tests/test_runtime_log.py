@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
 import threading
@@ -423,6 +424,46 @@ def test_to_read_a_killed_log_changes_nothing(
     assert {n: (left / n).read_bytes() for n in before} == before
     if not writable:
         assert {p.name for p in left.iterdir()} == set(before)
+
+
+def test_a_log_that_was_cut_off_while_it_was_closed_is_read(tmp_path: Path) -> None:
+    """Its journal, which tells how the file was, is followed beside a copy."""
+    path = tmp_path / "run.db"
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        fill(log, 500)
+    left = tmp_path / "left"
+    left.mkdir()
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as file:
+        file.execute("PRAGMA cache_size = 1")
+        file.execute("BEGIN")
+        file.execute("UPDATE steps SET phi = 7.0")  # more than its memory holds: it writes
+        for end in ("", "-journal"):
+            shutil.copy(f"{path}{end}", left / f"run.db{end}")
+        file.execute("ROLLBACK")
+    before = {p.name: p.read_bytes() for p in left.iterdir()}
+    assert before["run.db"] != path.read_bytes()
+    np.testing.assert_array_equal(read_log(left / "run.db").steps, read_log(path).steps)
+    assert {p.name: p.read_bytes() for p in left.iterdir()} == before
+
+
+def test_a_journal_that_names_a_file_does_not_remove_it(tmp_path: Path) -> None:
+    """SQLite would: it takes the file for one that ties several journals together."""
+    path, victim = tmp_path / "run.db", tmp_path / "victim"
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        fill(log, 500)
+    victim.write_text("of value")
+    name = str(victim).encode()
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as file:
+        file.execute("PRAGMA cache_size = 1")
+        file.execute("BEGIN")
+        file.execute("UPDATE steps SET phi = 7.0")
+        journal = Path(f"{path}-journal").read_bytes()
+        file.execute("ROLLBACK")
+    tail = struct.pack(">I", 0) + name + struct.pack(">II", len(name), sum(name))
+    Path(f"{path}-journal").write_bytes(journal + tail + log_module.JOURNAL)
+    with pytest.raises(ArtefactError, match="names another"):
+        read_log(path)
+    assert victim.read_text() == "of value"
 
 
 def test_companions_that_others_left_are_not_used(tmp_path: Path) -> None:

@@ -73,6 +73,9 @@ PATIENCE = 5.0
 #: Free space without which no log is begun, bytes.
 LEAST = 1 << 24
 
+#: What ends a journal of SQLite that belongs to another one.
+JOURNAL = bytes.fromhex("d9d505f920a163d7")
+
 #: Largest value in a file that is read, bytes.
 LONGEST = 1 << 26
 
@@ -436,6 +439,7 @@ def _claim(path: Path) -> None:
     message = "something else of that name, not a log"
     if not path.is_file():
         raise FileExistsError(message)
+    _check_journal(path)
     with contextlib.closing(sqlite3.connect(path, timeout=0.0)) as file:
         try:
             file.execute("PRAGMA journal_mode=DELETE")  # one file, and nobody else has it open
@@ -544,25 +548,41 @@ def _read_part(path: Path) -> Recording:
 def _opened(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
     """Open a log to be read, and nothing but read; also say how many bytes it has."""
     size = check_file(path, "log", remedy="Name a log of a run")
-    beside = Path(f"{path}-wal")
-    if beside.exists():
-        size += check_file(beside, "log")
+    waiting = {}
+    for end in ("-wal", "-journal"):
+        beside = Path(f"{path}{end}")
+        if os.path.lexists(beside):
+            waiting[end] = check_file(beside, "log")
+    writable = os.access(path.parent, os.W_OK)
     with contextlib.ExitStack() as stack:
-        if beside.exists() and not os.access(path.parent, os.W_OK):
-            # SQLite puts the log together beside it, or not at all.
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="undertow-"))
-            for part in (path, beside):
-                shutil.copyfile(part, Path(folder) / part.name)
-            path = Path(folder) / path.name
-        place = path.absolute().as_uri()
-        try:
-            file = _connected(f"{place}?mode=ro")
-        except sqlite3.OperationalError:
-            if os.access(path.parent, os.W_OK):
-                raise
-            file = _connected(f"{place}?immutable=1")
+        mode = "mode=ro"
+        if waiting.get("-journal") or (waiting.get("-wal") and not writable):
+            # SQLite puts the log together beside it: here beside a copy.
+            path, mode = _copied(path, stack), "mode=rw"
+        elif not writable:
+            mode = "immutable=1"
+        file = _connected(f"{path.absolute().as_uri()}?{mode}")
         with contextlib.closing(file):
-            yield file, size
+            yield file, size + sum(waiting.values())
+
+
+def _copied(path: Path, stack: contextlib.ExitStack) -> Path:
+    """Copy a log, with what waits beside it, into a folder of one's own, for as long as it takes.
+
+    A journal that names another one is refused: SQLite would remove the file of that name.
+    """
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="undertow-")))
+    for end in ("", "-wal", "-journal"):
+        if os.path.lexists(f"{path}{end}"):
+            shutil.copyfile(f"{path}{end}", folder / f"{path.name}{end}")
+    _check_journal(folder / path.name)
+    return folder / path.name
+
+
+def _check_journal(path: Path) -> None:
+    journal = Path(f"{path}-journal")
+    if journal.is_file() and journal.read_bytes()[-8:] == JOURNAL:
+        raise FileExistsError("a journal that names another one, which no run writes")
 
 
 def _connected(place: str) -> sqlite3.Connection:
