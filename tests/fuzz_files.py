@@ -139,7 +139,9 @@ class Watch:
             if written or flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
                 return self._outside(event, os.fsdecode(args[0]))
         elif event in self.CHANGES and isinstance(args[0], str | bytes | Path):
-            return self._outside(event, os.fsdecode(args[0]))
+            within = args[-1] if isinstance(args[-1], int) and args[-1] >= 0 else None
+            base = os.getcwd() if within is None else os.readlink(f"/proc/self/fd/{within}")
+            return self._outside(event, os.path.join(base, os.fsdecode(args[0])))
         return None
 
     def _outside(self, event: str, path: str) -> str | None:
@@ -676,12 +678,13 @@ def fuzz(kind: str, count: int, seed: int = 0, first: int = 0) -> Summary:
     summary = Summary(kind)
     began = time.perf_counter()
     prefixes = (sys.prefix, sys.base_prefix, str(Path(ut.__file__).parent), str(private_folder()))
-    before = os.getcwd()
+    before, temporary = os.getcwd(), tempfile.tempdir
     with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
         folder = Path(name).resolve()
         os.chdir(folder)
         try:
             samples = KINDS[kind](folder)
+            tempfile.tempdir = str(folder / "case")
             WATCH.sources = tuple(str(Path(p).resolve()) for p in prefixes) + prefixes
             WATCH.writable = (
                 str(folder / "case"), str(private_folder()), str(Path(ut.__file__).parent),
@@ -700,6 +703,7 @@ def fuzz(kind: str, count: int, seed: int = 0, first: int = 0) -> Summary:
                 ]
         finally:
             os.chdir(before)
+            tempfile.tempdir = temporary
     summary.seconds = time.perf_counter() - began
     return summary
 
