@@ -204,7 +204,7 @@ class Film:
         axes.set_aspect("equal")
         axes.axis("off")
         if words:
-            axes.set_title(f"{self.mechanism.name.replace('_', ' ')}, {self.span}")
+            axes.set_title(f"{self.mechanism.name.replace('_', ' ')}\n{self.span}")
 
 
 #: Positions (F, n) to points of each part (F, k, 3), angle and radius (F, 2), tip (F, 3).

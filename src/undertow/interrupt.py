@@ -9,8 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
-from pathlib import Path
+from contextlib import suppress
 from types import FrameType
 
 __all__ = ["INTERRUPTED", "at_once", "by_exception"]
@@ -27,16 +26,17 @@ def _leave(_signal: int, _frame: FrameType | None) -> None:
 def _is_command_line() -> bool:
     """Whether this process is ``undertow …`` or ``python -m undertow …``, and starting."""
     first = sys.argv[0] if sys.argv else ""
-    if first == "-m":
-        return any(word in ("undertow", "-mundertow") for word in sys.orig_argv[1:4])
-    return Path(first).stem == "undertow" and first in sys.orig_argv
+    if first == "-m":  # as long as Python looks for the module
+        return "undertow" in sys.orig_argv or "-mundertow" in sys.orig_argv
+    name = os.path.splitext(os.path.basename(first))[0]
+    return name == "undertow" and first in sys.orig_argv  # children of a process have other words
 
 
 def at_once() -> None:
     """Let Ctrl-C end the process at once, where it is the command line and nothing else asks."""
-    ours = threading.current_thread() is threading.main_thread() and _is_command_line()
-    if ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _leave)
+    if _is_command_line() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        with suppress(ValueError):  # not the main thread
+            signal.signal(signal.SIGINT, _leave)
 
 
 def by_exception() -> None:
