@@ -25,6 +25,7 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.motion import Trajectory
 from undertow.plot import COLOURS, style
 from undertow.sketches import Box, Disc, Line, Sketch, sketch
+from undertow.validity import check_symbols, vocabulary
 
 __all__ = ["Film", "gif", "still"]
 
@@ -205,6 +206,10 @@ def evaluator(mechanism: Mechanism, figure: Sketch) -> Evaluator:
         discs.append([sp.sympify(e) for e in round_])
     tip = [sp.sympify(c) for c in figure.tip]
     everything = [e for row in (*points, *discs, tip) for e in row]
+    places = vocabulary(
+        mechanism.coordinates, (), mechanism.parameters, velocities=False, time=False
+    )
+    check_symbols(f"sketch of '{mechanism.name}'", everything, places)
     values = mechanism.substitution
     function = sp.lambdify(list(mechanism.q), [e.xreplace(values) for e in everything], "numpy")
 
