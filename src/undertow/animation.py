@@ -206,10 +206,10 @@ def evaluator(mechanism: Mechanism, figure: Sketch) -> Evaluator:
         discs.append([sp.sympify(e) for e in round_])
     tip = [sp.sympify(c) for c in figure.tip]
     everything = [e for row in (*points, *discs, tip) for e in row]
-    places = vocabulary(
+    known = vocabulary(
         mechanism.coordinates, (), mechanism.parameters, velocities=False, time=False
     )
-    check_symbols(f"sketch of '{mechanism.name}'", everything, places)
+    check_symbols(f"sketch of '{mechanism.name}'", everything, known)
     values = mechanism.substitution
     function = sp.lambdify(list(mechanism.q), [e.xreplace(values) for e in everything], "numpy")
 
