@@ -14,6 +14,7 @@ from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 import undertow as ut
 from support import interpreted
 from undertow import modelling
+from undertow.animation import evaluator
 from undertow.check import check_mechanism
 from undertow.derivation import derivation
 from undertow.errors import InvalidInputError, ModelError, UndertowError
@@ -21,6 +22,7 @@ from undertow.estimators import KalmanFilter
 from undertow.mechanism import TIME
 from undertow.mechanisms import LIBRARY
 from undertow.objective import Names
+from undertow.sketches import Line, Sketch
 from undertow.stability import has_linear_model, linearise
 from undertow.validity import is_smooth, kinks, require_smooth
 
@@ -229,6 +231,18 @@ def test_forces_costs_and_constraints_take_no_foreign_symbol(
 ) -> None:
     with pytest.raises(UndertowError, match=r"[Dd]id you mean coordinate\.symbol"):
         attempt()
+
+
+def test_a_stick_figure_takes_no_foreign_symbol() -> None:
+    """Claim: the points of a sketch are those of this mechanism, or are refused."""
+    rig = cart()
+    for tip, fine in ((rig.q[0], True), (sp.Symbol("x"), False), (rig.x[2], False)):
+        figure = Sketch((Line(((0, 0, 0), (tip, 0, 1))),), (tip, 0, 0))
+        if fine:
+            assert evaluator(rig, figure)(np.array([[0.5, 0.1]]))[2].tolist() == [[0.5, 0.0, 0.0]]
+        else:
+            with pytest.raises(ModelError, match="sketch of 'cart'"):
+                evaluator(rig, figure)
 
 
 def test_text_is_no_expression_and_is_never_run() -> None:

@@ -26,6 +26,7 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.motion import Trajectory
 from undertow.plot import COLOURS, style
 from undertow.sketches import Box, Disc, Label, Line, Sketch, sketch
+from undertow.validity import check_symbols, vocabulary
 
 __all__ = ["Film", "gif", "still"]
 
@@ -224,6 +225,10 @@ def evaluator(mechanism: Mechanism, figure: Sketch) -> Evaluator:
         discs.append([sp.sympify(e) for e in round_])
     tip = [sp.sympify(c) for c in figure.tip]
     everything = [e for row in (*points, *discs, tip) for e in row]
+    known = vocabulary(
+        mechanism.coordinates, (), mechanism.parameters, velocities=False, time=False
+    )
+    check_symbols(f"sketch of '{mechanism.name}'", everything, known)
     values = mechanism.substitution
     function = compile_expressions(mechanism.q, [e.xreplace(values) for e in everything])
 

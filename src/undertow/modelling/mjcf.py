@@ -42,7 +42,8 @@ def from_mjcf(
     ellipsoids of given mass or density; hinge and slide joints with range, damping,
     stiffness, armature and ``frictionloss`` (a bound on the disturbance); default classes;
     ``motor`` actuators on joints and on ``fixed`` tendons, whose own damping, stiffness and
-    armature count too.  Contacts are left out.
+    armature count too.  Contacts are left out.  An input without a limit is unlimited, and the
+    description of the mechanism says so.
 
     Parameters
     ----------
@@ -68,8 +69,9 @@ def from_mjcf(
     InvalidInputError
         For broken XML or numbers that are none, unknown or repeated actuated joints.
     ModelError
-        For ball and free joints, equality constraints, massless moving bodies, elements that
-        change the motion in ways that are not read here.
+        For ball and free joints, equality constraints, massless moving bodies, inertias that no
+        body has, elements that change the motion in ways that are not read here, and more joints
+        than equations can be derived for.
     """
     with computable("MJCF"):
         return mechanism_from_tree(

@@ -40,7 +40,8 @@ def from_urdf(
 
     Its root link is fixed to the world.  Masses, centres of mass, inertias, damping and the
     strength of gravity become parameters; joint ranges become those of the coordinates;
-    effort limits those of the inputs; dry friction a bound on the disturbance.  Shapes,
+    effort limits those of the inputs (one without is unlimited, and the description of the
+    mechanism says so); dry friction a bound on the disturbance.  Shapes,
     velocity limits and safety controllers are not read.
 
     Parameters
@@ -69,8 +70,8 @@ def from_urdf(
     InvalidInputError
         For broken XML, numbers that are none, unknown or repeated actuated joints.
     ModelError
-        For loops, massless moving links, floating or planar joints, mimic joints, repeated
-        names.
+        For loops, massless moving links, inertias that no body has, floating or planar joints,
+        mimic joints, repeated names, and more joints than equations can be derived for.
     """
     with computable("URDF"):
         tree, transmitted = read_urdf(source, gravity)

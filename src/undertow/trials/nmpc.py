@@ -20,6 +20,7 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.stability import linearise
 from undertow.trials.trial import MakeController
+from undertow.validity import require_smooth
 
 __all__ = ["NMPC", "predictive"]
 
@@ -130,7 +131,9 @@ def _terminal(belief: Mechanism, objective: Objective) -> FloatArray:
     """Return the value function at the target of the cost's second-order part, (2n, 2n)."""
     lin = linearise(belief)
     symbols = [*belief.x, *belief.u]
-    hessian = sp.hessian(objective.stage_cost(belief), symbols).subs(dict.fromkeys(symbols, 0))
+    stage = objective.stage_cost(belief)
+    require_smooth(f"stage cost of '{objective.name}'", [stage], symbols)
+    hessian = sp.hessian(stage, symbols).subs(dict.fromkeys(symbols, 0))
     H = 0.5 * np.array(hessian, dtype=float)
     size = 2 * belief.n
     Q, R = H[:size, :size] + 1e-6 * np.eye(size), H[size:, size:]
