@@ -178,6 +178,8 @@ FOREIGN: dict[str, tuple[Mapping[str, sp.Expr], str]] = {
     "dynamicsymbol": ({"potential": dynamicsymbols("a")}, r"a\(t\).*coordinate\.symbol"),
     "its rate": ({"dissipation": dynamicsymbols("x").diff() ** 2}, r"coordinate\.velocity"),
     "function": ({"potential": sp.Function("h")(a_.symbol)}, r"h\(a\)"),
+    "function without code": ({"potential": sp.LambertW(a_.symbol + 1)}, "LambertW"),
+    "impulse": ({"potential": sp.DiracDelta(a_.symbol)}, "DiracDelta"),
     "undeclared": ({"potential": sp.Symbol("k", real=True) * a_.symbol**2}, "got k"),
     "input": ({"potential": force_.symbol * a_.symbol}, "got F"),
     "rate in V": ({"potential": w_**2}, "got a_dot"),

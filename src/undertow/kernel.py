@@ -73,6 +73,7 @@ GENERATOR = generators(
     "kernel.py",
     "objective.py",
     "sliding.py",
+    "validity.py",
     "codegen/block.py",
     "codegen/linear.py",
     "codegen/rows.py",

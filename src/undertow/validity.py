@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import sympy as sp
 from sympy.core.function import Application, AppliedUndef
 from sympy.core.relational import Relational
+from sympy.logic.boolalg import Boolean
 
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.quantities import (
@@ -40,9 +41,21 @@ __all__ = [
 #: Functions that are smooth wherever they are finite: a derivative of theirs is never wrong.
 _SMOOTH = (
     sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc, sp.sinc, sp.atan, sp.acot,
-    sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch, sp.asinh, sp.exp, sp.erf, sp.erfc,
+    sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch, sp.asinh, sp.exp,
     sp.Add, sp.Mul, sp.Symbol, sp.Number, sp.NumberSymbol,
 )  # fmt: skip
+
+#: What has no derivative at isolated points, and none there that is a number.
+_SINGULAR = (sp.Pow, sp.log, sp.asin, sp.acos, sp.atan2, sp.acosh, sp.atanh)
+
+#: Functions with kinks and jumps that code is written for, and the conditions of Piecewise.
+_BROKEN = (
+    sp.Abs, sp.sign, sp.Max, sp.Min, sp.Piecewise, sp.Heaviside, sp.floor, sp.ceiling, sp.frac,
+    sp.Mod, Boolean,
+)  # fmt: skip
+
+#: What stands for an expression that is not there.
+_UNDEFINED = (AppliedUndef, sp.Derivative, sp.Integral)
 
 #: A point is on a kink that is not further from it than this.
 _NEAR = 1e-9
@@ -127,7 +140,7 @@ def check_parts(
         ("inputs", Input, inputs),
         ("parameters", Parameter, parameters),
     ):
-        several = isinstance(parts, Sequence) and not isinstance(parts, str)
+        several = isinstance(parts, Collection) and not isinstance(parts, str)
         wrong = [p for p in parts if not isinstance(p, kind)] if several else [parts]
         if wrong:
             raise InvalidInputError(
@@ -214,7 +227,16 @@ def check_symbols(
     """
     unknown: set[sp.Basic] = set()
     for expression in expressions:
-        odd = expression.atoms(AppliedUndef, sp.Derivative, sp.Integral)
+        parts = expression.atoms(Application, sp.Derivative, sp.Integral)
+        odd = {part for part in parts if isinstance(part, _UNDEFINED)}
+        unwritten = [f for f in parts - odd if not isinstance(f, _SMOOTH + _SINGULAR + _BROKEN)]
+        if unwritten:
+            raise ModelError(
+                what,
+                value=", ".join(sorted(map(shortened, unwritten))),
+                limit="functions that code is written for, sin, exp, sqrt, Abs and the like",
+                remedy="Put an expression of them in its place, or an approximation",
+            )
         inside = set().union(*(part.free_symbols for part in odd))
         unknown |= odd | ((expression.free_symbols - set(known)) - inside)
         strange = expression.atoms(sp.nan.func, sp.zoo.func, sp.oo.func, type(-sp.oo), type(sp.I))
@@ -390,10 +412,6 @@ def _inside(
     if isinstance(part, sp.Piecewise):
         return [(branch.expr, ()) for branch in part.args]
     return [(arg, factors) for arg in part.args]
-
-
-#: What has no derivative at isolated points, and none there that is a number.
-_SINGULAR = (sp.Pow, sp.log, sp.asin, sp.acos, sp.atan2, sp.acosh, sp.atanh)
 
 
 def _edges(part: sp.Basic) -> list[sp.Expr] | None:

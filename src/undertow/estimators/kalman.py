@@ -187,8 +187,8 @@ class KalmanFilter:
         delay: float = 0.0,
     ) -> None:
         require_smooth(
-            f"a Kalman filter's model, the force of '{mechanism.name}',",
-            mechanism.force,
+            f"a Kalman filter's model, M or f of '{mechanism.name}',",
+            [*mechanism.force, *mechanism.mass_matrix],
             mechanism.x,
         )
         n, m = mechanism.n, mechanism.m
