@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,10 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy as sp
+from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.certification import certificate_files, certify_surface
+from undertow.certification import certificate_files, certify_surface, verification_report
+from undertow.certify.appendix import CASES, Constants, two_vertex
+from undertow.certify.appendix_search import search_rate
 from undertow.certify.certificate import (
     LARGEST,
     Certificate,
@@ -26,15 +30,24 @@ from undertow.certify.certificate import (
     function_data,
     read_certificate,
 )
+from undertow.certify.ellipsoid import TerminalEllipsoid, verify_ellipsoid
+from undertow.certify.ellipsoid_search import search_for
 from undertow.certify.gate import Policy, assess
+from undertow.certify.loop import LoopMotion
+from undertow.certify.loop_claim import LoopClaim, verify_loop
+from undertow.certify.loop_terminal import TerminalSet
 from undertow.certify.lyapunov import LyapunovFunction
+from undertow.certify.motion import SurfaceMotion, VectorField
+from undertow.certify.reaching import reaching
+from undertow.certify.region import verify_region
 from undertow.certify.sets import ProvedStarts, proved_sets
+from undertow.certify.surface import hurwitz, nonsingular
 from undertow.certify.verify import reaches, verify
 from undertow.cli import app
-from undertow.errors import ArtefactError, CertificateError, InvalidInputError
+from undertow.errors import ArtefactError, CertificateError, InvalidInputError, ModelError
 from undertow.modelling import mechanism_from_file
 from undertow.plan import Plan
-from undertow.verdict import Verdict
+from undertow.verdict import Verdict, inward, within
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 
@@ -341,6 +354,260 @@ def test_unreadable_and_huge_files_are_named(tmp_path: Path) -> None:
         file.truncate(LARGEST + 1)
     with pytest.raises(CertificateError, match="at most"):
         read_certificate(huge)
+
+
+# -- what is printed -----------------------------------------------------------------------------
+
+LIE = "every start at rest with |phi| ≤ 3.14159 rad converges"
+
+
+def printed(content: bytes, mechanism: ut.Mechanism = RIG) -> str:
+    """What the command line prints of a certificate, on one line."""
+    certificate = Certificate.from_bytes(content)
+    console = Console(width=4000, record=True, file=io.StringIO())
+    console.print(verification_report(certificate, verify(certificate, mechanism)))
+    return " ".join(console.export_text().split())
+
+
+@pytest.mark.parametrize("kind", ["stability", "nonsingular", "reaching", "terminal ellipsoid",
+                                  "surface region"])  # fmt: skip
+def test_a_verdict_says_what_was_decided_whatever_the_file_says(written: bytes, kind: str) -> None:
+    """A stability claim that is worded as one of global convergence is printed as what it is."""
+
+    def reword(document: dict[str, Any]) -> None:
+        only(kind)(document)
+        for claim in document["subjects"][0]["claims"]:
+            claim["verdict"].update(claim=LIE, method=LIE, unit=LIE, witness={LIE: 1.0})
+
+    true = printed(edited(written, only(kind)))
+    lied = printed(edited(written, reword))
+    assert "3.14159" not in lied
+    assert "otherwise" in lied
+    words = {
+        "stability": "motions on the surface near the target",
+        "nonsingular": "the law exists for |phi| ≤ 0.5 rad, the other coordinates at the target",
+        "reaching": "overcomes every disturbance on theta: 0.1139 N m at most",
+        "terminal ellipsoid": "its input renewed at every instant",
+        "surface region": "contains phi = 0.01",
+    }
+    if kind != "reaching":
+        assert words[kind] in lied
+    for line in (true, lied):
+        assert "alpha_a = [[-1.0]], lambda_a = [[-1.59]], alpha_u = [[1.96]]" in line
+        assert "eta = 20.0, layer = 0.1, saturation" in line
+        assert "m = 0.125" in line
+
+
+def test_what_is_decided_is_in_the_sentence(written: bytes) -> None:
+    """Another box, load, start or law is another sentence; a proof of one says so."""
+
+    def data(document: dict[str, Any]) -> dict[str, Any]:
+        found: dict[str, Any] = document["subjects"][0]["claims"][0]["data"]
+        return found
+
+    box = verdict_after(
+        written, "nonsingular", lambda d: data(d).update(region={"phi": [-0.1, 0.25]})
+    )
+    assert "phi in [-0.1, 0.25] rad" in box.claim
+    load = verdict_after(written, "reaching", lambda d: data(d).update(disturbance=[0.001, 0.0]))
+    assert "on theta: 0.001 N m at most" in load.claim
+    assert "for |phi| ≤ 0.5 rad, the other coordinates at the target" in load.claim
+    near = verdict_after(written, "surface region", lambda d: data(d).update(start=[1e-3, 0, 0]))
+    assert "contains phi = 0.001" in near.claim
+    weak = RIG.with_input_limit(12.345678901)
+    search = search_for(weak, SURFACE, ut.ReachingLaw())
+    assert search is not None
+    found = search.largest()
+    assert found is not None
+    assert "|voltage| ≤ 12.345678901 V" in verify_ellipsoid(
+        weak, SURFACE, ut.ReachingLaw(), found
+    ).claim  # fmt: skip
+
+
+NAMES: dict[str, Edit] = {
+    "control characters in a name": lambda d: d["mechanism"].update(name="\x1b[2Jrotary_pendulum"),
+    "a line break in a kind": lambda d: claims_of(d, "stability")[0].update(kind="x\n✓ proved"),
+    "a turn of the writing in a parameter": lambda d: d["mechanism"]["parameters"].update(
+        {"m\u202e": 1.0}
+    ),
+    "a carriage return in a remark": lambda d: d["subjects"][0]["remarks"][0].update(claim="a\rb"),
+    "a sentence for a name": lambda d: d["mechanism"].update(name=f"pendulum: {LIE}" * 2),
+    "a sentence for a kind": lambda d: claims_of(d, "stability")[0].update(kind=LIE * 2),
+    "a sentence for a parameter": lambda d: d["mechanism"]["parameters"].update({LIE * 2: 1.0}),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_in_a_file_cannot_smuggle_a_sentence(written: bytes, name: str) -> None:
+    """Refused, and not even the refusal shows it."""
+    with pytest.raises(CertificateError) as refusal:
+        verify(Certificate.from_bytes(edited(written, NAMES[name])), RIG)
+    assert "converges" not in str(refusal.value)
+    assert str(refusal.value).isprintable()
+
+
+def test_markup_in_a_file_is_not_obeyed(written: bytes, tmp_path: Path) -> None:
+    """Names that are short and printable are quoted in the refusal, as they are."""
+    edit = edited(written, lambda d: d["mechanism"].update(name="[green]✓[/green] proved"))
+    with pytest.raises(CertificateError, match=r"'\[green\]"):
+        verify(Certificate.from_bytes(edit), RIG)
+
+
+def test_margins_are_rounded_towards_zero(written: bytes) -> None:
+    """No more is printed than was proved, whatever the last digit."""
+    for value, text in (
+        (3.71689, "3.716"),
+        (0.99999, "0.9999"),
+        (0.5, "0.5"),
+        (-0.0559, "-0.0559"),
+    ):
+        assert inward(value) == text
+    assert within(0.95 * 0.125, 1.05 * 0.125) == "[0.11875, 0.13125]"
+    assert within(-0.87266462, 0.87266462) == "[-0.872664, 0.872664]"
+    assert within(0.12345678, 0.12345679) == "[0.12345678, 0.12345679]"
+    rng = np.random.default_rng(0)
+    for value in 10.0 ** rng.uniform(-12, 12, 300) * rng.choice([-1.0, 1.0], 300):
+        for digits in (1, 4, 6):
+            shown = float(inward(value, digits))
+            assert abs(shown) <= abs(value)
+            assert abs(value - shown) <= 10.0 ** (1 - digits) * abs(value)
+    proof = verify(Certificate.from_bytes(edited(written, only("stability"))), RIG)[0].verdict
+    shown = float(str(proof).split("margin ")[1].split()[0])
+    assert proof.margin * (1 - 1e-3) <= shown <= proof.margin
+
+
+# -- models that are not what they seem ------------------------------------------------------------
+
+
+def kinked(extra: sp.Expr) -> ut.Mechanism:
+    """The rotary pendulum with a torque on the pendulum that has a kink at the target."""
+    force = RIG.force + sp.Matrix([0, extra])
+    return replace(RIG, name="kinked", force=sp.ImmutableDenseMatrix(force))
+
+
+TILT = RIG.q[1]
+KINKS = {
+    "Abs": -3 * sp.Abs(TILT),
+    "Abs times sign": 3 * sp.Abs(TILT) * sp.sign(TILT),
+    "Max": 3 * sp.Max(TILT, 0),
+    "Max and Min": 3 * sp.Max(0, TILT) + 3 * sp.Min(0, TILT),
+    "Piecewise": 5 * sp.Piecewise((TILT, TILT > 0), (0, True)),
+    "Piecewise the other way": 5 * sp.Piecewise((0, sp.Not(TILT > 0)), (TILT, True)),
+    "Piecewise of three": sp.Piecewise((-TILT, TILT < 0), (0, sp.Eq(TILT, 0)), (TILT, True)),
+    "Heaviside": TILT * sp.Heaviside(TILT),
+    "a root": 5 * sp.sqrt(TILT**2),
+    "a root of a square in disguise": sp.sqrt(TILT**2 + 2 * TILT * RIG.q[0] + RIG.q[0] ** 2),
+    "a root of sines": sp.sqrt(sp.sin(TILT) ** 2 + 0.0 * TILT),
+    "a fourth root": (TILT**4) ** sp.Rational(1, 4),
+    "arccos of cos": sp.acos(sp.cos(TILT)),
+    "a kink in the mass's slope": sp.sin(sp.Abs(RIG.x[3])) * RIG.x[3],
+    "a real part": sp.Abs(sp.sin(TILT)) + TILT**2,
+}
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_a_model_with_a_kink_is_refused_by_every_claim(name: str) -> None:
+    """SymPy's derivative of |x| at 0 is 0; a proof with it "held" for a pendulum that falls."""
+    model = kinked(KINKS[name])
+    law = ut.ReachingLaw()
+    ellipsoid = TerminalEllipsoid(np.eye(4), np.eye(4), 0.01)
+    loop = LoopClaim("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
+    box = {"phi": (-0.1, 0.1)}
+    for decide in (
+        lambda: hurwitz(model, SURFACE),
+        lambda: nonsingular(model, SURFACE, box),
+        lambda: reaching(model, SURFACE, box),
+        lambda: verify_region(SurfaceMotion(model, SURFACE), quadratic(np.eye(3), 0.01)),
+        lambda: verify_ellipsoid(model, SURFACE, law, ellipsoid),
+        lambda: verify_loop(model, SURFACE, law, loop),
+        lambda: certify_surface(model, SURFACE, np.zeros(4), seconds=0.0, predict=False),
+    ):
+        with pytest.raises(ModelError, match="not smooth"):
+            decide()
+
+
+def test_a_certificate_of_a_model_with_a_kink_is_refused(written: bytes) -> None:
+    model = kinked(KINKS["Abs"])
+
+    def forged(document: dict[str, Any]) -> None:
+        document["mechanism"].update(name=model.name, structure=model.structure)
+
+    with pytest.raises(ModelError, match="not smooth"):
+        verify(Certificate.from_bytes(edited(written, forged)), model)
+
+
+def test_a_kink_of_parameters_alone_is_none() -> None:
+    """|m| is a number, and x**2.0 is x²."""
+    mass = RIG.parameters[2].symbol
+    smooth = kinked(0.001 * sp.Abs(mass - 1) * TILT + 0.001 * TILT**3.0)
+    assert hurwitz(smooth, SURFACE)
+
+
+X = sp.Symbol("x", real=True)
+
+
+@pytest.mark.parametrize("shift", [2.0**-13, 2.0**-9])
+def test_an_equilibrium_that_is_off_is_not_rounded_home(shift: float) -> None:
+    """Floats of 53 bits lose the shift beside 2⁵³; in rationals it is there, and nothing proved."""
+    big = float(2.0 ** np.ceil(np.log2(shift * 2.0**53.9)))
+    rest = big * (1 + X) ** 2 - big * X**2 - 2 * big * X - big + shift * sp.cos(X)
+    field = VectorField((X,), (-X + rest,))
+    assert not field.at_rest
+    assert not field.odd
+    V = LyapunovFunction(np.eye(1), np.array([[2]]), np.array([1.0]))
+    assert not verify_region(field, V, max_seconds=5)
+    # Likewise of a mechanism: no claim about the target, which is no equilibrium.
+    off = kinked(rest.xreplace({X: TILT}))
+    assert not hurwitz(off, SURFACE)
+    assert not SurfaceMotion(off, SURFACE).at_rest
+    assert not LoopMotion(off, SURFACE).at_rest
+    assert not LoopMotion(off, SURFACE).odd
+    found = TerminalEllipsoid(np.eye(4), np.eye(4), 1e-3)
+    assert "f_u(0, 0) = 0" in verify_ellipsoid(off, SURFACE, ut.ReachingLaw(), found).method
+    # And the same model without it is at rest, exactly.
+    still = VectorField((X,), (-X + rest - shift * sp.cos(X),))
+    assert still.at_rest
+
+
+def test_floats_in_a_model_are_the_numbers_that_they_are() -> None:
+    """The derivative of 0.1 x³ has 3 · 0.1 exactly, not the float beside it."""
+    field = VectorField((X,), (-0.1 * X**3,))
+    assert field.rates[0].atoms(sp.Float) == set()
+    assert sp.diff(field.rates[0], X).subs(X, 1) == -3 * sp.Rational(*(0.1).as_integer_ratio())
+
+
+def test_a_hold_that_is_no_whole_number_is_refused() -> None:
+    """0.9 steps were taken for none."""
+    claim = LoopClaim("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
+    for hold in (0.9, 1.0, "1", True, None):
+        with pytest.raises(InvalidInputError, match="hold"):
+            LoopClaim.from_dict(claim.to_dict() | {"hold": hold})
+    assert LoopClaim.from_dict(claim.to_dict() | {"hold": 2}).hold == 2
+
+
+def test_reaching_names_its_region_and_ends_at_the_singularity() -> None:
+    """Beyond arccos ε = 58° there is no law that could overcome anything."""
+    inside = reaching(RIG, SURFACE, {"phi": (-0.9, 0.9)}, eta=1.0, disturbance=[0.001, 0.0])
+    assert inside.verdict
+    assert "|phi| ≤ 0.9 rad" in inside.verdict.claim
+    across = reaching(RIG, SURFACE, {"phi": (-1.1, 1.1)}, eta=1.0, disturbance=[0.001, 0.0])
+    assert across.verdict.kind == "refuted"
+    assert "exist" in across.verdict.method
+    assert abs(across.verdict.witness["phi"]) > 1.0
+    assert across.scale == 0.0
+    assert [bound.proved for bound in across.largest] == [0.0, 0.0]
+
+
+def test_an_interval_beyond_the_singular_angle_is_refuted_wherever_its_end_is() -> None:
+    """cos 31.2 > ε, but R does not exist on the way there."""
+    case = CASES[3]
+    P, _ = search_rate(case.reduced(Constants.of(RIG)), case.half_width)
+    reduced = case.reduced(Constants.of(RIG))
+    assert two_vertex(reduced, P, case.half_width)
+    for width in (31.2, 6.3, 1.2, 3.2):
+        assert two_vertex(reduced, P, width).kind == "refuted"
+    with pytest.raises(InvalidInputError, match="half-width"):
+        two_vertex(reduced, P, -0.5)
 
 
 # -- independence ------------------------------------------------------------------------------

@@ -317,7 +317,7 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
     Parameters
     ----------
     half_width
-        Half-width of Ĩ, rad; a fraction or float is taken as it is.
+        Half-width of Ĩ, rad, ≥ 0; a fraction or float is taken as it is.
 
     Returns
     -------
@@ -326,10 +326,15 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
         the witness is an angle (and, within R, a direction) where it fails.
     """
     width = float(half_width)
+    if not width >= 0:
+        raise InvalidInputError("half-width of Ĩ", value=width, limit="≥ 0 rad")
+    if Fraction(width) > half_width:
+        width = math.nextafter(width, 0.0)
     claim = f"P ≻ 0 and R(y₁) ≻ 0 for |y₁| ≤ {inward(width, 6)} rad"
     method = f"R is affine in ξ: two vertices, Sylvester minors in {BITS}-bit balls"
     with flint().ctx.workprec(BITS):
-        if not ball(Fraction(half_width)).cos() > ball(reduced.epsilon):
+        # The cosine falls up to π alone: beyond 3 the interval holds 3, where R does not exist.
+        if not ball(Fraction(min(half_width, 3))).cos() > ball(reduced.epsilon):
             return Verdict(
                 claim, "refuted", -math.inf, "", {"y1": reduced.limit}, "R does not exist there"
             )

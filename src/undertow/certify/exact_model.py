@@ -39,15 +39,12 @@ def exact_mechanism(mechanism: Mechanism) -> Mechanism:
     blocks = ("mass_matrix", "force", "input_matrix")
     values = {p.symbol: p.value for p in mechanism.parameters}
     target = dict.fromkeys((*mechanism.x, TIME), 0.0) | values
-    for name in blocks:
-        what, matrix = f"{name} of '{mechanism.name}'", getattr(mechanism, name)
+    exact = {name: getattr(mechanism, name).applyfunc(exact_expression) for name in blocks}
+    for name, matrix in exact.items():
+        what = f"{name} of '{mechanism.name}'"
         require_smooth(what, matrix, mechanism.x)
         require_smooth(what, matrix, mechanism.x, at=target)
-    changed = {
-        name: getattr(mechanism, name).applyfunc(exact_expression)
-        for name in blocks
-        if getattr(mechanism, name).atoms(sp.Float)
-    }
+    changed = {k: v for k, v in exact.items() if v != getattr(mechanism, k)}
     return replace(mechanism, **changed) if changed else mechanism
 
 
@@ -61,10 +58,10 @@ def exact_rates(
     ModelError
         For expressions that are not smooth, everywhere or at 0.
     """
-    given = [sp.sympify(e) for e in rates]
-    require_smooth("vector field", given, states)
-    require_smooth("vector field", given, states, at=dict.fromkeys(states, 0.0) | values)
-    return tuple(exact_expression(e) for e in given)
+    exact = tuple(exact_expression(sp.sympify(e)) for e in rates)
+    require_smooth("vector field", exact, states)
+    require_smooth("vector field", exact, states, at=dict.fromkeys(states, 0.0) | values)
+    return exact
 
 
 def vanishes(expressions: Iterable[sp.Expr], at: Iterable[sp.Symbol]) -> bool:
