@@ -15,6 +15,7 @@ import numpy as np
 import sympy as sp
 
 import undertow as ut
+from undertow.mechanism import FloatArray
 
 BITS, ORDER = 220, 26
 
@@ -194,7 +195,7 @@ class Reference:
             return found
 
 
-def holds(low: Sequence[float], high: Sequence[float], value: Sequence[Any]) -> bool:
+def holds(low: FloatArray, high: FloatArray, value: Sequence[Any]) -> bool:
     """Whether a box holds a point, for certain."""
     with flint.ctx.workprec(BITS):
         return all(exact(a) <= v <= exact(b) for a, b, v in zip(low, high, value, strict=True))

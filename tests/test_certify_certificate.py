@@ -386,12 +386,11 @@ def test_a_verdict_says_what_was_decided_whatever_the_file_says(written: bytes, 
     words = {
         "stability": "motions on the surface near the target",
         "nonsingular": "the law exists for |phi| ≤ 0.5 rad, the other coordinates at the target",
-        "reaching": "overcomes every disturbance on theta: 0.1139 N m at most",
+        "reaching": "the law overcomes every disturbance on theta: ",
         "terminal ellipsoid": "its input renewed at every instant",
         "surface region": "contains phi = 0.01",
     }
-    if kind != "reaching":
-        assert words[kind] in lied
+    assert words[kind] in lied
     for line in (true, lied):
         assert "alpha_a = [[-1.0]], lambda_a = [[-1.59]], alpha_u = [[1.96]]" in line
         assert "eta = 20.0, layer = 0.1, saturation" in line
@@ -455,12 +454,8 @@ def test_markup_in_a_file_is_not_obeyed(written: bytes, tmp_path: Path) -> None:
 
 def test_margins_are_rounded_towards_zero(written: bytes) -> None:
     """No more is printed than was proved, whatever the last digit."""
-    for value, text in (
-        (3.71689, "3.716"),
-        (0.99999, "0.9999"),
-        (0.5, "0.5"),
-        (-0.0559, "-0.0559"),
-    ):
+    known = {3.71689: "3.716", 0.99999: "0.9999", 0.5: "0.5", -1.23459: "-1.234"}
+    for value, text in known.items():
         assert inward(value) == text
     assert within(0.95 * 0.125, 1.05 * 0.125) == "[0.11875, 0.13125]"
     assert within(-0.87266462, 0.87266462) == "[-0.872664, 0.872664]"
@@ -501,7 +496,7 @@ KINKS = {
     "a fourth root": (TILT**4) ** sp.Rational(1, 4),
     "arccos of cos": sp.acos(sp.cos(TILT)),
     "a kink in the mass's slope": sp.sin(sp.Abs(RIG.x[3])) * RIG.x[3],
-    "a real part": sp.Abs(sp.sin(TILT)) + TILT**2,
+    "Abs of sin": sp.Abs(sp.sin(TILT)) + TILT**2,
 }
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import mpmath
+import mpmath  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import sympy as sp
@@ -103,7 +103,7 @@ class Toy:
             *(Interval(np.repeat(v.lo, lanes), np.repeat(v.hi, lanes)) for v in values),
         ]
 
-    def over(self, z: Interval, *, middle: bool = False, **_: Any) -> Rates:
+    def over(self, z: Interval, *, middle: bool = False, **rest: Any) -> Rates:
         inputs = self.inputs(z, middle)
         f, slopes, _ = self.program
         side = Interval(np.where(z.lo[0] > 0, 1.0, -1.0), np.where(z.hi[0] < 0, -1.0, 1.0))
@@ -271,6 +271,29 @@ def _image(tubes: Tubes, rows: FloatArray) -> Interval:
     )
 
 
+def test_a_set_knows_which_parameter_a_point_has() -> None:
+    """Slopes times the way from the middle hold it at every corner, for parameters beside states.
+
+    A point and its parameter are on the same side: of their difference little is left.
+    """
+    toy = TOYS["a parameter"]
+    start = np.array([0.5, -0.25, 1.0])
+    tubes = Tubes.of(
+        toy, start[:, None], np.zeros((3, 0, 1)), Interval(np.zeros((3, 1)), np.zeros((3, 1)))
+    )
+    for _ in range(4):
+        tubes, _, _, _ = tubes.advance(2.0**-6)
+    middle, radius = toy.parameters[0]
+    slope = np.zeros((1, 4, 1))
+    slope[0, 1], slope[0, 3] = -16.0, 0.5
+    held = tubes.way(Interval(slope))
+    for side in (-1, 1):
+        there = toy.motion(mpmath.mpf(2) ** -4, *map(float, start), middle + side * radius)
+        value = slope[0, 1, 0] * (there[1] - tubes.middle[1, 0]) + 0.5 * side * radius
+        assert float(held.lo[0, 0]) <= value <= float(held.hi[0, 0])
+    assert float((held.hi - held.lo)[0, 0]) <= 0.02
+
+
 #: A box's image after a turn in ten steps of 1/32 is larger than the truth by this part.
 GROWTH = 4e-4
 
@@ -301,7 +324,7 @@ def points(mechanism: ut.Mechanism, count: int, seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
     x = rng.uniform(-1, 1, (count, 2 * n)) * np.r_[np.full(n, 0.3), np.ones(n)]
     x[::2] *= 0.02
-    return x
+    return np.asarray(x)
 
 
 #: Median width of the images of 40 points after 1 ms, twice what it is.
