@@ -481,5 +481,5 @@ MANY = {"closed loop": 10, "surface region": 40}
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", QUICK)
 def test_many_false_claims_are_not_proved(true: dict[str, Document], kind: str) -> None:
-    count = MANY.get(kind, 150)
+    count = MANY.get(kind, 80)
     assert count_false(true[kind], count, 1) >= count / 10

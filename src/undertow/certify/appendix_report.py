@@ -28,6 +28,7 @@ from undertow.certify.appendix_search import search_interval, search_rate
 from undertow.certify.surface import hurwitz
 from undertow.certify.verdict import Verdict
 from undertow.mechanisms import rotary_pendulum
+from undertow.verdict import inward
 
 __all__ = ["CaseReport", "markdown", "report"]
 
@@ -110,14 +111,14 @@ def _rows(reports: Sequence[CaseReport]) -> list[str]:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for r in reports:
-        margin = f"{r.printed_test.margin:.2g}"
-        sigma = f"{r.printed_sigma.margin:.2g}" if r.printed_sigma else "none"
+        margin = inward(r.printed_test.margin, 2)
+        sigma = inward(r.printed_sigma.margin, 2) if r.printed_sigma else "none"
         gap = r.false_bound.details
         place = tuple(round(v, 3) for v in r.false_bound.witness.values())
         lines.append(
             f"| {r.case.number} {r.case.title} | {r.case.epsilon} / {r.epsilon:.4f} "
             f"| {r.case.beta} / {r.beta:.4g} | ±{float(r.case.half_width):g} "
-            f"| {_mark(r.printed_test)} | {margin} | {r.printed_width:.4f} | {sigma} "
+            f"| {_mark(r.printed_test)} | {margin} | {inward(r.printed_width)} | {sigma} "
             f"| {_mark(r.false_bound)}: {gap['V̇']:.3g} / {gap['claimed bound']:.3g} at {place} |"
         )
     return lines
@@ -132,8 +133,8 @@ def _our_rows(reports: Sequence[CaseReport]) -> list[str]:
     for r in reports:
         entries = ", ".join(f"{float(v):.4g}" for v in r.ours)
         lines.append(
-            f"| {r.case.number} | {entries} | {_mark(r.our_rate)} | {r.our_rate.margin:.3g} "
-            f"| {r.our_width:.4f} / {r.limit:.4f} |"
+            f"| {r.case.number} | {entries} | {_mark(r.our_rate)} | {inward(r.our_rate.margin, 3)} "
+            f"| {inward(r.our_width)} / {r.limit:.4f} |"
         )
     return lines
 
@@ -153,7 +154,7 @@ def markdown() -> str:
     parts += ["| case | verdict | proved rate, 1/s |", "|---|---|---|"]
     for case in CASES:
         verdict = hurwitz(rig, case.surface)
-        parts.append(f"| {case.number} | {verdict.kind} | {verdict.margin:.4g} |")
+        parts.append(f"| {case.number} | {verdict.kind} | {inward(verdict.margin)} |")
     return "\n".join(parts) + "\n"
 
 

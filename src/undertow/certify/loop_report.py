@@ -33,6 +33,7 @@ from undertow.mechanisms import rotary_pendulum
 from undertow.objective import MinimumEnergy
 from undertow.rollout import ClosedLoop
 from undertow.sliding import ReachingLaw
+from undertow.verdict import inward
 
 __all__ = ["LoopReport", "markdown", "report"]
 
@@ -123,7 +124,7 @@ def markdown(reports: Sequence[LoopReport]) -> str:
         if claim.uncertain:
             more += "".join(f", {name} in a box" for name in claim.uncertain)
         lines.append(
-            f"| {r.case.number}, {r.case.title}{more} | {limit:.2f}° | {extent:.2f}° "
+            f"| {r.case.number}, {r.case.title}{more} | {limit:.2f}° | {inward(extent)}° "
             f"| {extent / limit:.0%} | {peak:.1f} V | {len(r.proved.claim.edges) - 1} "
             f"| {search} | {r.seconds:.0f} s |"
         )

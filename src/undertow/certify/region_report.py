@@ -33,6 +33,7 @@ from undertow.certify.verdict import Verdict
 from undertow.errors import InfeasibleError
 from undertow.mechanism import Mechanism
 from undertow.stability import first_surface
+from undertow.verdict import inward
 
 __all__ = ["Row", "motions", "read_chains", "report", "simulated_limit"]
 
@@ -88,7 +89,7 @@ class Row:
         degree = max(int(V.exponents.sum(axis=1).max()) for V in self.chain)
         searched = "" if math.isnan(self.seconds) else f"{self.seconds:.0f} s"
         return (
-            f"| {self.title} | {self.extent:.3f} {self.unit} | {self.target:.2f} "
+            f"| {self.title} | {inward(self.extent, 4)} {self.unit} | {self.target:.2f} "
             f"| {self.simulated:.3f} | {len(self.chain)}, {degree} "
             f"| {self.verdict.details['boxes']:,} | {searched} "
             f"| {self.verdict.kind}, {self.verdict.details['process_seconds']:.0f} s "
@@ -161,7 +162,7 @@ def _box(
         reach = extent(chain[k], way)
     else:
         k += 1
-    return f"{name}: {reach:.3f}" if k else f"{name}: {verdict.kind}"
+    return f"{name}: {inward(reach, 4)}" if k else f"{name}: {verdict.kind}"
 
 
 def report(
