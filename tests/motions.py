@@ -67,7 +67,8 @@ class Reference:
             cse=True,
         )
         self.fixed = [exact(v) for v in mechanism.parameter_values]
-        self.fixed += [flint.arb(flint.fmpq(int(r.p), int(r.q))) for r in fractions]
+        with flint.ctx.workprec(BITS):
+            self.fixed += [flint.arb(flint.fmpq(int(r.p), int(r.q))) for r in fractions]
         m = self.m
         self.velocity = [
             [exact(v) for v in row] for row in np.hstack([surface.alpha_a, surface.alpha_u])

@@ -182,9 +182,8 @@ def _end(
         return float(1e4 - np.abs(y).max())
 
     lost.terminal = True  # type: ignore[attr-defined]
-    found = scipy.integrate.solve_ivp(
-        counted, (0.0, duration), y, method=method, rtol=1e-6, atol=1e-8, events=lost
-    )
+    solve: Any = scipy.integrate.solve_ivp
+    found = solve(counted, (0.0, duration), y, method=method, rtol=1e-6, atol=1e-8, events=lost)
     return np.asarray(found.y[:, -1] if found.status == 0 else np.full_like(y, np.nan))
 
 

@@ -149,6 +149,7 @@ TOYS = {
     ),
     "a turn that quickens": Toy((ONE, A * C, -A * B), turned, 3),
     "a turn, no order won": Toy((ONE, A * C, -A * B), turned, 1),
+    "a fast decay": Toy((-5 * A,), lambda t, a: [a * mpmath.exp(-5 * t)], 1),
     "a blow-up": Toy((A**2, A * B), lambda t, a, b: [a / (1 - a * t), b / (1 - a * t)], 2),
     "a corner": Toy(
         (ONE, sp.Abs(A)),
@@ -242,6 +243,26 @@ def test_steps_are_tight(name: str) -> None:
     assert widths[0] <= EXCESS[name]
     if widths[1] > 1e-12:
         assert widths[0] / widths[1] >= (11.0 if toy.smooth == size else 5.5)
+
+
+@pytest.mark.parametrize("start", [1.5, 2.0, 2.5, 3.0])
+def test_boxes_hold_the_whole_step(start: float) -> None:
+    """A motion that quickens leaves the box that its first speed suggests: wider, or no step."""
+    toy = TOYS["a blow-up"]
+    middle = np.array([[start], [1.0]])
+    zero = Interval(np.zeros((2, 1)))
+    for h in (0.0625, 0.125, 0.25):
+        tubes = Tubes.of(toy, middle, np.zeros((2, 0, 1)), zero)
+        with np.errstate(all="ignore"):  # what found no box may overflow
+            tubes, outer, rates, moved = tubes.advance(h)
+        if not moved[0]:
+            continue
+        for part in np.linspace(0.0, 1.0, 17):
+            a, b = toy.motion(part * h, start, 1.0)
+            assert outer.lo[0, 0] <= a <= outer.hi[0, 0]
+            assert outer.lo[1, 0] <= b <= outer.hi[1, 0]
+            assert rates.rate.lo[0, 0] <= a * a <= rates.rate.hi[0, 0]
+        assert tubes.hull.lo[0, 0] <= a <= tubes.hull.hi[0, 0]
 
 
 def test_ends_of_a_box_keep_to_each_other() -> None:
