@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 import shutil
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +38,10 @@ from undertow.runtime import (
     replay_controller,
     respond,
 )
+from undertow.runtime import log as log_module
 from undertow.runtime.encoding import answer_from, answer_row, memory_from, memory_to
 from undertow.runtime.figures import chatter_figure, latency_figure, motion_figure
+from undertow.runtime.log import part_path
 from undertow.runtime.replay import build
 from undertow.runtime.slow import Request
 
@@ -286,6 +294,241 @@ def test_a_log_whose_writer_was_killed_opens(tmp_path: Path) -> None:
     rows = read_log(path).steps
     np.testing.assert_array_equal(rows[:, 0], np.arange(len(rows)))
     assert len(rows) >= said[0]
+
+
+# -- power, parts, privacy ----------------------------------------------------------------------
+
+
+def modes(folder: Path) -> set[int]:
+    return {path.stat().st_mode & 0o777 for path in folder.iterdir() if path.is_file()}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes of POSIX")
+def test_a_log_is_its_owners_alone(tmp_path: Path) -> None:
+    """With what lies beside it while it is written, and its further parts."""
+    before = os.umask(0)
+    try:
+        log = Log(tmp_path / "run.db", COLUMNS, {}, threaded=False, part_bytes=1)
+        fill(log, 300)
+        assert {"run.db", "run.db-wal"} <= {path.name for path in tmp_path.iterdir()}
+        assert modes(tmp_path) == {0o600}
+        log._synced -= 1.0
+        fill(log, 300)
+        log.close()
+        assert part_path(tmp_path / "run.db", 2).exists()
+        assert modes(tmp_path) == {0o600}
+    finally:
+        os.umask(before)
+
+
+def test_the_log_is_on_the_disk_after_half_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And its write-ahead log does not grow: both where nobody reads it, and where one does."""
+    path, beside = tmp_path / "run.db", tmp_path / "run.db-wal"
+    synced: list[Path] = []
+    monkeypatch.setattr(log_module, "_sync_file", synced.append)
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        sizes = []
+        for _ in range(20):
+            fill(log, 500)
+            log._synced -= 1.0  # as if half a second had passed
+            log.flush()
+            fill(log, 1)
+            log._unsynced = True
+            log.flush()
+            sizes.append(beside.stat().st_size)
+        assert path.stat().st_size > 10 * max(sizes[5:]) / 4
+        assert max(sizes) == max(sizes[:5])
+        assert synced == []
+        with contextlib.closing(sqlite3.connect(path)) as reader:
+            reader.execute("BEGIN")
+            reader.execute("SELECT count(*) FROM steps").fetchone()
+            fill(log, 500)
+            log._synced -= 1.0
+            log.flush()
+            assert synced == [beside]  # the reader keeps it from being moved, not from the disk
+
+
+def test_a_thread_syncs_by_itself(tmp_path: Path) -> None:
+    """What was written half a second ago has left the write-ahead log."""
+    path = tmp_path / "run.db"
+    with Log(path, COLUMNS, {}) as log:
+        fill(log, 2000)
+        deadline = time.monotonic() + 10.0
+        while time.monotonic() < deadline and path.stat().st_size < 100_000:
+            time.sleep(0.02)
+        assert path.stat().st_size > 100_000
+
+
+def test_a_log_goes_on_in_further_files_and_is_read_as_one(tmp_path: Path) -> None:
+    """Its replay too is the run; one part by itself is refused, and so is a part of another run."""
+    path = tmp_path / "run.db"
+    controller = RECIPE.make_controller(MEMORY)
+    worker = InlineWorker(lambda request: respond(RECIPE.cascade, request))
+    meta = about(controller, RECIPE)
+    with Log(path, COLUMNS, meta, threaded=False, part_bytes=30_000) as log:
+        log._keep_safe = _always(log)  # type: ignore[method-assign]
+        rig, clock = RECIPE.make_rig(), SimulatedClock()
+        report = Runtime(controller, rig, worker, clock=clock, log=log).run(0.6)
+    parts = [p.name for p in sorted(tmp_path.iterdir())]
+    assert parts[:2] == ["run.db", "run.db-2"]
+    recording = read_log(path)
+    assert len(recording.steps) == report.steps
+    assert replay(path, decisions=False).identical
+    with pytest.raises(ArtefactError, match="part 2 of a log"):
+        read_log(part_path(path, 2))
+    with contextlib.closing(sqlite3.connect(part_path(path, 2))) as file:
+        file.execute("UPDATE meta SET value = '\"other\"' WHERE key = 'run'")
+        file.commit()
+    assert len(read_log(path).steps) < report.steps
+
+
+def _always(log: Log) -> Callable[[], None]:
+    """Half a second has always passed."""
+
+    def keep_safe() -> None:
+        log._synced -= 1.0
+        Log._keep_safe(log)
+
+    return keep_safe
+
+
+def test_an_earlier_log_is_kept_with_its_parts(tmp_path: Path) -> None:
+    path = tmp_path / "run.db"
+    for _ in range(2):
+        with Log(path, COLUMNS, {}, threaded=False, part_bytes=1) as log:
+            log._keep_safe = _always(log)  # type: ignore[method-assign]
+            fill(log, 750)
+    names = {p.name for p in tmp_path.iterdir()}
+    assert {"run.db", "run.db-2", "run.db.1", "run.db.1-2"} <= names
+    assert len(read_log(path).steps) == len(read_log(tmp_path / "run.db.1").steps) == 750
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_to_read_a_killed_log_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writable: bool
+) -> None:
+    """Neither the file nor what lies beside it; also where nothing can be written."""
+    path = tmp_path / "run.db"
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        fill(log, 1000)
+        left = tmp_path / "left"
+        left.mkdir()
+        for end in ("", "-wal"):
+            shutil.copy(f"{path}{end}", left / f"run.db{end}")
+    before = {p.name: p.read_bytes() for p in left.iterdir()}
+    if not writable:
+        monkeypatch.setattr(os, "access", lambda *_: False)
+    assert len(read_log(left / "run.db").steps) == 1000
+    assert {n: (left / n).read_bytes() for n in before} == before
+    if not writable:
+        assert {p.name for p in left.iterdir()} == set(before)
+
+
+def test_a_log_that_was_cut_off_while_it_was_closed_is_read(tmp_path: Path) -> None:
+    """Its journal, which tells how the file was, is followed beside a copy."""
+    path = tmp_path / "run.db"
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        fill(log, 500)
+    left = tmp_path / "left"
+    left.mkdir()
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as file:
+        file.execute("PRAGMA cache_size = 1")
+        file.execute("BEGIN")
+        file.execute("UPDATE steps SET phi = 7.0")  # more than its memory holds: it writes
+        for end in ("", "-journal"):
+            shutil.copy(f"{path}{end}", left / f"run.db{end}")
+        file.execute("ROLLBACK")
+    before = {p.name: p.read_bytes() for p in left.iterdir()}
+    assert before["run.db"] != path.read_bytes()
+    np.testing.assert_array_equal(read_log(left / "run.db").steps, read_log(path).steps)
+    assert {p.name: p.read_bytes() for p in left.iterdir()} == before
+
+
+def test_a_journal_that_names_a_file_does_not_remove_it(tmp_path: Path) -> None:
+    """SQLite would: it takes the file for one that ties several journals together."""
+    path, victim = tmp_path / "run.db", tmp_path / "victim"
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        fill(log, 500)
+    victim.write_text("of value")
+    name = str(victim).encode()
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as file:
+        file.execute("PRAGMA cache_size = 1")
+        file.execute("BEGIN")
+        file.execute("UPDATE steps SET phi = 7.0")
+        journal = Path(f"{path}-journal").read_bytes()
+        file.execute("ROLLBACK")
+    tail = struct.pack(">I", 0) + name + struct.pack(">II", len(name), sum(name))
+    Path(f"{path}-journal").write_bytes(journal + tail + log_module.JOURNAL)
+    with pytest.raises(ArtefactError, match="names another"):
+        read_log(path)
+    assert victim.read_text() == "of value"
+
+
+def test_companions_that_others_left_are_not_used(tmp_path: Path) -> None:
+    """Anybody may have made them, in a folder that all can write, to read what is logged."""
+    path = tmp_path / "run.db"
+    theirs = tmp_path / "theirs"
+    theirs.touch(mode=0o666)
+    for end in ("-wal", "-shm", "-journal"):
+        Path(f"{path}{end}").symlink_to(theirs)
+    with Log(path, COLUMNS, {}, threaded=False) as log:
+        fill(log, 500)
+    assert theirs.stat().st_size == 0
+    assert len(read_log(path).steps) == 500
+
+
+def test_a_file_in_the_way_of_a_part_is_moved_aside(tmp_path: Path) -> None:
+    path = tmp_path / "run.db"
+    with Log(path, COLUMNS, {}, threaded=False, part_bytes=1) as log:
+        log._keep_safe = _always(log)  # type: ignore[method-assign]
+        with contextlib.closing(sqlite3.connect(part_path(path, 2))) as file:
+            file.execute("CREATE TABLE mine (a)")
+        fill(log, 750)
+    assert log.failure == ""
+    assert len(read_log(path).steps) == 750
+    assert Path(f"{path}-2.1").exists()
+
+
+@pytest.mark.parametrize("what", ["full", "no handles", "no threads"])
+def test_a_log_for_which_something_lacks_is_refused_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    path = tmp_path / "run.db"
+    if what == "full":
+        usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    elif what == "no handles":
+
+        def refuse(*_args: object) -> int:
+            raise OSError(errno.EMFILE, "Too many open files")
+
+        monkeypatch.setattr(os, "open", refuse)
+    else:
+
+        def unable(_thread: threading.Thread) -> None:
+            raise RuntimeError("can't start new thread")
+
+        monkeypatch.setattr(threading.Thread, "start", unable)
+    with pytest.raises(ArtefactError, match=r"run\.db"):
+        Log(path, COLUMNS, {})
+
+
+def test_a_disk_that_refuses_a_sync_ends_the_log_and_not_the_run(tmp_path: Path) -> None:
+    log = Log(tmp_path / "run.db", COLUMNS, {}, threaded=False)
+    fill(log, 500)
+
+    def refuse() -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    log._keep_safe = refuse  # type: ignore[method-assign]
+    fill(log, 500)
+    log.close()
+    assert "Input/output error" in log.failure
+    rows = read_log(tmp_path / "run.db").steps
+    np.testing.assert_array_equal(rows[:, 0], np.arange(len(rows)))
+    assert len(rows) + log.dropped == 1000
 
 
 # -- encoding ---------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import sympy as sp
 
+from undertow.codegen.expressions import parse_expression
 from undertow.codegen.store import content_key, recall, remember
 from undertow.errors import ModelError
 
@@ -39,7 +40,7 @@ def derived(
     if stored is not None:
         # Whatever is wrong with the file, the equations can be derived again.
         with contextlib.suppress(Exception):
-            mass, force = (eval(line, dict(vars(sp))) for line in stored.splitlines())
+            mass, force = (parse_expression(line) for line in stored.splitlines())
             return mass, force
     mass, force = derive(name, q, qd, kinetic, potential, dissipation)
     remember("equations", key, f"{sp.srepr(mass)}\n{sp.srepr(force)}")

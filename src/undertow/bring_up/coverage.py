@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from undertow.bring_up.identify import identify
 from undertow.bring_up.motion import doublets, perform
 from undertow.bring_up.rest import rest_state
 from undertow.errors import ArtefactError
+from undertow.files import parse_json, read_file
 from undertow.mechanism import Mechanism
 from undertow.mechanisms import rotary_pendulum
 from undertow.results import versions
@@ -25,6 +27,9 @@ __all__ = ["NOISES", "CoverageRow", "coverage", "deviations", "rig_in_the_class"
 #: Noise of the positions before they are counted, rad, standard deviation: with some, the
 #: errors of the counts are nearly independent; without, they hang together for many samples.
 NOISES = (1e-3, 0.0)
+
+#: Largest file of rigs that is read, bytes.
+LARGEST = 1 << 28
 
 #: What a motion with pushes of this voltage and these widths, s, is identified from.
 PUSH, WIDTHS, PAUSE = 2.5, (0.05, 0.1, 0.2, 0.1, 0.05, 0.2, 0.15), 0.3
@@ -160,17 +165,22 @@ def _kept(path: Path | None) -> dict[tuple[float, int], Mapping[str, float]]:
     """Read what was done already, and begin the file where there is none."""
     if path is None:
         return {}
-    if not path.exists():
+    if not os.path.lexists(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(versions()) + "\n", encoding="utf-8")
         return {}
     try:
-        head, *lines = path.read_text(encoding="utf-8").splitlines()
-        if json.loads(head) == versions():
-            rows = [json.loads(line) for line in lines]
-            return {(noise, seed): found for noise, seed, found in rows}
+        head, *lines = read_file(path, "rigs done in", most=LARGEST).decode("utf-8").splitlines()
+        if parse_json(head) == versions():
+            rows = [parse_json(line) for line in lines]
+            return {
+                (float(noise), int(seed)): {str(k): float(v) for k, v in found.items()}
+                for noise, seed, found in rows
+            }
         why = "of other versions"
-    except (OSError, ValueError) as error:
+    except ArtefactError:
+        raise
+    except (OSError, ValueError, TypeError, AttributeError, OverflowError) as error:
         why = f"{type(error).__name__}: {error}"
     raise ArtefactError(
         f"rigs done in '{path}'",

@@ -31,7 +31,8 @@ import numpy as np
 
 from undertow.certify.ellipsoid import TerminalEllipsoid
 from undertow.certify.lyapunov import LyapunovFunction
-from undertow.errors import ArtefactError, CertificateError, UndertowError
+from undertow.errors import CertificateError, UndertowError
+from undertow.files import check_file, parse_json, read_file
 from undertow.mechanism import Mechanism
 from undertow.sliding import ReachingLaw, Surface
 from undertow.verdict import Verdict
@@ -199,7 +200,10 @@ class Certificate:
             )
         try:
             return cls._from_document(document)
-        except (UndertowError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except (
+            UndertowError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError,
+            RecursionError,
+        ) as error:  # fmt: skip
             raise CertificateError(
                 "certificate",
                 value=f"{type(error).__name__}: {error}",
@@ -226,24 +230,17 @@ def read_certificate(path: Path) -> Certificate:
     Raises
     ------
     ArtefactError
-        When the file cannot be read.
+        When the file cannot be read, or is no plain file.
     CertificateError
         When it is too large, damaged or of an unknown version.
     """
-    try:
-        size = path.stat().st_size
-        if size > LARGEST:
-            raise CertificateError(
-                f"certificate '{path}'", value=f"{size} bytes", limit=f"at most {LARGEST}"
-            )
-        content = path.read_bytes()
-    except OSError as error:
-        raise ArtefactError(
-            f"certificate '{path}'",
-            value=error.strerror or str(error),
-            limit="a file that can be read",
-            remedy="undertow certify NAME --out FOLDER writes one",
-        ) from error
+    remedy = "undertow certify NAME --out FOLDER writes one"
+    size = check_file(path, "certificate", remedy=remedy)
+    if size > LARGEST:
+        raise CertificateError(
+            f"certificate '{path}'", value=f"{size} bytes", limit=f"at most {LARGEST}"
+        )
+    content = read_file(path, "certificate", most=LARGEST, remedy=remedy)
     return Certificate.from_bytes(content)
 
 
@@ -252,34 +249,10 @@ def read_certificate(path: Path) -> Certificate:
 
 def _parse(content: bytes) -> dict[str, Any]:
     """Parse strictly: one object, no repeated keys, no NaN or infinity, nothing absurd."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        if len(set(keys)) != len(keys):
-            raise ValueError("a key is repeated")
-        return dict(pairs)
-
-    def finite(text: str) -> float:
-        value = float(text)
-        if not math.isfinite(value):
-            raise ValueError(f"{text} is not finite")
-        return value
-
-    def whole(text: str) -> int:
-        if len(text) > 40:
-            raise ValueError("a whole number of more than forty digits")
-        return int(text)
-
     try:
         if len(content) > LARGEST:
             raise ValueError(f"{len(content)} bytes")
-        document = json.loads(
-            content.decode("utf-8"),
-            object_pairs_hook=once,
-            parse_constant=finite,
-            parse_float=finite,
-            parse_int=whole,
-        )
+        document = parse_json(content)
         if not isinstance(document, dict):
             raise ValueError("no JSON object")
     except (ValueError, RecursionError) as error:
@@ -303,7 +276,7 @@ def _checksum(document: Mapping[str, Any]) -> str:
         text = json.dumps(
             rest, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
         )
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise CertificateError(
             "certificate", value=str(error), limit="finite numbers, texts and lists alone"
         ) from error

@@ -248,10 +248,24 @@ def _seconds_on_terminal(seconds: float) -> Iterator[None]:
             sys.stderr.write("\r\033[K")
 
 
-@app.command(epilog=examples("undertow replay run.db", "undertow replay run.db --out figures"))
+@app.command(
+    epilog=examples(
+        "undertow replay run.db",
+        "undertow replay run.db --out figures",
+        "undertow replay run.db --mechanism my_arm.py:arm",
+    )
+)
 @reports_errors
 def replay(
     log: Annotated[Path, typer.Argument(help="Log of a run.", metavar="FILE")],
+    mechanism: Annotated[
+        str | None,
+        typer.Option(
+            help="A mechanism of your own, FILE.py:NAME, whose run it is. The file that a log "
+            "names is not run by itself.",
+            metavar="MECHANISM",
+        ),
+    ] = None,
     decisions: Annotated[
         bool, typer.Option(help="Also let the gate judge the recorded answers again.")
     ] = True,
@@ -268,7 +282,7 @@ def replay(
         results.check_folder(out)
     with progress_bar() as progress:
         progress("replaying", 0.0)
-        result = runtime.replay(log, decisions=decisions)
+        result = runtime.replay(log, mechanism=mechanism, decisions=decisions)
     console = terminal()
     console.print(replay_table(result))
     if out is not None:

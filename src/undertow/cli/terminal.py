@@ -123,7 +123,8 @@ def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
             return command(*args, **kwargs)
         except UndertowError as error:
             typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
-            typer.echo(" ".join(str(error).split()), err=True)
+            words = " ".join(str(error).split())  # some may be a file's, and anything
+            typer.echo("".join(c if c.isprintable() else "?" for c in words), err=True)
             raise typer.Exit(2 if isinstance(error, ValueError) else 1) from None
 
     return guarded

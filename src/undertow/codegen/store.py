@@ -1,7 +1,8 @@
 """Generated modules on disk: written once, named by their content, compiled once.
 
 numba's cache needs a real file and does not notice changed globals, so the file's name
-carries a hash of its source and of the versions that shape the machine code.
+carries a hash of its source and of the versions that shape the machine code.  All of it lies
+in a folder that nobody else can write, see :mod:`undertow.codegen.private`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 import sympy as sp
 
 from undertow.codegen.machine import numba
+from undertow.codegen.private import cache_folder, private_folder
 
 __all__ = [
     "cache_folder",
@@ -43,15 +45,6 @@ FORMULAS = (
     "codegen/scalar.py",
     "codegen/tape.py",
 )
-
-
-def cache_folder() -> Path:
-    """Return the folder of generated kernels: ``$UNDERTOW_CACHE`` or the user's cache."""
-    chosen = os.environ.get("UNDERTOW_CACHE")
-    if chosen:
-        return Path(chosen)
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return root / "undertow"
 
 
 def content_key(*texts: str, sources: Iterable[str] = ()) -> str:
@@ -87,7 +80,7 @@ def recall(name: str, key: str) -> str | None:
     """Return the text that was remembered under a key, ``None`` where there is none."""
     try:
         seal, _, text = (
-            (_writable_folder() / f"{name}_{key[:32]}.txt")
+            (private_folder() / f"{name}_{key[:32]}.txt")
             .read_text(encoding="utf-8")
             .partition("\n")
         )
@@ -98,8 +91,8 @@ def recall(name: str, key: str) -> str | None:
 
 def remember(name: str, key: str, text: str) -> None:
     """Keep a text under a key; a disk that refuses only costs time later."""
-    with contextlib.suppress(OSError):
-        path = _writable_folder() / f"{name}_{key[:32]}.txt"
+    with contextlib.suppress(OSError, UnicodeEncodeError):
+        path = private_folder() / f"{name}_{key[:32]}.txt"
         _write(path, f"{_seal(key, text)}\n{text}")
 
 
@@ -153,8 +146,8 @@ def load_module(name: str, source: str) -> ModuleType:
     module_name = f"{re.sub(r'[^A-Za-z0-9_]', '_', name)[:80]}_{digest}"
     if module_name in sys.modules:
         return sys.modules[module_name]
-    path = _writable_folder() / f"{module_name}.py"
-    if not path.exists() or path.read_text(encoding="utf-8") != source:
+    path = private_folder() / f"{module_name}.py"
+    if not path.exists() or path.read_bytes() != source.encode():
         _write(path, source)
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None  # a plain .py file always has a spec and a loader
@@ -163,15 +156,3 @@ def load_module(name: str, source: str) -> ModuleType:
     sys.modules[module_name] = module
     spec.loader.exec_module(module)
     return module
-
-
-def _writable_folder() -> Path:
-    """Return the cache folder, or a private temporary one where it cannot be written."""
-    for folder in (cache_folder(), Path(tempfile.gettempdir()) / f"undertow-{os.getuid()}"):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            return folder
-    return Path(tempfile.mkdtemp(prefix="undertow-"))

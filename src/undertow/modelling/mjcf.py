@@ -15,7 +15,7 @@ from undertow.mechanism import Mechanism
 from undertow.modelling.mjcf_bodies import Frame, link_of
 from undertow.modelling.rigid_body import mechanism_from_tree
 from undertow.modelling.tree import WORLD, Actuator, Coupling, Joint, Link, Tree, Vector
-from undertow.modelling.xml_files import numbers_of, parse_xml
+from undertow.modelling.xml_files import computable, numbers_of, parse_xml
 
 __all__ = ["from_mjcf", "read_mjcf"]
 
@@ -71,14 +71,15 @@ def from_mjcf(
         For ball and free joints, equality constraints, massless moving bodies, elements that
         change the motion in ways that are not read here.
     """
-    return mechanism_from_tree(
-        read_mjcf(source, motors=actuated is None),
-        actuated=actuated,
-        equilibrium=equilibrium,
-        start=start,
-        effort=effort,
-        source=str(source) if not str(source).lstrip().startswith("<") else "MJCF text",
-    )
+    with computable("MJCF"):
+        return mechanism_from_tree(
+            read_mjcf(source, motors=actuated is None),
+            actuated=actuated,
+            equilibrium=equilibrium,
+            start=start,
+            effort=effort,
+            source=str(source) if not str(source).lstrip().startswith("<") else "MJCF text",
+        )
 
 
 def read_mjcf(source: str | Path, *, motors: bool = True) -> Tree:

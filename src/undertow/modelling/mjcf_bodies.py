@@ -146,6 +146,13 @@ def _geom(geom: ET.Element, name: str, frame: Frame) -> tuple[float, FloatArray,
     centre = np.array(numbers_of(geom, "pos", "0 0 0", 3))
     R = frame.rotation(geom)
     ends = geom.get("fromto")
+    needed = 1 if ends is not None else _SIZES.get(kind, 3)
+    if len(size) < needed or not min(size[:needed]) > 0:
+        raise InvalidInputError(
+            f"size of a {kind} of body '{name}'",
+            value=geom.get("size", "missing"),
+            limit=f"{needed} numbers > 0",
+        )
     if ends is not None:
         if kind not in ("capsule", "cylinder", "box", "ellipsoid"):
             raise InvalidInputError("fromto of a geom", value=kind, limit="an elongated shape")
@@ -201,6 +208,10 @@ _SHAPES: dict[str, Callable[[Sequence[float]], tuple[float, tuple[float, float, 
     "box": _box,
     "ellipsoid": _ellipsoid,
 }
+
+
+#: How many numbers give the size of a shape without ``fromto``.
+_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2}
 
 
 def _unit(vector: Sequence[float]) -> FloatArray:

@@ -168,6 +168,13 @@ class Tree:
                         limit=f"one of {', '.join(sorted(known))}",
                         remedy="Declare the link, or correct its name",
                     )
+            if joint.child == WORLD:
+                raise ModelError(
+                    f"joint '{joint.name}' of '{self.name}'",
+                    value=f"child {WORLD!r}, the fixed frame",
+                    limit="a link that can move",
+                    remedy="The fixed frame carries the tree: turn the joint round, or rename it",
+                )
             if joint.child in parents:
                 raise ModelError(
                     f"link '{joint.child}' of '{self.name}' closes a loop",

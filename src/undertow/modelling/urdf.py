@@ -15,7 +15,7 @@ from undertow.errors import ModelError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.modelling.rigid_body import mechanism_from_tree
 from undertow.modelling.tree import WORLD, Joint, Link, Tree, Vector
-from undertow.modelling.xml_files import numbers_of, parse_xml, rotation_from_rpy
+from undertow.modelling.xml_files import computable, numbers_of, parse_xml, rotation_from_rpy
 
 __all__ = ["from_urdf", "read_urdf"]
 
@@ -72,16 +72,17 @@ def from_urdf(
         For loops, massless moving links, floating or planar joints, mimic joints, repeated
         names.
     """
-    tree, transmitted = read_urdf(source, gravity)
-    chosen = actuated if actuated is not None else transmitted or None
-    return mechanism_from_tree(
-        tree,
-        actuated=chosen,
-        equilibrium=equilibrium,
-        start=start,
-        effort=effort,
-        source=str(source) if not str(source).lstrip().startswith("<") else "URDF text",
-    )
+    with computable("URDF"):
+        tree, transmitted = read_urdf(source, gravity)
+        chosen = actuated if actuated is not None else transmitted or None
+        return mechanism_from_tree(
+            tree,
+            actuated=chosen,
+            equilibrium=equilibrium,
+            start=start,
+            effort=effort,
+            source=str(source) if not str(source).lstrip().startswith("<") else "URDF text",
+        )
 
 
 def read_urdf(

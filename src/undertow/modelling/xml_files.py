@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
+from xml.parsers import expat
 
 import numpy as np
 
 from undertow.errors import ArtefactError, InvalidInputError, ModelError
+from undertow.files import read_file
 from undertow.mechanism import FloatArray
 
-__all__ = ["numbers_of", "parse_xml", "rotation_from_quaternion", "rotation_from_rpy"]
+__all__ = ["computable", "numbers_of", "parse_xml", "rotation_from_quaternion", "rotation_from_rpy"]
+
+#: Largest file, bytes; deepest nesting, and most elements, of one that is read.
+LARGEST, DEEPEST, MOST = 1 << 24, 64, 20_000
 
 
 def parse_xml(source: str | Path, root: str) -> ET.Element:
@@ -29,13 +36,13 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
     text = source if isinstance(source, str) and source.lstrip().startswith("<") else None
     if text is None:
         try:
-            text = Path(source).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+            text = read_file(Path(source), "model file", most=LARGEST).decode("utf-8")
+        except UnicodeDecodeError as error:
             raise ArtefactError(
-                f"model file {str(source)!r}",
-                value=getattr(error, "strerror", None) or "no UTF-8 text",
+                f"model file '{source}'",
+                value="no UTF-8 text",
                 limit="a readable file, or XML text",
-                remedy="Check the path",
+                remedy="Save it as UTF-8",
             ) from error
     if "<!ENTITY" in text:
         raise InvalidInputError(
@@ -45,6 +52,7 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
             remedy="Expand the entities first",
         )
     try:
+        _check_size(text, root)
         element = ET.fromstring(text)
     except ET.ParseError as error:
         line, column = error.position
@@ -57,6 +65,57 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
     if element.tag != root:
         raise ModelError("model file", value=f"root <{element.tag}>", limit=f"<{root}>")
     return element
+
+
+def _check_size(text: str, root: str) -> None:
+    """Refuse what is nested or repeated beyond any mechanism, before a tree is built of it.
+
+    Raises
+    ------
+    InvalidInputError
+        Beyond :data:`DEEPEST` or :data:`MOST`.
+    """
+    depth = count = 0
+
+    def begin(_tag: str, _attributes: object) -> None:
+        nonlocal depth, count
+        depth, count = depth + 1, count + 1
+        if depth > DEEPEST or count > MOST:
+            raise InvalidInputError(
+                f"<{root}> file",
+                value=f"elements nested {depth} deep" if depth > DEEPEST else f"{count} elements",
+                limit=f"at most {DEEPEST} deep, {MOST} in all",
+                remedy="Keep the bodies of one mechanism alone",
+            )
+
+    def end(_tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    with contextlib.suppress(expat.ExpatError):  # the parser of the tree says where
+        parser.Parse(text, True)
+
+
+@contextlib.contextmanager
+def computable(what: str) -> Iterator[None]:
+    """Refuse numbers of a file from which no mechanism can be computed.
+
+    Raises
+    ------
+    InvalidInputError
+        Where arithmetic overflows or has no result.
+    """
+    try:
+        yield
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise InvalidInputError(
+            f"numbers of the {what}",
+            value=f"{type(error).__name__}: {error}",
+            limit="those of a mechanism, SI units",
+            remedy="Look for one that is far too large or too small",
+        ) from error
 
 
 def numbers_of(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.errors import InvalidInputError, MissingExtraError
+from undertow.files import check_file
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms.scenes import Scene, mujoco_scene
 from undertow.modelling.rigid_body import identifier
@@ -104,6 +105,8 @@ class MuJoCoRig:
 
     def _loaded(self, source: str | Path) -> Any:
         text = str(source).lstrip().startswith("<")
+        if not text and Path(source).exists():
+            check_file(Path(source), "MuJoCo scene")
         try:
             if text:
                 return self._engine.MjModel.from_xml_string(str(source))

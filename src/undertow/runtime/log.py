@@ -2,24 +2,33 @@
 
 The fast loop copies a row of numbers into a ring in memory; a thread empties the ring into
 the file every 25 ms, one transaction each time.  SQLite's write-ahead log makes a killed
-run readable up to its last transaction by whatever opens the file.  Until the end of the
-run nothing waits for the disk: checkpoints are made when the log is closed.
+run readable up to its last transaction by whatever opens the file.  Every half second the
+thread also has the disk take what was written, and moves it from the write-ahead log into
+the file: that is what a power cut costs, and the write-ahead log stays small.  A log that has
+grown large goes on in another file, ``run.db-2``, ``run.db-3``, …, which are read as one.
 
 Tables: ``meta`` (key, JSON), ``steps`` (a row a step), ``events`` (what happened, with the
 step), ``answers`` (what the slow loop said, with the step that it arrived in).
+
+To read a log is to read data: nothing in it is run, whoever wrote it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import itertools
 import json
-import math
 import os
+import shutil
 import sqlite3
+import tempfile
 import threading
+import time
+import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,9 +36,10 @@ from typing import Any, Self
 import numpy as np
 
 from undertow.errors import ArtefactError
+from undertow.files import check_file, parse_json
 from undertow.mechanism import FloatArray, Mechanism
 
-__all__ = ["Columns", "Log", "Recording", "check_log", "read_log"]
+__all__ = ["Columns", "Log", "Recording", "check_log", "part_path", "read_log"]
 
 #: Columns of ``answers``, with their types.
 ANSWERS = {
@@ -38,11 +48,35 @@ ANSWERS = {
     "evaluations": "INTEGER", "seconds": "REAL", "body": "TEXT",
 }  # fmt: skip
 
+#: Columns of ``events``.
+EVENTS = ("k", "t", "kind", "text")
+
+#: Layout of the file, SQLite's ``user_version``; logs of before it was kept have 0.
+VERSION = 2
+
 #: Rows that wait in memory at most.
 RING = 8192
 
 #: Time between transactions, s; and rows, where no thread writes.
 FLUSH, BATCH = 0.025, 250
+
+#: Time from what was written to when the disk is asked to take it, s.
+SYNC = 0.5
+
+#: Size at which a log goes on in another file, bytes: about an hour at 1 kHz.
+PART = 1 << 30
+
+#: How long a disk may take over the last rows, s.
+PATIENCE = 5.0
+
+#: Free space without which no log is begun, bytes.
+LEAST = 1 << 24
+
+#: What ends a journal of SQLite that belongs to another one.
+JOURNAL = bytes.fromhex("d9d505f920a163d7")
+
+#: Largest value in a file that is read, bytes.
+LONGEST = 1 << 26
 
 
 #: Values of one line of a table.
@@ -101,6 +135,8 @@ class Log:
         Write in a thread, every 25 ms.  Otherwise write every 250 rows, for simulated time.
     most_bytes
         Size that the file may grow to; the log ends there, and the run goes on.
+    part_bytes
+        Size at which the log goes on in another file, :func:`part_path`.
 
     Attributes
     ----------
@@ -123,6 +159,7 @@ class Log:
         *,
         threaded: bool = True,
         most_bytes: int | None = None,
+        part_bytes: int = PART,
     ) -> None:
         self.path, self.columns = path, columns
         self.failure, self.dropped = "", 0
@@ -133,26 +170,66 @@ class Log:
         self._insert = f"INSERT INTO steps VALUES ({', '.join('?' * len(columns.names))})"
         self._over = threading.Event()
         self._lock = threading.Lock()
+        self._meta = {**meta, "run": uuid.uuid4().hex}
+        self._part, self._part_bytes, self._most_bytes = 1, part_bytes, most_bytes
+        self._unsynced, self._synced = False, time.monotonic()
         check_log(path)
         with _refused(path):
             _move_earlier(path)
-            self._file = self._make(meta)
-            if most_bytes is not None:
-                (page,) = self._file.execute("PRAGMA page_size").fetchone()
-                self._file.execute(f"PRAGMA max_page_count={max(1, most_bytes // page)}")
+            self._file = self._make(1)
         self._thread: threading.Thread | None = None
         if threaded:
             self._thread = threading.Thread(target=self._write, name="undertow log", daemon=True)
-            self._thread.start()
+            try:
+                self._thread.start()
+            except RuntimeError as error:
+                _end(self._file)
+                raise ArtefactError(
+                    f"thread that writes log '{path}'",
+                    value=str(error),
+                    limit="one more thread",
+                    remedy="End other programs, or raise the limit (ulimit -u)",
+                ) from error
 
-    def _make(self, meta: Mapping[str, Any]) -> sqlite3.Connection:
-        file = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
-        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "wal_autocheckpoint=0"):
+    def _make(self, part: int) -> sqlite3.Connection:
+        """Begin a file; it is whole, and on the disk, before it has its name."""
+        path = part_path(self.path, part)
+        if part > 1 and os.path.lexists(path):
+            _claim(path)
+            _move_earlier(path)
+        for companion in ("-wal", "-shm", "-journal"):  # of a log that was removed, or anybody's
+            Path(f"{path}{companion}").unlink(missing_ok=True)
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))  # nobody else's
+        draft = path
+        try:
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")  # 0600
+            os.close(handle)
+            draft = Path(name)
+            with contextlib.closing(sqlite3.connect(draft, isolation_level=None)) as file:
+                self._lay_tables(file, {**self._meta, "part": part})
+            os.replace(draft, path)
+            _sync_folder(path.parent)
+            file = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+        except BaseException:
+            for rest in {draft, path}:
+                rest.unlink(missing_ok=True)
+            raise
+        for pragma in (
+            "synchronous=NORMAL", "wal_autocheckpoint=0", "checkpoint_fullfsync=ON",
+        ):  # fmt: skip
             file.execute(f"PRAGMA {pragma}")
+        if self._most_bytes is not None:
+            (page,) = file.execute("PRAGMA page_size").fetchone()
+            file.execute(f"PRAGMA max_page_count={max(1, self._most_bytes // page)}")
+        return file
+
+    def _lay_tables(self, file: sqlite3.Connection, meta: Mapping[str, Any]) -> None:
         whole = {"k": "INTEGER PRIMARY KEY", "mode": "INTEGER", "surface": "INTEGER"}
         steps = ", ".join(f'"{name}" {whole.get(name, "REAL")}' for name in self.columns.names)
         answers = ", ".join(f"{name} {kind}" for name, kind in ANSWERS.items())
+        file.execute("PRAGMA synchronous=FULL")
         file.execute("BEGIN")
+        file.execute(f"PRAGMA user_version={VERSION}")
         file.execute("CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT)")
         file.execute(f"CREATE TABLE steps ({steps})")
         file.execute("CREATE TABLE events (k INTEGER, t REAL, kind TEXT, text TEXT)")
@@ -162,7 +239,7 @@ class Log:
             [(key, json.dumps(value, ensure_ascii=False)) for key, value in meta.items()],
         )
         file.execute("COMMIT")
-        return file
+        file.execute("PRAGMA journal_mode=WAL")
 
     # -- called by the fast loop -----------------------------------------------------------
 
@@ -195,19 +272,35 @@ class Log:
         with self._lock:
             head, count = self._head, self._head - self._tail
             waiting = self._lines()
-            if not count and not waiting:
-                return
             if self.failure:
                 self.dropped += count
             else:
                 try:
-                    self._transact(head, waiting)
+                    if count or waiting:
+                        self._transact(head, waiting)
+                        self._tail, self._unsynced = head, True
+                    self._keep_safe()
                 except Exception as error:  # the thread must live, or the ring overflows unseen
-                    self.failure = str(error)
-                    self.dropped += count
+                    self.failure = str(error) or type(error).__name__
+                    self.dropped += head - self._tail
                     with contextlib.suppress(sqlite3.Error):
                         self._file.execute("ROLLBACK")
             self._tail = head
+
+    def _keep_safe(self) -> None:
+        """Every half second: have the disk take what was written; go on in another file."""
+        now = time.monotonic()
+        if not self._unsynced or now < self._synced + SYNC:
+            return
+        self._unsynced, self._synced = False, now
+        path = part_path(self.path, self._part)
+        _, written, moved = self._file.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+        if moved < written:  # who reads the log holds its end where it is, and off the disk
+            _sync_file(Path(f"{path}-wal"))
+        if _size(path) > self._part_bytes:
+            more = self._make(self._part + 1)
+            _end(self._file)
+            self._file, self._part = more, self._part + 1
 
     def _lines(self) -> list[tuple[str, Line]]:
         """Make the lines that wait; one that cannot be written is counted and left out."""
@@ -233,12 +326,13 @@ class Log:
         """Write the rest, and leave one file behind."""
         self._over.set()
         if self._thread is not None:
-            self._thread.join(timeout=5.0)
+            self._thread.join(timeout=PATIENCE)
+            if self._thread.is_alive():  # to wait for its lock would be to hang with it
+                self.failure = f"the disk has not answered for {PATIENCE:g} s"
+                self.dropped += self._head - self._tail
+                return
         self.flush()
-        with contextlib.suppress(sqlite3.Error):
-            self._file.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            self._file.execute("PRAGMA journal_mode=DELETE")
-        self._file.close()
+        _end(self._file)
         if not self.path.exists():
             self.failure, self.dropped = "the file was removed during the run", self._head
 
@@ -266,10 +360,10 @@ def _refused(path: Path) -> Iterator[None]:
     """Say of what the system refuses which log it was for."""
     try:
         yield
-    except (OSError, sqlite3.Error) as error:
+    except (OSError, sqlite3.Error, MemoryError) as error:
         raise ArtefactError(
             f"log '{path}'",
-            value=str(error),
+            value=str(error) or type(error).__name__,
             limit="a file that can be written",
             remedy="Name another one with --log",
         ) from error
@@ -288,8 +382,59 @@ def check_log(path: Path) -> None:
         if not os.access(path.parent, os.W_OK):
             message = "its folder cannot be written"
             raise PermissionError(message)
-        if path.exists():
-            _claim(path)
+        disk = shutil.disk_usage(path.parent)
+        if disk.total and disk.free < LEAST:
+            raise OSError(errno.ENOSPC, f"less than {LEAST >> 20} MiB are free on its disk")
+        for earlier in _parts(path):
+            _claim(earlier)
+
+
+def part_path(path: Path, part: int) -> Path:
+    """Return the path of a part of a log: ``run.db``, ``run.db-2``, ``run.db-3`` and so on."""
+    return path if part == 1 else Path(f"{path}-{part}")
+
+
+def _parts(path: Path) -> list[Path]:
+    """Return what there is of a log: its first file, and those that it goes on in."""
+    further = itertools.takewhile(os.path.lexists, (part_path(path, n) for n in itertools.count(2)))
+    return [*([path] if os.path.lexists(path) else []), *further]
+
+
+def _size(path: Path) -> int:
+    """Return the size of a log's file with what waits beside it, bytes."""
+    beside = Path(f"{path}-wal")
+    return path.stat().st_size + (beside.stat().st_size if beside.exists() else 0)
+
+
+def _sync_file(path: Path) -> None:
+    handle = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the disk take the names in a folder, where the system can."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # some file systems keep names by themselves
+            raise
+    finally:
+        os.close(handle)
+
+
+def _end(file: sqlite3.Connection) -> None:
+    """Close a log, leaving one file; what the disk refuses is left for whoever opens it next."""
+    with contextlib.suppress(sqlite3.Error):
+        file.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        file.execute("PRAGMA journal_mode=DELETE")
+    with contextlib.suppress(sqlite3.Error):
+        file.close()
 
 
 def _claim(path: Path) -> None:
@@ -297,6 +442,7 @@ def _claim(path: Path) -> None:
     message = "something else of that name, not a log"
     if not path.is_file():
         raise FileExistsError(message)
+    _check_journal(path)
     with contextlib.closing(sqlite3.connect(path, timeout=0.0)) as file:
         try:
             file.execute("PRAGMA journal_mode=DELETE")  # one file, and nobody else has it open
@@ -308,13 +454,15 @@ def _claim(path: Path) -> None:
 
 
 def _move_earlier(path: Path) -> None:
-    """Keep an earlier log of the same name."""
-    if not path.exists():
+    """Keep an earlier log of the same name, with its parts."""
+    earlier = _parts(path)
+    if not earlier:
         return
     number = 1
-    while Path(f"{path}.{number}").exists():
+    while _parts(Path(f"{path}.{number}")):
         number += 1
-    path.rename(f"{path}.{number}")
+    for one in earlier:
+        one.rename(f"{path}.{number}{one.name.removeprefix(path.name)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,33 +496,153 @@ class Recording:
 
 
 def read_log(path: Path) -> Recording:
-    """Read a log, of a run that ended or was killed.
+    """Read a log, of a run that ended or was killed, with its further parts.
 
     Raises
     ------
     ArtefactError
-        When it is no log, or was killed before its first line.
+        When it is no log, of a later version, damaged, or was killed before its first line.
     """
-    if not path.is_file():
-        raise ArtefactError(f"log '{path}'", value="no such file", remedy="Name a log of a run")
-    try:
-        with contextlib.closing(sqlite3.connect(path)) as file:
-            meta = {k: json.loads(v) for k, v in file.execute("SELECT key, value FROM meta")}
-            cursor = file.execute("SELECT * FROM steps ORDER BY k")
-            columns = tuple(item[0] for item in cursor.description)
-            rows = [[math.nan if v is None else v for v in row] for row in cursor]
-            events = tuple(file.execute("SELECT * FROM events ORDER BY rowid"))
-            names = ", ".join(ANSWERS)
-            answers = tuple(
-                dict(zip(ANSWERS, row, strict=True))
-                for row in file.execute(f"SELECT {names} FROM answers ORDER BY rowid")
-            )
-    except sqlite3.Error as error:
+    found = _read_part(path)
+    if found.meta.get("part", 1) != 1:
         raise ArtefactError(
             f"log '{path}'",
-            value=str(error),
-            limit="a log of a run",
+            value=f"part {found.meta['part']} of a log",
+            limit="its first part",
+            remedy="Name that: the others are read with it",
+        )
+    steps, events, answers, part = [found.steps], [*found.events], [*found.answers], 2
+    while (further := part_path(path, part)).exists() and further.stat().st_size:
+        more = _read_part(further)
+        if more.meta.get("run") != found.meta.get("run") or more.columns != found.columns:
+            break  # of another run
+        steps.append(more.steps)
+        events += more.events
+        answers += more.answers
+        part += 1
+    return replace(found, steps=np.concatenate(steps), events=tuple(events), answers=tuple(answers))
+
+
+def _read_part(path: Path) -> Recording:
+    try:
+        with _opened(path) as (file, most):
+            _check_tables(file)
+            meta = {}
+            for key, value in _rows(file, "SELECT key, value FROM meta", most):
+                meta[str(key)] = parse_json(str(value), finite=False)
+            columns = tuple(row[1] for row in file.execute("PRAGMA table_xinfo(steps)"))
+            steps = _numbers(file, len(columns), most)
+            events = _lines_of(file, "events", EVENTS, most)
+            answers = _lines_of(file, "answers", ANSWERS, most)
+    except ArtefactError:
+        raise
+    except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise ArtefactError(
+            f"log '{path}'",
+            value=str(error) or type(error).__name__,
+            limit="a log of a run, whole and of this version",
             remedy="A run that was killed before its first step leaves an empty file",
         ) from error
-    steps = np.array(rows, dtype=float).reshape(len(rows), len(columns))
-    return Recording(path, meta, columns, steps, events, answers)
+    said = tuple((one["k"], one["t"], one["kind"], one["text"]) for one in events)
+    return Recording(path, meta, columns, steps, said, answers)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
+    """Open a log to be read, and nothing but read; also say how many bytes it has."""
+    size = check_file(path, "log", remedy="Name a log of a run")
+    waiting = {}
+    for end in ("-wal", "-journal"):
+        beside = Path(f"{path}{end}")
+        if os.path.lexists(beside):
+            waiting[end] = check_file(beside, "log")
+    writable = os.access(path.parent, os.W_OK)
+    with contextlib.ExitStack() as stack:
+        mode = "mode=ro"
+        if waiting.get("-journal") or (waiting.get("-wal") and not writable):
+            # SQLite puts the log together beside it: here beside a copy.
+            path, mode = _copied(path, stack), "mode=rw"
+        elif not writable:
+            mode = "immutable=1"
+        file = _connected(f"{path.absolute().as_uri()}?{mode}")
+        with contextlib.closing(file):
+            yield file, size + sum(waiting.values())
+
+
+def _copied(path: Path, stack: contextlib.ExitStack) -> Path:
+    """Copy a log, with what waits beside it, into a folder of one's own, for as long as it takes.
+
+    A journal that names another one is refused: SQLite would remove the file of that name.
+    """
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="undertow-")))
+    for end in ("", "-wal", "-journal"):
+        if os.path.lexists(f"{path}{end}"):
+            shutil.copyfile(f"{path}{end}", folder / f"{path.name}{end}")
+    _check_journal(folder / path.name)
+    return folder / path.name
+
+
+def _check_journal(path: Path) -> None:
+    journal = Path(f"{path}-journal")
+    if journal.is_file() and journal.read_bytes()[-8:] == JOURNAL:
+        raise FileExistsError("a journal that names another one, which no run writes")
+
+
+def _connected(place: str) -> sqlite3.Connection:
+    file = sqlite3.connect(place, uri=True, isolation_level=None, timeout=1.0)
+    try:
+        for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON", "mmap_size=0"):
+            file.execute(f"PRAGMA {pragma}")
+        file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
+        (version,) = file.execute("PRAGMA user_version").fetchone()
+        if version > VERSION:
+            raise ArtefactError(
+                "log of a later version of Undertow",
+                value=f"layout {version}",
+                limit=f"at most {VERSION}",
+                remedy="Read it with the version that wrote it, which its table meta names",
+            )
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _check_tables(file: sqlite3.Connection) -> None:
+    """Refuse what a run does not write: views, triggers, tables that others make up."""
+    kinds = {}
+    for kind, name, text in file.execute("SELECT type, name, sql FROM sqlite_master"):
+        plain = kind == "index" or (kind == "table" and str(text)[:13].upper() == "CREATE TABLE ")
+        if not plain:
+            raise ValueError(f"a {kind} '{name}' that no run writes")
+        kinds[name] = kind
+    for name in ("meta", "steps", "events", "answers"):
+        if kinds.get(name) != "table":
+            raise ValueError(f"no table '{name}'")
+        if any(row[6] for row in file.execute(f"PRAGMA table_xinfo({name})")):
+            raise ValueError(f"table '{name}' has columns that are computed")
+
+
+def _rows(file: sqlite3.Connection, query: str, most: int) -> Iterator[Line]:
+    """Yield rows; more than there are bytes are of a file that leads in circles."""
+    for number, row in enumerate(file.execute(query)):
+        if number > most:
+            raise ValueError("more rows than bytes")
+        yield row
+
+
+def _numbers(file: sqlite3.Connection, width: int, most: int) -> FloatArray:
+    """Return the steps, (N, width); what is missing is NaN."""
+    rows, blocks = _rows(file, "SELECT * FROM steps ORDER BY k", most), []
+    while block := list(itertools.islice(rows, 4096)):
+        blocks.append(np.array(block, dtype=float).reshape(len(block), width))
+    return np.concatenate(blocks) if blocks else np.empty((0, width))
+
+
+def _lines_of(
+    file: sqlite3.Connection, table: str, names: Iterable[str], most: int
+) -> tuple[dict[str, Any], ...]:
+    """Return the rows of a table with their names, in the order in which they were written."""
+    names = tuple(names)
+    query = f"SELECT {', '.join(names)} FROM {table} ORDER BY rowid"
+    return tuple(dict(zip(names, row, strict=True)) for row in _rows(file, query, most))

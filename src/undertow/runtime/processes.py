@@ -9,8 +9,12 @@ import signal
 import warnings
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from multiprocessing.context import ForkProcess
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from undertow.errors import InvalidInputError
+
+if TYPE_CHECKING:  # not on Windows
+    from multiprocessing.context import ForkProcess
 
 __all__ = ["fork", "pipe", "withdraw"]
 
@@ -23,7 +27,19 @@ def fork(
     Python 3.12 and later warn that threads of this process may hold locks that the copy
     waits for.  Ours are begun after the forks; those of a linear algebra library take care
     of themselves.
+
+    Raises
+    ------
+    InvalidInputError
+        On a system that cannot copy a process.
     """
+    if not hasattr(os, "fork"):
+        raise InvalidInputError(
+            name,
+            value="a system that cannot fork",
+            limit="Linux or macOS",
+            remedy="Write --worker thread, or run in simulated time",
+        )
     process = multiprocessing.get_context("fork").Process(
         target=target, args=args, name=name, daemon=daemon
     )

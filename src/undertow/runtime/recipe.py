@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self
 
@@ -33,6 +33,9 @@ from undertow.runtime.slow import Answer, Request, respond
 from undertow.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 
 __all__ = ["Recipe"]
+
+#: Shortest period, and longest prediction, of a run, s.
+SHORTEST, FARTHEST = 1e-5, 3600.0
 
 
 @dataclass(frozen=True)
@@ -84,20 +87,33 @@ class Recipe:
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
-        """Refuse a period that is itself a stall."""
+        """Refuse a period that is itself a stall, or that no loop keeps, and other horizons."""
         stall = self.settings.stall
-        if not 0 < self.period < stall:
+        if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
                 "period of a run",
                 value=f"{self.period:g} s",
-                limit=f"> 0 and less than the longest gap between two steps, {stall:g} s",
+                limit=f"≥ {SHORTEST:g} s and less than the longest gap between two steps, "
+                f"{stall:g} s",
                 remedy="1 ms is usual; a longer one needs Settings(stall=...)",
             )
+        if not 0 < self.horizon <= FARTHEST:
+            raise InvalidInputError(
+                "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
+            )
+        if self.rig not in ("ideal", "realistic"):
+            raise InvalidInputError("rig of a run", value=self.rig, limit="ideal or realistic")
 
     @cached_property
     def belief(self) -> Mechanism:
         """The controller's model."""
         return named(self.mechanism).with_parameters(**self.parameters)
+
+    def of(self, mechanism: Mechanism) -> Self:
+        """Return the same recipe for a mechanism that is at hand, whatever its name says."""
+        other = replace(self)
+        vars(other)["belief"] = mechanism.with_parameters(**self.parameters)
+        return other
 
     @cached_property
     def x0(self) -> FloatArray:
@@ -194,11 +210,47 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the recipe that was written to a log."""
-        return cls(
-            **{
-                **values,
-                "start": tuple(values["start"]),
-                "settings": Settings(**values["settings"]),
-            }
-        )
+        """Return the recipe that was written to a log.
+
+        Raises
+        ------
+        InvalidInputError
+            For fields that a recipe has not, or values that are none for them.
+        """
+        taken = _of_types(cls, values)
+        for name, kind in (("start", taken["start"]), ("parameters", taken["parameters"].values())):
+            if not all(isinstance(v, int | float) for v in kind):
+                raise InvalidInputError(f"{name} of a recipe", value=kind, limit="numbers")
+        settings = Settings(**_of_types(Settings, taken["settings"]))
+        return cls(**{**taken, "start": tuple(taken["start"]), "settings": settings})
+
+
+def _of_types(made: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values for the fields of a data class; refuse others, and those of other types.
+
+    Raises
+    ------
+    InvalidInputError
+        With the first that is refused.
+    """
+    usual = {item.name: getattr(made(), item.name) for item in fields(made)}
+    for name, value in values.items():
+        if name not in usual:
+            raise InvalidInputError(
+                f"{made.__name__} of a log",
+                value=f"field {name!r}",
+                limit=f"one of {', '.join(usual)}",
+                remedy="It was written by another version of Undertow: replay it with that",
+            )
+        kinds = _KINDS.get(type(usual[name]), (dict,))
+        if type(value) not in kinds or (isinstance(value, float) and math.isnan(value)):
+            raise InvalidInputError(
+                f"{name} of a log", value=repr(value)[:80], limit=f"a {kinds[0].__name__}"
+            )
+    return {name: values.get(name, usual[name]) for name in usual}
+
+
+#: What JSON has for values of a type.
+_KINDS: Mapping[type, tuple[type, ...]] = {
+    bool: (bool,), int: (int,), float: (int, float), str: (str,), tuple: (list, tuple),
+}  # fmt: skip

@@ -1,20 +1,28 @@
-"""A log through the same build again: the same outputs, bit for bit."""
+"""A log through the same build again: the same outputs, bit for bit.
+
+A log is data.  Where its mechanism is one of its author's own, in a Python file, the log only
+names that file; whoever replays it names the file to run, and its hash is compared.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from undertow.errors import ArtefactError
-from undertow.mechanism import FloatArray
+from undertow.codegen.machine import processor
+from undertow.errors import ArtefactError, UndertowError
+from undertow.files import file_hash
+from undertow.mechanism import FloatArray, Mechanism
+from undertow.modelling.python_file import in_a_file
 from undertow.results import versions
 from undertow.rig.interface import Measurement
 from undertow.runtime.controller import Controller, Inputs
@@ -51,6 +59,8 @@ class Replay:
         Outputs, (steps, m).
     build
         What has changed since the log was written: name to (then, now).
+    remarks
+        What else is to be known of it, in sentences.
     """
 
     recording: Recording
@@ -62,6 +72,7 @@ class Replay:
     gap: int | None
     u: FloatArray
     build: Mapping[str, tuple[Any, Any]]
+    remarks: tuple[str, ...] = ()
 
     @property
     def identical(self) -> bool:
@@ -82,8 +93,10 @@ def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> 
         Further JSON values.
     """
     mechanism = controller.cascade.mechanism
+    own = recipe is not None and in_a_file(recipe.mechanism)
     return {
         "mechanism": mechanism.name,
+        "source": _source_hash(recipe.mechanism) if recipe is not None and own else None,
         "fingerprint": mechanism.fingerprint,
         "units": {i.name: i.unit for i in mechanism.inputs},
         "memory": memory_to(controller.memory),
@@ -96,40 +109,121 @@ def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> 
 
 @lru_cache(maxsize=1)
 def build() -> dict[str, str | None]:
-    """Return what shapes the bits of a run: versions, and a hash of this package's own sources."""
+    """Return what shapes the bits of a run: versions, processor, a hash of our own sources."""
     package = Path(__file__).parent.parent
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
-    return {**versions(), "sources": digest.hexdigest()[:12]}
+    return {**versions(), **processor(), "sources": digest.hexdigest()[:12]}
 
 
-def replay(path: Path, *, decisions: bool = True) -> Replay:
+def replay(
+    path: Path, *, mechanism: str | Mechanism | None = None, decisions: bool = True
+) -> Replay:
     """Replay a log that carries its recipe.
 
     Parameters
     ----------
     path
         The log.
+    mechanism
+        A mechanism of one's own, ``FILE.py:NAME`` or itself, whose run it is.  The file that
+        the log names is not run: say which one is.
     decisions
         Also let the gate judge each recorded answer again.
 
     Raises
     ------
     ArtefactError
-        When the file is no log, or has no recipe.
+        When the file is no log, is damaged, has no recipe, or is of another mechanism; when it
+        is of a mechanism in a file, and none is named.
     """
+    path = Path(path)
     recording = read_log(path)
-    recipe = recording.meta.get("recipe")
-    if recipe is None:
+    with _legible(path):
+        values = recording.meta.get("recipe")
+        if values is None:
+            raise ArtefactError(
+                f"log '{path}'",
+                value="no recipe: the controller was built in Python",
+                remedy="Build it again, and call undertow.runtime.replay_controller",
+            )
+        remarks: tuple[str, ...] = ()
+        if in_a_file(str(values["mechanism"])) or mechanism is not None:
+            remarks = _compare_source(recording, mechanism)
+        if isinstance(mechanism, str):
+            values = {**values, "mechanism": mechanism}
+        recipe = Recipe.from_dict(values)
+        if isinstance(mechanism, Mechanism):
+            recipe = recipe.of(mechanism)
+        _check_mechanism(recording, recipe.belief)  # before anything is designed for it
+        memory = memory_from(recording.meta["memory"])
+        controller = recipe.make_controller(memory)
+    found = replay_controller(recording, controller, decisions=decisions)
+    return replace(found, remarks=(*remarks, *found.remarks))
+
+
+@contextlib.contextmanager
+def _legible(path: Path) -> Iterator[None]:
+    """Say of what cannot be made of a log's content that it is the log's."""
+    try:
+        yield
+    except ArtefactError:
+        raise
+    except (
+        UndertowError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError,
+        RecursionError, MemoryError,
+    ) as error:  # fmt: skip
         raise ArtefactError(
             f"log '{path}'",
-            value="no recipe: the controller was built in Python",
-            remedy="Build it again, and call undertow.runtime.replay_controller",
+            value=f"{type(error).__name__}: {error}",
+            limit="complete, with what a run of this version writes",
+            remedy="It is damaged, or of another version: replay with the one that wrote it",
+        ) from error
+
+
+def _source_hash(name: str) -> str:
+    """Return the hash of the file of ``FILE.py:NAME``."""
+    return file_hash(Path(name.rpartition(":")[0]), "mechanism file")
+
+
+def _compare_source(recording: Recording, mechanism: str | Mechanism | None) -> tuple[str, ...]:
+    """Compare the file of a mechanism of one's own with the one of the run; say what differs."""
+    written = str(recording.meta["recipe"]["mechanism"])
+    if mechanism is None:
+        raise ArtefactError(
+            f"log '{recording.path}'",
+            value=f"a run of a mechanism of somebody's own, {written}",
+            limit="a mechanism that you name: what a log names is not run",
+            remedy=f"Look into that file, and write --mechanism {written}",
         )
-    memory = memory_from(recording.meta["memory"])
-    controller = Recipe.from_dict(recipe).make_controller(memory)
-    return replay_controller(recording, controller, decisions=decisions)
+    if isinstance(mechanism, Mechanism) or not in_a_file(mechanism):
+        return ()
+    then, now = recording.meta.get("source"), _source_hash(mechanism)
+    if then is None:
+        return (f"the log has no hash of its mechanism's file: {mechanism} may be another",)
+    if then != now:
+        return (f"{mechanism} has changed since: its hash was {str(then)[:12]}, is {now[:12]}",)
+    return ()
+
+
+def _check_mechanism(recording: Recording, mechanism: Mechanism) -> None:
+    """Refuse a log of other equations, numbers or columns."""
+    meta, columns = recording.meta, Columns.of(mechanism).names
+    if meta.get("fingerprint") != mechanism.fingerprint:
+        raise ArtefactError(
+            f"log '{recording.path}'",
+            value=f"a run of {meta.get('mechanism')} with other equations or numbers",
+            limit=f"the mechanism of the controller, {mechanism.name}",
+            remedy="Replay with the version of the library, or of the file, that wrote it",
+        )
+    if recording.columns != columns:
+        raise ArtefactError(
+            f"log '{recording.path}'",
+            value=f"columns {', '.join(recording.columns)[:200]}",
+            limit=", ".join(columns),
+            remedy="Replay with the version of the library that wrote it",
+        )
 
 
 def replay_controller(
@@ -140,16 +234,15 @@ def replay_controller(
     Raises
     ------
     ArtefactError
-        When the controller believes in another mechanism than the log.
+        When the controller believes in another mechanism than the log, or the log is damaged.
     """
+    _check_mechanism(recording, controller.cascade.mechanism)
+    with _legible(recording.path):
+        return _replayed(recording, controller, decisions=decisions)
+
+
+def _replayed(recording: Recording, controller: Controller, *, decisions: bool) -> Replay:
     mechanism = controller.cascade.mechanism
-    if recording.meta["fingerprint"] != mechanism.fingerprint:
-        raise ArtefactError(
-            f"log '{recording.path}'",
-            value=f"a run of {recording.meta['mechanism']} with other equations or numbers",
-            limit=f"the mechanism of the controller, {mechanism.name}",
-            remedy="Replay with the version of the library that wrote it",
-        )
     answers: dict[int, list[Answer]] = defaultdict(list)
     for row in recording.answers:
         answers[row["k"]].append(answer_from(row))
@@ -180,10 +273,21 @@ def replay_controller(
         if not _same_step(controller, row, columns):
             differing += 1
             first = k if first is None else first
-    then, now = recording.meta.get("versions", {}), build()
-    changed = {name: (then.get(name), now[name]) for name in now if then.get(name) != now[name]}
+    changed = _changes(recording.meta.get("versions", {}), build())
     u_all = np.array(outputs).reshape(len(outputs), mechanism.m)
     return Replay(recording, len(outputs), differing, first, judged, misjudged, gap, u_all, changed)
+
+
+def _changes(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[object, object]]:
+    """Return what is otherwise now; of the processor's features those that only one has."""
+    changed = {name: (then.get(name), now[name]) for name in now if then.get(name) != now[name]}
+    if "features" in changed and then.get("features") is not None:
+        before, after = (set(str(side).split()) for side in changed["features"])
+        changed["features"] = (
+            " ".join(sorted(before - after)) or None,
+            " ".join(sorted(after - before)) or None,
+        )
+    return changed
 
 
 def _measurement(row: FloatArray, columns: Columns) -> Measurement | None:

@@ -31,6 +31,15 @@ EDGES = (0.0, 50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, math.inf)
 _PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
 
 
+#: What a replay compares of the processor.
+PROCESSOR = ("processor", "target", "features")
+
+
+def _shown(text: str) -> str:
+    """Return what a log says as a terminal may show it: it may be anybody's."""
+    return escape("".join(c if c.isprintable() else "?" for c in text))
+
+
 def _micro(seconds: float) -> str:
     return f"{1e6 * seconds:,.0f}"
 
@@ -125,11 +134,11 @@ def replay_table(result: Replay) -> Table:
     """Return what came of a replay."""
     table = Table.grid(padding=(0, 2))
     recording = result.recording
-    table.add_row("log", f"{recording.path}: {recording.meta['mechanism']}")
+    table.add_row("log", _shown(f"{recording.path}: {recording.meta['mechanism']}"))
     stops = [(t, text) for _, t, kind, text in recording.events if kind == "state"]
     if stops and "SAFE_STOP" in stops[-1][1]:
         t, text = stops[-1]
-        table.add_row("stopped by", escape(f"{text.partition('SAFE_STOP: ')[2]}, at {t:.3f} s"))
+        table.add_row("stopped by", _shown(f"{text.partition('SAFE_STOP: ')[2]}, at {t:.3f} s"))
     else:
         table.add_row("stopped by", "nothing in the log: it was cut off")
     table.add_row("steps made again", f"{result.steps:,}")
@@ -147,7 +156,10 @@ def replay_table(result: Replay) -> Table:
     if result.gap is not None:
         table.add_row("gap", f"the log lost step {result.gap}: the replay ends there")
     for name, (then, now) in result.build.items():
-        table.add_row("another build", f"{name} {then} then, {now} now")
+        what = "another processor" if name in PROCESSOR else "another build"
+        table.add_row(what, _shown(f"{name} {then or 'unknown'} then, {now or 'none'} now"))
+    for remark in result.remarks:
+        table.add_row("mechanism", _shown(remark))
     return table
 
 

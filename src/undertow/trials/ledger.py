@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from undertow.errors import ArtefactError
+from undertow.files import parse_json, read_file
 from undertow.results import versions
 from undertow.trials.trial import Outcome, Result
 
@@ -19,6 +21,16 @@ __all__ = ["Ledger"]
 def _numbers(outcome: Outcome) -> Result:
     """Return what is kept of an outcome: all but its record."""
     return Result(**{field.name: getattr(outcome, field.name) for field in fields(Result)})
+
+
+#: Types of the numbers of a result.
+_KINDS: Mapping[str, tuple[type, ...]] = {
+    field.name: {"int": (int,), "bool": (bool,)}.get(str(field.type), (int, float))
+    for field in fields(Result)
+}
+
+#: Largest ledger that is read, bytes.
+LARGEST = 1 << 28
 
 
 class Ledger:
@@ -44,7 +56,9 @@ class Ledger:
             return
         head = {"settings": dict(settings), "versions": versions()}
         try:
-            text = path.read_text(encoding="utf-8") if path.exists() else ""
+            text = ""
+            if os.path.lexists(path):
+                text = read_file(path, "ledger", most=LARGEST).decode("utf-8")
             lines = text.splitlines()
             if text and not text.endswith("\n"):  # a run was killed while it wrote
                 with path.open("a", encoding="utf-8") as file:
@@ -52,7 +66,7 @@ class Ledger:
             if not lines:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(json.dumps(head) + "\n", encoding="utf-8")
-            elif json.loads(lines[0]) != head:
+            elif parse_json(lines[0]) != json.loads(json.dumps(head)):
                 raise ArtefactError(
                     f"ledger '{path}'",
                     value="runs of other versions or settings",
@@ -61,7 +75,9 @@ class Ledger:
                 )
             for line in lines[1:]:
                 self._take(line)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except ArtefactError:
+            raise
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ArtefactError(
                 f"ledger '{path}'",
                 value=f"{type(error).__name__}: {error}",
@@ -71,12 +87,16 @@ class Ledger:
 
     def _take(self, line: str) -> None:
         try:
-            name, what, value, numbers = json.loads(line)
+            entry = parse_json(line)
         except ValueError:  # the last line of a run that was killed
             return
-        numbers = {k: math.inf if v is None else v for k, v in numbers.items()}
-        result = Result(**numbers)
-        self._known[name, what, value, result.seed] = result
+        name, what, value, numbers = entry
+        kept: dict[str, Any] = {k: math.inf if v is None else v for k, v in numbers.items()}
+        result = Result(**kept)
+        whole = all(type(getattr(result, key)) in kinds for key, kinds in _KINDS.items())
+        if not (isinstance(name, str) and isinstance(what, str) and whole):
+            raise ValueError(f"a line that is no result: {line[:80]}")
+        self._known[name, what, float(value), result.seed] = result
 
     def find(self, name: str, what: str, value: float, seed: int) -> Result | None:
         """Return the result of a run that was made already."""
