@@ -13,6 +13,7 @@ __all__ = [
     "InvalidInputError",
     "MissingExtraError",
     "ModelError",
+    "ResourceError",
     "SingularSurfaceError",
     "UndertowError",
     "UnstableSurfaceError",
@@ -80,3 +81,7 @@ class MissingExtraError(UndertowError, ImportError):
 
 class ArtefactError(UndertowError, OSError):
     """A file or folder could not be read or written."""
+
+
+class ResourceError(UndertowError, OSError):
+    """The system refuses memory, a thread, a process, a descriptor or room on its disk."""

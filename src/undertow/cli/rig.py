@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -301,6 +301,8 @@ def replay(
         "undertow drill",
         "undertow drill --no-live --seed 3",
         "undertow drill --kills 50 --seed 1",
+        "undertow drill --systematic",
+        "undertow drill --only write:17:always:ideal",
     )
 )
 @reports_errors
@@ -312,6 +314,20 @@ def drill(
         int | None,
         typer.Option(help="Instead: kill -9 so many runs at random moments, and replay.", min=1),
     ] = None,
+    systematic: Annotated[
+        bool,
+        typer.Option(
+            "--systematic",
+            help="Instead: the n-th call of every kind fails, once and from then on, for every n.",
+        ),
+    ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Instead: these systematic faults alone. Repeatable.",
+            metavar="OPERATION:N:once|always:RIG",
+        ),
+    ] = None,
     seed: Seed = 0,
 ) -> None:
     """Put faults into runs on the realistic rig, one at a time, and say what happened."""
@@ -320,6 +336,9 @@ def drill(
     from undertow.runtime.drill_live import kill_drill, live_drill
 
     console = terminal()
+    if systematic or only:
+        _systematic(only or (), seed)
+        return
     if kills is not None:
         with progress_bar() as progress:
             killed = kill_drill(kills, seed=seed, progress=progress)
@@ -339,4 +358,27 @@ def drill(
     passed = [*(o.passed for o in outcomes), *(o.passed for o in lived)]
     say(console, f"{sum(passed)} of {len(passed)} as they should be, seed {seed}")
     if not all(passed):
+        raise typer.Exit(1)
+
+
+def _systematic(only: Sequence[str], seed: int) -> None:
+    """Run systematic faults, all of them or those that are named."""
+    from undertow.runtime import tables
+    from undertow.runtime.failing import Fault, intercepts_sqlite
+    from undertow.runtime.systematic import Systematic
+
+    faults = [Fault.parse(text) for text in only]
+    console = terminal()
+    with progress_bar() as progress:
+        progress("a run without a fault", 0.0)
+        cases = Systematic(seed).drill(faults or None, progress)
+    console.print(tables.systematic_table(cases))
+    if not intercepts_sqlite():
+        say(console, "The library of SQLite is out of reach: its own calls were left alone")
+    if faults:
+        for case in cases:
+            say(console, f"{case.fault}: {case.happened}, after {case.steps:,} steps")
+    passed = sum(case.passed for case in cases)
+    say(console, f"{passed:,} of {len(cases):,} cases as they should be, seed {seed}")
+    if passed < len(cases):
         raise typer.Exit(1)

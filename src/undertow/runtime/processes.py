@@ -1,22 +1,76 @@
-"""Processes of our own: forked, so that they begin with everything compiled."""
+"""Processes and threads of our own, and whether the system has what a run needs.
+
+Processes are forked, so that they begin with everything compiled.  What the system refuses
+(memory, threads, processes, descriptors, disk) is a :class:`undertow.errors.ResourceError`.
+"""
 
 from __future__ import annotations
 
+import _thread
 import contextlib
+import errno
+import mmap
 import multiprocessing
 import os
+import shutil
 import signal
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from undertow.errors import InvalidInputError
+from undertow.errors import InvalidInputError, ResourceError
 
 if TYPE_CHECKING:  # not on Windows
     from multiprocessing.context import ForkProcess
 
-__all__ = ["fork", "pipe", "withdraw"]
+__all__ = [
+    "STOPPING",
+    "Background",
+    "check_resources",
+    "fork",
+    "pipe",
+    "refused_by_the_system",
+    "withdraw",
+]
+
+#: Signals that ask for a safe stop, where the system has them.
+STOPPING = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP", "SIGQUIT")
+    if hasattr(signal, name)
+)
+
+#: The longest that a thread may take to begin, s.
+PATIENCE = 5.0
+
+#: Memory that a run needs besides what its process has when it begins, bytes: for itself, and
+#: for each process that it forks, which shares what neither of them changes.
+MEMORY, MEMORY_EACH = 128 << 20, 48 << 20
+
+#: Descriptors that a run needs: for itself, and for each process that it forks.
+FILES, FILES_EACH = 16, 8
+
+#: What a log needs of its disk, bytes: a run of a minute.
+DISK = 32 << 20
+
+#: What the system says when it has not enough of something.
+_SHORT = {
+    errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM, errno.ENOSPC, errno.EFBIG,
+    getattr(errno, "EDQUOT", errno.ENOSPC),
+}  # fmt: skip
+
+
+def _limit(name: str, option: str) -> str:
+    """Return what the system allows, in words: ``at most 100 (ulimit -u)``."""
+    with contextlib.suppress(ImportError, AttributeError, OSError, ValueError):
+        import resource
+
+        soft, _ = resource.getrlimit(getattr(resource, name))
+        if soft != resource.RLIM_INFINITY:
+            return f"at most {soft:,} (ulimit {option})"
+    return f"no limit of this process (ulimit {option}), so it is the system's own"
 
 
 def fork(
@@ -32,6 +86,8 @@ def fork(
     ------
     InvalidInputError
         On a system that cannot copy a process.
+    ResourceError
+        When the system has no process more, or no memory for it.
     """
     if not hasattr(os, "fork"):
         raise InvalidInputError(
@@ -45,21 +101,217 @@ def fork(
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        process.start()
+        try:
+            process.start()
+        except (OSError, MemoryError) as error:
+            raise ResourceError(
+                f"process '{name}'",
+                value=_said(error),
+                limit=f"a process more, {_limit('RLIMIT_NPROC', '-u')}",
+                remedy="End other processes of this user, raise the limit, or run the optimiser "
+                "in a thread: --worker thread",
+            ) from error
     return process
 
 
 def pipe() -> tuple[Connection, Connection]:
-    """Return the two ends of a pipe."""
-    return multiprocessing.get_context("fork").Pipe()
+    """Return the two ends of a pipe.
+
+    Raises
+    ------
+    ResourceError
+        When this process may have no more files open.
+    """
+    try:
+        return multiprocessing.get_context("fork").Pipe()
+    except OSError as error:
+        raise _no_files(error) from error
 
 
 def withdraw() -> None:
-    """Leave this process to its own: what a terminal sends is for the one that controls.
+    """Leave this process to its own: what asks for a stop is for the one that controls.
 
     Ctrl-C, Ctrl-Z and a lost connection reach every process of a session: a keeper that is
     stopped or ended with its controller keeps nothing.
     """
     with contextlib.suppress(OSError):
         os.setsid()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_IGN)
+
+
+class Background:
+    """A thread that has begun when it is made, or is refused within a stated time.
+
+    :meth:`threading.Thread.start` waits without end for a thread that the system made but had
+    no memory to begin with.
+
+    Parameters
+    ----------
+    target
+        What it does; the process does not wait for it when it ends.
+    name
+        Of the thread, for messages.
+
+    Raises
+    ------
+    ResourceError
+        When it does not begin.
+    """
+
+    def __init__(self, target: Callable[[], None], name: str) -> None:
+        self.target, self.name = target, name
+        self._begun, self._over = _thread.allocate_lock(), _thread.allocate_lock()
+        self._begun.acquire()
+        self._over.acquire()
+        try:
+            _thread.start_new_thread(self._run, ())
+        except (RuntimeError, MemoryError) as error:
+            raise self._refused(_said(error)) from error
+        if not self._begun.acquire(timeout=PATIENCE):
+            raise self._refused(f"it has not begun after {PATIENCE:g} s")
+
+    def _run(self) -> None:
+        self._begun.release()
+        try:
+            self.target()
+        finally:
+            self._over.release()
+
+    def _refused(self, value: str) -> ResourceError:
+        return ResourceError(
+            f"thread '{self.name}'",
+            value=value,
+            limit=f"a thread more: memory for its stack (ulimit -v); of threads and processes "
+            f"{_limit('RLIMIT_NPROC', '-u')}",
+            remedy="End other programs of this user, or raise the limit",
+        )
+
+    def join(self, timeout: float) -> bool:
+        """Wait for its end, s; whether it has come."""
+        if not self._over.acquire(timeout=timeout):
+            return False
+        self._over.release()
+        return True
+
+
+def check_resources(*, processes: int, folder: Path | None = None) -> None:
+    """See that the system has what a run needs, before anything of a rig is touched.
+
+    Parameters
+    ----------
+    processes
+        That the run will fork.
+    folder
+        Of its log.
+
+    Raises
+    ------
+    ResourceError
+        When it has not.
+    """
+    _check_memory(MEMORY + processes * MEMORY_EACH)
+    _check_files(FILES + processes * FILES_EACH)
+    if folder is not None:
+        _check_disk(folder)
+
+
+def _check_memory(need: int) -> None:
+    free = _available()
+    try:
+        with contextlib.closing(mmap.mmap(-1, need)):  # address space, not touched
+            pass
+    except (OSError, ValueError) as error:
+        limit, what = _limit("RLIMIT_AS", "-v"), _said(error)
+    else:
+        if free >= need:
+            return
+        limit, what = "what the machine or its container has", f"{free / 2**20:,.0f} MiB free"
+    raise ResourceError(
+        "memory for a run",
+        value=what,
+        limit=f"{need / 2**20:,.0f} MiB free; {limit}",
+        remedy="End other programs, raise the limit, or fork no processes: --worker thread",
+    )
+
+
+def _available() -> float:
+    """Return how much memory the machine or its container can give, bytes; inf if unknown."""
+    free = float("inf")
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        text = Path("/proc/meminfo").read_text(encoding="ascii")
+        free = 1024.0 * int(text.split("MemAvailable:")[1].split()[0])
+    with contextlib.suppress(OSError, ValueError):
+        group = Path("/sys/fs/cgroup")
+        most, used = ((group / f"memory.{name}").read_text("ascii") for name in ("max", "current"))
+        kept = (group / "memory.stat").read_text("ascii").split("inactive_file ")[1].split()[0]
+        free = min(free, float(int(most) - int(used) + int(kept)))
+    return free
+
+
+def _check_files(need: int) -> None:
+    opened: list[int] = []
+    try:
+        opened.append(os.open(os.devnull, os.O_RDONLY))
+        opened.extend(os.dup(opened[0]) for _ in range(need - 1))
+    except OSError as error:
+        raise _no_files(error, need) from error
+    finally:
+        for number in opened:
+            os.close(number)
+
+
+def _no_files(error: OSError, need: int = 2) -> ResourceError:
+    return ResourceError(
+        "open files of this process",
+        value=_said(error),
+        limit=f"{need} more; {_limit('RLIMIT_NOFILE', '-n')}",
+        remedy="Raise the limit: ulimit -n 1024",
+    )
+
+
+def _check_disk(folder: Path) -> None:
+    while not folder.exists():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free
+    largest = float("inf")
+    with contextlib.suppress(ImportError, AttributeError):
+        import resource
+
+        soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+        largest = largest if soft == resource.RLIM_INFINITY else soft
+    if min(free, largest) < DISK:
+        what = "free" if free < largest else "for a file (ulimit -f)"
+        raise ResourceError(
+            f"disk of the log, '{folder}'",
+            value=f"{min(free, largest) / 2**20:,.1f} MiB {what}",
+            limit=f"{DISK / 2**20:g} MiB, what a run of a minute writes",
+            remedy="Make room, or name a log elsewhere with --log",
+        )
+
+
+@contextlib.contextmanager
+def refused_by_the_system(what: str) -> Iterator[None]:
+    """Say of what the system refuses for lack of something what it was for.
+
+    Raises
+    ------
+    ResourceError
+        In the place of a MemoryError, and of an OSError for lack of memory, processes,
+        descriptors or disk.
+    """
+    try:
+        yield
+    except (MemoryError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in _SHORT:
+            raise
+        raise ResourceError(
+            what,
+            value=_said(error),
+            limit="what the system gives: ulimit -a, free -m, df",
+            remedy="End other programs, or raise the limit",
+        ) from error
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -8,12 +8,14 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any, Self
 
 from undertow.cascade import CascadeState
 from undertow.rig.interface import Rig
 from undertow.runtime.clock import SimulatedClock, WallClock
 from undertow.runtime.log import Columns, Log, check_log
 from undertow.runtime.loop import Runtime
+from undertow.runtime.processes import STOPPING, check_resources, refused_by_the_system
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
 from undertow.runtime.slow import (
@@ -24,13 +26,6 @@ from undertow.runtime.slow import (
 )
 
 __all__ = ["session", "warm_up"]
-
-#: Signals that ask for a safe stop, where the system has them.
-STOPPING = tuple(
-    getattr(signal, name)
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP", "SIGQUIT")
-    if hasattr(signal, name)
-)
 
 
 @contextlib.contextmanager
@@ -74,12 +69,37 @@ def session(
         When the first optimisation finds no admissible surface.
     ArtefactError
         When the log cannot be written.
+    ResourceError
+        When the system has not enough memory, threads, processes, descriptors or disk.
+    KeyboardInterrupt
+        When a stop is asked for, by whatever signal, before it is ready.
     """
+    with contextlib.ExitStack() as stack:
+        operator = stack.enter_context(_Operator())  # until the log and all else is closed
+        with operator.preparing(), refused_by_the_system("a session"):
+            runtime = _prepared(recipe, stack, log, simulated, processes, rig, shadow, progress)
+            operator.runtime = runtime
+        yield runtime
+
+
+def _prepared(
+    recipe: Recipe,
+    stack: contextlib.ExitStack,
+    log: Path | None,
+    simulated: bool,
+    processes: int,
+    rig: Rig | None,
+    shadow: bool,
+    progress: Callable[[str, float], None] | None,
+) -> Runtime:
+    """Make a runtime ready; what is to be closed goes on the stack."""
 
     def tell(what: str, fraction: float) -> None:
         if progress is not None:
             progress(what, fraction)
 
+    folder = None if log is None else log.parent
+    check_resources(processes=0 if simulated else processes, folder=folder)
     if log is not None:
         check_log(log)  # before the first optimum, which takes a while
     compute = recipe.respond
@@ -89,23 +109,21 @@ def session(
     tell("warming up", 0.6)
     warm_up(recipe, memory, compute)
     controller = recipe.make_controller(memory)
-    with contextlib.ExitStack() as stack:
-        # First the processes are forked, then threads begin.
-        worker: Worker = InlineWorker(compute)
-        if not simulated:
-            worker = background_worker(compute, processes=processes)
-        stack.callback(worker.close)
-        book = None
-        if log is not None:
-            meta = about(controller, recipe, simulated=simulated)
-            columns = Columns.of(recipe.belief)
-            book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
-        clock = SimulatedClock() if simulated else WallClock()
-        double = recipe.make_controller(memory) if shadow and not simulated else None
-        runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=double)
-        stack.enter_context(_operator(runtime))
-        tell("ready", 1.0)
-        yield runtime
+    # First the processes are forked, then threads begin.
+    worker: Worker = InlineWorker(compute)
+    if not simulated:
+        worker = background_worker(compute, processes=processes)
+    stack.callback(worker.close)
+    book = None
+    if log is not None:
+        meta = about(controller, recipe, simulated=simulated)
+        columns = Columns.of(recipe.belief)
+        book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
+    clock = SimulatedClock() if simulated else WallClock()
+    double = recipe.make_controller(memory) if shadow and not simulated else None
+    runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=double)
+    tell("ready", 1.0)
+    return runtime
 
 
 def warm_up(recipe: Recipe, memory: CascadeState, compute: Compute) -> None:
@@ -117,26 +135,44 @@ def warm_up(recipe: Recipe, memory: CascadeState, compute: Compute) -> None:
     runtime.run(min(recipe.settings.settle + 1.2 * lead, 1.0))
 
 
-@contextlib.contextmanager
-def _operator(runtime: Runtime) -> Iterator[None]:
-    """Let Ctrl-C, a polite kill and a lost terminal ask for a safe stop; and Ctrl-Z.
+class _Operator:
+    """Lets Ctrl-C, a polite kill and a lost terminal ask for a safe stop; and Ctrl-Z.
 
-    A process that is suspended leaves its output on.
+    A process that is suspended leaves its output on.  While a session is prepared it is given
+    up; from then on, until everything is closed, the run is asked to stop, and nothing else is
+    interrupted.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        runtime.stop()
+    def __init__(self) -> None:
+        self.runtime: Runtime | None = None
+        self._asked, self._preparing = False, False
+        self._before: dict[int, Any] = {}
 
-    before = {
-        number: signal.signal(number, stop)
-        for number in STOPPING
-        if signal.getsignal(number) is not signal.SIG_IGN  # `nohup` wants it so
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            for number in STOPPING:
+                if signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` wants it so
+                    self._before[number] = signal.signal(number, self._stop)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    @contextlib.contextmanager
+    def preparing(self) -> Iterator[None]:
+        """Give up what is being prepared when a stop is asked for."""
+        self._preparing = True
+        try:
+            yield
+        finally:
+            self._preparing = False
+        if self._asked:  # something that cannot be interrupted had kept it to itself
+            raise KeyboardInterrupt
+
+    def _stop(self, _signal: int, _frame: FrameType | None) -> None:
+        self._asked = True
+        if self.runtime is not None:
+            self.runtime.stop()
+        if self._preparing:
+            raise KeyboardInterrupt

@@ -12,7 +12,6 @@ import ctypes
 import math
 import os
 import signal
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -24,11 +23,12 @@ from typing import Protocol, TypeGuard
 import numpy as np
 
 from undertow.cascade import Admission, Cascade, CascadeState
+from undertow.errors import ResourceError
 from undertow.inner_loop import lane
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
 from undertow.proposal import Proposal
-from undertow.runtime.processes import fork, pipe, withdraw
+from undertow.runtime.processes import Background, fork, pipe, withdraw
 from undertow.sliding import SlidingModeLaw
 from undertow.swing_up import SwingUpAndCatch
 
@@ -274,17 +274,16 @@ class InlineWorker:
         """Nothing to stop."""
 
 
-class _Courier(threading.Thread):
-    """Carries requests to a computation and answers back, away from the fast loop."""
+class _Courier:
+    """Carries requests to a computation and answers back, in a thread beside the fast loop."""
 
     def __init__(self, compute: Compute) -> None:
-        super().__init__(name="undertow slow loop", daemon=True)
         self.compute = compute
         self.requests: SimpleQueue[Request | None] = SimpleQueue()
         self.answers: deque[Answer] = deque()
-        self.start()
+        self.thread = Background(self._carry, "undertow slow loop")
 
-    def run(self) -> None:
+    def _carry(self) -> None:
         while (request := self.requests.get()) is not None:
             try:
                 self.answers.append(self.compute(request))
@@ -293,11 +292,21 @@ class _Courier(threading.Thread):
 
 
 class BackgroundWorker:
-    """Computes in another thread, which may in turn wait for another process."""
+    """Computes in other threads, which may in turn wait for other processes.
+
+    Every computer has its thread from the beginning: a run that needs the next one asks the
+    system for nothing.
+    """
 
     def __init__(self, computers: list[_Computer]) -> None:
         self.computers = computers
-        self.courier = _Courier(computers[0].compute)
+        self.couriers: list[_Courier] = []
+        try:
+            for computer in computers:
+                self.couriers.append(_Courier(computer.compute))
+        except ResourceError:
+            self.close()
+            raise
 
     @property
     def processes(self) -> list[int]:
@@ -306,26 +315,27 @@ class BackgroundWorker:
 
     def ask(self, request: Request) -> None:
         """Hand the request over; costs some microseconds."""
-        self.courier.requests.put(request)
+        self.couriers[0].requests.put(request)
 
     def take(self, t: float) -> Answer | None:
         """Return an answer that has arrived."""
-        return self.courier.answers.popleft() if self.courier.answers else None
+        answers = self.couriers[0].answers
+        return answers.popleft() if answers else None
 
     def replace(self) -> bool:
         """End the present computation and let the next computer take over."""
         if len(self.computers) < 2:
             return False
         self.computers.pop(0).close()
-        self.courier.requests.put(None)
-        self.courier = _Courier(self.computers[0].compute)
+        self.couriers.pop(0).requests.put(None)
         return True
 
     def close(self) -> None:
         """End all computers."""
         for computer in self.computers:
             computer.close()
-        self.courier.requests.put(None)
+        for courier in self.couriers:
+            courier.requests.put(None)
 
 
 class _Computer:
@@ -343,8 +353,13 @@ class _Child(_Computer):
 
     def __init__(self, compute: Compute) -> None:
         self.pipe, theirs = pipe()
-        self.process = fork(_serve, (compute, theirs, self.pipe), "undertow slow loop")
-        theirs.close()
+        try:
+            self.process = fork(_serve, (compute, theirs, self.pipe), "undertow slow loop")
+        except ResourceError:
+            self.pipe.close()
+            raise
+        finally:
+            theirs.close()
         super().__init__(self._exchange)
 
     def _exchange(self, request: Request) -> Answer:
@@ -381,7 +396,19 @@ def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWork
     processes
         Processes to fork now, while the fast loop does not run yet: one to compute, the
         rest to take over from one that hangs or dies.  0: a thread of this process.
+
+    Raises
+    ------
+    ResourceError
+        When the system has no process or thread more.
     """
-    if processes < 1 or not hasattr(os, "fork"):
-        return BackgroundWorker([_Computer(compute) for _ in range(max(1, processes))])
-    return BackgroundWorker([_Child(compute) for _ in range(processes)])
+    forked = processes >= 1 and hasattr(os, "fork")
+    computers: list[_Computer] = []
+    try:
+        for _ in range(max(1, processes)):
+            computers.append(_Child(compute) if forked else _Computer(compute))
+    except ResourceError:
+        for computer in computers:
+            computer.close()
+        raise
+    return BackgroundWorker(computers)

@@ -17,11 +17,13 @@ from rich.text import Text
 from undertow.runtime.clock import Histogram
 from undertow.runtime.drill import Outcome
 from undertow.runtime.drill_live import Killed, LiveOutcome
+from undertow.runtime.failing import OPERATIONS
 from undertow.runtime.loop import Report
 from undertow.runtime.modes import Mode
 from undertow.runtime.replay import Replay
+from undertow.runtime.systematic import RIGS, Case
 
-__all__ = ["drill_table", "kill_table", "replay_table", "run_table"]
+__all__ = ["drill_table", "kill_table", "replay_table", "run_table", "systematic_table"]
 
 #: Edges of the histogram of response times, s.
 EDGES = (0.0, 50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, math.inf)
@@ -227,6 +229,26 @@ def kill_table(killed: Sequence[Killed]) -> Group:
         for reason, count in reasons.most_common()
     ]
     return Group(table, *lines)
+
+
+def systematic_table(cases: Sequence[Case]) -> Group:
+    """Return how many systematic faults passed, by operation and rig, and which did not."""
+    table = Table("what fails", *RIGS, "cases", "passed", "", **_PLAIN)
+    for column in table.columns[1:-1]:
+        column.justify = "right"
+    for operation in OPERATIONS:
+        here = [case for case in cases if case.fault.operation == operation]
+        if not here:
+            continue
+        by_rig = [sum(case.fault.rig == rig for case in here) for rig in RIGS]
+        passed = sum(case.passed for case in here)
+        counts = [f"{n:,}" for n in (*by_rig, len(here), passed)]
+        table.add_row(operation, *counts, _mark(passed == len(here)))
+    failed = Table.grid(padding=(0, 2))
+    for case in cases:
+        if not case.passed:
+            failed.add_row(str(case.fault), escape("; ".join(case.wrong)), escape(case.happened))
+    return Group(table, failed)
 
 
 def _indented(text: str) -> Padding:

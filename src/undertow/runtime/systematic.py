@@ -1,0 +1,468 @@
+"""Systematic faults: the n-th call of every kind fails, once or from then on, for every n.
+
+A run without a fault counts how often a short run makes each call.  Then every case is a run of
+its own, and judged: what the device accepted last is zero, or the verdict says that it did not
+accept it; the log opens, and its replay is identical.
+
+The rigs are the ideal one and the realistic one; and the realistic one kept by a process of its
+own (:mod:`undertow.runtime.keeper`).  What happens at every step fails in simulated time;
+forks, threads, files and syncs fail in a session against the clock, and so does all that
+concerns the log where the rig is kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import mmap
+import multiprocessing
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+
+from undertow.cascade import CascadeState
+from undertow.errors import InvalidInputError, UndertowError
+from undertow.mechanism import FloatArray
+from undertow.rig.interface import Measurement, Rig
+from undertow.runtime import keeper
+from undertow.runtime import log as logs
+from undertow.runtime.clock import SimulatedClock
+from undertow.runtime.drill import drill_recipe
+from undertow.runtime.failing import OPERATIONS, Fault, Tally, failing
+from undertow.runtime.faults import Witness
+from undertow.runtime.keeper import KeptRig
+from undertow.runtime.log import Columns, Log, read_log
+from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.recipe import Recipe
+from undertow.runtime.replay import about, replay_controller
+from undertow.runtime.session import session
+from undertow.runtime.slow import Answer, InlineWorker, Request
+
+__all__ = ["LIVE", "RIGS", "Case", "Device", "Systematic", "chosen"]
+
+#: The rigs; the last one is kept by a process of its own.
+RIGS = ("ideal", "realistic", "kept")
+
+#: What fails in a session against the clock, on all rigs and on the kept one besides.
+LIVE, LIVE_KEPT = ("fork", "thread", "open", "fsync"), ("insert", "disk")
+
+#: Length of a run, s: in simulated time, and against the clock.
+SECONDS, LIVE_SECONDS = 0.35, 0.25
+
+#: The longest that a case may take, s.
+PATIENCE = 20.0
+
+#: How long a keeper asks a rig again to take zero, s, and how long it waits for its controller.
+_INSISTENCE, _SILENCE = 0.02, 5.0
+
+#: Rows of a transaction in simulated time: few, so that there are many.
+_BATCH = 8
+
+#: Of the calls of a kind that fail: the first, the last, and spread between.
+FIRST, LAST, BETWEEN = 200, 50, 50
+
+
+def is_live(operation: str, rig: str) -> bool:
+    """Whether a fault comes in a session against the clock, not in simulated time."""
+    return operation in LIVE or (rig == "kept" and operation in LIVE_KEPT)
+
+
+def chosen(count: int) -> tuple[int, ...]:
+    """Return which of ``count`` calls fail in turn: all, or the first, the last, some between."""
+    if count <= FIRST + LAST + BETWEEN:
+        return tuple(range(1, count + 1))
+    between = np.linspace(FIRST, count - LAST + 1, BETWEEN + 2)[1:-1]
+    picked = {*range(1, FIRST + 1), *between.round().astype(int).tolist()}
+    return tuple(sorted(picked | set(range(count - LAST + 1, count + 1))))
+
+
+class Device:
+    """A rig that remembers what it accepted, in memory that forked processes share, and fails.
+
+    Parameters
+    ----------
+    make
+        Makes the rig, in the process where it is first used.
+    period
+        Of the rig, s.
+    m
+        Number of inputs.
+    tally
+        Counts the calls, and says which of them fail.
+
+    Attributes
+    ----------
+    last
+        What was accepted last, (m,).
+    """
+
+    def __init__(self, make: Callable[[], Rig], period: float, m: int, tally: Tally) -> None:
+        self.make, self.period, self.tally = make, period, tally
+        self._rig: Rig | None = None
+        self._shared = np.frombuffer(mmap.mmap(-1, 8 * (m + 1)), dtype=float)
+        self.last = self._shared[:m]
+
+    @property
+    def driven(self) -> bool:
+        """Whether an output other than zero was ever accepted."""
+        return bool(self._shared[-1])
+
+    @property
+    def rig(self) -> Rig:
+        """The rig itself."""
+        if self._rig is None:
+            self._rig = self.make()
+        return self._rig
+
+    def read(self) -> Measurement:
+        """Return the measurement, or fail."""
+        self.tally.check("read")
+        return self.rig.read()
+
+    def write(self, u: FloatArray) -> None:
+        """Accept the output; fail before, or after it."""
+        taken = self.tally.due("write-taken")
+        self.tally.check("write")
+        self.rig.write(u)
+        self.last[:] = u
+        self._shared[-1] += float(u.any())
+        if taken:
+            message = "no confirmation"
+            raise OSError(message)
+
+    def close(self) -> None:
+        """Let go of the rig; fail before, or after it."""
+        taken = self.tally.due("close-taken")
+        self.tally.check("close")
+        self.rig.close()
+        if taken:
+            message = "no confirmation"
+            raise OSError(message)
+
+
+class _InStep:
+    """A kept rig whose controller waits for its answers: simulated time has no other pace."""
+
+    def __init__(self, kept: KeptRig) -> None:
+        self.kept, self.period = kept, kept.period
+
+    def read(self) -> Measurement:
+        deadline = time.monotonic() + _SILENCE
+        while True:
+            try:
+                return self.kept.read()
+            except TimeoutError:
+                if time.monotonic() > deadline:
+                    raise
+
+    def write(self, u: FloatArray) -> None:
+        self.kept.write(u)
+
+    def close(self) -> None:
+        self.kept.close()
+
+
+@dataclass(frozen=True)
+class Case:
+    """What came of one fault.
+
+    Attributes
+    ----------
+    fault
+        The fault.
+    wrong
+        What is not as it should be, in words; empty when all is.
+    happened
+        What happened, in words.
+    steps
+        Steps of the run.
+    """
+
+    fault: Fault
+    wrong: tuple[str, ...]
+    happened: str
+    steps: int = 0
+
+    @property
+    def passed(self) -> bool:
+        """Whether all is as it should be."""
+        return not self.wrong
+
+
+@dataclass
+class _Run:
+    """One run: what was seen of it."""
+
+    device: Device
+    log: Path
+    threads: int = field(default_factory=lambda: len(sys._current_frames()))
+    refused: str = ""
+    report: Report | None = None
+    log_failure: str = ""
+    unsound: list[str] = field(default_factory=list)
+
+
+class Systematic:
+    """Runs with one fault each, on two rigs; what they share is computed once.
+
+    Parameters
+    ----------
+    seed
+        Of the rig and of the optimiser.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        short = replace(drill_recipe(seed), evaluations=32, horizon=10.0)
+        ideal, kept = replace(short, rig="ideal"), replace(short)
+        self.recipes: dict[str, Recipe] = {"ideal": ideal, "realistic": short, "kept": kept}
+        self.memory: CascadeState = self.recipes[RIGS[0]].first()
+        self._answers: dict[tuple[str, bytes, float, int], Answer] = {}
+        for rig, recipe in self.recipes.items():
+            recipe.rehearse(self.memory)
+            vars(recipe)["first"] = lambda: self.memory  # a session finds it done
+            vars(recipe)["rehearse"] = lambda memory: None
+            self.run(Fault("read", 1, False, rig))
+        self.counts: dict[str, dict[str, int]] = {}
+
+    def count(self) -> dict[str, dict[str, int]]:
+        """Return how often a run without a fault makes each call: rig, then operation."""
+        if not self.counts:
+            for rig in RIGS:
+                self.counts[rig] = {}
+                for live in (False, True):
+                    tally = Tally()
+                    with tempfile.TemporaryDirectory() as folder:
+                        self._made(rig, tally, Path(folder) / "log.db", live=live)
+                    for operation, n in zip(OPERATIONS, tally.counts.tolist(), strict=True):
+                        if is_live(operation, rig) == live:
+                            self.counts[rig][operation] = n
+        return self.counts
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return every fault, the quick ones first."""
+        counts = self.count()
+        return tuple(
+            Fault(operation, n, always, rig)
+            for live in (False, True)
+            for operation in OPERATIONS
+            for rig in RIGS
+            if is_live(operation, rig) == live
+            for n in chosen(counts[rig][operation])
+            for always in (False, True)
+        )
+
+    def run(self, fault: Fault) -> Case:
+        """Make one run with a fault, and judge it.
+
+        Raises
+        ------
+        InvalidInputError
+            For a rig that there is none of.
+        """
+        if fault.rig not in RIGS:
+            raise InvalidInputError("rig of a fault", value=fault.rig, limit=" or ".join(RIGS))
+        tally = Tally(fault)
+        with tempfile.TemporaryDirectory() as folder:
+            log = Path(folder) / "log.db"
+            try:
+                with _patience():
+                    run = self._made(
+                        fault.rig, tally, log, live=is_live(fault.operation, fault.rig)
+                    )
+            except _StillGoing:
+                _end_children()
+                return Case(fault, (f"still going after {PATIENCE:g} s",), "it hung")
+            except Exception as error:  # whatever came through is a finding
+                _end_children()
+                return Case(fault, (f"{type(error).__name__}: {error}",), "it raised")
+            return self._judged(fault, tally, run)
+
+    def drill(
+        self,
+        faults: Sequence[Fault] | None = None,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> tuple[Case, ...]:
+        """Run faults, all by default, in turn.
+
+        Parameters
+        ----------
+        faults
+            Which.
+        progress
+            Called with (what, fraction) before each.
+        """
+        cases = []
+        faults = self.faults() if faults is None else faults
+        for number, fault in enumerate(faults):
+            if progress is not None:
+                progress(f"{fault.operation}, {fault.rig} rig", number / len(faults))
+            cases.append(self.run(fault))
+        return tuple(cases)
+
+    # -- one run -----------------------------------------------------------------------------
+
+    def _made(self, rig: str, tally: Tally, log: Path, *, live: bool) -> _Run:
+        recipe = self.recipes[rig]
+        device = Device(recipe.make_rig, recipe.period, recipe.belief.m, tally)
+        run = _Run(device, log)
+        gc.collect(1)  # what earlier runs left open is not this one's
+        with _shortened(), failing(tally):
+            try:
+                (self._against_the_clock if live else self._simulated)(rig, run)
+            except UndertowError as error:
+                run.refused = str(error)
+        return run
+
+    def _simulated(self, name: str, run: _Run) -> None:
+        """Run in simulated time, as the drill does."""
+        recipe = self.recipes[name]
+        controller = recipe.make_controller(self.memory)
+        rig = self._rig(name, run.device, in_step=True)
+        witness = Witness(rig, controller.limits, controller.slew)
+        worker = InlineWorker(lambda request: self._answered(recipe, request))
+        meta = about(controller, recipe)
+        try:
+            book = Log(run.log, Columns.of(recipe.belief), meta, threaded=False)
+        except UndertowError:
+            rig.close()
+            raise
+        with book:
+            runtime = Runtime(controller, witness, worker, clock=SimulatedClock(), log=book)
+            run.report = runtime.run(SECONDS)
+        run.log_failure, run.unsound = book.failure, witness.faults
+
+    def _against_the_clock(self, name: str, run: _Run) -> None:
+        """Run a session as ``undertow run`` does."""
+        recipe = self.recipes[name]
+        rig = self._rig(name, run.device, in_step=False)
+        try:
+            with session(recipe, rig=rig, log=run.log, processes=2) as runtime:
+                run.report = runtime.run(LIVE_SECONDS)
+        finally:
+            with contextlib.suppress(Exception):
+                rig.close()
+        assert runtime.log is not None
+        run.log_failure = runtime.log.failure
+
+    def _rig(self, name: str, device: Device, *, in_step: bool) -> Rig:
+        if name != "kept":
+            return device
+        recipe = self.recipes[name]
+        limits = recipe.settings.limits(recipe.belief)
+        slew = recipe.settings.slew(recipe.belief) * recipe.period
+        if not in_step:
+            return KeptRig(lambda: device, recipe.period, limits, slew)
+        return _InStep(KeptRig(lambda: device, recipe.period, limits, slew, silence=_SILENCE))
+
+    def _answered(self, recipe: Recipe, request: Request) -> Answer:
+        """Answer a request; one that was made in an earlier run has the answer that it had."""
+        key = recipe.rig, request.x.tobytes(), request.use, request.sequence
+        if key not in self._answers:
+            self._answers[key] = recipe.respond(request)
+        return self._answers[key]
+
+    # -- and its judgement -------------------------------------------------------------------
+
+    def _judged(self, fault: Fault, tally: Tally, run: _Run) -> Case:
+        """Say what is wrong with a run, if anything."""
+        wrong = list(run.unsound)
+        device, report = run.device, run.report
+        if report is None:
+            if device.driven or device.last.any():
+                wrong.append(f"refused, with the output at {device.last.tolist()}")
+        else:
+            if device.last.any() and not _told(report):
+                wrong.append(f"the output stays at {device.last.tolist()}, and nothing says so")
+            wrong += self._log_faults(fault.rig, run)
+        wrong += _left_behind(run.threads)
+        if report is None:
+            happened = f"refused: {run.refused}"
+        else:
+            happened = report.stopped_by or "no reason"
+            if run.log_failure:
+                happened += f"; log: {run.log_failure}"
+            if not tally.failed:
+                happened += "; the call was not made"
+        return Case(fault, tuple(wrong), happened, 0 if report is None else report.steps)
+
+    def _log_faults(self, rig: str, run: _Run) -> list[str]:
+        """Open and replay the log of a run that was made."""
+        try:
+            recording = read_log(run.log)
+        except UndertowError as error:
+            return [f"the log does not open: {error}"]
+        again = replay_controller(recording, self.recipes[rig].make_controller(self.memory))
+        if again.identical:
+            return []
+        if again.steps == 0:
+            return [] if run.log_failure else ["no step in the log, and nothing says why"]
+        return [f"the replay differs: {again.differing} steps, {again.misjudged} decisions"]
+
+
+def _told(report: Report) -> bool:
+    """Whether a verdict says that the device did not accept the last zero."""
+    return "zero" in report.stopped_by
+
+
+def _left_behind(threads: int) -> list[str]:
+    """Return what still runs of a run that is over; it is given a moment, and then ended."""
+    deadline = time.monotonic() + 2.0
+    while True:
+        more = len(sys._current_frames()) - threads
+        left = [process.name for process in multiprocessing.active_children()]
+        left += [f"{more} threads"] * (more > 0)
+        if not left:
+            return []
+        if time.monotonic() > deadline:
+            _end_children()
+            return [f"left behind: {', '.join(left)}"]
+        time.sleep(0.002)
+
+
+def _end_children() -> None:
+    for process in multiprocessing.active_children():
+        process.kill()
+        process.join(1.0)
+
+
+@contextlib.contextmanager
+def _shortened() -> Iterator[None]:
+    """Let the log write often, and the keeper not insist for long: there are thousands of runs."""
+    before = logs.BATCH, keeper.INSISTENCE
+    logs.BATCH, keeper.INSISTENCE = _BATCH, _INSISTENCE
+    try:
+        yield
+    finally:
+        logs.BATCH, keeper.INSISTENCE = before
+
+
+class _StillGoing(BaseException):
+    """A case takes too long."""
+
+
+@contextlib.contextmanager
+def _patience() -> Iterator[None]:
+    """Interrupt what takes too long, in the main thread of a system that can."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def over(_number: int, _frame: FrameType | None) -> None:
+        raise _StillGoing
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
