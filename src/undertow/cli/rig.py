@@ -107,6 +107,7 @@ def run(
     """
     from undertow.runtime import Recipe
     from undertow.runtime import Settings as Patience
+    from undertow.runtime.processes import check_resources
     from undertow.runtime.session import session
     from undertow.runtime.tables import run_table
 
@@ -137,6 +138,8 @@ def run(
             limit="the wall clock, by which a keeper goes",
             remedy="Leave one of them out",
         )
+    forked = 0 if simulated else 3 * (worker == "process") + keeper
+    check_resources(processes=forked, log=log is not None)  # before a driver is opened
     plant = _plant(rig, recipe, keeper=keeper)
     with ExitStack() as stack, _let_go_of(plant) as kept:
         with progress_bar() as progress:
@@ -231,15 +234,16 @@ def _let_go_of(plant: Rig | None) -> Iterator[list[Rig]]:
 @contextmanager
 def _seconds_on_terminal(seconds: float) -> Iterator[None]:
     """Count the seconds on a terminal; a progress bar would cost the fast loop time."""
+    from undertow.runtime.processes import Background
+
     over, began = threading.Event(), time.monotonic()
 
     def count() -> None:
         while not over.wait(1.0):
             sys.stderr.write(f"\r… running, {time.monotonic() - began:.0f} of {seconds:g} s ")
 
-    thread = threading.Thread(target=count, daemon=True)
     if sys.stderr.isatty():
-        thread.start()
+        Background(count, "undertow seconds")
     try:
         yield
     finally:

@@ -35,9 +35,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from undertow.errors import ArtefactError
+from undertow.errors import ArtefactError, ResourceError
 from undertow.files import check_file, parse_json
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.runtime.processes import Background
 
 __all__ = ["Columns", "Log", "Recording", "check_log", "part_path", "read_log"]
 
@@ -149,6 +150,8 @@ class Log:
     ------
     ArtefactError
         When the file cannot be made, or is in use, or is no log: then it is left alone.
+    ResourceError
+        When the system has no thread for it.
     """
 
     def __init__(
@@ -177,19 +180,13 @@ class Log:
         with _refused(path):
             _move_earlier(path)
             self._file = self._make(1)
-        self._thread: threading.Thread | None = None
+        self._thread: Background | None = None
         if threaded:
-            self._thread = threading.Thread(target=self._write, name="undertow log", daemon=True)
             try:
-                self._thread.start()
-            except RuntimeError as error:
+                self._thread = Background(self._write, "undertow log")
+            except ResourceError:
                 _end(self._file)
-                raise ArtefactError(
-                    f"thread that writes log '{path}'",
-                    value=str(error),
-                    limit="one more thread",
-                    remedy="End other programs, or raise the limit (ulimit -u)",
-                ) from error
+                raise
 
     def _make(self, part: int) -> sqlite3.Connection:
         """Begin a file; it is whole, and on the disk, before it has its name."""
@@ -325,12 +322,11 @@ class Log:
     def close(self) -> None:
         """Write the rest, and leave one file behind."""
         self._over.set()
-        if self._thread is not None:
-            self._thread.join(timeout=PATIENCE)
-            if self._thread.is_alive():  # to wait for its lock would be to hang with it
-                self.failure = f"the disk has not answered for {PATIENCE:g} s"
-                self.dropped += self._head - self._tail
-                return
+        if self._thread is not None and not self._thread.join(PATIENCE):
+            # To wait for its lock would be to hang with it.
+            self.failure = f"the disk has not answered for {PATIENCE:g} s"
+            self.dropped += self._head - self._tail
+            return
         self.flush()
         _end(self._file)
         if not self.path.exists():

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from undertow.errors import ArtefactError, InvalidInputError
+from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, OutputOnError, Rig
 from undertow.runtime.clock import YIELD, Clock, Histogram, WallClock, locked_memory, prompt
@@ -23,6 +23,7 @@ from undertow.runtime.encoding import answer_row
 from undertow.runtime.health import SECOND, RigClock, Share
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
+from undertow.runtime.processes import Background, refused_by_the_system
 from undertow.runtime.slow import Answer, Worker, is_answer
 from undertow.runtime.stage import stage_module
 from undertow.runtime.steps import confine
@@ -231,7 +232,7 @@ class Runtime:
         ------
         InvalidInputError
             When it has run already: its rig has been let go of.
-        ArtefactError
+        ResourceError
             When the system has no thread or memory left for the run.
         """
         if self.report.steps or self._let_go_of:
@@ -242,8 +243,12 @@ class Runtime:
                 remedy="Make another session",
             )
         try:
-            self._reserve = bytes(RESERVE)
-            with _quiet_interpreter(self.clock) as self.report.system, self._watchdog():
+            with (
+                refused_by_the_system("a run"),
+                _quiet_interpreter(self.clock) as self.report.system,
+                self._watchdog(),
+            ):
+                self._reserve = bytes(RESERVE)
                 try:
                     self._say_system()
                     self._loop(seconds)
@@ -253,8 +258,6 @@ class Runtime:
                         raise
                 finally:
                     self._let_go()
-        except MemoryError as error:
-            raise _exhausted("memory", error) from error
         finally:
             self._let_go()
         return self.report
@@ -571,26 +574,12 @@ class Runtime:
                         self.rig.close()
                     return
 
-        thread = threading.Thread(target=watch, name="undertow watchdog", daemon=True)
         self._beat = self.clock.now()
-        try:
-            thread.start()
-        except RuntimeError as error:
-            raise _exhausted("threads", error) from error
+        Background(watch, "undertow watchdog")
         try:
             yield
         finally:
             over.set()
-
-
-def _exhausted(what: str, error: BaseException) -> ArtefactError:
-    """Return the condition that the system has not what a run needs."""
-    return ArtefactError(
-        f"{what} for a run",
-        value=str(error) or type(error).__name__,
-        limit="enough of it before the rig moves",
-        remedy="End other programs, or raise the limit (ulimit -a)",
-    )
 
 
 def _own(measurement: Measurement, n: int) -> Measurement:

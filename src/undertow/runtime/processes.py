@@ -9,10 +9,10 @@ from __future__ import annotations
 import _thread
 import contextlib
 import errno
+import math
 import mmap
 import multiprocessing
 import os
-import shutil
 import signal
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,6 +24,11 @@ from undertow.errors import InvalidInputError, ResourceError
 
 if TYPE_CHECKING:  # not on Windows
     from multiprocessing.context import ForkProcess
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None  # type: ignore[assignment]
 
 __all__ = [
     "STOPPING",
@@ -52,8 +57,8 @@ MEMORY, MEMORY_EACH = 128 << 20, 48 << 20
 #: Descriptors that a run needs: for itself, and for each process that it forks.
 FILES, FILES_EACH = 16, 8
 
-#: What a log needs of its disk, bytes: a run of a minute.
-DISK = 32 << 20
+#: How large a log may grow at least, bytes: a run of a minute.
+FILE = 32 << 20
 
 #: What the system says when it has not enough of something.
 _SHORT = {
@@ -64,13 +69,18 @@ _SHORT = {
 
 def _limit(name: str, option: str) -> str:
     """Return what the system allows, in words: ``at most 100 (ulimit -u)``."""
-    with contextlib.suppress(ImportError, AttributeError, OSError, ValueError):
-        import resource
+    soft = _soft_limit(name)
+    if soft == math.inf:
+        return f"no limit of this process (ulimit {option}), so it is the system's own"
+    return f"at most {soft:,} (ulimit {option})"
 
-        soft, _ = resource.getrlimit(getattr(resource, name))
-        if soft != resource.RLIM_INFINITY:
-            return f"at most {soft:,} (ulimit {option})"
-    return f"no limit of this process (ulimit {option}), so it is the system's own"
+
+def _soft_limit(name: str) -> float:
+    """Return a limit of this process; inf if there is none."""
+    if resource is None:
+        return math.inf
+    soft, _ = resource.getrlimit(getattr(resource, name))
+    return math.inf if soft == resource.RLIM_INFINITY else soft
 
 
 def fork(
@@ -195,15 +205,15 @@ class Background:
         return True
 
 
-def check_resources(*, processes: int, folder: Path | None = None) -> None:
+def check_resources(*, processes: int, log: bool = False) -> None:
     """See that the system has what a run needs, before anything of a rig is touched.
 
     Parameters
     ----------
     processes
         That the run will fork.
-    folder
-        Of its log.
+    log
+        Whether it writes a log; what its disk has free is :func:`undertow.runtime.log.check_log`'s.
 
     Raises
     ------
@@ -212,8 +222,8 @@ def check_resources(*, processes: int, folder: Path | None = None) -> None:
     """
     _check_memory(MEMORY + processes * MEMORY_EACH)
     _check_files(FILES + processes * FILES_EACH)
-    if folder is not None:
-        _check_disk(folder)
+    if log:
+        _check_file_size()
 
 
 def _check_memory(need: int) -> None:
@@ -237,7 +247,7 @@ def _check_memory(need: int) -> None:
 
 def _available() -> float:
     """Return how much memory the machine or its container can give, bytes; inf if unknown."""
-    free = float("inf")
+    free = math.inf
     with contextlib.suppress(OSError, ValueError, IndexError):
         text = Path("/proc/meminfo").read_text(encoding="ascii")
         free = 1024.0 * int(text.split("MemAvailable:")[1].split()[0])
@@ -270,23 +280,14 @@ def _no_files(error: OSError, need: int = 2) -> ResourceError:
     )
 
 
-def _check_disk(folder: Path) -> None:
-    while not folder.exists():
-        folder = folder.parent
-    free = shutil.disk_usage(folder).free
-    largest = float("inf")
-    with contextlib.suppress(ImportError, AttributeError):
-        import resource
-
-        soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
-        largest = largest if soft == resource.RLIM_INFINITY else soft
-    if min(free, largest) < DISK:
-        what = "free" if free < largest else "for a file (ulimit -f)"
+def _check_file_size() -> None:
+    largest = _soft_limit("RLIMIT_FSIZE")
+    if largest < FILE:
         raise ResourceError(
-            f"disk of the log, '{folder}'",
-            value=f"{min(free, largest) / 2**20:,.1f} MiB {what}",
-            limit=f"{DISK / 2**20:g} MiB, what a run of a minute writes",
-            remedy="Make room, or name a log elsewhere with --log",
+            "size of a file of this process",
+            value=f"at most {largest / 2**20:,.1f} MiB",
+            limit=f"{FILE / 2**20:g} MiB, a log of a minute",
+            remedy="Raise the limit: ulimit -f unlimited",
         )
 
 

@@ -98,8 +98,7 @@ def _prepared(
         if progress is not None:
             progress(what, fraction)
 
-    folder = None if log is None else log.parent
-    check_resources(processes=0 if simulated else processes, folder=folder)
+    check_resources(processes=0 if simulated else processes, log=log is not None)
     if log is not None:
         check_log(log)  # before the first optimum, which takes a while
     compute = recipe.respond

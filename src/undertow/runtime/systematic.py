@@ -229,7 +229,7 @@ class Systematic:
             recipe.rehearse(self.memory)
             vars(recipe)["first"] = lambda: self.memory  # a session finds it done
             vars(recipe)["rehearse"] = lambda memory: None
-            self.run(Fault("read", 1, False, rig))
+            self._tallied(rig, live=False)  # compiles the rest
         self.counts: dict[str, dict[str, int]] = {}
 
     def count(self) -> dict[str, dict[str, int]]:
@@ -238,13 +238,17 @@ class Systematic:
             for rig in RIGS:
                 self.counts[rig] = {}
                 for live in (False, True):
-                    tally = Tally()
-                    with tempfile.TemporaryDirectory() as folder:
-                        self._made(rig, tally, Path(folder) / "log.db", live=live)
-                    for operation, n in zip(OPERATIONS, tally.counts.tolist(), strict=True):
+                    for operation, n in self._tallied(rig, live=live).items():
                         if is_live(operation, rig) == live:
                             self.counts[rig][operation] = n
         return self.counts
+
+    def _tallied(self, rig: str, *, live: bool) -> dict[str, int]:
+        """Make a run without a fault, and return how often each call was made."""
+        tally = Tally()
+        with tempfile.TemporaryDirectory() as folder:
+            self._made(rig, tally, Path(folder) / "log.db", live=live)
+        return dict(zip(OPERATIONS, tally.counts.tolist(), strict=True))
 
     def faults(self) -> tuple[Fault, ...]:
         """Return every fault, the quick ones first."""
@@ -379,16 +383,14 @@ class Systematic:
             if device.driven or device.last.any():
                 wrong.append(f"refused, with the output at {device.last.tolist()}")
         else:
-            if device.last.any() and not _told(report):
+            if device.last.any() and report.verdict.off:
                 wrong.append(f"the output stays at {device.last.tolist()}, and nothing says so")
             wrong += self._log_faults(fault.rig, run)
         wrong += _left_behind(run.threads)
         if report is None:
             happened = f"refused: {run.refused}"
         else:
-            happened = report.stopped_by or "no reason"
-            if run.log_failure:
-                happened += f"; log: {run.log_failure}"
+            happened = str(report.verdict)
             if not tally.failed:
                 happened += "; the call was not made"
         return Case(fault, tuple(wrong), happened, 0 if report is None else report.steps)
@@ -405,11 +407,6 @@ class Systematic:
         if again.steps == 0:
             return [] if run.log_failure else ["no step in the log, and nothing says why"]
         return [f"the replay differs: {again.differing} steps, {again.misjudged} decisions"]
-
-
-def _told(report: Report) -> bool:
-    """Whether a verdict says that the device did not accept the last zero."""
-    return "zero" in report.stopped_by
 
 
 def _left_behind(threads: int) -> list[str]:
