@@ -28,7 +28,7 @@ from undertow.inner_loop import lane
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
 from undertow.proposal import Proposal
-from undertow.runtime.processes import Background, fork, pipe, withdraw
+from undertow.runtime.processes import PATIENCE, Background, fork, pipe, withdraw
 from undertow.sliding import SlidingModeLaw
 from undertow.swing_up import SwingUpAndCatch
 
@@ -44,6 +44,10 @@ __all__ = [
     "lanes_of",
     "respond",
 ]
+
+
+#: The first that a process says which is to compute.
+BEGUN = "begun"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -361,6 +365,20 @@ class _Child(_Computer):
         finally:
             theirs.close()
         super().__init__(self._exchange)
+        if not self._begun():
+            self.close()
+            self.process.join(PATIENCE)
+            raise ResourceError(
+                "process 'undertow slow loop'",
+                value=f"it ended with exit code {self.process.exitcode}",
+                limit=f"one that answers within {PATIENCE:g} s",
+                remedy="The system ends processes for lack of memory: end other programs",
+            )
+
+    def _begun(self) -> bool:
+        with contextlib.suppress(EOFError, OSError):
+            return self.pipe.poll(PATIENCE) and self.pipe.recv() == BEGUN
+        return False
 
     def _exchange(self, request: Request) -> Answer:
         self.pipe.send(request)
@@ -382,6 +400,7 @@ def _serve(compute: Compute, ours: Connection, theirs: Connection) -> None:
     with contextlib.suppress(OSError, AttributeError):  # Linux: do not outlive the fast loop
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
     with contextlib.suppress(EOFError, OSError):
+        ours.send(BEGUN)
         while True:
             ours.send(compute(ours.recv()))
 
@@ -407,7 +426,7 @@ def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWork
     try:
         for _ in range(max(1, processes)):
             computers.append(_Child(compute) if forked else _Computer(compute))
-    except ResourceError:
+    except BaseException:
         for computer in computers:
             computer.close()
         raise
