@@ -203,23 +203,47 @@ def test_screens_fit_80_columns() -> None:
     """Tables of made-up runs, whose words are long, at the usual width of a terminal."""
     from undertow.runtime import tables
     from undertow.runtime.drill_live import Killed, LiveOutcome
+    from undertow.runtime.failing import Fault
     from undertow.runtime.loop import Report
+    from undertow.runtime.systematic import Case
 
     report = Report(steps=60_000, missed=47, asleep=44, stopped_by="sensor 'theta' lost " * 5)
     report.events = [(0.1, "rig", "read: OSError: [Errno 5] Input/output error " * 3)] * 9
     live = [LiveOutcome("optimiser", "a read blocks for 1 s", "what happened, " * 12, True)]
     killed = [Killed(0.123, 1234, 0.01, 0.001, True, 0.02)]
+    fault = Fault("write-taken", 12345, True, "realistic")
+    hard = [Case(fault, ("the output stays at [-1.234], and nothing says so",), "long " * 30)]
     console = Console(width=80, record=True, file=io.StringIO())
     for shown in (
         tables.run_table(report, 1e-3, "N m", simulated=False),
         tables.drill_table([], live),
         tables.kill_table(killed),
+        tables.systematic_table(hard),
     ):
         console.print(shown)
     text = console.export_text()
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
     assert "9 times read: OSError" in text
+
+
+def test_a_systematic_fault_that_is_none_is_refused() -> None:
+    code, _, err = run("drill", "--only", "write:17:twice:ideal")
+    assert code == 2
+    assert "OPERATION:N:once|always:RIG" in err
+
+
+@pytest.mark.slow
+def test_single_systematic_faults_are_made_again() -> None:
+    """Each says what happened; a rig that there is none of is refused."""
+    code, out, err = run("drill", "--only", "write:60:always:ideal", "--only", "fork:1:once:kept")
+    assert code == 0
+    assert "2 of 2 cases as they should be, seed 0" in out
+    assert "the device did not take an output of zero" in out
+    assert "fork:1:once:kept: refused: process 'undertow" in out
+    code, _, err = run("drill", "--only", "write:60:always:mine")
+    assert code == 2
+    assert "ideal or realistic or kept" in err
 
 
 def test_a_missing_log_is_refused(tmp_path: Path) -> None:

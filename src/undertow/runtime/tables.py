@@ -244,11 +244,12 @@ def systematic_table(cases: Sequence[Case]) -> Group:
         passed = sum(case.passed for case in here)
         counts = [f"{n:,}" for n in (*by_rig, len(here), passed)]
         table.add_row(operation, *counts, _mark(passed == len(here)))
-    failed = Table.grid(padding=(0, 2))
-    for case in cases:
-        if not case.passed:
-            failed.add_row(str(case.fault), escape("; ".join(case.wrong)), escape(case.happened))
-    return Group(table, failed)
+    lines = [
+        Text(f"{case.fault}: {'; '.join(case.wrong)} ({case.happened})")
+        for case in cases
+        if not case.passed
+    ]
+    return Group(table, *lines)
 
 
 def _indented(text: str) -> Padding:
