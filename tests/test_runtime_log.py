@@ -22,7 +22,7 @@ import pytest
 
 import undertow as ut
 from undertow.cascade import CascadeState
-from undertow.errors import ArtefactError
+from undertow.errors import ArtefactError, ResourceError, UndertowError
 from undertow.plan import Plan
 from undertow.runtime import (
     Columns,
@@ -511,7 +511,11 @@ def test_a_log_for_which_something_lacks_is_refused_before_the_run(
             raise RuntimeError("can't start new thread")
 
         monkeypatch.setattr(threading.Thread, "start", unable)
-    with pytest.raises(ArtefactError, match=r"run\.db"):
+    refusal: type[UndertowError] = ArtefactError
+    named = r"run\.db"
+    if what == "no threads":
+        refusal, named = ResourceError, "thread 'undertow log'"
+    with pytest.raises(refusal, match=named):
         Log(path, COLUMNS, {})
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from runs import RECIPE
 from undertow.cascade import CascadeState
-from undertow.errors import ArtefactError
+from undertow.errors import ArtefactError, ResourceError
 from undertow.rig import Measurement, OutputOnError
 from undertow.runtime import (
     Columns,
@@ -251,7 +251,7 @@ def test_a_rig_is_closed_when_the_run_cannot_begin(
     device = Device()
     runtime = Runtime(controller, device, InlineWorker(RECIPE.respond))
     monkeypatch.setattr("undertow.runtime.loop.threading.Thread.start", start)
-    with pytest.raises(ArtefactError, match="threads for a run"):
+    with pytest.raises(ResourceError, match="thread 'undertow watchdog'"):
         runtime.run(0.1)
     assert (device.writes, device.closed) == (0, 1)
 

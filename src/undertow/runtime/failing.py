@@ -14,7 +14,6 @@ Nothing in the library knows of it: names of the standard library are replaced w
 
 from __future__ import annotations
 
-import _thread
 import builtins
 import contextlib
 import ctypes
@@ -181,7 +180,6 @@ def failing(tally: Tally) -> Iterator[None]:
     places: list[tuple[Any, str, Any]] = [
         (os, "fork", guarded("fork", os.fork, many_processes)),
         (threading.Thread, "start", guarded("thread", threading.Thread.start, no_thread)),
-        (_thread, "start_new_thread", guarded("thread", _thread.start_new_thread, no_thread)),
         (builtins, "open", opening),
         (io, "open", opening),
         (os, "open", guarded("open", os.open, many_files)),

@@ -322,11 +322,12 @@ class Log:
     def close(self) -> None:
         """Write the rest, and leave one file behind."""
         self._over.set()
-        if self._thread is not None and not self._thread.join(PATIENCE):
-            # To wait for its lock would be to hang with it.
-            self.failure = f"the disk has not answered for {PATIENCE:g} s"
-            self.dropped += self._head - self._tail
-            return
+        if self._thread is not None:
+            self._thread.join(timeout=PATIENCE)
+            if self._thread.is_alive():  # to wait for its lock would be to hang with it
+                self.failure = f"the disk has not answered for {PATIENCE:g} s"
+                self.dropped += self._head - self._tail
+                return
         self.flush()
         _end(self._file)
         if not self.path.exists():

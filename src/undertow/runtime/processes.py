@@ -6,7 +6,6 @@ Processes are forked, so that they begin with everything compiled.  What the sys
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import errno
 import math
@@ -14,6 +13,7 @@ import mmap
 import multiprocessing
 import os
 import signal
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
@@ -150,8 +150,8 @@ def withdraw() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-class Background:
-    """A thread that has begun when it is made, or is refused within a stated time.
+class Background(threading.Thread):
+    """A thread beside the fast loop that has begun when it is made, or is refused in time.
 
     :meth:`threading.Thread.start` waits without end for a thread that the system made but had
     no memory to begin with.
@@ -170,23 +170,20 @@ class Background:
     """
 
     def __init__(self, target: Callable[[], None], name: str) -> None:
-        self.target, self.name = target, name
-        self._begun, self._over = _thread.allocate_lock(), _thread.allocate_lock()
-        self._begun.acquire()
-        self._over.acquire()
+        super().__init__(name=name, daemon=True)
+        self._work, self._begun = target, threading.Event()
+        self._started = _Patient()  # what `start` waits for
         try:
-            _thread.start_new_thread(self._run, ())
+            self.start()
         except (RuntimeError, MemoryError) as error:
             raise self._refused(_said(error)) from error
-        if not self._begun.acquire(timeout=PATIENCE):
+        if not self._begun.wait(PATIENCE):
             raise self._refused(f"it has not begun after {PATIENCE:g} s")
 
-    def _run(self) -> None:
-        self._begun.release()
-        try:
-            self.target()
-        finally:
-            self._over.release()
+    def run(self) -> None:
+        """Work, once it is known to have begun."""
+        self._begun.set()
+        self._work()
 
     def _refused(self, value: str) -> ResourceError:
         return ResourceError(
@@ -197,12 +194,12 @@ class Background:
             remedy="End other programs of this user, or raise the limit",
         )
 
-    def join(self, timeout: float) -> bool:
-        """Wait for its end, s; whether it has come."""
-        if not self._over.acquire(timeout=timeout):
-            return False
-        self._over.release()
-        return True
+
+class _Patient(threading.Event):
+    """An event that nobody waits for without end."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return super().wait(PATIENCE if timeout is None else timeout)
 
 
 def check_resources(*, processes: int, log: bool = False) -> None:

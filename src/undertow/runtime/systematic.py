@@ -17,7 +17,6 @@ import gc
 import mmap
 import multiprocessing
 import signal
-import sys
 import tempfile
 import threading
 import time
@@ -41,6 +40,7 @@ from undertow.runtime.faults import Witness
 from undertow.runtime.keeper import KeptRig
 from undertow.runtime.log import Columns, Log, read_log
 from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.processes import Background
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about, replay_controller
 from undertow.runtime.session import session
@@ -203,7 +203,6 @@ class _Run:
 
     device: Device
     log: Path
-    threads: int = field(default_factory=lambda: len(sys._current_frames()))
     refused: str = ""
     report: Report | None = None
     log_failure: str = ""
@@ -386,7 +385,7 @@ class Systematic:
             if device.last.any() and report.verdict.off:
                 wrong.append(f"the output stays at {device.last.tolist()}, and nothing says so")
             wrong += self._log_faults(fault.rig, run)
-        wrong += _left_behind(run.threads)
+        wrong += _left_behind()
         if report is None:
             happened = f"refused: {run.refused}"
         else:
@@ -409,13 +408,12 @@ class Systematic:
         return [f"the replay differs: {again.differing} steps, {again.misjudged} decisions"]
 
 
-def _left_behind(threads: int) -> list[str]:
+def _left_behind() -> list[str]:
     """Return what still runs of a run that is over; it is given a moment, and then ended."""
     deadline = time.monotonic() + 2.0
     while True:
-        more = len(sys._current_frames()) - threads
         left = [process.name for process in multiprocessing.active_children()]
-        left += [f"{more} threads"] * (more > 0)
+        left += [f"thread {t.name}" for t in threading.enumerate() if isinstance(t, Background)]
         if not left:
             return []
         if time.monotonic() > deadline:
