@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from undertow.errors import InvalidInputError, ResourceError
+from undertow.errors import ArtefactError, InvalidInputError, ResourceError
 from undertow.mechanism import FloatArray
 from undertow.rig import Measurement
 from undertow.runtime import background_worker, processes, slow
 from undertow.runtime import log as logs
 from undertow.runtime.failing import OPERATIONS, Fault, Tally, failing, intercepts_sqlite
-from undertow.runtime.log import read_log
+from undertow.runtime.log import Columns, Log, read_log
 from undertow.runtime.loop import Runtime
 from undertow.runtime.processes import Background, check_resources, fork, pipe
 from undertow.runtime.replay import replay_controller
@@ -179,6 +179,34 @@ def test_calls_of_sqlite_fail_below_it(tmp_path: Path) -> None:
             assert file.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     with contextlib.closing(sqlite3.connect(tmp_path / "after.db")) as file:
         file.execute("CREATE TABLE numbers (n INTEGER)")  # nothing fails any more
+
+
+def test_a_log_opens_whichever_of_its_syncs_fail(tmp_path: Path) -> None:
+    """Those of its closing too, which may leave a journal that is to be undone."""
+    if not intercepts_sqlite():
+        pytest.skip("the library of SQLite is out of reach")
+    columns, left = Columns(("k",), *[slice(0, 0)] * 6), 0
+
+    def write(path: Path) -> int:
+        with Log(path, columns, {}, threaded=False) as log:
+            for k in range(300):
+                log.row[0] = k
+                log.commit_row()
+        return log.dropped
+
+    whole = Tally()
+    with failing(whole):
+        assert write(tmp_path / "0.db") == 0
+    for n in range(1, int(whole.counts[OPERATIONS.index("fsync")]) + 1):
+        path = tmp_path / f"{n}.db"
+        with failing(Tally(Fault("fsync", n, True, ""))):
+            try:
+                dropped = write(path)
+            except ArtefactError:
+                continue  # it could not be made, and says so
+        left += Path(f"{path}-journal").exists()
+        assert read_log(path).steps[:, 0].tolist() == list(range(300 - dropped))
+    assert left > 0
 
 
 def test_the_table_counts_by_operation_and_names_what_failed() -> None:
