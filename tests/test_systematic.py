@@ -490,6 +490,20 @@ def test_two_signals_at_any_moment_of_a_session_end_safely(
         assert len(read_log(log).steps) > 0
 
 
+def test_what_is_closed_is_not_disturbed() -> None:
+    """And what a signal did before it does again."""
+    heard: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: heard.append(number))
+    try:
+        with processes.undisturbed():
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert heard == []
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert heard == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 @pytest.mark.slow
 def test_two_signals_at_random_moments_end_safely(campaign: Systematic, tmp_path: Path) -> None:
     rng, recipe = np.random.default_rng(0), campaign.recipes["ideal"]

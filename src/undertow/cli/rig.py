@@ -224,12 +224,14 @@ def _kept(make: Callable[[], Rig], recipe: Recipe) -> Rig:
 @contextmanager
 def _let_go_of(plant: Rig | None) -> Iterator[list[Rig]]:
     """Close a rig that no run has taken over: what fails before may have left it energised."""
+    from undertow.runtime.processes import undisturbed
+
     kept = [] if plant is None else [plant]
     try:
         yield kept
     finally:
         for rig in kept:
-            with suppress(Exception):  # a driver may do anything
+            with undisturbed(), suppress(Exception):  # a driver may do anything
                 rig.close()
 
 

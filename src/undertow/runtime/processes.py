@@ -37,6 +37,7 @@ __all__ = [
     "fork",
     "pipe",
     "refused_by_the_system",
+    "undisturbed",
     "withdraw",
 ]
 
@@ -148,6 +149,19 @@ def withdraw() -> None:
         os.setsid()
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Let no signal that asks for a stop interrupt what is being closed."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.signal(number, signal.SIG_IGN) for number in STOPPING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Background(threading.Thread):
