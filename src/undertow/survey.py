@@ -193,9 +193,9 @@ def survey_one(
     x0 = mechanism.usual_start
     cascade = Cascade(mechanism, objective, seed=seed)
     loop = cascade.loop
-    proposal = cascade.optimiser.require(x0)
+    proposal = cascade.start(x0)[1]
     plan, first = proposal.plan, cascade.optimiser.first
-    assert plan is not None  # require() raises otherwise
+    assert plan is not None  # start() raises otherwise
     assert first is not None  # designed when the optimiser was made
     candidates: list[Surface | Plan] = [first, plan]
     costs = loop.batch(x0, candidates)
