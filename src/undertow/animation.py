@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from PIL import Image
 
+from undertow.codegen.vector import compile_expressions
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.motion import Trajectory
@@ -206,7 +207,7 @@ def evaluator(mechanism: Mechanism, figure: Sketch) -> Evaluator:
     tip = [sp.sympify(c) for c in figure.tip]
     everything = [e for row in (*points, *discs, tip) for e in row]
     values = mechanism.substitution
-    function = sp.lambdify(list(mechanism.q), [e.xreplace(values) for e in everything], "numpy")
+    function = compile_expressions(mechanism.q, [e.xreplace(values) for e in everything])
 
     def place(
         q: FloatArray,

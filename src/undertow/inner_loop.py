@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from undertow.codegen.function import PREAMBLE, function_source
+from undertow.codegen.names import docstring
 from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.mechanism import FloatArray, Mechanism
@@ -141,7 +142,7 @@ def law_module(mechanism: Mechanism, switching: Switching) -> Any:
             },
             {"demand": law.u, "s": law.s, "margin": [law.margin]},
         )
-        header = f'"""Sliding-mode law of {mechanism.name}; generated, do not edit."""\n\n'
+        header = docstring(f"Sliding-mode law of {mechanism.name}; generated, do not edit.")
         sizes = f"p, m = {len(mechanism.parameters)}, {mechanism.m}\n"
         return f"{header}{PREAMBLE}{sizes}\n\n{body}\n{_CLIP}"
 

@@ -201,7 +201,7 @@ class Mechanism:
             **rest,
         )
 
-    def with_parameters(self, **values: float) -> Self:
+    def with_parameters(self, /, **values: float) -> Self:
         """Return the mechanism with some parameter values replaced, SI units.
 
         Raises
@@ -344,7 +344,7 @@ class Mechanism:
         values = [p.value for p in self.parameters]
         return hashlib.sha256(f"{self.structure} {values} {limits}".encode()).hexdigest()
 
-    def state(self, **values: float) -> FloatArray:
+    def state(self, /, **values: float) -> FloatArray:
         """Return the state with the named entries set and all others zero, SI units.
 
         Raises

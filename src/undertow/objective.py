@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from undertow.codegen.vector import compile_expressions
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
 
@@ -315,9 +316,9 @@ def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
     """Return the smallest of 256 random values of a stage cost; NaN where one is no number."""
     rng = np.random.default_rng(0)
     symbols = [*mechanism.x, *mechanism.u]
-    function = sp.lambdify(symbols, stage.subs(mechanism.substitution), "numpy")
+    function = compile_expressions(symbols, [stage.subs(mechanism.substitution)])
     reach = np.ones(len(symbols)) * math.pi
     reach[2 * mechanism.n :] = np.minimum(mechanism.input_limits, 100.0)
     samples = rng.uniform(-1, 1, (256, len(symbols))) * reach
     with np.errstate(all="ignore"):
-        return float(np.min(np.real_if_close(function(*samples.T))))
+        return float(np.min(np.real_if_close(function(*samples.T)[0])))

@@ -97,8 +97,9 @@ class LoopProgram:
     ) -> None:
         n, m = mechanism.n, mechanism.m
         subject = _Subject.of(mechanism, surface, eta, uncertain)
-        z = tuple(sp.Symbol(f"z_{i}", real=True) for i in range(2 * n))
-        sw = tuple(sp.Symbol(f"sw_{i}", real=True) for i in range(m))
+        # No name of a user's has a full stop in it.
+        z = tuple(sp.Symbol(f"z.{i}", real=True) for i in range(2 * n))
+        sw = tuple(sp.Symbol(f"sw.{i}", real=True) for i in range(m))
         tape = Tape()
         slow, q_dot = _slow_rates(tape, subject, z)
         state = dict(zip(mechanism.x, [*z[:n], *q_dot], strict=True))
@@ -127,7 +128,7 @@ class LoopProgram:
         self.boxes = self._outward(
             self._inputs, [e for (b, _), d in zip(blocks, slopes, strict=True) for e in (*b, *d)]
         )
-        speeds = [sp.Symbol(f"dz_{i}", real=True) for i in range(2 * n)]
+        speeds = [sp.Symbol(f"dz.{i}", real=True) for i in range(2 * n)]
         first = self._slopes(slow, z)
         change = tape.let_all(
             sum(d * v for d, v in zip(first[i * 2 * n : (i + 1) * 2 * n], speeds, strict=True))
@@ -167,7 +168,7 @@ class LoopProgram:
     def _jerk(self) -> tuple[list[sp.Symbol], list[sp.Expr]]:
         tape, (z, slow, still, W, parameters) = self._tape, self._held
         m = len(still)
-        speeds = [sp.Symbol(f"ds_{i}", real=True) for i in range(m)]
+        speeds = [sp.Symbol(f"ds.{i}", real=True) for i in range(m)]
         rates = [*slow, *speeds]
         slopes = self._slopes([*still, *W], z)
         change = tape.let_all(

@@ -282,7 +282,7 @@ def reaches(V: LyapunovFunction, point: Sequence[float], pieces: int = 512) -> b
     size = len(V.scale)
     if len(point) != size or (V.stretch is not None and abs(point[0]) >= V.pole):
         return False
-    part = sp.Symbol("part", real=True)
+    part = sp.Symbol("_part", real=True)
     tape = Tape()
     y = tape.matrix(sp.Matrix([sp.Rational(*float(v).as_integer_ratio()) * part for v in point]))
     value, _ = V.lay(tape, list(y), [sp.Integer(0)] * size)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import sympy as sp
 
 from undertow.codegen import settle
+from undertow.codegen.names import distinct, docstring
 from undertow.codegen.rows import LANES, LoopProgram, Rows, entrance, total
 from undertow.codegen.scalar import Emitter
 
@@ -32,8 +33,10 @@ class _Writer:
 
     def __init__(self, program: LoopProgram) -> None:
         self.program = program
+        distinct((*program.state, *program.plant_parameters, program.time))
         self.emit = Emitter(program.tape)
         self.time = self.emit.text(program.time)
+        self.limits = [self.emit.text(limit) for limit in program.limits]
         self.hoisted = _hoist(program)
         self.rows = Rows(program, self.hoisted.lane)
         self.constant = {*self.hoisted.call, *self.hoisted.lane}
@@ -104,8 +107,8 @@ class _Writer:
         demand = self.program.demand
         code, needs = self.emit.lines([*demand, *more], self.constant)
         clip = [
-            f"u_{j} = max(-_limit_{j}, min(_limit_{j}, {self.emit.text(d)}))"
-            for j, d in enumerate(demand)
+            f"u_{j} = max(-{limit}, min({limit}, {self.emit.text(d)}))"
+            for j, (d, limit) in enumerate(zip(demand, self.limits, strict=True))
         ]
         return [*self._load(needs, source), *code, *clip]
 
@@ -244,7 +247,10 @@ class _Writer:
         return [
             f"calm = {r.active} > 0.0",
             *(f"calm = calm & (abs({s}) <= 0.1 * {e})" for s, e in zip(r.s, layers, strict=True)),
-            *(f"calm = calm & (abs({row}) <= 0.5 * _limit_{j})" for j, row in enumerate(r.u)),
+            *(
+                f"calm = calm & (abs({row}) <= 0.5 * {limit})"
+                for row, limit in zip(r.u, self.limits, strict=True)
+            ),
             f"code, active = {r.code}, {r.active}",
             f"{r.code} = {settle.HANDED_OVER} if calm else code",
             f"{r.active} = 0.0 if calm else active",
@@ -348,9 +354,7 @@ def block_source(program: LoopProgram, *, sampled: bool, header: str) -> str:
                 sample = min(step // hold, noise.shape[0] - 1)
 {_lanes(w.sample(), 4)}
 """
-    return f'''"""{header}"""
-
-import math
+    return f"""{docstring(header)}import math
 
 import numba
 import numpy as np
@@ -397,7 +401,7 @@ def rollout(
                 if alive == 0.0:
                     break
 {_lanes(w.collect(), 2)}
-{"" if sampled else _settling(w)}'''
+{"" if sampled else _settling(w)}"""
 
 
 def _settling(w: _Writer) -> str:
@@ -429,7 +433,7 @@ def settle(
             for half in range(2):
 {_lanes(w.rates_at_stage(), 4)}
                 if half == 0:
-{_lanes(settle.first_half(w.rows), 5)}
+{_lanes(settle.first_half(w.rows, w.limits), 5)}
 {_lanes(settle.second_half(w.rows), 3)}
 {_lanes(settle.finish(w.rows), 2)}
 """

@@ -15,8 +15,9 @@ import numpy as np
 import sympy as sp
 from sympy.codegen.ast import float32, real
 from sympy.printing.c import C99CodePrinter
-from sympy.printing.codeprinter import PrintMethodNotImplementedError
+from sympy.printing.codeprinter import CodePrinter, PrintMethodNotImplementedError
 
+from undertow.codegen.names import Names
 from undertow.codegen.scalar import Emitter
 from undertow.codegen.tape import Tape
 from undertow.errors import ModelError
@@ -46,7 +47,7 @@ def literal(value: float, kind: Real) -> str:
 class _Printer(C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
     """C99 expressions on one line, every literal of the chosen precision."""
 
-    def __init__(self, names: Mapping[sp.Symbol, str], kind: Real) -> None:
+    def __init__(self, names: Names, kind: Real) -> None:
         settings: dict[str, object] = {"allow_unknown_functions": False, "strict": True}
         if kind == "float":
             settings["type_aliases"] = {real: float32}
@@ -68,9 +69,7 @@ class _Printer(C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
         return f"pow{suffix}({self._print(base)}, {self._print(exponent)})"
 
     def _print_Symbol(self, expr: sp.Symbol) -> str:
-        if expr in self.names:
-            return self.names[expr]
-        return str(expr.name) if expr.name.startswith("_") else f"{expr.name}_"
+        return self.names[expr]
 
     def _print_Integer(self, expr: sp.Integer) -> str:
         return literal(int(expr), self.kind)
@@ -132,8 +131,12 @@ class C99Emitter(Emitter):
     """
 
     def __init__(self, tape: Tape, names: Mapping[sp.Symbol, str], kind: Real = "double") -> None:
-        super().__init__(tape, _Printer(names, kind))
         self.kind: Real = kind
+        super().__init__(tape, names)
+
+    def language(self) -> CodePrinter:
+        """Return the printer of C."""
+        return _Printer(self.names, self.kind)
 
     def assign(self, name: str, text: str) -> str:
         """Return a declaration."""

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import sympy as sp
 
+from undertow.codegen.names import distinct
 from undertow.codegen.scalar import Emitter
 from undertow.codegen.tape import Tape
 
@@ -48,15 +49,12 @@ def function_source(
         Argument name to the expressions that fill its entries, in order: one-dimensional
         float arrays, written last, so that an output may be the same array as an input.
     """
+    places = [place for group in inputs.items() for place in _places(*group)]
+    distinct(symbol for symbol, _ in places)
     emit = Emitter(tape)
     wanted = [expression for group in outputs.values() for expression in group]
     code, needs = emit.lines(wanted, set())
-    loads = [
-        f"{emit.text(symbol)} = {place}"
-        for argument, symbols in inputs.items()
-        for symbol, place in _places(argument, symbols)
-        if symbol in needs
-    ]
+    loads = [f"{emit.text(symbol)} = {place}" for symbol, place in places if symbol in needs]
     stores = [
         f"{argument}[{j}] = {emit.text(expression)}"
         for argument, group in outputs.items()

@@ -8,12 +8,13 @@ to 1e5 rad.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import sympy as sp
 from sympy.printing.codeprinter import CodePrinter
 from sympy.printing.pycode import PythonCodePrinter
 
+from undertow.codegen.names import Names
 from undertow.codegen.tape import Tape
 
 __all__ = ["SINCOS", "Emitter"]
@@ -36,6 +37,10 @@ _cos_{i} = g_{i} * (1.0 - 2.0 * o_{i}) * (pc_{i} if o_{i} == 0.0 else ps_{i})
 class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
     """Python code that numba turns into vector arithmetic."""
 
+    def __init__(self, names: Names) -> None:
+        super().__init__({"fully_qualified_modules": True})
+        self.names = names
+
     def _print_Pow(self, expr: sp.Pow, **_: object) -> str:
         base, exponent = expr.args
         text = self.parenthesize(base, 100)
@@ -49,8 +54,7 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
         return f"math.pow({self._print(base)}, {self._print(exponent)})"
 
     def _print_Symbol(self, expr: sp.Symbol) -> str:
-        # Names from outside end in an underscore, so that none can meet a generated one.
-        return str(expr.name) if expr.name.startswith("_") else f"{expr.name}_"
+        return self.names[expr]
 
     def _print_Integer(self, expr: sp.Integer) -> str:
         return f"{int(expr)}.0"
@@ -84,13 +88,26 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
 class Emitter:
     """Prints tape lines with one sine-cosine evaluation per distinct angle.
 
-    A printer for another language overrides :meth:`assign` and :meth:`sincos`.
+    A printer for another language overrides :meth:`language`, :meth:`assign` and :meth:`sincos`.
+
+    Parameters
+    ----------
+    tape
+        Where the expressions were laid.
+    given
+        Text of symbols that have one already; the others get names by their place, see
+        :class:`undertow.codegen.names.Names`.
     """
 
-    def __init__(self, tape: Tape, printer: CodePrinter | None = None) -> None:
+    def __init__(self, tape: Tape, given: Mapping[sp.Symbol, str] | None = None) -> None:
         self.tape = tape
-        self.printer = printer or _Printer({"fully_qualified_modules": True})
+        self.names = Names(tape, given or {})
+        self.printer = self.language()
         self.angles: dict[sp.Expr, int] = {}
+
+    def language(self) -> CodePrinter:
+        """Return the printer of expressions."""
+        return _Printer(self.names)
 
     def lines(
         self, outputs: Iterable[sp.Expr], given: set[sp.Symbol]
@@ -121,8 +138,10 @@ class Emitter:
                         index, argument, sp.sin(angle) in wanted, sp.cos(angle) in wanted
                     )
                 name = "sin" if isinstance(call, sp.sin) else "cos"
-                expression = expression.xreplace({call: sp.Symbol(f"_{name}_{index}", real=True)})
-            code.append(self.assign(str(line.symbol), self.text(expression)))
+                value = sp.Symbol(f"_{name}_{index}", real=True)
+                self.names.own(value)
+                expression = expression.xreplace({call: value})
+            code.append(self.assign(self.names[line.symbol], self.text(expression)))
         return code, {s for s in needed if isinstance(s, sp.Symbol)}
 
     def assign(self, name: str, text: str) -> str:

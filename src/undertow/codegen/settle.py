@@ -128,8 +128,8 @@ def _rest(r: Rows, j: int, x: str) -> str:
     )
 
 
-def first_half(r: Rows) -> list[str]:
-    """From the rates at x to the state a."""
+def first_half(r: Rows, limits: Sequence[str]) -> list[str]:
+    """From the rates at x to the state a; ``limits`` are the names of the inputs' limits."""
     size, half = len(r.x), range(len(r.linear))
     return [
         *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
@@ -138,7 +138,8 @@ def first_half(r: Rows) -> list[str]:
         *(f"{row} = q_{j}" for j, row in enumerate(r.rest)),
         f"{r.bend} = {_bend(r)}",
         f"{r.speed} = math.sqrt(" + total(f"{row} * {row}" for row in r.slope) + ")",
-        "free = " + " & ".join(f"(abs({u}) < _limit_{j})" for j, u in enumerate(r.u)),
+        "free = "
+        + " & ".join(f"(abs({u}) < {limit})" for u, limit in zip(r.u, limits, strict=True)),
         f"{r.free} = 1.0 if free else 0.0",
         *(
             f"{r.stage_x[j]} = "

@@ -40,6 +40,7 @@ FORMULAS = (
     "mechanism.py",
     "partition.py",
     "quantities.py",
+    "codegen/names.py",
     "codegen/scalar.py",
     "codegen/tape.py",
 )

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.codegen.function import COMPILED, PREAMBLE
+from undertow.codegen.names import docstring
 from undertow.codegen.store import content_key, generated, generators
 from undertow.errors import InvalidInputError
 from undertow.estimators.interface import positive
@@ -124,7 +125,7 @@ def _module(mechanism: Mechanism) -> Any:
 
     def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
-        header = f'"""Kalman filter of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
+        header = docstring(f"Kalman filter of {mechanism.name}; generated, do not edit. {key[:16]}")
         parts = "from undertow.estimators.covariance import carry, correct\n"
         parts += f"\nn, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
         return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"

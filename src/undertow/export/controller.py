@@ -164,14 +164,6 @@ class EmbeddedController:
                     limit=f"below 2 ε/k = {np.min(2 * layer / gains):g} s",
                     remedy="Use a shorter period, a thicker boundary layer or smaller gains",
                 )
-        named = [_c_name(p.name) for p in self.mechanism.parameters]
-        if len(set(named)) < len(named):
-            raise InvalidInputError(
-                f"parameters of '{self.mechanism.name}' in C",
-                value=", ".join(sorted({name for name in named if named.count(name) > 1})),
-                limit="different in ASCII letters",
-                remedy="Rename one: Greek letters are spelled out, accents dropped",
-            )
         self.starts(self.plan)
         self.slew_rates  # noqa: B018  # refuses what cannot be used
         if isinstance(self.differentiator, KalmanStep):
@@ -224,7 +216,7 @@ def _lay(controller: EmbeddedController) -> dict[str, str]:
     names |= {s: f"row->eta[{i}]" for i, s in enumerate(symbols.eta)}
     names |= {s: f"row->layer[{i}]" for i, s in enumerate(symbols.layer)}
     names[symbols.gamma_target] = "row->gamma"
-    names |= {p.symbol: f"UT_PARAMETER_{_c_name(p.name)}" for p in mechanism.parameters}
+    names |= {p.symbol: _macro(i, p.name) for i, p in enumerate(mechanism.parameters)}
 
     tape = Tape()
     law = lay_law(
@@ -291,6 +283,11 @@ def _letter(sign: str) -> str:
 def _c_name(name: str) -> str:
     """Return a Python identifier in ASCII."""
     return "".join(map(_letter, name))
+
+
+def _macro(index: int, name: str) -> str:
+    """Return the C name of a parameter: its place makes it one of a kind, its name readable."""
+    return f"UT_PARAMETER_{index}_{_c_name(name)[:32]}"
 
 
 def _ascii(text: str) -> str:
@@ -429,8 +426,8 @@ def _inputs(controller: EmbeddedController) -> str:
 
 def _parameters(controller: EmbeddedController) -> str:
     lines = []
-    for p in controller.mechanism.parameters:
-        define = f"#define UT_PARAMETER_{_c_name(p.name)} {literal(p.value, controller.real)}"
+    for i, p in enumerate(controller.mechanism.parameters):
+        define = f"#define {_macro(i, p.name)} {literal(p.value, controller.real)}"
         words = ": ".join(filter(None, (_ascii(p.unit), _ascii(p.description))))
         lines.append(f"{define} /* {words} */" if words else define)
     return "\n".join(lines)

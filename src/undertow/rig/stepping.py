@@ -20,6 +20,7 @@ from typing import Any
 import sympy as sp
 
 from undertow.codegen.function import COMPILED, PREAMBLE, function_source
+from undertow.codegen.names import docstring
 from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.mechanism import TIME, Mechanism
@@ -162,7 +163,7 @@ def stepping(mechanism: Mechanism) -> Any:
 
     def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
-        header = f'"""Rig of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
+        header = docstring(f"Rig of {mechanism.name}; generated, do not edit. {key[:16]}")
         names = "cross_gaps, dry_friction, end_stops, measure, part_company, transmit"
         parts = f"from undertow.rig.parts import {names}\n"
         return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"

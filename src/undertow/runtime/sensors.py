@@ -17,6 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 from undertow.codegen.function import COMPILED, PREAMBLE
+from undertow.codegen.names import docstring
 from undertow.codegen.store import content_key, generated, generators
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
@@ -166,7 +167,7 @@ def _module(mechanism: Mechanism) -> Any:
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
 
     def write() -> str:
-        header = f'"""Sensor watch of {mechanism.name}; generated, do not edit."""\n\n'
+        header = docstring(f"Sensor watch of {mechanism.name}; generated, do not edit.")
         sizes = f"n, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
         return f"{header}{PREAMBLE}{sizes}\n\n{dynamics_source(mechanism)}\n{_BODY}"
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from undertow.codegen.function import PREAMBLE
 from undertow.codegen.machine import numba
+from undertow.codegen.names import docstring
 from undertow.codegen.store import content_key, generated, generators
 from undertow.inner_loop import LAYOUT, law_module
 from undertow.mechanism import FloatArray, Mechanism
@@ -133,7 +134,7 @@ def step_module(mechanism: Mechanism, switching: Switching) -> Any:
 
     def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
-        header = f'"""Fast step of {mechanism.name}; generated, do not edit. {key[:16]}"""\n\n'
+        header = docstring(f"Fast step of {mechanism.name}; generated, do not edit. {key[:16]}")
         parts = (
             f"from {law.__name__} import step as law\n"
             "from undertow.estimators.compensation import take_off\n"

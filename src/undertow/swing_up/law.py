@@ -23,6 +23,7 @@ import numpy as np
 import sympy as sp
 
 from undertow.codegen.function import COMPILED, PREAMBLE, function_source
+from undertow.codegen.names import docstring
 from undertow.codegen.store import content_key, generated, generators
 from undertow.codegen.tape import Tape
 from undertow.errors import ModelError
@@ -84,8 +85,8 @@ def _module(mechanism: Mechanism) -> Any:
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
 
     def write() -> str:
-        head = f'"""Swing-up of {mechanism.name}; generated, do not edit."""\n\n{PREAMBLE}'
-        return f"{head}\n\n{swing_source(mechanism)}"
+        head = docstring(f"Swing-up of {mechanism.name}; generated, do not edit.")
+        return f"{head}{PREAMBLE}\n\n{swing_source(mechanism)}"
 
     return generated("swing", mechanism.name, key, write)
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from undertow.codegen.function import COMPILED, PREAMBLE
+from undertow.codegen.names import docstring
 from undertow.codegen.store import content_key, generated, generators, recall, remember
 from undertow.errors import InfeasibleError
 from undertow.mechanism import FloatArray, Mechanism
@@ -142,7 +143,8 @@ def _module(mechanism: Mechanism) -> Any:
     key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
 
     def write() -> str:
-        head = f'"""Swings of {mechanism.name}; generated, do not edit."""\n\n{PREAMBLE}'
+        words = docstring(f"Swings of {mechanism.name}; generated, do not edit.")
+        head = f"{words}{PREAMBLE}"
         parts = (head, dynamics_source(mechanism), swing_source(mechanism), _BODY)
         return "\n\n".join(parts)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.codegen.vector import compile_expressions
 from undertow.estimators import Controller, Estimator, Record, compensated, drive
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.motion import Event, Trajectory
@@ -157,16 +158,14 @@ def _settled(mechanism: Mechanism, record: Record, first: int) -> float:
 
 def _cost(mechanism: Mechanism, objective: Objective, record: Record) -> float:
     """Integrate the stage cost from sample to sample, until the terminal set is reached."""
-    import sympy as sp
-
     stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
-    function = sp.lambdify([*mechanism.x, *mechanism.u], stage, "numpy")
+    function = compile_expressions([*mechanism.x, *mechanism.u], [stage])
     radius = np.linalg.norm(record.truth, axis=1)
     inside = np.flatnonzero(radius <= objective.terminal_radius)
     end = int(inside[0]) if len(inside) else len(record.t)
     if end == 0:
         return 0.0
-    values = np.broadcast_to(function(*record.truth.T, *record.u.T), record.t.shape)
+    values = np.broadcast_to(function(*record.truth.T, *record.u.T)[0], record.t.shape)
     steps = np.diff(record.t, append=2 * record.t[-1] - record.t[-2])
     return float((values * steps)[:end].sum())
 
