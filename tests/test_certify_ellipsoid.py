@@ -40,7 +40,7 @@ def test_programs_enclose_values_and_derivatives() -> None:
     program = Program.of(tape, [x, y], [], tape.let_all(rows))
     values = sp.lambdify((x, y), rows, "mpmath")
     slopes = sp.lambdify((x, y), list(sp.Matrix(rows).jacobian([x, y])), "mpmath")
-    import mpmath  # type: ignore[import-untyped]
+    import mpmath
 
     rng = np.random.default_rng(0)
     with mpmath.workdps(30):

@@ -14,6 +14,7 @@ import numpy as np
 import sympy as sp
 
 from undertow.codegen import Tape, compile_numpy
+from undertow.codegen.store import cache_folder
 from undertow.errors import ModelError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.stability import controllability, linearise
@@ -82,7 +83,12 @@ class MechanismReport:
 
 
 def check_mechanism(
-    mechanism: Mechanism, *, strict: bool = False, samples: int = 64, seed: int = 0
+    mechanism: Mechanism,
+    *,
+    strict: bool = False,
+    samples: int = 64,
+    seed: int = 0,
+    compiled: bool = True,
 ) -> MechanismReport:
     """Check a mechanism at random states and at its target.
 
@@ -95,6 +101,11 @@ def check_mechanism(
     the equilibria near it form a manifold of dimension at most m; the linearisation there is
     controllable; the start state lies within the ranges.
 
+    Compiled code: the NumPy functions, the fast loop's law, one step of the rollout kernel and
+    the programme of the proofs are compared with M, f, B and the law evaluated exactly, see
+    :mod:`undertow.agreement`.  What is not kept from an earlier run is compiled first, which takes
+    some seconds.
+
     Parameters
     ----------
     mechanism
@@ -105,6 +116,8 @@ def check_mechanism(
         Random states for the identities.
     seed
         Of the random states.
+    compiled
+        Whether compiled code is compared with the symbols.
 
     Returns
     -------
@@ -133,6 +146,8 @@ def check_mechanism(
         *_target(mechanism),
         *_start(mechanism),
     )
+    if compiled and _solvable(checks):
+        checks += _agreement(mechanism, seed)
     report = MechanismReport(mechanism.name, checks)
     if strict and report.failures:
         first = report.failures[0]
@@ -143,6 +158,34 @@ def check_mechanism(
             remedy=first.remedy,
         )
     return report
+
+
+def _solvable(checks: tuple[Check, ...]) -> bool:
+    """Whether M is what every later formula takes it for."""
+    return all(check.passed for check in checks if check.name.startswith("M "))
+
+
+def _agreement(mechanism: Mechanism, seed: int) -> tuple[Check, ...]:
+    """Compare compiled code with exact values; the remedy names the worst difference."""
+    # Not wanted by a mere ``import undertow``: the programmes of the proofs come with it.
+    from undertow.agreement import LIMIT, QUICK, Subject, numpy_functions, worst
+
+    found = []
+    subject = Subject(mechanism, seed=seed)
+    for what, compare in QUICK.items():
+        if subject.autonomous or compare is numpy_functions:
+            difference = worst(compare(subject))
+            found.append(
+                Check(
+                    f"{what} as the symbols in 50 digits, largest difference",
+                    difference.relative <= LIMIT,
+                    difference.relative,
+                    f"≤ {LIMIT:g}, relative to what rounding scales with",
+                    f"{difference}. Empty the cache of generated code, {cache_folder()}; report it "
+                    "if it stays",
+                )
+            )
+    return tuple(found)
 
 
 def _positions(mechanism: Mechanism, rng: np.random.Generator, samples: int) -> FloatArray:
