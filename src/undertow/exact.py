@@ -25,7 +25,7 @@ from undertow.errors import ModelError
 from undertow.mechanism import TIME, Mechanism
 from undertow.surface import ReachingLaw, Surface
 
-__all__ = ["ExactLaw", "ExactModel", "Number", "evaluate", "runge_kutta"]
+__all__ = ["ExactLaw", "ExactModel", "Number", "evaluate", "product", "runge_kutta", "solve"]
 
 _MP: Any = MPContext()
 _MP.dps = 50
@@ -54,14 +54,7 @@ class Number:
     __slots__ = ("size", "value")
 
     def __init__(self, value: Any, size: float | None = None) -> None:
-        if isinstance(value, _MP.mpc) or not _MP.isfinite(value):
-            raise ModelError(
-                "exact value",
-                value=str(value),
-                limit="a real number",
-                remedy="The model is not defined there: a root, logarithm or quotient has no value",
-            )
-        self.value = _MP.mpf(value)
+        self.value = _real(value)
         self.size = abs(float(self.value)) if size is None else size
 
     def __float__(self) -> float:
@@ -120,11 +113,23 @@ class Number:
         return Number(_MP.sign(self.value), 1.0 if sure else math.inf)
 
 
+def _real(value: Any) -> Any:
+    """Return a real number of 50 digits, or say that there is none."""
+    if isinstance(value, _MP.mpc) or not _MP.isfinite(value):
+        raise ModelError(
+            "exact value",
+            value=str(value),
+            limit="a real number",
+            remedy="The model is not defined there: a root, logarithm or quotient has no value",
+        )
+    return _MP.mpf(value)
+
+
 def _smooth(name: str, slope: Callable[[Any], Any], least: float = 0.0) -> Any:
     function = getattr(_MP, name)
 
     def apply(a: Number) -> Number:
-        value = function(a.value)
+        value = _real(function(a.value))
         own = max(abs(float(value)), least if abs(float(a)) > math.pi / 4 else 0.0)
         return Number(value, abs(float(slope(a.value))) * a.size + own)
 
@@ -205,7 +210,7 @@ def _fresh(e: sp.Basic, known: dict[sp.Basic, Number]) -> Number:
 
 
 def _power(base: Number, exponent: Number, written: sp.Expr) -> Number:
-    value = base.value**exponent.value if base.value or exponent.value > 0 else _MP.inf
+    value = _real(base.value**exponent.value if base.value or exponent.value > 0 else _MP.inf)
     if written.is_number:
         slope = exponent.value * value / base.value if base.value else _MP.mpf(0)
         return Number(value, abs(float(slope)) * base.size + abs(float(value)))

@@ -1,0 +1,294 @@
+"""Comparisons with exact values of what is compiled besides the quick ones, and odd names."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+import undertow as ut
+from undertow.agreement import Difference, Subject
+from undertow.certify.batch import Interval
+from undertow.certify.loop import LoopMotion
+from undertow.certify.motion import SurfaceMotion
+from undertow.estimators import kalman
+from undertow.exact import Number, evaluate, product, runge_kutta, solve
+from undertow.export import EmbeddedController, KalmanStep
+from undertow.export.host import Build
+from undertow.mechanism import FloatArray
+from undertow.rig.stepping import stepping
+from undertow.swing_up import law as swing_law
+
+STEP = 0.002
+
+
+def exactly(values: Any) -> list[Number]:
+    """Floats as exact numbers."""
+    return [Number(float(v)) for v in np.ravel(values)]
+
+
+def _moved(
+    subject: Subject, x: FloatArray, u: FloatArray, damping: Sequence[Number] | None
+) -> list[Number]:
+    """A Runge-Kutta step of the plant under a held input."""
+    n, held = subject.mechanism.n, exactly(u)
+
+    def rates(stage: list[Number]) -> list[Number]:
+        return [*stage[n:], *subject.model.accelerations(0.0, stage, held, damping)]
+
+    return runge_kutta(STEP, exactly(x), rates)
+
+
+def rig_stepping(subject: Subject) -> Iterator[Difference]:
+    """q̈ with joint damping, M⁻¹, the diagonal of B and a step of the simulated rig."""
+    mechanism, n, m = subject.mechanism, subject.mechanism.n, subject.mechanism.m
+    module = stepping(mechanism)
+    viscous = np.random.default_rng(1).uniform(0.0, 0.1, n)
+    parameters, names = mechanism.parameter_values, [c.name for c in mechanism.coordinates]
+    for x, u in zip(subject.states, subject.inputs(), strict=True):
+        qdd, W, b, work = np.zeros(n), np.zeros(n * n), np.zeros(m), np.zeros((8, 2 * n))
+        module.forward(0.0, x, u, viscous, parameters, qdd)
+        damping = exactly(viscous)
+        true = subject.model.accelerations(0.0, exactly(x), exactly(u), damping)
+        yield from subject.compared("rig: q̈", x, qdd, true, names)
+        module.mobility(x, parameters, W)
+        M, _, B = subject.model.matrices(0.0, exactly(x))
+        for i in range(n):
+            unit = [[Number(int(i == j))] for j in range(n)]
+            column = [row[0] for row in solve(M, unit)]
+            yield from subject.compared(f"rig: M⁻¹ of {names[i]}", x, W.reshape(n, n)[:, i], column)
+        module.gains(parameters, b)
+        yield from subject.compared("rig: B", x, b, [B[i][i] for i in range(m)])
+        after = x.copy()
+        module.smooth(0.0, STEP, after, u, viscous, parameters, work)
+        true = _moved(subject, x, u, damping)
+        yield from subject.compared("rig: next state", x, after, true, mechanism.state_names)
+
+
+def estimator(subject: Subject) -> Iterator[Difference]:
+    """The Kalman filter's prediction and the linear model of its covariance."""
+    mechanism, n, m = subject.mechanism, subject.mechanism.n, subject.mechanism.m
+    module = kalman._module(mechanism)
+    parameters, names, small = mechanism.parameter_values, mechanism.state_names, 1e-6
+    for x, u in zip(subject.states, subject.inputs(), strict=True):
+        stage, total, qdd, base, viscous, driven = np.zeros((6, 2 * n))
+        F, A = np.zeros((2, 2 * n, 2 * n))
+        after = x.copy()
+        module.move(STEP, after, u, n, m, parameters, stage, total, qdd, viscous, driven)
+        yield from subject.compared(
+            "estimator: prediction", x, after, _moved(subject, x, u, None), names
+        )
+        module.jacobian(STEP, x.copy(), u, n, m, parameters, F, A, qdd, base, viscous, driven)
+        here = subject.model.accelerations(0.0, exactly(x), exactly(u))
+        slopes = [[Number(int(j == n + i)) for j in range(2 * n)] for i in range(n)]
+        columns = []
+        for j in range(2 * n):
+            ahead = x.copy()
+            ahead[j] += small
+            there = subject.model.accelerations(0.0, exactly(ahead), exactly(u))
+            columns.append([(a - b) / Number(small) for a, b in zip(there, here, strict=True)])
+        slopes += [list(row) for row in zip(*columns, strict=True)]
+        square = product(slopes, slopes)
+        h, half = Number(STEP), Number(0.5) * Number(STEP) * Number(STEP)
+        for i in range(2 * n):
+            true = [
+                Number(int(i == j)) + h * slopes[i][j] + half * square[i][j] for j in range(2 * n)
+            ]
+            yield from subject.compared(f"estimator: F, row of {names[i]}", x, F[i], true, names)
+
+
+def swing_up(subject: Subject) -> Iterator[Difference]:
+    """Energies and blocks of the swing-up's law."""
+    mechanism, n = subject.mechanism, subject.mechanism.n
+    assert mechanism.potential is not None
+    module, parameters = swing_law._module(mechanism), mechanism.parameter_values
+    rest = evaluate(mechanism.potential, subject.model.known(0.0, exactly(np.zeros(2 * n))))
+    for x in subject.states:
+        energies, blocks = np.zeros(2), np.zeros(3)
+        module.energies(x, parameters, energies)
+        module.blocks(x, parameters, blocks)
+        known = subject.model.known(0.0, exactly(x))
+        M, f, B = subject.model.matrices(0.0, exactly(x))
+        kinetic = Number(0)
+        for i in range(n):
+            for j in range(n):
+                kinetic = kinetic + M[i][j] * exactly(x)[n + i] * exactly(x)[n + j] / Number(2)
+        total = kinetic + evaluate(mechanism.potential, known) - rest
+        yield from subject.compared("swing-up: energy", x, energies, [kinetic, total])
+        # S = 1/(M⁻¹)₁₁ and h = S (M⁻¹ f)₁: neither needs the elimination of M_uu.
+        unit = [[Number(int(i == 0)), v] for i, v in enumerate(f)]
+        inverse, moved = solve(M, unit)[0]
+        S = Number(1) / inverse
+        yield from subject.compared("swing-up: S, h, B", x, blocks, [S, S * moved, B[0][0]])
+
+
+def loop_programme(subject: Subject) -> Iterator[Difference]:
+    """The equations that regions of the whole loop are proved with: floats, and enclosures."""
+    mechanism, n, m = subject.mechanism, subject.mechanism.n, subject.mechanism.m
+    motion = LoopMotion(mechanism, subject.surface, subject.reaching)
+    names = [i.name for i in mechanism.inputs]
+    layer = exactly(subject.reaching.vector(m)[m:])
+    parameters = [Interval(p) for p in mechanism.parameter_values]
+    row = [exactly(r) for r in np.hstack([subject.surface.velocity_row])]
+    position = [exactly(r) for r in subject.surface.position_row]
+    for x, state, law in zip(subject.states, subject.numbers, subject.laws, strict=True):
+        z = motion.from_state(x)
+        rates, demand = motion(z)
+        yield from subject.compared("loop programme: demand", x, demand, law.demand, names)
+        yield from subject.compared("loop programme: q̇", x, rates[:n], state[n:])
+        qdd = subject.model.accelerations(0.0, state, law.u)
+        s_dot = [
+            sum((a * b for a, b in zip(r, [*qdd, *state[n:]], strict=True)), Number(0))
+            for r in ([*v, *p] for v, p in zip(row, position, strict=True))
+        ]
+        yield from subject.compared("loop programme: ṡ", x, rates[2 * n - m :], s_dot)
+        switch = [(s / e).clip(Number(1)) for s, e in zip(law.s, layer, strict=True)]
+        if any(abs(float(w)) == 1.0 for w in switch):
+            continue  # sat(s/ε) of the float s, and of the exact one, may differ at the edge
+        around = [np.nextafter(v, [-np.inf, np.inf]) for v in (*z, *map(float, switch))]
+        wide = [Interval(*v) for v in around]
+        found = motion.equations.program.points(*wide, *parameters)
+        for name, box, true in zip(names, found[2 * n - m : 2 * n], law.demand, strict=True):
+            low, high = float(box.lo), float(box.hi)
+            slack = 64 * 2.0**-53 * true.size  # p and s are rounded before they are enclosed
+            off = 0.0 if true.inside(low - slack, high + slack) else true.off(low)
+            yield Difference(
+                f"loop programme: enclosure of {name}", subject.where(x), low, float(true), off
+            )
+
+
+def sliding_motion(subject: Subject) -> Iterator[Difference]:
+    """The motion on the surface that regions of attraction are proved with."""
+    mechanism, n, m = subject.mechanism, subject.mechanism.n, subject.mechanism.m
+    motion, surface = SurfaceMotion(mechanism, subject.surface), subject.surface
+    rng = np.random.default_rng(2)
+    for y in rng.uniform(-0.4, 0.4, (8, motion.size)):
+        free = n - m
+        q_u, v_u, w = np.split(y, [free, 2 * free])
+        turn = solve(*map(_rows, (surface.lambda_a, surface.lambda_u)))
+        back = product(turn, _rows(q_u[:, None]))
+        q_a = [Number(float(a)) - b[0] for a, b in zip(w, back, strict=True)]
+        position = [[v] for v in (*q_a, *exactly(q_u))]
+        pull = product(_rows(surface.position_row), position)
+        push = product(_rows(surface.alpha_u), _rows(v_u[:, None]))
+        right = [[-(a[0] + b[0])] for a, b in zip(pull, push, strict=True)]
+        v_a = [r[0] for r in solve(_rows(surface.alpha_a), right)]
+        x = [*q_a, *exactly(q_u), *v_a, *exactly(v_u)]
+        held = subject.model.law(surface, subject.reaching, x)
+        # On the surface s = 0 but for 50 digits: the switching function is 0 there.
+        qdd = subject.model.accelerations(0.0, x, held.demand)
+        along = product(turn, _rows(v_u[:, None]))
+        w_dot = [a + b[0] for a, b in zip(v_a, along, strict=True)]
+        true = [*exactly(v_u), *qdd[m:], *w_dot]
+        at = np.array([float(v) for v in x])
+        yield from subject.compared("sliding motion", at, motion(y), true, motion.names)
+
+
+def _rows(block: FloatArray) -> list[list[Number]]:
+    return [exactly(row) for row in block]
+
+
+def exported_law(subject: Subject, folder: Path, real: Any = "double") -> Iterator[Difference]:
+    """The law of the exported C, with its own test and the model of its observer passed."""
+    mechanism, m = subject.mechanism, subject.mechanism.m
+    controller = EmbeddedController(
+        mechanism, subject.surface, subject.reaching, differentiator=KalmanStep(), real=real
+    )
+    build = Build(controller, folder)
+    passed, said = build.self_test()
+    assert passed, said
+    lines = "".join("l " + " ".join(map(repr, row)) + "\n" for row in subject.states.tolist())
+    done = subprocess.run([build.pipe()], input=lines, capture_output=True, text=True, check=True)
+    for x, line, law in zip(subject.states, done.stdout.splitlines(), subject.laws, strict=True):
+        demand, s, margin = np.split(np.array(line.split(), dtype=float), [m, 2 * m])
+        names = [i.name for i in mechanism.inputs]
+        yield from subject.compared("C: demand", x, demand, law.demand, names)
+        yield from subject.compared("C: s", x, s, law.s)
+        yield from subject.compared("C: margin", x, margin, [law.margin])
+
+
+# -- names ---------------------------------------------------------------------------------------
+
+#: Names that generators, languages or SymPy use themselves, and some that are merely odd.
+ODD_NAMES = (
+    "z_1", "sw_0", "dz_0", "ds_0", "x", "u", "x_0", "u_0", "m_0", "self", "lambda", "int",
+    "double", "float", "const", "static", "ut_step", "ut_real", "UT_N", "NAN", "h", "numba", "np",
+    "math", "numpy", "pi", "E", "I", "S", "N", "O", "Q", "gamma", "beta", "zeta", "True", "None",
+    "α", "µ", "φ", "W", "b", "i", "out", "plant", "belief", "limits", "lanes", "record", "step",
+    "law", "parameters", "margin", "demand", "a0", "a1", "w0", "v0", "k_0", "r_0", "o_0", "g_0",
+    "angle_0", "part", "sigma", "alpha_a", "lambda_u", "M_11", "f_1", "s", "x_dot2", "class",
+    "n" * 300, "n" * 299 + "m", "sin", "cos", "sqrt", "range", "max", "abs", "w_q", "p_q", "time",
+)  # fmt: skip
+
+
+def named(
+    names: Sequence[str], like: ut.Mechanism | None = None, title: str = "odd names"
+) -> ut.Mechanism:
+    """A mechanism of the library under other names: coordinates, inputs, then parameters.
+
+    Where names are too few, parameters keep theirs.
+    """
+    base = like or ut.mechanisms.cart_pendulum()
+    n, m = base.n, base.m
+    old = [*(c.name for c in base.coordinates), *(i.name for i in base.inputs)]
+    old += [p.name for p in base.parameters]
+    new = [*names[: len(old)], *old[len(names) :]]
+    coordinates = [
+        ut.Coordinate(name, c.unit, "", c.low, c.high)
+        for name, c in zip(new[:n], base.coordinates, strict=True)
+    ]
+    inputs = [
+        ut.Input(name, i.unit, i.limit) for name, i in zip(new[n : n + m], base.inputs, strict=True)
+    ]
+    parameters = [
+        ut.Parameter(name, p.value, p.unit)
+        for name, p in zip(new[n + m :], base.parameters, strict=True)
+    ]
+    rename = {
+        **dict(zip(base.q, (c.symbol for c in coordinates), strict=True)),
+        **dict(zip(base.x[n:], (c.velocity for c in coordinates), strict=True)),
+        **dict(zip(base.parameter_symbols, (p.symbol for p in parameters), strict=True)),
+    }
+
+    def moved(matrix: sp.Matrix) -> sp.ImmutableDenseMatrix:
+        return sp.ImmutableDenseMatrix(matrix.applyfunc(lambda e: e.xreplace(rename)))
+
+    return ut.Mechanism(
+        title,
+        tuple(coordinates),
+        tuple(inputs),
+        moved(base.mass_matrix),
+        moved(base.force),
+        moved(base.input_matrix),
+        parameters=tuple(parameters),
+        potential=None if base.potential is None else base.potential.xreplace(rename),
+        start={coordinates[-1].name: 0.1},
+    )
+
+
+def bypassing_the_door(mechanism: ut.Mechanism, rename: dict[str, str]) -> ut.Mechanism:
+    """The mechanism with some names changed and nothing checked."""
+    symbols = {sp.Symbol(a, real=True): sp.Symbol(b, real=True) for a, b in rename.items()}
+    made = object.__new__(ut.Mechanism)
+    made.__dict__.update(
+        {k: v for k, v in mechanism.__dict__.items() if k in ut.Mechanism.__dataclass_fields__}
+    )
+    for part in ("mass_matrix", "force", "input_matrix"):
+        value = getattr(mechanism, part).xreplace(symbols)
+        made.__dict__[part] = sp.ImmutableDenseMatrix(value)
+    made.__dict__["potential"] = None
+    made.__dict__["parameters"] = tuple(
+        _renamed(p, rename.get(p.name, p.name)) for p in mechanism.parameters
+    )
+    return made
+
+
+def _renamed(parameter: ut.Parameter, name: str) -> ut.Parameter:
+    made = object.__new__(ut.Parameter)
+    made.__dict__.update(parameter.__dict__)
+    made.__dict__["name"] = name
+    return made
