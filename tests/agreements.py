@@ -146,7 +146,7 @@ def loop_programme(subject: Subject) -> Iterator[Difference]:
             for r in ([*v, *p] for v, p in zip(row, position, strict=True))
         ]
         yield from subject.compared("loop programme: ṡ", x, rates[2 * n - m :], s_dot)
-        switch = [(s / e).clip(Number(1)) for s, e in zip(law.s, layer, strict=True)]
+        switch = [(s / e).clip(1.0) for s, e in zip(law.s, layer, strict=True)]
         if any(abs(float(w)) == 1.0 for w in switch):
             continue  # sat(s/ε) of the float s, and of the exact one, may differ at the edge
         around = [np.nextafter(v, [-np.inf, np.inf]) for v in (*z, *map(float, switch))]

@@ -105,6 +105,15 @@ def inner_loop_of(subject: Subject) -> Iterator[Difference]:
     return QUICK["inner loop"](subject)
 
 
+def test_inputs_without_a_limit(interpreted: None) -> None:
+    """Claim: an actuator that can deliver everything is not clipped, in code or exactly."""
+    mechanism = named(["a", "b", "F"], title="no limit").with_input_limit(np.inf)
+    subject = Subject(mechanism)
+    assert max(abs(float(law.u[0])) for law in subject.laws) > 20.0
+    for compare in QUICK.values():
+        agree(compare(subject))
+
+
 def test_gains_that_declared_disturbances_ask_for() -> None:
     """Claim: the gains (13) are those of the symbols, in every compiled law."""
     mechanism = ut.mechanisms.rotary_pendulum().with_disturbance_bounds(0.01, 0.02)

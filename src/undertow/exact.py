@@ -51,15 +51,23 @@ class Number:
     (True, True)
     """
 
-    __slots__ = ("size", "value")
+    __slots__ = ("near", "size", "value")
 
     def __init__(self, value: Any, size: float | None = None) -> None:
         self.value = _real(value)
-        self.size = abs(float(self.value)) if size is None else size
+        self.near = float(self.value)
+        self.size = abs(self.near) if size is None else size
+
+    @classmethod
+    def _of(cls, value: Any, size: float) -> Number:
+        """Wrap a number of 50 digits."""
+        made = object.__new__(cls)
+        made.value, made.near, made.size = value, float(value), size
+        return made
 
     def __float__(self) -> float:
         """The nearest float."""
-        return float(self.value)
+        return self.near
 
     def off(self, computed: float) -> float:
         """Return |computed − value| relative to the size; infinite for what is no number."""
@@ -74,42 +82,43 @@ class Number:
 
     def __neg__(self) -> Number:
         """−a."""
-        return Number(-self.value, self.size)
+        return Number._of(-self.value, self.size)
 
     def __add__(self, other: Number) -> Number:
         """A + b."""
-        return Number(self.value + other.value, self.size + other.size)
+        return Number._of(self.value + other.value, self.size + other.size)
 
     def __sub__(self, other: Number) -> Number:
         """A − b."""
-        return Number(self.value - other.value, self.size + other.size)
+        return Number._of(self.value - other.value, self.size + other.size)
 
     def __mul__(self, other: Number) -> Number:
         """A b."""
-        size = abs(float(self)) * other.size + abs(float(other)) * self.size
-        return Number(self.value * other.value, size)
+        size = abs(self.near) * other.size + abs(other.near) * self.size
+        return Number._of(self.value * other.value, size)
 
     def __truediv__(self, other: Number) -> Number:
         """A / b."""
-        value = self.value / other.value if other.value else _MP.inf
-        below = abs(float(other)) or math.nan
-        return Number(value, (self.size + abs(float(value)) * other.size) / below)
+        value = _real(self.value / other.value if other.value else _MP.inf)
+        size = self.size + abs(float(value)) * other.size
+        return Number._of(value, size / (abs(other.near) or math.nan))
 
     def __abs__(self) -> Number:
         """|a|."""
-        return Number(abs(self.value), self.size)
+        return Number._of(abs(self.value), self.size)
 
-    def clip(self, limit: Number) -> Number:
-        """Return the value within ±limit."""
-        beyond = abs(self) - limit
-        if float(beyond) > _NEAR * beyond.size:
-            return limit if self.value > 0 else -limit
-        return self if float(beyond) <= 0 else Number((limit if self.value > 0 else -limit).value,
-                                                      self.size)  # fmt: skip
+    def clip(self, limit: float) -> Number:
+        """Return the value within ±limit; of its own size where rounding decides."""
+        if not abs(self.near) + self.size * _NEAR > limit:
+            return self
+        end = Number(math.copysign(limit, self.near))
+        if abs(self.near) - self.size * _NEAR > limit:
+            return end
+        return self if abs(self.value) <= limit else Number._of(end.value, self.size)
 
     def sign(self) -> Number:
         """−1, 0 or 1; of unlimited size where rounding decides."""
-        sure = (self.value == 0 and self.size == 0) or abs(float(self)) > _NEAR * self.size
+        sure = (self.value == 0 and self.size == 0) or abs(self.near) > _NEAR * self.size
         return Number(_MP.sign(self.value), 1.0 if sure else math.inf)
 
 
@@ -130,7 +139,7 @@ def _smooth(name: str, slope: Callable[[Any], Any], least: float = 0.0) -> Any:
 
     def apply(a: Number) -> Number:
         value = _real(function(a.value))
-        own = max(abs(float(value)), least if abs(float(a)) > math.pi / 4 else 0.0)
+        own = max(abs(float(value)), least if abs(a.near) > math.pi / 4 else 0.0)
         return Number(value, abs(float(slope(a.value))) * a.size + own)
 
     return apply
@@ -214,7 +223,7 @@ def _power(base: Number, exponent: Number, written: sp.Expr) -> Number:
     if written.is_number:
         slope = exponent.value * value / base.value if base.value else _MP.mpf(0)
         return Number(value, abs(float(slope)) * base.size + abs(float(value)))
-    relative = abs(float(exponent)) * base.size / abs(float(base))
+    relative = abs(exponent.near) * base.size / abs(base.near)
     relative += abs(float(_MP.log(abs(base.value)))) * exponent.size
     return Number(value, abs(float(value)) * (1.0 + relative))
 
@@ -234,6 +243,7 @@ def _holds(condition: sp.Basic, known: dict[sp.Basic, Number]) -> bool:
 # -- linear algebra ------------------------------------------------------------------------------
 
 Matrix = list[list[Number]]
+_Matrices = tuple[Matrix, list[Number], Matrix]
 
 
 def solve(A: Sequence[Sequence[Number]], b: Sequence[Sequence[Number]]) -> Matrix:
@@ -320,6 +330,7 @@ class ExactModel:
                 limit="one meaning each",
                 remedy="Rename a coordinate, an input or a parameter",
             )
+        self._last: tuple[Any, _Matrices] | None = None
         self._parameters = {p.symbol: Number(float(p.value)) for p in mechanism.parameters}
 
     def known(self, t: float, x: Sequence[Number]) -> dict[sp.Basic, Number]:
@@ -327,10 +338,14 @@ class ExactModel:
         state = dict(zip(self.mechanism.x, x, strict=True))
         return {TIME: Number(t), **state, **self._parameters}
 
-    def matrices(self, t: float, x: Sequence[Number]) -> tuple[Matrix, list[Number], Matrix]:
+    def matrices(self, t: float, x: Sequence[Number]) -> _Matrices:
         """Return M (n, n), f (n,) and B (m, m)."""
-        known = self.known(t, x)
+        key = (t, *((v.value, v.size) for v in x))
+        if self._last is None or self._last[0] != key:
+            self._last = (key, self._evaluated(self.known(t, x)))
+        return self._last[1]
 
+    def _evaluated(self, known: dict[sp.Basic, Number]) -> _Matrices:
         def entries(matrix: sp.Matrix) -> Matrix:
             rows, columns = range(matrix.rows), range(matrix.cols)
             return [[evaluate(matrix[i, j], known) for j in columns] for i in rows]
@@ -376,7 +391,7 @@ class ExactModel:
         ]  # fmt: skip
         grip = product(velocity, [row[1:] for row in moves])
         demand = [row[0] for row in solve(grip, wanted)]
-        limits = [Number(float(v)) for v in self.mechanism.input_limits]
+        limits = self.mechanism.input_limits.tolist()
         here, target = (determinant(self._gamma(surface, mass)) for mass in (M, self._at_target))
         clipped = [a.clip(b) for a, b in zip(demand, limits, strict=True)]
         return ExactLaw(clipped, demand, s, gains, here / target)
@@ -448,4 +463,4 @@ def _switch(s: Number, layer: Number, switching: str) -> Number:
     if switching == "sign":
         return s.sign()
     ratio = s / layer
-    return _FUNCTIONS[sp.tanh](ratio) if switching == "tanh" else ratio.clip(Number(1))
+    return _FUNCTIONS[sp.tanh](ratio) if switching == "tanh" else ratio.clip(1.0)
