@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from undertow.certify.ellipsoid import ClosedLoopProgram
-from undertow.errors import ModelError
+from undertow.errors import InvalidInputError, ModelError
 from undertow.exact import ExactLaw, ExactModel, Number, evaluate, runge_kutta
 from undertow.inner_loop import InnerLoop
 from undertow.kernel import compile_loop
@@ -71,9 +71,9 @@ class Difference:
         )
 
 
-def worst(differences: Iterable[Difference]) -> Difference:
-    """Return the largest of some differences."""
-    return max(differences, key=lambda d: d.relative)
+def worst(differences: Iterable[Difference]) -> Difference | None:
+    """Return the largest of some differences; none of none."""
+    return max(differences, key=lambda d: d.relative, default=None)
 
 
 class Subject:
@@ -250,7 +250,8 @@ def kernel(subject: Subject) -> Iterator[Difference]:
     n, m, objective = mechanism.n, mechanism.m, MinimumEnergy()
     kernels = compile_loop(mechanism, None, objective, subject.reaching.switching, sampled=False)
     at_target = coupling(mechanism, np.zeros(n))
-    room = Room(Shape(n, m, 0, at_target, None, False), len(subject.states), 1)
+    constraints = len(objective.path_margins(mechanism))
+    room = Room(Shape(n, m, constraints, at_target, None, False), len(subject.states), 1)
     room.fill(subject.states, subject.surface.vector, subject.reaching.vector(m))
     record = np.zeros((room.padded, 1, 2 * n + 2 * m + 2))
     parameters, limits = mechanism.parameter_values, mechanism.input_limits
@@ -271,7 +272,7 @@ def kernel(subject: Subject) -> Iterator[Difference]:
     ):
         _, u, s, margin = np.split(record[k, 0], [2 * n, 2 * n + m, 2 * n + 2 * m])
         yield from subject.compared_law("kernel", x, law, u, None, s, float(margin[-1]))
-        if float(law.margin) < 1e-6:
+        if float(law.margin) < 1e-6 or (after.path[k] < 0).any():
             continue  # it stops there
         *state, cost = runge_kutta(STEP, [*exact, Number(0)], rates)
         names = mechanism.state_names
@@ -282,10 +283,14 @@ def kernel(subject: Subject) -> Iterator[Difference]:
 def proof_programme(subject: Subject) -> Iterator[Difference]:
     """Compare the interval programme of the closed loop: it must enclose, and closely.
 
-    It is that of the loop inside its layer and limits: states outside are left out.
+    It is that of the loop inside its layer and limits: states outside are left out.  A model that
+    no proof can be about (time-dependent, not smooth, of other functions) has none.
     """
     mechanism, m = subject.mechanism, subject.mechanism.m
-    programme = ClosedLoopProgram.of(mechanism)
+    try:
+        programme = ClosedLoopProgram.of(mechanism)
+    except (InvalidInputError, ModelError):
+        return
     numbers = programme.numbers(mechanism, subject.surface, subject.reaching)
     names = [
         *(f"q̈ of {c.name}" for c in mechanism.coordinates),
