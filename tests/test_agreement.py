@@ -29,7 +29,7 @@ from undertow.agreement import LIMIT, QUICK, Difference, Subject, numpy_function
 from undertow.certify.ellipsoid import ClosedLoopProgram
 from undertow.check import check_mechanism
 from undertow.codegen.machine import numba
-from undertow.codegen.names import Names
+from undertow.codegen.names import SymbolNames
 from undertow.errors import ModelError
 from undertow.exact import ExactModel, Number, evaluate
 from undertow.mechanisms import LIBRARY
@@ -164,7 +164,7 @@ def test_exported_c_of_the_library_is_that_of_the_symbols(
 
 
 def drawn(seed: int, count: int) -> list[str]:
-    """Names for a mechanism: odd ones, none of which is another's velocity."""
+    """SymbolNames for a mechanism: odd ones, none of which is another's velocity."""
     rng = np.random.default_rng(seed)
     return [str(v) for v in rng.choice(np.array(ODD_NAMES), count, replace=False)]
 
@@ -315,12 +315,12 @@ def test_look_alikes_are_found_where_names_are_printed(
     """Claim: with names printed as on 09076aa the same model fails: the compiled law is another."""
     mechanism = replace_name(look_alike(), "look-alike printed")
 
-    def as_it_is(self: Names, symbol: sp.Symbol) -> str:
+    def as_it_is(self: SymbolNames, symbol: sp.Symbol) -> str:
         if symbol in self._given:
             return self._given[symbol]
         return str(symbol.name) if symbol.name.startswith("_") else f"{symbol.name}_"
 
-    monkeypatch.setattr(Names, "__getitem__", as_it_is)
+    monkeypatch.setattr(SymbolNames, "__getitem__", as_it_is)
     found = failed(mechanism)
     assert any(what.startswith("inner loop") for what in found)
     assert any("off by" in said and "a = " in said for said in found.values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from matplotlib.mathtext import MathTextParser
 from typer.testing import CliRunner
 
 import undertow as ut
+from agreements import named
 from undertow.cli import app
 from undertow.derivation import (
     Derivation,
@@ -215,3 +216,21 @@ def test_derive_on_the_command_line(tmp_path: object) -> None:
     assert "M₁₂ = l m_p cos(φ)" in text.stdout
     assert r"\begin{align*}" in CliRunner().invoke(app, [*words, "--latex"]).stdout
     assert CliRunner().invoke(app, ["derive", "piano"]).exit_code == 2
+
+
+def test_symbols_of_the_theory_step_aside_for_those_of_the_mechanism() -> None:
+    """Claim: a parameter called sigma, eta or alpha_u is not taken for the theory's: the formulas
+    are those under plain names, with the theory's symbols primed."""
+    plain_names, taken = ["x", "phi", "F", "c_1", "c_2", "c_3"], ["x", "phi", "F"]
+    taken += ["sigma", "eta", "alpha_u"]
+    usual, odd = (derivation(named(names)) for names in (plain_names, taken))
+    before = [*plain_names, *taken[3:]]
+    after = [*taken, "sigma'", "eta'", "alpha_u'"]
+    symbols = (map(partial(sp.Symbol, real=True), names) for names in (before, after))
+    rename = dict(zip(*symbols, strict=True))
+    for left, right in zip(usual.sections, odd.sections, strict=True):
+        for a, b in zip(left.equations, right.equations, strict=True):
+            for wanted, found in ((a.left, b.left), (a.right, b.right)):
+                assert sp.expand(sp.sympify(wanted).xreplace(rename) - found) == 0
+    assert "α_u'" in odd.text()
+    assert r"\alpha_{u'}" in odd.latex()

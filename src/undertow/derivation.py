@@ -24,9 +24,6 @@ from undertow.stability import first_surface, linearise, sliding_matrix
 
 __all__ = ["Derivation", "Equation", "Section", "derivation"]
 
-#: The variable of characteristic polynomials, 1/s; s is taken by the surface.
-_s = sp.Symbol("sigma", real=True)
-
 #: Longest line of words.
 WIDTH = 79
 
@@ -125,8 +122,18 @@ _TEX_RELATIONS = {"=": "=", "!=": r"\neq", ">": ">", "<": "<", "<=": r"\leq"}
 # -- the symbols of the formulas -----------------------------------------------------------------
 
 
-def _symbol(name: str) -> sp.Symbol:
+def _symbol(mechanism: Mechanism, name: str) -> sp.Symbol:
+    """Return a symbol of the theory, with primes where the mechanism has one that reads alike."""
+    own = (*mechanism.x, *mechanism.u, *mechanism.parameter_symbols)
+    taken = {plain(symbol) for symbol in own}
+    while plain(sp.Symbol(name)) in taken:
+        name += "'"
     return sp.Symbol(name, real=True)
+
+
+def _rate(mechanism: Mechanism) -> sp.Symbol:
+    """Return the variable of characteristic polynomials, 1/s; s is taken by the surface."""
+    return _symbol(mechanism, "sigma")
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,18 +161,23 @@ class Symbols:
         def grid(stem: str, rows: int, columns: int) -> sp.Matrix:
             if rows == 1:
                 return column(stem, columns).T
-            return sp.Matrix(rows, columns, lambda i, j: _symbol(f"{stem}_{i + 1}{j + 1}"))
+            return sp.Matrix(
+                rows, columns, lambda i, j: _symbol(mechanism, f"{stem}_{i + 1}{j + 1}")
+            )
 
         def column(stem: str, count: int) -> sp.Matrix:
             return sp.Matrix(
-                [_symbol(stem if count == 1 else f"{stem}_{i + 1}") for i in range(count)]
+                [
+                    _symbol(mechanism, stem if count == 1 else f"{stem}_{i + 1}")
+                    for i in range(count)
+                ]
             )
 
         M, B = mechanism.mass_matrix, mechanism.input_matrix
         return cls(
-            M=sp.Matrix(n, n, lambda i, j: _entry("M", min(i, j), max(i, j), M)),
-            f=sp.Matrix([_entry("f", i, None, mechanism.force) for i in range(n)]),
-            B=sp.Matrix(m, m, lambda i, j: _entry("B", i, j, B)),
+            M=sp.Matrix(n, n, lambda i, j: _entry(mechanism, "M", min(i, j), max(i, j), M)),
+            f=sp.Matrix([_entry(mechanism, "f", i, None, mechanism.force) for i in range(n)]),
+            B=sp.Matrix(m, m, lambda i, j: _entry(mechanism, "B", i, j, B)),
             alpha_a=-sp.eye(m),
             lambda_a=grid("lambda_a", m, m),
             alpha_u=grid("alpha_u", m, n - m),
@@ -173,16 +185,16 @@ class Symbols:
             surface=column("s", m),
             eta=column("eta", m),
             layer=column("epsilon", m),
-            v=sp.Matrix([_symbol(f"{c.name}_ddot") for c in mechanism.coordinates[:m]]),
-            w=sp.Matrix([_symbol(f"{c.name}_ddot") for c in mechanism.coordinates[m:]]),
+            v=sp.Matrix([_symbol(mechanism, f"{c.name}_ddot") for c in mechanism.coordinates[:m]]),
+            w=sp.Matrix([_symbol(mechanism, f"{c.name}_ddot") for c in mechanism.coordinates[m:]]),
         )
 
 
-def _entry(stem: str, i: int, j: int | None, matrix: sp.Matrix) -> sp.Expr:
+def _entry(mechanism: Mechanism, stem: str, i: int, j: int | None, matrix: sp.Matrix) -> sp.Expr:
     value = matrix[i] if j is None else matrix[i, j]
     if value.is_number:
         return value
-    return _symbol(f"{stem}_{i + 1}" if j is None else f"{stem}_{i + 1}{j + 1}")
+    return _symbol(mechanism, f"{stem}_{i + 1}" if j is None else f"{stem}_{i + 1}{j + 1}")
 
 
 # -- the derivation ------------------------------------------------------------------------------
@@ -249,7 +261,7 @@ def _coordinates(mechanism: Mechanism) -> Section:
 def _mass(mechanism: Mechanism) -> tuple[Equation, ...]:
     n = mechanism.n
     return tuple(
-        Equation(_symbol(f"M_{i + 1}{j + 1}"), readable(mechanism.mass_matrix[i, j]))
+        Equation(_symbol(mechanism, f"M_{i + 1}{j + 1}"), readable(mechanism.mass_matrix[i, j]))
         for i in range(n)
         for j in range(i, n)
     )
@@ -258,7 +270,7 @@ def _mass(mechanism: Mechanism) -> tuple[Equation, ...]:
 def _force(mechanism: Mechanism) -> tuple[Equation, ...]:
     rates = mechanism.x[mechanism.n :]
     return tuple(
-        Equation(_symbol(f"f_{i + 1}"), readable(mechanism.force[i], rates))
+        Equation(_symbol(mechanism, f"f_{i + 1}"), readable(mechanism.force[i], rates))
         for i in range(mechanism.n)
     )
 
@@ -266,7 +278,7 @@ def _force(mechanism: Mechanism) -> tuple[Equation, ...]:
 def _inputs(mechanism: Mechanism) -> tuple[Equation, ...]:
     m = mechanism.m
     return tuple(
-        Equation(_symbol(f"B_{i + 1}{j + 1}"), readable(mechanism.input_matrix[i, j]))
+        Equation(_symbol(mechanism, f"B_{i + 1}{j + 1}"), readable(mechanism.input_matrix[i, j]))
         for i in range(m)
         for j in range(m)
     )
@@ -332,11 +344,11 @@ def _existence(mechanism: Mechanism, y: Symbols) -> Section:
     if n - m == 1:
         return Section("Existence of the law (37)", words, (Equation(readable(E[0]), 0, "!="),))
     entries = tuple(
-        Equation(_symbol(f"E_{i + 1}{j + 1}"), readable(E[i, j]))
+        Equation(_symbol(mechanism, f"E_{i + 1}{j + 1}"), readable(E[i, j]))
         for i in range(n - m)
         for j in range(n - m)
     )
-    names = sp.Matrix(n - m, n - m, lambda i, j: _symbol(f"E_{i + 1}{j + 1}"))
+    names = sp.Matrix(n - m, n - m, lambda i, j: _symbol(mechanism, f"E_{i + 1}{j + 1}"))
     whole = Equation(names.det(method="berkowitz").expand(), sp.Integer(0), "!=")
     return Section("Existence of the law (37)", words, (*entries, whole))
 
@@ -347,7 +359,7 @@ def polynomial_matrix(mechanism: Mechanism, *, symbolic: bool) -> sp.Matrix:
     ``P = [[α_a σ + λ_a, α_u σ + λ_u], [M_auᵀ σ² − D_a σ − F_a, M_uu σ² − D_u σ − F_u]]`` at
     the target, with the linearisation's numbers or in the mechanism's parameters.
     """
-    n, m = mechanism.n, mechanism.m
+    n, m, rate = mechanism.n, mechanism.m, _rate(mechanism)
     y = Symbols.of(mechanism)
     if symbolic:
         at_target = dict.fromkeys(mechanism.x, 0)
@@ -357,12 +369,12 @@ def polynomial_matrix(mechanism: Mechanism, *, symbolic: bool) -> sp.Matrix:
     else:
         lin = linearise(mechanism)
         M, F, D = (sp.Matrix(a) for a in (lin.M, lin.F, lin.D))
-    top = sp.Matrix.hstack(y.alpha_a * _s + y.lambda_a, y.alpha_u * _s + y.lambda_u)
-    return sp.Matrix.vstack(top, (M * _s**2 - D * _s - F)[m:, :])
+    top = sp.Matrix.hstack(y.alpha_a * rate + y.lambda_a, y.alpha_u * rate + y.lambda_u)
+    return sp.Matrix.vstack(top, (M * rate**2 - D * rate - F)[m:, :])
 
 
 def _stability(mechanism: Mechanism, y: Symbols) -> Section:
-    n, m = mechanism.n, mechanism.m
+    n, m, rate = mechanism.n, mechanism.m, _rate(mechanism)
     degree = 2 * n - m
     title = "Stability on the surface (35)-(36)"
     general = (
@@ -372,15 +384,17 @@ def _stability(mechanism: Mechanism, y: Symbols) -> Section:
     if m > 1:
         P = polynomial_matrix(mechanism, symbolic=False).applyfunc(rounded)
         entries = tuple(
-            Equation(_symbol(f"P_{i + 1}{j + 1}"), P[i, j]) for i in range(n) for j in range(n)
+            Equation(_symbol(mechanism, f"P_{i + 1}{j + 1}"), P[i, j])
+            for i in range(n)
+            for j in range(n)
         )
         return Section(title, general, entries)
     symbolic = n == 2
     P = polynomial_matrix(mechanism, symbolic=symbolic)
-    polynomial = sp.Poly(P.det(method="berkowitz").expand(), _s)
-    coefficients = [polynomial.coeff_monomial(_s**k) for k in range(degree + 1)]
+    polynomial = sp.Poly(P.det(method="berkowitz").expand(), rate)
+    coefficients = [polynomial.coeff_monomial(rate**k) for k in range(degree + 1)]
     sign = _leading_sign(mechanism, y, coefficients)
-    names = [_symbol(f"p_{k}") for k in range(degree + 1)]
+    names = [_symbol(mechanism, f"p_{k}") for k in range(degree + 1)]
     shown = [
         Equation(a, readable(sign * c) if symbolic else rounded(sign * c))
         for a, c in zip(reversed(names), reversed(coefficients), strict=True)
@@ -389,7 +403,7 @@ def _stability(mechanism: Mechanism, y: Symbols) -> Section:
     hurwitz += [
         Equation(minor, sp.Integer(0), ">") for minor in hurwitz_minors(names) if minor.is_Add
     ]
-    leading = plain(names[-1] * _s**degree)
+    leading = plain(names[-1] * rate**degree)
     words = (
         f"{general} With det P = ±({leading} + … + p₀): where all p_k have one sign "
         "(that of a first surface is written as positive) and Hurwitz's minors are positive:"

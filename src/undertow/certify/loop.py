@@ -29,6 +29,7 @@ from undertow.certify.batch import Interval
 from undertow.certify.loop_parts import LoopEquations
 from undertow.certify.loop_pieces import excess, put_boxes, saturation, stacked, zeros
 from undertow.certify.loop_program import LoopProgram
+from undertow.certify.motion import unused
 from undertow.certify.tube import Paths, matmul, stack
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, Mechanism
@@ -150,11 +151,9 @@ class LoopMotion:
         """Names of z."""
         c = self.mechanism.coordinates
         m = self.mechanism.m
-        return (
-            *(k.name for k in c),
-            *(f"p_{k.name}" for k in c[m:]),
-            *(f"s_{k.name}" for k in c[:m]),
-        )
+        made = [*(f"p_{k.name}" for k in c[m:]), *(f"s_{k.name}" for k in c[:m])]
+        names = [k.name for k in c]
+        return (*names, *unused(made, names))
 
     @cached_property
     def gains(self) -> tuple[FloatArray, FloatArray]:

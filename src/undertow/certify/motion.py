@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -28,6 +28,20 @@ def exact_matrix(block: ArrayLike) -> sp.Matrix:
     return sp.Matrix(
         *array.shape, [sp.Rational(*float(v).as_integer_ratio()) for v in array.ravel()]
     )
+
+
+def unused(names: Iterable[str], taken: Collection[str]) -> list[str]:
+    """Return made-up names, each with underscores after it until nothing else has it.
+
+    >>> unused(["w_x"], ["x", "w_x"])
+    ['w_x_']
+    """
+    found: list[str] = []
+    for name in names:
+        while name in taken or name in found:
+            name += "_"  # noqa: PLW2901
+        found.append(name)
+    return found
 
 
 class Motion(ABC):
@@ -139,7 +153,7 @@ class SurfaceMotion(Motion):
         return (
             *(k.name for k in free),
             *(f"{k.name}_dot" for k in free),
-            *(f"w_{k.name}" for k in c[: self.mechanism.m]),
+            *unused((f"w_{k.name}" for k in c[: self.mechanism.m]), self.mechanism.state_names),
         )
 
     @property

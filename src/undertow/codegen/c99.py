@@ -17,7 +17,7 @@ from sympy.codegen.ast import float32, real
 from sympy.printing.c import C99CodePrinter
 from sympy.printing.codeprinter import CodePrinter, PrintMethodNotImplementedError
 
-from undertow.codegen.names import Names
+from undertow.codegen.names import SymbolNames
 from undertow.codegen.scalar import Emitter
 from undertow.codegen.tape import Tape
 from undertow.errors import ModelError
@@ -47,7 +47,7 @@ def literal(value: float, kind: Real) -> str:
 class _Printer(C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
     """C99 expressions on one line, every literal of the chosen precision."""
 
-    def __init__(self, names: Names, kind: Real) -> None:
+    def __init__(self, names: SymbolNames, kind: Real) -> None:
         settings: dict[str, object] = {"allow_unknown_functions": False, "strict": True}
         if kind == "float":
             settings["type_aliases"] = {real: float32}

@@ -14,10 +14,10 @@ import sympy as sp
 from undertow.codegen.tape import Tape
 from undertow.errors import ModelError
 
-__all__ = ["Names", "distinct", "docstring"]
+__all__ = ["SymbolNames", "distinct", "docstring"]
 
 
-class Names:
+class SymbolNames:
     """Symbols to their names in one piece of generated code.
 
     The symbols of the tape's lines, and those that are declared with :meth:`own`, keep their
@@ -36,7 +36,7 @@ class Names:
     >>> import sympy as sp
     >>> a, b = sp.symbols("lambda µ")
     >>> tape = Tape()
-    >>> names = Names(tape, {})
+    >>> names = SymbolNames(tape, {})
     >>> names[tape.let(a * b)], names[b], names[a], names[b]
     ('_v0', '_p0', '_p1', '_p0')
     """

@@ -14,7 +14,7 @@ import sympy as sp
 from sympy.printing.codeprinter import CodePrinter
 from sympy.printing.pycode import PythonCodePrinter
 
-from undertow.codegen.names import Names
+from undertow.codegen.names import SymbolNames
 from undertow.codegen.tape import Tape
 
 __all__ = ["SINCOS", "Emitter"]
@@ -37,7 +37,7 @@ _cos_{i} = g_{i} * (1.0 - 2.0 * o_{i}) * (pc_{i} if o_{i} == 0.0 else ps_{i})
 class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
     """Python code that numba turns into vector arithmetic."""
 
-    def __init__(self, names: Names) -> None:
+    def __init__(self, names: SymbolNames) -> None:
         super().__init__({"fully_qualified_modules": True})
         self.names = names
 
@@ -96,12 +96,12 @@ class Emitter:
         Where the expressions were laid.
     given
         Text of symbols that have one already; the others get names by their place, see
-        :class:`undertow.codegen.names.Names`.
+        :class:`undertow.codegen.names.SymbolNames`.
     """
 
     def __init__(self, tape: Tape, given: Mapping[sp.Symbol, str] | None = None) -> None:
         self.tape = tape
-        self.names = Names(tape, given or {})
+        self.names = SymbolNames(tape, given or {})
         self.printer = self.language()
         self.angles: dict[sp.Expr, int] = {}
 

@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 from sympy.printing.numpy import NumPyPrinter
 
-from undertow.codegen.names import Names, distinct
+from undertow.codegen.names import SymbolNames, distinct
 from undertow.codegen.tape import Tape
 from undertow.errors import ModelError
 
@@ -23,7 +23,7 @@ VectorFunction = Callable[..., list[Any]]
 class _Printer(NumPyPrinter):  # type: ignore[misc]  # SymPy is untyped
     """NumPy expressions in the names that are given."""
 
-    def __init__(self, names: Names) -> None:
+    def __init__(self, names: SymbolNames) -> None:
         super().__init__({"fully_qualified_modules": True, "allow_unknown_functions": False})
         self.names = names
 
@@ -47,7 +47,7 @@ def compile_numpy(
     needed: set[sp.Basic] = set().union(*(e.free_symbols for e in results))
     needed |= set().union(*(line.expression.free_symbols for line in lines))
     _refuse(needed - given.keys() - {line.symbol for line in lines})
-    printer = _Printer(Names(tape, {s: s.name for s in given.values()}))
+    printer = _Printer(SymbolNames(tape, {s: s.name for s in given.values()}))
 
     def text(expression: sp.Expr) -> str:
         return str(printer.doprint(expression.xreplace(given)))
@@ -72,7 +72,7 @@ def compile_expressions(
     results = [sp.sympify(o) for o in outputs]
     _refuse(set().union(*(e.free_symbols for e in results)) - set(inputs))
     given = {s: f"a{i}" for i, s in enumerate(distinct(inputs))}
-    printer = _Printer(Names(Tape(), given))
+    printer = _Printer(SymbolNames(Tape(), given))
     return _function(list(given.values()), [], [printer.doprint(e) for e in results])
 
 
