@@ -127,34 +127,47 @@ def swing_up(subject: Subject) -> Iterator[Difference]:
 
 
 def loop_programme(subject: Subject) -> Iterator[Difference]:
-    """The equations that regions of the whole loop are proved with: floats, and enclosures."""
+    """The equations that regions of the whole loop are proved with: floats, and enclosures.
+
+    They are in z = (q, p, s), s the surface and p = M_uu(0)⁻¹ [M_auᵀ M_uu] q̇: the velocities are
+    solved for exactly.
+    """
     mechanism, n, m = subject.mechanism, subject.mechanism.n, subject.mechanism.m
-    motion = LoopMotion(mechanism, subject.surface, subject.reaching)
+    surface = subject.surface
+    motion = LoopMotion(mechanism, surface, subject.reaching)
     names = [i.name for i in mechanism.inputs]
     layer = exactly(subject.reaching.vector(m)[m:])
     parameters = [Interval(p) for p in mechanism.parameter_values]
-    row = [exactly(r) for r in np.hstack([subject.surface.velocity_row])]
-    position = [exactly(r) for r in subject.surface.position_row]
-    for x, state, law in zip(subject.states, subject.numbers, subject.laws, strict=True):
+    position, velocity = _rows(surface.position_row), _rows(surface.velocity_row)
+    at_target = _rows(mechanism.M(np.zeros(n))[m:, m:])
+    for x in subject.states:
         z = motion.from_state(x)
+        q, p, s = ([[v] for v in exactly(part)] for part in np.split(z, [n, 2 * n - m]))
+        M, _, _ = subject.model.matrices(0.0, [*exactly(z[:n]), *exactly(x[n:])])
+        pull = product(position, q)
+        right = [*([a[0] - b[0]] for a, b in zip(s, pull, strict=True)), *product(at_target, p)]
+        speed = [row[0] for row in solve([*velocity, *M[m:]], right)]
+        state = [*exactly(z[:n]), *speed]
+        law = subject.model.law(surface, subject.reaching, state)
         rates, demand = motion(z)
         yield from subject.compared("loop programme: demand", x, demand, law.demand, names)
-        yield from subject.compared("loop programme: q̇", x, rates[:n], state[n:])
+        yield from subject.compared("loop programme: q̇", x, rates[:n], speed)
         qdd = subject.model.accelerations(0.0, state, law.u)
         s_dot = [
-            sum((a * b for a, b in zip(r, [*qdd, *state[n:]], strict=True)), Number(0))
-            for r in ([*v, *p] for v, p in zip(row, position, strict=True))
+            a[0] + b[0]
+            for a, b in zip(
+                product(velocity, [[v] for v in qdd]),
+                product(position, [[v] for v in speed]),
+                strict=True,
+            )
         ]
         yield from subject.compared("loop programme: ṡ", x, rates[2 * n - m :], s_dot)
-        switch = [(s / e).clip(1.0) for s, e in zip(law.s, layer, strict=True)]
-        if any(abs(float(w)) == 1.0 for w in switch):
-            continue  # sat(s/ε) of the float s, and of the exact one, may differ at the edge
-        around = [np.nextafter(v, [-np.inf, np.inf]) for v in (*z, *map(float, switch))]
-        wide = [Interval(*v) for v in around]
-        found = motion.equations.program.points(*wide, *parameters)
+        switch = [float((v[0] / e).clip(1.0)) for v, e in zip(s, layer, strict=True)]
+        around = [Interval(*np.nextafter(v, [-np.inf, np.inf])) for v in switch]
+        found = motion.equations.program.points(*map(Interval, z), *around, *parameters)
         for name, box, true in zip(names, found[2 * n - m : 2 * n], law.demand, strict=True):
             low, high = float(box.lo), float(box.hi)
-            slack = 64 * 2.0**-53 * true.size  # p and s are rounded before they are enclosed
+            slack = 2.0**-52 * true.size  # M_uu(0) may be rounded or not
             off = 0.0 if true.inside(low - slack, high + slack) else true.off(low)
             yield Difference(
                 f"loop programme: enclosure of {name}", subject.where(x), low, float(true), off
