@@ -24,7 +24,7 @@ from agreements import (
     sliding_motion,
     swing_up,
 )
-from undertow import inner_loop, kernel
+from undertow import exact, inner_loop, kernel
 from undertow.agreement import LIMIT, QUICK, Difference, Subject, numpy_functions, worst
 from undertow.certify.ellipsoid import ClosedLoopProgram
 from undertow.check import check_mechanism
@@ -61,6 +61,7 @@ def agree(differences: Iterator[Difference], limit: float = LIMIT) -> None:
         "Max(a, b, 0.1) - Min(a, b)", "Abs(a - b)*sign(b - a)", "a**3 - 0.1*a**(-2)", "2**a + pi*E",
         "Piecewise((a, a < b), (b**2, True))", "tanh(a) + sinh(b)/cosh(a) + asin(a/9) + acos(b/9)",
         "Heaviside(a - b) + floor(3*a) + erf(b) + atan(a)",
+        "Mod(5*a, b) + sec(a/3) + cot(b/2) + csc(b)",
     ],
 )  # fmt: skip
 def test_exact_values_are_those_of_sympy(text: str) -> None:
@@ -69,9 +70,9 @@ def test_exact_values_are_those_of_sympy(text: str) -> None:
     a, b = sp.symbols("a b", real=True)
     e = sp.sympify(text, {"a": a, "b": b})
     for x, y in ((0.7, 1.9), (1.9, 0.7), (1e-3, 2.5)):
-        exact = {a: sp.Rational(*x.as_integer_ratio()), b: sp.Rational(*y.as_integer_ratio())}
+        binary = {a: sp.Rational(*x.as_integer_ratio()), b: sp.Rational(*y.as_integer_ratio())}
         floats = {f: sp.Rational(*float(f).as_integer_ratio()) for f in e.atoms(sp.Float)}
-        wanted = sp.N(e.xreplace(floats).subs(exact), 45)
+        wanted = sp.N(e.xreplace(floats).subs(binary), 45)
         found = evaluate(e, {a: Number(x), b: Number(y)})
         assert abs(sp.Float(found.value, 45) - wanted) <= abs(wanted) * sp.Float("1e-43")
         assert found.off(float(sp.lambdify((a, b), e, ["math", "scipy"])(x, y))) <= 8 * 2.0**-53
@@ -352,6 +353,16 @@ def test_a_model_without_a_value_is_said() -> None:
     nowhere.__dict__["force"] = sp.ImmutableDenseMatrix(force)
     with pytest.raises(ModelError, match="real numbers at 0"):
         Subject(nowhere)
+
+
+def test_a_function_without_an_exact_value_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim: what cannot be compared counts as not passed, with the reason, and raises nothing."""
+    known = {k: v for k, v in exact._FUNCTIONS.items() if k not in (sp.sin, sp.cos)}
+    monkeypatch.setattr(exact, "_FUNCTIONS", known)
+    report = check_mechanism(named(["a", "b", "F"], title="sines are not known"))
+    (check,) = report.failures
+    assert check.name.startswith("compiled code")
+    assert "real numbers at 0" in check.remedy
 
 
 def test_a_plant_that_depends_on_time(interpreted: None) -> None:

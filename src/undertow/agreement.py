@@ -133,7 +133,7 @@ class Subject:
             a, b = self._rng.uniform(0.2, 1.0, (2, m, m))
             c, d = self._rng.uniform(0.2, 1.0, (2, m, n - m))
             alpha_a = -np.eye(m) - 0.2 * a
-            if abs(np.linalg.det(alpha_a - size * c @ X)) >= 0.1:
+            if not abs(np.linalg.det(alpha_a - size * c @ X)) < 0.1:
                 return Surface(alpha_a, -b - np.eye(m), size * c, 3.0 * d)
             size *= 0.8
 

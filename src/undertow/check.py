@@ -14,7 +14,6 @@ import numpy as np
 import sympy as sp
 
 from undertow.codegen import Tape, compile_numpy
-from undertow.codegen.store import cache_folder
 from undertow.errors import ModelError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.stability import controllability, linearise
@@ -171,7 +170,10 @@ def _agreement(mechanism: Mechanism, seed: int) -> tuple[Check, ...]:
     from undertow.agreement import LIMIT, QUICK, Subject, numpy_functions, worst
 
     found = []
-    subject = Subject(mechanism, count=1, seed=seed)
+    try:
+        subject = Subject(mechanism, count=1, seed=seed)
+    except ModelError as error:
+        return (Check("compiled code as the symbols", False, math.nan, "comparable", str(error)),)
     for what, compare in QUICK.items():
         if subject.autonomous or compare is numpy_functions:
             difference = worst(compare(subject))
@@ -183,8 +185,8 @@ def _agreement(mechanism: Mechanism, seed: int) -> tuple[Check, ...]:
                     difference.relative <= LIMIT,
                     difference.relative,
                     f"≤ {LIMIT:g}, relative to what rounding scales with",
-                    f"{difference}. Empty the cache of generated code, {cache_folder()}; report it "
-                    "if it stays",
+                    f"{difference}. Empty the cache of generated code ($UNDERTOW_CACHE, or "
+                    "undertow in the user's); report it if it stays",
                 )
             )
     return tuple(found)

@@ -165,6 +165,10 @@ _FUNCTIONS: Mapping[Any, Callable[[Number], Number]] = {
     sp.floor: lambda a: Number(_MP.floor(a.value)),
     sp.ceiling: lambda a: Number(_MP.ceil(a.value)),
     sp.Heaviside: lambda a: (a.sign() + Number(1)) * Number(0.5),
+    sp.sec: lambda a: Number(1) / _FUNCTIONS[sp.cos](a),
+    sp.csc: lambda a: Number(1) / _FUNCTIONS[sp.sin](a),
+    sp.cot: lambda a: _FUNCTIONS[sp.cos](a) / _FUNCTIONS[sp.sin](a),
+    sp.coth: lambda a: Number(1) / _FUNCTIONS[sp.tanh](a),
     sp.Abs: abs,
     sp.sign: Number.sign,
 }
@@ -210,6 +214,8 @@ def _fresh(e: sp.Basic, known: dict[sp.Basic, Number]) -> Number:
         below = float(x.value**2 + y.value**2)
         size = (abs(float(x)) * y.size + abs(float(y)) * x.size) / below
         return Number(_MP.atan2(y.value, x.value), size + math.pi)
+    if e.func is sp.Mod:
+        return args[0] - args[1] * Number(_MP.floor((args[0] / args[1]).value))
     raise ModelError(
         "exact value",
         value=str(e),
