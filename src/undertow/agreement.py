@@ -247,7 +247,7 @@ def inner_loop(subject: Subject) -> Iterator[Difference]:
 def kernel(subject: Subject) -> Iterator[Difference]:
     """Compare one step of the rollout kernel: the law, the next state, the cost."""
     mechanism, model = subject.mechanism, subject.model
-    n, m, objective = mechanism.n, mechanism.m, MinimumEnergy()
+    n, m, objective = mechanism.n, mechanism.m, MinimumEnergy().on(mechanism)
     kernels = compile_loop(mechanism, None, objective, subject.reaching.switching, sampled=False)
     at_target = coupling(mechanism, np.zeros(n))
     constraints = len(objective.path_margins(mechanism))
