@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import sympy as sp
+from sympy.core.function import Application
 
 from undertow.certify.interval import exact_fraction
 from undertow.mechanism import TIME, Mechanism
@@ -41,9 +42,7 @@ def exact_mechanism(mechanism: Mechanism) -> Mechanism:
     target = dict.fromkeys((*mechanism.x, TIME), 0.0) | values
     exact = {name: getattr(mechanism, name).applyfunc(exact_expression) for name in blocks}
     for name, matrix in exact.items():
-        what = f"{name} of '{mechanism.name}'"
-        require_smooth(what, matrix, mechanism.x)
-        require_smooth(what, matrix, mechanism.x, at=target)
+        _require_smooth(f"{name} of '{mechanism.name}'", list(matrix), mechanism.x, target)
     changed = {k: v for k, v in exact.items() if v != getattr(mechanism, k)}
     return replace(mechanism, **changed) if changed else mechanism
 
@@ -59,9 +58,20 @@ def exact_rates(
         For expressions that are not smooth, everywhere or at 0.
     """
     exact = tuple(exact_expression(sp.sympify(e)) for e in rates)
-    require_smooth("vector field", exact, states)
-    require_smooth("vector field", exact, states, at=dict.fromkeys(states, 0.0) | values)
+    _require_smooth("vector field", exact, states, dict.fromkeys(states, 0.0) | values)
     return exact
+
+
+def _require_smooth(
+    what: str,
+    expressions: Sequence[sp.Expr],
+    states: Sequence[sp.Symbol],
+    target: dict[sp.Symbol, float],
+) -> None:
+    """Refuse a kink anywhere, also one that a factor softens: proofs differentiate twice."""
+    functions = {f for e in expressions for f in e.atoms(Application)}
+    require_smooth(what, [*expressions, *sorted(functions, key=str)], states)
+    require_smooth(what, expressions, states, at=target)
 
 
 def vanishes(expressions: Iterable[sp.Expr], at: Iterable[sp.Symbol]) -> bool:
