@@ -496,6 +496,7 @@ KINKS = {
     "a fourth root": (TILT**4) ** sp.Rational(1, 4),
     "arccos of cos": sp.acos(sp.cos(TILT)),
     "a kink in the mass's slope": sp.sin(sp.Abs(RIG.x[3])) * RIG.x[3],
+    "drag, a kink that a factor softens": -0.01 * sp.Abs(RIG.x[3]) * RIG.x[3],
     "Abs of sin": sp.Abs(sp.sin(TILT)) + TILT**2,
 }
 

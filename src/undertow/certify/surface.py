@@ -239,7 +239,7 @@ def hurwitz(mechanism: Mechanism, surface: Surface) -> Verdict:
             )
         stable = _is_hurwitz(matrix, 0.0, exact)
         method = f"Routh array in {'exact rationals' if exact else f'{_BITS}-bit balls'}"
-        mode = critical_mode(mechanism, surface)
+        mode = critical_mode(exact_mechanism(mechanism), surface)
         estimate = -mode.eigenvalue.real
         witness = {"Re eigenvalue": mode.eigenvalue.real, "Im eigenvalue": mode.eigenvalue.imag}
         details = {"critical mode": mode.shape}
