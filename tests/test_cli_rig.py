@@ -185,7 +185,7 @@ class Port(Three):
         ("Quick", "--period 0.0005"),
         ("Dead", "unplugged"),
         ("Port", "no such port"),
-        ("Nobody", "without read, write, close, period"),
+        ("Nobody", "no name 'Nobody', must be one of NoRead, Three, Quick, Dead, Port"),
     ],
 )
 def test_what_is_no_driver_is_refused_before_anything_runs(

@@ -550,7 +550,9 @@ def test_a_keeper_that_is_gone_leaves_the_output_unknown(controller: Controller)
     rig.write = write  # type: ignore[method-assign]
     verdict = runtime.run(2.0).verdict
     assert verdict.exit_code == EXIT_CODES["output on"]
-    assert "did not take an output of zero" in verdict.output
+    # Which of the two depends on whether the last writes still went into the pipe.
+    told = ("did not take an output of zero", "whether the output is at zero is not known")
+    assert any(words in verdict.output for words in told)
 
 
 def test_a_rig_that_cannot_be_made_is_refused_with_its_own_condition() -> None:

@@ -589,6 +589,8 @@ def _interrupted(moment: str) -> tuple[int, list[str]]:
         stderr=subprocess.PIPE,
         text=True,
         encoding="utf-8",
+        # What is started in the background ignores Ctrl-C, and so do its children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     ) as process:
         assert process.stderr is not None
         lines = []

@@ -78,6 +78,7 @@ GENERATOR = generators(
     "codegen/linear.py",
     "codegen/rows.py",
     "codegen/settle.py",
+    "codegen/vector.py",
 )
 
 

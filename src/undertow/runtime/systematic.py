@@ -21,7 +21,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
@@ -68,6 +70,10 @@ _BATCH = 8
 
 #: Of the calls of a kind that fail: the first, the last, and spread between.
 FIRST, LAST, BETWEEN = 200, 50, 50
+
+
+#: What a run must not leave behind.
+_Worker = BaseProcess | Background
 
 
 def is_live(operation: str, rig: str) -> bool:
@@ -273,7 +279,7 @@ class Systematic:
         """
         if fault.rig not in RIGS:
             raise InvalidInputError("rig of a fault", value=fault.rig, limit=" or ".join(RIGS))
-        tally = Tally(fault)
+        tally, before = Tally(fault), _running()
         with tempfile.TemporaryDirectory() as folder:
             log = Path(folder) / "log.db"
             try:
@@ -287,7 +293,7 @@ class Systematic:
             except Exception as error:  # whatever came through is a finding
                 _end_children()
                 return Case(fault, (f"{type(error).__name__}: {error}",), "it raised")
-            return self._judged(fault, tally, run)
+            return self._judged(fault, tally, run, before)
 
     def drill(
         self,
@@ -375,8 +381,8 @@ class Systematic:
 
     # -- and its judgement -------------------------------------------------------------------
 
-    def _judged(self, fault: Fault, tally: Tally, run: _Run) -> Case:
-        """Say what is wrong with a run, if anything."""
+    def _judged(self, fault: Fault, tally: Tally, run: _Run, before: AbstractSet[_Worker]) -> Case:
+        """Say what is wrong with a run, if anything; ``before`` it, these were running."""
         wrong = list(run.unsound)
         device, report = run.device, run.report
         if report is None:
@@ -386,7 +392,7 @@ class Systematic:
             if device.last.any() and report.verdict.off:
                 wrong.append(f"the output stays at {device.last.tolist()}, and nothing says so")
             wrong += self._log_faults(fault.rig, run)
-        wrong += _left_behind()
+        wrong += _left_behind(before)
         if report is None:
             happened = f"refused: {run.refused}"
         else:
@@ -416,12 +422,17 @@ class Systematic:
         return [f"the replay differs: {again.differing} steps, {again.misjudged} decisions"]
 
 
-def _left_behind() -> list[str]:
+def _running() -> set[_Worker]:
+    """Return the processes and threads of ours that run now."""
+    threads = (t for t in threading.enumerate() if isinstance(t, Background))
+    return {*multiprocessing.active_children(), *threads}
+
+
+def _left_behind(before: AbstractSet[_Worker]) -> list[str]:
     """Return what still runs of a run that is over; it is given a moment, and then ended."""
     deadline = time.monotonic() + 2.0
     while True:
-        left = [process.name for process in multiprocessing.active_children()]
-        left += [f"thread {t.name}" for t in threading.enumerate() if isinstance(t, Background)]
+        left = sorted(f"{type(r).__name__} {r.name}" for r in _running() - before)
         if not left:
             return []
         if time.monotonic() > deadline:
