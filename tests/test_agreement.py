@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -39,10 +40,24 @@ SINGLE = 1e-6
 
 
 @pytest.fixture
-def interpreted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Generated modules run as Python, from a cache of their own: nothing has to be compiled."""
-    monkeypatch.setattr(numba.config, "DISABLE_JIT", True)
+def interpreted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """Generated modules run as Python, from a cache of their own: nothing has to be compiled.
+
+    Only their decorator is taken away: numba's own switch would also meet what numba compiles of
+    itself for others, and that stays so in this process.
+    """
+    monkeypatch.setattr(numba, "njit", _as_it_is)
     monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path / "cache"))
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]  # whoever needs it next wants it compiled
+
+
+def _as_it_is(function: Any = None, **_options: Any) -> Any:
+    """Decorate nothing, with options or without."""
+    return _as_it_is if function is None else function
 
 
 def agree(differences: Iterator[Difference], limit: float = LIMIT) -> None:
@@ -200,6 +215,7 @@ def test_names_drawn_at_random(seed: int, interpreted: None, tmp_path: Path) -> 
     agree(exported_law(subject, tmp_path))
 
 
+@pytest.mark.slow  # the same as above, but for the compiler
 def test_a_mechanism_of_odd_names_compiled(tmp_path: Path) -> None:
     """Claim: names of generators, of C and of Python, compiled: all checks pass, and C agrees.
 
