@@ -165,6 +165,23 @@ FORGERIES: dict[str, tuple[Edit, str]] = {
     "an ellipsoid of another size": (
         lambda d: claims_of(d, "terminal ellipsoid")[0]["data"].update(W=[[1.0]]), "shape"
     ),
+    "numbers beyond all floats": (
+        lambda d: claims_of(d, "surface region")[0]["data"]["function"].update(
+            stretch=[np.eye(3).tolist()], pole=1e308
+        ),
+        "OverflowError",
+    ),
+    "a fraction over 0": (
+        lambda d: d["subjects"][0].update(
+            surface={k: [[float(getattr(CASES[3], k))]] for k in SURFACE.__dataclass_fields__},
+            claims=[{
+                "kind": "appendix interval",
+                "data": {"P": ["1/0", "1", "1", "1", "1"], "half_width": "1/2"},
+                "verdict": d["subjects"][0]["claims"][0]["verdict"],
+            }],
+        ),
+        "ZeroDivisionError",
+    ),
     "an unknown coordinate": (
         lambda d: claims_of(d, "nonsingular")[0]["data"].update(region={"psi": [-1, 1]}), "psi"
     ),
@@ -497,6 +514,9 @@ KINKS = {
     "arccos of cos": sp.acos(sp.cos(TILT)),
     "a kink in the mass's slope": sp.sin(sp.Abs(RIG.x[3])) * RIG.x[3],
     "drag, a kink that a factor softens": -0.01 * sp.Abs(RIG.x[3]) * RIG.x[3],
+    "arccot, which jumps at 0": -3 * TILT * sp.acot(TILT),
+    "arctan of cot": TILT * sp.atan(sp.cot(TILT)),
+    "a pole in disguise": TILT * sp.tanh(sp.tan(TILT + sp.pi / 2)),
     "Abs of sin": sp.Abs(sp.sin(TILT)) + TILT**2,
 }
 

@@ -208,7 +208,7 @@ def verify(
 def _decide(mechanism: Mechanism, subject: Subject, claim: Claim, seconds: float) -> Verdict:
     try:
         verdict = CHECKS[claim.kind](mechanism, subject, claim.data, seconds)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise CertificateError(
             f"claim '{claim.kind}'", value=f"{type(error).__name__}: {error}", limit="complete"
         ) from error
