@@ -267,6 +267,11 @@ _HELPERS = {
     return a < b || isnan(a) ? a : b;
 }
 """,
+    "ut_mod": """static ut_real ut_mod(ut_real remainder, ut_real b)
+{
+    return (remainder < 0 && b > 0) || (remainder > 0 && b < 0) ? remainder + b : remainder;
+}
+""",
     "ut_sign": """static ut_real ut_sign(ut_real a)
 {
     return (ut_real)((a > 0) - (a < 0));
