@@ -430,6 +430,8 @@ def test_what_is_decided_is_in_the_sentence(written: bytes) -> None:
     assert "for |phi| ≤ 0.5 rad, the other coordinates at the target" in load.claim
     near = verdict_after(written, "surface region", lambda d: data(d).update(start=[1e-3, 0, 0]))
     assert "contains phi = 0.001" in near.claim
+    assert load.claim.endswith("the inputs not limited")
+    assert near.claim.endswith("the inputs not limited")
     weak = RIG.with_input_limit(12.345678901)
     search = search_for(weak, SURFACE, ut.ReachingLaw())
     assert search is not None

@@ -290,7 +290,7 @@ def region_words(motion: Motion, start: Sequence[float], parameters: Box) -> str
     ranges = "".join(f", for every {n} in {within(a, b)}" for n, (a, b) in parameters.items())
     return (
         "a region of attraction on the surface, non-singular and compact, contains "
-        f"{', '.join(points) or 'the target'}{ranges}"
+        f"{', '.join(points) or 'the target'}{ranges}, the inputs not limited"
     )
 
 
