@@ -350,6 +350,26 @@ def test_a_verified_certificate_serves_the_gate(written: bytes) -> None:
     assert proved_sets(RIG, doubtful) == ()
 
 
+def test_proved_sets_are_of_one_mechanism(written: bytes) -> None:
+    """What was proved for other parameters is no evidence, in one step or the other."""
+    heavy = RIG.with_input_limit(14.0)
+    checked = verify(Certificate.from_bytes(edited(written, only("terminal ellipsoid"))), RIG)
+    with pytest.raises(CertificateError, match="other equations, parameters or limits"):
+        proved_sets(heavy, checked)
+    sets, x = proved_sets(RIG, checked), 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
+    verdict = assess(ut.ClosedLoop(heavy), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    assert "proved before" not in verdict.method
+
+
+def test_a_claim_of_a_held_input_is_no_set_of_the_continuous_loop(written: bytes) -> None:
+    terminal = {"scale": (0.01 * np.eye(3)).tolist(), "widths": [0.01]}
+    data = {"coordinate": "phi", "edges": [0.0, 0.1], "terminal": terminal, "step": 1e-3}
+    item = verify(Certificate.from_bytes(edited(written, only("stability"))), RIG)[0]
+    for hold, count in ((0, 1), (1, 0)):
+        claim = Claim("closed loop", data | {"horizon": 1.0, "hold": hold}, item.verdict)
+        assert len(proved_sets(RIG, [replace(item, claim=claim)])) == count
+
+
 def test_starts_at_rest_are_a_set() -> None:
     starts = ProvedStarts(SURFACE, ut.ReachingLaw(), 1, 0.3)
     assert starts.contains(RIG.state(phi=-0.3))

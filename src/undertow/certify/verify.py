@@ -53,11 +53,14 @@ class Checked:
         As the file has it; its words say nothing.
     verdict
         As it was decided now, with the sentence that was decided.
+    model
+        Fingerprint of the mechanism that it was decided for: equations, parameters, limits.
     """
 
     subject: Subject
     claim: Claim
     verdict: Verdict
+    model: str
 
     @property
     def reworded(self) -> bool:
@@ -185,7 +188,8 @@ def verify(
     MissingExtraError
         Without python-flint.
     """
-    model = exact_mechanism(match(certificate, mechanism, own_parameters=own_parameters))
+    matched = match(certificate, mechanism, own_parameters=own_parameters)
+    model = exact_mechanism(matched)
     tasks = [(s, c) for s in certificate.subjects for c in s.claims]
     if not tasks:
         raise CertificateError("certificate", value="no claim", limit="at least one")
@@ -201,7 +205,8 @@ def verify(
     for index, (subject, claim) in enumerate(tasks):
         if progress is not None:
             progress(claim.kind, index / len(tasks))
-        done.append(Checked(subject, claim, _decide(model, subject, claim, max_seconds)))
+        verdict = _decide(model, subject, claim, max_seconds)
+        done.append(Checked(subject, claim, verdict, matched.fingerprint))
     return tuple(done)
 
 
