@@ -167,7 +167,7 @@ def test_exported_c_of_the_library_is_that_of_the_symbols(
 
 
 def drawn(seed: int, count: int) -> list[str]:
-    """SymbolNames for a mechanism: odd ones, none of which is another's velocity."""
+    """Names for a mechanism: odd ones, none of which is another's velocity."""
     rng = np.random.default_rng(seed)
     return [str(v) for v in rng.choice(np.array(ODD_NAMES), count, replace=False)]
 

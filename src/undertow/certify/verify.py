@@ -215,7 +215,9 @@ def _decide(mechanism: Mechanism, subject: Subject, claim: Claim, seconds: float
         verdict = CHECKS[claim.kind](mechanism, subject, claim.data, seconds)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise CertificateError(
-            f"claim '{claim.kind}'", value=f"{type(error).__name__}: {error}", limit="complete"
+            f"claim '{claim.kind}'",
+            value=f"{type(error).__name__}: {error}",
+            limit="complete, with numbers that can be computed with",
         ) from error
     stated = claim.verdict.margin
     if verdict and math.isfinite(stated) and not verdict.margin >= stated - 1e-9 * abs(stated):
