@@ -24,7 +24,7 @@ from agreements import (
     sliding_motion,
     swing_up,
 )
-from undertow import exact, inner_loop, kernel
+from undertow import agreement, exact, inner_loop, kernel
 from undertow.agreement import LIMIT, QUICK, Difference, Subject, numpy_functions, worst
 from undertow.certify.ellipsoid import ClosedLoopProgram
 from undertow.check import check_mechanism
@@ -116,6 +116,21 @@ def test_inputs_without_a_limit(interpreted: None) -> None:
     assert max(abs(float(law.u[0])) for law in subject.laws) > 20.0
     for compare in QUICK.values():
         agree(compare(subject))
+
+
+def test_the_kernel_of_a_sampled_loop(interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim: it holds the input of the sample over its step; one that forgets to is found."""
+    subject = Subject(named(["a", "b", "F"], title="sampled"))
+    agree(agreement.kernel(subject, sampled=True))
+    compiled = kernel.compile_loop
+
+    def renewed(*args: Any, sampled: bool) -> Any:
+        return compiled(*args, sampled=not sampled)
+
+    monkeypatch.setattr(agreement, "compile_loop", renewed)
+    found = worst(agreement.kernel(subject, sampled=True))
+    assert found is not None
+    assert found.relative > 1e3 * LIMIT
 
 
 def test_gains_that_declared_disturbances_ask_for() -> None:
