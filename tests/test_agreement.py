@@ -25,10 +25,12 @@ from agreements import (
     sliding_motion,
     swing_up,
 )
-from undertow import exact, inner_loop, kernel
+from undertow import agreement, exact, inner_loop, kernel
 from undertow.agreement import LIMIT, QUICK, Difference, Subject, numpy_functions, worst
 from undertow.certify.ellipsoid import ClosedLoopProgram
 from undertow.check import check_mechanism
+from undertow.codegen import Tape
+from undertow.codegen.c99 import C99Emitter
 from undertow.codegen.machine import numba
 from undertow.codegen.names import SymbolNames
 from undertow.errors import ModelError
@@ -131,6 +133,21 @@ def test_inputs_without_a_limit(interpreted: None) -> None:
         agree(compare(subject))
 
 
+def test_the_kernel_of_a_sampled_loop(interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim: it holds the input of the sample over its step; one that forgets to is found."""
+    subject = Subject(named(["a", "b", "F"], title="sampled"))
+    agree(agreement.kernel(subject, sampled=True))
+    compiled = kernel.compile_loop
+
+    def renewed(*args: Any, sampled: bool) -> Any:
+        return compiled(*args, sampled=not sampled)
+
+    monkeypatch.setattr(agreement, "compile_loop", renewed)
+    found = worst(agreement.kernel(subject, sampled=True))
+    assert found is not None
+    assert found.relative > 1e3 * LIMIT
+
+
 def test_gains_that_declared_disturbances_ask_for() -> None:
     """Claim: the gains (13) are those of the symbols, in every compiled law."""
     mechanism = ut.mechanisms.rotary_pendulum().with_disturbance_bounds(0.01, 0.02)
@@ -180,7 +197,7 @@ def test_exported_c_of_the_library_is_that_of_the_symbols(
 
 
 def drawn(seed: int, count: int) -> list[str]:
-    """SymbolNames for a mechanism: odd ones, none of which is another's velocity."""
+    """Names for a mechanism: odd ones, none of which is another's velocity."""
     rng = np.random.default_rng(seed)
     return [str(v) for v in rng.choice(np.array(ODD_NAMES), count, replace=False)]
 
@@ -405,3 +422,31 @@ def test_the_quick_part_can_be_left_out() -> None:
     whole, brief = (check_mechanism(mechanism, compiled=flag) for flag in (True, False))
     assert len(whole.checks) == len(brief.checks) + len(QUICK)
     assert replace(whole, checks=whole.checks[: len(brief.checks)]) == brief
+
+
+FUNCTIONS = (
+    "a*frac(b)", "-frac(a)", "a*Mod(b, 2)", "Mod(a, -3)**2", "acot(b + 2)", "sech(b)",
+    "b*csch(a + 2)", "coth(a + 2)", "sinc(b)", "sec(b)*tan(b)", "csc(b + 2)*cot(b + 2)",
+    "floor(a) - ceiling(b)", "Heaviside(b)*a",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", FUNCTIONS)
+def test_functions_that_code_is_written_for(text: str, interpreted: None) -> None:
+    """Claim: each is compiled as it is meant, also as a factor and of negative arguments."""
+    plain = named(["a", "b", "F"], title=f"force {text}")
+    extra = sp.sympify(text, {"a": plain.q[0], "b": plain.q[1]}) / 50
+    force = sp.Matrix(plain.force) + sp.Matrix([extra, 0])
+    subject = Subject(replace(plain, force=sp.ImmutableDenseMatrix(force), potential=None))
+    agree(inner_loop_of(subject))
+    agree(QUICK["rollout kernel"](subject))
+    agree(numpy_functions(subject))
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_a_remainder_in_c_has_the_sign_of_the_divisor(real: Any) -> None:
+    """Claim: C's fmod(−1, 2) is −1, where SymPy and Python have 1."""
+    x = sp.Symbol("x", real=True)
+    text = C99Emitter(Tape(), {x: "x"}, real).text(x * sp.Mod(x, 2))
+    ends = {"double": ("fmod(x, 2.0)", "2.0"), "float": ("fmodf(x, 2.0f)", "2.0f")}[real]
+    assert text == f"x*(ut_mod({ends[0]}, {ends[1]}))"

@@ -165,6 +165,23 @@ FORGERIES: dict[str, tuple[Edit, str]] = {
     "an ellipsoid of another size": (
         lambda d: claims_of(d, "terminal ellipsoid")[0]["data"].update(W=[[1.0]]), "shape"
     ),
+    "numbers beyond all floats": (
+        lambda d: claims_of(d, "surface region")[0]["data"]["function"].update(
+            stretch=[np.eye(3).tolist()], pole=1e308
+        ),
+        "OverflowError",
+    ),
+    "a fraction over 0": (
+        lambda d: d["subjects"][0].update(
+            surface={k: [[float(getattr(CASES[3], k))]] for k in SURFACE.__dataclass_fields__},
+            claims=[{
+                "kind": "appendix interval",
+                "data": {"P": ["1/0", "1", "1", "1", "1"], "half_width": "1/2"},
+                "verdict": d["subjects"][0]["claims"][0]["verdict"],
+            }],
+        ),
+        "ZeroDivisionError",
+    ),
     "an unknown coordinate": (
         lambda d: claims_of(d, "nonsingular")[0]["data"].update(region={"psi": [-1, 1]}), "psi"
     ),
@@ -333,6 +350,26 @@ def test_a_verified_certificate_serves_the_gate(written: bytes) -> None:
     assert proved_sets(RIG, doubtful) == ()
 
 
+def test_proved_sets_are_of_one_mechanism(written: bytes) -> None:
+    """What was proved for other parameters is no evidence, in one step or the other."""
+    heavy = RIG.with_input_limit(14.0)
+    checked = verify(Certificate.from_bytes(edited(written, only("terminal ellipsoid"))), RIG)
+    with pytest.raises(CertificateError, match="other equations, parameters or limits"):
+        proved_sets(heavy, checked)
+    sets, x = proved_sets(RIG, checked), 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
+    verdict = assess(ut.ClosedLoop(heavy), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    assert "proved before" not in verdict.method
+
+
+def test_a_claim_of_a_held_input_is_no_set_of_the_continuous_loop(written: bytes) -> None:
+    terminal = {"scale": (0.01 * np.eye(3)).tolist(), "widths": [0.01]}
+    data = {"coordinate": "phi", "edges": [0.0, 0.1], "terminal": terminal, "step": 1e-3}
+    item = verify(Certificate.from_bytes(edited(written, only("stability"))), RIG)[0]
+    for hold, count in ((0, 1), (1, 0)):
+        claim = Claim("closed loop", data | {"horizon": 1.0, "hold": hold}, item.verdict)
+        assert len(proved_sets(RIG, [replace(item, claim=claim)])) == count
+
+
 def test_starts_at_rest_are_a_set() -> None:
     starts = ProvedStarts(SURFACE, ut.ReachingLaw(), 1, 0.3)
     assert starts.contains(RIG.state(phi=-0.3))
@@ -413,6 +450,8 @@ def test_what_is_decided_is_in_the_sentence(written: bytes) -> None:
     assert "for |phi| ≤ 0.5 rad, the other coordinates at the target" in load.claim
     near = verdict_after(written, "surface region", lambda d: data(d).update(start=[1e-3, 0, 0]))
     assert "contains phi = 0.001" in near.claim
+    assert load.claim.endswith("the inputs not limited")
+    assert near.claim.endswith("the inputs not limited")
     weak = RIG.with_input_limit(12.345678901)
     search = search_for(weak, SURFACE, ut.ReachingLaw())
     assert search is not None
@@ -497,6 +536,9 @@ KINKS = {
     "arccos of cos": sp.acos(sp.cos(TILT)),
     "a kink in the mass's slope": sp.sin(sp.Abs(RIG.x[3])) * RIG.x[3],
     "drag, a kink that a factor softens": -0.01 * sp.Abs(RIG.x[3]) * RIG.x[3],
+    "arccot, which jumps at 0": -3 * TILT * sp.acot(TILT),
+    "arctan of cot": TILT * sp.atan(sp.cot(TILT)),
+    "a pole in disguise": TILT * sp.tanh(sp.tan(TILT + sp.pi / 2)),
     "Abs of sin": sp.Abs(sp.sin(TILT)) + TILT**2,
 }
 

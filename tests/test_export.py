@@ -1314,3 +1314,14 @@ def test_report_counts_instructions_and_bytes(tmp_path: Path) -> None:
     assert row["mechanism"] == "rotary_pendulum"
     assert 200 < int(row["instr."]) < 1000
     assert max(len(line) for line in said.splitlines() if "Written" not in line) <= 80
+
+
+@pytest.mark.parametrize("words", ["*\\ #error run /*", "/* */*/", "????/ \\", "kg/*m**/ ???"])
+def test_words_of_a_user_stay_in_their_comment(words: str, tmp_path: Path) -> None:
+    """Names, units and descriptions neither end a comment nor begin one: the C compiles."""
+    plain = ut.mechanisms.cart_pendulum()
+    parameters = tuple(replace(p, unit=words, description=words) for p in plain.parameters)
+    odd = replace(plain, name=f"x {words}", parameters=parameters)
+    controller = EmbeddedController(odd, ut.first_surface(plain), ut.ReachingLaw())
+    passed, said = Build(controller, tmp_path).self_test()
+    assert passed, said

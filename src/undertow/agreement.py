@@ -11,7 +11,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from undertow.inner_loop import InnerLoop
 from undertow.kernel import compile_loop
 from undertow.mechanism import TIME, FloatArray, Mechanism
 from undertow.objective import MinimumEnergy
-from undertow.room import NOTHING, Room, Shape
+from undertow.room import Room, Shape
 from undertow.sliding import ReachingLaw, SlidingModeLaw, Surface, coupling
 
 __all__ = [
@@ -244,26 +244,29 @@ def inner_loop(subject: Subject) -> Iterator[Difference]:
         )
 
 
-def kernel(subject: Subject) -> Iterator[Difference]:
-    """Compare one step of the rollout kernel: the law, the next state, the cost."""
+def kernel(subject: Subject, *, sampled: bool = False) -> Iterator[Difference]:
+    """Compare one step of the rollout kernel: the law, the next state, the cost.
+
+    With ``sampled`` that of a sampled loop, which holds its input over the step.
+    """
     mechanism, model = subject.mechanism, subject.model
     n, m, objective = mechanism.n, mechanism.m, MinimumEnergy().on(mechanism)
-    kernels = compile_loop(mechanism, None, objective, subject.reaching.switching, sampled=False)
+    kernels = compile_loop(mechanism, None, objective, subject.reaching.switching, sampled=sampled)
     at_target = coupling(mechanism, np.zeros(n))
     constraints = len(objective.path_margins(mechanism))
-    room = Room(Shape(n, m, constraints, at_target, None, False), len(subject.states), 1)
+    room = Room(Shape(n, m, constraints, at_target, None, sampled), len(subject.states), 1)
     room.fill(subject.states, subject.surface.vector, subject.reaching.vector(m))
     record = np.zeros((room.padded, 1, 2 * n + 2 * m + 2))
     parameters, limits = mechanism.parameter_values, mechanism.input_limits
     kernels.rollout(
         room.states, room.live, room.lanes, np.zeros(1, dtype=np.int64), parameters, parameters,
-        limits, NOTHING, 0.0, STEP, 1, 1, 0.0, math.inf, math.inf, 0.0, 1, 1, record, room.out,
+        limits, room.quiet, 0.0, STEP, 1, 1, 0.0, math.inf, math.inf, 0.0, 1, 1, record, room.out,
     )  # fmt: skip
     after = room.batch(0.0)
     stage = objective.stage_cost(mechanism)
 
-    def rates(x: list[Number]) -> list[Number]:
-        u = model.law(subject.surface, subject.reaching, x[:-1]).u
+    def rates(x: list[Number], held: list[Number]) -> list[Number]:
+        u = held if sampled else model.law(subject.surface, subject.reaching, x[:-1]).u
         known = model.known(0.0, x[:-1]) | dict(zip(mechanism.u, u, strict=True))
         return [*x[n : 2 * n], *model.accelerations(0.0, x[:-1], u), evaluate(stage, known)]
 
@@ -274,7 +277,7 @@ def kernel(subject: Subject) -> Iterator[Difference]:
         yield from subject.compared_law("kernel", x, law, u, None, s, float(margin[-1]))
         if float(law.margin) < 1e-6 or (after.path[k] < 0).any():
             continue  # it stops there
-        *state, cost = runge_kutta(STEP, [*exact, Number(0)], rates)
+        *state, cost = runge_kutta(STEP, [*exact, Number(0)], partial(rates, held=law.u))
         names = mechanism.state_names
         yield from subject.compared("kernel: next state", x, after.x[k], state, names)
         yield from subject.compared("kernel: cost of a step", x, [after.cost[k]], [cost])

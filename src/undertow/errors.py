@@ -23,6 +23,7 @@ __all__ = [
     "UndertowError",
     "UnstableSurfaceError",
     "near",
+    "printable",
     "raised_at",
 ]
 
@@ -92,6 +93,15 @@ class ArtefactError(UndertowError, OSError):
 
 class ResourceError(UndertowError, OSError):
     """The system refuses memory, a thread, a process, a descriptor or room on its disk."""
+
+
+def printable(text: str) -> str:
+    r"""Return a text with "?" for every character that a terminal would obey instead of showing.
+
+    >>> printable("an escape: \x1b[2J")
+    'an escape: ?[2J'
+    """
+    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def near(name: str, names: Iterable[str]) -> str:

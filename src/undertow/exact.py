@@ -169,6 +169,11 @@ _FUNCTIONS: Mapping[Any, Callable[[Number], Number]] = {
     sp.csc: lambda a: Number(1) / _FUNCTIONS[sp.sin](a),
     sp.cot: lambda a: _FUNCTIONS[sp.cos](a) / _FUNCTIONS[sp.sin](a),
     sp.coth: lambda a: Number(1) / _FUNCTIONS[sp.tanh](a),
+    sp.sech: lambda a: Number(1) / _FUNCTIONS[sp.cosh](a),
+    sp.csch: lambda a: Number(1) / _FUNCTIONS[sp.sinh](a),
+    sp.acot: lambda a: _FUNCTIONS[sp.atan](Number(1) / a),
+    sp.sinc: lambda a: _FUNCTIONS[sp.sin](a) / a if a.value else Number(1),
+    sp.frac: lambda a: a - Number(_MP.floor(a.value)),
     sp.Abs: abs,
     sp.sign: Number.sign,
 }

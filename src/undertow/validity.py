@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -40,18 +41,26 @@ __all__ = [
 
 #: Functions that are smooth wherever they are finite: a derivative of theirs is never wrong.
 _SMOOTH = (
-    sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc, sp.sinc, sp.atan, sp.acot,
-    sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch, sp.asinh, sp.exp,
+    sp.sin, sp.cos, sp.sinc, sp.atan, sp.sinh, sp.cosh, sp.tanh, sp.sech, sp.asinh, sp.exp,
     sp.Add, sp.Mul, sp.Symbol, sp.Number, sp.NumberSymbol,
 )  # fmt: skip
 
+#: Functions that go to infinity at isolated points, and what is zero there.
+_POLES: Mapping[Any, Callable[[sp.Expr], sp.Expr]] = {
+    sp.tan: sp.cos, sp.sec: sp.cos, sp.cot: sp.sin, sp.csc: sp.sin,
+    sp.coth: lambda e: e, sp.csch: lambda e: e,
+}  # fmt: skip
+
 #: What has no derivative at isolated points, and none there that is a number.
-_SINGULAR = (sp.Pow, sp.log, sp.asin, sp.acos, sp.atan2, sp.acosh, sp.atanh)
+_SINGULAR = (
+    sp.Pow, sp.log, sp.asin, sp.acos, sp.atan2, sp.acosh, sp.atanh, *_POLES,
+)  # fmt: skip
 
 #: Functions with kinks and jumps that code is written for, and the conditions of Piecewise.
+#: SymPy's acot jumps at 0, from −π/2 to π/2; its derivative there is −1 all the same.
 _BROKEN = (
-    sp.Abs, sp.sign, sp.Max, sp.Min, sp.Piecewise, sp.Heaviside, sp.floor, sp.ceiling, sp.frac,
-    sp.Mod, Boolean,
+    sp.acot, sp.Abs, sp.sign, sp.Max, sp.Min, sp.Piecewise, sp.Heaviside, sp.floor, sp.ceiling,
+    sp.frac, sp.Mod, Boolean,
 )  # fmt: skip
 
 #: What stands for an expression that is not there.
@@ -419,8 +428,10 @@ def _edges(part: sp.Basic) -> list[sp.Expr] | None:
     if isinstance(part, sp.Pow):
         smooth = part.exp.is_Integer and part.exp.is_nonnegative
         return [] if smooth or not part.base.free_symbols else [part.base]
-    if isinstance(part, sp.Abs | sp.sign | sp.Heaviside | sp.DiracDelta | sp.log):
+    if isinstance(part, sp.Abs | sp.sign | sp.Heaviside | sp.DiracDelta | sp.log | sp.acot):
         return [part.args[0]]
+    if part.func in _POLES:
+        return [_POLES[part.func](part.args[0])]
     if isinstance(part, sp.asin | sp.acos | sp.acosh | sp.atanh):
         return [1 - part.args[0] ** 2]
     if isinstance(part, sp.atan2):

@@ -94,11 +94,15 @@ class TerminalEllipsoid:
 
 @dataclass(frozen=True)
 class ProvedEllipsoid:
-    """A terminal ellipsoid, proved, and the closed loop that it is of."""
+    """A terminal ellipsoid, proved, and the closed loop that it is of.
+
+    ``model`` is the mechanism's fingerprint; empty where nobody said it.
+    """
 
     surface: Surface
     reaching: ReachingLaw
     ellipsoid: TerminalEllipsoid
+    model: str = ""
 
     def contains(self, x: ArrayLike) -> bool:
         """Whether the state is inside for certain."""

@@ -246,5 +246,5 @@ def terminal_sets(
         search = search_for(mechanism, surface, reaching)
         ellipsoid = None if search is None else search.largest()
         if ellipsoid is not None:
-            found.append(ProvedEllipsoid(surface, reaching, ellipsoid))
+            found.append(ProvedEllipsoid(surface, reaching, ellipsoid, mechanism.fingerprint))
     return tuple(found)

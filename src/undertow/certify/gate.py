@@ -143,10 +143,17 @@ class _Case:
 
     @cached_property
     def known(self) -> list[ProvedSet]:
-        """Sets that were proved before for the last surface."""
+        """Sets that were proved before for the last surface, and not of another mechanism."""
         if self.loop.hold:
             return []
-        return [s for s in self.sets if s.surface == self.surface and s.reaching == self.law]
+        own = ("", self.loop.mechanism.fingerprint)
+        return [
+            s
+            for s in self.sets
+            if s.surface == self.surface
+            and s.reaching == self.law
+            and getattr(s, "model", "") in own
+        ]
 
     def proved_at(self, x: FloatArray) -> tuple[float, str] | None:
         """Whether a state is in a set that is proved, or can be on the spot; margin, method."""

@@ -252,7 +252,7 @@ def _claim(
     )
     what = f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
     left = ", ".join(inward(r, 6) for r in rate)
-    return f"the law {what} {where}: (16) with η = {left}"
+    return f"the law {what} {where}: (16) with η = {left}, the inputs not limited"
 
 
 def _verdict(claim: str, names: list[str], worst: Minimum, lower: float, method: str) -> Verdict:

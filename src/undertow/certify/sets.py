@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from undertow.certify.certificate import ellipsoid_of
 from undertow.certify.ellipsoid import ProvedEllipsoid
 from undertow.certify.loop_claim import LoopClaim
 from undertow.certify.verify import Checked
+from undertow.errors import CertificateError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.sliding import ReachingLaw, Surface
 
@@ -19,12 +20,16 @@ __all__ = ["ProvedStarts", "proved_sets"]
 
 @dataclass(frozen=True)
 class ProvedStarts:
-    """Starts at rest, one coordinate off the target by at most ``extent``, SI units."""
+    """Starts at rest, one coordinate off the target by at most ``extent``, SI units.
+
+    ``model`` is the mechanism's fingerprint; empty where nobody said it.
+    """
 
     surface: Surface
     reaching: ReachingLaw
     index: int
     extent: float
+    model: str = ""
 
     def contains(self, x: FloatArray) -> bool:
         """Whether the state is one of them."""
@@ -35,7 +40,7 @@ class ProvedStarts:
 
 
 def proved_sets(
-    mechanism: Mechanism, checked: Iterable[Checked]
+    mechanism: Mechanism, checked: Sequence[Checked]
 ) -> tuple[ProvedEllipsoid | ProvedStarts, ...]:
     """Return the regions of the full closed loop that were proved again.
 
@@ -44,13 +49,26 @@ def proved_sets(
     mechanism
         The one that they were checked for.
     checked
-        From :func:`undertow.certify.verify.verify`; what was not proved is passed over.
+        From :func:`undertow.certify.verify.verify`; what was not proved is passed over, and what
+        was proved of a held input: the gate's sets are those of the continuous law.
 
     Returns
     -------
     tuple
         For ``certified_gate(sets=…)``.
+
+    Raises
+    ------
+    CertificateError
+        For claims that were checked for another mechanism, or other parameters.
     """
+    if any(item.model != mechanism.fingerprint for item in checked):
+        raise CertificateError(
+            f"proved sets for '{mechanism.name}'",
+            value="claims that were checked for other equations, parameters or limits",
+            limit="those of this very mechanism",
+            remedy="Pass the mechanism with the certificate's parameters: with_parameters(…)",
+        )
     names = [c.name for c in mechanism.coordinates]
     found: list[ProvedEllipsoid | ProvedStarts] = []
     for item in checked:
@@ -58,8 +76,10 @@ def proved_sets(
         if not item.verdict:
             continue
         if item.claim.kind == "terminal ellipsoid":
-            found.append(ProvedEllipsoid(*law, ellipsoid_of(item.claim.data)))
+            found.append(ProvedEllipsoid(*law, ellipsoid_of(item.claim.data), item.model))
         elif item.claim.kind == "closed loop":
             claim = LoopClaim.from_dict(item.claim.data)
-            found.append(ProvedStarts(*law, names.index(claim.coordinate), claim.extent))
+            if claim.hold == 0:
+                index = names.index(claim.coordinate)
+                found.append(ProvedStarts(*law, index, claim.extent, item.model))
     return tuple(found)

@@ -53,11 +53,14 @@ class Checked:
         As the file has it; its words say nothing.
     verdict
         As it was decided now, with the sentence that was decided.
+    model
+        Fingerprint of the mechanism that it was decided for: equations, parameters, limits.
     """
 
     subject: Subject
     claim: Claim
     verdict: Verdict
+    model: str
 
     @property
     def reworded(self) -> bool:
@@ -185,7 +188,8 @@ def verify(
     MissingExtraError
         Without python-flint.
     """
-    model = exact_mechanism(match(certificate, mechanism, own_parameters=own_parameters))
+    matched = match(certificate, mechanism, own_parameters=own_parameters)
+    model = exact_mechanism(matched)
     tasks = [(s, c) for s in certificate.subjects for c in s.claims]
     if not tasks:
         raise CertificateError("certificate", value="no claim", limit="at least one")
@@ -201,16 +205,19 @@ def verify(
     for index, (subject, claim) in enumerate(tasks):
         if progress is not None:
             progress(claim.kind, index / len(tasks))
-        done.append(Checked(subject, claim, _decide(model, subject, claim, max_seconds)))
+        verdict = _decide(model, subject, claim, max_seconds)
+        done.append(Checked(subject, claim, verdict, matched.fingerprint))
     return tuple(done)
 
 
 def _decide(mechanism: Mechanism, subject: Subject, claim: Claim, seconds: float) -> Verdict:
     try:
         verdict = CHECKS[claim.kind](mechanism, subject, claim.data, seconds)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise CertificateError(
-            f"claim '{claim.kind}'", value=f"{type(error).__name__}: {error}", limit="complete"
+            f"claim '{claim.kind}'",
+            value=f"{type(error).__name__}: {error}",
+            limit="complete, with numbers that can be computed with",
         ) from error
     stated = claim.verdict.margin
     if verdict and math.isfinite(stated) and not verdict.margin >= stated - 1e-9 * abs(stated):
@@ -290,7 +297,7 @@ def region_words(motion: Motion, start: Sequence[float], parameters: Box) -> str
     ranges = "".join(f", for every {n} in {within(a, b)}" for n, (a, b) in parameters.items())
     return (
         "a region of attraction on the surface, non-singular and compact, contains "
-        f"{', '.join(points) or 'the target'}{ranges}"
+        f"{', '.join(points) or 'the target'}{ranges}, the inputs not limited"
     )
 
 

@@ -18,7 +18,7 @@ from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
 from undertow import results
-from undertow.errors import InvalidInputError, UndertowError, near
+from undertow.errors import InvalidInputError, UndertowError, near, printable
 from undertow.interrupt import INTERRUPTED
 
 __all__ = [
@@ -139,7 +139,7 @@ def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
         except UndertowError as error:
             typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
             words = " ".join(str(error).split())  # some may be a file's, and anything
-            typer.echo("".join(c if c.isprintable() else "?" for c in words), err=True)
+            typer.echo(printable(words), err=True)
             raise typer.Exit(2 if isinstance(error, ValueError) else 1) from None
 
     return guarded

@@ -91,6 +91,11 @@ class _Printer(C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
     def _print_sign(self, expr: sp.sign) -> str:
         return f"ut_sign({self._print(expr.args[0])})"
 
+    def _print_Mod(self, expr: sp.Mod) -> str:
+        # C's remainder has the sign of a, SymPy's and Python's that of b.
+        a, b = map(self._print, expr.args)
+        return f"ut_mod(fmod{'f' * (self.kind == 'float')}({a}, {b}), {b})"
+
     def _print_Max(self, expr: sp.Max) -> str:
         return self._nest("ut_max", expr.args)
 

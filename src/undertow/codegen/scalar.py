@@ -72,6 +72,10 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
         x = self._print(expr.args[0])
         return f"((1.0 if {x} > 0.0 else 0.0) - (1.0 if {x} < 0.0 else 0.0))"
 
+    def _print_frac(self, expr: sp.frac) -> str:
+        # SymPy leaves out the brackets: x*frac(y) becomes (x*y) % 1.
+        return f"(({self._print(expr.args[0])}) % 1.0)"
+
     def _print_Max(self, expr: sp.Max) -> str:
         return self._nest("max", expr.args)
 

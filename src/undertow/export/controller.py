@@ -267,6 +267,11 @@ _HELPERS = {
     return a < b || isnan(a) ? a : b;
 }
 """,
+    "ut_mod": """static ut_real ut_mod(ut_real remainder, ut_real b)
+{
+    return (remainder < 0 && b > 0) || (remainder > 0 && b < 0) ? remainder + b : remainder;
+}
+""",
     "ut_sign": """static ut_real ut_sign(ut_real a)
 {
     return (ut_real)((a > 0) - (a < 0));
@@ -301,11 +306,11 @@ def _macro(index: int, name: str) -> str:
 
 
 def _ascii(text: str) -> str:
-    """Return words with no other letters but ASCII, and no end of a comment."""
+    """Return words in ASCII that neither begin nor end a comment, and hold no trigraph."""
     for sign, words in {"²": "^2", "³": "^3", "·": " ", "Ω": "Ohm"}.items():
         text = text.replace(sign, words)
-    plain = "".join(map(_letter, text))
-    return " ".join(plain.replace("*/", "* /").replace("\\", "/").replace("??", "? ?").split())
+    plain = "".join(map(_letter, text)).replace("\\", "/")  # first: "*\" would become an end
+    return " ".join(re.sub(r"[*](?=/)|/(?=[*])|[?](?=[?])", r"\g<0> ", plain).split())
 
 
 def _listed(values: Iterable[float], real: Real) -> str:
@@ -421,7 +426,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         "tiny": literal(1e-12, real),
         "fabs": "fabsf" if real == "float" else "fabs",
         "rate_check": "1" if sharp else "UT_PERIOD * out.gain[i] < 2 * row->layer[i]",
-        "helpers": "\n".join(v for k, v in _HELPERS.items() if k in used),
+        "helpers": "\n".join(v for k, v in _HELPERS.items() if f"{k}(" in used),
         **code,
     }
     return {

@@ -39,7 +39,7 @@ class Share:
         self.value = 0.0
 
     def add(self, failed: int, periods: int = 1) -> None:
-        """Count so many periods, of which so many failed."""
+        """Count some periods, and how many of them failed."""
         keep = self._keep**periods
         self.value = keep * self.value + (1.0 - keep) * failed / periods
 
@@ -87,8 +87,8 @@ class RigClock:
         if low - self._drift <= self._rig <= high + self._drift:
             return ""
         off = abs(self._rig - (high if self._rig > high else low))
-        now = (stamp - last[0]) / max(host, steps)
+        rate = (stamp - last[0]) / max(host, steps)
         return (
             f"the rig's clock went {1e3 * off:.0f} ms off the host's within a second, "
-            f"it runs {now:.2g} times as fast"
+            f"it runs {rate:.2g} times as fast"
         )

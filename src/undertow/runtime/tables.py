@@ -14,6 +14,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from undertow.errors import printable
 from undertow.runtime.clock import Histogram
 from undertow.runtime.drill import Outcome
 from undertow.runtime.drill_live import Killed, LiveOutcome
@@ -39,7 +40,7 @@ PROCESSOR = ("processor", "target", "features")
 
 def _shown(text: str) -> str:
     """Return what a log says as a terminal may show it: it may be anybody's."""
-    return escape("".join(c if c.isprintable() else "?" for c in text))
+    return escape(printable(text))
 
 
 def _micro(seconds: float) -> str:
