@@ -182,6 +182,8 @@ def test_what_does_not_follow_is_not_proved(claim: LoopClaim) -> None:
 def test_an_unstable_or_ill_formed_claim_is_refused(claim: LoopClaim) -> None:
     unstable = Surface(-1, -1.59, 0.5, 12.1)
     assert not verify_loop(RIG, unstable, LAW, claim)
+    with pytest.raises(InvalidInputError, match="all sets move at once"):
+        replace(claim, edges=tuple(np.linspace(0.0, 0.5, 30_000)))
     with pytest.raises(InvalidInputError, match="rising from 0"):
         LoopClaim("phi", (0.1, 0.2), TERMINAL, 0.001, 1.0)
     with pytest.raises(InvalidInputError, match="coordinate"):

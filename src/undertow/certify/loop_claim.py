@@ -37,6 +37,10 @@ __all__ = ["LoopClaim", "TubeEnd", "run_tubes", "start_tubes", "verify_loop"]
 FloatArray = NDArray[np.float64]
 
 
+#: Edges that a claim may have: some kilobytes of memory for each.
+MOST_EDGES = 20_000
+
+
 @dataclass(frozen=True, eq=False)
 class LoopClaim:
     """Every start at rest with |coordinate| ≤ edges[−1] converges under the clipped law.
@@ -83,6 +87,10 @@ class LoopClaim:
             )
         if not np.isfinite(edges).all():
             raise InvalidInputError("edges of a claim", limit="finite")
+        if edges.size > MOST_EDGES:
+            raise InvalidInputError(
+                "edges of a claim", value=edges.size, limit=f"≤ {MOST_EDGES}: all sets move at once"
+            )
         for name in ("step", "horizon"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
