@@ -427,6 +427,12 @@ def test_a_rigs_clock_may_jump_jitter_and_stop_with_the_host() -> None:
     for k in range(5000):  # a simulated rig knows of no gap
         host += 0.001 + (0.09 if k % 300 == 100 else 0.0)
         assert simulated.check(0.001 * k, host, k) == ""
+    slow = RigClock(settings, 0.001)
+    for k in range(5000):  # a sensor of half the rate tells when it measured, twice
+        assert slow.check(0.002 * (k // 2), 0.001 * k, k) == ""
+    refusing = RigClock(settings, 0.001)
+    for k in range(5000):  # a simulated rig that takes half of what is written stands still
+        assert refusing.check(0.001 * (k // 2), 0.001 * k, k) == ""
     fast = RigClock(settings, 0.001)
     texts = [fast.check(5.0 + 0.002 * k, 0.001 * k, k) for k in range(300)]
     first = next(k for k, text in enumerate(texts) if text)
