@@ -150,6 +150,39 @@ def test_a_rig_of_ones_own_is_kept_by_another_process_unless_told_otherwise(
     assert re.search(r"(granted|refused), ", out)
 
 
+LEAVES = """
+import sys
+import numpy as np
+from undertow import mechanisms
+from undertow.rig import IdealRig
+
+class Arm(IdealRig):
+    count = 0
+    def __init__(self):
+        m = mechanisms.rotary_pendulum()
+        super().__init__(m, m.state(phi=0.2))
+
+    def write(self, u):
+        self.count += 1
+        if self.count == STEP:
+            sys.exit(0)
+        super().write(u)
+"""
+
+
+@pytest.mark.parametrize(("step", "code"), [("150", 5), ("150 or self.count > 150", 7)])
+def test_a_driver_that_leaves_the_interpreter_does_not_choose_the_exit_code(
+    step: str, code: int, tmp_path: Path
+) -> None:
+    """``sys.exit(0)`` in a driver would otherwise be *balanced*, with the output left on."""
+    (tmp_path / "arm.py").write_text(LEAVES.replace("STEP", step))
+    place = f"{tmp_path / 'arm.py'}:Arm"
+    words = ("--start", "phi=0.2rad", "--seconds", "0.5", "--simulated")
+    got, out, _ = run("run", "rotary_pendulum", "--rig", place, *words)
+    assert got == code
+    assert "Verdict: stopped, loop: SystemExit: 0" in out
+
+
 DRIVERS = """
 from dataclasses import dataclass
 import numpy as np

@@ -142,6 +142,14 @@ def test_a_mechanism_that_is_named_is_run_and_its_hash_compared(own: tuple[Path,
         replay(path, mechanism=name)
 
 
+def test_a_wrong_word_for_the_mechanism_is_not_taken_for_a_damaged_log(
+    own: tuple[Path, str],
+) -> None:
+    with pytest.raises(UndertowError, match="no name 'arms'") as refused:
+        replay(own[0], mechanism=f"{own[1]}s")
+    assert "damaged" not in str(refused.value)
+
+
 def test_a_log_of_before_hashes_were_kept_says_so(own: tuple[Path, str]) -> None:
     path, name = own
     change(path, "DELETE FROM meta WHERE key = 'source'")

@@ -382,6 +382,9 @@ def test_a_log_goes_on_in_further_files_and_is_read_as_one(tmp_path: Path) -> No
         file.execute("UPDATE meta SET value = '\"other\"' WHERE key = 'run'")
         file.commit()
     assert len(read_log(path).steps) < report.steps
+    part_path(path, 2).unlink()
+    rest = replay(path, decisions=False)
+    assert rest.gap == rest.steps > 0
 
 
 def _always(log: Log) -> Callable[[], None]:

@@ -427,6 +427,12 @@ def test_a_rigs_clock_may_jump_jitter_and_stop_with_the_host() -> None:
     for k in range(5000):  # a simulated rig knows of no gap
         host += 0.001 + (0.09 if k % 300 == 100 else 0.0)
         assert simulated.check(0.001 * k, host, k) == ""
+    slow = RigClock(settings, 0.001)
+    for k in range(5000):  # a sensor of half the rate tells when it measured, twice
+        assert slow.check(0.002 * (k // 2), 0.001 * k, k) == ""
+    refusing = RigClock(settings, 0.001)
+    for k in range(5000):  # a simulated rig that takes half of what is written stands still
+        assert refusing.check(0.001 * (k // 2), 0.001 * k, k) == ""
     fast = RigClock(settings, 0.001)
     texts = [fast.check(5.0 + 0.002 * k, 0.001 * k, k) for k in range(300)]
     first = next(k for k, text in enumerate(texts) if text)
@@ -533,6 +539,57 @@ def test_a_keeper_says_that_its_rig_did_not_take_zero() -> None:
     with pytest.raises(OSError, match="close: OSError: stuck") as told:
         shut.close()
     assert not isinstance(told.value, OutputOnError)
+
+
+def test_a_keeper_whose_rig_hangs_is_ended_and_what_is_known_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It would keep the controller's process from ending, and the device from everybody else."""
+    monkeypatch.setattr("undertow.runtime.keeper.FAREWELL", 0.2)
+    monkeypatch.setattr("undertow.runtime.keeper.INSISTENCE", 0.2)
+
+    class Hanging(Device):
+        def close(self) -> None:
+            time.sleep(60.0)
+
+    def hang(k: int, _: np.ndarray) -> None:
+        time.sleep(60.0 if k > 1 else 0.0)
+
+    for rig, kind, said in (
+        (lambda: Device(write=hang), OutputOnError, "is not known"),
+        (Hanging, OSError, "does not come to an end"),
+    ):
+        kept = KeptRig(rig, 1e-3, LIMITS, SLEW)
+        kept.write(np.array([0.0]))
+        kept.write(np.array([0.0]))
+        time.sleep(0.05)
+        kept.write(np.array([0.0]))
+        with pytest.raises(kind, match=said) as told:
+            kept.close()
+        assert type(told.value) is kind
+        kept.process.join(5.0)
+        assert not kept.process.is_alive()
+
+
+def test_who_only_writes_to_a_keeper_is_told_what_came_of_it() -> None:
+    """After a safe stop nothing is read any more: an early failure must not hide that zero came."""
+    rig = KeptRig(lambda: Device(write=fails(lambda k: k < 20, OSError("bus"))), 1e-3, LIMITS, SLEW)
+    failed = 0
+    try:
+        rig.write(np.zeros(1))
+        assert rig._pipe.poll(10.0)
+        rig.read()
+        for _ in range(300):
+            try:
+                rig.write(np.zeros(1))
+            except OSError:
+                failed += 1
+                time.sleep(0.002)
+            else:
+                break
+    finally:
+        rig.close()
+    assert 1 <= failed < 300
 
 
 def test_a_keeper_that_is_gone_leaves_the_output_unknown(controller: Controller) -> None:

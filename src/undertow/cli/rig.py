@@ -37,7 +37,7 @@ from undertow.objectives import Goal as OneGoal
 
 if TYPE_CHECKING:
     from undertow.rig import Rig
-    from undertow.runtime import Recipe
+    from undertow.runtime import Recipe, Report, Runtime
 
 __all__ = ["drill", "replay", "run"]
 
@@ -160,7 +160,7 @@ def run(
                 runtime.stop()
         stack.enter_context(_seconds_on_terminal(seconds))
         kept.clear()  # the run closes it
-        report = runtime.run(seconds)
+        report = _run(runtime, seconds)
     what = "simulated time" if simulated else f"optimiser in another {worker}"
     what += ", the rig in a keeper" if keeper else ""
     where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
@@ -175,6 +175,19 @@ def run(
     say(console, f"Verdict: {verdict}.")
     if verdict.exit_code:
         raise typer.Exit(verdict.exit_code)
+
+
+def _run(runtime: Runtime, seconds: float) -> Report:
+    """Run, and report also of a run that a driver left with a way out of the interpreter.
+
+    Its exit code is the verdict's: 0, which ``sys.exit()`` in a driver would give, is *balanced*.
+    """
+    try:
+        return runtime.run(seconds)
+    except Exception:
+        raise
+    except BaseException:  # it was stopped safely, and how is in its report
+        return runtime.report
 
 
 def _plant(rig: str, recipe: Recipe, *, keeper: bool) -> Rig | None:

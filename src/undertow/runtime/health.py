@@ -49,8 +49,9 @@ class RigClock:
 
     The clock of hardware keeps to the host's, that of a simulated rig to the steps that it was
     taken through: both agree but where steps are missed, and a rig's clock may lie between them.
-    A reading that runs back, stands still or jumps by more than a stall is left out: the sensors'
-    watch judges it.
+    A reading that runs back or jumps by more than a stall is left out: the sensors' watch judges
+    it.  One that stands still, of a sensor slower than the loop or of a rig that took no output,
+    may have let that time pass or not.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ class RigClock:
     def __init__(self, settings: Settings, period: float) -> None:
         self._drift, self._stall, self._period = settings.drift, settings.stall, period
         self._last: tuple[float, float, int] | None = None
-        self._rig = self._host = self._steps = 0.0
+        self._rig = self._host = self._steps = self._still = 0.0
 
     def check(self, stamp: float, now: float, step: int) -> str:
         """Return what is wrong with the rig's clock; empty where nothing is.
@@ -76,18 +77,22 @@ class RigClock:
             Time on the host's clock, s, and number of the step in which it was read.
         """
         last, self._last = self._last, (stamp, now, step)
-        if last is None or not 0.0 < stamp - last[0] <= self._stall:
+        if last is None or not 0.0 <= stamp - last[0] <= self._stall:
             return ""
         host, steps = now - last[1], self._period * (step - last[2])
-        keep = max(0.0, 1.0 - max(host, steps) / SECOND)
-        self._rig = keep * self._rig + stamp - last[0]
+        moved, passed = stamp - last[0], max(host, steps)
+        if not moved:
+            host = steps = 0.0
+        keep = max(0.0, 1.0 - passed / SECOND)
+        self._still = keep * self._still + (0.0 if moved else passed)
+        self._rig = keep * self._rig + moved
         self._host = keep * self._host + host
         self._steps = keep * self._steps + steps
-        low, high = min(self._host, self._steps), max(self._host, self._steps)
+        low, high = min(self._host, self._steps), max(self._host, self._steps) + self._still
         if low - self._drift <= self._rig <= high + self._drift:
             return ""
         off = abs(self._rig - (high if self._rig > high else low))
-        rate = (stamp - last[0]) / max(host, steps)
+        rate = moved / passed
         return (
             f"the rig's clock went {1e3 * off:.0f} ms off the host's within a second, "
             f"it runs {rate:.2g} times as fast"

@@ -39,6 +39,9 @@ SILENT = "the keeper does not answer"
 #: waited for besides.
 INSISTENCE, FAREWELL = 1.0, 2.0
 
+#: Said while the rig is being closed, which may take for ever.
+CLOSING = "close: it does not come to an end"
+
 #: Asks for a new reading without an output; and how long that is waited for, s.
 AGAIN, ANSWER = "read", 0.05
 
@@ -135,6 +138,7 @@ class KeptRig:
             raise said.error()
         self._said, self._closed, self._heard = said, False, time.perf_counter()
         self._unanswered = 0
+        self._way = period * float(np.max(np.where(np.isfinite(limits), limits / slew, 0.0)))
 
     def read(self) -> Measurement:
         """Return the measurement that the keeper took after the last output.
@@ -157,9 +161,7 @@ class KeptRig:
         if self._unanswered:
             if not self._pipe.poll(patience):
                 raise TimeoutError(SILENT)
-            while self._pipe.poll(0.0):  # late answers too: the newest counts
-                self._said = self._pipe.recv()
-            self._unanswered, self._heard = 0, time.perf_counter()
+            self._listen()  # to late answers too
         if self._said.measurement is None:
             raise OSError(self._said.read)
         return self._said.measurement
@@ -174,12 +176,20 @@ class KeptRig:
         TimeoutError
             When so much is unanswered that to send more could block.
         """
+        if self._said.write:
+            self._listen()  # who only writes, as after a safe stop, is told what came of it
         if self._unanswered >= QUEUE:
             raise TimeoutError(SILENT)
         self._pipe.send(u)
         self._unanswered += 1
         if self._said.write:
             raise OSError(self._said.write)
+
+    def _listen(self) -> None:
+        """Take what the keeper has said by now: the newest counts."""
+        while self._pipe.poll(0.0):
+            self._said = self._pipe.recv()
+            self._unanswered, self._heard = 0, time.perf_counter()
 
     def close(self) -> None:
         """Let the keeper bring the output to zero and let go.
@@ -189,22 +199,25 @@ class KeptRig:
         OutputOnError
             When the rig did not take zero, or the keeper does not say whether it did.
         OSError
-            When the rig took it, but could not be closed.
+            When the rig took it, but could not be closed.  A keeper whose rig hangs is ended.
         """
         if self._closed:
             return
         self._closed = True
         last = _Farewell(f"{SILENT}: whether the output is at zero is not known", "")
-        until = time.perf_counter() + INSISTENCE + FAREWELL
+        until = time.perf_counter() + INSISTENCE + FAREWELL + self._way
         with contextlib.suppress(OSError, EOFError):
             self._pipe.send(None)
             while self._pipe.poll(max(0.0, until - time.perf_counter())):
                 if isinstance(said := self._pipe.recv(), _Farewell):
                     last = said
-                    break
+                    if last.close != CLOSING:
+                        break
         with contextlib.suppress(OSError):
             self._pipe.close()
         self.process.join(timeout=1.0)
+        if self.process.is_alive():  # its driver hangs: it would keep us, and the device, for ever
+            self.process.kill()
         if last.output:
             raise OutputOnError(last.output)
         if last.close:
@@ -280,6 +293,8 @@ def _hold(
             _reply(ours, rig, failure)
     output = "" if not failure else f"the device did not take an output of zero: {failure}"
     close = ""
+    with contextlib.suppress(OSError):
+        ours.send(_Farewell(output, CLOSING))
     try:
         rig.close()
     except BaseException as error:  # a rig that failed may fail again

@@ -20,6 +20,7 @@ import errno
 import itertools
 import json
 import os
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -397,6 +398,16 @@ def _parts(path: Path) -> list[Path]:
     return [*([path] if os.path.lexists(path) else []), *further]
 
 
+def _beyond(path: Path, part: int) -> list[Path]:
+    """Return the parts of a log whose numbers are greater, in their order."""
+    beside: list[Path] = []
+    with contextlib.suppress(OSError):  # a folder that may not be listed
+        beside = list(path.parent.iterdir())
+    ends = (one.name.removeprefix(f"{path.name}-") for one in beside)
+    numbers = sorted(int(end) for end in ends if re.fullmatch(r"[1-9]\d{0,8}", end))
+    return [part_path(path, number) for number in numbers if number > part]
+
+
 def _size(path: Path) -> int:
     """Return the size of a log's file with what waits beside it, bytes."""
     beside = Path(f"{path}-wal")
@@ -517,6 +528,11 @@ def read_log(path: Path) -> Recording:
         events += more.events
         answers += more.answers
         part += 1
+    for further in _beyond(path, part):  # a part between is missing: its steps will be
+        with contextlib.suppress(ArtefactError):
+            more = _read_part(further)
+            if more.meta.get("run") == found.meta.get("run") and more.columns == found.columns:
+                steps.append(more.steps)
     return replace(found, steps=np.concatenate(steps), events=tuple(events), answers=tuple(answers))
 
 

@@ -315,7 +315,7 @@ class Runtime:
         controller, clock, u = self.controller, self.clock, self._written
         zero, failure = np.zeros_like(u), ""
         due = began = clock.now()
-        for _ in range(math.ceil(controller.settings.insist / controller.period) + 1000):
+        while True:
             if self._silent:
                 return self._silent
             confine(zero, u, controller.limits, controller.slew)

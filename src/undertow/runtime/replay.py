@@ -22,6 +22,7 @@ from undertow.codegen.machine import processor
 from undertow.errors import ArtefactError, UndertowError
 from undertow.files import file_hash
 from undertow.mechanism import FloatArray, Mechanism
+from undertow.mechanisms.named import named
 from undertow.modelling.python_file import in_a_file
 from undertow.results import versions
 from undertow.rig.interface import Measurement
@@ -140,6 +141,8 @@ def replay(
     """
     path = Path(path)
     recording = read_log(path)
+    if isinstance(mechanism, str):
+        named(mechanism)  # what is wrong with it is not the log's
     with _legible(path):
         values = recording.meta.get("recipe")
         if values is None:
