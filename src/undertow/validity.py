@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 import sympy as sp
@@ -24,6 +25,7 @@ from undertow.quantities import (
 )
 
 __all__ = [
+    "by_names",
     "check_definite",
     "check_names",
     "check_parts",
@@ -38,9 +40,11 @@ __all__ = [
     "vocabulary",
 ]
 
+T = TypeVar("T")
+
 #: Functions that are smooth wherever they are finite: a derivative of theirs is never wrong.
 _SMOOTH = (
-    sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc, sp.sinc, sp.atan, sp.acot,
+    sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc, sp.sinc, sp.atan,
     sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch, sp.asinh, sp.exp,
     sp.Add, sp.Mul, sp.Symbol, sp.Number, sp.NumberSymbol,
 )  # fmt: skip
@@ -51,7 +55,7 @@ _SINGULAR = (sp.Pow, sp.log, sp.asin, sp.acos, sp.atan2, sp.acosh, sp.atanh)
 #: Functions with kinks and jumps that code is written for, and the conditions of Piecewise.
 _BROKEN = (
     sp.Abs, sp.sign, sp.Max, sp.Min, sp.Piecewise, sp.Heaviside, sp.floor, sp.ceiling, sp.frac,
-    sp.Mod, Boolean,
+    sp.Mod, sp.acot, Boolean,
 )  # fmt: skip
 
 #: What stands for an expression that is not there.
@@ -118,6 +122,31 @@ def twins(names: Sequence[str]) -> str:
         elif len(group) > 1:
             said.append(group[0])
     return ", ".join(said)
+
+
+def by_names(what: str, values: Mapping[str, T]) -> dict[str, T]:
+    """Return values by their names in Python's spelling, NFKC.
+
+    Raises
+    ------
+    InvalidInputError
+        For two names that Python takes for one, and for what is no name.
+
+    Examples
+    --------
+    >>> by_names("forces", {"µ": 1.0}) == {"μ": 1.0}
+    True
+    """
+    odd = [name for name in values if not isinstance(name, str)]
+    repeated = "" if odd else twins(list(values))
+    if odd or repeated:
+        raise InvalidInputError(
+            what,
+            value=f"{odd[0]!r}, a {type(odd[0]).__name__}" if odd else repeated,
+            limit="names as text, each once",
+            remedy="Write coordinate.name for a coordinate" if odd else "Keep one",
+        )
+    return {normal_name(name): value for name, value in values.items()}
 
 
 def check_parts(
@@ -419,7 +448,7 @@ def _edges(part: sp.Basic) -> list[sp.Expr] | None:
     if isinstance(part, sp.Pow):
         smooth = part.exp.is_Integer and part.exp.is_nonnegative
         return [] if smooth or not part.base.free_symbols else [part.base]
-    if isinstance(part, sp.Abs | sp.sign | sp.Heaviside | sp.DiracDelta | sp.log):
+    if isinstance(part, sp.Abs | sp.sign | sp.Heaviside | sp.DiracDelta | sp.log | sp.acot):
         return [part.args[0]]
     if isinstance(part, sp.asin | sp.acos | sp.acosh | sp.atanh):
         return [1 - part.args[0] ** 2]
