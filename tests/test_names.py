@@ -666,3 +666,16 @@ def test_an_input_matrix_takes_no_time_and_a_force_has_all_rows() -> None:
     for force, matrix in ((sp.zeros(2, 1), [TIME, 0]), (sp.zeros(1, 1), [1, 0])):
         with pytest.raises(ModelError):
             modelling.from_matrices("pair", both, push, sp.eye(2), force, sp.Matrix(matrix))
+
+
+def test_a_box_is_of_names_and_numbers_and_constraints_are_a_tuple_of_them() -> None:
+    assert ut.state_box(**{MICRO: 1.0})[0].state == MU
+    with pytest.raises(InvalidInputError, match="one name"):
+        ut.state_box(**{MICRO: 1.0, MU: 2.0})
+    with pytest.raises(InvalidInputError, match="a number"):
+        ut.state_box(phi="1")  # type: ignore[arg-type]
+    (box,) = ut.state_box(phi=1.0)
+    assert ut.MinimumTime(constraints=[box]).constraints == (box,)  # type: ignore[arg-type]
+    for wrong in (box, (box, 3)):
+        with pytest.raises(InvalidInputError, match=r"undertow\.Constraint"):
+            ut.MinimumTime(constraints=wrong)  # type: ignore[arg-type]
