@@ -22,6 +22,7 @@ from undertow.estimators import KalmanFilter
 from undertow.mechanism import TIME
 from undertow.mechanisms import LIBRARY
 from undertow.objective import Names
+from undertow.runtime.recipe import Recipe
 from undertow.sketches import Line, Sketch
 from undertow.stability import has_linear_model, linearise
 from undertow.validity import is_smooth, kinks, require_smooth
@@ -679,3 +680,20 @@ def test_a_box_is_of_names_and_numbers_and_constraints_are_a_tuple_of_them() -> 
     for wrong in (box, (box, 3)):
         with pytest.raises(InvalidInputError, match=r"undertow\.Constraint"):
             ut.MinimumTime(constraints=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda: ut.objective_for(cart(), None),  # type: ignore[arg-type]
+        lambda: ut.Cascade(cart(), period="1"),  # type: ignore[arg-type]
+        lambda: ut.Cascade(cart(), first=3),  # type: ignore[arg-type]
+        lambda: ut.SlidingModeLaw(cart(), 3),  # type: ignore[arg-type]
+        lambda: Recipe(horizon="20"),  # type: ignore[arg-type]
+        lambda: Recipe(period="1"),  # type: ignore[arg-type]
+        lambda: modelling.DCMotor("0.1", 1.0),  # type: ignore[arg-type]
+    ],
+)
+def test_arguments_of_another_kind_are_conditions(act: Callable[[], Any]) -> None:
+    with pytest.raises(InvalidInputError):
+        act()

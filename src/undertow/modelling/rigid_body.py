@@ -211,7 +211,8 @@ def _inputs(
             f"'{tree.name}' names no actuator",
             value=f"joints {', '.join(j.name for j in joints)}",
             limit="at least one actuated joint",
-            remedy="Say which joints are actuated: actuated=['...'], or FILE:JOINT on the command line",
+            remedy="Say which joints are actuated: actuated=['...'], or FILE:JOINT on the command "
+            "line",
         )
     B = sp.zeros(len(joints), len(tree.actuators))
     for k, actuator in enumerate(tree.actuators):
