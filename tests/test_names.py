@@ -653,6 +653,7 @@ def test_a_target_a_little_off_names_the_nearest_equilibrium() -> None:
     leaning = pair(3 * sp.sin(ANGLE - 0.002))
     with pytest.raises(ModelError, match=r"off by phi=0\.002") as off:
         linearise(leaning)
+    assert "off by phi=0.002" in str(check_mechanism(leaning, compiled=False))
     with pytest.raises(ModelError, match=r"off by phi=-0\.09"):
         modelling.move_target(leaning, phi=0.1)
     found = float(str(off.value).rsplit("phi=", 1)[1].rstrip(")."))

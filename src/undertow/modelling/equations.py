@@ -181,8 +181,9 @@ def nearest_equilibrium(mechanism: Mechanism) -> str:
     free = zip(mechanism.coordinates, q, strict=True)
     named = ", ".join(f"{c.name}={float(v)!r}" for c, v in list(free)[mechanism.m :])
     return (
-        f"The nearest equilibrium that was found is off by {named}: add this to what was "
-        f"given, or take undertow.modelling.move_target(mechanism, {named})"
+        "The nearest equilibrium that was found is off by "
+        f"{named}: add this to what was given, or take "
+        f"undertow.modelling.move_target(mechanism, {named})"
     )
 
 
