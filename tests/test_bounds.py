@@ -21,7 +21,7 @@ from undertow.bounds import Bound, bound
 from undertow.bounds.expressions import smooth, translate
 from undertow.bounds.guesses import Guess
 from undertow.bounds.programme import Programme
-from undertow.errors import InfeasibleError, InvalidInputError, MissingExtraError
+from undertow.errors import InfeasibleError, InvalidInputError, MissingExtraError, ModelError
 from undertow.mechanism import FloatArray
 from undertow.stability import linearise
 
@@ -554,3 +554,20 @@ def test_solver_is_silent_and_repeatable(capfd: pytest.CaptureFixture[str]) -> N
     assert capfd.readouterr() == ("", "")
     np.testing.assert_array_equal(first.u, second.u)
     np.testing.assert_array_equal(first.x, second.x)
+
+
+@pytest.mark.parametrize("where", ["cost", "jump", "constraint", "force"])
+def test_what_has_kinks_has_no_bound(where: str) -> None:
+    """Claim: of a cost of 1 + sign(phi), IPOPT, to which its slope is 0, calls anything optimal."""
+    rig = ut.mechanisms.cart_pendulum()
+    widest = ut.Constraint("the wider", lambda v: sp.Max(v.phi, -v.x) - 0.3)
+    energy = ut.MinimumEnergy(horizon=3.0)
+    problem = {
+        "cost": ut.Objective("modulus", lambda v: sp.Abs(v.force), horizon=3.0),
+        "jump": ut.Objective("jump", lambda v: 1 + sp.sign(v.phi), horizon=3.0),
+        "constraint": replace(energy, constraints=(widest,)),
+    }
+    if where == "force":
+        rig = rig.disturbed({"phi": sp.Max(rig.q[1] - 0.1, 0)})
+    with pytest.raises(ModelError, match="not smooth"):
+        bound(rig, problem.get(where, energy), rig.state(phi=0.2))

@@ -22,11 +22,13 @@ from undertow.estimators import KalmanFilter
 from undertow.mechanism import TIME
 from undertow.mechanisms import LIBRARY
 from undertow.objective import Names
+from undertow.runtime.recipe import Recipe
 from undertow.sketches import Line, Sketch
 from undertow.stability import has_linear_model, linearise
 from undertow.validity import is_smooth, kinks, require_smooth
 
 MICRO, MU = "\u00b5", "\u03bc"  # of the keyboard, and Greek
+ANGLE = sp.Symbol("phi", real=True)
 PHI, CURLY = "\u03c6", "\u03d5"
 
 
@@ -535,3 +537,164 @@ def test_a_stage_cost_may_be_a_constant() -> None:
 def test_a_potential_may_depend_on_time_and_its_energy_says_when() -> None:
     rig = energies(potential=sp.sin(TIME) * x_.symbol)
     assert rig.energy([2.0, 0, 0, 0], t=math.pi / 2) - rig.energy([2.0, 0, 0, 0]) == 2.0
+
+
+# -- values by names ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["parameters", "state", "forces", "equilibrium", "target"])
+def test_values_under_two_spellings_of_one_name_are_refused(what: str) -> None:
+    model, both = cart(x=MU, rod_mass="Å"), {MICRO: 0.1, MU: 0.2}
+    acts: Mapping[str, Callable[[], Any]] = {
+        "parameters": lambda: model.with_parameters(**{"\u00c5": 0.1, "\u212b": 0.2}),
+        "state": lambda: model.state(**both),
+        "forces": lambda: model.disturbed(both),
+        "equilibrium": lambda: modelling.find_equilibrium(model, **both),
+        "target": lambda: modelling.move_target(model, **both),
+    }
+    with pytest.raises(InvalidInputError, match=r"U\+.* and .*U\+.*one name"):
+        acts[what]()
+
+
+def test_a_usual_start_under_two_spellings_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="one name"):
+        cart(x=MU, start={MICRO: 0.1, MU: 0.2})
+
+
+def test_forces_by_a_symbol_are_refused_as_no_name() -> None:
+    with pytest.raises(InvalidInputError, match="a Symbol"):
+        cart().disturbed({sp.Symbol("x"): 1.0})
+
+
+def test_a_coordinate_may_be_called_mechanism() -> None:
+    model = cart(x="mechanism")
+    assert modelling.find_equilibrium(model, mechanism=0.5)["mechanism"] == 0.5
+    assert modelling.move_target(model, mechanism=0.5).state_names[0] == "mechanism"
+
+
+def test_a_motor_is_put_on_an_input_by_any_spelling() -> None:
+    matrices = sp.Matrix([[2, 1], [1, 2]]), sp.zeros(2, 1), sp.Matrix([1, 0])
+    pair = [ut.Coordinate("x", "m"), ut.Coordinate("phi")]
+    model = modelling.from_matrices("pair", pair, [ut.Input(MU, "N", 1.0)], *matrices)
+    motor = modelling.DCMotor(0.1, 1.0, voltage_limit=10.0)
+    driven = modelling.voltage_driven(model, {MICRO: motor})
+    assert driven.inputs[0].unit == "V"
+    with pytest.raises(InvalidInputError, match="DCMotor"):
+        modelling.voltage_driven(model, {MU: 3})  # type: ignore[dict-item]
+
+
+# -- SymPy's mechanics takes plain symbols for constants -----------------------------------------
+
+
+def lagranges(extra: Callable[[Any, Any], Any]) -> ut.Mechanism:
+    """A cart with a rod from a Lagrangian, with a term more."""
+    x, phi, push = dynamicsymbols("x phi F")
+    mass = sp.Symbol(MICRO)
+    rates = x.diff() ** 2 + x.diff() * phi.diff() * sp.cos(phi) / 2 + mass * phi.diff() ** 2
+    frame, point = sp.physics.mechanics.ReferenceFrame("N"), sp.physics.mechanics.Point("P")
+    point.set_vel(frame, x.diff() * frame.x)
+    method = LagrangesMethod(
+        rates + extra(x, phi), [x, phi], forcelist=[(point, push * frame.x)], frame=frame
+    )
+    data = [ut.Parameter(MICRO, 1.0, "kg")]
+    return modelling.from_lagrange(
+        "rod", method, {push: ut.Input("F", "N", 5.0)}, parameters=data, units={"x": "m"}
+    )
+
+
+def test_a_parameter_of_a_lagrangian_may_be_spelt_as_keyboards_do() -> None:
+    model = lagranges(lambda x, phi: -(phi**2))
+    assert model.M(np.zeros(2))[1, 1] == 2.0
+
+
+@pytest.mark.parametrize("term", ["potential", "kinetic", "alike"])
+def test_a_plain_symbol_of_a_coordinates_name_is_refused_in_a_lagrangian(term: str) -> None:
+    plain = sp.Symbol("phi", real=True)  # ut.Coordinate("phi").symbol
+    terms: Mapping[str, Callable[[Any, Any], Any]] = {
+        "potential": lambda x, phi: -5 * plain**2,  # has no derivative by phi(t): no force
+        "kinetic": lambda x, phi: plain**2 * phi.diff() ** 2,
+        "alike": lambda x, phi: -sp.Symbol(MU) * x**2,  # beside the other spelling
+    }
+    with pytest.raises(ModelError, match="one name" if term == "alike" else "phi as plain"):
+        lagranges(terms[term])
+
+
+# -- what the target must be -------------------------------------------------------------------
+
+
+def pair(force: sp.Expr, **rest: Any) -> ut.Mechanism:
+    """Two masses, the free one under a force of one's own, in phi."""
+    mass = sp.Matrix([[2, 1], [1, 2]])
+    both = [ut.Coordinate("x", "m"), ut.Coordinate("phi")]
+    return modelling.from_matrices(
+        "pair", both, [ut.Input("push", "N", 5.0)], mass, sp.Matrix([0, force]),
+        sp.Matrix([1, 0]), **rest,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        ANGLE**2 * sp.cot(ANGLE),  # 0/0 where it is programmed
+        ANGLE**3 * sp.csc(ANGLE) ** 2,
+        sp.tan(ANGLE + sp.pi / 2),
+        ANGLE * sp.sqrt(ANGLE - 1),
+        ANGLE * sp.log(ANGLE - 1),  # of a complex number, π i, it would be 0
+        sp.acot(ANGLE) - sp.pi / 2,  # jumps by π
+    ],
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_what_is_no_number_at_the_target_has_no_linear_model(force: sp.Expr) -> None:
+    with pytest.raises(ModelError, match="at the target"):
+        linearise(pair(force))
+
+
+def test_a_target_a_little_off_names_the_nearest_equilibrium() -> None:
+    leaning = pair(3 * sp.sin(ANGLE - 0.002))
+    with pytest.raises(ModelError, match=r"off by phi=0\.002") as off:
+        linearise(leaning)
+    assert "off by phi=0.002" in str(check_mechanism(leaning, compiled=False))
+    with pytest.raises(ModelError, match=r"off by phi=-0\.09"):
+        modelling.move_target(leaning, phi=0.1)
+    found = float(str(off.value).rsplit("phi=", 1)[1].rstrip(")."))
+    assert linearise(modelling.move_target(leaning, phi=found)).F[1, 1] == pytest.approx(3.0)
+    with pytest.raises(ModelError, match="No equilibrium was found"):
+        linearise(pair(3 + sp.sin(ANGLE)))
+
+
+def test_an_input_matrix_takes_no_time_and_a_force_has_all_rows() -> None:
+    both = [ut.Coordinate("x", "m"), ut.Coordinate("phi")]
+    push = [ut.Input("push", "N", 5.0)]
+    for force, matrix in ((sp.zeros(2, 1), [TIME, 0]), (sp.zeros(1, 1), [1, 0])):
+        with pytest.raises(ModelError):
+            modelling.from_matrices("pair", both, push, sp.eye(2), force, sp.Matrix(matrix))
+
+
+def test_a_box_is_of_names_and_numbers_and_constraints_are_a_tuple_of_them() -> None:
+    assert ut.state_box(**{MICRO: 1.0})[0].state == MU
+    with pytest.raises(InvalidInputError, match="one name"):
+        ut.state_box(**{MICRO: 1.0, MU: 2.0})
+    with pytest.raises(InvalidInputError, match="a number"):
+        ut.state_box(phi="1")  # type: ignore[arg-type]
+    (box,) = ut.state_box(phi=1.0)
+    assert ut.MinimumTime(constraints=[box]).constraints == (box,)  # type: ignore[arg-type]
+    for wrong in (box, (box, 3)):
+        with pytest.raises(InvalidInputError, match=r"undertow\.Constraint"):
+            ut.MinimumTime(constraints=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda: ut.objective_for(cart(), None),  # type: ignore[arg-type]
+        lambda: ut.Cascade(cart(), period="1"),  # type: ignore[arg-type]
+        lambda: ut.Cascade(cart(), first=3),  # type: ignore[arg-type]
+        lambda: ut.SlidingModeLaw(cart(), 3),  # type: ignore[arg-type]
+        lambda: Recipe(horizon="20"),  # type: ignore[arg-type]
+        lambda: Recipe(period="1"),  # type: ignore[arg-type]
+        lambda: modelling.DCMotor("0.1", 1.0),  # type: ignore[arg-type]
+    ],
+)
+def test_arguments_of_another_kind_are_conditions(act: Callable[[], Any]) -> None:
+    with pytest.raises(InvalidInputError):
+        act()

@@ -24,6 +24,7 @@ from undertow.objective import MinimumEnergy, Objective, require_objective
 from undertow.optimiser import Optimiser
 from undertow.plan import Plan
 from undertow.proposal import Budget, Proposal
+from undertow.quantities import number_of
 from undertow.rollout import ClosedLoop
 from undertow.sliding import Control, SlidingModeLaw
 from undertow.stability import check_surface, stability_margin
@@ -336,7 +337,7 @@ class Cascade:
             )
         assert self.loop is not None  # built here, so that its checks run first
         stride = self.step * max(1, self.hold)
-        count = self.period / stride
+        count = number_of("period of the cascade", self.period) / stride
         if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
             raise InvalidInputError(
                 "period of the cascade",

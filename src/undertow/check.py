@@ -16,6 +16,7 @@ import sympy as sp
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import ModelError
 from undertow.mechanism import FloatArray, Mechanism, require_mechanism
+from undertow.modelling.equations import nearest_equilibrium
 from undertow.stability import controllability, has_linear_model, linearise
 
 __all__ = ["Check", "MechanismReport", "check_mechanism"]
@@ -355,7 +356,8 @@ def _target(mechanism: Mechanism) -> tuple[Check, ...]:
             left <= _ROUNDING,
             left,
             f"≤ {_ROUNDING:g} N m or N",
-            "Shift the coordinates: undertow.modelling.find_equilibrium and move_target",
+            ("" if left <= _ROUNDING else f"{nearest_equilibrium(mechanism)}. ")
+            + "Shift the coordinates: undertow.modelling.find_equilibrium and move_target",
         ),
         Check(
             "inputs can hold the target, |B⁻¹ f_a(0, 0)| of their limits",

@@ -18,6 +18,7 @@ from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms.named import named
 from undertow.objective import Constraint, Objective, state_box
 from undertow.objectives import objective_for
+from undertow.quantities import normal_name
 from undertow.surface import Surface
 
 __all__ = [
@@ -118,7 +119,7 @@ def _split(word: str, example: str) -> tuple[str, str]:
     name, equals, value = word.partition("=")
     if not (equals and name.strip() and value.strip()):
         raise InvalidInputError("setting", value=repr(word), limit=f"name=value, like {example}")
-    return name.strip(), value.strip()
+    return normal_name(name.strip()), value.strip()
 
 
 def _pairs(words: Sequence[str], example: str) -> dict[str, str]:

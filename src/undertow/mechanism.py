@@ -28,11 +28,11 @@ from undertow.quantities import (
     FloatArray,
     Input,
     Parameter,
-    normal_name,
     number_of,
     numbers,
 )
 from undertow.validity import (
+    by_names,
     check_definite,
     check_parts,
     check_symbols,
@@ -177,6 +177,7 @@ class Mechanism:
             )
         object.__setattr__(self, "disturbance_bounds", bounds)
         self._check()
+        by_names(f"start of '{self.name}'", self.start)
         self.state(**self.start)
 
     def _check(self) -> None:
@@ -262,7 +263,7 @@ class Mechanism:
         if not values:
             return self
         known = {p.name: p for p in self.parameters}
-        values = {normal_name(name): value for name, value in values.items()}
+        values = by_names(f"parameters of '{self.name}'", values)
         for name in values:
             if name not in known:
                 raise InvalidInputError(
@@ -310,7 +311,7 @@ class Mechanism:
         parameters
             Further parameters that the expressions use.
         """
-        force = {normal_name(name): value for name, value in force.items()}
+        force = by_names(f"forces on '{self.name}'", force)
         names = [c.name for c in self.coordinates]
         unknown = sorted(set(force) - set(names))
         if unknown:
@@ -432,12 +433,11 @@ class Mechanism:
             For an unknown state name or a value that is not finite.
         """
         x = np.zeros(2 * self.n)
-        for given, value in values.items():
-            name = normal_name(given)
+        for name, value in by_names(f"state of '{self.name}'", values).items():
             if name not in self.state_names:
                 raise InvalidInputError(
                     f"unknown state of '{self.name}'",
-                    value=repr(given),
+                    value=repr(name),
                     limit=f"one of {', '.join(self.state_names)}",
                     remedy=near(name, self.state_names)
                     or "Use a coordinate's name, or its velocity's",

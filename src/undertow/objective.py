@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -19,7 +19,7 @@ from undertow.codegen.vector import compile_expressions
 from undertow.errors import InvalidInputError, ModelError, UndertowError, near, raised_at
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.quantities import normal_name, number_of
-from undertow.validity import check_symbols, expression_of, shortened, vocabulary
+from undertow.validity import by_names, check_symbols, expression_of, shortened, vocabulary
 
 __all__ = [
     "Constraint",
@@ -162,7 +162,9 @@ def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
     """
 
     def bounded(name: str, bound: float | tuple[float, float]) -> Constraint:
-        low, high = bound if isinstance(bound, tuple) else (-bound, bound)
+        ends = bound if isinstance(bound, tuple) else (bound, bound)
+        low, high = (number_of(f"bound of state '{name}'", end) for end in ends)
+        low = low if isinstance(bound, tuple) else -low
         if not (math.isfinite(low) and math.isfinite(high) and low < 0 < high):
             alone = not isinstance(bound, tuple)
             raise InvalidInputError(
@@ -175,7 +177,8 @@ def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
         words = f"|{name}| ≤ {high:g}" if low == -high else f"{low:g} ≤ {name} ≤ {high:g}"
         return Constraint(words, _Within(name, low, high), state=name)
 
-    return tuple(bounded(name, bound) for name, bound in bounds.items())
+    named = by_names("bounds of states", bounds)
+    return tuple(bounded(name, bound) for name, bound in named.items())
 
 
 def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constraint, ...]:
@@ -273,6 +276,16 @@ class Objective:
                 limit="a function of the mechanism's names that returns an expression",
                 remedy="Write lambda v: v.inputs[0]**2, or lambda v: 1 for a constant",
             )
+        several = isinstance(self.constraints, Iterable)
+        odd = [c for c in self.constraints if not isinstance(c, Constraint)] if several else [self]
+        if odd:
+            raise InvalidInputError(
+                f"constraints of objective '{self.name}'",
+                value=f"a {type(odd[0] if several else self.constraints).__name__}",
+                limit="a tuple of undertow.Constraint",
+                remedy="Write constraints=(*undertow.state_box(phi=1.0), Constraint(...))",
+            )
+        object.__setattr__(self, "constraints", tuple(self.constraints))
         for field in ("horizon", "terminal_radius"):
             value = number_of(f"{field} of objective '{self.name}'", getattr(self, field))
             if not (math.isfinite(value) and value > 0):

@@ -146,7 +146,7 @@ def objective_for(
             "objective",
             value=repr(word),
             limit=f"one of {', '.join(words)}",
-            remedy=near(word, words),
+            remedy=near(str(word), words),
         )
     own = tuple(constraints)
     return replace(made, horizon=horizon, constraints=own, hard_input=hard_input).on(mechanism)

@@ -310,7 +310,14 @@ def _law_function(mechanism: Mechanism, switching: Switching) -> _LawFunction:
 
 
 def check_surface_shape(mechanism: Mechanism, surface: Surface) -> None:
-    """Refuse a surface whose n or m differ from the mechanism's."""
+    """Refuse what is no surface, and one whose n or m differ from the mechanism's."""
+    if not isinstance(surface, Surface):
+        raise InvalidInputError(
+            f"surface for '{mechanism.name}'",
+            value=f"{surface!r}, a {type(surface).__name__}",
+            limit="an undertow.Surface",
+            remedy="Design one: undertow.first_surface(mechanism)",
+        )
     if (surface.n, surface.m) != (mechanism.n, mechanism.m):
         raise InvalidInputError(
             f"surface for '{mechanism.name}'",

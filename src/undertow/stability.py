@@ -28,9 +28,10 @@ from undertow.errors import (
     UnstableSurfaceError,
 )
 from undertow.mechanism import TIME, FloatArray, Mechanism, numbers, require_mechanism
+from undertow.modelling.equations import nearest_equilibrium
 from undertow.sliding import check_surface_shape, coupling, gamma_determinant, singularity
 from undertow.surface import Surface
-from undertow.validity import kinks, require_smooth
+from undertow.validity import kinks, require_smooth, shortened
 
 __all__ = [
     "Linearisation",
@@ -88,12 +89,21 @@ def linearise(mechanism: Mechanism) -> Linearisation:
         f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
     )
     rest, jacobian = _force_at_target(mechanism)
+    if not (np.isfinite(rest).all() and np.isfinite(jacobian).all()):
+        raise ModelError(
+            f"force of '{mechanism.name}' at the target",
+            value=f"f = {rest}, with slopes that are no numbers"
+            if np.isfinite(rest).all()
+            else rest,
+            limit="finite, with its slopes",
+            remedy="Something is divided by zero there: write it so that it is not",
+        )
     if np.abs(rest[mechanism.m :]).max() > 1e-9:
         raise ModelError(
             f"target of '{mechanism.name}'",
             value=f"f_u(0, 0) = {rest[mechanism.m :]}",
             limit="an equilibrium, f_u = 0",
-            remedy="Shift the coordinates so that x = 0 is the equilibrium to be stabilised",
+            remedy=nearest_equilibrium(mechanism),
         )
     return Linearisation(
         M=mechanism.M(np.zeros(n)),
@@ -134,13 +144,23 @@ def _force_at_target(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
         x = np.vstack([np.zeros(size), 1j * step * np.eye(size)])
         with np.errstate(all="ignore"):
             entries = mechanism.function("force")(0.0, *x.T, *mechanism.parameter_values)
+            real = np.isfinite(mechanism.f(np.zeros(size))).all()
         values = np.stack([np.broadcast_to(e, size + 1) for e in entries])
-        if np.isfinite(values).all():
+        if np.isfinite(values).all() and real:  # of a negative number, a logarithm is complex
             return values[:, 0].real, values[:, 1:].imag / step
     at_target = dict.fromkeys(mechanism.x, 0)
     numeric = sp.Matrix(force).subs(mechanism.substitution | {TIME: 0})
     jacobian = numeric.jacobian(list(mechanism.x)).subs(at_target)
-    return numbers(numeric.subs(at_target)).ravel(), numbers(jacobian)
+    try:
+        return numbers(numeric.subs(at_target)).ravel(), numbers(jacobian)
+    except TypeError as error:  # zoo, or complex
+        raise ModelError(
+            f"force of '{mechanism.name}' at the target",
+            value=shortened(list(numeric.subs(at_target))),
+            limit="real and finite, with its slopes",
+            remedy="Something is divided by zero there, or a root or logarithm taken of a "
+            "negative number",
+        ) from error
 
 
 def controllability(mechanism: Mechanism) -> float:

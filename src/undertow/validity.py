@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import sympy as sp
@@ -25,6 +25,7 @@ from undertow.quantities import (
 )
 
 __all__ = [
+    "by_names",
     "check_definite",
     "check_names",
     "check_parts",
@@ -38,6 +39,8 @@ __all__ = [
     "twins",
     "vocabulary",
 ]
+
+T = TypeVar("T")
 
 #: Functions that are smooth wherever they are finite: a derivative of theirs is never wrong.
 _SMOOTH = (
@@ -127,6 +130,31 @@ def twins(names: Sequence[str]) -> str:
         elif len(group) > 1:
             said.append(group[0])
     return ", ".join(said)
+
+
+def by_names(what: str, values: Mapping[str, T]) -> dict[str, T]:
+    """Return values by their names in Python's spelling, NFKC.
+
+    Raises
+    ------
+    InvalidInputError
+        For two names that Python takes for one, and for what is no name.
+
+    Examples
+    --------
+    >>> by_names("forces", {"µ": 1.0}) == {"μ": 1.0}
+    True
+    """
+    odd = [name for name in values if not isinstance(name, str)]
+    repeated = "" if odd else twins(list(values))
+    if odd or repeated:
+        raise InvalidInputError(
+            what,
+            value=f"{odd[0]!r}, a {type(odd[0]).__name__}" if odd else repeated,
+            limit="names as text, each once",
+            remedy="Write coordinate.name for a coordinate" if odd else "Keep one",
+        )
+    return {normal_name(name): value for name, value in values.items()}
 
 
 def check_parts(

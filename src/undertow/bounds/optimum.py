@@ -146,6 +146,8 @@ def bound(
         For a state, horizon, mesh or guess that cannot be used.
     MissingExtraError
         When CasADi is not installed.
+    ModelError
+        For a cost, a constraint or a force with kinks, but for the moduli of a box.
     InfeasibleError
         When no guess led to an admissible motion.  That proves nothing: other guesses may.
 

@@ -18,6 +18,7 @@ from undertow.codegen import Tape
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, FloatArray, Mechanism
 from undertow.objective import Objective
+from undertow.validity import require_smooth
 
 __all__ = ["Programme", "Solution"]
 
@@ -117,6 +118,14 @@ class Programme:
         # ∫ effort dt weighs every input by its limit: 1 is all inputs at their limits.
         effort = sum(((u / limit) ** 2 for u, limit in zip(mechanism.u, limits, strict=True)))
         margins = [w for m in objective.path_margins(mechanism) for w in smooth(m)]
+        # IPOPT's derivatives of a kink are as wrong as anybody's, and it would call "optimal" what
+        # is not even a local optimum.
+        for what, expressions in (
+            (f"stage cost of '{objective.name}', to be optimised,", [stage]),
+            (f"a constraint of '{objective.name}', to be optimised,", margins),
+            (f"force of '{mechanism.name}', to be optimised,", mechanism.force),
+        ):
+            require_smooth(what, expressions, (*mechanism.x, *mechanism.u))
         self.cost = self._dynamics(stage, margins)
         #: The cost that IPOPT's tolerances, which are absolute, take for one.
         self.unit = 1.0

@@ -102,11 +102,15 @@ def run(
 ) -> None:
     """Run the two-rate controller on a rig, against the clock, and time every step.
 
-    Ends with a verdict, and its exit code. 0 balanced: held to the end, settled and at home.
-    3 caught: held, but not settled or not at home. 4 lost: thrown out, past its travel, or never
-    caught. 5 stopped: by a fault, or by the operator before the time. 6 degraded: held, but with
-    deadlines missed, rows of the log lost, reads or writes failed, unsound answers. 7: the device
-    did not take an output of zero at the end. 1 and 2: no run, for the reason that is printed.
+    Ends with a verdict, and its exit code:
+    0 balanced: held to the end, settled and at home.
+    3 caught: held, but not settled or not at home.
+    4 lost: thrown out, past its travel, or never caught.
+    5 stopped: by a fault, or by the operator before the time.
+    6 degraded: held, but with deadlines missed, rows of the log lost,
+    reads or writes failed, or unsound answers.
+    7: the device did not take an output of zero at the end.
+    1 and 2: no run, for the reason that is printed.
     """
     from undertow.runtime import Recipe
     from undertow.runtime import Settings as Patience

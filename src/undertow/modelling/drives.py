@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import sympy as sp
 
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import Input, Mechanism, Parameter
+from undertow.quantities import number_of
+from undertow.validity import by_names
 
 __all__ = ["DCMotor", "voltage_driven"]
 
@@ -67,6 +69,9 @@ class DCMotor:
 
     def __post_init__(self) -> None:
         """Refuse values that no motor has."""
+        for part in fields(self):
+            if part.name != "source" and getattr(self, part.name) is not None:
+                number_of(f"{part.name} of a DC motor", getattr(self, part.name))
         for name, low in (
             ("torque_constant", 0.0),
             ("resistance", 0.0),
@@ -141,8 +146,16 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
         When an input is in volts already.
     """
     names = [i.name for i in mechanism.inputs]
-    chosen = dict.fromkeys(names, motors) if isinstance(motors, DCMotor) else dict(motors)
-    for name in chosen:
+    each = dict.fromkeys(names, motors) if isinstance(motors, DCMotor) else motors
+    chosen = by_names(f"motors of '{mechanism.name}'", each)
+    for name, motor in chosen.items():
+        if not isinstance(motor, DCMotor):
+            raise InvalidInputError(
+                f"motor of '{mechanism.name}' on '{name}'",
+                value=f"{motor!r}, a {type(motor).__name__}",
+                limit="an undertow.modelling.DCMotor",
+                remedy="Write DCMotor(torque_constant, resistance), from the data sheet",
+            )
         if name not in names:
             raise InvalidInputError(
                 f"motor of '{mechanism.name}'",
@@ -154,9 +167,9 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
     a, b, J = sp.eye(m), sp.zeros(m), sp.zeros(m)
     inputs, parameters = list(mechanism.inputs), list(mechanism.parameters)
     for j, given in enumerate(mechanism.inputs):
-        motor = chosen.get(given.name)
-        if motor is None:
+        if given.name not in chosen:
             continue
+        motor = chosen[given.name]
         if given.unit == "V":
             raise ModelError(
                 f"input '{given.name}' of '{mechanism.name}'",

@@ -7,6 +7,7 @@ through a constant (n, m) matrix, coordinates in any order, a target that is not
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,13 +16,25 @@ import sympy as sp
 
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError, ModelError, near
-from undertow.mechanism import TIME, Coordinate, Input, Mechanism, Parameter, energies, matrix_of
+from undertow.mechanism import (
+    TIME,
+    Coordinate,
+    FloatArray,
+    Input,
+    Mechanism,
+    Parameter,
+    energies,
+    matrix_of,
+)
 from undertow.modelling.coordinates import actuate, exact_angle, tidy
-from undertow.quantities import normal_name, number_of
-from undertow.validity import check_parts, check_symbols, expression_of, vocabulary
+from undertow.quantities import number_of
+from undertow.validity import by_names, check_parts, check_symbols, expression_of, vocabulary
 
 #: |f_u| at an equilibrium, relative to the largest force that gravity and springs exert.
 BALANCE = 1e-9
+
+#: How far an equilibrium may be from a target and still be the one that was meant, rad or m.
+NEAR = 0.5
 
 __all__ = ["from_energies", "from_matrices", "lagrange_force", "unit_inputs"]
 
@@ -90,7 +103,7 @@ def from_matrices(
     for what, matrix, known in (
         ("mass_matrix", mass_matrix, places | {TIME: "undertow.mechanism.TIME"}),
         ("force", force, vocabulary(coordinates, parameters=parameters)),
-        ("input_matrix", input_matrix, vocabulary(coordinates, parameters=parameters)),
+        ("input_matrix", input_matrix, vocabulary(coordinates, parameters=parameters, time=False)),
     ):
         check_symbols(f"{what} of '{name}'", matrix_of(f"{what} of '{name}'", matrix), known)
     if potential is not None:
@@ -98,6 +111,8 @@ def from_matrices(
         check_symbols(f"potential of '{name}'", [potential], places)
     M = _symmetric(name, sp.Matrix(mass_matrix), coordinates, values)
     f = sp.Matrix(force)
+    if f.shape != (n := len(coordinates), 1):
+        raise ModelError(f"force of '{name}'", value=f"shape {f.shape}", limit=f"({n}, 1)")
     V = None if potential is None else sp.sympify(potential)
     if equilibrium:
         coordinates, (M, f, V) = shifted(name, coordinates, equilibrium, M, f, V)
@@ -148,8 +163,49 @@ def check_balanced(mechanism: Mechanism) -> None:
             f"target of '{mechanism.name}'",
             value=f"a force of {residual.max():.4g} on '{worst}', which no input balances",
             limit=f"an equilibrium, |f_u| ≤ {limit:.2g}",
-            remedy="Solve for one: undertow.modelling.find_equilibrium(mechanism, ...)",
+            remedy=nearest_equilibrium(mechanism),
         )
+
+
+def nearest_equilibrium(mechanism: Mechanism) -> str:
+    """Return a remedy for a target that is no equilibrium: the one that is found near it.
+
+    Values are errors from the target, in the mechanism's own coordinates.
+    """
+    q, left = _newton(mechanism)
+    if not (left <= BALANCE and np.abs(q).max() <= NEAR):
+        return (
+            f"No equilibrium was found within {NEAR} rad or m: give a guess to "
+            "undertow.modelling.find_equilibrium(mechanism, ...)"
+        )
+    free = zip(mechanism.coordinates, q, strict=True)
+    named = ", ".join(f"{c.name}={float(v)!r}" for c, v in list(free)[mechanism.m :])
+    return (
+        "The nearest equilibrium that was found is off by "
+        f"{named}: add this to what was given, or take "
+        f"undertow.modelling.move_target(mechanism, {named})"
+    )
+
+
+def _newton(mechanism: Mechanism) -> tuple[FloatArray, float]:
+    """Solve f_u(q, 0) = 0 for the free coordinates, from the target on, by Newton's method.
+
+    Without a solver of a library: what verifies proofs refuses targets, too, and reaches none.
+
+    Returns
+    -------
+    numpy.ndarray, float
+        Positions, (n,), and the |f_u| that is left, relative to :func:`force_scale`.
+    """
+    n, m, scale = mechanism.n, mechanism.m, force_scale(mechanism)
+    x, steps = np.zeros(2 * n), 1e-6 * np.eye(2 * n)[m:n]
+    try:
+        for _ in range(30):
+            slope = (mechanism.f(x + steps) - mechanism.f(x - steps))[:, m:].T / 2e-6
+            x[m:n] -= np.linalg.solve(slope, mechanism.f(x)[m:])
+        return x[:n], float(np.abs(mechanism.f(x)[m:] / scale).max())
+    except (InvalidInputError, np.linalg.LinAlgError):  # the way left what can be computed
+        return x[:n], math.inf
 
 
 def force_scale(mechanism: Mechanism) -> float:
@@ -274,7 +330,7 @@ def shifted(
 ) -> tuple[tuple[Coordinate, ...], list[Any]]:
     """Replace q by q* + e; the errors e keep the coordinates' names."""
     known = {c.name: c for c in coordinates}
-    equilibrium = {normal_name(joint): value for joint, value in equilibrium.items()}
+    equilibrium = by_names(f"equilibrium of '{name}'", equilibrium)
     for joint, value in equilibrium.items():
         if joint not in known:
             raise InvalidInputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,7 +11,8 @@ import sympy as sp
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.modelling.equations import BALANCE, check_balanced, force_scale, shifted
-from undertow.quantities import normal_name, number_of
+from undertow.quantities import number_of
+from undertow.validity import by_names
 
 __all__ = ["find_equilibrium", "holding_input", "move_target"]
 
@@ -31,7 +33,7 @@ def holding_input(mechanism: Mechanism, q: FloatArray | None = None) -> FloatArr
     return np.asarray(-np.linalg.solve(B, mechanism.f(x)[:m]))
 
 
-def find_equilibrium(mechanism: Mechanism, **guess: float) -> dict[str, float]:
+def find_equilibrium(mechanism: Mechanism, /, **guess: float) -> dict[str, float]:
     """Find an equilibrium near a guess: f_u(q, 0) = 0 with the actuated coordinates as given.
 
     Parameters
@@ -61,32 +63,44 @@ def find_equilibrium(mechanism: Mechanism, **guess: float) -> dict[str, float]:
     >>> round(find_equilibrium(rig, phi=3.0)["phi"], 6)
     3.141593
     """
-    from scipy.optimize import root
+    q, relative = _solved(mechanism, _positions(mechanism, guess))
+    if not relative <= BALANCE:
+        scale = force_scale(mechanism)
+        raise ModelError(
+            f"equilibrium of '{mechanism.name}' near {dict(guess)}",
+            value=f"|f_u| = {scale * relative:.3g} left",
+            limit=f"below {BALANCE * scale:.3g}",
+            remedy="Start from another guess, or hold the actuated coordinates elsewhere",
+        )
+    names = [c.name for c in mechanism.coordinates]
+    return dict(zip(names, (float(v) for v in q), strict=True))
 
-    n, m = mechanism.n, mechanism.m
-    q = _positions(mechanism, guess)
+
+def _solved(mechanism: Mechanism, q: FloatArray) -> tuple[FloatArray, float]:
+    """Solve f_u(q, 0) = 0 for the free coordinates, from q on; the actuated ones are kept.
+
+    Returns
+    -------
+    numpy.ndarray, float
+        Positions, (n,), and the |f_u| that is left, relative to :func:`force_scale`.
+    """
+    from scipy.optimize import root  # slow to import
+
+    n, m, scale = mechanism.n, mechanism.m, force_scale(mechanism)
 
     def force(q_u: FloatArray) -> FloatArray:
         x = np.zeros(2 * n)
         x[:m], x[m:n] = q[:m], q_u
         return np.asarray(mechanism.f(x)[m:] / scale)
 
-    scale = force_scale(mechanism)
-    solution = root(force, q[m:], tol=1e-14)
-    left = scale * float(np.abs(force(solution.x)).max())
-    if not left <= BALANCE * scale:
-        raise ModelError(
-            f"equilibrium of '{mechanism.name}' near {dict(guess)}",
-            value=f"|f_u| = {left:.3g} left",
-            limit=f"below {BALANCE * scale:.3g}",
-            remedy="Start from another guess, or hold the actuated coordinates elsewhere",
-        )
-    q[m:] = solution.x
-    names = [c.name for c in mechanism.coordinates]
-    return dict(zip(names, (float(v) for v in q), strict=True))
+    try:
+        found = root(force, q[m:], tol=1e-14).x
+        return np.concatenate([q[:m], found]), float(np.abs(force(found)).max())
+    except InvalidInputError:  # the search left what can be computed
+        return q, math.inf
 
 
-def move_target(mechanism: Mechanism, **equilibrium: float) -> Mechanism:
+def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
     """Return the mechanism in error coordinates from another equilibrium.
 
     Parameters
@@ -135,7 +149,7 @@ def move_target(mechanism: Mechanism, **equilibrium: float) -> Mechanism:
 
 def _positions(mechanism: Mechanism, values: Mapping[str, float]) -> FloatArray:
     names = [c.name for c in mechanism.coordinates]
-    values = {normal_name(name): value for name, value in values.items()}
+    values = by_names(f"coordinates of '{mechanism.name}'", values)
     for name in values:
         if name not in names:
             raise InvalidInputError(

@@ -107,6 +107,7 @@ def mechanism_from_tree(
         rate = sum(k * coordinates[index[j]].velocity for j, k in coupling.coefficients.items())
         dissipation += coupling.damping * rate**2 / 2
     force = lagrange_force(coordinates, mass, potential, dissipation)
+    given = equilibrium or {}
     friction = [joint.friction for joint in joints]
     names_of_strokes, gains = (None, None) if actuated is not None else _strokes(tree)
     return from_matrices(
@@ -120,7 +121,7 @@ def mechanism_from_tree(
         potential=potential,
         actuated=names_of_strokes,
         gains=gains,
-        equilibrium={identifier(k): v for k, v in (equilibrium or {}).items()},
+        equilibrium=dict(zip(_distinct(list(given)), given.values(), strict=True)),
         disturbance_bounds=friction if any(friction) else (),
         start=start,
         description=description or f"rigid-body tree '{tree.name}'" + _unlimited(inputs),
@@ -210,7 +211,8 @@ def _inputs(
             f"'{tree.name}' names no actuator",
             value=f"joints {', '.join(j.name for j in joints)}",
             limit="at least one actuated joint",
-            remedy="Say which joints are actuated: actuated=['...']",
+            remedy="Say which joints are actuated: actuated=['...'], or FILE:JOINT on the command "
+            "line",
         )
     B = sp.zeros(len(joints), len(tree.actuators))
     for k, actuator in enumerate(tree.actuators):

@@ -16,7 +16,7 @@ from undertow.errors import InvalidInputError, ModelError
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.modelling.coordinates import tidy
 from undertow.modelling.equations import from_matrices
-from undertow.validity import require_smooth
+from undertow.validity import by_names, check_parts, require_smooth, twins
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import KanesMethod, LagrangesMethod
@@ -86,6 +86,7 @@ def from_lagrange(
     resting = dict.fromkeys((c.diff(_time()) for c in q), 0)
     # The only place where SymPy keeps the Lagrangian, as a (1, 1) matrix.
     lagrangian = sp.Matrix([method._L])[0]
+    _check_plain(name, [lagrangian, *method.forcing], q, inputs, parameters)
     states = {c.diff(_time()): sp.Dummy(f"{_plain(c)}_dot", real=True) for c in q}
     states |= {c: sp.Dummy(_plain(c), real=True) for c in q}
     require_smooth(f"Lagrangian of '{name}'", [lagrangian.subs(states)], states.values())
@@ -145,6 +146,7 @@ def from_kane(
     speeds = dict(zip(u, G * qd, strict=True))
     mass, forcing = method.mass_matrix, method.forcing.subs(speeds)
     inertial = mass * G.diff(t) * qd
+    _check_plain(name, [*mass, *forcing], q, inputs, parameters)
     return _build(
         name,
         q,
@@ -156,6 +158,36 @@ def from_kane(
         units,
         rest,
     )
+
+
+def _check_plain(
+    name: str,
+    expressions: Sequence[sp.Expr],
+    q: Sequence[Any],
+    inputs: Mapping[Any, Input],
+    parameters: Sequence[Parameter],
+) -> None:
+    """Refuse plain symbols that would meet others when dynamicsymbols become plain ones, too.
+
+    SymPy's mechanics takes every plain symbol for a constant: ``coordinate.symbol`` in a
+    Lagrangian has no derivative there, and would be the coordinate here.
+    """
+    coordinates = [Coordinate(_plain(c)) for c in q]
+    check_parts(name, coordinates, list(inputs.values()), parameters)
+    own = {s for c in coordinates for s in (c.symbol, c.velocity)}
+    own |= {given.symbol for given in inputs.values()}
+    free = set().union(*(expression.free_symbols for expression in expressions))
+    mixed = ", ".join(sorted(str(s) for s in free & own - set(inputs)))
+    alike = twins(sorted({s.name for s in free}))
+    if mixed or alike:
+        raise ModelError(
+            f"symbols of '{name}'",
+            value=f"{mixed} as plain symbols" if mixed else alike,
+            limit="dynamicsymbols for what moves, and a name of its own for each constant",
+            remedy="SymPy's mechanics takes plain symbols for constants: use the dynamicsymbol"
+            if mixed
+            else "Rename one of them",
+        )
 
 
 def _build(
@@ -171,20 +203,23 @@ def _build(
 ) -> Mechanism:
     """Translate symbols, take the inputs out of the forcing, and build."""
     t = _time()
-    units = dict(units or {})
-    names = [_plain(c) for c in q]
+    units = by_names(f"units of '{name}'", units or {})
+    coordinates = [Coordinate(_plain(c)) for c in q]
+    names = [c.name for c in coordinates]
     unknown = sorted(set(units) - set(names))
     if unknown:
         raise InvalidInputError(
             f"units of '{name}'", value=", ".join(unknown), limit=f"one of {', '.join(names)}"
         )
-    coordinates = [Coordinate(c, units.get(c, "rad")) for c in names]
+    coordinates = [
+        Coordinate(_plain(c), units.get(n, "rad")) for c, n in zip(q, names, strict=True)
+    ]
     translate: dict[Any, Any] = {}
     for symbol, coordinate in zip(q, coordinates, strict=True):
         translate[symbol.diff(t)] = coordinate.velocity
         translate[symbol] = coordinate.symbol
     translate |= {symbol: given.symbol for symbol, given in inputs.items()}
-    by_name = {p.name: p.symbol for p in parameters}
+    by_name = {n: p.symbol for p in parameters for n in (p.name, p.spelling)}
 
     def plain(expression: Any) -> sp.Expr:
         moved = sp.sympify(expression).subs(translate)

@@ -25,6 +25,7 @@ from undertow.practice import (
     reaching_for,
 )
 from undertow.proposal import Budget
+from undertow.quantities import number_of
 from undertow.rig import Bench, IdealRig, RealisticRig
 from undertow.rig.presets import bench_for
 from undertow.runtime.controller import Controller
@@ -99,6 +100,8 @@ class Recipe:
                 limit=f"one of {', '.join(get_args(Goal))}",
                 remedy=near(str(self.objective), get_args(Goal)),
             )
+        for what in ("period", "horizon"):
+            number_of(f"{what} of a run", getattr(self, what))
         stall = self.settings.stall
         if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
