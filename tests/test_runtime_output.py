@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,6 +35,7 @@ from undertow.runtime import (
 )
 from undertow.runtime.health import RigClock, Share
 from undertow.runtime.keeper import KeptRig
+from undertow.runtime.session import session
 from undertow.runtime.settings import Settings
 from undertow.runtime.verdict import EXIT_CODES
 
@@ -634,3 +638,33 @@ def test_the_first_reading_of_a_keeper_is_not_an_old_one() -> None:
         assert rig.read().t >= now
     finally:
         rig.close()
+
+
+@pytest.mark.slow  # against the clock, and the rig is given its second
+@pytest.mark.skipif(not hasattr(signal, "SIGTERM"), reason="asks by signals")
+@pytest.mark.parametrize("call", ["write", "close"])
+def test_a_second_signal_ends_a_rig_that_never_returns(call: str) -> None:
+    """The first asks for a safe stop; one that comes a second after that interrupts the rig."""
+
+    def never(k: int = 300, _: object = None) -> None:
+        if k == 300:
+            time.sleep(60.0)
+
+    device = Device(write=never if call == "write" else lambda _k, _u: None)
+    if call == "close":
+        device.close = never  # type: ignore[method-assign]
+    asking = [
+        threading.Timer(after, os.kill, (os.getpid(), signal.SIGTERM)) for after in (1.0, 3.5, 6.0)
+    ]
+    with session(RECIPE, rig=device, processes=0, shadow=False) as runtime:
+        for timer in asking:
+            timer.start()
+        began = time.monotonic()
+        verdict = runtime.run(30.0).verdict
+        assert time.monotonic() - began < 10.0
+        for timer in asking:
+            timer.cancel()
+    if call == "write":
+        assert verdict.exit_code == EXIT_CODES["output on"]
+    else:
+        assert "KeyboardInterrupt" in verdict.output

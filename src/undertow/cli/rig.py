@@ -317,7 +317,7 @@ def replay(
             "chatter.png": figures.chatter_figure(result.recording),
         }
         say(console, write(out, pictures))
-    if not result.identical:
+    if not result.identical or result.gap is not None:
         raise typer.Exit(1)
 
 

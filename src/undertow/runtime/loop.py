@@ -215,6 +215,12 @@ class Runtime:
         self._rate, self._since, self._balanced = np.zeros(1), 0.0, 0.0
         self._reserve = b""
         self._beat = self._origin = self.clock.now()
+        self._left = math.inf
+
+    @property
+    def hangs(self) -> bool:
+        """Whether the rig holds the run up: in its close, or since the watchdog let go of it."""
+        return self.clock.now() - self._left > self.controller.settings.insist
 
     def stop(self) -> None:
         """Ask for a safe stop, as an operator does: from anywhere, also before the run."""
@@ -296,11 +302,13 @@ class Runtime:
         output = [] if report.off else [f"the device did not take an output of zero: {failure}"]
         if self._silent and report.off:
             output.append(self._silent)
+        self._left = self.clock.now()
         try:
             self.rig.close()
         except BaseException as error:  # a rig that failed may fail again
             output.append(f"close: {type(error).__name__}: {error}")
             report.off = report.off and not isinstance(error, OutputOnError)
+        self._left = math.inf
         report.output = "; ".join(output)
         report.mode, report.stopped_by = controller.mode, controller.stopped_by
         report.error = float(np.linalg.norm(controller.home))
@@ -570,6 +578,7 @@ class Runtime:
                 silence = self.clock.now() - self._beat
                 if silence > 2.0 * stall:
                     self._silent = f"watchdog: the fast loop was silent for {1e3 * silence:.0f} ms"
+                    self._left = self.clock.now()
                     with contextlib.suppress(Exception):
                         self.rig.close()
                     return

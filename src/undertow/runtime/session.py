@@ -139,7 +139,7 @@ class _Operator:
 
     A process that is suspended leaves its output on.  While a session is prepared it is given
     up; from then on, until everything is closed, the run is asked to stop, and nothing else is
-    interrupted.
+    interrupted but a rig that has held its safe stop up for longer than that may take.
     """
 
     def __init__(self) -> None:
@@ -173,5 +173,5 @@ class _Operator:
         self._asked = True
         if self.runtime is not None:
             self.runtime.stop()
-        if self._preparing:
+        if self._preparing or (self.runtime is not None and self.runtime.hangs):
             raise KeyboardInterrupt

@@ -147,7 +147,7 @@ def replay_table(result: Replay) -> Table:
     table.add_row("steps made again", f"{result.steps:,}")
     table.add_row(
         "outputs, estimates, states",
-        "identical, bit for bit"
+        f"identical, bit for bit{', to the gap' if result.gap is not None else ''}"
         if not result.differing
         else f"{result.differing:,} steps differ, the first is {result.first}",
     )
