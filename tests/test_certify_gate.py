@@ -241,6 +241,7 @@ def test_the_refusal_keeps_the_old_plans_cost_and_verdict() -> None:
     assert admission.verdict.details["evidence"] == "dual"
 
 
+@pytest.mark.slow  # an interpreter of its own
 def test_a_gate_travels_to_another_process() -> None:
     """The optimiser may run in a process of its own: what it decides there is the same."""
     gate = certified_gate(Policy(("dual",), singular_margin=0.1), tail=5e-3)

@@ -28,9 +28,7 @@ def test_every_mechanism_of_the_library_passes(name: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=() if name in ("tora", "two_motor_three_link") else pytest.mark.slow
-        )
+        pytest.param(name, marks=() if name == "two_motor_three_link" else pytest.mark.slow)
         for name in sorted(LIBRARY)
     ],
 )

@@ -480,7 +480,7 @@ def fuzzed(controller: EmbeddedController, folder: Path, steps: int) -> list[int
     ("name", "real", "step", "steps"),
     [
         ("rotary_pendulum", "double", DerivativeStep(), 60_000),
-        (M, "float", DerivativeStep(), 60_000),
+        pytest.param(M, "float", DerivativeStep(), 60_000, marks=pytest.mark.slow),
         ("rotary_pendulum", "float", KalmanStep(), 60_000),
         *(
             pytest.param(name, real, step, 3_000_000, marks=pytest.mark.slow)

@@ -399,6 +399,7 @@ def test_a_machine_without_memory_is_found_before_a_session(
 
 
 @linux
+@pytest.mark.slow  # a run against the clock each
 @pytest.mark.parametrize("name", ["RLIMIT_AS", "RLIMIT_NOFILE", "RLIMIT_FSIZE"])
 def test_a_limit_that_is_met_in_a_run_ends_safely(
     campaign: Systematic, tmp_path: Path, name: str
@@ -437,7 +438,10 @@ def test_a_limit_that_is_met_in_a_run_ends_safely(
 MOMENTS = ["first", "warming up", "ready", "between", "read", "close", "log", "worker"]
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize(
+    "moment",
+    [pytest.param(m, marks=() if m in ("ready", "read") else pytest.mark.slow) for m in MOMENTS],
+)
 def test_two_signals_at_any_moment_of_a_session_end_safely(
     campaign: Systematic, tmp_path: Path, moment: str
 ) -> None:

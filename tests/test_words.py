@@ -491,6 +491,7 @@ def test_a_film_says_which_part_of_a_motion_it_shows() -> None:
     assert "--longest" in out
 
 
+@pytest.mark.slow  # proves and draws
 def test_the_picture_of_a_region_says_where_it_ignores_the_input_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
