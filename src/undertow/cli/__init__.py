@@ -11,7 +11,7 @@ import typer
 from undertow import results
 from undertow.cli import bench, certify, control, export, library, paper, rig, trials
 from undertow.cli.terminal import app, examples
-from undertow.interrupt import at_once, by_exception
+from undertow.interrupt import INTERRUPTED, at_once, by_exception
 
 __all__ = [
     "app",
@@ -58,9 +58,12 @@ def root(
 
 def main() -> None:
     """Run the command line."""
-    by_exception()
     try:
+        by_exception()
         app(prog_name="undertow")
+    except KeyboardInterrupt:  # before a command begins, which says so itself
+        sys.stderr.write("interrupted\n")
+        raise SystemExit(INTERRUPTED) from None
     finally:  # what is left is to end
         with suppress(OSError, ValueError):  # a pipe may be closed
             sys.stdout.flush()
