@@ -646,24 +646,33 @@ def test_the_first_reading_of_a_keeper_is_not_an_old_one() -> None:
 def test_a_second_signal_ends_a_rig_that_never_returns(call: str) -> None:
     """The first asks for a safe stop; one that comes a second after that interrupts the rig."""
 
+    hanging = threading.Event()
+
     def never(k: int = 300, _: object = None) -> None:
         if k == 300:
+            hanging.set()
             time.sleep(60.0)
+
+    def ask() -> None:
+        if call == "write":  # `close` comes only after a stop
+            hanging.wait(30.0)
+        for pause in (1.0, 2.5, 2.5):
+            if over.wait(pause):
+                return
+            os.kill(os.getpid(), signal.SIGTERM)
 
     device = Device(write=never if call == "write" else lambda _k, _u: None)
     if call == "close":
         device.close = never  # type: ignore[method-assign]
-    asking = [
-        threading.Timer(after, os.kill, (os.getpid(), signal.SIGTERM)) for after in (1.0, 3.5, 6.0)
-    ]
+    over = threading.Event()
     with session(RECIPE, rig=device, processes=0, shadow=False) as runtime:
-        for timer in asking:
-            timer.start()
+        asking = threading.Thread(target=ask)
+        asking.start()
         began = time.monotonic()
         verdict = runtime.run(30.0).verdict
-        assert time.monotonic() - began < 10.0
-        for timer in asking:
-            timer.cancel()
+        assert time.monotonic() - began < 15.0
+        over.set()
+        asking.join()
     if call == "write":
         assert verdict.exit_code == EXIT_CODES["output on"]
     else:

@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import sqlite3
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -506,6 +507,41 @@ def test_what_is_closed_is_not_disturbed() -> None:
         assert heard == [signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.slow
+def test_a_stop_while_processes_are_made_leaves_none(campaign: Systematic) -> None:
+    """At every seventh line that Python runs meanwhile, our own and its library's."""
+    number, beyond = 1, False
+    while not beyond:
+        ours, theirs = processes.pipe()
+
+        def work(number: int = number, say: Any = theirs) -> None:
+            left, process = number, os.getpid()
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+            def trace(*_: object) -> object:
+                nonlocal left
+                left -= 1
+                if left == 0 and os.getpid() == process:
+                    sys.settrace(None)
+                    os.kill(process, signal.SIGTERM)
+                return trace if left > 0 and os.getpid() == process else None
+
+            sys.settrace(trace)
+            try:
+                slow.background_worker(campaign.recipes["ideal"].respond, processes=2).close()
+            finally:
+                sys.settrace(None)
+                say.send(left > 0)
+
+        child = fork(work, (), "child of a test", daemon=False)
+        child.join(10.0)
+        assert not child.is_alive(), number
+        beyond, number = ours.recv(), number + 7
+        ours.close()
+        theirs.close()
+    assert number > 700
 
 
 @pytest.mark.slow

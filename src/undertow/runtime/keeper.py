@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import signal
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -25,7 +24,7 @@ from undertow.errors import ArtefactError, UndertowError
 from undertow.mechanism import FloatArray
 from undertow.rig.interface import Measurement, OutputOnError, Rig
 from undertow.runtime.clock import prompt
-from undertow.runtime.processes import fork, pipe, withdraw
+from undertow.runtime.processes import STOPPING, fork, pipe
 from undertow.runtime.steps import confine
 
 __all__ = ["KeptRig"]
@@ -118,13 +117,26 @@ class KeptRig:
         self.period = period
         confine(np.zeros_like(limits), np.zeros_like(limits), limits, slew)  # compiled by now
         self._pipe, theirs = pipe()
-        self.process = fork(
-            _keep,
-            (make, theirs, self._pipe, period, limits, slew, silence, record),
-            "undertow keeper",
-            daemon=False,
-        )
-        theirs.close()
+        try:
+            try:
+                self.process = fork(
+                    _keep,
+                    (make, theirs, self._pipe, period, limits, slew, silence, record),
+                    "undertow keeper",
+                    daemon=False,
+                    ignores=STOPPING,
+                )
+            finally:
+                theirs.close()
+            said = self._first()
+        except BaseException:
+            self._pipe.close()  # then the keeper lets go
+            raise
+        self._said, self._closed, self._heard = said, False, time.perf_counter()
+        self._unanswered = 0
+        self._way = period * float(np.max(np.where(np.isfinite(limits), limits / slew, 0.0)))
+
+    def _first(self) -> _Reply:
         try:
             said: _Reply | _Refused = self._pipe.recv()
         except EOFError as error:
@@ -136,9 +148,7 @@ class KeptRig:
             ) from error
         if isinstance(said, _Refused):
             raise said.error()
-        self._said, self._closed, self._heard = said, False, time.perf_counter()
-        self._unanswered = 0
-        self._way = period * float(np.max(np.where(np.isfinite(limits), limits / slew, 0.0)))
+        return said
 
     def read(self) -> Measurement:
         """Return the measurement that the keeper took after the last output.
@@ -236,8 +246,6 @@ def _keep(
 ) -> None:
     """Apply what comes; once nothing comes, bring the output to zero."""
     theirs.close()
-    withdraw()
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with prompt():  # also for the threads of a driver
         try:
             rig = make()

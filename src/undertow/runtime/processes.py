@@ -15,7 +15,7 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,10 +35,10 @@ __all__ = [
     "Background",
     "check_resources",
     "fork",
+    "held_back",
     "pipe",
     "refused_by_the_system",
     "undisturbed",
-    "withdraw",
 ]
 
 #: Signals that ask for a safe stop, where the system has them.
@@ -85,13 +85,30 @@ def _soft_limit(name: str) -> float:
 
 
 def fork(
-    target: Callable[..., None], args: tuple[Any, ...], name: str, *, daemon: bool = True
+    target: Callable[..., None],
+    args: tuple[Any, ...],
+    name: str,
+    *,
+    daemon: bool = True,
+    ignores: Collection[int] = (),
 ) -> ForkProcess:
     """Start a function in a process that is a copy of this one.
 
     Python 3.12 and later warn that threads of this process may hold locks that the copy
     waits for.  Ours are begun after the forks; those of a linear algebra library take care
     of themselves.
+
+    Parameters
+    ----------
+    target, args, name
+        What it runs, and its name in messages.
+    daemon
+        Whether it is ended with this process, by SIGTERM; otherwise this one waits for it.
+    ignores
+        Which of :data:`STOPPING` it ignores from the beginning, in a session of its own: Ctrl-C,
+        Ctrl-Z and a lost connection reach every process of a terminal, and a keeper that is
+        stopped or ended with its controller keeps nothing.  The others end it.  A stop that is
+        asked for meanwhile reaches this process once the other has begun.
 
     Raises
     ------
@@ -108,9 +125,9 @@ def fork(
             remedy="Write --worker thread, or run in simulated time",
         )
     process = multiprocessing.get_context("fork").Process(
-        target=target, args=args, name=name, daemon=daemon
+        target=_begin, args=(target, args, ignores), name=name, daemon=daemon
     )
-    with warnings.catch_warnings():
+    with held_back(), _blocked(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
             process.start()
@@ -123,6 +140,30 @@ def fork(
                 "in a thread: --worker thread",
             ) from error
     return process
+
+
+@contextlib.contextmanager
+def _blocked() -> Iterator[None]:
+    """Let what asks a process for a stop wait in the system while it is being copied.
+
+    Python forgets the signals that reach the copy before it has begun.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(target: Callable[..., None], args: tuple[Any, ...], ignores: Collection[int]) -> None:
+    """Run what was forked, with signals of its own."""
+    if ignores:
+        with contextlib.suppress(OSError):
+            os.setsid()
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_IGN if number in ignores else signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+    target(*args)
 
 
 def pipe() -> tuple[Connection, Connection]:
@@ -139,16 +180,24 @@ def pipe() -> tuple[Connection, Connection]:
         raise _no_files(error) from error
 
 
-def withdraw() -> None:
-    """Leave this process to its own: what asks for a stop is for the one that controls.
+@contextlib.contextmanager
+def held_back() -> Iterator[None]:
+    """Let signals that ask for a stop wait until what is being opened can also be closed."""
+    heard: list[int] = []
+    with contextlib.ExitStack() as stack:  # restores the rest, too, when a handler raises
+        stack.callback(_again, heard)
+        if threading.current_thread() is threading.main_thread():
+            for number in STOPPING:
+                before = signal.getsignal(number)
+                if before not in (signal.SIG_IGN, None):  # None: not Python's own
+                    stack.callback(signal.signal, number, before)
+                    signal.signal(number, lambda n, _: heard.append(n))
+        yield
 
-    Ctrl-C, Ctrl-Z and a lost connection reach every process of a session: a keeper that is
-    stopped or ended with its controller keeps nothing.
-    """
-    with contextlib.suppress(OSError):
-        os.setsid()
-    for number in STOPPING:
-        signal.signal(number, signal.SIG_IGN)
+
+def _again(heard: Sequence[int]) -> None:
+    for number in dict.fromkeys(heard):
+        os.kill(os.getpid(), number)
 
 
 @contextlib.contextmanager

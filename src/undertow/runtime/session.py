@@ -15,7 +15,12 @@ from undertow.rig.interface import Rig
 from undertow.runtime.clock import SimulatedClock, WallClock
 from undertow.runtime.log import Columns, Log, check_log
 from undertow.runtime.loop import Runtime
-from undertow.runtime.processes import STOPPING, check_resources, refused_by_the_system
+from undertow.runtime.processes import (
+    STOPPING,
+    check_resources,
+    held_back,
+    refused_by_the_system,
+)
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
 from undertow.runtime.slow import (
@@ -108,16 +113,16 @@ def _prepared(
     tell("warming up", 0.6)
     warm_up(recipe, memory, compute)
     controller = recipe.make_controller(memory)
-    # First the processes are forked, then threads begin.
-    worker: Worker = InlineWorker(compute)
-    if not simulated:
-        worker = background_worker(compute, processes=processes)
-    stack.callback(worker.close)
-    book = None
-    if log is not None:
-        meta = about(controller, recipe, simulated=simulated)
-        columns = Columns.of(recipe.belief)
-        book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
+    meta, book = about(controller, recipe, simulated=simulated), None
+    with held_back():  # what is opened is closed
+        # First the processes are forked, then threads begin.
+        worker: Worker = InlineWorker(compute)
+        if not simulated:
+            worker = background_worker(compute, processes=processes)
+        stack.callback(worker.close)
+        if log is not None:
+            columns = Columns.of(recipe.belief)
+            book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
     clock = SimulatedClock() if simulated else WallClock()
     double = recipe.make_controller(memory) if shadow and not simulated else None
     runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=double)

@@ -28,7 +28,7 @@ from undertow.inner_loop import lane
 from undertow.mechanism import FloatArray
 from undertow.plan import Plan
 from undertow.proposal import Proposal
-from undertow.runtime.processes import PATIENCE, Background, fork, pipe, withdraw
+from undertow.runtime.processes import PATIENCE, STOPPING, Background, fork, pipe
 from undertow.sliding import SlidingModeLaw
 from undertow.swing_up import SwingUpAndCatch
 
@@ -48,6 +48,9 @@ __all__ = [
 
 #: The first that a process says which is to compute.
 BEGUN = "begun"
+
+#: What asks the fast loop for a stop, which decides when its processes end, by SIGTERM.
+OTHERS = tuple(number for number in STOPPING if number != signal.SIGTERM)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -359,9 +362,11 @@ class _Child(_Computer):
     def __init__(self, compute: Compute) -> None:
         self.pipe, theirs = pipe()
         try:
-            self.process = fork(_serve, (compute, theirs, self.pipe), "undertow slow loop")
-        except ResourceError:
-            self.pipe.close()
+            self.process = fork(
+                _serve, (compute, theirs, self.pipe), "undertow slow loop", ignores=OTHERS
+            )
+        except BaseException:
+            self.pipe.close()  # which ends it
             raise
         finally:
             theirs.close()
@@ -396,8 +401,6 @@ class _Child(_Computer):
 def _serve(compute: Compute, ours: Connection, theirs: Connection) -> None:
     """Answer requests until the other end is gone."""
     theirs.close()
-    withdraw()  # the fast loop decides when to end
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with contextlib.suppress(OSError, AttributeError):  # Linux: do not outlive the fast loop
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
     with contextlib.suppress(EOFError, OSError):
