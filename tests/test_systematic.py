@@ -520,7 +520,7 @@ def test_a_stop_while_processes_are_made_leaves_none(campaign: Systematic) -> No
             left, process = number, os.getpid()
             signal.signal(signal.SIGTERM, signal.default_int_handler)
 
-            def trace(*_: object) -> object:
+            def trace(*_: object) -> Any:
                 nonlocal left
                 left -= 1
                 if left == 0 and os.getpid() == process:
