@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.arguments import at_least, check_fields, checked
 from undertow.decision import Freedom
 from undertow.errors import InvalidInputError
 from undertow.mechanism import TIME, FloatArray, Mechanism, require_mechanism
@@ -314,6 +315,7 @@ class Cascade:
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
+        check_fields(self)
         require_mechanism("mechanism of a cascade", self.mechanism)
         require_objective(self.objective)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
@@ -331,10 +333,7 @@ class Cascade:
                 limit="finite and ≥ 0",
                 remedy="1e-4 is a ten-thousandth of the first cost",
             )
-        if self.seed < 0:
-            raise InvalidInputError(
-                "seed", value=self.seed, limit="≥ 0", remedy="Any whole number from 0 will do"
-            )
+        at_least("seed", self.seed, 0)
         assert self.loop is not None  # built here, so that its checks run first
         stride = self.step * max(1, self.hold)
         count = number_of("period of the cascade", self.period) / stride
@@ -391,6 +390,7 @@ class Cascade:
 
     # -- the state machine ----------------------------------------------------------------
 
+    @checked
     def start(self, x: ArrayLike) -> tuple[CascadeState, Proposal]:
         """Run the first, global optimisation from x: at the start, and again after a jump.
 
@@ -410,6 +410,7 @@ class Cascade:
         begun = CascadeState(plan, 0, cost, cost, x=_kept(self.mechanism.check_state(x)))
         return begun, proposal
 
+    @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
         """Put the first plan before the gate: there is no other, so it is used all the same.
 
@@ -431,6 +432,7 @@ class Cascade:
         score = float(self.loop.batch(x, plan, duration=horizon).score(horizon)[0])
         return score if score < INADMISSIBLE else math.inf
 
+    @checked
     def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
         """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits.
 
@@ -440,6 +442,7 @@ class Cascade:
         surface, law = state.plan.at(t - state.since)
         return SlidingModeLaw(self.mechanism, surface, law or self.reaching)(t, x)
 
+    @checked
     def propose(
         self, state: CascadeState, x: ArrayLike, t: float = 0.0, horizon: float | None = None
     ) -> Proposal:
@@ -477,6 +480,7 @@ class Cascade:
             message = f"{type(error).__name__}: {error}"
             return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, message)
 
+    @checked
     def consider(
         self,
         state: CascadeState,
@@ -549,6 +553,7 @@ class Cascade:
 
     # -- simulation -----------------------------------------------------------------------
 
+    @checked
     def simulate(
         self,
         x0: ArrayLike | None = None,

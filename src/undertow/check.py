@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
+from undertow.arguments import at_least, checked
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import ModelError
 from undertow.mechanism import FloatArray, Mechanism, require_mechanism
@@ -88,6 +89,7 @@ class MechanismReport:
         return "\n".join([f"{self.mechanism}:", *(f"  {check}" for check in self.checks)])
 
 
+@checked
 def check_mechanism(
     mechanism: Mechanism,
     *,
@@ -143,6 +145,8 @@ def check_mechanism(
     True
     """
     require_mechanism("mechanism to check", mechanism)
+    at_least("samples", samples, 1, "64 are usual")
+    at_least("seed", seed, 0)
     rng = np.random.default_rng(seed)
     q = _positions(mechanism, rng, samples)
     qd = rng.uniform(-3.0, 3.0, q.shape)

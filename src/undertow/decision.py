@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from undertow.arguments import check_fields
 from undertow.codegen.machine import numba
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
@@ -43,6 +44,7 @@ class Freedom:
 
     def __post_init__(self) -> None:
         """Refuse times that do not rise from 0."""
+        check_fields(self)
         rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
         if not self.times or self.times[0] != 0 or not rising:
             raise InvalidInputError(

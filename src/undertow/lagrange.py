@@ -83,6 +83,7 @@ def derive(
     ):
         raise ModelError(
             f"kinetic energy of '{name}'",
+            value=str(kinetic)[:80],
             limit="a quadratic form in the velocities",
             remedy="Move velocity-free terms to the potential; gyroscopic terms to force",
         )

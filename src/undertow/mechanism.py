@@ -18,6 +18,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.arguments import REMEDIES, checked, floats
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.lagrange import derived
@@ -205,6 +206,7 @@ class Mechanism:
             )
 
     @classmethod
+    @checked
     def from_energies(
         cls,
         name: str,
@@ -299,6 +301,7 @@ class Mechanism:
         """Return the mechanism with declared bounds |g_i|, one per coordinate (N m or N)."""
         return replace(self, disturbance_bounds=bounds)
 
+    @checked
     def disturbed(
         self, force: Mapping[str, sp.Expr | float], parameters: Iterable[Parameter] = ()
     ) -> Self:
@@ -455,7 +458,7 @@ class Mechanism:
         InvalidInputError
             With the offending entry.
         """
-        state = _floats(f"state of '{self.name}'", x)
+        state = floats(f"state of '{self.name}'", x)
         if state.ndim == 0 or state.shape[-1] != 2 * self.n:
             raise InvalidInputError(
                 f"state of '{self.name}'",
@@ -476,7 +479,7 @@ class Mechanism:
     def _columns(self, what: str, values: ArrayLike, names: Sequence[str]) -> FloatArray:
         """Return values as floats, (…, len(names)), or refuse them."""
         what = f"{what} of '{self.name}'"
-        array = _floats(what, values)
+        array = floats(what, values)
         if array.ndim == 0 or array.shape[-1] != len(names):
             raise InvalidInputError(
                 what,
@@ -535,6 +538,7 @@ class Mechanism:
         """Return f(q, q̇) at the states x: (…, 2n) to (…, n), N m or N."""
         return self._evaluate("force", t, self.check_state(x))
 
+    @checked
     def accelerations(self, t: float, x: ArrayLike, u: ArrayLike) -> FloatArray:
         """Forward dynamics: q̈ at (t, x, u), (…, n), equations (3)-(4).
 
@@ -634,25 +638,12 @@ def matrix_of(what: str, value: object) -> sp.ImmutableDenseMatrix:
         return sp.ImmutableDenseMatrix(value)
     except ModelError:
         raise
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, NotImplementedError) as error:
         raise ModelError(
             what,
             value=f"{value!r}, a {type(value).__name__}",
             limit="a matrix of SymPy expressions",
             remedy="Write sympy.Matrix([[...], [...]])",
-        ) from error
-
-
-def _floats(what: str, values: ArrayLike) -> FloatArray:
-    """Return values as an array of floats, or refuse them."""
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(
-            what,
-            value=f"{values!r}, a {type(values).__name__}",
-            limit="numbers, in SI units",
-            remedy="Set states by name: mechanism.state(name=value)",
         ) from error
 
 
@@ -669,8 +660,7 @@ def require_mechanism(what: str, value: object) -> None:
             what,
             value=f"{value!r}, a {type(value).__name__}",
             limit="an undertow.Mechanism",
-            remedy="Make one: undertow.mechanisms.rotary_pendulum(), or of one's own with "
-            "undertow.Mechanism.from_energies",
+            remedy=REMEDIES["Mechanism"],
         )
 
 

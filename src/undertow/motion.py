@@ -10,6 +10,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from undertow.arguments import at_least, checked
 from undertow.codegen.machine import numba
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, Mechanism
@@ -156,8 +157,10 @@ class Trajectory:
         return np.asarray(self.x[:, self.mechanism.state_names.index(name)])
 
     @classmethod
+    @checked
     def join(cls, pieces: Sequence[Trajectory]) -> Trajectory:
         """Join consecutive pieces; costs add up, doubled end points are dropped."""
+        at_least("number of pieces", len(pieces), 1, "Give at least one")
         first, spent = pieces[0], 0.0
         columns: dict[str, list[FloatArray]] = {k: [] for k in ("t", "x", "u", "s", "margin")}
         costs = []

@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
+from undertow.arguments import REMEDIES, check_fields, checked
 from undertow.codegen.vector import compile_expressions
 from undertow.errors import InvalidInputError, ModelError, UndertowError, near, raised_at
 from undertow.mechanism import FloatArray, Mechanism
@@ -296,6 +297,7 @@ class Objective:
                     remedy=_REMEDIES[field],
                 )
 
+    @checked
     def on(self, mechanism: Mechanism) -> Self:
         """Return the problem as it is for a mechanism: with the travel that it declares.
 
@@ -312,6 +314,7 @@ class Objective:
         constraints = own + declared
         return self if constraints == self.constraints else replace(self, constraints=constraints)
 
+    @checked
     def meaning(self, mechanism: Mechanism) -> str:
         """Return in one line what is minimised, until when, and within which bounds.
 
@@ -341,6 +344,7 @@ class Objective:
     def _formula(self, mechanism: Mechanism) -> str:
         return self.formula or f"∫ ({self.stage_cost(mechanism)}) dt"
 
+    @checked
     def written(self, mechanism: Mechanism) -> Self:
         """Return the same objective with what no other process can import as expressions.
 
@@ -380,6 +384,7 @@ class Objective:
     def __deepcopy__(self, _memo: object) -> Self:
         return self
 
+    @checked
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
         """Return Φ(x, u) as an expression.
 
@@ -401,6 +406,7 @@ class Objective:
             )
         return stage
 
+    @checked
     def path_margins(self, mechanism: Mechanism) -> list[sp.Expr]:
         """Return −w(x, u) of every constraint: signed margins, ≥ 0 is satisfied."""
         return [
@@ -408,6 +414,7 @@ class Objective:
             for c in self.constraints
         ]
 
+    @checked
     def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
         """Refuse an initial state that breaks a path constraint, whatever the input does.
 
@@ -424,7 +431,9 @@ class Objective:
             With the constraint and its margin.
         """
         problem = self.on(mechanism)
-        values = mechanism.substitution | dict(zip(mechanism.x, x.tolist(), strict=True))
+        values = mechanism.substitution | dict(
+            zip(mechanism.x, mechanism.check_state(x).tolist(), strict=True)
+        )
         margins = zip(problem.constraints, problem.path_margins(mechanism), strict=True)
         for constraint, margin in margins:
             at_start = margin.subs(values)
@@ -483,8 +492,7 @@ def require_objective(value: object) -> None:
             "objective",
             value=f"{value!r}, a {type(value).__name__}",
             limit="an undertow.Objective",
-            remedy="Make one: undertow.MinimumTime(), undertow.MinimumEnergy(), or "
-            'undertow.Objective("my cost", lambda v: v.phi**2)',
+            remedy=REMEDIES["Objective"],
         )
 
 
@@ -533,6 +541,7 @@ class MinimumEnergy(Objective):
 
     def __post_init__(self) -> None:
         """Refuse a negative weight, besides what every objective refuses."""
+        check_fields(self)
         super().__post_init__()
         if not (math.isfinite(self.state_weight) and self.state_weight >= 0):
             raise InvalidInputError(
@@ -542,6 +551,7 @@ class MinimumEnergy(Objective):
                 remedy="Theorem 1 wants a small positive one; the paper has 0",
             )
 
+    @checked
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
         """Return Φ(x, u) = uᵀu + w xᵀx."""
         x = sp.Matrix(mechanism.x)

@@ -14,6 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 import sympy as sp
 
+from undertow.arguments import checked
 from undertow.errors import InvalidInputError, near
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Names, Objective
@@ -74,6 +75,7 @@ def _energy_unit(mechanism: Mechanism) -> str:
     return f"({unit})² s" if " " in unit else f"{unit}² s"
 
 
+@checked
 def objective_for(
     mechanism: Mechanism,
     word: str = "energy",

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.arguments import at_least, check_fields, checked
 from undertow.decision import Freedom
-from undertow.errors import InfeasibleError, InvalidInputError
+from undertow.errors import InfeasibleError
 from undertow.optimisation import Optimisation, Problem
 from undertow.plan import Plan
 from undertow.proposal import Budget, Proposal
@@ -52,16 +53,14 @@ class Optimiser:
 
     def __post_init__(self) -> None:
         """Design the first surface and the coordinates of the search around it."""
+        check_fields(self)
         if self.first is None:
             self.first = first_surface(self.loop.mechanism)
         check_surface(self.loop.mechanism, self.first)
-        if self.population < 4:
-            raise InvalidInputError(
-                "population of the optimiser",
-                value=self.population,
-                limit="≥ 4",
-                remedy="32 fills two blocks of rollouts",
-            )
+        at_least(
+            "population of the optimiser", self.population, 4, "32 fills two blocks of rollouts"
+        )
+        at_least("seed", self.seed, 0)
         self.problem = Problem(self.loop, self.first, self.freedom, self.population)
 
     def _budget(self, warm: bool) -> Budget:
@@ -81,6 +80,7 @@ class Optimiser:
         """Part of the horizon to plan for: a prediction may be early by its tolerance."""
         return 1.0 - min(0.5 * self.loop.tail, 0.1)
 
+    @checked
     def propose(
         self,
         x: ArrayLike,
@@ -116,6 +116,7 @@ class Optimiser:
             Always; an infeasible task is a status and not an exception.
         """
         began = time.perf_counter()
+        at_least("sequence of a proposal", sequence, 0)
         state = self.loop.mechanism.check_state(x)
         task = Optimisation(
             self.problem,
@@ -135,6 +136,7 @@ class Optimiser:
             converged = task.shoot()
         return task.answer(converged, sequence, computed_for)
 
+    @checked
     def require(self, x: ArrayLike) -> Proposal:
         """Return a global optimum from x, or raise with the evidence.
 

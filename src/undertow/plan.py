@@ -13,6 +13,7 @@ from typing import Self
 
 import numpy as np
 
+from undertow.arguments import at_least, check_fields, checked
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray
 from undertow.sliding import ReachingLaw, Surface
@@ -52,6 +53,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         """Check lengths, times and shapes."""
+        check_fields(self)
         shapes = {(s.n, s.m) for s in self.surfaces if isinstance(s, Surface)}
         if len(shapes) > 1 or not all(isinstance(s, Surface) for s in self.surfaces):
             raise InvalidInputError(
@@ -81,6 +83,7 @@ class Plan:
             )
 
     @classmethod
+    @checked
     def of(cls, what: Surface | Plan | Sequence[Surface], times: Iterable[float] = (0.0,)) -> Plan:
         """Return a plan made of a surface, of several with their times, or as it is."""
         times = tuple(times)
@@ -100,11 +103,13 @@ class Plan:
         """Index of the surface in use at t; a nanosecond early counts as on time."""
         return max(0, int(np.searchsorted(self.times, t + 1e-9, side="right")) - 1)
 
+    @checked
     def at(self, t: float) -> tuple[Surface, ReachingLaw | None]:
         """Return the surface in use t seconds after the start, and its reaching law."""
         k = self._index(t)
         return self.surfaces[k], None if self.reaching is None else self.reaching[k]
 
+    @checked
     def shifted(self, t: float) -> Self:
         """Return what is left of the plan t seconds after its start."""
         k = self._index(t)
@@ -115,10 +120,12 @@ class Plan:
         return replace(self, surfaces=self.surfaces[k:], times=times, reaching=laws)
 
     @staticmethod
+    @checked
     def align(
         plans: Sequence[Plan], otherwise: ReachingLaw
     ) -> tuple[tuple[float, ...], FloatArray, FloatArray]:
         """Return common times (S), surface vectors (N, S, 2mn) and gains (N, S, 2m)."""
+        at_least("number of plans", len(plans), 1, "Give at least one")
         times = tuple(sorted({t for plan in plans for t in plan.times}))
         vectors = [[plan.at(t)[0].vector for t in times] for plan in plans]
         m = plans[0].surfaces[0].m
@@ -130,6 +137,7 @@ class Plan:
         """Surface vectors, (S, 2mn)."""
         return np.stack([surface.vector for surface in self.surfaces])
 
+    @checked
     def gains(self, otherwise: ReachingLaw) -> FloatArray:
         """Return η and ε of each surface, (S, 2m), with ``otherwise`` where none is given."""
         m = self.surfaces[0].m

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from undertow.arguments import check_fields
 from undertow.errors import InvalidInputError, SingularSurfaceError
 from undertow.mechanism import FloatArray
 from undertow.motion import Event
@@ -38,6 +39,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Refuse budgets that allow nothing."""
+        check_fields(self)
         whole = isinstance(self.evaluations, int | np.integer) and self.evaluations >= 1
         if not whole or not self.seconds > 0:
             raise InvalidInputError(

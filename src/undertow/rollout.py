@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from undertow.arguments import check_fields, checked, floats
 from undertow.codegen.rows import LANES
 from undertow.errors import InvalidInputError
 from undertow.mechanism import FloatArray, require_mechanism
@@ -73,6 +74,7 @@ class ClosedLoop(UncheckedLoop):
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
+        check_fields(self)
         require_mechanism("mechanism of a closed loop", self.mechanism)
         if self.plant is not None:
             require_mechanism("plant of a closed loop", self.plant)
@@ -176,6 +178,7 @@ class ClosedLoop(UncheckedLoop):
         """
         return Probe(self, x, self._switch_steps(times), self._steps(horizon))
 
+    @checked
     def batch(
         self,
         x0: ArrayLike,
@@ -226,9 +229,7 @@ class ClosedLoop(UncheckedLoop):
                 )
             switch_times, vectors, reaching = Plan.align(plans, self.reaching)
         else:
-            vectors = np.asarray(surfaces, dtype=float)
-            if vectors.ndim == 1:
-                vectors = vectors[None]
+            vectors = np.atleast_2d(floats("surface vectors of a batch", surfaces))  # type: ignore[arg-type]
             if vectors.ndim == 2:
                 vectors = vectors[:, None, :]
         states = np.atleast_2d(self.mechanism.check_state(x0))
@@ -282,6 +283,7 @@ class ClosedLoop(UncheckedLoop):
             seek=seek,
         )[0]
 
+    @checked
     def simulate(
         self,
         x0: ArrayLike,
@@ -362,6 +364,7 @@ class ClosedLoop(UncheckedLoop):
 
     def _steps(self, duration: float) -> int:
         """Return the number of steps of a rollout, refusing what memory or patience forbid."""
+        self._check_duration(duration)
         steps = round(duration / self.step)
         if steps > MOST_STEPS or (steps < 1 and duration > 0):
             raise InvalidInputError(

@@ -22,6 +22,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.arguments import REMEDIES, check_fields
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError, SingularSurfaceError
 from undertow.mechanism import TIME, FloatArray, Mechanism, Partition
@@ -200,6 +201,7 @@ class SlidingModeLaw:
 
     def __post_init__(self) -> None:
         """Check that surface and mechanism fit and that the law exists at the target."""
+        check_fields(self)
         if TIME in self.mechanism.force.free_symbols:
             raise InvalidInputError(
                 f"model '{self.mechanism.name}' of a sliding-mode law",
@@ -316,7 +318,7 @@ def check_surface_shape(mechanism: Mechanism, surface: Surface) -> None:
             f"surface for '{mechanism.name}'",
             value=f"{surface!r}, a {type(surface).__name__}",
             limit="an undertow.Surface",
-            remedy="Design one: undertow.first_surface(mechanism)",
+            remedy=REMEDIES["Surface"],
         )
     if (surface.n, surface.m) != (mechanism.n, mechanism.m):
         raise InvalidInputError(

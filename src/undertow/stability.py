@@ -20,6 +20,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 from sympy.core.function import Application
 
+from undertow.arguments import checked
 from undertow.codegen.store import content_key, recall, remember
 from undertow.errors import (
     InvalidInputError,
@@ -257,6 +258,7 @@ class Margin:
     remedy: str
 
 
+@checked
 def surface_margins(
     mechanism: Mechanism, surface: Surface, q: ArrayLike | None = None
 ) -> tuple[Margin, ...]:
@@ -325,6 +327,7 @@ def _paper_margins(mechanism: Mechanism, surface: Surface) -> tuple[Margin, ...]
     )
 
 
+@checked
 def check_surface(mechanism: Mechanism, surface: Surface, x0: ArrayLike | None = None) -> None:
     """Refuse a surface that is unstable, or singular at the target or at ``x0``.
 
@@ -369,6 +372,7 @@ def check_surface(mechanism: Mechanism, surface: Surface, x0: ArrayLike | None =
             )
 
 
+@checked
 def first_surface(
     mechanism: Mechanism, weights: Sequence[float] | None = None, rate: float = 0.0
 ) -> Surface:
@@ -437,6 +441,7 @@ def first_surface(
     return surface
 
 
+@checked
 def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
     """Design a surface whose sliding dynamics have the given 2n − m eigenvalues, 1/s.
 

@@ -12,6 +12,7 @@ from typing import Literal, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.arguments import at_least, check_fields, checked, floats
 from undertow.errors import InvalidInputError
 from undertow.quantities import FloatArray
 
@@ -48,6 +49,7 @@ class Surface:
     alpha_u: FloatArray
     lambda_u: FloatArray
 
+    @checked
     def __init__(
         self, alpha_a: ArrayLike, lambda_a: ArrayLike, alpha_u: ArrayLike, lambda_u: ArrayLike
     ) -> None:
@@ -106,9 +108,20 @@ class Surface:
         )
 
     @classmethod
+    @checked
     def from_vector(cls, vector: ArrayLike, n: int, m: int) -> Self:
         """Rebuild a surface from its 2mn entries, the inverse of :attr:`vector`."""
-        blocks = np.split(np.asarray(vector, dtype=float), [m * m, 2 * m * m, m * m + m * n])
+        at_least("number of inputs", m, 1, "One surface goes with each input")
+        at_least("number of coordinates", n, m + 1, "Fewer inputs than coordinates")
+        entries = floats("surface vector", vector)
+        if entries.shape != (2 * m * n,):
+            raise InvalidInputError(
+                "surface vector",
+                value=f"shape {entries.shape}",
+                limit=f"({2 * m * n},), 2mn numbers",
+                remedy="Give α_a, λ_a, α_u, λ_u, each row by row",
+            )
+        blocks = np.split(entries, [m * m, 2 * m * m, m * m + m * n])
         shapes = [(m, m), (m, m), (m, n - m), (m, n - m)]
         return cls(*(b.reshape(s) for b, s in zip(blocks, shapes, strict=True)))
 
@@ -137,9 +150,18 @@ class Surface:
             -np.eye(m), scale @ self.lambda_a, scale @ self.alpha_u, scale @ self.lambda_u
         )
 
+    @checked
     def s(self, x: ArrayLike) -> FloatArray:
         """Return s at the states x: (…, 2n) to (…, m)."""
-        return np.asarray(np.asarray(x, dtype=float) @ self.matrix.T)
+        states = floats("states of a surface", x)
+        if states.ndim == 0 or states.shape[-1] != 2 * self.n:
+            raise InvalidInputError(
+                "states of a surface",
+                value=f"shape {states.shape}",
+                limit=f"(…, {2 * self.n})",
+                remedy="Set states by name: mechanism.state(name=value)",
+            )
+        return np.asarray(states @ self.matrix.T)
 
     def __eq__(self, other: object) -> bool:
         """Compare entry by entry."""
@@ -182,6 +204,14 @@ class ReachingLaw:
 
     def __post_init__(self) -> None:
         """Refuse gains and layers that are not positive and finite."""
+        if self.switching not in ("saturation", "tanh", "sign"):
+            raise InvalidInputError(
+                "switching function",
+                value=repr(self.switching),
+                limit="'saturation', 'tanh' or 'sign'",
+                remedy="Choose 'saturation' for the paper's law (39)",
+            )
+        check_fields(self)
         for name in ("eta", "layer"):
             values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             if not (np.isfinite(values).all() and (values > 0).all()):
@@ -191,16 +221,11 @@ class ReachingLaw:
                     limit="finite and > 0",
                     remedy="The paper uses η = 20 and a layer of 0.1",
                 )
-        if self.switching not in ("saturation", "tanh", "sign"):
-            raise InvalidInputError(
-                "switching function",
-                value=repr(self.switching),
-                limit="'saturation', 'tanh' or 'sign'",
-                remedy="Choose 'saturation' for the paper's law (39)",
-            )
 
+    @checked
     def vector(self, m: int) -> FloatArray:
         """Return (η_1 … η_m, ε_1 … ε_m)."""
+        at_least("number of inputs", m, 1, "One surface goes with each input")
         values = [np.atleast_1d(np.asarray(v, dtype=float)) for v in (self.eta, self.layer)]
         for name, value in zip(("eta", "layer"), values, strict=True):
             if value.size not in (1, m):

@@ -13,6 +13,7 @@ from sympy.core.function import Application, AppliedUndef
 from sympy.core.relational import Relational
 from sympy.logic.boolalg import Boolean
 
+from undertow.arguments import REMEDIES
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.quantities import (
     TIME,
@@ -184,19 +185,12 @@ def check_parts(
                 f"{what} of '{owner}'",
                 value=f"{wrong[0]!r}, a {type(wrong[0]).__name__}",
                 limit=f"a sequence of undertow.{kind.__name__}",
-                remedy=f"Write {_EXAMPLES[what]}",
+                remedy=REMEDIES[kind.__name__],
             )
     spelt = [c.spelling for c in coordinates]
     channels = [i.spelling for i in inputs]
     data = [p.spelling for p in parameters]
     check_names(owner, [*spelt, *(f"{name}_dot" for name in spelt), *channels, *data])
-
-
-_EXAMPLES = {
-    "coordinates": '[Coordinate("x", "m"), Coordinate("phi", "rad")]',
-    "inputs": '[Input("force", "N", 10.0)]',
-    "parameters": '[Parameter("mass", 0.5, "kg")]',
-}
 
 
 def vocabulary(
@@ -264,9 +258,11 @@ def check_symbols(
     """
     unknown: set[sp.Basic] = set()
     for expression in expressions:
-        parts = expression.atoms(Application, sp.Derivative, sp.Integral)
+        parts = expression.atoms(sp.Expr, Boolean)
         odd = {part for part in parts if isinstance(part, _UNDEFINED)}
-        unwritten = [f for f in parts - odd if not isinstance(f, _SMOOTH + _SINGULAR + _BROKEN)]
+        strange = expression.atoms(sp.nan.func, sp.zoo.func, sp.oo.func, type(-sp.oo), type(sp.I))
+        written = _SMOOTH + _SINGULAR + _BROKEN
+        unwritten = [f for f in parts - odd - strange if not isinstance(f, written)]
         if unwritten:
             raise ModelError(
                 what,
@@ -276,7 +272,6 @@ def check_symbols(
             )
         inside = set().union(*(part.free_symbols for part in odd))
         unknown |= odd | ((expression.free_symbols - set(known)) - inside)
-        strange = expression.atoms(sp.nan.func, sp.zoo.func, sp.oo.func, type(-sp.oo), type(sp.I))
         if strange:
             raise ModelError(
                 what,

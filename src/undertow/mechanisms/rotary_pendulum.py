@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 
 import sympy as sp
 
+from undertow.arguments import checked
 from undertow.errors import InvalidInputError
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.modelling.drives import DCMotor
@@ -110,6 +111,7 @@ PARAMETER_SETS = {
 }
 
 
+@checked
 def rotary_pendulum(parameter_set: str = "paper", **values: float) -> Mechanism:
     """Return the rotary pendulum with the paper's parameters, or another set's.
 

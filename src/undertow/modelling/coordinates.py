@@ -16,8 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
+from undertow.arguments import checked
 from undertow.errors import InvalidInputError, ModelError
-from undertow.mechanism import Coordinate, FloatArray
+from undertow.mechanism import Coordinate, FloatArray, matrix_of
+from undertow.validity import expression_of
 
 __all__ = ["ActuatedForm", "actuate", "exact_angle", "number", "tidy"]
 
@@ -50,12 +52,21 @@ class ActuatedForm:
     transform: sp.Matrix
     potential: sp.Expr | None
 
+    @checked
     def bounds(self, q_bounds: Sequence[float], values: Mapping[sp.Symbol, float]) -> list[float]:
         """Return bounds on generalised forces in z, given those in q: |g_z| ≤ |Tᵀ| |g_q|."""
         T = np.array(self.transform.subs(values), dtype=np.float64)
+        if len(q_bounds) != len(self.coordinates):
+            raise InvalidInputError(
+                "bounds on generalised forces",
+                value=len(q_bounds),
+                limit=f"{len(self.coordinates)} numbers, one per coordinate",
+                remedy="Give 0 where nothing acts",
+            )
         return [float(b) for b in np.abs(T.T) @ np.asarray(q_bounds, dtype=float)]
 
 
+@checked
 def actuate(
     coordinates: Sequence[Coordinate],
     mass_matrix: sp.Matrix,
@@ -113,10 +124,21 @@ def actuate(
     """
     coordinates = tuple(coordinates)
     n = len(coordinates)
-    B = sp.Matrix(input_matrix)
+    B = sp.Matrix(matrix_of("input matrix", input_matrix))
     m = B.cols
     if B.rows != n:
         raise ModelError("input matrix", value=f"shape {B.shape}", limit=f"({n}, m)")
+    equations = []
+    for what, given, shape in (("mass matrix", mass_matrix, (n, n)), ("force", force, (n, 1))):
+        equations.append(matrix_of(what, given))
+        if equations[-1].shape != shape:
+            raise ModelError(
+                what,
+                value=f"shape {equations[-1].shape}",
+                limit=f"{shape}",
+                remedy="Give one row per coordinate",
+            )
+    energy = None if potential is None else expression_of("potential", potential)
     moving = {c.symbol for c in coordinates} | {c.velocity for c in coordinates}
     if B.free_symbols & moving:
         raise ModelError(
@@ -129,7 +151,17 @@ def actuate(
     pivots = _pivots(numbers)
     scales = [B[_leading(numbers[:, j]), j] for j in range(m)]
     if gains is not None:
-        scales = [s if k is None else sp.sympify(k) for s, k in zip(scales, gains, strict=True)]
+        if len(gains) != m:
+            raise InvalidInputError(
+                "gains of the inputs",
+                value=len(gains),
+                limit=f"{m}, one per input",
+                remedy="None where the column's largest entry will do",
+            )
+        scales = [
+            s if k is None else expression_of("gain of an input", k)
+            for s, k in zip(scales, gains, strict=True)
+        ]
     directions = sp.Matrix.hstack(*((B[:, j] / scales[j]).applyfunc(number) for j in range(m)))
     kept = [i for i in range(n) if i not in pivots]
     J = sp.Matrix.vstack(directions.T, *(sp.eye(n)[i, :] for i in kept))
@@ -147,15 +179,15 @@ def actuate(
         return moved if plain else moved.applyfunc(tidy)
 
     # Mirror the upper half, so that symmetry is kept to the letter.
-    mass = T.T * substitute(mass_matrix) * T
+    mass = T.T * substitute(equations[0]) * T
     mass = sp.Matrix(n, n, lambda i, j: mass[min(i, j), max(i, j)])
     return ActuatedForm(
         coordinates=new,
         mass_matrix=mass if plain else mass.applyfunc(tidy),
-        force=T.T * substitute(force),
+        force=T.T * substitute(equations[1]),
         input_matrix=sp.diag(*scales),
         transform=T,
-        potential=None if potential is None else sp.sympify(potential).xreplace(change),
+        potential=None if energy is None else energy.xreplace(change),
     )
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, fields, replace
 
 import sympy as sp
 
+from undertow.arguments import check_fields, checked
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import Input, Mechanism, Parameter
 from undertow.quantities import number_of
@@ -69,6 +70,7 @@ class DCMotor:
 
     def __post_init__(self) -> None:
         """Refuse values that no motor has."""
+        check_fields(self)
         for part in fields(self):
             if part.name != "source" and getattr(self, part.name) is not None:
                 number_of(f"{part.name} of a DC motor", getattr(self, part.name))
@@ -120,6 +122,7 @@ class DCMotor:
         return self.gear_efficiency * self.gear_ratio**2 * self.rotor_inertia
 
 
+@checked
 def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]) -> Mechanism:
     """Turn torque inputs into voltages: the same mechanism behind DC motors.
 

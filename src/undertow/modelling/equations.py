@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from undertow.arguments import checked
 from undertow.codegen import Tape, compile_numpy
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import (
@@ -39,6 +40,7 @@ NEAR = 0.5
 __all__ = ["from_energies", "from_matrices", "lagrange_force", "unit_inputs"]
 
 
+@checked
 def from_matrices(
     name: str,
     coordinates: Sequence[Coordinate],
@@ -215,6 +217,7 @@ def force_scale(mechanism: Mechanism) -> float:
     return float(np.abs(forces).max()) or 1.0
 
 
+@checked
 def from_energies(
     name: str,
     coordinates: Sequence[Coordinate],
@@ -260,6 +263,7 @@ def from_energies(
     if mass.free_symbols & set(velocities) or sp.simplify(rest_of_kinetic) != 0:
         raise ModelError(
             f"kinetic energy of '{name}'",
+            value=str(kinetic)[:80],
             limit="a quadratic form in the velocities",
             remedy="Move velocity-free terms to the potential; gyroscopic terms to force",
         )

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import sympy as sp
 
+from undertow.arguments import checked, floats
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.modelling.equations import BALANCE, check_balanced, force_scale, shifted
@@ -17,6 +18,7 @@ from undertow.validity import by_names
 __all__ = ["find_equilibrium", "holding_input", "move_target"]
 
 
+@checked
 def holding_input(mechanism: Mechanism, q: FloatArray | None = None) -> FloatArray:
     """Return the input that holds the mechanism at rest at q, −B⁻¹ f_a(q, 0), (m,).
 
@@ -28,11 +30,12 @@ def holding_input(mechanism: Mechanism, q: FloatArray | None = None) -> FloatArr
     n, m = mechanism.n, mechanism.m
     x = np.zeros(2 * n)
     if q is not None:
-        x[:n] = q
+        x = mechanism.check_state(np.append(floats("positions", q), np.zeros(n)))
     B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=np.float64)
     return np.asarray(-np.linalg.solve(B, mechanism.f(x)[:m]))
 
 
+@checked
 def find_equilibrium(mechanism: Mechanism, /, **guess: float) -> dict[str, float]:
     """Find an equilibrium near a guess: f_u(q, 0) = 0 with the actuated coordinates as given.
 
@@ -100,6 +103,7 @@ def _solved(mechanism: Mechanism, q: FloatArray) -> tuple[FloatArray, float]:
         return q, math.inf
 
 
+@checked
 def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
     """Return the mechanism in error coordinates from another equilibrium.
 

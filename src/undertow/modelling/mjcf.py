@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from undertow.arguments import checked
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import Mechanism
 from undertow.modelling.mjcf_bodies import Frame, link_of
@@ -28,6 +29,7 @@ _READ = {"worldbody", "actuator", "tendon", "equality"}
 _BODY_PARTS = {"body", "inertial", "joint", "freejoint", "geom", "site", "camera", "light"}
 
 
+@checked
 def from_mjcf(
     source: str | Path,
     *,
@@ -85,6 +87,7 @@ def from_mjcf(
 
 
 @np.errstate(all="ignore")  # what overflows is refused with the tree
+@checked
 def read_mjcf(source: str | Path, *, motors: bool = True) -> Tree:
     """Read an MJCF file as a tree; ``motors=False`` leaves its actuators out.
 

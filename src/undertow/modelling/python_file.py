@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from undertow.arguments import checked
 from undertow.errors import ArtefactError, InvalidInputError, UndertowError, near, raised_at
 from undertow.mechanism import Mechanism
 
@@ -20,6 +21,7 @@ def in_a_file(text: str) -> bool:
     return ".py:" in text
 
 
+@checked
 def mechanism_from_file(text: str) -> Mechanism:
     """Load a mechanism of one's own: ``FILE.py:NAME``, a Mechanism or a function that makes one.
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
+from undertow.arguments import checked
 from undertow.errors import InvalidInputError, ModelError, near
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.modelling.coordinates import number, tidy
@@ -35,6 +36,7 @@ __all__ = ["identifier", "mechanism_from_tree"]
 MOST_OPERATIONS = 8_000
 
 
+@checked
 def mechanism_from_tree(
     tree: Tree,
     *,

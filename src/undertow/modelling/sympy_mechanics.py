@@ -8,25 +8,24 @@ are linear in.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sympy as sp
 
+from undertow.arguments import at_least, checked
 from undertow.errors import InvalidInputError, ModelError
 from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.modelling.coordinates import tidy
 from undertow.modelling.equations import from_matrices
-from undertow.validity import by_names, check_parts, require_smooth, twins
-
-if TYPE_CHECKING:
-    from sympy.physics.mechanics import KanesMethod, LagrangesMethod
+from undertow.validity import by_names, check_parts, expression_of, require_smooth, twins
 
 __all__ = ["from_kane", "from_lagrange"]
 
 
+@checked
 def from_lagrange(
     name: str,
-    method: LagrangesMethod,
+    method: Any,
     inputs: Mapping[Any, Input],
     *,
     parameters: Sequence[Parameter] = (),
@@ -78,6 +77,7 @@ def from_lagrange(
     >>> rig.state_names
     ('x', 'phi', 'x_dot', 'phi_dot')
     """
+    _require(name, method, "LagrangesMethod")
     if getattr(method, "coneqs", None):
         raise _constrained(name, "LagrangesMethod")
     if method.eom is None:
@@ -96,9 +96,10 @@ def from_lagrange(
     )
 
 
+@checked
 def from_kane(
     name: str,
-    method: KanesMethod,
+    method: Any,
     inputs: Mapping[Any, Input],
     *,
     parameters: Sequence[Parameter] = (),
@@ -125,6 +126,7 @@ def from_kane(
     ModelError
         For dependent speeds (constraints), or as for :func:`from_lagrange`.
     """
+    _require(name, method, "KanesMethod")
     if len(method.u) != len(method.q) or getattr(method, "_udep", None):
         raise _constrained(name, "KanesMethod")
     t = _time()
@@ -202,6 +204,7 @@ def _build(
     rest: Mapping[str, Any],
 ) -> Mechanism:
     """Translate symbols, take the inputs out of the forcing, and build."""
+    at_least(f"number of inputs of '{name}'", len(inputs), 1, "Name what acts on it")
     t = _time()
     units = by_names(f"units of '{name}'", units or {})
     coordinates = [Coordinate(_plain(c)) for c in q]
@@ -222,7 +225,7 @@ def _build(
     by_name = {n: p.symbol for p in parameters for n in (p.name, p.spelling)}
 
     def plain(expression: Any) -> sp.Expr:
-        moved = sp.sympify(expression).subs(translate)
+        moved = expression_of(f"an expression of '{name}'", expression).subs(translate)
         free = {s for s in moved.free_symbols if s.name in by_name}
         return moved.xreplace({s: by_name[s.name] for s in free})
 
@@ -281,3 +284,16 @@ def _constrained(name: str, method: str) -> ModelError:
         limit="independent coordinates",
         remedy="Eliminate the constraints first; closed loops and rolling need minimal coordinates",
     )
+
+
+def _require(name: str, method: object, kind: str) -> None:
+    """Refuse what is no method of that kind."""
+    from sympy.physics import mechanics  # slow to import
+
+    if not isinstance(method, getattr(mechanics, kind)):
+        raise InvalidInputError(
+            f"method of '{name}'",
+            value=f"{method!r}, a {type(method).__name__}",
+            limit=f"a sympy.physics.mechanics.{kind}",
+            remedy=f"Form its equations first, then give the {kind} itself",
+        )

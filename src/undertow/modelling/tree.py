@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from undertow.arguments import check_fields
 from undertow.errors import ModelError, near
 from undertow.mechanism import FloatArray
 from undertow.validity import twins
@@ -155,6 +156,8 @@ class Tree:
 
     def __post_init__(self) -> None:
         """Refuse repeated names, dangling ends, loops, and links that cannot be bodies."""
+        for parts in ("links", "joints", "couplings", "actuators"):
+            check_fields(self, parts)
         moving = sum(joint.kind != "fixed" for joint in self.joints)
         for what, count, most in (
             ("moving joints", moving, MOST_MOVING),
@@ -250,7 +253,7 @@ class Tree:
         if np.shape(self.gravity) != (3,):
             raise ModelError(
                 f"gravity of '{self.name}'",
-                value=self.gravity,
+                value=repr(self.gravity),
                 limit="three numbers, m/s²",
                 remedy="Write gravity=(0, 0, -9.81)",
             )

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from undertow.arguments import checked
 from undertow.errors import ModelError
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.modelling.rigid_body import mechanism_from_tree
@@ -27,6 +28,7 @@ _KINDS: dict[str, Literal["hinge", "slide", "fixed"]] = {
 }
 
 
+@checked
 def from_urdf(
     source: str | Path,
     *,
@@ -87,6 +89,7 @@ def from_urdf(
 
 
 @np.errstate(all="ignore")  # what overflows is refused with the tree
+@checked
 def read_urdf(
     source: str | Path, gravity: Vector = (0.0, 0.0, -9.81)
 ) -> tuple[Tree, tuple[str, ...]]:
