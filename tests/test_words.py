@@ -195,6 +195,27 @@ def test_a_box_of_one_s_own_takes_the_place_of_the_travel(cart: ut.Mechanism) ->
     assert moved.objective.constraints == ()
 
 
+def test_a_box_beyond_the_travel_is_refused_in_python_too(cart: ut.Mechanism) -> None:
+    """As by ``--box``: it replaced the travel in silence.  ``travel=False`` is the way out."""
+    wide = ut.state_box(x=(-1.0, 3.0))
+    for attempt in (
+        lambda: ut.ClosedLoop(cart, ut.MinimumTime(constraints=wide)),
+        lambda: ut.Cascade(cart, ut.MinimumEnergy(constraints=wide)),
+        lambda: objective_for(cart, "energy", constraints=wide),
+    ):
+        with pytest.raises(
+            InvalidInputError, match=r"'-1 ≤ x ≤ 3'.*travel that cart_pendulum.*travel=False"
+        ):
+            attempt()
+    free = ut.ClosedLoop(cart, ut.MinimumTime(constraints=wide, travel=False)).objective
+    assert [c.name for c in free.constraints] == ["-1 ≤ x ≤ 3"]
+    whole = ut.ClosedLoop(cart, ut.MinimumTime(constraints=ut.state_box(x=1.5))).objective
+    assert [c.name for c in whole.constraints] == ["|x| ≤ 1.5"]
+    own = ut.Constraint("x far off", lambda v: v.x - 3.0, state="x")
+    kept = ut.ClosedLoop(cart, ut.MinimumTime(constraints=(own,))).objective
+    assert [c.name for c in kept.constraints] == ["x far off", "|x| ≤ 1.425 m"]
+
+
 @pytest.mark.slow  # a cascade that has to turn round before the end of the rail
 def test_simulate_keeps_the_cart_on_its_rail(cart: ut.Mechanism) -> None:
     """The optimum without the rail needs 6.5 m of it; what is planned stays within 1.425 m."""

@@ -16,7 +16,7 @@ import numpy as np
 from undertow.errors import InvalidInputError, near
 from undertow.mechanism import FloatArray, Mechanism
 from undertow.mechanisms.named import named
-from undertow.objective import Constraint, Objective, state_box
+from undertow.objective import Constraint, Objective, check_travel, state_box
 from undertow.objectives import objective_for
 from undertow.quantities import normal_name
 from undertow.surface import Surface
@@ -267,25 +267,12 @@ def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, .
                 remedy=f"Write for instance {example}",
             )
         si, rate, _ = UNITS[units[0]]
-        _check_travel(mechanism, name, text, low, high)
+        check_travel(mechanism, name, low, high, text)
         shown = [_shown(*part) for part in parts]
         (bound,) = state_box(**{name: (low, high)})
         label = f"|{name}| ≤ {shown[0]}" if len(ends) == 1 else f"{shown[0]} ≤ {name} ≤ {shown[1]}"
         found.append(replace(bound, name=label, unit=f"{si}/s" if rate else si))
     return tuple(found)
-
-
-def _check_travel(mechanism: Mechanism, name: str, text: str, low: float, high: float) -> None:
-    """Refuse a box that reaches beyond the travel of its coordinate."""
-    for c in mechanism.coordinates:
-        if c.name == name and (low < c.low or high > c.high):
-            raise InvalidInputError(
-                f"box of '{name}'",
-                value=repr(text),
-                limit=f"within the travel that {mechanism.name} declares, "
-                f"{c.low:g} to {c.high:g} {c.unit}",
-                remedy="A longer one is a mechanism of your own, with other ends: FILE.py:NAME",
-            )
 
 
 def parse_surface(mechanism: Mechanism, text: str) -> Surface:

@@ -28,6 +28,7 @@ __all__ = [
     "MinimumTime",
     "Names",
     "Objective",
+    "check_travel",
     "require_objective",
     "state_box",
     "travel_box",
@@ -223,6 +224,26 @@ def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constrai
     return tuple(found)
 
 
+def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown: str) -> None:
+    """Refuse a box, ``shown`` in words, that reaches beyond the travel of its coordinate.
+
+    Raises
+    ------
+    InvalidInputError
+        With the travel that the mechanism declares.
+    """
+    for c in mechanism.coordinates:
+        if c.name == name and (low < c.low or high > c.high):
+            raise InvalidInputError(
+                f"box of '{name}'",
+                value=repr(shown),
+                limit=f"within the travel that {mechanism.name} declares, "
+                f"{c.low:g} to {c.high:g} {c.unit}",
+                remedy="A longer one is a mechanism of your own, with other ends: FILE.py:NAME; "
+                "in Python an objective with travel=False ignores what is declared",
+            )
+
+
 @dataclass(frozen=True)
 class Objective:
     """A stage cost with its horizon, terminal set and constraints.
@@ -248,7 +269,8 @@ class Objective:
         the others are; in a sampled loop at the samples.
     travel
         True: the ranges of travel that the mechanism declares are constraints too, 95 % of each
-        side, but for a coordinate that a :func:`state_box` among the constraints bounds anew.
+        side, but for a coordinate that a :func:`state_box` among the constraints bounds anew,
+        up to all of the travel; one that reaches beyond it is refused.
         False: only what ``constraints`` say.
     formula
         What is integrated, in words; by default the expression itself.
@@ -307,10 +329,15 @@ class Objective:
         Raises
         ------
         InvalidInputError
-            For a declared range that does not hold the target.
+            For a declared range that does not hold the target, and for a :func:`state_box` that
+            reaches beyond one.
         """
         own = tuple(c for c in self.constraints if not c.source)
-        declared = travel_box(mechanism, {c.state for c in own}) if self.travel else ()
+        boxes = {c.state: c for c in own if isinstance(c.formula, _Within)}
+        declared = travel_box(mechanism, boxes) if self.travel else ()
+        for state, box in boxes.items() if self.travel else ():
+            ends: Any = box.formula
+            check_travel(mechanism, state, ends.low, ends.high, box.name)
         constraints = own + declared
         return self if constraints == self.constraints else replace(self, constraints=constraints)
 
