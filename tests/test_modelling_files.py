@@ -19,6 +19,7 @@ from undertow.mechanism import FloatArray
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.mechanisms.scenes import mujoco_scene
+from undertow.modelling.python_file import in_a_file
 from undertow.rig.python_file import rig_from_file
 
 TIGHT = 1e-10
@@ -682,6 +683,17 @@ def test_errors_of_ones_own_file_name_file_and_line(
     for fact in facts:
         assert fact in str(refusal.value)
     assert "tora," not in str(refusal.value)
+
+
+def test_a_file_without_a_name_behind_it_lists_its_names(tmp_path: Path) -> None:
+    """``simulate own.py``: those of the file, not those of the library."""
+    path = tmp_path / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    with pytest.raises(InvalidInputError, match=r"no name behind it.*one of mine, make") as refusal:
+        named(str(path))
+    assert f"{path}:mine" in refusal.value.remedy
+    assert "tora" not in str(refusal.value)
+    assert in_a_file(str(path))  # and so a log's word for it is not run
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def named(name: str) -> Mechanism:
 
 def from_anywhere(name: str) -> str:
     """Return the name of a mechanism as it holds in any folder: paths of files are whole."""
-    if in_a_file(name):
+    if in_a_file(name) and not name.endswith(".py"):
         path, _, inside = name.rpartition(":")
         return f"{Path(path).resolve()}:{inside}"
     file, joints = _in_data(name)

@@ -17,8 +17,8 @@ __all__ = ["in_a_file", "mechanism_from_file", "object_from_file"]
 
 
 def in_a_file(text: str) -> bool:
-    """Whether a word of the command line is ``FILE.py:NAME``."""
-    return ".py:" in text
+    """Whether a word of the command line is ``FILE.py:NAME``, or lacks but the name."""
+    return ".py:" in text or text.endswith(".py")
 
 
 @checked
@@ -55,7 +55,7 @@ def object_from_file(text: str, what: str, suits: Callable[[object], bool] = cal
     Parameters
     ----------
     text
-        ``FILE.py:NAME``.
+        ``FILE.py:NAME``; without a name, the message says which there are.
     what
         What is looked for, in a word, for messages.
     suits
@@ -71,8 +71,8 @@ def object_from_file(text: str, what: str, suits: Callable[[object], bool] = cal
     UndertowError
         What the file itself met, with its line.
     """
-    file, colon, name = text.rpartition(":")
-    if not (colon and file.endswith(".py") and name.isidentifier()):
+    file, _, name = (text, "", "") if text.endswith(".py") else text.rpartition(":")
+    if not (file.endswith(".py") and (name.isidentifier() or file == text)):
         raise InvalidInputError(
             f"{what} of one's own",
             value=repr(text),
@@ -124,7 +124,8 @@ def _nameless(
     ]
     return InvalidInputError(
         f"'{file}'",
-        value=f"no name {name!r}",
+        value=f"no name {name!r}" if name else "no name behind it",
         limit=f"one of {', '.join(here)}" if here else "a file that defines it",
-        remedy=near(name, here) or "Name what the file defines",
+        remedy=near(name, here)
+        or f"Name what the file defines: {file}:{here[0] if here else 'NAME'}",
     )
