@@ -540,9 +540,23 @@ def test_a_keeper_says_that_its_rig_did_not_take_zero() -> None:
         rig.close()
     rig.close()  # once is enough
     shut = KeptRig(lambda: Device(close=OSError("stuck")), 1e-3, LIMITS, SLEW)
-    with pytest.raises(OSError, match="close: OSError: stuck") as told:
+    with pytest.raises(OSError, match=r"^stuck$") as told:
         shut.close()
     assert not isinstance(told.value, OutputOnError)
+
+
+def test_what_failed_in_a_keeper_names_its_kind_once() -> None:
+    """The loop shows an error with its kind; the keeper had shown it so before."""
+    rig = KeptRig(lambda: Device(write=fails(lambda _: True, OSError("bus"))), 1e-3, LIMITS, SLEW)
+    rig.write(np.array([5.0]))
+    rig.read()
+    with pytest.raises(OSError, match=r"^bus$"):
+        rig.write(np.array([5.0]))
+    with pytest.raises(OutputOnError, match=r"^the device did not take .* zero: OSError: bus$"):
+        rig.close()
+    on = KeptRig(lambda: Device(close=OutputOnError("relay stuck")), 1e-3, LIMITS, SLEW)
+    with pytest.raises(OutputOnError, match=r"^relay stuck$"):
+        on.close()
 
 
 def test_a_keeper_whose_rig_hangs_is_ended_and_what_is_known_is_told(

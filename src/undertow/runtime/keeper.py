@@ -173,7 +173,7 @@ class KeptRig:
                 raise TimeoutError(SILENT)
             self._listen()  # to late answers too
         if self._said.measurement is None:
-            raise OSError(self._said.read)
+            raise _told(self._said.read)
         return self._said.measurement
 
     def write(self, u: FloatArray) -> None:
@@ -193,7 +193,7 @@ class KeptRig:
         self._pipe.send(u)
         self._unanswered += 1
         if self._said.write:
-            raise OSError(self._said.write)
+            raise _told(self._said.write)
 
     def _listen(self) -> None:
         """Take what the keeper has said by now: the newest counts."""
@@ -229,9 +229,9 @@ class KeptRig:
         if self.process.is_alive():  # its driver hangs: it would keep us, and the device, for ever
             self.process.kill()
         if last.output:
-            raise OutputOnError(last.output)
+            raise _told(last.output, OutputOnError)
         if last.close:
-            raise OSError(last.close)
+            raise _told(last.close)
 
 
 def _keep(
@@ -312,6 +312,11 @@ def _hold(
         ours.send(_Farewell(output, close))
     facts: dict[str, object] = {"heard": heard, "zero": at_zero, "largest": largest}
     return {**facts, "u": u.tolist(), "failure": failure, "close": close}
+
+
+def _told(words: str, kind: type[OSError] = OSError) -> OSError:
+    """Return what failed in the keeper as an error: who shows it names its kind, and when."""
+    return kind(words.removeprefix("close: ").removeprefix(f"{kind.__name__}: "))
 
 
 def _attempt(rig: Rig, u: FloatArray) -> str:
