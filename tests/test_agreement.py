@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,19 @@ from agreements import (
     swing_up,
 )
 from undertow import agreement, exact, inner_loop, kernel
-from undertow.agreement import LIMIT, QUICK, Difference, Subject, numpy_functions, worst
+from undertow.agreement import (
+    LIMIT,
+    QUICK,
+    SETTLED,
+    Difference,
+    Subject,
+    numpy_functions,
+    settling,
+    worst,
+)
 from undertow.certify.ellipsoid import ClosedLoopProgram
 from undertow.check import check_mechanism
-from undertow.codegen import Tape
+from undertow.codegen import Tape, settle
 from undertow.codegen.c99 import C99Emitter
 from undertow.codegen.machine import numba
 from undertow.codegen.names import SymbolNames
@@ -163,6 +173,8 @@ REST: dict[str, tuple[Callable[[Subject], Iterator[Difference]], float]] = {
     "swing-up": (swing_up, LIMIT),
     "loop programme": (loop_programme, LIMIT),
     "sliding motion": (sliding_motion, LIMIT),
+    "large steps, energy": (settling, SETTLED),
+    "large steps, time": (partial(settling, objective=ut.MinimumTime(travel=False)), SETTLED),
 }
 EVERY = [
     pytest.param(name, marks=() if name == "rotary_pendulum" else pytest.mark.slow)
@@ -312,6 +324,56 @@ def test_a_sign_that_flips_in_generated_code_is_found(
         assert "off by" in found[what]
     cache_of_the_test = {p.name for p in Path(os.environ["UNDERTOW_CACHE"]).iterdir()}
     assert any(name.startswith("l") for name in cache_of_the_test)
+
+
+SLOW = pytest.mark.slow
+#: One wrong character or name in the generated code of the large steps, and where it is.
+MUTANTS = {
+    "the cost begins without V": ("begin", "cost + counted * level", "cost"),
+    "p is not P x": ("begin", "level = p_0", "level = 2.0 * p_0"),
+    "the rates at x are not used": ("first_half", "q_1 = ", "q_1 = 0.0 * "),
+    "r changes sign": ("first_half", "] - (", "] + ("),
+    "Φ + V̇ without the two": ("first_half", "2.0 * counted", "counted"),
+    "a rest that is another's": ("first_half", "q_1 = ", "q_1 = q_0 + "),
+    "r(a) + r(x)": ("second_half", "y_1 = ", "y_1 = 2.0 * "),
+    "half the cost": ("second_half", "0.5 * (bend + late)", "0.25 * (bend + late)"),
+    "the cost of a part is a whole one's": ("second_half", "part * span * mean", "span * mean"),
+    "time passes twice": ("second_half", "+ part * span if", "+ 2.0 * part * span if"),
+    "time of a part is a whole one's": ("second_half", "+ part * span if", "+ span if"),
+    "the terminal set is missed": ("second_half", "part * m_0", "m_0"),
+    "V stays in the cost": ("finish", "cost - counted * level", "cost + counted * level"),
+}
+
+
+@pytest.mark.parametrize(
+    "mutant",
+    [
+        pytest.param(name, marks=() if place == "finish" or name == "r changes sign" else SLOW)
+        for name, (place, _, _) in MUTANTS.items()
+    ],
+)
+def test_what_is_wrong_in_the_large_steps_is_found(
+    mutant: str, monkeypatch: pytest.MonkeyPatch, interpreted: None
+) -> None:
+    """Claim: cost and arrival beside SciPy's show each of these; the kernel's step does not."""
+    part, right, wrong = MUTANTS[mutant]
+    write = getattr(settle, part)
+
+    def mutated(*args: Any) -> list[str]:
+        lines = "\n".join(write(*args))
+        assert right in lines
+        return lines.replace(right, wrong, 1).splitlines()
+
+    monkeypatch.setattr(settle, part, mutated)
+    kernel.compile_loop.cache_clear()
+    try:
+        subject = Subject(ut.mechanisms.rotary_pendulum(), count=1)
+        agree(agreement.kernel(subject))
+        problems = (ut.MinimumEnergy(travel=False), ut.MinimumTime(travel=False))
+        found = (worst(settling(subject, problem)) for problem in problems)
+        assert any(d is not None and d.relative > SETTLED for d in found)
+    finally:
+        kernel.compile_loop.cache_clear()
 
 
 def test_wrong_numbers_in_a_proof_programme_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
