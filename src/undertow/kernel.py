@@ -70,6 +70,7 @@ def lay_loop(
 
 #: The files that write kernels: a kept source is theirs no more once one of them changes.
 GENERATOR = generators(
+    "arguments.py",
     "kernel.py",
     "objective.py",
     "sliding.py",

@@ -503,7 +503,7 @@ class Mechanism:
 
     # -- numbers ------------------------------------------------------------------------
 
-    def _evaluate(self, which: str, t: float, x: FloatArray, *more: object) -> FloatArray:
+    def _evaluate(self, which: str, t: ArrayLike, x: FloatArray, *more: object) -> FloatArray:
         columns = [x[..., i] for i in range(x.shape[-1])]
         values = self.function(which)(t, *columns, *more, *self.parameter_values)
         shape = np.broadcast_shapes(x.shape[:-1], *(np.shape(v) for v in values))
@@ -538,7 +538,6 @@ class Mechanism:
         """Return f(q, q̇) at the states x: (…, 2n) to (…, n), N m or N."""
         return self._evaluate("force", t, self.check_state(x))
 
-    @checked
     def accelerations(self, t: float, x: ArrayLike, u: ArrayLike) -> FloatArray:
         """Forward dynamics: q̈ at (t, x, u), (…, n), equations (3)-(4).
 
@@ -553,7 +552,7 @@ class Mechanism:
         """
         state = self.check_state(x)
         inputs = self._columns("inputs", u, [i.name for i in self.inputs])
-        return self._evaluate("dynamics", t, state, *np.moveaxis(inputs, -1, 0))
+        return self._evaluate("dynamics", floats("time", t), state, *np.moveaxis(inputs, -1, 0))
 
     def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
         """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
