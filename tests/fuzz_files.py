@@ -747,7 +747,7 @@ def _one(samples: Any, case: Path, rng: random.Random, summary: Summary) -> None
 
 def _part(kind: str, first: int, count: int, seed: int) -> tuple[int, str]:
     """Fuzz a part in a process of its own; return its exit status and what it said."""
-    words = ["--kind", kind, "--first", first, "--count", count, "--seed", seed]
+    words = ["--kind", kind, "--first", first, "--count", count, "--seed", seed, "--jobs", 1]
     done = subprocess.run(
         [sys.executable, __file__, *map(str, words)], capture_output=True, text=True, check=False
     )
@@ -761,19 +761,20 @@ def main() -> int:
     parser.add_argument("--kind", choices=("all", *KINDS), default="all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes, for all")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     asked = parser.parse_args()
-    end, step = asked.first + asked.count, 2500
-    if asked.kind == "all":
+    if asked.jobs > 1 or asked.kind == "all":
+        kinds = KINDS if asked.kind == "all" else (asked.kind,)
+        end, step = asked.first + asked.count, 500
         parts = [
             (kind, first, min(step, end - first), asked.seed)
-            for kind in KINDS
+            for kind in kinds
             for first in range(asked.first, end, step)
         ]
         worst = 0
         with ThreadPoolExecutor(asked.jobs) as pool:
-            for status, said in pool.map(lambda part: _part(*part), parts):
-                print(said, end="", flush=True)
+            for done, (status, said) in enumerate(pool.map(lambda part: _part(*part), parts), 1):
+                print(f"{done} of {len(parts)}: {said}", end="", flush=True)
                 worst = max(worst, abs(status))
         print(f"{asked.count} of each kind, seed {asked.seed}: {'FAILED' if worst else 'all well'}")
         return 1 if worst else 0
