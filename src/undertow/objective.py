@@ -100,8 +100,8 @@ class Constraint:
     there; nothing is tested between them.  Large steps (:class:`undertow.ClosedLoop`, ``tail``) are
     taken only where all constraints are bounds of states, :func:`state_box` or declared travel, and
     only where they cannot come near a bound, nor as near as the small steps before them.  A motion
-    stops at the first test that fails.  The state at its end, where it enters the terminal set or the
-    horizon is over, is tested no more.
+    stops at the first test that fails.  The state at its end, where it enters the terminal set or
+    the horizon is over, is tested no more.
 
     *What may happen in between.*  Where ẇ is Lipschitz, w exceeds its larger value at two
     neighbouring tests, h apart, by at most (h²/8) max |ẅ| (the error of linear interpolation).
@@ -142,12 +142,11 @@ class _Within:
             return self.low - x
         return sp.Abs(x - (self.low + self.high) / 2) - (self.high - self.low) / 2
 
-    def box(self, mechanism: Mechanism) -> tuple[int, float]:
-        """Which state it bounds, and how far from the bound large steps stay."""
-        names = [str(s) for s in mechanism.x]
-        index = names.index(normal_name(self.state)) if isinstance(self.state, str) else self.state
+    @property
+    def spare(self) -> float:
+        """How far from the bound large steps stay."""
         ends = [abs(end) for end in (self.low, self.high) if math.isfinite(end)]
-        return index, SPARE * sum(ends) / len(ends)
+        return SPARE * sum(ends) / len(ends)
 
 
 def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
@@ -425,9 +424,13 @@ class Objective:
 
         Empty where there are none, and where one is no :func:`state_box` and no travel.
         """
-        formulas = [c.formula for c in self.constraints]
-        bounds = [f.box(mechanism) for f in formulas if isinstance(f, _Within)]
-        return tuple(bounds) if len(bounds) == len(formulas) else ()
+        found = []
+        for constraint, margin in zip(self.constraints, self.path_margins(mechanism), strict=True):
+            bounded = [i for i, x in enumerate(mechanism.x) if margin.free_symbols == {x}]
+            if not (bounded and isinstance(constraint.formula, _Within)):
+                return ()
+            found.append((bounded[0], constraint.formula.spare))
+        return tuple(found)
 
     def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
         """Refuse an initial state that breaks a path constraint, whatever the input does.

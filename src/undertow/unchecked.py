@@ -104,8 +104,8 @@ class UncheckedLoop:
     @cached_property
     def _hands_over(self) -> bool:
         """Whether rollouts may end in the linear model."""
-        bounds, objective = self.objective.boxes(self.mechanism), self.objective
-        if not self.tail > 0 or len(bounds) < len(objective.constraints):
+        problem = self.objective
+        if not self.tail > 0 or (problem.constraints and not problem.boxes(self.mechanism)):
             return False
         end = self.linear_end
         return end is not None and end.stage is not None
