@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+from numpy.typing import NDArray
 
 import undertow as ut
 from undertow.cascade import TAIL
@@ -62,7 +63,7 @@ def test_the_reach_of_a_step_bounds_what_scipy_integrates() -> None:
                 exact = np.abs(scipy.linalg.expm(s * chain)[[0, 3], 4:])
                 assert (exact <= reach[level, :, :, lane] * (1 + 1e-6) + 1e-12).all()
             if level == 0:  # and not far from it
-                assert (reach[level, 0, :, lane] <= 3 * exact[0]).all()
+                assert reach[level, 0, 0, lane] <= 1.1 * exact[0, 0]
 
 
 @pytest.mark.parametrize("goal", [ut.MinimumEnergy(), ut.MinimumTime()])
@@ -98,12 +99,12 @@ def _swinging(loop: ClosedLoop, count: int) -> FloatArray:
     """Surfaces whose slowest mode swings, so that a motion overshoots again and again."""
     surfaces = _around(loop.mechanism, 40 * LANES * (count // LANES + 1), 1.0, seed=0)
     A = _whole(_prepared(loop, surfaces).A)
-    sound = np.isfinite(A).all(axis=(1, 2))
+    sound = np.asarray(np.isfinite(A).all(axis=(1, 2)))
     modes = np.linalg.eigvals(np.where(sound[:, None, None], A, np.eye(A.shape[1])))
     slowest = np.take_along_axis(modes, modes.real.argmax(axis=1)[:, None], axis=1)[:, 0]
     swings = np.abs(slowest.imag) > 0.5 * np.abs(slowest.real)
     calm = (slowest.real < -0.05) & (np.abs(modes).max(axis=1) < 300)
-    return surfaces[swings & calm][:count]
+    return np.asarray(surfaces[swings & calm][:count])
 
 
 @pytest.mark.parametrize("name", ["cart_pendulum", "overhead_crane"])
@@ -117,8 +118,8 @@ def test_a_late_touch_is_seen_and_a_near_miss_is_none(name: str) -> None:
     ray = 0.01 * rng.standard_normal((len(surfaces), 4))
     ray[:, 0] = rng.uniform(-0.35, -0.18, len(surfaces))
 
-    def breaks(scale: FloatArray) -> FloatArray:
-        return exact.batch(ray * scale[:, None], surfaces).event == Event.CONSTRAINT
+    def breaks(scale: FloatArray) -> NDArray[np.bool_]:
+        return np.asarray(exact.batch(ray * scale[:, None], surfaces).event == Event.CONSTRAINT)
 
     kept, broken = np.full(len(ray), 0.05), np.full(len(ray), np.nan)
     for scale in np.geomspace(0.1, 3.5, 8):
