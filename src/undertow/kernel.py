@@ -65,6 +65,7 @@ def lay_loop(
         stage=stage,
         path=tuple(path),
         input_margin=input_margin,
+        boxes=objective.boxes(truth),
     )
 
 
@@ -102,6 +103,7 @@ def compile_loop(
         "the belief" if plant is None else plant.structure,
         sp.srepr([objective.stage_cost(truth), *objective.path_margins(truth)]),
         repr((belief.name, objective.name, objective.hard_input, switching, sampled, LANES)),
+        repr(objective.boxes(truth)),
         sources=GENERATOR,
     )
     source = recall("loop", key)

@@ -38,6 +38,9 @@ __all__ = [
 #: knows of, before the end stop.
 TRAVEL = 0.95
 
+#: Part of a bound on a state that large steps keep clear of, see :mod:`undertow.codegen.settle`.
+SPARE = 0.05
+
 
 class Names:
     """The states, inputs and parameters of a mechanism as attributes: ``v.phi``, ``v.voltage``.
@@ -96,9 +99,11 @@ class Constraint:
     -----
     *Where it is tested.*  A rollout tests w at the start of each of its small Runge-Kutta steps,
     ``ClosedLoop.step`` apart (2 ms unless told otherwise), at the state and the input applied
-    there; nothing is tested between them, and a loop with constraints takes no large steps.  A
-    motion stops at the first test that fails.  The state at its end, where it enters the terminal
-    set or the horizon is over, is tested no more.
+    there; nothing is tested between them.  Large steps (:class:`undertow.ClosedLoop`, ``tail``) are
+    taken only where all constraints are bounds of states, :func:`state_box` or declared travel, and
+    only where they cannot come near a bound, nor as near as the small steps before them.  A motion
+    stops at the first test that fails.  The state at its end, where it enters the terminal set or
+    the horizon is over, is tested no more.
 
     *What may happen in between.*  Where ẇ is Lipschitz, w exceeds its larger value at two
     neighbouring tests, h apart, by at most (h²/8) max |ẅ| (the error of linear interpolation).
@@ -138,6 +143,12 @@ class _Within:
         if not math.isfinite(self.high):
             return self.low - x
         return sp.Abs(x - (self.low + self.high) / 2) - (self.high - self.low) / 2
+
+    @property
+    def spare(self) -> float:
+        """How far from the bound large steps stay."""
+        ends = [abs(end) for end in (self.low, self.high) if math.isfinite(end)]
+        return SPARE * sum(ends) / len(ends)
 
 
 def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
@@ -440,6 +451,19 @@ class Objective:
             -self._expression(mechanism, f"constraint '{c.name}'", c.formula)
             for c in self.constraints
         ]
+
+    def boxes(self, mechanism: Mechanism) -> tuple[tuple[int, float], ...]:
+        """Return which state each constraint bounds, and how far large steps stay from the bound.
+
+        Empty where there are none, and where one is no :func:`state_box` and no travel.
+        """
+        found = []
+        for constraint, margin in zip(self.constraints, self.path_margins(mechanism), strict=True):
+            bounded = [i for i, x in enumerate(mechanism.x) if margin.free_symbols == {x}]
+            if not (bounded and isinstance(constraint.formula, _Within)):
+                return ()
+            found.append((bounded[0], constraint.formula.spare))
+        return tuple(found)
 
     @checked
     def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:

@@ -59,8 +59,8 @@ class ClosedLoop(UncheckedLoop):
     tail
         Relative tolerance of the large steps that a batch takes once the law is in its
         boundary layer, see :mod:`undertow.codegen.settle`; 0: small steps to the end.  Used by
-        :meth:`batch` where belief and truth agree, the loop is continuous, there are no path
-        constraints and the stage cost has a second-order model.
+        :meth:`batch` where belief and truth agree, the loop is continuous, all path
+        constraints are bounds of states and the stage cost has a second-order model.
 
     Examples
     --------

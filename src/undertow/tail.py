@@ -11,13 +11,14 @@ and P exactly, and what they leave over by quadrature: :mod:`undertow.codegen.se
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import sympy as sp
 
-from undertow.codegen.linear import SETTLING, linear_source
+from undertow.codegen.linear import SETTLING, UNIT, linear_source
 from undertow.codegen.machine import numba
 from undertow.codegen.rows import LANES
 from undertow.codegen.store import load_module
@@ -27,6 +28,10 @@ from undertow.stability import linearise
 from undertow.validity import is_smooth
 
 __all__ = ["LinearEnd", "QuadraticStage", "quadratic_stage"]
+
+
+#: Terms of the series of e^{|A|t} before a loop is too fast to bound.
+TERMS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +78,8 @@ class Prepared(NamedTuple):
 
     ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
     ``P`` (C, 2n, 2n); ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and ``forced`` responses,
-    see :mod:`undertow.codegen.linear`.
+    see :mod:`undertow.codegen.linear`; ``reach`` of bounded states (C/16, SETTLING, w·2n·16), see
+    :mod:`undertow.codegen.settle`.
     """
 
     A: FloatArray
@@ -82,6 +88,7 @@ class Prepared(NamedTuple):
     stable: FloatArray
     powers: FloatArray
     forced: FloatArray
+    reach: FloatArray
 
 
 class LinearEnd:
@@ -117,6 +124,7 @@ class LinearEnd:
         self.B_inverse = np.linalg.inv(lin.B)
         # Where Φ has no quadratic part (minimum time) the state itself must be exact.
         self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
+        self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
         self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
 
     def room(self, count: int) -> Prepared:
@@ -130,6 +138,7 @@ class LinearEnd:
             np.empty(count),
             np.empty((count // LANES, SETTLING, N * N * LANES)),
             np.empty((count // LANES, SETTLING, 2, N * N * LANES)),
+            np.empty((count // LANES, SETTLING, len(self._bounded) * N * LANES)),
         )
 
     def prepare(self, lanes: FloatArray, gains: FloatArray | None, into: Prepared) -> None:
@@ -151,6 +160,8 @@ class LinearEnd:
             self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, into.A, into.Q,
         )  # fmt: skip
         self._blocks.double(into.A, into.Q, into.P, into.stable, into.powers, into.forced)
+        if len(self._bounded):
+            _reach(into.A, into.powers, into.forced, self._bounded, into.reach)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -245,3 +256,41 @@ def _solve(a, b):  # type: ignore[no-untyped-def]
             for i in range(k + 1, size):
                 value -= a[k, i] * b[i, j]
             b[k, j] = value / a[k, k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reach(A, powers, forced, bounded, reach):  # type: ignore[no-untyped-def]
+    """Write bounds of |F_ij(s)| for all 0 ≤ s ≤ t, for the times t of the ``powers``.
+
+    F(s) = ∫₀ˢ e^{Aτ} dτ.  Over the first the series of ∫₀ᵗ e^{|A|τ} dτ bounds them; over twice as
+    long a time the moduli of F(t + s) = F(s) e^{At} + F(t) do.
+    """
+    n, N = A.shape[1], A.shape[2]
+    row, term, after = np.empty(N), np.empty(N), np.empty(N)
+    for lane in range(A.shape[0]):
+        block, i = lane // LANES, lane % LANES
+        for b in range(len(bounded)):
+            bound = bounded[b]
+            term[:] = 0.0
+            term[bound] = UNIT
+            row[:] = term
+            for order in range(2, TERMS + 1):
+                for j in range(N):
+                    value = term[j - n] if j >= n else 0.0
+                    for a in range(n):
+                        value += term[n + a] * abs(A[lane, a, j])
+                    after[j] = value * UNIT / order
+                row += after
+                term[:] = after
+                if term.sum() <= 1e-9 * row.sum():
+                    break
+            else:
+                row[:] = math.inf
+            for level in range(SETTLING):
+                for j in range(N):
+                    reach[block, level, (b * N + j) * LANES + i] = row[j]
+                    value = abs(forced[block, level, 0, (bound * N + j) * LANES + i])
+                    for k in range(N):
+                        value += row[k] * abs(powers[block, level, (k * N + j) * LANES + i])
+                    after[j] = max(row[j], value)
+                row[:] = after

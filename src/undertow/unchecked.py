@@ -104,7 +104,8 @@ class UncheckedLoop:
     @cached_property
     def _hands_over(self) -> bool:
         """Whether rollouts may end in the linear model."""
-        if not self.tail > 0 or self.objective.constraints:
+        problem = self.objective
+        if not self.tail > 0 or (problem.constraints and not problem.boxes(self.mechanism)):
             return False
         end = self.linear_end
         return end is not None and end.stage is not None
@@ -174,7 +175,7 @@ class UncheckedLoop:
         self._kernels.settle(
             room.lanes, numbers.plant, numbers.belief, numbers.limits, start + steps * self.step,
             terminal, self.escape, self.tail, 1.0 if self.linear_end.counts_cost else 0.0,
-            prepared.A, prepared.P, prepared.powers, prepared.forced, out,
+            prepared.A, prepared.P, prepared.powers, prepared.forced, prepared.reach, out,
         )  # fmt: skip
         again = np.flatnonzero(out[: room.count, 2] == UNSETTLED)
         if not len(again):

@@ -195,13 +195,13 @@ class _Writer:
             f"{r.cost_slope} = {r.cost_slope} + weight * ({text(program.stage)})",
         ]
 
-    def _evaluate(self, source: Sequence[str]) -> list[str]:
-        """Evaluate the continuous law, and the rates of the plant under it."""
+    def _evaluate(self, source: Sequence[str], more: Sequence[sp.Expr] = ()) -> list[str]:
+        """Evaluate the continuous law, the rates of the plant under it, and ``more``."""
         known = self._laid(self.program.demand)
         return [
             *self._law(source, []),
             *self._apply(),
-            *self._flow(source, self.rates, known),
+            *self._flow(source, [*self.rates, *more], known),
         ]
 
     def _apply(self) -> list[str]:
@@ -238,11 +238,11 @@ class _Writer:
         ]
 
     def hand_over(self) -> list[str]:
-        """Stop a lane (code −1) that is well inside its boundary layer and its input limits.
+        """Stop a lane (code −1) that is well inside its boundary layer and its limits.
 
         The rest is left to :mod:`undertow.codegen.settle`.
         """
-        r, m = self.rows, len(self.rows.u)
+        r, m, boxes = self.rows, len(self.rows.u), self.program.boxes
         layers = [r.lane[symbol] for symbol in self.program.lane_inputs[-1 - m : -1]]
         return [
             f"calm = {r.active} > 0.0",
@@ -251,16 +251,25 @@ class _Writer:
                 f"calm = calm & (abs({row}) <= 0.5 * {limit})"
                 for row, limit in zip(r.u, self.limits, strict=True)
             ),
+            *(
+                f"calm = calm & ({row} > max({spare!r}, {low}))"
+                for row, low, (_, spare) in zip(r.path, r.low, boxes, strict=bool(boxes))
+            ),
             f"code, active = {r.code}, {r.active}",
             f"{r.code} = {settle.HANDED_OVER} if calm else code",
             f"{r.active} = 0.0 if calm else active",
         ]
 
     def rates_at_stage(self) -> list[str]:
-        """Law and plant at the state of a stage: input, rates and stage cost into their rows."""
+        """Law and plant at the state of a stage: input, rates and stage cost into their rows.
+
+        Where large steps know bounds of states, the margins to them, too.
+        """
         r, text = self.rows, self.emit.text
+        path = self.program.path if self.program.boxes else ()
         return [
-            *self._evaluate(r.stage_x),
+            *self._evaluate(r.stage_x, path),
+            *(f"{row} = {text(e)}" for row, e in zip(r.path, path, strict=bool(path))),
             *(f"{row} = u_{j}" for j, row in enumerate(r.u)),
             *(
                 f"{row} = {text(rate)}"
@@ -413,7 +422,7 @@ def _settling(w: _Writer) -> str:
 )
 def settle(
     lanes, plant, belief, limits, until, terminal, escape, tail, counted,
-    linear, value, powers, forced, out,
+    linear, value, powers, forced, reach, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
     W = np.empty({w.rows.count * LANES})

@@ -21,7 +21,8 @@ class LoopProgram:
 
     The control part maps (x, surface, gains) to ``demand``, ``s`` and ``margins``; the flow
     part maps (t, x, ``applied``) to ``derivative``, ``stage`` and ``path``.  ``applied`` are
-    the symbols that stand for the inputs after the actuator.
+    the symbols that stand for the inputs after the actuator.  ``boxes`` are, where all of ``path``
+    are bounds of one state, its number and how far from the bound large steps stay.
     """
 
     tape: Tape
@@ -39,6 +40,7 @@ class LoopProgram:
     stage: sp.Expr
     path: tuple[sp.Expr, ...]
     input_margin: sp.Expr | None
+    boxes: tuple[tuple[int, float], ...] = ()
 
 
 class Rows:
@@ -70,6 +72,11 @@ class Rows:
         self.active, self.end, self.code, self.radius, self.steps = self._take(5)
         self.near, self.near_time = self._take(2)
         self.near_x = self._take(nx)
+        self.boxes = program.boxes
+        self.reach = [self._take(nx) for _ in program.boxes]
+        self.room = self._take(len(program.boxes))
+        self.low = self.smallest[2:] if program.boxes else []
+        self.pull = self._take(nx // 2) if program.boxes else []
 
     def _take(self, rows: int) -> list[str]:
         start = self.count

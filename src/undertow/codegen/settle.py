@@ -12,6 +12,16 @@ Each lane has a step of its own, a power of two of the unit: it keeps the last t
 norm of V = xᵀPx, and cannot leap over the terminal set.  With AᵀP + PA = −Q the cost is
 V(x) − V(x₊) + ∫ (Φ + V̇) dt, whose integrand is of fourth order: three points do.
 Once r has died out the steps are as long as the terminal set is far.
+
+*Bounds of states.*  With r as at x throughout, ẋ(s) = e^{As} ẋ(0) within a step, and a state x_i
+that is bounded moves by no more than
+
+    Σ_j F̄_ij |ẋ_j|,   F̄_ij ≥ |F_ij(s)| for all 0 ≤ s ≤ h;
+
+where r grows to r(a) the motion differs by less than F̄ |r(a) − r(x)|, and twice that is added.  A
+step is taken only if the margin that is then left is still larger than a spare part of the bound,
+and than the smallest margin of the small steps: no large step decides whether a bound is kept, and
+none changes the smallest margin.  A lane that no step is short enough for goes back to small ones.
 """
 
 from __future__ import annotations
@@ -73,6 +83,7 @@ def begin(r: Rows) -> list[str]:
             for j, row in enumerate(r.value)
             for k, e in enumerate(row)
         ),
+        *(f"{row} = out[b + i, {6 + k}]" for k, row in enumerate(r.low)),
         *_level(r, [f"x_{j}" for j in range(size)]),
         f"cost, begins = {r.cost}, {r.code} == {HANDED_OVER}",
         f"{r.active} = 1.0 if begins else 0.0",
@@ -104,6 +115,11 @@ def choose_step(r: Rows) -> str:
         for j, rows in enumerate(matrix)
         for k, row in enumerate(rows)
     ]
+    lines += [
+        f"{row} = reach[block, power, {(k * size + j) * LANES} + i]"
+        for k, rows in enumerate(r.reach)
+        for j, row in enumerate(rows)
+    ]
     body = "\n".join(f"        {line}" for line in lines)
     return f"""\
 for lane in range({LANES}):
@@ -128,6 +144,24 @@ def _rest(r: Rows, j: int, x: str) -> str:
     )
 
 
+def _clear(r: Rows) -> list[str]:
+    """Whether all bounds are out of this step's reach: ``clear``; of one four times: ``wide``."""
+    half = range(len(r.linear))
+    lines = [f"rate_{j} = abs(x_{j + len(half)})" for j in half]
+    lines += [
+        f"rate_{j + len(half)} = abs({row}) + 2.0 * abs(y_{j})" for j, row in enumerate(r.pull)
+    ]
+    for k, (row, (_, spare)) in enumerate(zip(r.low, r.boxes, strict=True)):
+        moved = total(f"{e} * rate_{j}" for j, e in enumerate(r.reach[k]))
+        lines += [f"moved_{k} = {moved}", f"left_{k} = {r.room[k]} - max({spare!r}, {row})"]
+    boxes = range(len(r.boxes))
+    return [
+        *lines,
+        "clear = " + " & ".join(f"(moved_{k} < left_{k})" for k in boxes),
+        "wide = " + " & ".join(f"(4.0 * moved_{k} < left_{k})" for k in boxes),
+    ]
+
+
 def first_half(r: Rows, limits: Sequence[str]) -> list[str]:
     """From the rates at x to the state a; ``limits`` are the names of the inputs' limits."""
     size, half = len(r.x), range(len(r.linear))
@@ -137,6 +171,11 @@ def first_half(r: Rows, limits: Sequence[str]) -> list[str]:
         *(f"q_{j} = {_rest(r, j, 'x')}" for j in half),
         *(f"{row} = q_{j}" for j, row in enumerate(r.rest)),
         f"{r.bend} = {_bend(r)}",
+        *(f"{row} = {margin}" for row, margin in zip(r.room, r.path, strict=bool(r.boxes))),
+        *(
+            f"{row} = {rate}"
+            for row, rate in zip(r.pull, r.slope[size // 2 :], strict=bool(r.boxes))
+        ),
         f"{r.speed} = math.sqrt(" + total(f"{row} * {row}" for row in r.slope) + ")",
         "free = "
         + " & ".join(f"(abs({u}) < {limit})" for u, limit in zip(r.u, limits, strict=True)),
@@ -154,6 +193,7 @@ def first_half(r: Rows, limits: Sequence[str]) -> list[str]:
 def second_half(r: Rows) -> list[str]:
     """From the rates at a to the end of the step, where it is taken; and the next step."""
     size, half = len(r.x), range(len(r.linear))
+    bounds, clear, wide = (_clear(r), " & clear", " & wide") if r.boxes else ([], "", "")
     return [
         *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
         *(f"a_{j} = {row}" for j, row in enumerate(r.stage_x)),
@@ -166,6 +206,7 @@ def second_half(r: Rows) -> list[str]:
             for j in range(size)
         ),
         *_level(r, [f"c_{j}" for j in range(size)]),
+        *bounds,
         f"small = ({CORRECTION} * tail) * ({CORRECTION} * tail) * high",
         *(f"a_{j} = a_{j} + c_{j}" for j in range(size)),
         "outer = math.sqrt(" + total(f"a_{j} * a_{j}" for j in range(size)) + ")",
@@ -175,14 +216,14 @@ def second_half(r: Rows) -> list[str]:
         "turn = (late - bend) / span - ((bend - last) / ago if ago > 0.0 else 0.0)",
         "turn = 2.0 * turn / (span + ago) if ago > 0.0 else 0.0",
         "mean = 0.5 * (bend + late) - span * span * turn / 12.0",
-        "sound = free & (outer < escape) & ((size > 0.0) | (level <= 16.0 * small))",
+        f"sound = free & (outer < escape) & ((size > 0.0) | (level <= 16.0 * small){clear})",
         f"before = {r.radius}",
         *(f"m_{j} = a_{j} - x_{j}" for j in range(size)),
         *entrance([f"x_{j}" for j in range(size)], "before"),
         "inside = (outer <= terminal) | passed",
         "part = max(0.0, min(1.0, part)) if inside else 1.0",
         "far = before - terminal > span * speed",
-        "taken = going & sound & ((size <= 0.0) | ((level <= small) & far & (not inside)))",
+        f"taken = going & sound & ((size <= 0.0) | ((level <= small) & far & (not inside){clear}))",
         *(f"x_{j} = x_{j} + part * m_{j} if taken else x_{j}" for j in range(size)),
         *(f"{row} = x_{j}" for j, row in enumerate(r.x)),
         *(f"{row} = x_{j}" for j, row in enumerate(r.stage_x)),
@@ -190,7 +231,7 @@ def second_half(r: Rows) -> list[str]:
         f"end = {r.end} + part * span if taken else {r.end}",
         "radius = (terminal if inside else outer) if taken else before",
         "further = outer - terminal > 4.0 * span * speed",
-        f"up = taken & further & (64.0 * level <= small) & (size < {SETTLING - 1}.0)",
+        f"up = taken & further & (64.0 * level <= small) & (size < {SETTLING - 1}.0){wide}",
         "down = going & (not taken) & (size > 0.0)",
         f"{r.power} = size + (1.0 if up else (-1.0 if down else 0.0))",
         f"{r.span} = span * (2.0 if up else (0.5 if down else 1.0))",
