@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 
 import undertow as ut
-from undertow.cascade import TAIL, cost_gate
-from undertow.certify.ellipsoid_search import search_for
-from undertow.certify.gate import Policy, assess, certified_gate
+from undertow.cascade import cost_gate
+from undertow.cascade.cascade import TAIL
+from undertow.certify.claims.gate import Policy, assess, certified_gate
+from undertow.certify.surface.ellipsoid_search import search_for
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 

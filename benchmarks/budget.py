@@ -17,8 +17,8 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade import TAIL
-from undertow.mechanism import FloatArray
+from undertow.cascade.cascade import TAIL
+from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 START = ut.deg(38)

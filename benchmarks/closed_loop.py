@@ -36,9 +36,9 @@ import sympy as sp
 
 import undertow as ut
 from rivals import DoMPC, Outcome, Plant, ShootingMPC
-from undertow.errors import UndertowError
-from undertow.mechanism import FloatArray, Parameter
-from undertow.stability import linearise
+from undertow.base import UndertowError
+from undertow.law import linearise
+from undertow.models import FloatArray, Parameter
 
 HORIZON, RADIUS = 60.0, 0.01
 
@@ -129,7 +129,11 @@ Result = tuple[Outcome | None, list[float]]
 
 
 def cascade(
-    scene: Scene, plant: ut.Mechanism, objective: ut.Objective, freedom: ut.Freedom, now: Clock
+    scene: Scene,
+    plant: ut.Mechanism,
+    objective: ut.Objective,
+    freedom: ut.DecisionVariables,
+    now: Clock,
 ) -> Result:
     """Run undertow's cascade; also return the seconds of each optimisation."""
     controller = ut.Cascade(scene.rig, objective, freedom=freedom)
@@ -181,7 +185,7 @@ def controllers(
     """Return everything that can be run on a plant, by name."""
     truth = Plant(plant, RADIUS, HORIZON)
     hasty = Plant(plant, RADIUS, PATIENCE)
-    free = ut.Freedom(reaching=True)
+    free = ut.DecisionVariables(reaching=True)
 
     def predictive(mpc: ShootingMPC | DoMPC) -> Result:
         return (truth if mpc.goal == "energy" else hasty).held(scene.x0, mpc), mpc.seconds
@@ -192,11 +196,11 @@ def controllers(
 
     energy, time = ut.MinimumEnergy(horizon=HORIZON), ut.MinimumTime(horizon=PATIENCE)
     everything: dict[str, Callable[[], Result]] = {
-        "cascade, energy": lambda: cascade(scene, plant, energy, ut.Freedom(), now),
+        "cascade, energy": lambda: cascade(scene, plant, energy, ut.DecisionVariables(), now),
         "LQR clipped, energy": lambda: regulated("energy"),
         "NMPC 10 Hz, energy": lambda: predictive(ShootingMPC(scene.rig, "energy", now=now)),
         "do-mpc 10 Hz, energy": lambda: predictive(DoMPC(scene.rig, "energy", now=now)),
-        "cascade, time": lambda: cascade(scene, plant, time, ut.Freedom(), now),
+        "cascade, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now),
         "cascade, time, reaching free": lambda: cascade(scene, plant, time, free, now),
         "LQR clipped, time": lambda: regulated("time"),
         "NMPC 10 Hz, time": lambda: predictive(ShootingMPC(scene.rig, "time", now=now)),

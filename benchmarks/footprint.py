@@ -22,7 +22,7 @@ JOBS = {
     "cascade, energy": RIG + "ut.Cascade(rig).simulate(phi=ut.deg(41))",
     "cascade, time": RIG + "ut.Cascade(rig, ut.MinimumTime()).simulate(phi=ut.deg(41))",
     "cascade, time, reaching free": RIG + "ut.Cascade(rig, ut.MinimumTime(), "
-    "freedom=ut.Freedom(reaching=True), warm=ut.Budget(4000)).simulate(phi=ut.deg(41))",
+    "freedom=ut.DecisionVariables(reaching=True), warm=ut.Budget(4000)).simulate(phi=ut.deg(41))",
     "cascade, energy, n = 4": "import undertow as ut; "
     "ut.Cascade(ut.mechanisms.triple_pendulum_on_a_cart()).simulate(duration=1.0)",
     "20,000 rollouts at once": RIG + "import numpy as np; p = np.tile([-1, -1.59, 1.96, 12.1], "

@@ -24,20 +24,25 @@ RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 BOX = ut.state_box(phi=math.pi / 2)
 
 #: What is run: name, objective, freedom, and what is wanted: a gap for energy, a time in s.
-Kind = tuple[str, ut.Objective, ut.Freedom, float | None]
+Kind = tuple[str, ut.Objective, ut.DecisionVariables, float | None]
 
 
 def kinds(schedule: list[float]) -> dict[str, Kind]:
     """Return what can be run, by the names of the command line."""
     times = (0.0, *schedule)
-    free = ut.Freedom(reaching=True)
+    free = ut.DecisionVariables(reaching=True)
     energy, time = ut.MinimumEnergy(), ut.MinimumTime()
     return {
-        "energy": ("energy", energy, ut.Freedom(), 0.01),
+        "energy": ("energy", energy, ut.DecisionVariables(), 0.01),
         "energy-reaching": ("energy, reaching free", energy, free, 0.01),
-        "time": ("time", time, ut.Freedom(), None),
+        "time": ("time", time, ut.DecisionVariables(), None),
         "time-reaching": ("time, reaching free", time, free, 0.70),
-        "time-schedule": ("time, schedule", time, ut.Freedom(reaching=True, times=times), 0.60),
+        "time-schedule": (
+            "time, schedule",
+            time,
+            ut.DecisionVariables(reaching=True, times=times),
+            0.60,
+        ),
     }
 
 

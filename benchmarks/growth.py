@@ -23,8 +23,8 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade import TAIL
-from undertow.mechanism import FloatArray
+from undertow.cascade.cascade import TAIL
+from undertow.models import FloatArray
 
 FAMILY: dict[int, Callable[[], ut.Mechanism]] = {
     2: ut.mechanisms.cart_pendulum,

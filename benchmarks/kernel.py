@@ -27,7 +27,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import undertow as ut
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
 
 SURFACES, STEPS, STEP = 256, 2500, 0.002
 HERE = Path(__file__).parent

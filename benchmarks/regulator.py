@@ -16,8 +16,8 @@ import scipy.integrate
 import scipy.linalg
 
 import undertow as ut
-from undertow.mechanism import FloatArray
-from undertow.stability import linearise
+from undertow.law import linearise
+from undertow.models import FloatArray
 
 WEIGHTS = 10.0 ** np.arange(-9.0, 1.0)
 HORIZON = 60.0

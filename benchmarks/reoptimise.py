@@ -31,7 +31,7 @@ import numpy as np
 
 import undertow as ut
 from rivals import DoMPC, ShootingMPC
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 STARTS = (20.0, 30.0, 35.0, 38.0, 40.0, 41.0, 42.0)

@@ -24,9 +24,9 @@ import sympy as sp
 import undertow as ut
 from harness import Clock, need
 from undertow.bounds.expressions import translate
-from undertow.codegen import Tape
-from undertow.mechanism import TIME, FloatArray
-from undertow.stability import linearise
+from undertow.law import linearise
+from undertow.models import TIME, FloatArray
+from undertow.symbolic import Tape
 
 __all__ = ["DoMPC", "Outcome", "Plant", "ShootingMPC", "riccati"]
 

@@ -5,8 +5,9 @@ The task: the surface of least energy, or least time, for the rotary pendulum (d
 surface with the same width, and may ask for the same number of rollouts; the costs it is told
 are those of the kernel.  Repeated from several seeds.
 
-* *ours*: undertow.search.CMAES, a whole population a call, and undertow.trust_region.TrustRegion,
-  16 a call, restarted at random when it gains nothing any more.
+* *ours*: undertow.optimiser.cma_es.CMAES, a whole population a call, and
+  undertow.optimiser.trust_region.TrustRegion, 16 a call, restarted at random when it gains nothing
+  any more.
 * *cmaes*: the package of that name, told one member at a time.
 * *SciPy …*: routines that call the cost themselves, turned inside out by a thread; differential
   evolution hands over populations, the others one point at a time, restarted at random when
@@ -33,11 +34,11 @@ import numpy as np
 import scipy.optimize
 
 import undertow as ut
-from undertow.cascade import TAIL
-from undertow.codegen.rows import LANES
-from undertow.mechanism import FloatArray
-from undertow.search import CMAES
-from undertow.trust_region import TrustRegion
+from undertow.cascade.cascade import TAIL
+from undertow.models import FloatArray
+from undertow.optimiser import CMAES
+from undertow.optimiser.trust_region import TrustRegion
+from undertow.symbolic import LANES
 
 Cost = Callable[[FloatArray], FloatArray]
 POPULATION, WIDTH, REACH = 32, 0.5, 4.0

@@ -18,10 +18,10 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade import TAIL
-from undertow.mechanism import FloatArray
-from undertow.motion import Batch
-from undertow.stability import sliding_matrix
+from undertow.cascade.cascade import TAIL
+from undertow.closed_loop.trajectory import Batch
+from undertow.law import sliding_matrix
+from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 

@@ -22,9 +22,9 @@ from wire import LOST, Device, command, parse
 
 import undertow as ut
 from undertow.estimators import KalmanFilter, drive
-from undertow.inner_loop import InnerLoop
-from undertow.mechanism import FloatArray
-from undertow.rig import Measurement, RealisticRig, srv02_rig
+from undertow.law import InnerLoop
+from undertow.models import FloatArray
+from undertow.plants import Measurement, RealisticRig, srv02_rig
 
 
 class UdpRig:

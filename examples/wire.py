@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from undertow.rig import Measurement, RealisticRig
+from undertow.plants import Measurement, RealisticRig
 
 #: Counts per turn of both encoders.
 COUNTS = 4096

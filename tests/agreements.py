@@ -11,17 +11,17 @@ import numpy as np
 import sympy as sp
 
 import undertow as ut
-from undertow.agreement import Difference, Subject
-from undertow.certify.batch import Interval
-from undertow.certify.loop import LoopMotion
-from undertow.certify.motion import SurfaceMotion
+from undertow.cascade.swing_up import law as swing_law
+from undertow.certify.closed_loop.loop import LoopMotion
+from undertow.certify.intervals.batch import Interval
+from undertow.certify.region.motion import SurfaceMotion
+from undertow.checks.agreement import Difference, Subject
+from undertow.checks.exact import Number, evaluate, product, runge_kutta, solve
 from undertow.estimators import kalman
-from undertow.exact import Number, evaluate, product, runge_kutta, solve
 from undertow.export import EmbeddedController, KalmanStep
 from undertow.export.host import Build
-from undertow.mechanism import FloatArray
-from undertow.rig.stepping import stepping
-from undertow.swing_up import law as swing_law
+from undertow.models import FloatArray
+from undertow.plants.stepping import stepping
 
 STEP = 0.002
 

@@ -10,7 +10,7 @@ from hypothesis import settings
 
 import undertow as ut
 from undertow.cascade import CascadeState
-from undertow.plan import Plan
+from undertow.law import Plan
 
 if TYPE_CHECKING:
     from undertow.runtime import Controller

@@ -32,14 +32,13 @@ from types import FrameType
 from typing import Any
 
 import undertow as ut
-from undertow import lagrange, modelling
+from undertow.base import UndertowError, versions
+from undertow.base.artefacts import to_json
 from undertow.cascade import CascadeState
-from undertow.codegen import store
-from undertow.codegen.private import private_folder
-from undertow.errors import UndertowError
-from undertow.lagrange import derived
-from undertow.plan import Plan
-from undertow.results import to_json, versions
+from undertow.law import Plan
+from undertow.models import importers as modelling
+from undertow.models import lagrange
+from undertow.models.lagrange import derived
 from undertow.runtime import (
     Columns,
     InlineWorker,
@@ -52,7 +51,9 @@ from undertow.runtime import (
     replay,
     respond,
 )
-from undertow.trials.ledger import Ledger
+from undertow.studies.trials.ledger import Ledger
+from undertow.symbolic import store
+from undertow.symbolic.private import private_folder
 
 #: Longest time that a file may take, s; after the second the whole fuzzer is ended.
 LIMIT, HANG = 10.0, 60.0
@@ -425,10 +426,10 @@ class Certificates:
     """Certificates with a claim of each kind; most of the mutated ones have a checksum again."""
 
     def __init__(self, _folder: Path) -> None:
-        from undertow.certification import certify_surface
-        from undertow.certify.certificate import Certificate, Claim, Subject
-        from undertow.certify.verify import verify
-        from undertow.verdict import Verdict
+        from undertow.base import Verdict
+        from undertow.certify.claims.certificate import Certificate, Claim, Subject
+        from undertow.certify.claims.verify import verify
+        from undertow.studies.certification import certify_surface
 
         rig, surface = ut.mechanisms.rotary_pendulum(), ut.Surface(-1, -1.59, 1.96, 12.1)
         one = certify_surface(rig, surface, rig.state(phi=0.5), seconds=0.0, predict=False)
@@ -449,8 +450,8 @@ class Certificates:
             verify(Certificate.from_bytes(content), rig, max_seconds=1.0)  # compiles what it needs
 
     def make(self, case: Path, rng: random.Random) -> Callable[[], object]:
-        from undertow.certify.certificate import _checksum, read_certificate
-        from undertow.certify.verify import verify
+        from undertow.certify.claims.certificate import _checksum, read_certificate
+        from undertow.certify.claims.verify import verify
         from undertow.mechanisms import LIBRARY
 
         document, target = mutated(rng.choice(self.samples), rng), case / "certificate.json"
@@ -506,7 +507,7 @@ class Manifests:
         self.sample = json.loads(to_json(facts))
 
     def make(self, case: Path, rng: random.Random) -> Callable[[], object]:
-        from undertow.certify.certificate import read_certificate
+        from undertow.certify.claims.certificate import read_certificate
 
         target = case / "manifest.json"
         content = written(mutated(self.sample, rng)).encode("utf-8", "surrogatepass")

@@ -15,7 +15,7 @@ import numpy as np
 import sympy as sp
 
 import undertow as ut
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
 
 BITS, ORDER = 220, 26
 

@@ -25,8 +25,8 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.errors import ArtefactError
-from undertow.mechanism import FloatArray
+from undertow.base import ArtefactError
+from undertow.models import FloatArray
 from undertow.runtime.log import Recording, read_log
 
 HERE = Path(__file__).parent

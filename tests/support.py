@@ -11,7 +11,7 @@ import numpy as np
 import sympy as sp
 
 import undertow as ut
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
 
 #: (n, m) of the random systems on which the formulas are checked.
 SHAPES = ((2, 1), (3, 1), (3, 2), (4, 2), (5, 2))

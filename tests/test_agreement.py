@@ -26,8 +26,10 @@ from agreements import (
     sliding_motion,
     swing_up,
 )
-from undertow import agreement, exact, inner_loop, kernel
-from undertow.agreement import (
+from undertow.base import ModelError
+from undertow.certify.surface.ellipsoid import ClosedLoopProgram
+from undertow.checks import agreement, check_mechanism, exact
+from undertow.checks.agreement import (
     LIMIT,
     QUICK,
     SETTLED,
@@ -37,15 +39,12 @@ from undertow.agreement import (
     settling,
     worst,
 )
-from undertow.certify.ellipsoid import ClosedLoopProgram
-from undertow.check import check_mechanism
-from undertow.codegen import Tape, settle
-from undertow.codegen.c99 import C99Emitter
-from undertow.codegen.machine import numba
-from undertow.codegen.names import SymbolNames
-from undertow.errors import ModelError
-from undertow.exact import ExactModel, Number, evaluate
+from undertow.checks.exact import ExactModel, Number, evaluate
+from undertow.closed_loop import kernel
+from undertow.law import inner_loop
 from undertow.mechanisms import LIBRARY
+from undertow.symbolic import C99Emitter, Tape, numba, settle
+from undertow.symbolic.names import SymbolNames
 
 #: Single precision, relative to the same.
 SINGLE = 1e-6
@@ -463,7 +462,7 @@ def test_a_function_without_an_exact_value_is_reported(monkeypatch: pytest.Monke
 def test_a_plant_that_depends_on_time(interpreted: None) -> None:
     """Claim: it has no law and no kernel of its own; M, f and q̈ are compared."""
     plain = named(["a", "b", "F"], title="pushed")
-    plant = plain.disturbed({"b": sp.Rational(1, 100) * sp.sin(3 * ut.mechanism.TIME)})
+    plant = plain.disturbed({"b": sp.Rational(1, 100) * sp.sin(3 * ut.models.mechanism.TIME)})
     report = check_mechanism(plant)
     assert sum("50 digits" in check.name for check in report.checks) == 1
     agree(numpy_functions(Subject(plant)))

@@ -15,13 +15,13 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.animation import Film, evaluator, gif, still
+from undertow.base import InvalidInputError
 from undertow.cli import app
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
+from undertow.display.animation import Film, evaluator, gif, still
+from undertow.display.sketches import Label, Line, sketch
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.scenes import mujoco_scene
-from undertow.sketches import Label, Line, sketch
+from undertow.models import FloatArray
 
 NAMES = sorted(LIBRARY)
 

@@ -20,7 +20,7 @@ import sympy as sp
 from sympy.physics import mechanics
 
 import undertow as ut
-from undertow.errors import ModelError, UndertowError
+from undertow.base import ModelError, UndertowError
 
 #: What is given instead of each argument.
 WRONG: tuple[Any, ...] = (None, "a", math.nan, math.inf, -1, [], [[]], {}, object(), True)
@@ -67,7 +67,8 @@ def parts() -> dict[str, Any]:
     return {
         "Budget": budget, "Cascade": cascade, "ClosedLoop": loop, "Mechanism": rig,
         "Constraint": ut.Constraint("c", lambda v: v.phi - 1), "Coordinate": coordinates[0],
-        "Freedom": ut.Freedom(), "Input": ut.Input("u", "V"), "MinimumEnergy": ut.MinimumEnergy(),
+        "DecisionVariables": ut.DecisionVariables(), "Input": ut.Input("u", "V"),
+        "MinimumEnergy": ut.MinimumEnergy(),
         "MinimumTime": problem, "Objective": ut.Objective("o", lambda v: 1),
         "Optimiser": ut.Optimiser(loop, cold=budget, warm=budget), "Plan": ut.Plan((surface,)),
         "Parameter": ut.Parameter("p", 1.0, "m"), "Proposal": proposal,

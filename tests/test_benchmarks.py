@@ -88,7 +88,7 @@ def test_rivals_move_by_the_mechanisms_own_equations(rivals: ModuleType, rig: ut
 
 
 def test_the_regulator_solves_its_riccati_equation(rivals: ModuleType, rig: ut.Mechanism) -> None:
-    from undertow.stability import linearise
+    from undertow.law import linearise
 
     lin, (P, K) = linearise(rig), rivals.riccati(rig, 0.1)
     residual = lin.A.T @ P + P @ lin.A - P @ lin.input @ lin.input.T @ P + 0.1 * np.eye(4)

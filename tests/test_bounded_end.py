@@ -10,13 +10,11 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 import undertow as ut
-from undertow.cascade import TAIL
-from undertow.codegen.linear import SETTLING, UNIT
-from undertow.codegen.rows import LANES
-from undertow.mechanism import FloatArray
-from undertow.motion import Event
-from undertow.rollout import ClosedLoop
-from undertow.tail import Prepared
+from undertow.cascade.cascade import TAIL
+from undertow.closed_loop import ClosedLoop, Event
+from undertow.closed_loop.terminal_model import Prepared
+from undertow.models import FloatArray
+from undertow.symbolic import LANES, SETTLING, UNIT
 
 #: A cart that may overshoot by little.
 OVERSHOOT = ut.state_box(x=(-1.4, 0.1))

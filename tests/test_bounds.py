@@ -17,13 +17,13 @@ import scipy.optimize
 import sympy as sp
 
 import undertow as ut
+from undertow.base import InfeasibleError, InvalidInputError, MissingExtraError, ModelError
 from undertow.bounds import Bound, bound
 from undertow.bounds.expressions import smooth, translate
 from undertow.bounds.guesses import Guess
 from undertow.bounds.programme import Programme
-from undertow.errors import InfeasibleError, InvalidInputError, MissingExtraError, ModelError
-from undertow.mechanism import FloatArray
-from undertow.stability import linearise
+from undertow.law import linearise
+from undertow.models import FloatArray
 
 ca = pytest.importorskip("casadi")
 
@@ -421,7 +421,7 @@ def test_running_cost_that_counts_rest_frees_the_final_time() -> None:
 
 def test_disturbance_that_depends_on_time_is_met() -> None:
     """A plant with an explicit t in its forces: the motion is one of that plant."""
-    plant = linear_plant(5.0).disturbed({"b": sp.sin(3 * ut.mechanism.TIME)})
+    plant = linear_plant(5.0).disturbed({"b": sp.sin(3 * ut.models.mechanism.TIME)})
     found = bound(plant, ut.MinimumEnergy(terminal_radius=0.05), [0.5, 0, 0, 0], horizon=3.0)
     end = drive(found, found.x[0], 0.0, 3.0)
     np.testing.assert_allclose(end, found.x[-1], atol=1e-5)

@@ -15,6 +15,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
+from undertow.base import ArtefactError, InfeasibleError, InvalidInputError, versions
 from undertow.bring_up import (
     BringUp,
     GuardError,
@@ -32,10 +33,8 @@ from undertow.bring_up.coverage import NOISES, coverage, deviations, rig_in_the_
 from undertow.bring_up.intervals import counted, dwell, readings
 from undertow.bring_up.report import coverage_table
 from undertow.cli import app
-from undertow.errors import ArtefactError, InfeasibleError, InvalidInputError
 from undertow.mechanisms import LIBRARY
-from undertow.results import versions
-from undertow.rig import (
+from undertow.plants import (
     Encoder,
     IdealRig,
     Measurement,
@@ -365,8 +364,8 @@ def test_how_long_a_motion_dwells() -> None:
 
 DRIVER = """
 import numpy as np
-from undertow.rig import RealisticRig, srv02_rig
-from undertow.swing_up import hanging
+from undertow.plants import RealisticRig, srv02_rig
+from undertow.cascade.swing_up import hanging
 
 class Driver:
     def __init__(self):
@@ -390,7 +389,7 @@ def test_the_wizard_meets_a_driver_of_ones_own(
 ) -> None:
     """From the command line; a swapped sign is found, and the rig is let go of."""
     (tmp_path / "driver.py").write_text(DRIVER)
-    monkeypatch.setattr("undertow.rig.Paced", lambda rig: rig)  # this one needs no clock
+    monkeypatch.setattr("undertow.plants.Paced", lambda rig: rig)  # this one needs no clock
     words = ["bench", "rotary_pendulum", "--rig", f"{tmp_path / 'driver.py'}:Driver"]
     result = CliRunner().invoke(app, [*words, "--quick"])
     assert result.exit_code == 1

@@ -14,12 +14,11 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow import lagrange
-from undertow.codegen import private, store
-from undertow.codegen.expressions import parse_expression
-from undertow.codegen.machine import caching
-from undertow.codegen.private import is_private, private_folder
-from undertow.errors import ArtefactError
+from undertow.base import ArtefactError
+from undertow.models import lagrange
+from undertow.symbolic import parse_expression, private, store
+from undertow.symbolic.machine import caching
+from undertow.symbolic.private import is_private, private_folder
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="owners and modes of POSIX")
 
@@ -134,7 +133,7 @@ def test_equations_come_back_from_the_cache_as_they_were() -> None:
 
 WHERE = """
 import undertow as ut
-from undertow.trust_region import __dict__ as names
+from undertow.optimiser.trust_region import __dict__ as names
 from numba.core.dispatcher import Dispatcher
 found = {f._cache.cache_path for f in names.values() if isinstance(f, Dispatcher)}
 print(*found, sep="\\n")
@@ -143,7 +142,7 @@ print(*found, sep="\\n")
 COMPILED = """
 import os
 import undertow as ut
-from undertow.codegen import store
+from undertow.symbolic import store
 source = '''import numba
 
 @numba.njit(cache=True)
@@ -246,9 +245,10 @@ del multiprocessing.context.ForkProcess
 for name in ("fcntl", "pwd", "grp", "resource", "termios"):
     sys.modules[name] = None
 import undertow as ut
-import undertow.cli, undertow.runtime, undertow.trials.report, undertow.certify, undertow.export
+import undertow.cli, undertow.runtime, undertow.studies.trials.report
+import undertow.certify, undertow.export
 from pathlib import Path
-from undertow.errors import InvalidInputError
+from undertow.base.errors import InvalidInputError
 from undertow.runtime import Recipe, replay
 from undertow.runtime.processes import fork
 from undertow.runtime.session import session

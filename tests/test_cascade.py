@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.cascade import CascadeState, cost_gate
-from undertow.errors import (
+from undertow.base import (
     InfeasibleError,
     InvalidInputError,
     SingularSurfaceError,
     UnstableSurfaceError,
 )
-from undertow.paper import CASES
-from undertow.plan import Plan
-from undertow.proposal import Proposal
+from undertow.cascade import CascadeState, cost_gate
+from undertow.law import Plan
+from undertow.optimiser import Proposal
+from undertow.studies.paper import CASES
 
 GOOD = CASES["4 one-time, time"]
 BASE = CASES["1 base case"]
@@ -47,7 +47,7 @@ def test_time_to_go_falls_by_the_period_at_each_decision(run: ut.Run) -> None:
     assert len(predicted) > 3
     assert (predicted[1:] <= predicted[:-1] - 0.1 + 1e-9).all()
     assert run.time <= predicted[0] + 1e-9
-    assert run.descent.min() >= -1e-9
+    assert run.lemma3_slack.min() >= -1e-9
 
 
 def test_cost_to_go_falls_by_what_was_spent(rig: ut.Mechanism) -> None:
@@ -57,7 +57,7 @@ def test_cost_to_go_falls_by_what_was_spent(rig: ut.Mechanism) -> None:
     )
     run = cascade.simulate(phi=ut.deg(30))
     assert run.reached
-    assert run.descent.min() >= -1e-9 * run.updates[0].predicted
+    assert run.lemma3_slack.min() >= -1e-9 * run.updates[0].predicted
     spent = sum(update.spent for update in run.updates)
     assert spent <= run.cost <= run.updates[0].predicted * (1 + 1e-9)
     assert run.cost == pytest.approx(run.trajectory.total)
@@ -73,7 +73,7 @@ def test_prediction_equals_what_happens_when_nothing_is_replaced(
     run = shut.simulate(phi=ut.deg(30))
     assert run.cost == pytest.approx(run.updates[0].predicted, rel=1e-9)
     assert len(set(run.surfaces)) == 1
-    np.testing.assert_allclose(run.descent, 0, atol=1e-9)
+    np.testing.assert_allclose(run.lemma3_slack, 0, atol=1e-9)
 
 
 def refuse(admission: Any) -> Any:
@@ -99,7 +99,7 @@ def test_cascades_at_41_degrees(rig: ut.Mechanism, objective: ut.Objective, at_m
     assert costs.max() <= at_most
     assert np.ptp(costs) <= 0.01 * costs.min()
     assert np.ptp(firsts) <= 0.01 * firsts.min()
-    assert min(float(run.descent.min()) for run in runs) >= -1e-9 * at_most
+    assert min(float(run.lemma3_slack.min()) for run in runs) >= -1e-9 * at_most
 
 
 # -- determinism ---------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def test_replay_of_the_record_gives_the_same_decisions(run: ut.Run, cascade: ut.
     first = run.updates[0]
     state = CascadeState(first.plan, 0, first.predicted)
     for update in run.updates[1:]:
-        state, admission = cascade.consider(state, update.proposal, update.x, 60.0 - update.t)
+        state, admission = cascade.apply_gate(state, update.proposal, update.x, 60.0 - update.t)
         assert admission == update.admission
         assert state.surface == update.surface
 
@@ -203,7 +203,7 @@ def test_bad_surfaces_are_refused_as_long_as_they_are_bad(
     assert faulty.reached
     assert reason in faulty.updates[1].admission.reason
     assert faulty.updates[1].surface == run.surfaces[0]
-    assert faulty.descent.min() >= -1e-9
+    assert faulty.lemma3_slack.min() >= -1e-9
     assert faulty.cost <= run.updates[0].predicted + 1e-9
 
 
@@ -220,7 +220,7 @@ def test_failures_now_and_then_cost_little(cascade: ut.Cascade) -> None:
     assert any(verdicts)
     assert not all(verdicts)
     assert run.cost < run.updates[0].predicted
-    assert run.descent.min() >= -1e-9
+    assert run.lemma3_slack.min() >= -1e-9
 
 
 def test_bad_measurement_is_refused_before_anything_is_decided(cascade: ut.Cascade) -> None:
@@ -230,7 +230,7 @@ def test_bad_measurement_is_refused_before_anything_is_decided(cascade: ut.Casca
     assert proposal.status == "failed"
     assert "'phi'" in proposal.message
     with pytest.raises(InvalidInputError, match="'phi'"):
-        cascade.consider(state, proposal, np.array([0.0, np.nan, 0.0, 0.0]))
+        cascade.apply_gate(state, proposal, np.array([0.0, np.nan, 0.0, 0.0]))
 
 
 # -- the gate ------------------------------------------------------------------------------
@@ -263,9 +263,9 @@ def test_proposals_out_of_order_are_refused(cascade: ut.Cascade) -> None:
     x = cascade.mechanism.state(phi=ut.deg(30))
     state = CascadeState(Plan.of(BASE), 0, math.inf)
     proposal = cascade.propose(state, x)
-    after, admission = cascade.consider(state, proposal, x)
+    after, admission = cascade.apply_gate(state, proposal, x)
     assert admission.accepted
-    again, refused = cascade.consider(after, proposal, x)
+    again, refused = cascade.apply_gate(after, proposal, x)
     assert again is after
     assert not refused.accepted
     assert refused.reason.startswith("stale")

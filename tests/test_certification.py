@@ -13,8 +13,13 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow import report
-from undertow.certification import (
+from undertow.base import Verdict
+from undertow.certify.claims.gate import Policy, certified_gate
+from undertow.certify.region.lyapunov import LyapunovFunction
+from undertow.certify.region.motion import SurfaceMotion
+from undertow.certify.region.search import ProvedRegion
+from undertow.cli import app, report
+from undertow.studies.certification import (
     appendix_report,
     certify_appendix,
     certify_run,
@@ -23,12 +28,6 @@ from undertow.certification import (
     run_report,
     subject_report,
 )
-from undertow.certify.gate import Policy, certified_gate
-from undertow.certify.lyapunov import LyapunovFunction
-from undertow.certify.motion import SurfaceMotion
-from undertow.certify.region_search import ProvedRegion
-from undertow.cli import app
-from undertow.verdict import Verdict
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 

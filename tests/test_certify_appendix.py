@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from undertow.base import InvalidInputError
 from undertow.certify import hurwitz
-from undertow.certify.appendix import (
+from undertow.certify.surface.appendix import (
     CASES,
     PRINTED,
     Constants,
@@ -23,10 +24,9 @@ from undertow.certify.appendix import (
     paper_rate,
     two_vertex,
 )
-from undertow.certify.appendix_report import _rows, figures, report
-from undertow.certify.appendix_search import search_interval, search_rate
-from undertow.errors import InvalidInputError
-from undertow.sliding import SlidingModeLaw
+from undertow.law import SlidingModeLaw
+from undertow.studies.paper.appendix_report import _rows, figures, report
+from undertow.studies.paper.appendix_search import search_interval, search_rate
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 pytest.importorskip("clarabel", reason="the search is the extra undertow[certify]")
@@ -301,8 +301,13 @@ def test_the_page_shows_what_the_command_computes() -> None:
             assert row in page
 
 
-def test_figures_7_to_11_are_drawn(tmp_path: Path) -> None:
-    """One picture per case."""
-    paths = figures(tmp_path)
-    assert [p.name for p in paths] == [f"figure_{i}.png" for i in range(7, 12)]
-    assert all(p.stat().st_size > 5000 for p in paths)
+def test_figures_7_to_11_are_drawn() -> None:
+    """One picture per case, with λ_min of R for the printed P before and after, and for ours."""
+    drawn = figures()
+    assert list(drawn) == [f"figure-{i}-appendix" for i in range(7, 12)]
+    for case, figure in zip(CASES, drawn.values(), strict=True):
+        _, after, ours, _ = figure.axes[0].get_lines()
+        y1 = np.asarray(after.get_xdata())
+        curve = case.reduced(REAL).R_curve(case.P, y1)
+        np.testing.assert_array_equal(np.asarray(after.get_ydata()), curve)
+        assert np.asarray(ours.get_ydata()).min() > 0  # ours holds on the printed interval

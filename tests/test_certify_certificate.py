@@ -18,10 +18,10 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.certification import certificate_files, certify_surface, verification_report
-from undertow.certify.appendix import CASES, Constants, two_vertex
-from undertow.certify.appendix_search import search_rate
-from undertow.certify.certificate import (
+from undertow.base import ArtefactError, InvalidInputError, ModelError, Verdict, inward
+from undertow.base.errors import CertificateError
+from undertow.base.verdict import within
+from undertow.certify.claims.certificate import (
     LARGEST,
     Certificate,
     Claim,
@@ -30,24 +30,25 @@ from undertow.certify.certificate import (
     function_data,
     read_certificate,
 )
-from undertow.certify.ellipsoid import TerminalEllipsoid, verify_ellipsoid
-from undertow.certify.ellipsoid_search import search_for
-from undertow.certify.gate import Policy, assess
-from undertow.certify.loop import LoopMotion
-from undertow.certify.loop_claim import LoopClaim, verify_loop
-from undertow.certify.loop_terminal import TerminalSet
-from undertow.certify.lyapunov import LyapunovFunction
-from undertow.certify.motion import SurfaceMotion, VectorField
-from undertow.certify.reaching import reaching
-from undertow.certify.region import verify_region
-from undertow.certify.sets import ProvedStarts, proved_sets
-from undertow.certify.surface import hurwitz, nonsingular
-from undertow.certify.verify import reaches, verify
+from undertow.certify.claims.gate import Policy, assess
+from undertow.certify.claims.verify import reaches, verify
+from undertow.certify.closed_loop.claim import LoopClaim, verify_loop
+from undertow.certify.closed_loop.loop import LoopMotion
+from undertow.certify.closed_loop.terminal import TerminalSet
+from undertow.certify.region.lyapunov import LyapunovFunction
+from undertow.certify.region.motion import SurfaceMotion, VectorField
+from undertow.certify.region.region import verify_region
+from undertow.certify.surface.appendix import CASES, Constants, two_vertex
+from undertow.certify.surface.ellipsoid import TerminalEllipsoid, verify_ellipsoid
+from undertow.certify.surface.ellipsoid_search import search_for
+from undertow.certify.surface.reaching import reaching
+from undertow.certify.surface.sets import ProvedStarts, proved_sets
+from undertow.certify.surface.surface import hurwitz, nonsingular
 from undertow.cli import app
-from undertow.errors import ArtefactError, CertificateError, InvalidInputError, ModelError
-from undertow.modelling import mechanism_from_file
-from undertow.plan import Plan
-from undertow.verdict import Verdict, inward, within
+from undertow.law import Plan
+from undertow.models.importers import mechanism_from_file
+from undertow.studies.certification import certificate_files, certify_surface, verification_report
+from undertow.studies.paper.appendix_search import search_rate
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 
@@ -68,7 +69,7 @@ def lyapunov_matrix() -> np.ndarray:
     """P of the linear sliding dynamics in y = (φ, φ̇, w)."""
     import scipy.linalg
 
-    from undertow.certify.motion import SurfaceMotion
+    from undertow.certify.region.motion import SurfaceMotion
 
     A = SurfaceMotion(RIG, SURFACE).jacobian
     return np.asarray(scipy.linalg.solve_continuous_lyapunov(A.T, -np.diag([30.0, 0.3, 3.0])))
@@ -675,7 +676,7 @@ def _is_module(name: str) -> bool:
 
 def test_the_verifier_shares_nothing_with_the_searches() -> None:
     """All that it reaches: no search, no linear program, no semidefinite or other optimiser."""
-    todo, seen = ["undertow.certify.verify"], set[str]()
+    todo, seen = ["undertow.certify.claims.verify"], set[str]()
     while todo:
         module = todo.pop()
         if module in seen:
@@ -683,11 +684,11 @@ def test_the_verifier_shares_nothing_with_the_searches() -> None:
         seen.add(module)
         # Package files that only collect names are not what is used of a package.
         if module.split(".")[0] == "undertow" and module not in (
-            "undertow", "undertow.certify", "undertow.modelling", "undertow.mechanisms"
+            "undertow", "undertow.certify", "undertow.models.importers", "undertow.mechanisms"
         ):  # fmt: skip
             todo += imports_of(module)
     ours = {name for name in seen if name.startswith("undertow")}
-    assert "undertow.certify.region" in ours
+    assert "undertow.certify.region.region" in ours
     assert not [n for n in ours if "search" in n or "optimis" in n or "linear_program" in n]
     foreign = seen - ours
     assert not [n for n in foreign if n.split(".")[0] in ("clarabel", "cvxpy", "cmaes", "casadi")]

@@ -7,13 +7,17 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow.certify.ellipsoid import ClosedLoopProgram, TerminalEllipsoid, verify_ellipsoid
-from undertow.certify.ellipsoid_search import search_for
-from undertow.certify.program import Program
-from undertow.codegen import Tape
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
-from undertow.paper.data import CASES
+from undertow.base import InvalidInputError
+from undertow.certify.intervals.program import Program
+from undertow.certify.surface.ellipsoid import (
+    ClosedLoopProgram,
+    TerminalEllipsoid,
+    verify_ellipsoid,
+)
+from undertow.certify.surface.ellipsoid_search import search_for
+from undertow.models import FloatArray
+from undertow.studies.paper.data import CASES
+from undertow.symbolic import Tape
 
 RIG = ut.mechanisms.rotary_pendulum()
 LAW = ut.ReachingLaw()
@@ -171,7 +175,7 @@ def test_conditions_that_break_are_named() -> None:
     assert "layer" in verify_ellipsoid(RIG, surface, thin, found).method
     assert search_for(RIG, ut.Surface(-1, 0.5, 5, 10), LAW) is None
     with pytest.raises(InvalidInputError, match="autonomous"):
-        search_for(RIG.disturbed({"phi": sp.sin(ut.mechanism.TIME)}), surface, LAW)
+        search_for(RIG.disturbed({"phi": sp.sin(ut.models.mechanism.TIME)}), surface, LAW)
     with pytest.raises(InvalidInputError, match="shape"):
         verify_ellipsoid(RIG, surface, LAW, TerminalEllipsoid(np.eye(3), np.eye(4), 1.0))
 

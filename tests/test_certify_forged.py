@@ -26,9 +26,8 @@ import sympy as sp
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 
 import undertow as ut
-from undertow.certify.appendix import CASES, Constants, Reduced
-from undertow.certify.appendix_search import search_rate
-from undertow.certify.certificate import (
+from undertow.base import UndertowError, Verdict
+from undertow.certify.claims.certificate import (
     Certificate,
     Claim,
     Subject,
@@ -36,12 +35,12 @@ from undertow.certify.certificate import (
     ellipsoid_data,
     function_data,
 )
-from undertow.certify.ellipsoid_search import search_for
-from undertow.certify.lyapunov import LyapunovFunction
-from undertow.certify.verify import verify
-from undertow.errors import UndertowError
-from undertow.mechanism import FloatArray
-from undertow.verdict import Verdict
+from undertow.certify.claims.verify import verify
+from undertow.certify.region.lyapunov import LyapunovFunction
+from undertow.certify.surface.appendix import CASES, Constants, Reduced
+from undertow.certify.surface.ellipsoid_search import search_for
+from undertow.models import FloatArray
+from undertow.studies.paper.appendix_search import search_rate
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
 CASE = CASES[3]
@@ -319,7 +318,7 @@ ORACLES: dict[str, Callable[[Loop, Document], bool]] = {
 
 
 def region() -> Document:
-    from undertow.certify.motion import SurfaceMotion
+    from undertow.certify.region.motion import SurfaceMotion
 
     A = SurfaceMotion(RIG, CASE.surface).jacobian
     P = scipy.linalg.solve_continuous_lyapunov(A.T, -np.diag([30.0, 0.3, 3.0])) / 0.5

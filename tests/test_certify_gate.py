@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from undertow.base import InvalidInputError
 from undertow.cascade import Admission, cost_gate
-from undertow.certify.ellipsoid import TerminalEllipsoid
-from undertow.certify.ellipsoid_search import search_for
-from undertow.certify.gate import Evidence, Policy, assess, certified_gate
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
-from undertow.plan import Plan
-from undertow.sliding import singularity
+from undertow.certify.claims.gate import Evidence, Policy, assess, certified_gate
+from undertow.certify.surface.ellipsoid import TerminalEllipsoid
+from undertow.certify.surface.ellipsoid_search import search_for
+from undertow.law import Plan
+from undertow.law.sliding import singularity
+from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 GOOD = ut.Surface(-1, -1.59, 1.96, 12.1)
@@ -35,7 +35,7 @@ def singular_at(angle: float) -> ut.Surface:
     alpha_u = float(-M[1, 1] / M[0, 1] / np.cos(angle))
     surface = ut.Surface(-1, -1.0, alpha_u, 8 * alpha_u)
     assert float(singularity(RIG, surface.vector, [0.0, angle])) == pytest.approx(0, abs=1e-12)
-    assert ut.stability.stability_margin(RIG, surface) > 0
+    assert ut.law.stability.stability_margin(RIG, surface) > 0
     return surface
 
 
@@ -84,7 +84,7 @@ def test_bad_proposals_are_refused_and_the_run_converges() -> None:
     # No worse than the run that would have been without any proposal.
     alone = LOOP.simulate(RIG.state(phi=0.3), GOOD)
     assert run.time <= alone.duration + 1e-9
-    assert run.descent.min() >= -1e-9
+    assert run.lemma3_slack.min() >= -1e-9
 
 
 def test_each_applied_plan_has_its_verdict() -> None:
@@ -118,7 +118,7 @@ def test_the_switching_sequence_descends(goal: ut.Objective, surfaces: list[ut.S
     run = made.simulate(phi=0.3)
     assert run.reached
     assert len(set(run.surfaces)) > 1
-    assert run.descent.min() >= -1e-6 * run.cost
+    assert run.lemma3_slack.min() >= -1e-6 * run.cost
     assert run.cost <= run.updates[0].predicted * (1 + 1e-6)
 
 

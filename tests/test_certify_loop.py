@@ -11,26 +11,26 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.certification import loop_figure
-from undertow.certify.appendix import CASES
-from undertow.certify.batch import Interval
-from undertow.certify.loop import LoopMotion
-from undertow.certify.loop_claim import LoopClaim, run_tubes, start_tubes, verify_loop
-from undertow.certify.loop_held import HeldLoop
-from undertow.certify.loop_search import follow, prove_loop
-from undertow.certify.loop_terminal import TerminalSet, verify_terminal
-from undertow.certify.sampled import (
+from undertow.base import InvalidInputError
+from undertow.certify.closed_loop.claim import LoopClaim, run_tubes, start_tubes, verify_loop
+from undertow.certify.closed_loop.loop import LoopMotion
+from undertow.certify.closed_loop.sampled_data import SampledDataLoop
+from undertow.certify.closed_loop.search import follow, prove_loop
+from undertow.certify.closed_loop.terminal import TerminalSet, verify_terminal
+from undertow.certify.closed_loop.tube import bracket
+from undertow.certify.intervals.batch import Interval
+from undertow.certify.surface.appendix import CASES
+from undertow.certify.surface.sampled import (
     box_starts,
     ellipsoid_starts,
     failure_bound,
     sampled_extent,
     sampled_region,
 )
-from undertow.certify.tube import bracket
 from undertow.cli import app
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
-from undertow.sliding import ReachingLaw, SlidingModeLaw, Surface
+from undertow.law import ReachingLaw, SlidingModeLaw, Surface
+from undertow.models import FloatArray
+from undertow.studies.certification import loop_figure
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
 LAW = ReachingLaw()
@@ -235,7 +235,7 @@ def held_motion(x: FloatArray, period: float, count: int) -> FloatArray:
 def test_held_tubes_hold_the_motions_of_the_sampled_loop() -> None:
     """Far off, and through the edge of the layer; no room for a continuous law's motions."""
     edges = np.radians([0.8, 0.81, 25.0, 25.05])
-    held = HeldLoop(HELD)
+    held = SampledDataLoop(HELD)
     tubes = held.begin(start_tubes(HELD, "phi", edges).take(np.array([True, False, True])))
     x = np.zeros((20, 4))
     x[:, 1] = np.repeat(edges[::2], 10) + np.tile(np.linspace(0, 1, 10), 2) * np.repeat(

@@ -10,19 +10,18 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow.certify.appendix import CASES, Constants
-from undertow.certify.linear_program import minimise_linear
-from undertow.certify.lyapunov import LyapunovFunction, extent, first_crossing
-from undertow.certify.motion import Motion, SurfaceMotion, VectorField
-from undertow.certify.region import verify_region
-from undertow.certify.region_chart import natural_stretch
-from undertow.certify.region_report import motions, read_chains
-from undertow.certify.region_search import TIGHT, ProvedRegion, prove_region, search_region
-from undertow.certify.verify import reaches
-from undertow.errors import InvalidInputError, UnstableSurfaceError
-from undertow.mechanism import TIME
-from undertow.sliding import SlidingModeLaw
-from undertow.stability import sliding_matrix
+from undertow.base import InvalidInputError, UnstableSurfaceError
+from undertow.certify.claims.verify import reaches
+from undertow.certify.region.chart import natural_stretch
+from undertow.certify.region.lyapunov import LyapunovFunction, extent, first_crossing
+from undertow.certify.region.motion import Motion, SurfaceMotion, VectorField
+from undertow.certify.region.region import verify_region
+from undertow.certify.region.search import TIGHT, ProvedRegion, prove_region, search_region
+from undertow.certify.surface.appendix import CASES, Constants
+from undertow.certify.surface.linear_program import minimise_linear
+from undertow.law import SlidingModeLaw, sliding_matrix
+from undertow.models import TIME
+from undertow.studies.certification.region_report import motions, read_chains
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 
@@ -240,7 +239,7 @@ def test_branch_and_bound_alone_proves_no_set_that_is_too_large(
 
     A little inside it is proved, as a first function and as one around another.
     """
-    monkeypatch.setattr("undertow.certify.region._Proof._sampled_witness", lambda _: None)
+    monkeypatch.setattr("undertow.certify.region.region._Proof._sampled_witness", lambda _: None)
     x, y = sp.symbols("x y", real=True)
     motion = VectorField((x, y), (-y, x - (1 - x**2) * y))
     T = np.array([[1.0, 0.0], [0.6, 0.9]])
@@ -269,7 +268,7 @@ def test_a_set_with_a_ring_inside_that_motions_cannot_cross_is_not_proved(
 
     Only a set inside that holds the ring would do.
     """
-    monkeypatch.setattr("undertow.certify.region._Proof._sampled_witness", lambda _: None)
+    monkeypatch.setattr("undertow.certify.region.region._Proof._sampled_witness", lambda _: None)
     x = sp.Symbol("x", real=True)
     third, half = sp.Rational(3, 10), sp.Rational(6, 10)
     motion = VectorField((x,), (-x * (x**2 - third) * (x**2 - half),))

@@ -11,14 +11,19 @@ import scipy.linalg
 import sympy as sp
 
 import undertow as ut
+from undertow.base import InvalidInputError
 from undertow.certify import Verdict, closed_forms, hurwitz, nonsingular, reaching
-from undertow.certify.batch import Interval, IntervalArithmetic
-from undertow.certify.interval import ball, compile_outward, derivative_tape, exact_fraction
-from undertow.certify.surface import singular_distance
-from undertow.codegen import Tape
-from undertow.errors import InvalidInputError
-from undertow.sliding import ReachingLaw, SlidingModeLaw, singularity
-from undertow.stability import linearise, sliding_matrix, stability_margin
+from undertow.certify.intervals.batch import Interval, IntervalArithmetic
+from undertow.certify.intervals.interval import (
+    ball,
+    compile_outward,
+    derivative_tape,
+    exact_fraction,
+)
+from undertow.certify.surface.surface import singular_distance
+from undertow.law import ReachingLaw, SlidingModeLaw, linearise, sliding_matrix, stability_margin
+from undertow.law.sliding import singularity
+from undertow.symbolic import Tape
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 

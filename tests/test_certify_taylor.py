@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from undertow.certify.interval import ball, compile_outward
-from undertow.certify.taylor import TaylorProgram
-from undertow.certify.taylor_kernel import bounds, excluded
-from undertow.codegen import Tape
-from undertow.errors import InvalidInputError
+from undertow.base import InvalidInputError
+from undertow.certify.intervals.interval import ball, compile_outward
+from undertow.certify.intervals.taylor import TaylorProgram
+from undertow.certify.intervals.taylor_kernel import bounds, excluded
+from undertow.symbolic import Tape
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 

@@ -20,14 +20,14 @@ pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certi
 
 import undertow as ut
 from motions import Reference, holds
-from undertow.certify.batch import Interval, IntervalArithmetic
-from undertow.certify.interval import compile_outward
-from undertow.certify.loop import LoopMotion
-from undertow.certify.loop_held import HeldLoop
-from undertow.certify.loop_pieces import put_boxes
-from undertow.certify.tube import Tubes
-from undertow.codegen import Tape
-from undertow.mechanism import FloatArray
+from undertow.certify.closed_loop.loop import LoopMotion
+from undertow.certify.closed_loop.pieces import put_boxes
+from undertow.certify.closed_loop.sampled_data import SampledDataLoop
+from undertow.certify.closed_loop.tube import Tubes
+from undertow.certify.intervals.batch import Interval, IntervalArithmetic
+from undertow.certify.intervals.interval import compile_outward
+from undertow.models import FloatArray
+from undertow.symbolic import Tape
 
 LAW = ut.ReachingLaw()
 
@@ -379,7 +379,7 @@ class Loop:
         for k, h in enumerate(steps):
             tubes = Tubes.of(motion, z.T.copy(), np.zeros((size, 0, count)), zero)
             if held:
-                tubes, _ = HeldLoop(motion).sample(HeldLoop(motion).begin(tubes))
+                tubes, _ = SampledDataLoop(motion).sample(SampledDataLoop(motion).begin(tubes))
             tubes, _, _, moved = tubes.advance(h)
             hull = tubes.hull[:size]
             for lane in np.flatnonzero(moved):

@@ -9,9 +9,9 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow.agreement import QUICK
-from undertow.check import check_mechanism
-from undertow.errors import ModelError
+from undertow.base import ModelError
+from undertow.checks import check_mechanism
+from undertow.checks.agreement import QUICK
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.chain import chain_energies
 

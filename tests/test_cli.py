@@ -17,10 +17,10 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import undertow as ut
+from undertow.base import InvalidInputError
 from undertow.cli import app
-from undertow.errors import InvalidInputError
-from undertow.inputs import mechanism_named, objective_named, parse_start, parse_surface
-from undertow.report import ended
+from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
+from undertow.cli.report import ended
 
 runner = CliRunner()
 RIG = "rotary_pendulum"

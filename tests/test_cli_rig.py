@@ -99,7 +99,7 @@ import os
 from pathlib import Path
 import numpy as np
 from undertow import mechanisms
-from undertow.rig import IdealRig
+from undertow.plants import IdealRig
 
 class Arm(IdealRig):
     def __init__(self):
@@ -154,7 +154,7 @@ LEAVES = """
 import sys
 import numpy as np
 from undertow import mechanisms
-from undertow.rig import IdealRig
+from undertow.plants import IdealRig
 
 class Arm(IdealRig):
     count = 0
@@ -186,7 +186,7 @@ def test_a_driver_that_leaves_the_interpreter_does_not_choose_the_exit_code(
 DRIVERS = """
 from dataclasses import dataclass
 import numpy as np
-from undertow.rig import Measurement
+from undertow.plants import Measurement
 
 class NoRead:
     period = 0.001
@@ -214,7 +214,7 @@ class Port(Three):
     ("name", "words"),
     [
         ("NoRead", "without read"),
-        ("Three", "q of shape (3,), must be undertow.rig.Measurement with q = (theta, phi)"),
+        ("Three", "q of shape (3,), must be undertow.plants.Measurement with q = (theta, phi)"),
         ("Quick", "--period 0.0005"),
         ("Dead", "unplugged"),
         ("Port", "no such port"),
@@ -237,8 +237,8 @@ def test_screens_fit_80_columns() -> None:
     from undertow.runtime import tables
     from undertow.runtime.drill_live import Killed, LiveOutcome
     from undertow.runtime.failing import Fault
-    from undertow.runtime.loop import Report
     from undertow.runtime.systematic import Case
+    from undertow.runtime.verdict import Report
 
     report = Report(steps=60_000, missed=47, asleep=44, stopped_by="sensor 'theta' lost " * 5)
     report.events = [(0.1, "rig", "read: OSError: [Errno 5] Input/output error " * 3)] * 9

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.delay import bench_gate, delay_gate, delay_margin, feedback, noise_share
-from undertow.errors import InvalidInputError
-from undertow.inner_loop import InnerLoop
-from undertow.plan import Plan
-from undertow.practice import NOISE, estimator_for, reaching_for
-from undertow.rig import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
+from undertow.base import InvalidInputError
+from undertow.cascade import noise_share, robustness_gate
+from undertow.cascade.robustness import delay_gate, delay_margin, feedback
+from undertow.law import InnerLoop, Plan
+from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
+from undertow.runtime.controller_defaults import NOISE, estimator_for, reaching_for
 
 #: Nearly singular (37): excellent on the model, enormous gains.
 KEEN = ut.Surface(-1, -3.561, 1.051, 8.234)
@@ -77,10 +77,10 @@ def test_what_an_estimator_does_not_know_comes_out_as_input(
     assert noise_share(arm, base, P) < 0.2 < noise_share(arm, KEEN, P)
     loop, x = ut.ClosedLoop(arm, ut.MinimumTime()), arm.state(phi=0.1)
     plans = Plan.of(base), Plan.of(KEEN)
-    refused = bench_gate(0.001, 0.0, covariance=P)(loop, *plans, x, 60.0)
+    refused = robustness_gate(0.001, 0.0, covariance=P)(loop, *plans, x, 60.0)
     assert not refused.accepted
     assert "noise" in refused.reason
-    assert bench_gate(0.001, 0.0, covariance=P, noise=9.0)(loop, *plans, x, 60.0).accepted
+    assert robustness_gate(0.001, 0.0, covariance=P, noise=9.0)(loop, *plans, x, 60.0).accepted
 
 
 def test_the_boundary_layer_is_as_thick_as_the_sensors_need(arm: ut.Mechanism) -> None:
@@ -102,12 +102,12 @@ def test_a_weaker_motor_must_do(arm: ut.Mechanism) -> None:
     assert better is not None
     loop = ut.ClosedLoop(arm)
     old = Plan.of(first)
-    assert bench_gate(0.001, 0.0)(loop, old, better, edge, 60.0).accepted
-    refused = bench_gate(0.001, 0.2)(loop, old, better, edge, 60.0)
+    assert robustness_gate(0.001, 0.0)(loop, old, better, edge, 60.0).accepted
+    refused = robustness_gate(0.001, 0.2)(loop, old, better, edge, 60.0)
     assert not refused.accepted
     assert "less input" in refused.reason
     near = arm.state(phi=ut.deg(10))
-    assert bench_gate(0.001, 0.2)(replace(loop), old, old, near, 60.0).accepted
+    assert robustness_gate(0.001, 0.2)(replace(loop), old, old, near, 60.0).accepted
 
 
 def test_senseless_periods_are_refused(arm: ut.Mechanism, base: ut.Surface) -> None:

@@ -14,16 +14,16 @@ from typer.testing import CliRunner
 import undertow as ut
 from agreements import named
 from undertow.cli import app
-from undertow.derivation import (
+from undertow.display.derivation import (
     Derivation,
     derivation,
     hurwitz_minors,
     polynomial_matrix,
 )
-from undertow.formulas import plain, readable, tex
+from undertow.display.formulas import plain, readable, tex
+from undertow.law import sliding_matrix, stability_margin
+from undertow.law.sliding import singularity
 from undertow.mechanisms import LIBRARY
-from undertow.sliding import singularity
-from undertow.stability import sliding_matrix, stability_margin
 
 NAMES = sorted(LIBRARY)
 SIGMA = sp.Symbol("sigma", real=True)

@@ -11,8 +11,8 @@ import pytest
 
 import undertow as ut
 from undertow.cascade import CascadeState
-from undertow.plan import Plan
-from undertow.rig import IdealRig
+from undertow.law import Plan
+from undertow.plants import IdealRig
 from undertow.runtime import InlineWorker, Recipe, Runtime, SimulatedClock, respond
 from undertow.runtime.cases import CASES, Case
 from undertow.runtime.drill import Outcome, drill, drill_recipe, run_case
@@ -95,7 +95,7 @@ def test_the_witness_sees_what_is_wrong() -> None:
         assert not witness.faults
         try:
             witness.write(np.array([wrong]))
-        except ut.errors.InvalidInputError:
+        except ut.base.errors.InvalidInputError:
             assert np.isnan(wrong)  # no rig takes that
         assert word in witness.faults[0]
 

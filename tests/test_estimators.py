@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.errors import InvalidInputError
+from undertow.base import InvalidInputError
 from undertow.estimators import (
     Estimator,
     FilteredDerivative,
@@ -18,8 +18,8 @@ from undertow.estimators import (
     SuperTwisting,
     drive,
 )
-from undertow.inner_loop import InnerLoop
-from undertow.rig import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
+from undertow.law import InnerLoop
+from undertow.plants import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
 
 PERIOD = 1e-3
 

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 import undertow as ut
 from undertow.cli import app
-from undertow.rig import check_rig
+from undertow.plants import check_rig
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX")

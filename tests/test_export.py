@@ -20,16 +20,14 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.cli import app
-from undertow.codegen import Tape
-from undertow.codegen.c99 import C99Emitter, literal
-from undertow.errors import (
+from undertow.base import (
     ArtefactError,
     InvalidInputError,
     MissingExtraError,
     ModelError,
     UnstableSurfaceError,
 )
+from undertow.cli import app
 from undertow.export import (
     Build,
     DerivativeStep,
@@ -41,17 +39,17 @@ from undertow.export import (
     Verdict,
     files,
 )
-from undertow.export.controller import plan_numbers
 from undertow.export.host import FLAGS, tool
 from undertow.export.loop import run_on_rig
+from undertow.export.plans import plan_numbers
 from undertow.export.routh import lay_polynomial
 from undertow.export.seal import seals
 from undertow.export.upsets import upset_every_bit
 from undertow.export.vectors import run_positions
+from undertow.law import Plan, sliding_matrix, stability_margin
 from undertow.mechanisms import LIBRARY
-from undertow.plan import Plan
-from undertow.rig import RealisticRig, plausible_rig, srv02_rig
-from undertow.stability import sliding_matrix, stability_margin
+from undertow.plants import RealisticRig, plausible_rig, srv02_rig
+from undertow.symbolic import C99Emitter, Tape, literal
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 
@@ -714,7 +712,7 @@ def test_offers_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
             a_u, l_a = entries.get("alpha_u", a_u), entries.get("lambda_a", l_a)
             return f"{start} {a_a!r} {l_a!r} {a_u!r} {l_u!r} {eta!r} {layer!r}"
 
-        singular = -1.0 / float(ut.sliding.coupling(rig, np.zeros(2))[0, 0])
+        singular = -1.0 / float(ut.law.sliding.coupling(rig, np.zeros(2))[0, 0])
         assert offer(row(alpha_u=singular)) is Verdict.INVALID
         assert offer(row(lambda_a=math.nan)) is Verdict.INVALID
         assert offer(row(eta=0.0)) is Verdict.INVALID
@@ -743,7 +741,10 @@ def test_a_plan_is_sealed_by_its_sender_and_damage_on_the_way_is_noticed(tmp_pat
     with Build(controller, tmp_path).start() as process:
 
         def offer(
-            number: int, starts: list[int], rows: list[ut.mechanism.FloatArray], checks: list[int]
+            number: int,
+            starts: list[int],
+            rows: list[ut.models.mechanism.FloatArray],
+            checks: list[int],
         ) -> Verdict:
             words = ["p", str(number), str(len(rows))]
             for start, row in zip(starts, rows, strict=True):
@@ -1028,7 +1029,7 @@ def test_without_control_the_rig_falls(tmp_path: Path) -> None:
     """``held`` is no matter of course: on a rig whose input is cut the pendulum falls."""
     controller = exported()
     bench = srv02_rig()
-    dead = replace(bench, amplifiers={"voltage": ut.rig.Amplifier(1e-9)})
+    dead = replace(bench, amplifiers={"voltage": ut.plants.Amplifier(1e-9)})
     with Build(controller, tmp_path).start() as process:
         assert not run_on_rig(process, RealisticRig(dead, seed=0), 2.0).held
 

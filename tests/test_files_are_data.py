@@ -17,13 +17,19 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow import modelling
+from undertow.base import (
+    ArtefactError,
+    InvalidInputError,
+    ModelError,
+    UndertowError,
+    parse_json,
+    read_file,
+)
 from undertow.bring_up.coverage import coverage
 from undertow.cascade import CascadeState
 from undertow.cli import app
-from undertow.errors import ArtefactError, InvalidInputError, ModelError, UndertowError
-from undertow.files import parse_json, read_file
-from undertow.plan import Plan
+from undertow.law import Plan
+from undertow.models import importers as modelling
 from undertow.runtime import (
     Columns,
     InlineWorker,
@@ -36,7 +42,7 @@ from undertow.runtime import (
     replay,
 )
 from undertow.runtime.slow import respond
-from undertow.trials.ledger import Ledger
+from undertow.studies.trials.ledger import Ledger
 
 MEMORY = CascadeState(Plan.of(ut.Surface(alpha_a=-1, lambda_a=-0.25, alpha_u=1.6, lambda_u=17.3)))
 
@@ -273,7 +279,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "log": read_log,
     "replay": replay,
     "certificate": lambda path: __import__(
-        "undertow.certify.certificate", fromlist=["x"]
+        "undertow.certify.claims.certificate", fromlist=["x"]
     ).read_certificate(path),
     "urdf": modelling.from_urdf,
     "mjcf": modelling.from_mjcf,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.errors import InvalidInputError
-from undertow.inner_loop import InnerLoop
+from undertow.base import InvalidInputError
+from undertow.law import InnerLoop
 
 
 @pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link"])

@@ -26,10 +26,10 @@ from support import (
     random_surface,
     runge_kutta,
 )
-from undertow.codegen import block, rows, store
-from undertow.kernel import lay_loop
-from undertow.mechanism import TIME, FloatArray
-from undertow.sliding import Switching
+from undertow.closed_loop.kernel import build_loop_graph
+from undertow.law import Switching
+from undertow.models import TIME, FloatArray
+from undertow.symbolic import block, rows, store
 
 #: States to the values of all formulas there.
 Evaluate = Callable[[FloatArray], dict[str, FloatArray]]
@@ -100,7 +100,7 @@ def test_compiled_formulas_equal_sympys(evaluate: Evaluate, name: str, rig: ut.M
     x = random_states(rig, 48, seed=2)
     x[:3, 1] = 0.0
     x[3, 1] = x[3, 3]  # on the seam of the cases
-    formula = sp.sympify(FORMULAS[name](ut.objective.Names(rig))).subs(rig.substitution)
+    formula = sp.sympify(FORMULAS[name](ut.objective.objective.Names(rig))).subs(rig.substitution)
     expected = [float(formula.subs(dict(zip(rig.x, row, strict=True)))) for row in x]
     np.testing.assert_allclose(evaluate(x)[name], expected, rtol=1e-13, atol=1e-14)
 
@@ -219,10 +219,10 @@ def test_changed_numbers_need_no_new_kernel_and_changed_formulas_do(rig: ut.Mech
 SOURCE_HASH = """
 import hashlib
 import undertow as ut
-from undertow.codegen import block
-from undertow.kernel import lay_loop
+from undertow.symbolic import block
+from undertow.closed_loop.kernel import build_loop_graph
 rig = ut.mechanisms.rotary_pendulum()
-program = lay_loop(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")
+program = build_loop_graph(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")
 print(hashlib.sha256(block.block_source(program, sampled=False, header="").encode()).hexdigest())
 """
 
@@ -238,7 +238,7 @@ def test_source_does_not_depend_on_the_order_of_hashing() -> None:
         check=True,
     ).stdout.strip()
     rig = ut.mechanisms.rotary_pendulum()
-    program = lay_loop(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")
+    program = build_loop_graph(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")
     source = block.block_source(program, sampled=False, header="")
     assert hashlib.sha256(source.encode()).hexdigest() == printed
 
@@ -247,7 +247,7 @@ def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
     """Inside a lane loop everything is an expression: that is what lets it be vectorised."""
     rig = ut.mechanisms.rotary_pendulum()
     source = block.block_source(
-        lay_loop(rig, None, ut.MinimumEnergy(), "saturation"), sampled=False, header=""
+        build_loop_graph(rig, None, ut.MinimumEnergy(), "saturation"), sampled=False, header=""
     )
     lines = source.splitlines()
     heads = [i for i, line in enumerate(lines) if line.strip() == f"for i in range({rows.LANES}):"]

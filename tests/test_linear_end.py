@@ -11,15 +11,15 @@ import pytest
 import scipy.linalg
 
 import undertow as ut
-from undertow.cascade import TAIL
-from undertow.codegen.rows import LANES
-from undertow.mechanism import FloatArray
-from undertow.rollout import ClosedLoop
-from undertow.stability import sliding_matrix
-from undertow.tail import LinearEnd, Prepared
+from undertow.cascade.cascade import TAIL
+from undertow.closed_loop import ClosedLoop
+from undertow.closed_loop.terminal_model import Prepared, TerminalLinearModel
+from undertow.law import sliding_matrix
+from undertow.models import FloatArray
+from undertow.symbolic import LANES
 
 
-def _prepared(loop: ClosedLoop, spread: float) -> tuple[Prepared, LinearEnd]:
+def _prepared(loop: ClosedLoop, spread: float) -> tuple[Prepared, TerminalLinearModel]:
     """Prepare the ends of a block of surfaces around the designed one."""
     rig, rng = loop.mechanism, np.random.default_rng(3)
     base = ut.first_surface(rig).normalised().vector

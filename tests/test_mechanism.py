@@ -23,9 +23,9 @@ from support import (
     random_states,
     runge_kutta,
 )
-from undertow.codegen import Tape
-from undertow.errors import InvalidInputError, ModelError, UndertowError
-from undertow.mechanism import TIME, FloatArray
+from undertow.base import InvalidInputError, ModelError, UndertowError
+from undertow.models import TIME, FloatArray
+from undertow.symbolic import Tape
 
 shapes = pytest.mark.parametrize(("n", "m"), SHAPES)
 

@@ -12,12 +12,12 @@ import pytest
 
 import undertow as ut
 from undertow import mechanisms
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
+from undertow.base import InvalidInputError
+from undertow.law import stability_margin
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.rotary_pendulum import PARAMETER_SETS
 from undertow.mechanisms.scenes import mujoco_scene
-from undertow.stability import stability_margin
+from undertow.models import FloatArray
 
 NAMES = sorted(LIBRARY)
 

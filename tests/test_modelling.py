@@ -11,12 +11,12 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow import modelling
-from undertow.check import check_mechanism
-from undertow.errors import InvalidInputError, ModelError
-from undertow.mechanism import FloatArray
+from undertow.base import InvalidInputError, ModelError
+from undertow.checks import check_mechanism
 from undertow.mechanisms.chain import chain_energies
-from undertow.modelling.coordinates import exact_angle
+from undertow.models import FloatArray
+from undertow.models import importers as modelling
+from undertow.models.importers.coordinates import exact_angle
 
 TIGHT = 1e-10
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow import modelling
-from undertow.check import check_mechanism
-from undertow.errors import ArtefactError, InvalidInputError, ModelError, UndertowError
-from undertow.mechanism import FloatArray
+from undertow.base import ArtefactError, InvalidInputError, ModelError, UndertowError
+from undertow.checks import check_mechanism
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.mechanisms.scenes import mujoco_scene
-from undertow.modelling.python_file import in_a_file
-from undertow.rig.python_file import rig_from_file
+from undertow.models import FloatArray
+from undertow.models import importers as modelling
+from undertow.models.importers.python_file import in_a_file
+from undertow.plants.python_file import rig_from_file
 
 TIGHT = 1e-10
 

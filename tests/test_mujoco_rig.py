@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.errors import InvalidInputError
+from undertow.base import InvalidInputError
 from undertow.mechanisms.scenes import Scene, mujoco_scene
-from undertow.rig import IdealRig, MuJoCoRig
+from undertow.plants import IdealRig, MuJoCoRig
 
 pytest.importorskip("mujoco")
 
@@ -127,6 +127,6 @@ def test_a_target_with_another_name_is_refused() -> None:
     "name", ["rotary_pendulum", "cart_pendulum", "double_pendulum_on_a_cart", "acrobot"]
 )
 def test_the_cascade_balances_in_mujoco_without_retuning(name: str) -> None:
-    from undertow.trials.upright import engine_trial
+    from undertow.studies.trials.upright import engine_trial
 
     assert engine_trial(ut.mechanisms.LIBRARY[name](), seconds=6.0, budget=128).outcome.balanced

@@ -13,19 +13,18 @@ from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 
 import undertow as ut
 from support import interpreted
-from undertow import modelling
-from undertow.animation import evaluator
-from undertow.check import check_mechanism
-from undertow.derivation import derivation
-from undertow.errors import InvalidInputError, ModelError, UndertowError
+from undertow.base import InvalidInputError, ModelError, UndertowError
+from undertow.checks import check_mechanism
+from undertow.display.animation import evaluator
+from undertow.display.derivation import derivation
+from undertow.display.sketches import Line, Sketch
 from undertow.estimators import KalmanFilter
-from undertow.mechanism import TIME
+from undertow.law import has_linear_model, linearise
 from undertow.mechanisms import LIBRARY
-from undertow.objective import Names
+from undertow.models import TIME, is_smooth, kinks, require_smooth
+from undertow.models import importers as modelling
+from undertow.objective.objective import Names
 from undertow.runtime.recipe import Recipe
-from undertow.sketches import Line, Sketch
-from undertow.stability import has_linear_model, linearise
-from undertow.validity import is_smooth, kinks, require_smooth
 
 MICRO, MU = "\u00b5", "\u03bc"  # of the keyboard, and Greek
 ANGLE = sp.Symbol("phi", real=True)

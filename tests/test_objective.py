@@ -11,8 +11,8 @@ import sympy as sp
 
 import undertow as ut
 from support import interpreted, random_mechanism
-from undertow.errors import InvalidInputError
-from undertow.objective import Names
+from undertow.base import InvalidInputError
+from undertow.objective.objective import Names
 
 
 def test_minimum_energy_is_the_sum_of_squared_inputs(rig: ut.Mechanism) -> None:

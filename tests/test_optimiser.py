@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import undertow as ut
-from undertow.errors import InfeasibleError, InvalidInputError
-from undertow.paper import CASES
-from undertow.proposal import motion_margins
+from undertow.base import InfeasibleError, InvalidInputError
+from undertow.optimiser.proposal import motion_margins
+from undertow.studies.paper import CASES
 
 OBJECTIVES = {"energy": ut.MinimumEnergy(), "time": ut.MinimumTime()}
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow import paper
-from undertow.paper import (
+from undertow.studies import paper
+from undertow.studies.paper import (
     CASES,
     CONDITIONS,
     OBJECTIVES,
@@ -23,9 +23,9 @@ from undertow.paper import (
     printed_motion,
     singular_angle,
 )
-from undertow.paper.experiment import own_optimum
-from undertow.paper.repeats import noisy_repeats
-from undertow.paper.tables import COLUMNS, reasons
+from undertow.studies.paper.experiment import own_optimum
+from undertow.studies.paper.repeats import noisy_repeats
+from undertow.studies.paper.tables import COLUMNS, reasons
 
 AS_PRINTED = ut.mechanisms.rotary_pendulum()
 
@@ -176,7 +176,7 @@ def test_printed_cascade_outlasts_the_printed_horizon() -> None:
 def test_bound_at_40_degrees_is_above_the_printed_totals() -> None:
     """d_e = 0.073: no control costs as little as 17.6 or 15.7 V² s from 40°."""
     pytest.importorskip("casadi")
-    from undertow.paper.experiment import lower_bound
+    from undertow.studies.paper.experiment import lower_bound
 
     bound = lower_bound(CONDITIONS["as-printed-40"], "energy")
     assert bound.value is not None
@@ -300,7 +300,7 @@ def test_missing_bound_says_what_to_install(
     """Without CasADi the column says so in one line and nothing else is lost."""
     import sys
 
-    from undertow.paper.experiment import lower_bound
+    from undertow.studies.paper.experiment import lower_bound
 
     monkeypatch.setitem(sys.modules, "casadi", None)
     missing = lower_bound(CONDITIONS["matched"], "time")

@@ -13,7 +13,7 @@ import pytest
 import undertow as ut
 from runs import RECIPE
 from undertow.cascade import Admission
-from undertow.plan import Plan
+from undertow.law import Plan, ReachingLaw, first_surface, sliding_matrix
 from undertow.runtime import (
     Columns,
     Controller,
@@ -27,8 +27,6 @@ from undertow.runtime import (
 from undertow.runtime.faults import FaultyWorker
 from undertow.runtime.routh import PlanTest, is_hurwitz
 from undertow.runtime.slow import Answer, lanes_of
-from undertow.sliding import ReachingLaw
-from undertow.stability import first_surface, sliding_matrix
 
 MECHANISMS = (
     "rotary_pendulum", "cart_pendulum", "overhead_crane", "pendubot", "acrobot",

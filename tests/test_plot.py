@@ -8,9 +8,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import undertow as ut
-from undertow import plot
-from undertow.errors import InvalidInputError
-from undertow.paper import CASES, PRINTED
+from undertow.base import InvalidInputError
+from undertow.display import plot
+from undertow.studies.paper import CASES, PRINTED
 
 
 @pytest.fixture(scope="module")

@@ -52,13 +52,22 @@ def test_commands_exist() -> None:
             command.make_context("", words)
 
 
-def test_the_map_names_rooms_that_are_there_and_every_page() -> None:
-    """The table of rooms has modules and packages alone; each page has its link."""
-    table = README.split("The rooms import downwards only:")[1]
-    named = set(re.findall(r"`(\w+)`", table))
+def test_the_map_names_every_package_in_the_order_of_imports_and_every_page() -> None:
+    """The first table has each package once, above what it imports; the second's files exist."""
+    first, second = README.split("import downwards only")[1].split("To change something")
     package = ROOT / "src" / "undertow"
-    rooms = {path.stem for path in package.iterdir() if not path.name.startswith("_")}
-    assert named <= rooms
+    rows = [re.findall(r"`(\w+)`", row.split("|")[1]) for row in first.splitlines() if "|" in row]
+    named = [name for row in rows for name in row]
+    assert sorted(named) == sorted(path.parent.name for path in package.glob("*/__init__.py"))
+    level = {name: k for k, row in enumerate(rows) for name in row}
+    for name in named:
+        text = "".join(path.read_text(encoding="utf-8") for path in (package / name).rglob("*.py"))
+        for other in set(re.findall(r"^\s*from undertow\.(\w+)", text, re.MULTILINE)) - {name}:
+            assert level[name] < level[other], (name, other)
+    files = re.findall(r"`([\w/]+\.py)`", second)
+    assert files
+    for file in files:
+        assert (package / file).is_file()
     for page in (ROOT / "docs").glob("*.md"):
         assert f"docs/{page.name}" in README
 

@@ -11,9 +11,9 @@ import sympy as sp
 
 import undertow as ut
 from support import interpreted
+from undertow.base import InvalidInputError, UndertowError, UnstableSurfaceError
 from undertow.cascade import Update
-from undertow.errors import InvalidInputError, UndertowError, UnstableSurfaceError
-from undertow.mechanism import TIME
+from undertow.models import TIME
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -76,7 +76,7 @@ def test_descent_is_undefined_where_a_prediction_is() -> None:
         Update(0.1 * k, nothing, nothing, nothing, nothing, predicted, 1.0)
         for k, predicted in enumerate((9.0, 7.5, np.inf, np.inf, 5.0, 4.0))
     )
-    slack = ut.Run(nothing, updates).descent
+    slack = ut.Run(nothing, updates).lemma3_slack
     np.testing.assert_array_equal(slack, [0.5, np.nan, np.nan, np.nan, 0.0])
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.errors import InvalidInputError
-from undertow.inner_loop import InnerLoop
-from undertow.rig import (
+from undertow.base import InvalidInputError
+from undertow.law import InnerLoop
+from undertow.plants import (
     Amplifier,
     Backlash,
     Bench,

@@ -21,10 +21,10 @@ from support import (
     random_surface,
     runge_kutta,
 )
-from undertow.errors import InvalidInputError
-from undertow.mechanism import TIME, FloatArray
-from undertow.motion import Batch
-from undertow.sliding import reaching_time_bound
+from undertow.base import InvalidInputError
+from undertow.closed_loop.trajectory import Batch
+from undertow.law.sliding import reaching_time_bound
+from undertow.models import TIME, FloatArray
 
 PUSH = ut.Parameter("push", 0.05, "N m", "size of the disturbance")
 

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 
 import undertow as ut
 from runs import RECIPE
+from undertow.base import InvalidInputError
 from undertow.cascade import Admission, CascadeState
-from undertow.errors import InvalidInputError
-from undertow.inner_loop import law_module
-from undertow.plan import Plan
-from undertow.rig import Measurement, Push, RealisticRig
+from undertow.law import Plan, law_module
+from undertow.plants import Measurement, Push, RealisticRig
 from undertow.runtime import (
     Command,
     Controller,

@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from undertow.base import ArtefactError, ResourceError, UndertowError
 from undertow.cascade import CascadeState
-from undertow.errors import ArtefactError, ResourceError, UndertowError
-from undertow.plan import Plan
+from undertow.law import Plan
 from undertow.runtime import (
     Columns,
     InlineWorker,
@@ -129,8 +129,8 @@ def test_same_seed_same_log(logged: Path, tmp_path: Path) -> None:
 HASHED = """
 import hashlib
 import undertow as ut
-from undertow.cascade import CascadeState
-from undertow.plan import Plan
+from undertow.cascade.cascade import CascadeState
+from undertow.law.schedule import Plan
 from undertow.runtime import Command, Inputs, Recipe
 recipe = Recipe(rig="realistic", start=(0.0, 0.2, 0.0, 0.0))
 surface = ut.Surface(alpha_a=-1, lambda_a=-0.25, alpha_u=1.6, lambda_u=17.3)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from runs import RECIPE
+from undertow.base import InvalidInputError
 from undertow.cascade import CascadeState
-from undertow.errors import InvalidInputError
-from undertow.rig import Measurement, RealisticRig
+from undertow.plants import Measurement, RealisticRig
 from undertow.runtime import (
     Columns,
     Controller,

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from runs import RECIPE
+from undertow.base import ArtefactError, ResourceError
 from undertow.cascade import CascadeState
-from undertow.errors import ArtefactError, ResourceError
-from undertow.rig import Measurement, OutputOnError
+from undertow.plants import Measurement, OutputOnError
 from undertow.runtime import (
     Columns,
     Controller,
@@ -34,7 +34,7 @@ from undertow.runtime import (
     replay,
 )
 from undertow.runtime.health import RigClock, Share
-from undertow.runtime.keeper import KeptRig
+from undertow.runtime.keeper import SupervisedRig
 from undertow.runtime.session import session
 from undertow.runtime.settings import Settings
 from undertow.runtime.verdict import EXIT_CODES
@@ -533,13 +533,13 @@ LIMITS, SLEW = np.array([15.0]), np.array([7.5])
 def test_a_keeper_says_that_its_rig_did_not_take_zero() -> None:
     """What it writes itself has nobody who sees it fail: closing says so."""
     never = Device(write=fails(lambda k: k > 1, OSError("bus")))
-    rig = KeptRig(lambda: never, 1e-3, LIMITS, SLEW)
+    rig = SupervisedRig(lambda: never, 1e-3, LIMITS, SLEW)
     rig.write(np.array([5.0]))
     time.sleep(0.05)
     with pytest.raises(OutputOnError, match="did not take an output of zero: OSError: bus"):
         rig.close()
     rig.close()  # once is enough
-    shut = KeptRig(lambda: Device(close=OSError("stuck")), 1e-3, LIMITS, SLEW)
+    shut = SupervisedRig(lambda: Device(close=OSError("stuck")), 1e-3, LIMITS, SLEW)
     with pytest.raises(OSError, match=r"^stuck$") as told:
         shut.close()
     assert not isinstance(told.value, OutputOnError)
@@ -547,14 +547,16 @@ def test_a_keeper_says_that_its_rig_did_not_take_zero() -> None:
 
 def test_what_failed_in_a_keeper_names_its_kind_once() -> None:
     """The loop shows an error with its kind; the keeper had shown it so before."""
-    rig = KeptRig(lambda: Device(write=fails(lambda _: True, OSError("bus"))), 1e-3, LIMITS, SLEW)
+    rig = SupervisedRig(
+        lambda: Device(write=fails(lambda _: True, OSError("bus"))), 1e-3, LIMITS, SLEW
+    )
     rig.write(np.array([5.0]))
     rig.read()
     with pytest.raises(OSError, match=r"^bus$"):
         rig.write(np.array([5.0]))
     with pytest.raises(OutputOnError, match=r"^the device did not take .* zero: OSError: bus$"):
         rig.close()
-    on = KeptRig(lambda: Device(close=OutputOnError("relay stuck")), 1e-3, LIMITS, SLEW)
+    on = SupervisedRig(lambda: Device(close=OutputOnError("relay stuck")), 1e-3, LIMITS, SLEW)
     with pytest.raises(OutputOnError, match=r"^relay stuck$"):
         on.close()
 
@@ -577,7 +579,7 @@ def test_a_keeper_whose_rig_hangs_is_ended_and_what_is_known_is_told(
         (lambda: Device(write=hang), OutputOnError, "is not known"),
         (Hanging, OSError, "does not come to an end"),
     ):
-        kept = KeptRig(rig, 1e-3, LIMITS, SLEW)
+        kept = SupervisedRig(rig, 1e-3, LIMITS, SLEW)
         kept.write(np.array([0.0]))
         kept.write(np.array([0.0]))
         time.sleep(0.05)
@@ -591,7 +593,9 @@ def test_a_keeper_whose_rig_hangs_is_ended_and_what_is_known_is_told(
 
 def test_who_only_writes_to_a_keeper_is_told_what_came_of_it() -> None:
     """After a safe stop nothing is read any more: an early failure must not hide that zero came."""
-    rig = KeptRig(lambda: Device(write=fails(lambda k: k < 20, OSError("bus"))), 1e-3, LIMITS, SLEW)
+    rig = SupervisedRig(
+        lambda: Device(write=fails(lambda k: k < 20, OSError("bus"))), 1e-3, LIMITS, SLEW
+    )
     failed = 0
     try:
         rig.write(np.zeros(1))
@@ -612,7 +616,7 @@ def test_who_only_writes_to_a_keeper_is_told_what_came_of_it() -> None:
 
 def test_a_keeper_that_is_gone_leaves_the_output_unknown(controller: Controller) -> None:
     """Killed from outside: the run says that nobody knows whether the output is at zero."""
-    rig = KeptRig(RECIPE.make_rig, 1e-3, LIMITS, SLEW)
+    rig = SupervisedRig(RECIPE.make_rig, 1e-3, LIMITS, SLEW)
     worker = background_worker(RECIPE.respond, processes=0)
     runtime = Runtime(controller, rig, worker)
     honest, calls = rig.write, count(1)
@@ -635,7 +639,7 @@ def test_a_rig_that_cannot_be_made_is_refused_with_its_own_condition() -> None:
         raise ArtefactError("port", value="no such port", remedy="Plug it in")
 
     with pytest.raises(ArtefactError, match=r"port: got no such port\. Plug it in"):
-        KeptRig(make, 1e-3, LIMITS, SLEW)
+        SupervisedRig(make, 1e-3, LIMITS, SLEW)
 
 
 def test_the_first_reading_of_a_keeper_is_not_an_old_one() -> None:
@@ -645,7 +649,7 @@ def test_the_first_reading_of_a_keeper_is_not_an_old_one() -> None:
         def read(self) -> Measurement:
             return Measurement(time.perf_counter(), np.zeros(2))
 
-    rig = KeptRig(Moving, 1e-3, LIMITS, SLEW)
+    rig = SupervisedRig(Moving, 1e-3, LIMITS, SLEW)
     try:
         time.sleep(0.2)
         now = time.perf_counter()

@@ -12,13 +12,13 @@ import pytest
 
 from runs import RECIPE
 from undertow.cascade import CascadeState
-from undertow.rig import Measurement
+from undertow.plants import Measurement
 from undertow.runtime import (
     background_worker,
     respond,
 )
 from undertow.runtime.faults import Witness
-from undertow.runtime.keeper import QUEUE, KeptRig
+from undertow.runtime.keeper import QUEUE, SupervisedRig
 from undertow.runtime.slow import Answer, Request
 
 
@@ -89,7 +89,7 @@ def test_a_keeper_brings_the_output_to_zero_when_its_controller_falls_silent(
             with written.open("a") as file:
                 file.write(f"{float(u[0])} {len(self.faults)}\n")
 
-    rig = KeptRig(lambda: Watched(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew)
+    rig = SupervisedRig(lambda: Watched(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew)
     try:
         first = rig.read()
         rig.write(np.array([5.0]))
@@ -116,7 +116,7 @@ def test_a_keeper_that_was_held_up_applies_the_newest_output_alone(tmp_path: Pat
             with written.open("a") as file:
                 file.write(f"{float(u[0])}\n")
 
-    rig = KeptRig(lambda: Told(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew)
+    rig = SupervisedRig(lambda: Told(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew)
     try:
         pid = rig.process.pid or 0
         assert os.getsid(pid) != os.getsid(0)
@@ -158,7 +158,9 @@ def test_a_keeper_outlives_a_rig_that_fails_and_says_so() -> None:
                 raise OSError(message)
             super().write(u)
 
-    rig = KeptRig(lambda: Failing(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew, silence=9.0)
+    rig = SupervisedRig(
+        lambda: Failing(RECIPE.make_rig(), limits, slew), 1e-3, limits, slew, silence=9.0
+    )
 
     def read() -> Measurement:
         assert rig._pipe.poll(10.0)

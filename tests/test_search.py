@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undertow.errors import InvalidInputError
-from undertow.search import CMAES, FloatArray, minimise
+from undertow.base import InvalidInputError
+from undertow.optimiser import CMAES
+from undertow.optimiser.cma_es import FloatArray, minimise
 
 Cost = Callable[[FloatArray], FloatArray]
 

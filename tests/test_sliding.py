@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 import undertow as ut
 from support import SHAPES, corners, random_mechanism, random_states, random_surface, runge_kutta
-from undertow.errors import InvalidInputError, SingularSurfaceError, UndertowError
-from undertow.mechanism import TIME, FloatArray
-from undertow.sliding import Switching, constant_gains, reaching_time_bound, singularity
+from undertow.base import InvalidInputError, SingularSurfaceError, UndertowError
+from undertow.law import Switching
+from undertow.law.sliding import constant_gains, reaching_time_bound, singularity
+from undertow.models import TIME, FloatArray
 
 shapes = pytest.mark.parametrize(("n", "m"), SHAPES)
 switchings = pytest.mark.parametrize("switching", ["saturation", "tanh", "sign"])

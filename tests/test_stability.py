@@ -11,20 +11,10 @@ import sympy as sp
 from numpy.typing import NDArray
 
 import undertow as ut
-from undertow.errors import (
-    InvalidInputError,
-    ModelError,
-    SingularSurfaceError,
-    UnstableSurfaceError,
-)
-from undertow.paper import CASES
-from undertow.stability import (
-    Linearisation,
-    controllability,
-    linearise,
-    sliding_matrix,
-    stability_margin,
-)
+from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
+from undertow.law import controllability, linearise, sliding_matrix, stability_margin
+from undertow.law.stability import Linearisation
+from undertow.studies.paper import CASES
 
 Spectrum = NDArray[Any]
 SHAPES = [(2, 1), (3, 1), (3, 2), (4, 2), (5, 2), (5, 3)]

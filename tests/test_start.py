@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -14,11 +12,11 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow import kernel, lagrange, stability
-from undertow.codegen import block, store
-from undertow.mechanism import numbers
+from undertow.closed_loop import kernel
+from undertow.law import linearise, stability
 from undertow.mechanisms import LIBRARY
-from undertow.stability import linearise
+from undertow.models import lagrange, numbers
+from undertow.symbolic import store
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +44,7 @@ def derivations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def generations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the mechanisms whose loop is written afresh from now on."""
     names: list[str] = []
-    original = kernel.lay_loop
+    original = kernel.build_loop_graph
 
     def counted(belief: ut.Mechanism, *rest: Any) -> Any:
         names.append(belief.name)
@@ -55,7 +53,7 @@ def generations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def not_compiled(name: str, source: str) -> Any:
         return type("Module", (), {"rollout": staticmethod(lambda: source)})
 
-    monkeypatch.setattr(kernel, "lay_loop", counted)
+    monkeypatch.setattr(kernel, "build_loop_graph", counted)
     monkeypatch.setattr(kernel, "load_module", not_compiled)
     return names
 
@@ -111,16 +109,31 @@ def test_a_changed_energy_never_finds_the_old_equations(monkeypatch: pytest.Monk
     assert len(names) == 5
 
 
-def test_a_changed_source_file_never_finds_the_old_result(tmp_path: Path) -> None:
-    """Claim: the key follows the text of the files that compute the result."""
-    file = tmp_path / "rule.py"
-    file.write_text("a = 1\n")
-    keys = {store.content_key("x", sources=[str(file)])}
-    file.write_text("a = 2\n")
-    store._file_digest.cache_clear()
-    keys |= {store.content_key("x", sources=[str(file)]), store.content_key("x")}
-    keys |= {store.content_key("ab", "c"), store.content_key("a", "bc")}
-    assert len(keys) == 5
+def test_a_changed_source_file_never_finds_the_old_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Claim: the key follows the name and the text of every file of the package."""
+    monkeypatch.setattr(store, "PACKAGE", tmp_path)
+    (tmp_path / "law").mkdir()
+    file = tmp_path / "law" / "rule.py"
+    keys = set()
+
+    def note(*texts: str) -> None:
+        store.sources_digest.cache_clear()
+        keys.add(store.content_key(*texts))
+
+    try:
+        note("x")
+        for text in ("a = 1\n", "a = 2\n"):
+            file.write_text(text)
+            note("x")
+        file.rename(tmp_path / "rule.py")
+        note("x")
+        note("ab", "c")
+        note("a", "bc")
+    finally:
+        store.sources_digest.cache_clear()
+    assert len(keys) == 6
 
 
 @pytest.mark.parametrize("damage", ["", "not equations", "other key"])
@@ -187,28 +200,6 @@ def test_a_changed_loop_never_finds_an_old_kernel(monkeypatch: pytest.MonkeyPatc
     assert len(names) == len(loops) == len(set(sources))
     assert [source(*loop) for loop in loops] == sources
     assert len(names) == len(loops)
-
-
-def test_the_key_knows_every_file_that_writes_kernels() -> None:
-    """Claim: each file of the package that runs while a loop is written is in its key."""
-    package = Path(kernel.__file__).parent
-    met: set[str] = set()
-
-    def note(frame: FrameType, _event: str, _argument: object) -> None:
-        if frame.f_code.co_filename.startswith(str(package)):
-            met.add(frame.f_code.co_filename)
-
-    rig = ut.mechanisms.two_motor_three_link().with_disturbance_bounds(0.1, 0.1, 0.1)
-    goal = ut.MinimumEnergy(constraints=ut.state_box(q_1=1.0), hard_input=True)
-    before = sys.getprofile()
-    sys.setprofile(note)
-    try:
-        program = kernel.lay_loop(rig, rig, goal, "saturation")
-        block.block_source(program, sampled=True, header="")
-    finally:
-        sys.setprofile(before)
-    assert met
-    assert met <= set(kernel.GENERATOR)
 
 
 # -- linearisation -------------------------------------------------------------------------------

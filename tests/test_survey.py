@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from undertow import survey
+from undertow.base import InvalidInputError
 from undertow.cli import app
-from undertow.errors import InvalidInputError
 from undertow.mechanisms import LIBRARY
+from undertow.studies import survey
 
 DOCS = Path(__file__).parent.parent / "docs"
 NAMES = sorted(LIBRARY)

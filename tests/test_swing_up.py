@@ -10,14 +10,21 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from undertow.base import InvalidInputError, ModelError
+from undertow.cascade.swing_up import (
+    CatchRegion,
+    Gains,
+    SwingUp,
+    SwingUpAndCatch,
+    designed,
+    hanging,
+)
+from undertow.cascade.swing_up.search import KEPT, _judged, _Swings, as_kept, found_for, search
 from undertow.certify import terminal_sets
-from undertow.certify.ellipsoid import ProvedEllipsoid
-from undertow.errors import InvalidInputError, ModelError
-from undertow.rig import Bench, Push, RealisticRig, srv02_rig
-from undertow.swing_up import CatchRegion, Gains, SwingUp, SwingUpAndCatch, designed, hanging
-from undertow.swing_up.search import KEPT, _judged, _Swings, as_kept, found_for, search
-from undertow.trials.trial import trial
-from undertow.trials.upright import SWINGING
+from undertow.certify.surface.ellipsoid import ProvedEllipsoid
+from undertow.plants import Bench, Push, RealisticRig, srv02_rig
+from undertow.studies.trials.trial import trial
+from undertow.studies.trials.upright import SWINGING
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +187,7 @@ def test_what_is_kept_swings_up_whatever_is_a_little_different(name: str) -> Non
 
 @pytest.mark.slow
 def test_a_fresh_search_swings_the_cart_up_and_it_stays_on_its_track() -> None:
-    from undertow.trials.upright import swing_trials
+    from undertow.studies.trials.upright import swing_trials
 
     cart = ut.mechanisms.cart_pendulum()
     gains = tuple(one.gains for one in search(cart, seed=5))

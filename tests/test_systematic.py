@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from undertow.errors import ArtefactError, InvalidInputError, ResourceError
-from undertow.mechanism import FloatArray
-from undertow.rig import Measurement
+from undertow.base import ArtefactError, InvalidInputError, ResourceError
+from undertow.models import FloatArray
+from undertow.plants import Measurement
 from undertow.runtime import background_worker, processes, slow
 from undertow.runtime import log as logs
 from undertow.runtime.failing import OPERATIONS, Fault, Tally, failing, intercepts_sqlite

@@ -10,9 +10,9 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from undertow.codegen import Tape, compile_numpy
-from undertow.codegen.vector import VectorFunction
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
+from undertow.symbolic import Tape, compile_numpy
+from undertow.symbolic.vector import VectorFunction
 
 a, b, c = sp.symbols("a b c", real=True)
 

@@ -12,20 +12,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import undertow as ut
-from undertow.errors import ArtefactError
+from undertow.base import ArtefactError
 from undertow.estimators import Record
-from undertow.estimators.compensation import take_off
-from undertow.inner_loop import InnerLoop
-from undertow.objectives import objective_for
-from undertow.practice import estimator_for
-from undertow.rig import Friction, srv02_rig
-from undertow.trials.balance import controllers
-from undertow.trials.ledger import Ledger
-from undertow.trials.nmpc import predictive
-from undertow.trials.report import balance_files, balance_report
-from undertow.trials.robustness import breaking_point, clipped_regulator, random_bench
-from undertow.trials.steering import CascadeSteering, steady
-from undertow.trials.trial import Outcome, judge, spread, trial, undisturbed
+from undertow.estimators.compensation import subtract_disturbance
+from undertow.law import InnerLoop
+from undertow.objective import objective_for
+from undertow.plants import Friction, srv02_rig
+from undertow.runtime.controller_defaults import estimator_for
+from undertow.studies.trials.balance import controllers
+from undertow.studies.trials.ledger import Ledger
+from undertow.studies.trials.nmpc import predictive
+from undertow.studies.trials.report import balance_files, balance_report
+from undertow.studies.trials.robustness import breaking_point, clipped_regulator, random_bench
+from undertow.studies.trials.steering import CascadeSteering, steady
+from undertow.studies.trials.trial import Outcome, judge, spread, trial, undisturbed
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_a_fixed_law_is_the_compiled_one(arm: ut.Mechanism, base: ut.Surface) ->
 def test_the_report_prints_what_was_run() -> None:
     from rich.console import Console
 
-    from undertow.trials.balance import balance
+    from undertow.studies.trials.balance import balance
 
     result = balance(seeds=2, seconds=4.0, budget=64, limits=False)
     console = Console(record=True, width=100)
@@ -188,7 +188,7 @@ def test_what_is_taken_off_keeps_to_its_share_and_to_the_limits(
     u: list[float], disturbance: list[float]
 ) -> None:
     limits, out = np.array([2.0, math.inf]), np.zeros(2)
-    take_off(np.array(u), np.array(disturbance), limits, out)
+    subtract_disturbance(np.array(u), np.array(disturbance), limits, out)
     assert abs(out[0]) <= 2.0
     free = min(max(u[0] - min(max(disturbance[0], -1.0), 1.0), -2.0), 2.0)
     assert out[0] == free

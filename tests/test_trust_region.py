@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
-from undertow.search import CMAES, minimise
-from undertow.trust_region import TrustRegion
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray
+from undertow.optimiser import CMAES
+from undertow.optimiser.cma_es import minimise
+from undertow.optimiser.trust_region import TrustRegion
 
 
 def _bowl(x: FloatArray) -> FloatArray:

@@ -25,27 +25,33 @@ from typer.testing import CliRunner
 import undertow as ut
 from support import interpreted
 from test_cli import run
-from undertow import survey
-from undertow.animation import Film
+from undertow.base import InvalidInputError, UndertowError
 from undertow.bounds import bound
-from undertow.cascade import Admission, Update, cost_gate, gate_words, problem_words
+from undertow.cascade import (
+    Admission,
+    Update,
+    cost_gate,
+    gate_words,
+    problem_words,
+    robustness_gate,
+)
 from undertow.cli import app
-from undertow.delay import bench_gate
-from undertow.errors import InvalidInputError, UndertowError
-from undertow.inputs import objective_named, parse_start
-from undertow.mechanism import FloatArray
+from undertow.cli.parsing import objective_named, parse_start
+from undertow.cli.report import ended, motion_report
+from undertow.display.animation import Film
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import from_anywhere, named
-from undertow.objective import travel_box
-from undertow.objectives import Goal, objective_for
-from undertow.practice import default_gate, estimator_for
-from undertow.proposal import Proposal
-from undertow.report import ended, motion_report
-from undertow.rig import srv02_rig
+from undertow.models import FloatArray
+from undertow.objective import Goal, objective_for
+from undertow.objective.objective import travel_box
+from undertow.optimiser import Proposal
+from undertow.plants import srv02_rig
 from undertow.runtime import Recipe
+from undertow.runtime.controller_defaults import default_gate, estimator_for
 from undertow.runtime.encoding import memory_from, memory_to
-from undertow.trials.balance import controllers
-from undertow.trials.steering import CascadeSteering
+from undertow.studies import survey
+from undertow.studies.trials.balance import controllers
+from undertow.studies.trials.steering import CascadeSteering
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 NOWHERE = replace(RIG, start={})
@@ -247,7 +253,7 @@ def test_one_gate_is_the_default_everywhere() -> None:
 
 
 def test_gates_are_pickled() -> None:
-    gate = bench_gate(0.006, covariance=np.eye(4))
+    gate = robustness_gate(0.006, covariance=np.eye(4))
     again = pickle.loads(pickle.dumps(gate))
     assert gate_words(again) == gate_words(gate)
 
@@ -384,15 +390,15 @@ def test_an_admission_says_that_the_target_jumped(steered: ut.Cascade) -> None:
     for jump, said in ((0.0, False), (0.05, False), (1.0, True), (-2.0, True)):
         here = ahead - RIG.state(theta=jump)
         proposal = steered.propose(state, here, 0.1)
-        after, admission = steered.consider(state, proposal, here)
+        after, admission = steered.apply_gate(state, proposal, here)
         assert ("off the plan's prediction" in admission.reason) == said
         if said:
             assert f"{abs(jump):g} off" in admission.reason
             assert "call start again" in admission.reason
     later = steered.loop.batch(here, after.plan, duration=0.1, terminal=0.0).x[0]
-    _, usual = steered.consider(after, steered.propose(after, later, 0.2), later)
+    _, usual = steered.apply_gate(after, steered.propose(after, later, 0.2), later)
     assert "off the plan" not in usual.reason
-    for method in (steered.propose, steered.consider, steered.start):
+    for method in (steered.propose, steered.apply_gate, steered.start):
         assert "jump" in str(method.__doc__)
     assert "horizon" in str(steered.propose.__doc__)
 
@@ -521,8 +527,8 @@ def test_the_picture_of_a_region_says_where_it_ignores_the_input_limit(
     A small region says nothing with 15 V, and says it with a motor of 0.1 V.
     """
     from test_certification import region
-    from undertow.certification import figure
-    from undertow.certify.motion import SurfaceMotion
+    from undertow.certify.region.motion import SurfaceMotion
+    from undertow.studies.certification import figure
 
     monkeypatch.setattr(figure, "GRID", 9)
     one = region()
@@ -626,7 +632,7 @@ def _interrupted(moment: str) -> tuple[int, list[str]]:
     return process.returncode, said
 
 
-@pytest.mark.parametrize("moment", [" numpy.version\n", " undertow.kernel\n"])
+@pytest.mark.parametrize("moment", [" numpy.version\n", " undertow.closed_loop.kernel\n"])
 def test_ctrl_c_while_importing_is_one_line(moment: str) -> None:
     """Among the first modules of others, and among our own."""
     assert _interrupted(moment) == (130, ["interrupted"])
@@ -634,7 +640,8 @@ def test_ctrl_c_while_importing_is_one_line(moment: str) -> None:
 
 @pytest.mark.slow  # a process for each moment
 @pytest.mark.parametrize(
-    "moment", [" sympy", " numba", " typer", " undertow.cli\n", " undertow.survey\n", "… pendubot"]
+    "moment",
+    [" sympy", " numba", " typer", " undertow.cli\n", " undertow.studies.survey\n", "… pendubot"],
 )
 def test_ctrl_c_at_any_moment_is_one_line(moment: str) -> None:
     """Imports of others, the command line's own, what a command imports, and its work."""
@@ -673,8 +680,8 @@ def test_an_interrupted_survey_keeps_its_rows(
 def test_interrupted_trials_keep_their_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from undertow.trials import library
-    from undertow.trials.library import LibraryRow
+    from undertow.studies.trials import library
+    from undertow.studies.trials.library import LibraryRow
 
     def some(*, done: Callable[[LibraryRow], None], **_: Any) -> None:
         done(LibraryRow("tora", 1, 0.1, 1, 1, {}, 3.0, 0.5))
@@ -694,7 +701,7 @@ def test_interrupted_balance_keeps_what_is_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The row that was finished is in the table and in balance.csv; figures need all of them."""
-    from undertow.trials import balance
+    from undertow.studies.trials import balance
 
     calls = iter(range(100))
     honest = vars(balance)["trial"]

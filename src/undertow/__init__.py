@@ -1,27 +1,37 @@
 """Undertow: optimal sliding-mode cascade control of underactuated mechanisms."""
 
-from undertow.interrupt import at_once
+from undertow.base import at_once
 
 at_once()
 
 # ruff: noqa: E402 - what follows takes a second to import
 from math import radians as deg
 
-from undertow import mechanisms, modelling
+from undertow import mechanisms
 from undertow.cascade import Cascade, Run
-from undertow.check import MechanismReport, check_mechanism
-from undertow.decision import Freedom
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
-from undertow.motion import Event, Trajectory
-from undertow.objective import Constraint, MinimumEnergy, MinimumTime, Objective, state_box
-from undertow.objectives import objective_for
-from undertow.optimiser import Optimiser
-from undertow.plan import Plan
-from undertow.proposal import Budget, Proposal
-from undertow.rollout import ClosedLoop
-from undertow.sliding import SlidingModeLaw
-from undertow.stability import check_surface, first_surface, placed_surface, surface_margins
-from undertow.surface import ReachingLaw, Surface
+from undertow.checks import MechanismReport, check_mechanism
+from undertow.closed_loop import ClosedLoop, Event, Trajectory
+from undertow.law import (
+    Plan,
+    ReachingLaw,
+    SlidingModeLaw,
+    Surface,
+    check_surface,
+    first_surface,
+    placed_surface,
+    surface_margins,
+)
+from undertow.models import Coordinate, Input, Mechanism, Parameter
+from undertow.models import importers as modelling
+from undertow.objective import (
+    Constraint,
+    MinimumEnergy,
+    MinimumTime,
+    Objective,
+    objective_for,
+    state_box,
+)
+from undertow.optimiser import Budget, DecisionVariables, Optimiser, Proposal
 
 __all__ = [
     "Budget",
@@ -29,8 +39,8 @@ __all__ = [
     "ClosedLoop",
     "Constraint",
     "Coordinate",
+    "DecisionVariables",
     "Event",
-    "Freedom",
     "Input",
     "Mechanism",
     "MechanismReport",

@@ -9,7 +9,7 @@ from typing import Any
 
 import sympy as sp
 
-from undertow.errors import InvalidInputError
+from undertow.base import InvalidInputError
 
 __all__ = ["smooth", "translate"]
 

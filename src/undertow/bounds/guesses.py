@@ -10,10 +10,10 @@ import numpy as np
 import scipy.integrate
 import scipy.linalg
 
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.motion import Trajectory
-from undertow.stability import linearise
+from undertow.base import InvalidInputError
+from undertow.closed_loop import Trajectory
+from undertow.law import linearise
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["Guess", "built_in", "recorded", "rests", "time_scale"]
 

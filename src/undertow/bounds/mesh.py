@@ -8,7 +8,7 @@ import numpy as np
 import scipy.interpolate
 import scipy.optimize
 
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["adapted_mesh", "defects", "first_mesh", "hermite"]
 

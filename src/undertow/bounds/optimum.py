@@ -12,12 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.base import InfeasibleError, InvalidInputError, MissingExtraError
 from undertow.bounds.guesses import built_in, recorded
 from undertow.bounds.mesh import hermite
 from undertow.bounds.programme import Programme, Solution
-from undertow.errors import InfeasibleError, InvalidInputError, MissingExtraError
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.motion import Trajectory
+from undertow.closed_loop import Trajectory
+from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 
 __all__ = ["Bound", "bound"]

@@ -11,14 +11,13 @@ import numpy as np
 import scipy.interpolate
 import sympy as sp
 
+from undertow.base import InvalidInputError
 from undertow.bounds.expressions import smooth, translate
 from undertow.bounds.guesses import Guess, rests, time_scale
 from undertow.bounds.mesh import adapted_mesh, defects, first_mesh
-from undertow.codegen import Tape
-from undertow.errors import InvalidInputError
-from undertow.mechanism import TIME, FloatArray, Mechanism
+from undertow.models import TIME, FloatArray, Mechanism, require_smooth
 from undertow.objective import Objective
-from undertow.validity import require_smooth
+from undertow.symbolic import Tape
 
 __all__ = ["Programme", "Solution"]
 

@@ -12,15 +12,13 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
+from undertow.base import ArtefactError, parse_json, read_file, versions
 from undertow.bring_up.identify import identify
 from undertow.bring_up.motion import doublets, perform
 from undertow.bring_up.rest import rest_state
-from undertow.errors import ArtefactError
-from undertow.files import parse_json, read_file
-from undertow.mechanism import Mechanism
 from undertow.mechanisms import rotary_pendulum
-from undertow.results import versions
-from undertow.rig import Bench, Encoder, Friction, RealisticRig, Timing
+from undertow.models import Mechanism
+from undertow.plants import Bench, Encoder, Friction, RealisticRig, Timing
 
 __all__ = ["NOISES", "CoverageRow", "coverage", "deviations", "rig_in_the_class"]
 

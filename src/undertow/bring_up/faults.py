@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.rig.bench import Bench
-from undertow.rig.interface import Measurement, Rig
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray, Mechanism
+from undertow.plants.bench import Bench
+from undertow.plants.interface import Measurement, Rig
 
 __all__ = ["Miswired", "miswired", "rubbing"]
 

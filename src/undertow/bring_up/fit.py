@@ -15,12 +15,12 @@ import numpy as np
 import scipy.optimize
 import scipy.signal
 
+from undertow.base import InvalidInputError
 from undertow.bring_up.intervals import readings
 from undertow.bring_up.motion import Record
 from undertow.bring_up.predict import Predictor
 from undertow.bring_up.quantities import RATE, START, Quantity, candidates
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["Fit"]
 

@@ -17,7 +17,7 @@ import scipy.stats
 from undertow.bring_up.fit import Fit
 from undertow.bring_up.intervals import correlated, counted
 from undertow.bring_up.motion import Record
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["Estimate", "Identification", "identify"]
 

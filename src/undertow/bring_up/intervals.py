@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
 
 __all__ = ["correlated", "counted", "dwell", "readings"]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.errors import UndertowError
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Rig
+from undertow.base import UndertowError
+from undertow.models import FloatArray
+from undertow.plants.interface import Rig
 
 __all__ = ["GuardError", "Record", "doublets", "perform", "ramp"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from undertow.bring_up.motion import Record
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.rig.stepping import stepping
+from undertow.models import FloatArray, Mechanism
+from undertow.plants.stepping import stepping
 
 __all__ = ["Predictor"]
 

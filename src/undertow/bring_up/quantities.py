@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.bring_up.motion import Record
-from undertow.mechanism import FloatArray, Mechanism, Parameter
+from undertow.models import FloatArray, Mechanism, Parameter
 
 __all__ = ["RATE", "START", "Quantity", "candidates"]
 

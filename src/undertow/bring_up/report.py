@@ -11,12 +11,12 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from undertow import results
+from undertow.base import artefacts as results
 from undertow.bring_up.coverage import CoverageRow
 from undertow.bring_up.identify import Identification
 from undertow.bring_up.wizard import BringUp
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.plot import figure_bytes, style
+from undertow.display.plot import figure_bytes, style
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["coverage_table", "files", "findings_table", "parameter_table", "plus_minus", "summary"]
 

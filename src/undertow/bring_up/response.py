@@ -13,7 +13,7 @@ import numpy as np
 from undertow.bring_up.motion import Record
 from undertow.bring_up.predict import Predictor
 from undertow.bring_up.wiring import Wiring, explained
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
 
 __all__ = ["Response", "Understood", "respond", "understand"]
 

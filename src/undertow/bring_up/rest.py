@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from undertow.errors import InfeasibleError
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.base import InfeasibleError
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["rest_state"]
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement, Rig
+from undertow.models import FloatArray
+from undertow.plants.interface import Measurement, Rig
 
 __all__ = ["KNOWN", "Wiring", "explain", "explained", "known_factor"]
 

@@ -15,8 +15,8 @@ from undertow.bring_up.predict import Predictor
 from undertow.bring_up.response import Response, Understood, respond, understand
 from undertow.bring_up.rest import rest_state
 from undertow.bring_up.wiring import KNOWN, Wiring, known_factor
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.rig.interface import Rig
+from undertow.models import FloatArray, Mechanism
+from undertow.plants.interface import Rig
 
 __all__ = ["BringUp", "Finding", "bring_up"]
 

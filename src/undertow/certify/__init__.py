@@ -3,14 +3,15 @@
 Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when first used.
 """
 
-from undertow.certify.certificate import Certificate, Claim, Subject, read_certificate
-from undertow.certify.ellipsoid import TerminalEllipsoid, verify_ellipsoid
-from undertow.certify.ellipsoid_search import terminal_sets
-from undertow.certify.gate import Policy, assess, certified_gate
-from undertow.certify.reaching import DisturbanceBound, ReachingCertificate, reaching
-from undertow.certify.region import LyapunovFunction, SurfaceMotion, verify_region
-from undertow.certify.region_search import ProvedRegion, prove_region
-from undertow.certify.surface import (
+from undertow.certify.claims.certificate import Certificate, Claim, Subject, read_certificate
+from undertow.certify.claims.gate import Policy, assess, certified_gate
+from undertow.certify.intervals.verdict import Verdict
+from undertow.certify.region.region import LyapunovFunction, SurfaceMotion, verify_region
+from undertow.certify.region.search import ProvedRegion, prove_region
+from undertow.certify.surface.ellipsoid import TerminalEllipsoid, verify_ellipsoid
+from undertow.certify.surface.ellipsoid_search import terminal_sets
+from undertow.certify.surface.reaching import DisturbanceBound, ReachingCertificate, reaching
+from undertow.certify.surface.surface import (
     CriticalMode,
     closed_forms,
     critical_mode,
@@ -18,7 +19,6 @@ from undertow.certify.surface import (
     nonsingular,
     singular_distance,
 )
-from undertow.certify.verdict import Verdict
 
 __all__ = [
     "Certificate",

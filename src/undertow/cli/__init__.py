@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from undertow import results
+from undertow.base import INTERRUPTED, at_once, by_exception
+from undertow.base import artefacts as results
 from undertow.cli import bench, certify, control, export, library, paper, rig, trials
 from undertow.cli.terminal import app, examples
-from undertow.interrupt import INTERRUPTED, at_once, by_exception
 
 __all__ = [
     "app",

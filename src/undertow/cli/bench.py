@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from undertow import inputs, results
+from undertow.base import InvalidInputError
+from undertow.base import artefacts as results
+from undertow.cli import parsing as inputs
 from undertow.cli.terminal import (
     AnyName,
     Seed,
@@ -23,12 +25,11 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
-from undertow.errors import InvalidInputError
-from undertow.modelling.python_file import in_a_file
+from undertow.models.importers.python_file import in_a_file
 
 if TYPE_CHECKING:
-    from undertow.mechanism import FloatArray, Mechanism
-    from undertow.rig import Rig
+    from undertow.models import FloatArray, Mechanism
+    from undertow.plants import Rig
 
 __all__ = ["bench"]
 
@@ -80,7 +81,7 @@ def bench(
     """Check a rig at rest by small safe motions: signs, scales, delay, friction, parameters."""
     from undertow.bring_up import bring_up, miswired, rest_state
     from undertow.bring_up.report import files, findings_table, parameter_table, summary
-    from undertow.rig import RealisticRig
+    from undertow.plants import RealisticRig
 
     request = {"mechanism": name, "rig": rig, "fault": fault or [], "seed": seed}
     belief = inputs.mechanism_named(name, setting or ())
@@ -123,8 +124,8 @@ def _plant(
 ) -> Rig:
     """Return the rig that was asked for; a simulated one moves as the library's numbers say."""
     from undertow.bring_up import rubbing
-    from undertow.rig import IdealRig, Paced, RealisticRig, rig_from_file
-    from undertow.rig.presets import bench_for
+    from undertow.plants import IdealRig, Paced, RealisticRig, rig_from_file
+    from undertow.plants.presets import bench_for
 
     if in_a_file(rig):
         if faults:

@@ -7,8 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from undertow import inputs, results
+from undertow.base import InvalidInputError
+from undertow.base import artefacts as results
 from undertow.cascade import Cascade
+from undertow.cli import parsing as inputs
 from undertow.cli.terminal import (
     Goal,
     Horizon,
@@ -23,11 +25,10 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
-from undertow.errors import InvalidInputError
-from undertow.mechanism import Mechanism
+from undertow.law import first_surface
 from undertow.mechanisms import LIBRARY
-from undertow.modelling.python_file import in_a_file
-from undertow.stability import first_surface
+from undertow.models import Mechanism
+from undertow.models.importers.python_file import in_a_file
 
 __all__ = ["certify", "verify"]
 
@@ -118,10 +119,10 @@ def certify(
 
     Exit status 0 when local stability at least is proved for every surface, else 1.
     """
-    from undertow import certification
-    from undertow.certify.gate import certified_gate
-    from undertow.certify.loop_claim import LoopClaim
-    from undertow.plot import figure_bytes
+    from undertow.certify.claims.gate import certified_gate
+    from undertow.certify.closed_loop.claim import LoopClaim
+    from undertow.display.plot import figure_bytes
+    from undertow.studies import certification
 
     if appendix == (name is not None):
         raise InvalidInputError(
@@ -232,10 +233,10 @@ def verify(
 
     Exit status 0 when every claim is proved again, else 1.
     """
-    from undertow import certification
-    from undertow.certify.certificate import read_certificate
-    from undertow.certify.verify import check_settings
-    from undertow.certify.verify import verify as decide
+    from undertow.certify.claims.certificate import read_certificate
+    from undertow.certify.claims.verify import check_settings
+    from undertow.certify.claims.verify import verify as decide
+    from undertow.studies import certification
 
     certificate = read_certificate(file)
     check_settings(certificate, inputs.parse_values(setting or ()))

@@ -7,8 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from undertow import inputs, results
+from undertow.base import InvalidInputError
+from undertow.base import artefacts as results
 from undertow.cascade import Cascade, Gate
+from undertow.cli import parsing as inputs
 from undertow.cli.terminal import (
     AnyName,
     Box,
@@ -28,12 +30,10 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
-from undertow.errors import InvalidInputError
-from undertow.optimiser import Optimiser
-from undertow.practice import default_gate
-from undertow.proposal import Budget
-from undertow.rollout import ClosedLoop
-from undertow.stability import check_surface, first_surface
+from undertow.closed_loop import ClosedLoop
+from undertow.law import check_surface, first_surface
+from undertow.optimiser import Budget, Optimiser
+from undertow.runtime.controller_defaults import default_gate
 
 __all__ = ["optimise", "simulate"]
 
@@ -102,7 +102,7 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a mechanism under its sliding-mode law, from a start to the target."""
-    from undertow import report
+    from undertow.cli import report
 
     request = {k: v for k, v in locals().items() if k not in ("report", "out")}
     check_control(control, ("cascade", "one-time", "designed"))
@@ -152,7 +152,7 @@ def simulate(
 
 def _evidence_gate(accept: list[str]) -> Gate:
     """Return the gate that asks for evidence of these kinds."""
-    from undertow.certify.gate import Policy, certified_gate
+    from undertow.certify.claims.gate import Policy, certified_gate
 
     kinds: Any = tuple(accept)
     return certified_gate(Policy(kinds))
@@ -181,7 +181,7 @@ def optimise(
     out: Annotated[Path | None, typer.Option(help="Folder for proposal.json.")] = None,
 ) -> None:
     """Find the best surface from a start: one global optimisation, with its margins."""
-    from undertow import report
+    from undertow.cli import report
 
     request: dict[str, Any] = {k: v for k, v in locals().items() if k not in ("report", "out")}
     belief = inputs.mechanism_named(name, setting or (), limit or ())

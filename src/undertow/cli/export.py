@@ -13,7 +13,9 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
-from undertow import inputs, results
+from undertow.base import InvalidInputError
+from undertow.base import artefacts as results
+from undertow.cli import parsing as inputs
 from undertow.cli.terminal import (
     Application,
     Goal,
@@ -29,8 +31,7 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
-from undertow.codegen.c99 import Real
-from undertow.errors import InvalidInputError
+from undertow.closed_loop import ClosedLoop
 from undertow.export import (
     DerivativeStep,
     EmbeddedController,
@@ -40,13 +41,12 @@ from undertow.export import (
 )
 from undertow.export.estimate import EstimatorStep
 from undertow.export.host import Build
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.law import ReachingLaw, check_surface, first_surface
 from undertow.mechanisms import LIBRARY
+from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import Optimiser
-from undertow.rig.presets import bench_for
-from undertow.rollout import ClosedLoop
-from undertow.sliding import ReachingLaw
-from undertow.stability import check_surface, first_surface
+from undertow.plants.presets import bench_for
+from undertow.symbolic import Real
 
 __all__ = ["export_c"]
 
@@ -269,7 +269,7 @@ def on_rigs(
 ) -> int:
     """Return on how many realistic rigs the exported controller holds the mechanism."""
     from undertow.export.loop import run_on_rig
-    from undertow.rig import RealisticRig
+    from undertow.plants import RealisticRig
 
     bench = bench_for(one.mechanism).with_timing(period=one.period)
     held = 0
@@ -285,7 +285,7 @@ def on_rigs(
 def flip_bits(one: EmbeddedController, x0: FloatArray, compiler: str, console: Console) -> bool:
     """Upset every bit of the controller's memory, say what came of it: whether limits held."""
     from undertow.export.upsets import upset_every_bit, upsets_table
-    from undertow.rig import RealisticRig
+    from undertow.plants import RealisticRig
 
     bench = bench_for(one.mechanism).with_timing(period=one.period)
     beyond = 0

@@ -8,8 +8,10 @@ from typing import Annotated
 
 import typer
 
-from undertow import inputs, results
+from undertow.base import INTERRUPTED
+from undertow.base import artefacts as results
 from undertow.cascade import problem_words
+from undertow.cli import parsing as inputs
 from undertow.cli.terminal import (
     AnyName,
     Box,
@@ -28,10 +30,9 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
-from undertow.interrupt import INTERRUPTED
+from undertow.closed_loop import ClosedLoop
 from undertow.mechanisms import LIBRARY
 from undertow.optimiser import Optimiser
-from undertow.rollout import ClosedLoop
 
 __all__ = ["animate", "derive", "list_mechanisms", "survey"]
 
@@ -46,7 +47,7 @@ def list_mechanisms(
     ] = None,
 ) -> None:
     """List the mechanisms of the library; with --out also draw them."""
-    from undertow import commands
+    from undertow.cli import commands
 
     console = terminal()
     console.width = max(console.width, 80)
@@ -73,7 +74,7 @@ def derive(
     out: Annotated[Path | None, typer.Option(help="Folder for NAME.txt and NAME.tex.")] = None,
 ) -> None:
     """Show M, f, the law and the surface conditions as formulas."""
-    from undertow import commands
+    from undertow.cli import commands
 
     mechanism = inputs.mechanism_named(name)
     if out is not None:
@@ -103,7 +104,7 @@ def survey(
     out: Annotated[Path | None, typer.Option(help="Folder for survey.csv and survey.md.")] = None,
 ) -> None:
     """Bring every mechanism to its target: cost, time, bound and gap of all in one table."""
-    from undertow import survey as study
+    from undertow.studies import survey as study
 
     request = {k: v for k, v in locals().items() if k not in ("study", "out")}
     if out is not None:
@@ -168,9 +169,9 @@ def animate(
 
     The film ends where the motion has settled, or after 8 s, see --longest.
     """
-    from undertow import commands
-    from undertow.animation import Film
-    from undertow.report import ended
+    from undertow.cli import commands
+    from undertow.cli.report import ended
+    from undertow.display.animation import Film
 
     request = {k: v for k, v in locals().items() if k not in ("commands", "out", "Film", "ended")}
     belief = inputs.mechanism_named(name, setting or (), limit or ())

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
-from undertow import inputs, results
+from undertow.base import InvalidInputError
+from undertow.base import artefacts as results
 from undertow.cascade import problem_words
+from undertow.cli import parsing as inputs
 from undertow.cli.terminal import (
     AnyName,
     Goal,
@@ -30,13 +32,12 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
-from undertow.errors import InvalidInputError
 from undertow.mechanisms.named import from_anywhere
-from undertow.modelling.python_file import in_a_file
-from undertow.objectives import Goal as OneGoal
+from undertow.models.importers.python_file import in_a_file
+from undertow.objective import Goal as OneGoal
 
 if TYPE_CHECKING:
-    from undertow.rig import Rig
+    from undertow.plants import Rig
     from undertow.runtime import Recipe, Report, Runtime
 
 __all__ = ["drill", "replay", "run"]
@@ -196,7 +197,7 @@ def _run(runtime: Runtime, seconds: float) -> Report:
 
 def _plant(rig: str, recipe: Recipe, *, keeper: bool) -> Rig | None:
     """Return the rig that was asked for, or nothing for what the recipe itself makes."""
-    from undertow.rig import MuJoCoRig, rig_from_file
+    from undertow.plants import MuJoCoRig, rig_from_file
 
     if rig in ("ideal", "realistic"):
         return _kept(recipe.make_rig, recipe) if keeper else None
@@ -231,11 +232,11 @@ def _plant(rig: str, recipe: Recipe, *, keeper: bool) -> Rig | None:
 
 def _kept(make: Callable[[], Rig], recipe: Recipe) -> Rig:
     """Return a rig that a process of its own holds."""
-    from undertow.runtime.keeper import KeptRig
+    from undertow.runtime.keeper import SupervisedRig
 
     settings, belief = recipe.settings, recipe.belief
     limits, slew = settings.limits(belief), settings.slew(belief) * recipe.period
-    return KeptRig(make, recipe.period, limits, slew)
+    return SupervisedRig(make, recipe.period, limits, slew)
 
 
 @contextmanager

@@ -17,9 +17,8 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
-from undertow import results
-from undertow.errors import InvalidInputError, UndertowError, near, printable
-from undertow.interrupt import INTERRUPTED
+from undertow.base import INTERRUPTED, InvalidInputError, UndertowError, near, printable
+from undertow.base import artefacts as results
 
 __all__ = [
     "AnyName",

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import RenderableType
 
-from undertow import results
+from undertow.base import INTERRUPTED
+from undertow.base import artefacts as results
 from undertow.cli.terminal import (
     app,
     as_text,
@@ -21,7 +22,6 @@ from undertow.cli.terminal import (
     terminal,
     write,
 )
-from undertow.interrupt import INTERRUPTED
 
 __all__ = ["trials"]
 
@@ -88,12 +88,12 @@ def trials(
     """Run controllers on realistic rigs, over and over, and print what came of it."""
     from undertow.bring_up.coverage import coverage
     from undertow.bring_up.report import coverage_table
-    from undertow.swing_up import SwingUp
-    from undertow.swing_up.search import KEPT, as_kept
-    from undertow.trials import balance as experiment
-    from undertow.trials import estimation, report, upright
-    from undertow.trials import robustness as stress
-    from undertow.trials.library import through_the_runtime
+    from undertow.cascade.swing_up import SwingUp
+    from undertow.cascade.swing_up.search import KEPT, as_kept
+    from undertow.studies.trials import balance as experiment
+    from undertow.studies.trials import estimation, report, upright
+    from undertow.studies.trials import robustness as stress
+    from undertow.studies.trials.library import through_the_runtime
 
     if out is not None:
         results.check_folder(out)

@@ -13,12 +13,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from undertow.codegen.machine import numba
 from undertow.estimators.drive import Controller
 from undertow.estimators.interface import Estimator
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
+from undertow.symbolic import numba
 
-__all__ = ["SHARE", "compensated", "take_off"]
+__all__ = ["SHARE", "compensated", "subtract_disturbance"]
 
 #: Largest part of an input's limit that an estimated disturbance may claim: of a sensor or an
 #: actuator that has failed an observer believes anything.
@@ -26,7 +26,9 @@ SHARE = 0.5
 
 
 @numba.njit(cache=True, error_model="numpy")
-def take_off(u: FloatArray, disturbance: FloatArray, limits: FloatArray, out: FloatArray) -> None:
+def subtract_disturbance(
+    u: FloatArray, disturbance: FloatArray, limits: FloatArray, out: FloatArray
+) -> None:
     """Write u − d̂, (m,), into ``out``: |d̂| at most ``SHARE`` of the limits, the sum within them."""
     for i in range(u.shape[0]):
         most = SHARE * limits[i]
@@ -59,7 +61,7 @@ def compensated(
         u = controller(t, x)
         if not when():
             return u
-        take_off(u, estimator.disturbance, limits, out)
+        subtract_disturbance(u, estimator.disturbance, limits, out)
         return out
 
     return both

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from undertow.codegen.machine import numba
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
+from undertow.symbolic import numba
 
-__all__ = ["carry", "correct"]
+__all__ = ["measurement_update", "predict_covariance"]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def carry(F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: float) -> None:
+def predict_covariance(
+    F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: float
+) -> None:
     """Turn P into F P Fᵀ + h diag(noise), exactly symmetric; A, of P's size, is scratch."""
     size = P.shape[0]
     for i in range(size):
@@ -29,7 +31,7 @@ def carry(F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: flo
 
 
 @numba.njit(cache=True, error_model="numpy")
-def correct(
+def measurement_update(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray
 ) -> None:
     """Take in positions one by one, nothing inverted; a missing one (NaN) is left out."""

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.codegen.machine import numba
 from undertow.estimators.interface import positive
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.rig.interface import Measurement
+from undertow.models import FloatArray, Mechanism
+from undertow.plants.interface import Measurement
+from undertow.symbolic import numba
 
 __all__ = ["FilteredDerivative", "SuperTwisting"]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.errors import InvalidInputError
+from undertow.base import InvalidInputError
 from undertow.estimators.interface import Estimator
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Rig
+from undertow.models import FloatArray
+from undertow.plants.interface import Rig
 
 __all__ = ["Controller", "Record", "drive"]
 

@@ -7,9 +7,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.rig.interface import Measurement
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray, Mechanism
+from undertow.plants.interface import Measurement
 
 __all__ = ["Estimator", "Measured"]
 

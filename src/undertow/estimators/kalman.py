@@ -16,16 +16,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.codegen.function import COMPILED, PREAMBLE
-from undertow.codegen.names import docstring
-from undertow.codegen.store import content_key, generated, generators
-from undertow.errors import InvalidInputError
+from undertow.base import InvalidInputError
 from undertow.estimators.interface import positive
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.memory import BRIEF, Memory, unpacked
-from undertow.rig.interface import Measurement
-from undertow.rig.stepping import dynamics_source
-from undertow.validity import require_smooth
+from undertow.models import FloatArray, Mechanism, require_smooth
+from undertow.plants.interface import Measurement
+from undertow.plants.stepping import dynamics_source
+from undertow.symbolic import (
+    BRIEF,
+    COMPILED,
+    PREAMBLE,
+    Workspace,
+    content_key,
+    docstring,
+    generated,
+    unpacked,
+)
 
 __all__ = ["KalmanFilter"]
 
@@ -103,8 +108,8 @@ def estimate(h, q, u, block, size, lead):
     then = past[(start + 1) % (lead + 1)]
     jacobian(h, x, then, n, m, parameters, F, A, qdd, base, viscous, driven)
     move(h, x, then, n, m, parameters, stage, total, qdd, viscous, driven)
-    carry(F, P, A, noise, h)
-    correct(x, P, q, variance, total)
+    predict_covariance(F, P, A, noise, h)
+    measurement_update(x, P, q, variance, total)
     count[0] = start + 1.0
     for i in range(size):
         out[i] = x[i]
@@ -114,20 +119,16 @@ def estimate(h, q, u, block, size, lead):
 """
 
 
-_GENERATOR = generators(
-    "estimators/kalman.py", "estimators/covariance.py", "memory.py", "rig/stepping.py",
-    "codegen/function.py",
-)  # fmt: skip
-
-
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
-    key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
+    key = content_key(mechanism.structure, mechanism.name)
 
     def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
         header = docstring(f"Kalman filter of {mechanism.name}; generated, do not edit. {key[:16]}")
-        parts = "from undertow.estimators.covariance import carry, correct\n"
+        parts = (
+            "from undertow.estimators.covariance import predict_covariance, measurement_update\n"
+        )
         parts += f"\nn, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
         return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
 
@@ -208,7 +209,9 @@ class KalmanFilter:
         self.period = float(positive("period of an estimator", [period], 1)[0])
         size = 2 * n + (m if disturbance_drift > 0 else 0)
         self._size, self._lead = size, round(delay / period)
-        memory = Memory(_LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, lead=self._lead)
+        memory = Workspace(
+            _LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, lead=self._lead
+        )
         self._block, self._count, self._past = memory.block, memory["count"], memory["past"]
         self._x, self._out = memory["x"], memory["out"]
         self._P: FloatArray = memory["P"]

@@ -13,10 +13,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import sympy as sp
 
-from undertow.codegen.tape import Tape
 from undertow.estimators import Estimator, FilteredDerivative, SuperTwisting
 from undertow.estimators.interface import positive
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism
+from undertow.symbolic import Tape
 
 __all__ = ["DerivativeStep", "DifferentiatorStep", "StepSymbols", "SuperTwistingStep"]
 

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 
 import sympy as sp
 
-from undertow.codegen.c99 import C99Emitter, Real, literal
-from undertow.codegen.tape import Tape
 from undertow.export.differentiators import DifferentiatorStep, StepSymbols
 from undertow.export.observer import KalmanStep, lay_accelerations
-from undertow.mechanism import Mechanism
+from undertow.models import Mechanism
+from undertow.symbolic import C99Emitter, Real, Tape, literal
 
 __all__ = ["EstimatorStep", "estimate_code"]
 

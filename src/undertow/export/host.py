@@ -18,13 +18,15 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.errors import ArtefactError, MissingExtraError
-from undertow.export.controller import EmbeddedController, files, plan_numbers
+from undertow.base import ArtefactError, MissingExtraError
+from undertow.export.controller import EmbeddedController
+from undertow.export.plans import plan_numbers
 from undertow.export.seal import seals
-from undertow.export.twin import Status, Verdict
+from undertow.export.sources import files
+from undertow.export.status import Status, Verdict
 from undertow.export.vectors import random_states
-from undertow.mechanism import FloatArray
-from undertow.plan import Plan
+from undertow.law import Plan
+from undertow.models import FloatArray
 
 __all__ = ["FLAGS", "NEAREST", "Agreement", "Build", "Footprint", "HostProcess", "tool", "version"]
 

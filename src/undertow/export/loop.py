@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.export.host import HostProcess
-from undertow.export.twin import Status
-from undertow.mechanism import FloatArray
-from undertow.rig import Rig
+from undertow.export.status import Status
+from undertow.models import FloatArray
+from undertow.plants import Rig
 
 __all__ = ["HELD", "Loop", "run_on_rig"]
 

@@ -14,12 +14,12 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.codegen.tape import Tape
 from undertow.estimators import KalmanFilter
 from undertow.estimators.interface import positive
-from undertow.export.twin import LARGEST
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.rig import Measurement
+from undertow.export.status import LARGEST
+from undertow.models import FloatArray, Mechanism
+from undertow.plants import Measurement
+from undertow.symbolic import Tape
 
 __all__ = ["KalmanStep", "Observer", "lay_accelerations"]
 

@@ -11,10 +11,10 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from undertow.base import to_csv
 from undertow.export.controller import EmbeddedController
 from undertow.export.host import Agreement, Build, Footprint
 from undertow.export.vectors import run_positions
-from undertow.results import to_csv
 
 __all__ = ["Entry", "csv", "measure", "tables"]
 

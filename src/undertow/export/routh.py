@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 import sympy as sp
 
-from undertow.mechanism import Mechanism
-from undertow.stability import linearise
+from undertow.law import linearise
+from undertow.models import Mechanism
 
 __all__ = ["lay_polynomial"]
 

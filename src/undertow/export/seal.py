@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.codegen.c99 import Real, literal
+from undertow.symbolic import Real, literal
 
 __all__ = ["FACTOR", "WIDTH", "as_held", "seals"]
 

@@ -2,52 +2,16 @@
 
 from __future__ import annotations
 
-from enum import IntEnum, IntFlag
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.mechanism import FloatArray
-from undertow.plan import Plan
-from undertow.rig import Measurement
-from undertow.sliding import Control, SlidingModeLaw
+from undertow.export.controller import EmbeddedController
+from undertow.export.status import LARGEST, STALE_SPAN, Status, Verdict
+from undertow.law import Control, Plan, SlidingModeLaw
+from undertow.models import FloatArray
+from undertow.plants import Measurement
 
-if TYPE_CHECKING:
-    from undertow.export.controller import EmbeddedController
-
-__all__ = ["LARGEST", "STALE_SPAN", "Status", "Twin", "Verdict"]
-
-#: A measurement beyond is no number either.
-LARGEST = 1e9
-
-#: So many numbers up to the last accepted plan's are stale; every other one is a later one's, so
-#: that none locks out the next. Numbers count modulo 2³².
-STALE_SPAN = 2**16
-
-
-class Status(IntFlag):
-    """What happened in a period; the bits that the C returns."""
-
-    OK = 0
-    CLIPPED = 1
-    SLEWED = 2
-    BRIDGED = 4
-    LOST = 8
-    SINGULAR = 16
-    SWITCHED = 32
-    FAULT = 64
-    FALLBACK = 128
-
-
-class Verdict(IntEnum):
-    """Answer to an offered plan."""
-
-    ACCEPTED = 0
-    BUSY = 1
-    STALE = 2
-    INVALID = 3
-    CORRUPT = 4
+__all__ = ["Twin"]
 
 
 class Twin:

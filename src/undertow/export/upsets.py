@@ -18,11 +18,11 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from undertow.export.controller import prefixed
 from undertow.export.host import Build
 from undertow.export.loop import HELD
-from undertow.mechanism import FloatArray
-from undertow.rig import RealisticRig
+from undertow.export.sources import prefixed
+from undertow.models import FloatArray
+from undertow.plants import RealisticRig
 
 __all__ = ["Upsets", "upset_every_bit", "upsets_table"]
 

@@ -6,13 +6,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from undertow.codegen.c99 import literal
-from undertow.export.controller import EmbeddedController, plan_text
+from undertow.export.controller import EmbeddedController
 from undertow.export.observer import KalmanStep
-from undertow.export.twin import Status, Twin
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.plan import Plan
-from undertow.sliding import Surface
+from undertow.export.plans import plan_text
+from undertow.export.status import Status
+from undertow.export.twin import Twin
+from undertow.law import Plan, Surface
+from undertow.models import FloatArray, Mechanism
+from undertow.symbolic import literal
 
 __all__ = ["TOLERANCE", "random_states", "run_positions", "vectors"]
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from undertow.mechanism import Mechanism
 from undertow.mechanisms.acrobot import acrobot
 from undertow.mechanisms.ball_and_beam import ball_and_beam
 from undertow.mechanisms.cart_pendulum import cart_pendulum
@@ -16,6 +15,7 @@ from undertow.mechanisms.tora import tora
 from undertow.mechanisms.triple_pendulum_on_a_cart import triple_pendulum_on_a_cart
 from undertow.mechanisms.two_motor_three_link import two_motor_three_link
 from undertow.mechanisms.wheeled_inverted_pendulum import wheeled_inverted_pendulum
+from undertow.models import Mechanism
 
 __all__ = [
     "acrobot",

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanism import Mechanism, Parameter
 from undertow.mechanisms.chain import two_link
+from undertow.models import Mechanism, Parameter
 
 __all__ = ["acrobot"]
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.mechanisms.chain import chain_energies
+from undertow.models import Coordinate, Input, Mechanism, Parameter
 
 __all__ = ["cart_pendulum"]
 

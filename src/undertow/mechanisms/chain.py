@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import sympy as sp
 
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
+from undertow.models import Coordinate, Input, Mechanism, Parameter
 
 __all__ = ["chain_energies", "two_link"]
 

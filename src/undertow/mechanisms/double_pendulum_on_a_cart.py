@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.mechanisms.chain import chain_energies
+from undertow.models import Coordinate, Input, Mechanism, Parameter
 
 __all__ = ["double_pendulum_on_a_cart"]
 

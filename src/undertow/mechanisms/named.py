@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from undertow.errors import InvalidInputError, near
-from undertow.mechanism import Mechanism
+from undertow.base import InvalidInputError, near
 from undertow.mechanisms import LIBRARY
-from undertow.modelling.mjcf import from_mjcf
-from undertow.modelling.python_file import in_a_file, mechanism_from_file
-from undertow.modelling.urdf import from_urdf
+from undertow.models import Mechanism
+from undertow.models.importers.mjcf import from_mjcf
+from undertow.models.importers.python_file import in_a_file, mechanism_from_file
+from undertow.models.importers.urdf import from_urdf
 
 __all__ = ["from_anywhere", "named"]
 

@@ -25,10 +25,9 @@ from dataclasses import dataclass, replace
 
 import sympy as sp
 
-from undertow.arguments import checked
-from undertow.errors import InvalidInputError
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
-from undertow.modelling.drives import DCMotor
+from undertow.base import InvalidInputError, checked
+from undertow.models import Coordinate, Input, Mechanism, Parameter
+from undertow.models.importers.drives import DCMotor
 
 __all__ = ["PARAMETER_SETS", "rotary_pendulum"]
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["Scene", "mujoco_scene"]
 
@@ -51,7 +51,7 @@ def mujoco_scene(mechanism: Mechanism) -> Scene:
             "MuJoCo scene",
             value=repr(mechanism.name),
             limit=f"one of {', '.join(_SCENES)}",
-            remedy="Bring an MJCF file of your own: undertow.modelling.from_mjcf",
+            remedy="Bring an MJCF file of your own: undertow.models.importers.from_mjcf",
         )
     values = {p.name: p.value for p in mechanism.parameters}
     bodies, motors, joints = _SCENES[mechanism.name](values)

@@ -12,7 +12,7 @@ import math
 
 import sympy as sp
 
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
+from undertow.models import Coordinate, Input, Mechanism, Parameter
 
 __all__ = ["tora"]
 

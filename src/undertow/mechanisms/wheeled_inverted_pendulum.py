@@ -15,8 +15,8 @@ import math
 
 import sympy as sp
 
-from undertow.mechanism import Coordinate, Input, Mechanism, Parameter
-from undertow.modelling.drives import DCMotor, voltage_driven
+from undertow.models import Coordinate, Input, Mechanism, Parameter
+from undertow.models.importers.drives import DCMotor, voltage_driven
 
 __all__ = ["wheeled_inverted_pendulum"]
 

@@ -3,13 +3,13 @@
 from undertow.runtime.clock import SimulatedClock, WallClock
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.log import Columns, Log, Recording, read_log
-from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.loop import Runtime
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import Replay, about, replay, replay_controller
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import InlineWorker, Worker, background_worker, respond
-from undertow.runtime.verdict import RunVerdict
+from undertow.runtime.verdict import Report, RunVerdict
 
 __all__ = [
     "Columns",

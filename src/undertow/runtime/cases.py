@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from undertow.cascade import Admission
-from undertow.mechanism import FloatArray
-from undertow.plan import Plan
-from undertow.proposal import Proposal
-from undertow.rig.interface import Measurement
+from undertow.law import Plan, Surface
+from undertow.models import FloatArray
+from undertow.optimiser import Proposal
+from undertow.plants.interface import Measurement
 from undertow.runtime.faults import Change, Drive, Hang, Sense, Spoil
 from undertow.runtime.slow import Answer
 from undertow.runtime.verdict import Ending
-from undertow.sliding import Surface
 
 __all__ = ["CASES", "Case"]
 

@@ -18,9 +18,10 @@ from typing import NamedTuple
 import numpy as np
 
 from undertow.cascade import Cascade, CascadeState
+from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators.interface import Estimator
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement
+from undertow.models import FloatArray
+from undertow.plants.interface import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.routh import PlanTest
 from undertow.runtime.sensors import LAST_HARMLESS, SensorWatch
@@ -33,7 +34,6 @@ from undertow.runtime.steps import (
     step_memory,
     step_module,
 )
-from undertow.swing_up import SwingUpAndCatch
 
 __all__ = ["UNSOUND", "Controller", "Inputs", "Note"]
 

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from undertow.cascade import CascadeState
 from undertow.estimators import Estimator
-from undertow.mechanism import FloatArray
-from undertow.rig import Push, RealisticRig
-from undertow.rig.interface import Measurement, Rig
+from undertow.models import FloatArray
+from undertow.plants import Push, RealisticRig
+from undertow.plants.interface import Measurement, Rig
 from undertow.runtime.cases import CASES, Case
 from undertow.runtime.clock import SimulatedClock
 from undertow.runtime.controller import Controller

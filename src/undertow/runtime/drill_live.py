@@ -16,21 +16,21 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.errors import ArtefactError
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement, Rig
+from undertow.base import ArtefactError
+from undertow.models import FloatArray
+from undertow.plants.interface import Measurement, Rig
 from undertow.runtime.drill import drill_recipe
 from undertow.runtime.faults import Witness
-from undertow.runtime.keeper import KeptRig
+from undertow.runtime.keeper import SupervisedRig
 from undertow.runtime.log import Columns, Recording, read_log
-from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.loop import Runtime
 from undertow.runtime.modes import Mode
 from undertow.runtime.processes import fork
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import replay
 from undertow.runtime.session import session
 from undertow.runtime.slow import BackgroundWorker
-from undertow.runtime.verdict import EXIT_CODES
+from undertow.runtime.verdict import EXIT_CODES, Report
 
 __all__ = [
     "ATTEMPTS",
@@ -125,7 +125,7 @@ def _keeper() -> LiveOutcome:
     limits = recipe.settings.limits(recipe.belief)
     slew = recipe.settings.slew(recipe.belief) * recipe.period
     recipe.make_rig().write(np.zeros_like(limits))
-    rig = KeptRig(recipe.make_rig, recipe.period, limits, slew)
+    rig = SupervisedRig(recipe.make_rig, recipe.period, limits, slew)
     pid = rig.process.pid or 0
     with session(recipe, rig=rig, processes=1) as runtime:
         for after, number in ((0.5, signal.SIGSTOP), (0.9, signal.SIGCONT)):
@@ -225,7 +225,7 @@ def _victim(recipe: Recipe, log: Path, record: Path) -> None:
     limits = recipe.settings.limits(recipe.belief)
     slew = recipe.settings.slew(recipe.belief) * recipe.period
     recipe.make_rig().write(np.zeros_like(limits))  # compiles what the keeper needs
-    rig = KeptRig(recipe.make_rig, recipe.period, limits, slew, record=record)
+    rig = SupervisedRig(recipe.make_rig, recipe.period, limits, slew, record=record)
     with session(recipe, rig=rig, log=log, processes=1) as runtime:
         runtime.run(60.0)
 

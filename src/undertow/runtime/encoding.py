@@ -10,10 +10,9 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from undertow.cascade import Admission, CascadeState
-from undertow.plan import Plan
-from undertow.proposal import Proposal
+from undertow.law import Plan, ReachingLaw, Surface
+from undertow.optimiser import Proposal
 from undertow.runtime.slow import Answer
-from undertow.sliding import ReachingLaw, Surface
 
 __all__ = ["answer_from", "answer_row", "memory_from", "memory_to"]
 

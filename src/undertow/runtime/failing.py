@@ -30,7 +30,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from undertow.errors import InvalidInputError
+from undertow.base import InvalidInputError
 
 __all__ = ["OPERATIONS", "Fault", "Tally", "failing", "intercepts_sqlite"]
 

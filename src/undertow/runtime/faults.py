@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from undertow.cascade import Cascade
-from undertow.mechanism import FloatArray
-from undertow.optimiser import Optimiser
-from undertow.proposal import Proposal
-from undertow.rig.interface import Measurement, Rig
+from undertow.models import FloatArray
+from undertow.optimiser import Optimiser, Proposal
+from undertow.plants.interface import Measurement, Rig
 from undertow.runtime.clock import SimulatedClock
 from undertow.runtime.slow import Answer, Request, Worker
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.mechanism import FloatArray
+from undertow.models import FloatArray
 from undertow.runtime.log import Recording
 from undertow.runtime.modes import Mode
 

@@ -19,15 +19,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undertow import errors
-from undertow.errors import ArtefactError, UndertowError
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement, OutputOnError, Rig
+from undertow.base import ArtefactError, UndertowError, errors
+from undertow.models import FloatArray
+from undertow.plants.interface import Measurement, OutputOnError, Rig
 from undertow.runtime.clock import prompt
 from undertow.runtime.processes import STOPPING, fork, pipe
 from undertow.runtime.steps import confine
 
-__all__ = ["KeptRig"]
+__all__ = ["SupervisedRig"]
 
 #: Outputs that wait for the keeper at most.
 QUEUE = 100
@@ -84,7 +83,7 @@ class _Farewell(NamedTuple):
     close: str
 
 
-class KeptRig:
+class SupervisedRig:
     """A rig that is kept by another process.
 
     Parameters

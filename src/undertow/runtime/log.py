@@ -36,9 +36,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from undertow.errors import ArtefactError, ResourceError
-from undertow.files import check_file, parse_json
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.base import ArtefactError, ResourceError, check_file, parse_json
+from undertow.models import FloatArray, Mechanism
 from undertow.runtime.processes import Background
 
 __all__ = ["Columns", "Log", "Recording", "check_log", "part_path", "read_log"]

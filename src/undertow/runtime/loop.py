@@ -7,17 +7,16 @@ import gc
 import math
 import sys
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement, OutputOnError, Rig
-from undertow.runtime.clock import YIELD, Clock, Histogram, WallClock, locked_memory, prompt
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray
+from undertow.plants.interface import Measurement, OutputOnError, Rig
+from undertow.runtime.clock import YIELD, Clock, WallClock, locked_memory, prompt
 from undertow.runtime.controller import UNSOUND, Controller, Inputs
 from undertow.runtime.encoding import answer_row
 from undertow.runtime.health import SECOND, RigClock, Share
@@ -27,9 +26,9 @@ from undertow.runtime.processes import Background, refused_by_the_system
 from undertow.runtime.slow import Answer, Worker, is_answer
 from undertow.runtime.stage import stage_module
 from undertow.runtime.steps import confine
-from undertow.runtime.verdict import RunVerdict
+from undertow.runtime.verdict import Report
 
-__all__ = ["Report", "Runtime"]
+__all__ = ["Runtime"]
 
 
 #: Time before a step is due at which the shadow rehearses, s.
@@ -43,109 +42,6 @@ EVENTS = 10_000
 
 #: Memory that is held back for the way to zero, bytes.
 RESERVE = 4 << 20
-
-
-@dataclass(eq=False)
-class Report:
-    """What came of a run.
-
-    Attributes
-    ----------
-    steps, missed
-        Steps made, and steps that ended after their period: output, what follows it, log.
-    asleep
-        Missed steps that took less than a period, but were woken too late.
-    skipped
-        Periods in which no step was made, because an earlier one took too long.
-    think, whole, late, rest
-        Time of the fast step's own computation between reading and writing; from when the
-        step was due to when its output was written; to when it began; and what follows the
-        output: answers judged, requests made, rows of the log copied.
-    shadowed, disagreed
-        Steps that the shadow made again, and those in which its output was another.
-    mode, stopped_by
-        State at the end, and why the run stopped, if it did.
-    entered
-        How often each state was entered.
-    answers
-        Verdicts on the answers of the slow loop, in a few words each, with their numbers.
-    events
-        Everything that happened: (t, what, text).
-    variation
-        Total variation of the inputs, Σ|u_k − u_{k−1}|, (m,).
-    last, settled_for
-        State before the stop, and for how long it had been *balance* then, s.
-    early
-        Whether the operator stopped the run before its time.
-    unread, unwritten, missing
-        Reads and writes of the rig that failed; steps in which a reading was missing, or not
-        believed.
-    unsound
-        Answers of the slow loop that were none, or refused as unsound: their numbers are not
-        those of their plan, or the plan is not stable.
-    unreached
-        How often the slow loop could not be asked, or nobody was left to take over.
-    off, output
-        Whether the device took an output of zero at the end; what went wrong with that, or with
-        closing it.
-    error, cost, unit
-        ‖x‖₂ of the last estimate, and ∫ Φ dt over the run, in the objective's unit.
-    home, homing
-        Of the settings: what a run that ends settled is measured by.
-    system
-        What the loop asked of the system, and what it got, in words.
-    log
-        Where everything went.
-    """
-
-    steps: int = 0
-    missed: int = 0
-    asleep: int = 0
-    skipped: int = 0
-    think: Histogram = field(default_factory=Histogram)
-    whole: Histogram = field(default_factory=Histogram)
-    late: Histogram = field(default_factory=Histogram)
-    rest: Histogram = field(default_factory=Histogram)
-    shadowed: int = 0
-    disagreed: int = 0
-    mode: Mode = Mode.IDLE
-    stopped_by: str = ""
-    entered: Counter[str] = field(default_factory=Counter)
-    answers: Counter[str] = field(default_factory=Counter)
-    events: list[tuple[float, str, str]] = field(default_factory=list)
-    variation: FloatArray = field(default_factory=lambda: np.zeros(0))
-    last: Mode = Mode.IDLE
-    settled_for: float = 0.0
-    early: bool = False
-    unread: int = 0
-    unwritten: int = 0
-    missing: int = 0
-    unsound: int = 0
-    unreached: int = 0
-    off: bool = True
-    output: str = ""
-    error: float = math.nan
-    cost: float = 0.0
-    unit: str = ""
-    home: float = math.inf
-    homing: float = 0.0
-    system: tuple[str, ...] = ()
-    log: Log | None = field(default=None, repr=False)
-
-    @property
-    def lost_rows(self) -> int:
-        """Rows of the log that were lost, also by its closing."""
-        return 0 if self.log is None else self.log.dropped
-
-    @property
-    def log_failure(self) -> str:
-        """Why the log could not be written to its end; empty where it could."""
-        return "" if self.log is None else self.log.failure
-
-    @property
-    def verdict(self) -> RunVerdict:
-        """How the run ended; ask again once the log is closed, which may lose rows."""
-        return RunVerdict.of(self)
 
 
 class Runtime:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from undertow.codegen.machine import numba
+from undertow.symbolic import numba
 
 __all__ = ["Command", "Mode", "Reason", "successor", "transition"]
 

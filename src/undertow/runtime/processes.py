@@ -1,7 +1,7 @@
 """Processes and threads of our own, and whether the system has what a run needs.
 
 Processes are forked, so that they begin with everything compiled.  What the system refuses
-(memory, threads, processes, descriptors, disk) is a :class:`undertow.errors.ResourceError`.
+(memory, threads, processes, descriptors, disk) is a :class:`undertow.base.ResourceError`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from undertow.errors import InvalidInputError, ResourceError
+from undertow.base import InvalidInputError, ResourceError
 
 if TYPE_CHECKING:  # not on Windows
     from multiprocessing.context import ForkProcess

@@ -9,29 +9,27 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
 
-from undertow.cascade import Cascade, CascadeState
-from undertow.delay import weakened
-from undertow.errors import InvalidInputError, UndertowError, near
+from undertow.base import InvalidInputError, UndertowError, near
+from undertow.cascade import Cascade, CascadeState, derate_actuator
+from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import KalmanFilter
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.law import Plan
 from undertow.mechanisms.named import named
-from undertow.objectives import Goal, objective_for
-from undertow.plan import Plan
-from undertow.practice import (
+from undertow.models import FloatArray, Mechanism, number_of
+from undertow.objective import Goal, objective_for
+from undertow.optimiser import Budget
+from undertow.plants import Bench, IdealRig, RealisticRig
+from undertow.plants.presets import bench_for
+from undertow.runtime.controller import Controller
+from undertow.runtime.controller_defaults import (
     RESERVE,
     default_gate,
     estimator_for,
     provable,
     reaching_for,
 )
-from undertow.proposal import Budget
-from undertow.quantities import number_of
-from undertow.rig import Bench, IdealRig, RealisticRig
-from undertow.rig.presets import bench_for
-from undertow.runtime.controller import Controller
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow import Answer, Request, respond
-from undertow.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 
 __all__ = ["Recipe"]
 
@@ -187,7 +185,7 @@ class Recipe:
                 memory = cascade.start(x)[0]
             self.respond(Request(0.0, x, step, memory, 0))
         self.respond(Request(0.0, x, step, memory))
-        weakened(cascade.loop, RESERVE).batch(x, memory.plan, duration=step)
+        derate_actuator(cascade.loop, RESERVE).batch(x, memory.plan, duration=step)
 
     @cached_property
     def bench(self) -> Bench:

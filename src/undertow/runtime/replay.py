@@ -7,7 +7,6 @@ names that file; whoever replays it names the file to run, and its hash is compa
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -18,20 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from undertow.codegen.machine import processor
-from undertow.errors import ArtefactError, UndertowError
-from undertow.files import file_hash
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.base import ArtefactError, UndertowError, file_hash, versions
 from undertow.mechanisms.named import named
-from undertow.modelling.python_file import in_a_file
-from undertow.results import versions
-from undertow.rig.interface import Measurement
+from undertow.models import FloatArray, Mechanism
+from undertow.models.importers.python_file import in_a_file
+from undertow.plants.interface import Measurement
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import answer_from, memory_from, memory_to
 from undertow.runtime.log import Columns, Recording, read_log
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.slow import Answer, judge
+from undertow.symbolic import processor, sources_digest
 
 __all__ = ["Replay", "about", "replay", "replay_controller"]
 
@@ -111,11 +108,7 @@ def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> 
 @lru_cache(maxsize=1)
 def build() -> dict[str, str | None]:
     """Return what shapes the bits of a run: versions, processor, a hash of our own sources."""
-    package = Path(__file__).parent.parent
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
-    return {**versions(), **processor(), "sources": digest.hexdigest()[:12]}
+    return {**versions(), **processor(), "sources": sources_digest()[:12]}
 
 
 def replay(

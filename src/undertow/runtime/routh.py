@@ -10,12 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from undertow.codegen.machine import numba
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.memory import Memory
-from undertow.plan import Plan
-from undertow.sliding import ReachingLaw, coupling
-from undertow.stability import linearise
+from undertow.law import Plan, ReachingLaw, coupling, linearise
+from undertow.models import FloatArray, Mechanism
+from undertow.symbolic import Workspace, numba
 
 __all__ = ["PlanTest", "is_hurwitz"]
 
@@ -43,7 +40,7 @@ class PlanTest:
         n, m = self._n, self._m = mechanism.n, mechanism.m
         self._reaching, self._usual = reaching, reaching.vector(m)
         linear, free = linearise(mechanism), n - m
-        self._parts = Memory(
+        self._parts = Workspace(
             _LAYOUT, n=n, m=m, free=free, size=n + free, width=max(m, free)
         )  # fmt: skip
         for name, whole in (("M", linear.M), ("F", linear.F), ("D", linear.D)):

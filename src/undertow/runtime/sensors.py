@@ -16,15 +16,21 @@ import math
 from functools import lru_cache
 from typing import Any
 
-from undertow.codegen.function import COMPILED, PREAMBLE
-from undertow.codegen.names import docstring
-from undertow.codegen.store import content_key, generated, generators
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.memory import BRIEF, Memory, unpacked
-from undertow.rig.interface import Measurement
-from undertow.rig.stepping import dynamics_source
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray, Mechanism
+from undertow.plants.interface import Measurement
+from undertow.plants.stepping import dynamics_source
 from undertow.runtime.settings import Settings
+from undertow.symbolic import (
+    BRIEF,
+    COMPILED,
+    PREAMBLE,
+    Workspace,
+    content_key,
+    docstring,
+    generated,
+    unpacked,
+)
 
 __all__ = ["LAST_HARMLESS", "SensorWatch"]
 
@@ -79,7 +85,7 @@ def slow(h, x, band, gain, parameters, W):
 
 
 {COMPILED}
-def believe(x, u, block):
+def gate_measurement(x, u, block):
     # What is not believable becomes NaN; returns how many are missing, where the longest gap
     # is, and which reading is frozen (-1: none).
 {unpacked(_LAYOUT)}
@@ -154,7 +160,7 @@ def check(stamp, x, u, block):
     if clock[3] == 0.0:
         clock[2] += settings[0]
         return ({NEVER} if clock[2] > settings[3] else {NOT_YET}), 0, n, False, clock[1], 0.0
-    missing, worst, still = believe(x, u, block)
+    missing, worst, still = gate_measurement(x, u, block)
     beyond = quiet[0] - {PROBE}
     probe = 0.0 if beyond < 0.0 else 1.0 - 2.0 * (int(beyond / {SIDE}) % 2)
     if gaps[worst] > settings[3]:
@@ -167,12 +173,10 @@ def check(stamp, x, u, block):
     return {SOUND}, 0, missing, False, clock[1], probe
 """
 
-_GENERATOR = generators("runtime/sensors.py", "memory.py", "rig/stepping.py", "codegen/function.py")
-
 
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
-    key = content_key(mechanism.structure, mechanism.name, sources=_GENERATOR)
+    key = content_key(mechanism.structure, mechanism.name)
 
     def write() -> str:
         header = docstring(f"Sensor watch of {mechanism.name}; generated, do not edit.")
@@ -208,7 +212,7 @@ class SensorWatch:
         self.names = [c.name for c in mechanism.coordinates]
         n = mechanism.n
         self._check = _module(mechanism).check
-        memory = Memory(_LAYOUT, n=n, m=mechanism.m, p=len(mechanism.parameters))
+        memory = Workspace(_LAYOUT, n=n, m=mechanism.m, p=len(mechanism.parameters))
         self._block, self._clock, self._gaps = memory.block, memory["clock"], memory["gaps"]
         self._ages, self._quiet, self._shares = memory["ages"], memory["quiet"], memory["shares"]
         memory["settings"][:] = (

@@ -11,7 +11,7 @@ from types import FrameType
 from typing import Any, Self
 
 from undertow.cascade import CascadeState
-from undertow.rig.interface import Rig
+from undertow.plants.interface import Rig
 from undertow.runtime.clock import SimulatedClock, WallClock
 from undertow.runtime.log import Columns, Log, check_log
 from undertow.runtime.loop import Runtime

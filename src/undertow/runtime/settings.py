@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from undertow.errors import InvalidInputError
-from undertow.mechanism import FloatArray, Mechanism
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray, Mechanism
 
 __all__ = ["Settings"]
 

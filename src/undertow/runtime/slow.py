@@ -22,15 +22,13 @@ from typing import Protocol, TypeGuard
 
 import numpy as np
 
+from undertow.base import ResourceError
 from undertow.cascade import Admission, Cascade, CascadeState
-from undertow.errors import ResourceError
-from undertow.inner_loop import lane
-from undertow.mechanism import FloatArray
-from undertow.plan import Plan
-from undertow.proposal import Proposal
+from undertow.cascade.swing_up import SwingUpAndCatch
+from undertow.law import Plan, SlidingModeLaw, pack_law_parameters
+from undertow.models import FloatArray
+from undertow.optimiser import Proposal
 from undertow.runtime.processes import PATIENCE, STOPPING, Background, fork, pipe
-from undertow.sliding import SlidingModeLaw
-from undertow.swing_up import SwingUpAndCatch
 
 __all__ = [
     "Answer",
@@ -135,7 +133,9 @@ def lanes_of(cascade: Cascade, plan: Plan) -> FloatArray:
     """
     laws = plan.reaching or (cascade.reaching,) * len(plan.surfaces)
     pairs = zip(plan.surfaces, laws, strict=True)
-    return np.stack([lane(SlidingModeLaw(cascade.mechanism, s, law)) for s, law in pairs])
+    return np.stack(
+        [pack_law_parameters(SlidingModeLaw(cascade.mechanism, s, law)) for s, law in pairs]
+    )
 
 
 def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None = None) -> Answer:
@@ -209,7 +209,7 @@ def judge(
 ) -> tuple[CascadeState, Admission, FloatArray]:
     """Pass a proposal through the cascade's gate; whatever goes wrong refuses it."""
     try:
-        after, admission = cascade.consider(memory, proposal, x)
+        after, admission = cascade.apply_gate(memory, proposal, x)
         return after, admission, lanes_of(cascade, after.plan)
     except Exception as error:  # an optimiser's answer may be anything
         reason = f"gate: {type(error).__name__}: {error}"

@@ -7,15 +7,11 @@ from typing import Any
 
 import sympy as sp
 
-from undertow.codegen.function import PREAMBLE, function_source
-from undertow.codegen.store import content_key, generated, generators
-from undertow.codegen.tape import Tape
-from undertow.mechanism import Mechanism
+from undertow.models import Mechanism
 from undertow.objective import Objective
+from undertow.symbolic import PREAMBLE, Tape, content_key, function_source, generated
 
 __all__ = ["stage_module"]
-
-_GENERATOR = generators("runtime/stage.py", "codegen/function.py")
 
 
 @lru_cache(maxsize=64)
@@ -30,7 +26,7 @@ def stage_module(mechanism: Mechanism, objective: Objective) -> Any:
         Whose stage cost it is; ``cost``, (1,), is filled with it.
     """
     stage = objective.stage_cost(mechanism)
-    key = content_key(mechanism.structure, mechanism.name, sp.srepr(stage), sources=_GENERATOR)
+    key = content_key(mechanism.structure, mechanism.name, sp.srepr(stage))
 
     def write() -> str:
         tape = Tape()

@@ -8,16 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from undertow.codegen.function import PREAMBLE
-from undertow.codegen.machine import numba
-from undertow.codegen.names import docstring
-from undertow.codegen.store import content_key, generated, generators
-from undertow.inner_loop import LAYOUT, law_module
-from undertow.mechanism import FloatArray, Mechanism
-from undertow.memory import BRIEF, Memory, unpacked
+from undertow.law import LAYOUT, Switching, law_module
+from undertow.models import FloatArray, Mechanism
 from undertow.runtime.modes import Mode
 from undertow.runtime.settings import Settings
-from undertow.surface import Switching
+from undertow.symbolic import (
+    BRIEF,
+    PREAMBLE,
+    Workspace,
+    content_key,
+    docstring,
+    generated,
+    numba,
+    unpacked,
+)
 
 __all__ = ["PAST", "UNSOUND", "confine", "off_by", "settle", "sound", "step_memory", "step_module"]
 
@@ -85,7 +89,7 @@ def act(
         mode, command, fault, since[0] >= settings[4], inside, lost, math.sqrt(part) <= near, swings
     )
     if after == {Mode.CATCH:d} or after == {Mode.BALANCE:d}:
-        take_off(demand, disturbance, limits, wanted)
+        subtract_disturbance(demand, disturbance, limits, wanted)
         for i in range(m):
             wanted[i] += 2.0 * probe * band[i]
     else:
@@ -96,13 +100,8 @@ def act(
     return used, after, reason, what, where
 """
 
-_GENERATOR = generators(
-    "runtime/steps.py", "runtime/modes.py", "estimators/compensation.py", "memory.py",
-    "inner_loop.py", "codegen/function.py",
-)  # fmt: skip
 
-
-def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: float) -> Memory:
+def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: float) -> Workspace:
     """Return what a step of the fast loop works on, its settings filled in.
 
     Parameters
@@ -117,7 +116,7 @@ def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: f
         A free angle further than this from the target has been thrown out, rad.
     """
     n, m = mechanism.n, mechanism.m
-    memory = Memory(_LAYOUT, n=n, m=m, p=len(mechanism.parameters))
+    memory = Workspace(_LAYOUT, n=n, m=m, p=len(mechanism.parameters))
     memory["parameters"][:] = mechanism.parameter_values
     limits = memory["limits"]
     limits[:] = settings.limits(mechanism)
@@ -137,14 +136,14 @@ def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: f
 def step_module(mechanism: Mechanism, switching: Switching) -> Any:
     """Return the compiled module of a fast step: ``act`` on a :func:`step_memory`."""
     law = law_module(mechanism, switching)
-    key = content_key(mechanism.structure, mechanism.name, law.__name__, sources=_GENERATOR)
+    key = content_key(mechanism.structure, mechanism.name, law.__name__)
 
     def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
         header = docstring(f"Fast step of {mechanism.name}; generated, do not edit. {key[:16]}")
         parts = (
             f"from {law.__name__} import step as law\n"
-            "from undertow.estimators.compensation import take_off\n"
+            "from undertow.estimators.compensation import subtract_disturbance\n"
             "from undertow.runtime.modes import transition\n"
             "from undertow.runtime.steps import confine, off_by, settle\n"
             f"\np, n, m = {len(mechanism.parameters)}, {mechanism.n}, {mechanism.m}\n"

@@ -29,24 +29,25 @@ from types import FrameType
 
 import numpy as np
 
+from undertow.base import InvalidInputError, UndertowError
 from undertow.cascade import CascadeState
-from undertow.errors import InvalidInputError, UndertowError
-from undertow.mechanism import FloatArray
-from undertow.rig.interface import Measurement, Rig
+from undertow.models import FloatArray
+from undertow.plants.interface import Measurement, Rig
 from undertow.runtime import keeper
 from undertow.runtime import log as logs
 from undertow.runtime.clock import SimulatedClock
 from undertow.runtime.drill import drill_recipe
 from undertow.runtime.failing import OPERATIONS, Fault, Tally, failing
 from undertow.runtime.faults import Witness
-from undertow.runtime.keeper import KeptRig
+from undertow.runtime.keeper import SupervisedRig
 from undertow.runtime.log import Columns, Log, read_log
-from undertow.runtime.loop import Report, Runtime
+from undertow.runtime.loop import Runtime
 from undertow.runtime.processes import Background
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about, replay_controller
 from undertow.runtime.session import session
 from undertow.runtime.slow import Answer, InlineWorker, Request
+from undertow.runtime.verdict import Report
 
 __all__ = ["LIVE", "RIGS", "Case", "Device", "Systematic", "chosen"]
 
@@ -157,7 +158,7 @@ class Device:
 class _InStep:
     """A kept rig whose controller waits for its answers: simulated time has no other pace."""
 
-    def __init__(self, kept: KeptRig) -> None:
+    def __init__(self, kept: SupervisedRig) -> None:
         self.kept, self.period = kept, kept.period
 
     def read(self) -> Measurement:
@@ -369,8 +370,8 @@ class Systematic:
         limits = recipe.settings.limits(recipe.belief)
         slew = recipe.settings.slew(recipe.belief) * recipe.period
         if not in_step:
-            return KeptRig(lambda: device, recipe.period, limits, slew)
-        return _InStep(KeptRig(lambda: device, recipe.period, limits, slew, silence=_SILENCE))
+            return SupervisedRig(lambda: device, recipe.period, limits, slew)
+        return _InStep(SupervisedRig(lambda: device, recipe.period, limits, slew, silence=_SILENCE))
 
     def _answered(self, recipe: Recipe, request: Request) -> Answer:
         """Answer a request; one that was made in an earlier run has the answer that it had."""

@@ -14,15 +14,15 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from undertow.errors import printable
+from undertow.base import printable
 from undertow.runtime.clock import Histogram
 from undertow.runtime.drill import Outcome
 from undertow.runtime.drill_live import Killed, LiveOutcome
 from undertow.runtime.failing import OPERATIONS
-from undertow.runtime.loop import Report
 from undertow.runtime.modes import Mode
 from undertow.runtime.replay import Replay
 from undertow.runtime.systematic import RIGS, Case
+from undertow.runtime.verdict import Report
 
 __all__ = ["drill_table", "kill_table", "replay_table", "run_table", "systematic_table"]
 

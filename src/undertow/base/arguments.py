@@ -1,0 +1,278 @@
+"""Arguments of another type, refused at the door by what their annotations say.
+
+One rule for all that is public: :func:`checked` reads the annotations of a function or method,
+:func:`check_fields` those of a dataclass.  Ranges and shapes are for who uses the values.
+"""
+
+from __future__ import annotations
+
+import inspect
+import types
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import cache, wraps
+from numbers import Complex, Real
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+
+from undertow.base.errors import InvalidInputError
+
+__all__ = ["REMEDIES", "at_least", "check_fields", "checked", "floats"]
+
+#: What to give for a type, by its name.
+REMEDIES = {
+    "float": "Give a number in SI units: undertow.deg(10) for an angle of 10°",
+    "int": "Give a whole number",
+    "str": "Write it as text, in quotes",
+    "Mechanism": "Make one: undertow.mechanisms.rotary_pendulum(), or of one's own with "
+    "undertow.Mechanism.from_energies",
+    "Coordinate": 'Write [Coordinate("x", "m"), Coordinate("phi", "rad")]',
+    "Input": 'Write [Input("force", "N", 10.0)]',
+    "Parameter": 'Write [Parameter("mass", 0.5, "kg")]',
+    "Objective": "Make one: undertow.MinimumTime(), undertow.MinimumEnergy(), or "
+    'undertow.Objective("my cost", lambda v: v.phi**2)',
+    "Surface": "Design one: undertow.first_surface(mechanism)",
+    "ReachingLaw": "Write undertow.ReachingLaw(eta=20.0, layer=0.1)",
+    "Budget": "Write undertow.Budget(1024)",
+    "Freedom": "Write undertow.DecisionVariables(times=(0.0, 0.1))",
+    "Plan": "Write undertow.Plan((surface,)), or take the plan of a proposal",
+    "CascadeState": "Take the one that Cascade.start returned",
+    "Proposal": "Take the one that Cascade.propose returned",
+}
+
+#: What stands for a number that is written in full, and the most of a value that is shown.
+_ARRAY, _SHOWN = "array", 80
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def floats(what: str, values: ArrayLike) -> np.typing.NDArray[np.float64]:
+    """Return values as an array of floats, or refuse them.
+
+    Raises
+    ------
+    InvalidInputError
+        With what was given instead.
+    """
+    if _fits(values, _ARRAY):
+        return np.asarray(values, dtype=np.float64)
+    raise InvalidInputError(
+        what,
+        value=_shown(values),
+        limit="numbers, in SI units",
+        remedy="Set states by name: mechanism.state(name=value)",
+    )
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Have every argument of a function or method checked against its annotation.
+
+    Raises
+    ------
+    InvalidInputError
+        At a call, for an argument of another type, by name.
+
+    Examples
+    --------
+    >>> @checked
+    ... def half(length: float) -> float:
+    ...     return length / 2
+    >>> half("a")
+    Traceback (most recent call last):
+        ...
+    undertow.base.errors.InvalidInputError: length of half: got 'a', a str, must be a number. \
+Give a number in SI units: undertow.deg(10) for an angle of 10°
+    """
+    signature = inspect.signature(function)
+    starred = {
+        p.name: p.kind is p.VAR_KEYWORD
+        for p in signature.parameters.values()
+        if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+    }
+    name = function.__qualname__
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        hints = _hints(function)
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:  # a missing or an unknown name: Python's own message is the best
+            return function(*args, **kwargs)
+        for argument, value in given.items():
+            if argument not in hints:
+                continue
+            if argument not in starred:
+                _check(f"{argument} of {name}", value, hints[argument])
+                continue
+            named = starred[argument]
+            for key, one in value.items() if named else enumerate(value):
+                _check(f"{key if named else argument} of {name}", one, hints[argument])
+        return function(*args, **kwargs)
+
+    return call
+
+
+def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
+    """Refuse a number below a limit, and NaN.
+
+    Raises
+    ------
+    InvalidInputError
+        With the value and the limit.
+    """
+    if not value >= low:
+        raise InvalidInputError(
+            what,
+            value=value,
+            limit=f"≥ {low:g}",
+            remedy=remedy or f"Any whole number from {low:g} will do",
+        )
+
+
+def check_fields(instance: Any, *names: str) -> None:
+    """Check the fields of a dataclass, all or those named, against their annotations.
+
+    Raises
+    ------
+    InvalidInputError
+        For a field of another type, by name.
+    """
+    owner: Any = type(instance)
+    for field in owner.__dataclass_fields__.values():
+        if field.init and field.name in (names or owner.__dataclass_fields__):
+            what = f"{field.name} of {owner.__name__}"
+            _check(what, getattr(instance, field.name), _hints(owner)[field.name])
+
+
+@cache
+def _hints(of: Any) -> dict[str, Any]:
+    return get_type_hints(of)
+
+
+def _check(what: str, value: object, hint: Any) -> None:
+    if _fits(value, hint):
+        return
+    members = [m for m in _members(hint) if m is not types.NoneType]
+    names = (_name(m) for member in members for m in (member, *get_args(member)))
+    remedies = (REMEDIES.get(name) for name in names)
+    raise InvalidInputError(
+        what,
+        value=_shown(value),
+        limit=" or ".join(_words(m) for m in members),
+        remedy=next((r for r in remedies if r), "Its documentation shows what it takes"),
+    )
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    text = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+    return f"{text}, a {type(value).__name__}"
+
+
+def _members(hint: Any) -> list[Any]:
+    """Return what a hint allows, one by one; what NumPy calls ``ArrayLike`` is one."""
+    if hint is ArrayLike:
+        return [_ARRAY]
+    if get_origin(hint) not in (Union, types.UnionType):
+        return [hint]
+    members, arrays = list(get_args(hint)), set(get_args(ArrayLike))
+    if arrays and arrays <= set(members):
+        return [_ARRAY, *(m for m in members if m not in arrays)]
+    return members
+
+
+def _name(hint: Any) -> str:
+    return getattr(hint, "__name__", "")
+
+
+def _words(hint: Any) -> str:
+    """Return in words what a hint that is no union allows."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is _ARRAY or origin is np.ndarray:
+        return "numbers"
+    if origin is Literal:
+        return " or ".join(map(repr, inner))
+    if origin is not None and issubclass(origin, Mapping):
+        return f"a mapping of names to {_several(inner[1])}"
+    if origin is not None and issubclass(origin, Iterable):
+        return f"a sequence of {_several(inner[0])}"
+    if origin is Callable or callable is hint:
+        return "a function"
+    plain = {float: "a number", complex: "a number", int: "a whole number", str: "text"}
+    name = plain.get(hint) or _name(hint)
+    return (
+        f"an undertow.{name}"
+        if str(getattr(hint, "__module__", "")).startswith("undertow")
+        else name
+    )
+
+
+def _several(hint: Any) -> str:
+    members = [m for m in _members(hint) if m is not types.NoneType]
+    plain = {float: "numbers", complex: "numbers", int: "whole numbers", str: "names"}
+    return " or ".join(plain.get(m) or _words(m).removeprefix("an ") for m in members)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Tell whether a value is of a type, with numbers and sequences as users write them."""
+    if isinstance(hint, list) or get_origin(hint) in (Union, types.UnionType) or hint is ArrayLike:
+        return any(_fits(value, member) for member in _members(hint))
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is _ARRAY or origin is np.ndarray:
+        return _is_array(value)
+    if origin is Literal:
+        return any(type(value) is type(one) and value == one for one in inner)
+    if origin is Callable:
+        return callable(value)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return isinstance(value, Mapping) and all(_fits(v, inner[1]) for v in value.values())
+    if isinstance(origin, type) and issubclass(origin, Iterable):
+        return _is_sequence(value, inner)
+    if hint in (float, int, complex):
+        return _is_number(value, hint)
+    if (
+        hint is Any
+        or not isinstance(hint, type)
+        or hint is bool
+        or hint.__module__.startswith("sympy")
+    ):
+        return True  # expressions are for those who know the symbols
+    if getattr(hint, "_is_protocol", False):
+        return True
+    return isinstance(value, hint)
+
+
+def _is_array(value: Any) -> bool:
+    if value is None or isinstance(value, str):
+        return False
+    try:
+        return np.asarray(value, dtype=np.float64) is not None
+    except (TypeError, ValueError):
+        return False
+
+
+def _is_sequence(value: Any, inner: tuple[Any, ...]) -> bool:
+    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+        return False
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        return False
+    if not isinstance(value, Collection):
+        return True  # looking at the parts would use them up
+    if len(inner) > 1 and inner[1] is not Ellipsis:
+        return len(value) == len(inner) and all(map(_fits, value, inner))
+    return all(_fits(one, inner[0]) for one in value)
+
+
+def _is_number(value: Any, hint: type) -> bool:
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, sp.Expr):
+        return bool(value.is_number and (hint is complex or value.is_real))
+    if isinstance(value, bool | np.bool_):
+        return False
+    if hint is int:
+        return isinstance(value, Real) and bool(value == value // 1)
+    return isinstance(value, Complex if hint is complex else Real)

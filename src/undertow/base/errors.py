@@ -1,0 +1,141 @@
+"""Conditions that Undertow raises: each carries the offending value, the limit and the remedy.
+
+One root, :class:`UndertowError`; a few conditions below it. Every message reads
+*what is wrong: the value, the limit. The remedy.*
+"""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+__all__ = [
+    "ArtefactError",
+    "CertificateError",
+    "InfeasibleError",
+    "InvalidInputError",
+    "MissingExtraError",
+    "ModelError",
+    "ResourceError",
+    "SingularSurfaceError",
+    "UndertowError",
+    "UnstableSurfaceError",
+    "near",
+    "printable",
+    "raised_at",
+]
+
+#: This package: lines of its own are not where a user's file raised.
+PACKAGE = os.path.dirname(os.path.dirname(__file__))
+
+
+class UndertowError(Exception):
+    """Root of all conditions raised by Undertow.
+
+    Parameters
+    ----------
+    what
+        What is wrong, in one clause.
+    value
+        The value that was met, or ``None`` where there is no single value.
+    limit
+        The limit that it should have kept, in words or numbers.
+    remedy
+        What the user can do about it, as a sentence.
+    """
+
+    def __init__(
+        self, what: str, *, value: object = None, limit: object = None, remedy: str = ""
+    ) -> None:
+        self.what = what
+        self.value = value
+        self.limit = limit
+        self.remedy = remedy
+        facts = [
+            f"{label} {fact}"
+            for label, fact in (("got", value), ("must be", limit))
+            if fact is not None
+        ]
+        message = what + (": " + ", ".join(facts) if facts else "")
+        super().__init__(f"{message}. {remedy}" if remedy else message + ".")
+
+
+class InvalidInputError(UndertowError, ValueError):
+    """A number, name or shape that was passed in cannot be used."""
+
+
+class ModelError(UndertowError, ValueError):
+    """A mechanism breaks an assumption of the class of systems treated here."""
+
+
+class UnstableSurfaceError(UndertowError, ValueError):
+    """A surface whose sliding dynamics are not exponentially stable, (35)-(36)."""
+
+
+class SingularSurfaceError(UndertowError, ValueError):
+    """The law does not exist: α_a − α_u M_uu⁻¹ M_auᵀ is singular there, (37)."""
+
+
+class InfeasibleError(UndertowError):
+    """No admissible surface was found for the task."""
+
+
+class CertificateError(UndertowError):
+    """A certificate that says nothing: damaged, of another model, or of an unknown version."""
+
+
+class MissingExtraError(UndertowError, ImportError):
+    """An optional dependency is not installed."""
+
+
+class ArtefactError(UndertowError, OSError):
+    """A file or folder could not be read or written."""
+
+
+class ResourceError(UndertowError, OSError):
+    """The system refuses memory, a thread, a process, a descriptor or room on its disk."""
+
+
+def printable(text: str) -> str:
+    r"""Return a text with "?" for every character that a terminal would obey instead of showing.
+
+    >>> printable("an escape: \x1b[2J")
+    'an escape: ?[2J'
+    """
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def near(name: str, names: Iterable[str]) -> str:
+    """Return "Did you mean …?" with the names that are like a wrong one; nothing where none is.
+
+    >>> near("rotary_pendlum", ["cart_pendulum", "rotary_pendulum", "tora"])
+    'Did you mean rotary_pendulum or cart_pendulum?'
+    """
+    found = get_close_matches(name, list(names), n=3)
+    return f"Did you mean {' or '.join(found)}?" if found else ""
+
+
+def raised_at(error: BaseException, file: str = "") -> str:
+    """Return ", FILE line N" of the innermost line of a user's own that an error went through.
+
+    Parameters
+    ----------
+    error
+        With its traceback.
+    file
+        The user's file; where it is left out, any outside of Undertow and of installed packages.
+
+    Returns
+    -------
+    str
+        Empty where there is no such line.
+    """
+    if isinstance(error, SyntaxError) and error.lineno and error.filename == file:
+        return f", {file} line {error.lineno}"
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        ours = frame.filename.startswith(PACKAGE)
+        if frame.filename == file if file else not ours and "-packages" not in frame.filename:
+            return f", {frame.filename} line {frame.lineno}"
+    return ""

@@ -1,0 +1,29 @@
+"""The controller: law, optimiser and gate at two rates; robustness; swing-up and catch."""
+
+from undertow.cascade.cascade import (
+    Admission,
+    Cascade,
+    CascadeState,
+    Gate,
+    Run,
+    Update,
+    cost_gate,
+    gate_words,
+    problem_words,
+)
+from undertow.cascade.robustness import derate_actuator, noise_share, robustness_gate
+
+__all__ = [
+    "Admission",
+    "Cascade",
+    "CascadeState",
+    "Gate",
+    "Run",
+    "Update",
+    "cost_gate",
+    "derate_actuator",
+    "gate_words",
+    "noise_share",
+    "problem_words",
+    "robustness_gate",
+]

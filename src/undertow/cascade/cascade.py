@@ -1,0 +1,625 @@
+"""The two-rate cascade: sliding-mode law inside, surface optimiser outside, a gate between.
+
+The cascade is a pure state machine: it holds no clock and no thread, and every decision is
+a function of its arguments, so a recorded run can be replayed.  The runtime, or
+:meth:`Cascade.simulate`, supplies the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base import InvalidInputError, Verdict, at_least, check_fields, checked
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event, Trajectory
+from undertow.law import (
+    Control,
+    Plan,
+    ReachingLaw,
+    SlidingModeLaw,
+    Surface,
+    check_surface,
+    stability_margin,
+)
+from undertow.models import TIME, FloatArray, Mechanism, number_of, require_mechanism
+from undertow.objective import MinimumEnergy, Objective, require_objective
+from undertow.optimiser import Budget, DecisionVariables, Optimiser, Proposal
+
+__all__ = [
+    "Admission",
+    "Cascade",
+    "CascadeState",
+    "Gate",
+    "Run",
+    "Update",
+    "cost_gate",
+    "gate_words",
+    "problem_words",
+]
+
+
+@dataclass(frozen=True)
+class Admission:
+    """The gate's decision on a proposal: accepted or not, and why.
+
+    ``cost`` is the predicted cost of the plan that stays in use, new or old; ``verdict`` what is
+    known of that plan at the present state, where the gate gives one.
+    """
+
+    accepted: bool
+    reason: str
+    cost: float
+    verdict: Verdict | None = None
+
+
+#: Relative tolerance of the linear tail in the optimiser's rollouts.
+TAIL = 2e-3
+
+#: Largest step times rate of the boundary layer in the optimiser's rollouts.
+RESOLVED = 1.0
+
+#: How far positions may be off what the plan in use predicted for them before an admission says
+#: so: this much, rad or m, and this part of how far the plan was to move them meanwhile.  A target
+#: that jumps shows in positions at once; what a model does not know shows in velocities first.
+JUMP, PART = 0.1, 0.5
+
+Gate = Callable[[ClosedLoop, Plan, Plan, FloatArray, float], Admission]
+
+
+def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
+    """Admit a plan that is stable, feasible from x, and does not raise the cost.
+
+    Both plans are rolled out afresh from the present state: nothing that the optimiser
+    says of them is believed.  This is the step of Lemma 3, J̃_{k+1} ≤ Ĵ_{k+1}.
+
+    Parameters
+    ----------
+    loop
+        The predicted closed loop.
+    old, new
+        The plan in use, shifted to now, and the proposed one.
+    x
+        Present state, (2n,).
+    horizon
+        Longest prediction, s.
+    """
+    pair = loop.batch(x, [old, new], duration=horizon)
+    old_cost, new_cost = pair.score(horizon)
+    old_cost = float(old_cost) if old_cost < INADMISSIBLE else math.inf
+    stability = float(stability_margin(loop.mechanism, new.surfaces[-1]))
+    if not stability > 0:
+        return Admission(False, f"unstable: margin {stability:.3g} 1/s", old_cost)
+    if new_cost >= INADMISSIBLE:
+        event = Event(int(pair.event[1])).name.lower()
+        return Admission(
+            False, f"not feasible from here: {event} at {pair.time[1]:.3g} s", old_cost
+        )
+    if new_cost > old_cost:
+        return Admission(
+            False, f"raises the predicted cost: {new_cost:.6g} > {old_cost:.6g}", old_cost
+        )
+    return Admission(True, "stable, feasible, cost not raised", float(new_cost))
+
+
+def gate_words(gate: Gate) -> str:
+    """Return what a gate asks for, in words: its own ``words``, or else its name.
+
+    >>> gate_words(cost_gate)
+    'stable, feasible, cost not raised'
+    """
+    if gate is cost_gate:
+        return "stable, feasible, cost not raised"
+    return getattr(gate, "words", "") or getattr(gate, "__name__", type(gate).__name__)
+
+
+def problem_words(mechanism: Mechanism, objective: Objective, gate: Gate | None = None) -> str:
+    """Return in one line what a word for an objective meant, and who admits what is found.
+
+    >>> import undertow as ut
+    >>> print(problem_words(ut.mechanisms.pendubot(), ut.MinimumTime(), cost_gate))
+    objective time: ∫ 1 dt, s, to ‖x‖ ≤ 0.01 within 60 s; gate: stable, feasible, cost not raised
+    """
+    asked = "" if gate is None else f"; gate: {gate_words(gate)}"
+    return f"objective {objective.meaning(mechanism)}{asked}"
+
+
+@dataclass(frozen=True)
+class CascadeState:
+    """What the cascade remembers between steps.
+
+    ``plan`` is in use since the time ``since``; ``sequence`` is the number of the last
+    proposal considered; ``predicted`` is the predicted cost J̃_k at the last decision;
+    ``scale`` that of the first; ``x`` the state at ``since``, empty where it is not known.
+    """
+
+    plan: Plan
+    sequence: int = 0
+    predicted: float = math.inf
+    scale: float = 0.0
+    since: float = 0.0
+    x: tuple[float, ...] = ()
+
+    @property
+    def surface(self) -> Surface:
+        """The first surface of the plan in use."""
+        return self.plan.surfaces[0]
+
+    def at(self, t: float) -> Plan:
+        """Return what is left of the plan in use at time t, s."""
+        return self.plan.shifted(t - self.since)
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """One decision of the outer loop, as recorded.
+
+    ``t`` and ``x`` are when and where; ``plan`` the one in use afterwards; ``predicted``
+    its J̃_k; ``spent`` the cost spent since the decision before.
+    """
+
+    t: float
+    x: FloatArray
+    proposal: Proposal
+    admission: Admission
+    plan: Plan
+    predicted: float
+    spent: float
+
+    @property
+    def surface(self) -> Surface:
+        """The surface in use after the decision."""
+        return self.plan.surfaces[0]
+
+    def __repr__(self) -> str:
+        """Show when, what was decided and why."""
+        decided = "admitted" if self.admission.accepted else "kept"
+        return f"Update(t={self.t:g} s, {decided}: {self.admission.reason})"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A simulated run of the cascade.
+
+    Attributes
+    ----------
+    trajectory
+        The motion of the plant.
+    updates
+        The decisions of the outer loop, in order.
+    """
+
+    trajectory: Trajectory
+    updates: tuple[Update, ...]
+
+    def __repr__(self) -> str:
+        """Show how it ended."""
+        admitted = sum(update.admission.accepted for update in self.updates)
+        return (
+            f"Run({self.trajectory.mechanism.name}, {self.trajectory.event.name.lower()} at "
+            f"{self.time:.4g} s, cost {self.cost:.6g}, {len(self.updates)} decisions, "
+            f"{admitted} admitted)"
+        )
+
+    @property
+    def cost(self) -> float:
+        """Total cost of the motion; that of its trajectory is ``trajectory.total``."""
+        return self.trajectory.total
+
+    @property
+    def time(self) -> float:
+        """Time at which the terminal set was reached, or the run ended, s."""
+        return self.trajectory.duration
+
+    @property
+    def reached(self) -> bool:
+        """Whether the terminal set was reached."""
+        return self.trajectory.event == Event.REACHED
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The surface in use after each decision."""
+        return tuple(update.surface for update in self.updates)
+
+    @property
+    def verdicts(self) -> tuple[Verdict | None, ...]:
+        """What is known of the plan in use, at each decision."""
+        return tuple(update.admission.verdict for update in self.updates)
+
+    @property
+    def lemma3_slack(self) -> FloatArray:
+        """Slack of Lemma 3 at each decision, J̃_k − spent − J̃_{k+1}, in units of cost.
+
+        Never negative, to integration tolerance, where belief and truth agree; for
+        minimum time it is t_{f,k} − Δt − t_{f,k+1}.  NaN where one of the predictions is
+        infinite: a disturbed plant may leave what the belief can bring home.
+        """
+        predicted = np.array([update.predicted for update in self.updates])
+        spent = np.array([update.spent for update in self.updates])
+        finite = np.isfinite(predicted)
+        known = finite[1:] & finite[:-1]
+        predicted = np.where(finite, predicted, 0.0)
+        return np.where(known, predicted[:-1] - spent[1:] - predicted[1:], np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Cascade:
+    """The controller a user runs: law, optimiser and gate.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's belief.
+    objective
+        What is best; the travel that the mechanism declares joins its constraints, see
+        :meth:`undertow.Objective.on`.
+    reaching
+        Reaching law of the inner loop.
+    period
+        Δt between re-optimisations, s.
+    first
+        First surface, checked; designed by itself by default.
+    step, hold
+        Runge-Kutta step of the predictions, s, and steps per sample of the inner loop
+        (0: continuous), as for :class:`undertow.ClosedLoop`.
+    freedom
+        What may be chosen besides the paper's surface parameters: reaching gains, a
+        schedule of surfaces.  Times of a schedule are multiples of the period.
+    cold, warm
+        Budgets of the first optimisation and of the later ones; by default as the method
+        needs.
+    resolution
+        Differences in predicted cost below this part of the first one are not worth a
+        search.
+    gate
+        Admission gate: with exact states :func:`cost_gate`, the default everywhere.  For a rig,
+        its estimator and its delays :func:`undertow.runtime.controller_defaults.default_gate` adds
+        margins.
+    seed
+        Seed of the optimiser.
+
+    Raises
+    ------
+    InvalidInputError
+        For a period that is not a whole number of steps.
+    UnstableSurfaceError, SingularSurfaceError
+        For a first surface that cannot be used.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    >>> run = ut.Cascade(rig, ut.MinimumTime()).simulate(phi=ut.deg(20))
+    >>> run.reached
+    True
+    """
+
+    mechanism: Mechanism
+    objective: Objective = MinimumEnergy()
+    reaching: ReachingLaw = ReachingLaw()
+    period: float = 0.1
+    first: Surface | None = None
+    step: float = 0.002
+    hold: int = 0
+    freedom: DecisionVariables = DecisionVariables()
+    cold: Budget | None = None
+    warm: Budget | None = None
+    resolution: float = 1e-4
+    gate: Gate = cost_gate
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check all settings before any work starts."""
+        check_fields(self)
+        require_mechanism("mechanism of a cascade", self.mechanism)
+        require_objective(self.objective)
+        object.__setattr__(self, "objective", self.objective.on(self.mechanism))
+        if TIME in self.mechanism.force.free_symbols:
+            raise InvalidInputError(
+                f"belief '{self.mechanism.name}' of a cascade",
+                value="a force that depends on the time t",
+                limit="autonomous",
+                remedy="Predictions have no clock: give disturbances to plant= alone",
+            )
+        if not (math.isfinite(self.resolution) and self.resolution >= 0):
+            raise InvalidInputError(
+                "resolution of the cascade",
+                value=self.resolution,
+                limit="finite and ≥ 0",
+                remedy="1e-4 is a ten-thousandth of the first cost",
+            )
+        at_least("seed", self.seed, 0)
+        assert self.loop is not None  # built here, so that its checks run first
+        stride = self.step * max(1, self.hold)
+        count = number_of("period of the cascade", self.period) / stride
+        if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
+            raise InvalidInputError(
+                "period of the cascade",
+                value=f"{self.period:g} s",
+                limit=f"a whole multiple of the inner step, {stride:g} s",
+                remedy="Change the period, or the step",
+            )
+        if any(abs(t / self.period - round(t / self.period)) > 1e-6 for t in self.freedom.times):
+            raise InvalidInputError(
+                "times of a schedule",
+                value=self.freedom.times,
+                limit=f"multiples of the period, {self.period:g} s",
+                remedy="Then what is left of a plan is a plan again",
+            )
+        if self.first is not None:
+            check_surface(self.mechanism, self.first)
+
+    @cached_property
+    def loop(self) -> ClosedLoop:
+        """The predicted closed loop, belief as plant, integrated to its end: the gate's."""
+        return ClosedLoop(
+            self.mechanism, self.objective, self.reaching, step=self.step, hold=self.hold
+        )
+
+    @cached_property
+    def optimiser(self) -> Optimiser:
+        """The optimiser of the outer loop; its rollouts end in the exact linear tail.
+
+        Its steps are twice as long where that resolves the boundary layer: the gate integrates
+        what it finds again.  A time of arrival is a matter of milliseconds, and is not searched
+        for with longer steps than it is judged with.
+        """
+        loop = replace(self.loop, tail=TAIL)
+        end = loop.linear_end
+        smooth = end is not None and end.counts_cost and not self.freedom.reaching
+        eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
+        slow = 2 * self.step * float((eta / layer).max()) <= RESOLVED
+        even = all(round(t / self.step) % 2 == 0 for t in self.freedom.times)
+        if smooth and slow and even and not any(self.mechanism.disturbance_bounds):
+            loop = replace(loop, step=2 * self.step)
+        return Optimiser(loop, self.first, self.cold, self.warm, self.freedom, seed=self.seed)
+
+    def __repr__(self) -> str:
+        """Show what is controlled, for what, and how often it is planned anew."""
+        return f"Cascade({self.mechanism.name}, {self.objective.name}, period={self.period:g} s)"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it was made from: a copy compiles, or finds, the same kernels."""
+        made = {field.name: getattr(self, field.name) for field in fields(self)}
+        return made | {"objective": self.objective.written(self.mechanism)}
+
+    # -- the state machine ----------------------------------------------------------------
+
+    @checked
+    def start(self, x: ArrayLike) -> tuple[CascadeState, Proposal]:
+        """Run the first, global optimisation from x: at the start, and again after a jump.
+
+        A target of one's own is moved by taking it off the state: x is always the way to the
+        target.  When it jumps, so does x, and what was planned is for another task: call this
+        again.
+
+        Raises
+        ------
+        InfeasibleError
+            When no admissible surface was found.
+        """
+        proposal, plan, cost = self._global(self.optimiser, x)
+        if not math.isfinite(cost):  # large steps were too hopeful: small ones throughout
+            exact = replace(self.optimiser, loop=self.loop)
+            proposal, plan, cost = self._global(exact, x)
+        begun = CascadeState(plan, 0, cost, cost, x=_kept(self.mechanism.check_state(x)))
+        return begun, proposal
+
+    @checked
+    def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
+        """Put the first plan before the gate: there is no other, so it is used all the same.
+
+        The admission says what the gate would have said; ``accepted`` is always true.
+        """
+        current = self.mechanism.check_state(x)
+        asked = self.gate(self.loop, state.plan, state.plan, current, horizon)
+        reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
+        return Admission(True, reason, state.predicted, asked.verdict)
+
+    def _global(self, optimiser: Optimiser, x: ArrayLike) -> tuple[Proposal, Plan, float]:
+        """Return a global optimum, its plan and its cost integrated to the end."""
+        proposal = optimiser.require(x)
+        plan = proposal.plan
+        assert plan is not None  # require() raises otherwise
+        return proposal, plan, self._exact_cost(plan, x, self.objective.horizon)
+
+    def _exact_cost(self, plan: Plan, x: ArrayLike, horizon: float) -> float:
+        score = float(self.loop.batch(x, plan, duration=horizon).score(horizon)[0])
+        return score if score < INADMISSIBLE else math.inf
+
+    @checked
+    def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
+        """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits.
+
+        It follows the plan in use wherever x is: after a jump of the target, too, which asks for
+        :meth:`start`.
+        """
+        surface, law = state.plan.at(t - state.since)
+        return SlidingModeLaw(self.mechanism, surface, law or self.reaching)(t, x)
+
+    @checked
+    def propose(
+        self, state: CascadeState, x: ArrayLike, t: float = 0.0, horizon: float | None = None
+    ) -> Proposal:
+        """Slow step: re-optimise from x, warm-started; an exception becomes a status.
+
+        Parameters
+        ----------
+        state
+            Memory of the cascade.
+        x
+            State that the plan is for, (2n,).
+        t
+            When that is, s.
+        horizon
+            Time that is left, s.  Without it the plan looks the whole of the objective's horizon
+            ahead, each time anew: a task that is to be done by a time needs what is left until
+            then, or its end recedes for ever and least energy puts off arriving.
+
+        Notes
+        -----
+        The search is warm: it looks near the plan in use.  Where the state has jumped, or the
+        target, the optimum may be far from it: :meth:`apply_gate` says so, :meth:`start` finds it.
+        """
+        sequence = state.sequence + 1
+        try:
+            return self.optimiser.propose(
+                x,
+                incumbent=state.at(t),
+                horizon=horizon,
+                sequence=sequence,
+                computed_for=t,
+                resolution=self.resolution * state.scale,
+            )
+        except Exception as error:  # the inner loop must survive whatever the outer loop does
+            message = f"{type(error).__name__}: {error}"
+            return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, message)
+
+    @checked
+    def apply_gate(
+        self,
+        state: CascadeState,
+        proposal: Proposal,
+        x: ArrayLike,
+        horizon: float | None = None,
+    ) -> tuple[CascadeState, Admission]:
+        """Pass a proposal through the gate; the last good surface stays unless it is admitted.
+
+        Proposals that are not newer than the last one considered are refused.  ``horizon`` is
+        the time that is left, s, as for :meth:`propose`.
+
+        Where the positions of x are farther from those that the plan in use predicted for this
+        moment than ``JUMP`` = 0.1 rad or m and ``PART`` = half of the way that it was to move them
+        since, the admission's reason says so: after a jump the cost is compared with that of a plan
+        for another task, and "cost not raised" is little.
+        """
+        span = self.objective.horizon if horizon is None else horizon
+        current = self.mechanism.check_state(x)
+        if proposal.sequence <= state.sequence:
+            stale = f"stale: number {proposal.sequence} after {state.sequence}"
+            return state, Admission(False, stale, state.predicted)
+        t = proposal.computed_for
+        old = state.at(t)
+        jump = self._jump(state, t, current)
+        state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
+        if proposal.plan is None:
+            kept = self.gate(self.loop, old, old, current, span)
+            reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
+            admission = replace(kept, accepted=False, reason=reason)
+            return replace(state, predicted=kept.cost), admission
+        admission = self.gate(self.loop, old, proposal.plan, current, span)
+        admission = replace(admission, reason=f"{admission.reason}{jump}")
+        plan = proposal.plan if admission.accepted else old
+        return replace(state, plan=plan, predicted=admission.cost), admission
+
+    def _jump(self, state: CascadeState, t: float, x: FloatArray) -> str:
+        """Say how far a state is off what the plan in use predicted for it, where it is far."""
+        if not state.x or not 0 <= t - state.since <= self.objective.horizon:
+            return ""
+        span = round((t - state.since) / self.step) * self.step
+        ahead = self.loop.batch(state.x, state.plan, duration=span, terminal=0.0).x[0]
+        n = self.mechanism.n
+        off = float(np.linalg.norm((x - ahead)[:n]))
+        moved = float(np.linalg.norm((ahead - state.x)[:n]))
+        if not off > JUMP + PART * moved:  # a prediction that ended in NaN says nothing
+            return ""
+        return f"; the state is {off:.3g} off the plan's prediction: after a jump, call start again"
+
+    def _start_state(self, x0: ArrayLike | None, names: dict[str, float]) -> FloatArray:
+        """Return the initial state that was given one way or the other."""
+        if x0 is None:
+            return self.mechanism.state(**names) if names else self.mechanism.usual_start
+        if names:
+            raise InvalidInputError(
+                "initial state",
+                value=f"x0 and {', '.join(names)}",
+                limit="x0 or names, not both",
+                remedy="Leave one of them out",
+            )
+        x = self.mechanism.check_state(x0)
+        if x.ndim != 1:
+            raise InvalidInputError(
+                "initial state",
+                value=f"shape {x.shape}",
+                limit=f"({2 * self.mechanism.n},)",
+                remedy="A run has one start; ClosedLoop.batch takes many",
+            )
+        return x
+
+    # -- simulation -----------------------------------------------------------------------
+
+    @checked
+    def simulate(
+        self,
+        x0: ArrayLike | None = None,
+        *,
+        plant: Mechanism | None = None,
+        duration: float | None = None,
+        progress: Callable[[float, float], None] | None = None,
+        **state: float,
+    ) -> Run:
+        """Simulate the cascade until the terminal set is reached.
+
+        Parameters
+        ----------
+        x0
+            Initial state, (2n,); or give its non-zero entries by name (``phi=0.7``).
+            With neither, the mechanism's usual ``start``, where it has one.
+        plant
+            The truth; the belief by default.
+        duration
+            Longest run, s; the objective's horizon by default.  Predictions end there too.
+        progress
+            Called with (time, duration) after each period.
+
+        Raises
+        ------
+        InfeasibleError
+            When the first optimisation finds no admissible surface.
+        InvalidInputError
+            For an unknown state name, a state that is not finite, or no start at all.
+        """
+        x = self._start_state(x0, state)
+        total = self.objective.horizon if duration is None else duration
+        if not (math.isfinite(total) and total > 0):
+            raise InvalidInputError(
+                "duration of a run",
+                value=f"{total} s",
+                limit="finite and > 0",
+                remedy="Leave it out for the objective's horizon",
+            )
+        truth = replace(self.loop, plant=plant)
+        memory, proposal = self.start(x)
+        admission = self.first_admission(memory, x, total)
+        updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
+        pieces: list[Trajectory] = []
+        for k in range(math.ceil(total / self.period - 1e-9)):
+            t = k * self.period
+            if k > 0:
+                proposal = self.propose(memory, x, t, total - t)
+                memory, admission = self.apply_gate(memory, proposal, x, total - t)
+                updates.append(
+                    Update(
+                        t, x, proposal, admission, memory.plan, memory.predicted,
+                        pieces[-1].total,
+                    )
+                )  # fmt: skip
+            pieces.append(
+                truth.simulate(x, memory.plan, duration=min(self.period, total - t), start=t)
+            )
+            x = pieces[-1].x[-1]
+            if progress is not None:
+                progress(t + self.period, total)
+            if pieces[-1].event != Event.HORIZON:
+                break
+        return Run(Trajectory.join(pieces), tuple(updates))
+
+
+def _kept(x: FloatArray) -> tuple[float, ...]:
+    """Return a state as plain numbers; several of them are none."""
+    return tuple(x.tolist()) if x.ndim == 1 else ()

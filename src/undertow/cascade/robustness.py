@@ -1,0 +1,288 @@
+"""What a surface must bear before a bench may meet it: delay, noise, and a weaker actuator.
+
+Inside the boundary layer the law is smooth; at the target it is a state feedback u = k x.
+Held from sample to sample and applied d samples late it closes a discrete loop whose
+spectral radius says whether it is stable.  A surface can be excellent on the model and yet
+bear no delay: near-singular ones (37) have the largest gains.  And far from the target the
+cheapest motion uses all of the actuator, so that a motor a little weaker than its data sheet
+loses it.  The same gains turn what an estimator does not know of the state, one count of an
+encoder, into input: of a near-singular surface more than the actuator has.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import scipy.linalg
+
+from undertow.base import InvalidInputError
+from undertow.cascade.cascade import Admission, cost_gate, gate_words
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
+from undertow.law import InnerLoop, Plan, ReachingLaw, Surface, linearise
+from undertow.models import FloatArray, Mechanism
+
+__all__ = [
+    "BenchGate",
+    "DelayGate",
+    "delay_gate",
+    "delay_margin",
+    "derate_actuator",
+    "feedback",
+    "noise_share",
+    "robustness_gate",
+]
+
+
+def feedback(law: InnerLoop) -> FloatArray:
+    """Return k, (m, 2n), with u = k x near the target, inside the boundary layer."""
+    size = 2 * law.mechanism.n
+    columns = []
+    for i in range(size):
+        x = np.zeros(size)
+        x[i] = 1e-6
+        law(x)
+        ahead = law.demand.copy()
+        law(-x)
+        columns.append((ahead - law.demand) / 2e-6)
+    return np.column_stack(columns)
+
+
+@lru_cache(maxsize=32)
+def _sampled(mechanism: Mechanism, period: float) -> tuple[FloatArray, FloatArray]:
+    """Return the linear model at the target with its input held for a period."""
+    lin = linearise(mechanism)
+    A, B = lin.A, lin.input
+    size = A.shape[0] + B.shape[1]
+    whole = np.zeros((size, size))
+    whole[: len(A)] = np.hstack([A, B])
+    held = scipy.linalg.expm(whole * period)
+    return held[: len(A), : len(A)], held[: len(A), len(A) :]
+
+
+def _stable(A: FloatArray, B: FloatArray, k: FloatArray, late: int) -> bool:
+    """Whether u = k x, applied ``late`` samples after x, holds the sampled system."""
+    size, m = B.shape
+    loop = np.zeros((size + late * m, size + late * m))
+    loop[:size, :size] = A
+    if late == 0:
+        loop[:size, :size] += B @ k
+    else:
+        loop[:size, size : size + m] = B
+        shift = (late - 1) * m
+        loop[size : size + shift, size + m :] = np.eye(shift)
+        loop[size + shift :, :size] = k
+    return bool(np.abs(np.linalg.eigvals(loop)).max() < 1.0)
+
+
+def delay_margin(
+    mechanism: Mechanism,
+    surface: Surface,
+    reaching: ReachingLaw | None = None,
+    *,
+    period: float = 0.001,
+    longest: float = 0.05,
+) -> float:
+    """Return the longest delay, s, in whole periods, that the loop at the target bears.
+
+    Parameters
+    ----------
+    mechanism
+        The model.
+    surface, reaching
+        The law; the paper's gains by default.
+    period
+        Sampling period, s.
+    longest
+        Where to stop looking, s.
+
+    Returns
+    -------
+    float
+        Stable up to and including this delay; −period where the sampled loop is unstable
+        without any.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> round(delay_margin(rig, ut.first_surface(rig)), 3)
+    0.007
+    """
+    if not (0 < period < math.inf and 0 <= longest <= 1000 * period):
+        raise InvalidInputError(
+            "period and longest delay",
+            value=(period, longest),
+            limit="0 < period, 0 ≤ longest ≤ 1000 periods",
+        )
+    A, B = _sampled(mechanism, period)
+    k = feedback(InnerLoop(mechanism, surface, reaching or ReachingLaw()))
+    late = 0
+    while late * period <= longest and _stable(A, B, k, late):
+        late += 1
+    return (late - 1) * period
+
+
+def noise_share(
+    mechanism: Mechanism,
+    surface: Surface,
+    covariance: FloatArray,
+    reaching: ReachingLaw | None = None,
+) -> float:
+    """Return the standard deviation of the input at the target that is noise alone.
+
+    With u = k x̂ near the target and an error of the estimate with covariance P it is
+    √(k P kᵀ)_ii, as a part of the input's limit; of several inputs the largest part.
+
+    Parameters
+    ----------
+    mechanism
+        The model; an input without a limit does not count.
+    surface, reaching
+        The law; the paper's gains by default.
+    covariance
+        P of the estimated state, (2n, 2n).
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> noise_share(rig, ut.first_surface(rig), np.zeros((4, 4)))
+    0.0
+    """
+    k = feedback(InnerLoop(mechanism, surface, reaching or ReachingLaw()))
+    variances = np.einsum("ij,jk,ik->i", k, covariance, k)
+    return float((np.sqrt(np.maximum(variances, 0.0)) / mechanism.input_limits).max())
+
+
+@dataclass(frozen=True)
+class DelayGate:
+    """The gate that :func:`delay_gate` returns; a plain record, so it can be pickled."""
+
+    least: float
+    period: float
+
+    @property
+    def words(self) -> str:
+        """What it asks for."""
+        return f"{gate_words(cost_gate)}, bears {1e3 * self.least:.3g} ms of delay"
+
+    def __call__(
+        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float
+    ) -> Admission:
+        """Decide on a plan, as :func:`undertow.cascade.cost_gate` does."""
+        laws = new.reaching or (loop.reaching,) * len(new.surfaces)
+        if new is not old and new != old:
+            for surface, law in zip(new.surfaces, laws, strict=True):
+                margin = delay_margin(
+                    loop.mechanism, surface, law, period=self.period, longest=self.least
+                )
+                if margin < self.least - 1e-9:
+                    wanted = f"wanted {1e3 * self.least:.3g} ms"
+                    reason = f"bears {1e3 * margin:.3g} ms of delay, {wanted}"
+                    return _refused(loop, old, x, horizon, reason)
+        return cost_gate(loop, old, new, x, horizon)
+
+
+def _refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: str) -> Admission:
+    """Return a refusal with the cost of the plan that stays."""
+    score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
+    return Admission(False, why, score if score < INADMISSIBLE else math.inf)
+
+
+def delay_gate(least: float, period: float = 0.001) -> DelayGate:
+    """Return a gate that, besides the cost, asks every surface to bear a delay.
+
+    Parameters
+    ----------
+    least
+        Smallest :func:`delay_margin` that is admitted, s: three times what is known of the
+        delays leaves room for what is not.
+    period
+        Sampling period of the inner loop, s.
+    """
+    return DelayGate(least, period)
+
+
+def derate_actuator(loop: ClosedLoop, reserve: float) -> ClosedLoop:
+    """Return the loop on a plant whose input limits are lower by a part of them."""
+    limits = (1.0 - reserve) * loop.mechanism.input_limits
+    return replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BenchGate:
+    """The gate that :func:`robustness_gate` returns; a plain record, so it can be pickled."""
+
+    late: DelayGate
+    reserve: float
+    seconds: float
+    covariance: FloatArray | None
+    noise: float
+
+    @property
+    def words(self) -> str:
+        """What it asks for."""
+        quiet = f", at most {100 * self.noise:g} % of the input is noise"
+        return (
+            f"{self.late.words}, does with {100 * self.reserve:g} % less input"
+            f"{'' if self.covariance is None else quiet}"
+        )
+
+    def _noisiest(self, loop: ClosedLoop, plan: Plan) -> float:
+        if self.covariance is None:
+            return 0.0
+        laws = plan.reaching or (loop.reaching,) * len(plan.surfaces)
+        pairs = zip(plan.surfaces, laws, strict=True)
+        return max(noise_share(loop.mechanism, s, self.covariance, law) for s, law in pairs)
+
+    def __call__(
+        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float
+    ) -> Admission:
+        """Decide on a plan, as :func:`undertow.cascade.cost_gate` does."""
+        admission = self.late(loop, old, new, x, horizon)
+        if not admission.accepted or new == old:
+            return admission
+        share = self._noisiest(loop, new)
+        if share > max(self.noise, self._noisiest(loop, old)):
+            most = f"{100 * self.noise:g} % at most"
+            why = f"{100 * share:.3g} % of the input would be noise, {most}"
+            return _refused(loop, old, x, horizon, why)
+        weak = derate_actuator(loop, self.reserve)
+        event = Event(int(weak.batch(x, new, duration=min(self.seconds, horizon)).event[0]))
+        if event in (Event.HORIZON, Event.REACHED):
+            return admission
+        why = f"with {100 * self.reserve:g} % less input: {event.name.lower()}"
+        return _refused(loop, old, x, horizon, why)
+
+
+def robustness_gate(
+    least: float,
+    reserve: float = 0.15,
+    *,
+    period: float = 0.001,
+    seconds: float = 4.0,
+    covariance: FloatArray | None = None,
+    noise: float = 0.2,
+) -> BenchGate:
+    """Return a gate that asks for a delay margin, little noise, and a reserve of the actuator.
+
+    Parameters
+    ----------
+    least
+        Smallest :func:`delay_margin`, s.
+    reserve
+        Part of the inputs' limits that may be missing: a new plan must stay in the region
+        where its law exists, and not diverge, on a plant whose limits are lower by this.
+    period
+        Sampling period of the inner loop, s.
+    seconds
+        How far that is looked ahead.
+    covariance
+        Of what an estimator does not know of the state, (2n, 2n); ``None``: nothing.
+    noise
+        Largest :func:`noise_share` that this may cause, where the old plan causes less.
+    """
+    return BenchGate(delay_gate(least, period), reserve, seconds, covariance, noise)

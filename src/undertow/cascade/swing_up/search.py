@@ -1,0 +1,373 @@
+"""The search for a swing-up's gains: judged by many swings, each a little different.
+
+From rest a swing-up is chaotic: a change in the last bit of a state, or a plant off by one
+per cent, sends it past the target on the other side.  What one swing on the model says of
+gains is therefore chance, and the gains that are quickest there may fail on a bench.  Here
+gains are judged by the average of many swings, on benches of usual quality: parameters, dry
+friction and the hand that lets go differ from swing to swing, and some begin where a mechanism
+that was thrown out may be.  The gains that are taken are judged once more, by swings that the
+search has not seen.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from undertow.base import InfeasibleError
+from undertow.cascade.swing_up.catch import unclipped
+from undertow.cascade.swing_up.law import Gains, SwingUp, hanging, periods, swing_source
+from undertow.models import FloatArray, Mechanism
+from undertow.optimiser import CMAES
+from undertow.plants.presets import plausible_rig
+from undertow.plants.stepping import SMOOTH, dynamics_source
+from undertow.symbolic import (
+    COMPILED,
+    PREAMBLE,
+    content_key,
+    docstring,
+    generated,
+    recall,
+    remember,
+)
+
+__all__ = ["KEPT", "Found", "as_kept", "designed", "found_for", "search"]
+
+#: Gains of mechanisms of the library, as the search found them: see :func:`as_kept`.
+KEPT = Path(__file__).with_name("gains.json")
+
+#: A swing may take so long, s, before other gains are tried; its law is held for so long, s.
+SECONDS, STEP = 4.0, 0.002
+
+#: Dry friction of the driven joint, up to this part of the input's limit; the part of the
+#: swings that begins anywhere, not hanging at rest.
+DRAG, ANYWHERE = 0.03, 0.25
+
+#: From a state with xᵀPx up to this many times what the regulator holds without clipping it is
+#: tried whether it comes home, clipped, every so many steps, within so long, s.
+REACH, EVERY, HOME = 4.0, 5, 3.0
+
+#: Random gains and the swings that each is tried on; those that are tried on all swings; those
+#: that are refined, for so many generations; swings that judge what is taken.
+RANDOM, FEW, GOOD, STARTS, GENERATIONS, SWINGS, FRESH = 2000, 4, 60, 4, 24, 32, 128
+
+#: Where gains lie, decades about their scales: k_D, k_P, k_V, surplus.
+DECADES = np.array([[-2.5, 1.5], [-2.5, 1.5], [-2.5, 1.5], [-3.0, -0.3]])
+
+#: Gains are kept to be tried in turn while they need less than this times the best one's time.
+WORSE = 2.5
+
+_BODY = f"""
+{SMOOTH}
+
+{COMPILED}
+def advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
+    # A smooth step with dry friction of the driven joint; whether it met no stop.
+    n = x.shape[0] // 2
+    u[0] = force - drag * limit * math.tanh(x[n] / 0.02) * (1.0 if gain > 0.0 else -1.0)
+    smooth(0.0, h, x, u, viscous, plant, stages)
+    for i in range(n):
+        if not stops[i, 0] < x[i] < stops[i, 1]:
+            return False
+    return True
+
+
+{COMPILED}
+def distance(x, P):
+    total = 0.0
+    for i in range(x.shape[0]):
+        for j in range(x.shape[0]):
+            total += x[i] * P[i, j] * x[j]
+    return total
+
+
+{COMPILED}
+def attempt(x0, gains, belief, plant, drag, limit, stops, P, level, k, wraps, seconds, h, out):
+    # Time from which the regulator brings it home, infinite where there is none; least xᵀPx/level.
+    n = x0.shape[0] // 2
+    x, near, stages = x0.copy(), x0.copy(), np.zeros((3, 2 * n))
+    viscous, u, work = np.zeros(n), np.zeros(1), np.zeros(5)
+    out[0], out[1] = math.inf, math.inf
+    wait = 0
+    for step in range(int(seconds / h)):
+        force = swing(x, gains, belief, limit, 0.0, work)
+        gain = work[4]
+        if not advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
+            out[1] = math.inf
+            return
+        for i in range(n):
+            turn = wraps[i]
+            near[i] = x[i] - turn * math.floor(x[i] / turn + 0.5) if turn > 0.0 else x[i]
+            near[n + i] = x[n + i]
+        ratio = distance(near, P) / level
+        out[1] = min(out[1], ratio)
+        wait -= 1
+        if ratio > {REACH} or wait > 0:
+            continue
+        wait = {EVERY}
+        for _ in range(int({HOME} / h)):
+            force = 0.0
+            for i in range(2 * n):
+                force += k[i] * near[i]
+            force = max(-limit, min(limit, force))
+            if not advance(near, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
+                break
+            ratio = distance(near, P) / level
+            if ratio > 10.0 * {REACH}:
+                break
+            if ratio < 0.05:
+                out[0] = step * h
+                return
+
+
+{COMPILED}
+def attempts(
+    starts, gains, belief, plants, drags, limit, stops, P, level, k, wraps, seconds, h, out
+):
+    for i in range(out.shape[0]):
+        attempt(
+            starts[i], gains, belief, plants[i], drags[i], limit, stops, P, level, k, wraps,
+            seconds, h, out[i],
+        )
+"""
+
+
+@lru_cache(maxsize=32)
+def _module(mechanism: Mechanism) -> Any:
+    key = content_key(mechanism.structure, mechanism.name)
+
+    def write() -> str:
+        words = docstring(f"Swings of {mechanism.name}; generated, do not edit.")
+        head = f"{words}{PREAMBLE}"
+        parts = (head, dynamics_source(mechanism), swing_source(mechanism), _BODY)
+        return "\n\n".join(parts)
+
+    return generated("attempts", mechanism.name, key, write)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Gains and what swings that the search had not seen said of them.
+
+    Attributes
+    ----------
+    gains
+        k_D, k_P, k_V, surplus.
+    arrives
+        Part of the swings that came near the target in time.
+    expected
+        Time until one does, s, when such swings follow one another.
+    """
+
+    gains: Gains
+    arrives: float
+    expected: float
+
+
+class _Swings:
+    """Swings on benches of usual quality, drawn one after the other from a seed."""
+
+    def __init__(self, mechanism: Mechanism, seed: int) -> None:
+        self.mechanism, self.bench, self.seed = mechanism, plausible_rig(mechanism), seed
+        self.low, n = hanging(mechanism), mechanism.n
+        self.P, self.level, self.k = unclipped(mechanism)
+        self.wraps = periods(mechanism)
+        self.stops = np.array([[0.97 * c.low, 0.97 * c.high] for c in mechanism.coordinates])
+        self.missing = float(mechanism.energy(np.zeros(2 * n)) - mechanism.energy(self.low))
+        self._module, self._limit = _module(mechanism), mechanism.inputs[0].limit
+        self._belief = mechanism.parameter_values
+        self._starts: list[FloatArray] = []
+        self._plants: list[FloatArray] = []
+        self._drags: list[float] = []
+
+    def _draw(self) -> None:
+        rng = np.random.default_rng([self.seed, len(self._drags)])
+        plant = self.bench.drawn(rng)
+        anywhere = rng.uniform() < ANYWHERE
+        start = self._anywhere(rng) if anywhere else self.bench.released(self.low, rng)
+        self._starts.append(start)
+        self._plants.append(plant.parameter_values)
+        self._drags.append(rng.uniform(0.0, DRAG))
+
+    def _anywhere(self, rng: np.random.Generator) -> FloatArray:
+        """Return a state with no more than half the missing energy above the target's, (2n,)."""
+        mechanism, n = self.mechanism, self.mechanism.n
+        room = np.where(self.wraps > 0, math.pi, 0.5 * np.minimum(1.0, self.stops[:, 1]))
+        x = np.concatenate([room * rng.uniform(-1.0, 1.0, n), rng.standard_normal(n)])
+        kinetic = 0.5 * float(x[n:] @ mechanism.M(x[:n]) @ x[n:])
+        still = mechanism.energy(np.concatenate([x[:n], np.zeros(n)]))
+        spare = float(mechanism.energy(np.zeros(2 * n))) + 0.5 * self.missing - float(still)
+        x[n:] *= math.sqrt(max(spare, 0.0) * rng.uniform() / kinetic)
+        return x
+
+    def __call__(self, gains: FloatArray, first: int, last: int) -> FloatArray:
+        """Return times and nearest distances of some of the swings, (N, 2)."""
+        while len(self._drags) < last:
+            self._draw()
+        some = slice(first, last)
+        out = np.empty((last - first, 2))
+        self._module.attempts(
+            np.array(self._starts[some]), gains, self._belief, np.array(self._plants[some]),
+            np.array(self._drags[some]), self._limit, self.stops, self.P, self.level,
+            self.k, self.wraps, SECONDS, STEP, out,
+        )  # fmt: skip
+        return out
+
+
+def _merit(ends: FloatArray) -> float:
+    """Mean of how near swings came, in decades; in [−1, 0] where they arrived, soon is less."""
+    times, near = ends.T
+    missed = np.log10(np.clip(near, 1.0, 1e3))
+    return float(np.where(np.isfinite(times), times / SECONDS - 1.0, missed).mean())
+
+
+def _judged(row: FloatArray, ends: FloatArray) -> Found:
+    """Return gains with the time that swings which are tried again and again take.
+
+    A swing is given up after ``SECONDS``: E[min(t, SECONDS)]/P(t ≤ SECONDS).
+    """
+    times = ends[:, 0]
+    part = float(np.isfinite(times).mean())
+    spent = float(np.minimum(times, SECONDS).mean())
+    expected = spent / part if part else math.inf
+    return Found(Gains(*(float(v) for v in row)), part, expected)
+
+
+def search(
+    mechanism: Mechanism,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda _: None,
+) -> tuple[Found, ...]:
+    """Search for gains that swing a mechanism up, whatever is a little different.
+
+    Random gains are tried on a few swings, the best of them on more, and the best of those
+    are refined by CMA-ES.  Nothing that was found before is looked at.
+
+    Parameters
+    ----------
+    mechanism
+        One input with a limit, a potential, a target that stands upright.
+    seed
+        Of the gains and of the swings.
+    progress
+        Called with the part done.
+
+    Returns
+    -------
+    tuple of Found
+        The best first; empty where nothing arrives.
+
+    Raises
+    ------
+    ModelError
+        For a mechanism that the formula does not cover, or that does not hang.
+    """
+    SwingUp(mechanism, (Gains(1.0, 1.0, 1.0),))  # refuses what the formula does not cover
+    swings, rng = _Swings(mechanism, seed), np.random.default_rng(seed)
+    inertia = float(mechanism.M(swings.low[: mechanism.n])[0, 0])
+    scale = swings.missing * np.array([inertia, 1.0, 0.1, 1.0])
+    rows = 10.0 ** rng.uniform(DECADES[:, 0], DECADES[:, 1], (RANDOM, 4)) * scale
+
+    def merits(some: FloatArray, last: int) -> FloatArray:
+        return np.array([_merit(swings(row, 0, last)) for row in some])
+
+    rows = rows[np.argsort(merits(rows, FEW), kind="stable")[:GOOD]]
+    rows = rows[np.argsort(merits(rows, SWINGS), kind="stable")[:STARTS]]
+    found = []
+    for number, row in enumerate(rows):
+        climb = CMAES(np.log(row), 0.3, 12, rng)
+        for generation in range(GENERATIONS):
+            progress((number + generation / GENERATIONS) / STARTS)
+            asked = climb.ask()
+            climb.tell(asked, merits(np.exp(asked), SWINGS))
+        best = np.exp(climb.best_x)
+        found.append(_judged(best, swings(best, SWINGS, SWINGS + FRESH)))
+    found.sort(key=lambda one: one.expected)
+    return tuple(one for one in found if one.arrives and one.expected <= WORSE * found[0].expected)
+
+
+def found_for(
+    mechanism: Mechanism,
+    *,
+    seed: int = 0,
+    fresh: bool = False,
+    progress: Callable[[float], None] = lambda _: None,
+) -> tuple[Found, ...]:
+    """Return what :func:`search` finds, from what is kept where it was found before.
+
+    Parameters
+    ----------
+    mechanism
+        See :func:`search`.
+    seed
+        Of the search; the library keeps what seed 0 found.
+    fresh
+        Look at nothing that is kept: search.
+    progress
+        Called with the part done.
+
+    Raises
+    ------
+    InfeasibleError
+        When no gains bring it there.
+    """
+    key = content_key(mechanism.fingerprint, str(seed))
+    if not fresh:
+        shipped = _kept().get(mechanism.fingerprint) if seed == 0 else None
+        if shipped is not None:
+            return shipped
+        text = recall("swing_gains", key)
+        if text is not None:
+            return _read(json.loads(text))
+    found = search(mechanism, seed, progress)
+    if not found:
+        raise InfeasibleError(
+            f"no gains found that swing up '{mechanism.name}'",
+            value=f"inputs up to {mechanism.inputs[0].limit:g} {mechanism.inputs[0].unit}",
+            limit=f"near the target within {SECONDS:g} s",
+            remedy="Give it a larger input limit",
+        )
+    remember("swing_gains", key, json.dumps([asdict(one) for one in found]))
+    return found
+
+
+def designed(
+    mechanism: Mechanism,
+    *,
+    seed: int = 0,
+    fresh: bool = False,
+    progress: Callable[[float], None] = lambda _: None,
+) -> SwingUp:
+    """Return the swing-up with the gains that :func:`found_for` returns: see there."""
+    found = found_for(mechanism, seed=seed, fresh=fresh, progress=progress)
+    return SwingUp(mechanism, tuple(one.gains for one in found))
+
+
+def as_kept(found: Mapping[Mechanism, Sequence[Found]]) -> str:
+    """Return the text of the file ``KEPT`` for what the search found, seed 0."""
+    rows = {
+        mechanism.fingerprint: {
+            "mechanism": mechanism.name,
+            "found": [asdict(one) for one in some],
+        }
+        for mechanism, some in found.items()
+    }
+    return json.dumps(rows, indent=1) + "\n"
+
+
+def _read(rows: Sequence[dict[str, Any]]) -> tuple[Found, ...]:
+    return tuple(Found(**{**row, "gains": Gains(**row["gains"])}) for row in rows)
+
+
+@lru_cache(maxsize=1)
+def _kept() -> dict[str, tuple[Found, ...]]:
+    """What the library keeps, by the fingerprint of the mechanism."""
+    kept = json.loads(KEPT.read_text(encoding="utf-8"))
+    return {fingerprint: _read(entry["found"]) for fingerprint, entry in kept.items()}

@@ -1,0 +1,1 @@
+"""Arithmetic with rounding that encloses: intervals, Taylor models, branch and bound."""

@@ -1,0 +1,1 @@
+"""Claims about a surface: stability, singularity, reaching, ellipsoids."""

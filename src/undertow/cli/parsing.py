@@ -1,0 +1,317 @@
+"""Words of the command line to values of the library: states, parameters, surfaces.
+
+The one place where degrees come in.  Every quantity that is typed carries its unit, so
+that no number can be taken for another.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from undertow.base import InvalidInputError, near
+from undertow.law import Surface
+from undertow.mechanisms.named import named
+from undertow.models import FloatArray, Mechanism, normal_name
+from undertow.objective import Constraint, Objective, check_travel, objective_for, state_box
+
+__all__ = [
+    "mechanism_named",
+    "objective_named",
+    "parse_box",
+    "parse_start",
+    "parse_surface",
+    "parse_values",
+]
+
+#: Unit as typed to (SI unit of the coordinate, whether it is a rate, factor to SI).
+UNITS: Mapping[str, tuple[str, bool, float]] = {
+    "deg": ("rad", False, math.pi / 180),
+    "rad": ("rad", False, 1.0),
+    "m": ("m", False, 1.0),
+    "deg/s": ("rad", True, math.pi / 180),
+    "rad/s": ("rad", True, 1.0),
+    "m/s": ("m", True, 1.0),
+}
+
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)")
+
+
+def mechanism_named(
+    name: str, settings: Sequence[str] = (), limits: Sequence[str] = ()
+) -> Mechanism:
+    """Return a mechanism of the library or of a file, its parameters and input limits replaced.
+
+    Parameters
+    ----------
+    name
+        Its name in the library, or ``FILE.py:NAME`` for one's own, see
+        :func:`undertow.models.importers.mechanism_from_file`.
+    settings
+        Parameters as ``name=value``, SI units.
+    limits
+        Largest magnitudes of inputs as ``name=value``, each in the input's unit.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown mechanism, parameter or input, or a value outside its bounds.
+    ArtefactError
+        When the file cannot be read or fails.
+    """
+    mechanism = named(name).with_parameters(**parse_values(settings))
+    if not limits:
+        return mechanism
+    new = parse_values(limits, "limit of input", "voltage=10")
+    known = {channel.name: channel.limit for channel in mechanism.inputs}
+    for channel in new:
+        if channel not in known:
+            raise InvalidInputError(
+                f"input of '{mechanism.name}'",
+                value=repr(channel),
+                limit=f"one of {', '.join(known)}",
+                remedy=near(channel, known) or f"Write for instance --limit {next(iter(known))}=10",
+            )
+    return mechanism.with_input_limit(*(known | new).values())
+
+
+def objective_named(
+    name: str,
+    mechanism: Mechanism,
+    horizon: float,
+    box: Sequence[str] = (),
+    *,
+    hard_input: bool = False,
+) -> Objective:
+    """Return the objective that a word means, within bounds that are words too.
+
+    Parameters
+    ----------
+    name
+        A word of :func:`undertow.objective_for`.
+    mechanism
+        Whose inputs and states are meant.
+    horizon
+        Longest motion, s.
+    box
+        Bounds on states, see :func:`parse_box`.
+    hard_input
+        Whether a motion whose law asks for more than the actuator gives is refused.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown name, a bound that cannot be, or a horizon that is not positive.
+    """
+    constraints = parse_box(mechanism, box)
+    return objective_for(
+        mechanism, name, horizon=horizon, constraints=constraints, hard_input=hard_input
+    )
+
+
+def _split(word: str, example: str) -> tuple[str, str]:
+    name, equals, value = word.partition("=")
+    if not (equals and name.strip() and value.strip()):
+        raise InvalidInputError("setting", value=repr(word), limit=f"name=value, like {example}")
+    return normal_name(name.strip()), value.strip()
+
+
+def _pairs(words: Sequence[str], example: str) -> dict[str, str]:
+    """Split ``name=value`` words, refusing a name that is given twice."""
+    found: dict[str, str] = {}
+    for word in words:
+        name, value = _split(word, example)
+        if name in found:
+            raise InvalidInputError(
+                "settings", value=f"'{name}' twice", limit="each name once", remedy="Keep one"
+            )
+        found[name] = value
+    return found
+
+
+def _number(text: str, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InvalidInputError(what, value=repr(text), limit="a finite number")
+    return value
+
+
+def parse_values(
+    words: Sequence[str], what: str = "parameter", example: str = "d_e=0.025"
+) -> dict[str, float]:
+    """Read ``name=value`` words, SI units.
+
+    >>> parse_values(["d_e=0.025"])
+    {'d_e': 0.025}
+    """
+    pairs = _pairs(words, example)
+    return {name: _number(value, f"{what} '{name}'") for name, value in pairs.items()}
+
+
+def _units_of(mechanism: Mechanism, name: str, what: str) -> tuple[str, ...]:
+    """Return the units in which a state may be typed."""
+    if name not in mechanism.state_names:
+        raise InvalidInputError(
+            f"{what} of '{mechanism.name}'",
+            value=repr(name),
+            limit=f"one of {', '.join(mechanism.state_names)}",
+            remedy=near(name, mechanism.state_names),
+        )
+    index = mechanism.state_names.index(name)
+    kind = (mechanism.coordinates[index % mechanism.n].unit, index >= mechanism.n)
+    return tuple(unit for unit, (si, rate, _) in UNITS.items() if (si, rate) == kind)
+
+
+def _shown(number: float, unit: str) -> str:
+    """Return a typed quantity as it is shown.
+
+    >>> _shown(60.0, "deg"), _shown(-4.0, "rad/s")
+    ('60°', '-4 rad/s')
+    """
+    return f"{number:g}{'' if unit.startswith('deg') else ' '}{unit.replace('deg', '°')}"
+
+
+def _quantity(text: str, units: Sequence[str], what: str, example: str) -> tuple[float, str]:
+    """Return the number and the unit of a quantity, refusing others than ``units``."""
+    match = _QUANTITY.fullmatch(text.strip())
+    if match is None or match[2] not in units:
+        raise InvalidInputError(
+            what,
+            value=repr(text),
+            limit=f"a number with its unit, {' or '.join(units)}",
+            remedy=f"Write for instance {example}",
+        )
+    return float(match[1]), match[2]
+
+
+def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
+    """Read an initial state from ``name=value`` words with units; the rest is zero.
+
+    Parameters
+    ----------
+    mechanism
+        Whose states they are.
+    words
+        Like ``phi=40deg``, ``theta_dot=10deg/s`` or ``x=0.2m``.  Without any word, the
+        mechanism's usual start.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown state, a missing or wrong unit, or what is no number; and for no word at
+        all where the mechanism has no usual start.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> parse_start(rig, ["phi=90deg"]).round(3).tolist()
+    [0.0, 1.571, 0.0, 0.0]
+    """
+    if not words:
+        return mechanism.usual_start
+    values: dict[str, float] = {}
+    for name, text in _pairs(words, f"{mechanism.coordinates[-1].name}=40deg").items():
+        units = _units_of(mechanism, name, "initial state")
+        example = f"--start {name}=10{units[0]}"
+        number, unit = _quantity(text, units, f"initial state '{name}'", example)
+        values[name] = number * UNITS[unit][2]
+    return mechanism.state(**values)
+
+
+def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, ...]:
+    """Read bounds on states from words with units.
+
+    Parameters
+    ----------
+    mechanism
+        Whose states they are.
+    words
+        Like ``theta=60deg``, which is |theta| ≤ 60°, or ``x=-0.2m:0.5m``.  What they bound, the
+        mechanism's declared travel bounds no more; they cannot reach beyond it.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown state, a missing or wrong unit, bounds that exclude the target or reach
+        beyond the declared travel, or two pairs of bounds on one state.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> [c.name for c in parse_box(rig, ["theta=60deg", "phi_dot=-4rad/s:5rad/s"])]
+    ['|theta| ≤ 60°', '-4 rad/s ≤ phi_dot ≤ 5 rad/s']
+    """
+    found = []
+    for name, text in _pairs(words, f"{mechanism.coordinates[0].name}=LOW:HIGH").items():
+        units = _units_of(mechanism, name, "box")
+        example = f"--box {name}=-10{units[0]}:20{units[0]}"
+        parts = [_quantity(p, units, f"box of '{name}'", example) for p in text.split(":")]
+        ends = [number * UNITS[unit][2] for number, unit in parts]
+        low, high = (-ends[0], ends[0]) if len(ends) == 1 else (ends[0], ends[-1])
+        if len(ends) > 2 or not low < 0 < high:
+            raise InvalidInputError(
+                f"box of '{name}'",
+                value=repr(text),
+                limit="one bound > 0, or LOW:HIGH around the target, LOW < 0 < HIGH",
+                remedy=f"Write for instance {example}",
+            )
+        si, rate, _ = UNITS[units[0]]
+        check_travel(mechanism, name, low, high, text)
+        shown = [_shown(*part) for part in parts]
+        (bound,) = state_box(**{name: (low, high)})
+        label = f"|{name}| ≤ {shown[0]}" if len(ends) == 1 else f"{shown[0]} ≤ {name} ≤ {shown[1]}"
+        found.append(replace(bound, name=label, unit=f"{si}/s" if rate else si))
+    return tuple(found)
+
+
+def parse_surface(mechanism: Mechanism, text: str) -> Surface:
+    """Read a surface from its blocks; α_a is −I where it is not given.
+
+    Parameters
+    ----------
+    mechanism
+        For the shapes.
+    text
+        ``"lambda_a=-0.5 alpha_u=5 lambda_u=10"``; entries of a row are joined by commas,
+        rows by semicolons.
+
+    Raises
+    ------
+    InvalidInputError
+        For a missing, unknown or ill-shaped block.
+    """
+    blocks: dict[str, FloatArray] = {"alpha_a": -np.eye(mechanism.m)}
+    names = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
+    example = "lambda_a=-0.5 alpha_u=5 lambda_u=10"
+    for word in text.split():
+        name, value = _split(word, example)
+        if name not in names:
+            raise InvalidInputError(
+                "surface block", value=repr(name), limit=f"one of {', '.join(names)}"
+            )
+        rows = [
+            [_number(v, f"surface block {name}") for v in r.split(",")] for r in value.split(";")
+        ]
+        if len({len(row) for row in rows}) != 1:
+            raise InvalidInputError(
+                f"surface block {name}", value=repr(value), limit="rows of equal length"
+            )
+        blocks[name] = np.array(rows)
+    missing = [name for name in names if name not in blocks]
+    if missing:
+        raise InvalidInputError(
+            "surface",
+            value=repr(text),
+            limit=f"complete; {', '.join(missing)} is missing",
+            remedy=f"Write for instance --surface '{example}'",
+        )
+    return Surface(**blocks)

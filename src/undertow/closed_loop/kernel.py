@@ -1,0 +1,110 @@
+"""The closed loop on one tape, and the compiled kernel that integrates it in blocks."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import sympy as sp
+
+from undertow.law import LawSymbols, Switching, build_law_graph
+from undertow.models import TIME, Mechanism
+from undertow.objective import Objective
+from undertow.symbolic import (
+    LANES,
+    LoopProgram,
+    Tape,
+    block_source,
+    content_key,
+    load_module,
+    recall,
+    remember,
+)
+
+__all__ = ["build_loop_graph", "compile_loop"]
+
+
+def build_loop_graph(
+    belief: Mechanism, plant: Mechanism | None, objective: Objective, switching: Switching
+) -> LoopProgram:
+    """Compose law, plant and objective on one tape.
+
+    With ``plant=None`` both share symbols, so everything they have in common is computed
+    once; otherwise the belief keeps its own parameter symbols.
+    """
+    tape = Tape()
+    truth = belief if plant is None else plant
+    x = truth.x
+    rename: dict[sp.Symbol, sp.Expr] = dict(zip(belief.x, x, strict=True))
+    belief_parameters: tuple[sp.Symbol, ...] = ()
+    if plant is not None:
+        belief_parameters = tuple(
+            sp.Symbol(f"_belief_{s}", real=True) for s in belief.parameter_symbols
+        )
+        rename |= dict(zip(belief.parameter_symbols, belief_parameters, strict=True))
+    symbols = LawSymbols.of(belief.n, belief.m)
+    law = build_law_graph(
+        belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds
+    )
+    applied = tuple(sp.Symbol(f"_applied_{i}", real=True) for i in range(truth.m))
+    limits = tuple(sp.Symbol(f"_limit_{i}", real=True) for i in range(truth.m))
+    inputs = dict(zip(truth.u, applied, strict=True))
+    qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
+    stage, *path = tape.let_all(
+        [e.xreplace(inputs) for e in (objective.stage_cost(truth), *objective.path_margins(truth))]
+    )
+    input_margin = None
+    if objective.hard_input:
+        margins = [limit - sp.Abs(d) for limit, d in zip(limits, law.u, strict=True)]
+        input_margin = tape.let(sp.Min(*margins))
+    return LoopProgram(
+        tape=tape,
+        time=TIME,
+        state=x,
+        applied=applied,
+        limits=limits,
+        plant_parameters=truth.parameter_symbols,
+        belief_parameters=belief_parameters,
+        lane_inputs=(*symbols.surface, *symbols.eta, *symbols.layer, symbols.gamma_target),
+        demand=tuple(law.u),
+        s=tuple(law.s),
+        singular=law.margin,
+        derivative=(*x[truth.n :], *qdd),
+        stage=stage,
+        path=tuple(path),
+        input_margin=input_margin,
+        boxes=objective.boxes(truth),
+    )
+
+
+@lru_cache(maxsize=64)
+def compile_loop(
+    belief: Mechanism,
+    plant: Mechanism | None,
+    objective: Objective,
+    switching: Switching,
+    sampled: bool,
+) -> Any:
+    """Return the kernel of a closed loop, from the cache where it is known.
+
+    A module with the functions ``rollout`` and, for continuous loops, ``settle``; each is
+    compiled when it is first called.
+    """
+    truth = belief if plant is None else plant
+    key = content_key(
+        belief.structure,
+        "the belief" if plant is None else plant.structure,
+        sp.srepr([objective.stage_cost(truth), *objective.path_margins(truth)]),
+        repr((belief.name, objective.name, objective.hard_input, switching, sampled, LANES)),
+        repr(objective.boxes(truth)),
+    )
+    source = recall("loop", key)
+    if source is None:
+        program = build_loop_graph(belief, plant, objective, switching)
+        source = block_source(
+            program,
+            sampled=sampled,
+            header=f"Closed loop of {belief.name}, {objective.name}; generated, do not edit.",
+        )
+        remember("loop", key, source)
+    return load_module(f"loop_{belief.name}", source)

@@ -1,0 +1,292 @@
+"""The infinite horizon done exactly: the linear model of a closed loop, and what goes with it.
+
+Inside the boundary layer, unsaturated and near the target, the closed loop is ẋ = A x and
+the stage cost is Φ₀ + xᵀQx to second order.  With AᵀP + PA = −Q,
+
+    ∫ xᵀQx dt from x to x_f  =  xᵀPx − x_fᵀPx_f.
+
+A rollout that has come into its boundary layer goes on from there in large steps that take A
+and P exactly, and what they leave over by quadrature: :mod:`undertow.symbolic.settle`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from undertow.law import linearise
+from undertow.models import FloatArray, Mechanism, is_smooth, numbers
+from undertow.objective import Objective
+from undertow.symbolic import LANES, SETTLING, UNIT, linear_source, load_module, numba
+
+__all__ = ["QuadraticStage", "TerminalLinearModel", "quadratic_stage"]
+
+
+#: Terms of the series of e^{|A|t} before a loop is too fast to bound.
+TERMS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticStage:
+    """Second-order model of a stage cost at the target.
+
+    Φ ≈ ``rest`` + xᵀ ``xx`` x + 2 xᵀ ``xu`` u + uᵀ ``uu`` u.
+    """
+
+    rest: float
+    xx: FloatArray
+    xu: FloatArray
+    uu: FloatArray
+
+
+def quadratic_stage(mechanism: Mechanism, objective: Objective) -> QuadraticStage | None:
+    """Return the second-order model of Φ at the target; ``None`` where there is none.
+
+    There is none when Φ is not twice differentiable at 0 (|u|, say) or has a slope there.
+    """
+    symbols = [*mechanism.x, *mechanism.u]
+    origin = dict.fromkeys(symbols, 0)
+    stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
+    if not is_smooth(stage):
+        return None
+    slope = sp.Matrix([stage]).jacobian(symbols).subs(origin)
+    hessian = sp.hessian(stage, symbols).subs(origin)
+    values = [*slope, *hessian, stage.subs(origin)]
+    if not all(v.is_finite and v.is_real for v in values) or any(slope):
+        return None
+    half = numbers(hessian) / 2
+    k = 2 * mechanism.n
+    return QuadraticStage(
+        float(stage.subs(origin)), half[:k, :k].copy(), half[:k, k:].copy(), half[k:, k:].copy()
+    )
+
+
+#: Stands for gains that are η.
+_SAME = np.empty((0, 0))
+
+
+class Prepared(NamedTuple):
+    """Linear ends of C closed loops.
+
+    ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
+    ``P`` (C, 2n, 2n); ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and ``forced`` responses,
+    see :mod:`undertow.symbolic.linear`; ``reach`` of bounded states (C/16, SETTLING, w·2n·16), see
+    :mod:`undertow.symbolic.settle`.
+    """
+
+    A: FloatArray
+    Q: FloatArray
+    P: FloatArray
+    stable: FloatArray
+    powers: FloatArray
+    forced: FloatArray
+    reach: FloatArray
+
+
+class TerminalLinearModel:
+    """The linear ends of all closed loops of one mechanism and objective.
+
+    Parameters
+    ----------
+    mechanism, objective
+        The closed loop's.
+
+    Attributes
+    ----------
+    stage
+        Second-order model of the stage cost; ``None`` where it has none, and then only
+        stability can be read off.
+    """
+
+    def __init__(self, mechanism: Mechanism, objective: Objective) -> None:
+        lin = linearise(mechanism)
+        m = mechanism.m
+        self.objective = objective
+        self.stage = quadratic_stage(mechanism, objective)
+        n = mechanism.n
+        self._weights = self.stage or QuadraticStage(
+            0.0, np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m)), np.zeros((m, m))
+        )
+        M_uu, M_au = lin.M[m:, m:], lin.M[:m, m:]
+        forces = np.hstack([lin.F, lin.D])
+        self.X = np.ascontiguousarray(np.linalg.solve(M_uu, M_au.T))
+        self.Y = np.ascontiguousarray(np.linalg.solve(M_uu, forces[m:]))
+        self.H = np.ascontiguousarray(forces[:m] - M_au @ self.Y)
+        self.S = lin.M[:m, :m] - M_au @ self.X
+        self.B_inverse = np.linalg.inv(lin.B)
+        # Where Φ has no quadratic part (minimum time) the state itself must be exact.
+        self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
+        self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
+        self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
+
+    def room(self, count: int) -> Prepared:
+        """Return room for the ends of ``count`` closed loops, a multiple of the lanes."""
+        n = self.X.shape[0] + self.X.shape[1]
+        N = 2 * n
+        return Prepared(
+            np.empty((count, n, N)),
+            np.empty((count, N, N)) if self.counts_cost else np.eye(N)[None],
+            np.empty((count, N, N)),
+            np.empty(count),
+            np.empty((count // LANES, SETTLING, N * N * LANES)),
+            np.empty((count // LANES, SETTLING, 2, N * N * LANES)),
+            np.empty((count // LANES, SETTLING, len(self._bounded) * N * LANES)),
+        )
+
+    def prepare(self, lanes: FloatArray, gains: FloatArray | None, into: Prepared) -> None:
+        """Linearise closed loops and integrate what their linear ends need.
+
+        Parameters
+        ----------
+        lanes
+            Rows of loops, (C, S, 2mn + 2m + 1), as the kernel reads them: surface vector, η
+            and ε of each of S surfaces, of which the last counts.
+        gains
+            k_i at the target, (C, m), where that is not η_i.
+        into
+            What is filled, see :meth:`room`.
+        """
+        stage = self._weights
+        _close(
+            lanes, _SAME if gains is None else gains, self.X, self.Y, self.H, self.S,
+            self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, into.A, into.Q,
+        )  # fmt: skip
+        self._blocks.double(into.A, into.Q, into.P, into.stable, into.powers, into.forced)
+        if len(self._bounded):
+            _reach(into.A, into.powers, into.forced, self._bounded, into.reach)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _close(  # type: ignore[no-untyped-def]
+    lanes, gains, X, Y, H, S, B_inverse, xx, xu, uu, counts_cost, A, Q
+):
+    """Write the acceleration rows A and the stage cost Q of each closed loop; NaN if singular."""
+    free, m = X.shape
+    n = m + free
+    N = 2 * n
+    width = 2 * m * n
+    gamma, drive = np.empty((m, m)), np.empty((m, N))
+    K, D = np.empty((m, N)), np.empty((m, N))
+    for lane in range(lanes.shape[0]):
+        p = lanes[lane, lanes.shape[1] - 1]
+        lambda_a, alpha_u, lambda_u = m * m, 2 * m * m, m * m + m * n
+        for i in range(m):
+            k = (p[width + i] if gains.size == 0 else gains[lane, i]) / p[width + m + i]
+            for j in range(m):
+                value = p[i * m + j]
+                for f in range(free):
+                    value -= p[alpha_u + i * free + f] * X[f, j]
+                gamma[i, j] = value
+            for j in range(N):
+                value = 0.0
+                for f in range(free):
+                    value += p[alpha_u + i * free + f] * Y[f, j]
+                drive[i, j] = -value
+            for j in range(m):
+                drive[i, j] -= k * p[lambda_a + i * m + j]
+                drive[i, n + j] -= k * p[i * m + j] + p[lambda_a + i * m + j]
+            for f in range(free):
+                drive[i, m + f] -= k * p[lambda_u + i * free + f]
+                drive[i, n + m + f] -= k * p[alpha_u + i * free + f] + p[lambda_u + i * free + f]
+        _solve(gamma, drive)
+        for j in range(N):
+            for i in range(m):
+                A[lane, i, j] = drive[i, j]
+            for f in range(free):
+                value = Y[f, j]
+                for i in range(m):
+                    value -= X[f, i] * drive[i, j]
+                A[lane, m + f, j] = value
+        if not counts_cost:
+            continue
+        for i in range(m):
+            for j in range(N):
+                value = -H[i, j]
+                for k in range(m):
+                    value += S[i, k] * drive[k, j]
+                D[i, j] = value
+        for i in range(m):
+            for j in range(N):
+                K[i, j] = 0.0
+                for k in range(m):
+                    K[i, j] += B_inverse[i, k] * D[k, j]
+        for i in range(N):
+            for j in range(N):
+                value = xx[i, j]
+                for k in range(m):
+                    value += xu[i, k] * K[k, j] + xu[j, k] * K[k, i]
+                    for j2 in range(m):
+                        value += K[k, i] * uu[k, j2] * K[j2, j]
+                Q[lane, i, j] = value
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _solve(a, b):  # type: ignore[no-untyped-def]
+    """Overwrite b with a⁻¹ b: Gaussian elimination with partial pivoting; a is spoilt."""
+    size, columns = b.shape
+    for k in range(size):
+        pivot = k
+        for i in range(k + 1, size):
+            if abs(a[i, k]) > abs(a[pivot, k]):
+                pivot = i
+        if pivot != k:
+            for j in range(k, size):
+                a[k, j], a[pivot, j] = a[pivot, j], a[k, j]
+            for j in range(columns):
+                b[k, j], b[pivot, j] = b[pivot, j], b[k, j]
+        inverse = 1.0 / a[k, k]
+        for i in range(k + 1, size):
+            factor = a[i, k] * inverse
+            if factor != 0.0:
+                for j in range(k + 1, size):
+                    a[i, j] -= factor * a[k, j]
+                for j in range(columns):
+                    b[i, j] -= factor * b[k, j]
+    for k in range(size - 1, -1, -1):
+        for j in range(columns):
+            value = b[k, j]
+            for i in range(k + 1, size):
+                value -= a[k, i] * b[i, j]
+            b[k, j] = value / a[k, k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reach(A, powers, forced, bounded, reach):  # type: ignore[no-untyped-def]
+    """Write bounds of |F_ij(s)| for all 0 ≤ s ≤ t, for the times t of the ``powers``.
+
+    F(s) = ∫₀ˢ e^{Aτ} dτ.  Over the first the series of ∫₀ᵗ e^{|A|τ} dτ bounds them; over twice as
+    long a time the moduli of F(t + s) = F(s) e^{At} + F(t) do.
+    """
+    n, N = A.shape[1], A.shape[2]
+    row, term, after = np.empty(N), np.empty(N), np.empty(N)
+    for lane in range(A.shape[0]):
+        block, i = lane // LANES, lane % LANES
+        for b in range(len(bounded)):
+            bound = bounded[b]
+            term[:] = 0.0
+            term[bound] = UNIT
+            row[:] = term
+            for order in range(2, TERMS + 1):
+                for j in range(N):
+                    value = term[j - n] if j >= n else 0.0
+                    for a in range(n):
+                        value += term[n + a] * abs(A[lane, a, j])
+                    after[j] = value * UNIT / order
+                row += after
+                term[:] = after
+                if term.sum() <= 1e-9 * row.sum():
+                    break
+            else:
+                row[:] = math.inf
+            for level in range(SETTLING):
+                for j in range(N):
+                    reach[block, level, (b * N + j) * LANES + i] = row[j]
+                    value = abs(forced[block, level, 0, (bound * N + j) * LANES + i])
+                    for k in range(N):
+                        value += row[k] * abs(powers[block, level, (k * N + j) * LANES + i])
+                    after[j] = max(row[j], value)
+                row[:] = after

@@ -1,0 +1,1 @@
+"""What people see: formulas, sketches, plots and films."""

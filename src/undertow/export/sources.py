@@ -1,0 +1,218 @@
+"""The C99 of a controller: templates filled from the tape.
+
+The templates in ``templates/`` are C but for ``${…}``; every name in them begins with ``ut_`` or
+``UT_``, which becomes the prefix of choice.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from importlib import metadata, resources
+from string import Template
+
+import numpy as np
+import sympy as sp
+
+from undertow.export.controller import EmbeddedController
+from undertow.export.estimate import estimate_code
+from undertow.export.names import ascii_words, c_name, macro
+from undertow.export.plans import plan_text
+from undertow.export.routh import lay_polynomial
+from undertow.export.seal import FACTOR, WIDTH
+from undertow.export.status import LARGEST
+from undertow.export.vectors import vectors
+from undertow.law import LawSymbols, build_law_graph
+from undertow.models import Mechanism
+from undertow.symbolic import C99Emitter, Tape, literal
+
+__all__ = ["files", "prefixed", "render"]
+
+
+#: Values of the templates that hold a user's words: their ``ut_`` stays as it is.
+_WORDS = {"name", "title", "coordinates", "inputs", "estimator", "gain_meaning"}
+
+
+def prefixed(text: str, prefix: str) -> str:
+    """Give the names of C their prefix."""
+    text = re.sub(r"\but_", f"{prefix}_", text)
+    return re.sub(r"\bUT_", f"{prefix.upper()}_", text)
+
+
+def render(name: str, values: dict[str, str], prefix: str) -> bytes:
+    """Fill a template and give its names their prefix."""
+    source = resources.files("undertow.export") / "templates" / name
+    text = Template(prefixed(source.read_text(encoding="ascii"), prefix)).substitute(
+        {key: value if key in _WORDS else prefixed(value, prefix) for key, value in values.items()}
+    )
+    return re.sub(r"[ \t]+$", "", text, flags=re.MULTILINE).encode("ascii")
+
+
+def _version() -> str:
+    try:
+        return metadata.version("undertow")
+    except metadata.PackageNotFoundError:
+        return "(from source)"
+
+
+def common(controller: EmbeddedController) -> dict[str, str]:
+    """Return what every template is told."""
+    mechanism = controller.mechanism
+    title = f"{mechanism.name}: sliding-mode law, n = {mechanism.n}, m = {mechanism.m}"
+    return {"name": controller.stem, "title": ascii_words(title), "version": _version()}
+
+
+def files(controller: EmbeddedController) -> dict[str, bytes]:
+    """Return the C of a controller: file names to contents, ASCII.
+
+    ``<name>.h`` and ``<name>.c`` are the controller; ``<name>_vectors.h`` and
+    ``<name>_test.c`` test it on any machine; ``<name>_pipe.c`` speaks to it in lines of text.
+    """
+    mechanism, real = controller.mechanism, controller.real
+    name, prefix = controller.stem, controller.prefix
+    shared = common(controller)
+    plan = plan_text(controller, controller.plan, controller.number)
+    code = _lay(controller)
+    used = "\n".join(code.values())
+    sharp = controller.reaching.switching == "sign"
+    limits = mechanism.input_limits
+    slew = np.minimum(controller.slew_rates * controller.period, 2 * limits)
+    values = shared | {
+        "real": real,
+        "word": f"uint{WIDTH[real]}_t",
+        "turn": str(WIDTH[real] - 5),
+        "factor": f"{FACTOR[real]:#x}",
+        "fingerprint": mechanism.fingerprint[:16],
+        "coordinates": _coordinates(mechanism),
+        "inputs": _inputs(controller),
+        "n": str(mechanism.n),
+        "m": str(mechanism.m),
+        "states": str(2 * mechanism.n),
+        "surface": str(2 * mechanism.m * mechanism.n),
+        "rows": str(controller.most_rows),
+        "period": literal(controller.period, real),
+        "missed": str(controller.missed),
+        "parameters": _parameters(controller),
+        "number": str(controller.number),
+        "count": plan["count"],
+        "starts": plan["starts"],
+        "plan": plan["rows"],
+        "estimator": ascii_words(controller.differentiator.description),
+        "gain_meaning": ascii_words(controller.differentiator.meaning),
+        "limits": ", ".join(controller.limit(v) for v in limits),
+        "slews": ", ".join(controller.limit(v) for v in slew),
+        "largest": literal(LARGEST, real),
+        "tiny": literal(1e-12, real),
+        "fabs": "fabsf" if real == "float" else "fabs",
+        "rate_check": "1" if sharp else "UT_PERIOD * out.gain[i] < 2 * row->layer[i]",
+        "helpers": "\n".join(v for k, v in _HELPERS.items() if f"{k}(" in used),
+        **code,
+    }
+    return {
+        f"{name}.h": render("controller.h", values, prefix),
+        f"{name}.c": render("controller.c", values, prefix),
+        f"{name}_vectors.h": render("vectors.h", shared | vectors(controller), prefix),
+        f"{name}_test.c": render("test.c", shared, prefix),
+        f"{name}_pipe.c": render("pipe.c", shared | {"place": code["place"]}, prefix),
+    }
+
+
+def _coordinates(mechanism: Mechanism) -> str:
+    width = max(len(c.name) for c in mechanism.coordinates)
+    return "\n".join(
+        f" *   q[{i}]  {c_name(c.name):{width}}  {c.unit:3}  {ascii_words(c.description)}"
+        for i, c in enumerate(mechanism.coordinates)
+    )
+
+
+def _inputs(controller: EmbeddedController) -> str:
+    lines = []
+    for i, (channel, slew) in enumerate(
+        zip(controller.mechanism.inputs, controller.slew_rates, strict=True)
+    ):
+        unit = ascii_words(channel.unit)
+        line = f" *   u[{i}]  {c_name(channel.name)}, {unit}, at most {channel.limit:g} {unit}"
+        lines.append(line + f", {slew:g} {unit}/s" * math.isfinite(slew))
+    return "\n".join(lines)
+
+
+def _parameters(controller: EmbeddedController) -> str:
+    lines = []
+    for i, p in enumerate(controller.mechanism.parameters):
+        define = f"#define {macro(i, p.name)} {literal(p.value, controller.real)}"
+        words = ": ".join(filter(None, (ascii_words(p.unit), ascii_words(p.description))))
+        lines.append(f"{define} /* {words} */" if words else define)
+    return "\n".join(lines)
+
+
+# -- the generated parts --------------------------------------------------------------------------
+
+
+def _lay(controller: EmbeddedController) -> dict[str, str]:
+    """Return the statements of the law and of det Γ(0), and the estimator."""
+    mechanism, switching = controller.mechanism, controller.reaching.switching
+    n, m = mechanism.n, mechanism.m
+    symbols = LawSymbols.of(n, m)
+    names: dict[sp.Symbol, str] = {x: f"x[{i}]" for i, x in enumerate(mechanism.x)}
+    names |= {s: f"row->surface[{i}]" for i, s in enumerate(symbols.surface)}
+    names |= {s: f"row->eta[{i}]" for i, s in enumerate(symbols.eta)}
+    names |= {s: f"row->layer[{i}]" for i, s in enumerate(symbols.layer)}
+    names[symbols.gamma_target] = "row->gamma"
+    names |= {p.symbol: macro(i, p.name) for i, p in enumerate(mechanism.parameters)}
+
+    tape = Tape()
+    law = build_law_graph(
+        mechanism.partition(tape), mechanism.x, symbols, switching, mechanism.disturbance_bounds
+    )
+    results = {f"out->demand[{i}]": e for i, e in enumerate(law.u)}
+    results |= {f"out->s[{i}]": e for i, e in enumerate(law.s)}
+    results |= {f"out->gain[{i}]": e for i, e in enumerate(law.gains)}
+    results["out->margin"] = law.margin
+    evaluate = C99Emitter(tape, names, controller.real).statements(results)
+
+    tape = Tape()
+    target = mechanism.partition(tape, dict.fromkeys(mechanism.x, sp.Integer(0)))
+    entries = list(symbols.surface)
+    alpha_a = sp.Matrix(m, m, entries[: m * m])
+    alpha_u = sp.Matrix(m, n - m, entries[2 * m * m : m * m + m * n])
+    _, determinant = tape.adjugate(tape.matrix(alpha_a - alpha_u * target.X))
+    gamma = C99Emitter(tape, names, controller.real).statements({"value": determinant})
+
+    estimate = estimate_code(
+        controller.differentiator,
+        mechanism,
+        controller.period,
+        {p.symbol: names[p.symbol] for p in mechanism.parameters},
+        controller.real,
+    )
+    tape = Tape()
+    powers = tape.let_all(lay_polynomial(mechanism, symbols.surface))
+    powers += [sp.Integer(0)] * (2 * n + 2 - len(powers))
+    polynomial = C99Emitter(tape, names, controller.real).statements(
+        {f"a[{k}]": a for k, a in enumerate(powers)}
+    )
+    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **estimate}
+
+
+_HELPERS = {
+    "ut_max": """static ut_real ut_max(ut_real a, ut_real b)
+{
+    return a > b || isnan(a) ? a : b;
+}
+""",
+    "ut_min": """static ut_real ut_min(ut_real a, ut_real b)
+{
+    return a < b || isnan(a) ? a : b;
+}
+""",
+    "ut_mod": """static ut_real ut_mod(ut_real remainder, ut_real b)
+{
+    return (remainder < 0 && b > 0) || (remainder > 0 && b < 0) ? remainder + b : remainder;
+}
+""",
+    "ut_sign": """static ut_real ut_sign(ut_real a)
+{
+    return (ut_real)((a > 0) - (a < 0));
+}
+""",
+}

@@ -1,0 +1,57 @@
+"""How it slides: surfaces and their schedule, reaching law, sliding-mode law, stability margins."""
+
+from undertow.law.inner_loop import LAYOUT, InnerLoop, law_module, pack_law_parameters
+from undertow.law.schedule import Plan
+from undertow.law.sliding import (
+    Control,
+    LawSymbols,
+    SlidingModeLaw,
+    build_law_graph,
+    check_surface_shape,
+    coupling,
+    gains_at_target,
+    gamma_determinant,
+)
+from undertow.law.stability import (
+    Margin,
+    check_surface,
+    controllability,
+    first_surface,
+    has_linear_model,
+    linearise,
+    placed_surface,
+    sliding_matrix,
+    stability_margin,
+    surface_margins,
+)
+from undertow.law.surface import ProvedSet, ReachingLaw, Surface, Switching
+
+__all__ = [
+    "LAYOUT",
+    "Control",
+    "InnerLoop",
+    "LawSymbols",
+    "Margin",
+    "Plan",
+    "ProvedSet",
+    "ReachingLaw",
+    "SlidingModeLaw",
+    "Surface",
+    "Switching",
+    "build_law_graph",
+    "check_surface",
+    "check_surface_shape",
+    "controllability",
+    "coupling",
+    "first_surface",
+    "gains_at_target",
+    "gamma_determinant",
+    "has_linear_model",
+    "law_module",
+    "linearise",
+    "pack_law_parameters",
+    "placed_surface",
+    "sliding_matrix",
+    "stability_margin",
+    "surface_margins",
+]

@@ -1,0 +1,144 @@
+"""Plans: which surface, reached how, from when on. One surface for all time, or a schedule.
+
+The paper optimises one surface at a time and re-plans.  A plan may also hold several that
+take over one after another (move blocking), each with a reaching law of its own, so that
+switching is planned and not only re-planned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from undertow.base import InvalidInputError, at_least, check_fields, checked
+from undertow.law.sliding import ReachingLaw, Surface
+from undertow.models import FloatArray
+
+__all__ = ["Plan"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Surfaces that take over one after another.
+
+    Parameters
+    ----------
+    surfaces
+        One or more, in order.
+    times
+        When each takes over, s from the start of the plan; the first is 0, and they rise.
+    reaching
+        The reaching law of each; ``None``: that of the closed loop it is used in.
+
+    Raises
+    ------
+    InvalidInputError
+        When the lengths differ, or the times do not rise from 0.
+
+    Examples
+    --------
+    >>> a, b = Surface(-1, -0.5, 5, 10), Surface(-1, -0.248, 1.94, 11.14)
+    >>> plan = Plan((a, b), (0.0, 0.1))
+    >>> plan.at(0.05) == (a, None), plan.shifted(0.1).surfaces == (b,)
+    (True, True)
+    """
+
+    surfaces: tuple[Surface, ...]
+    times: tuple[float, ...] = (0.0,)
+    reaching: tuple[ReachingLaw, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Check lengths, times and shapes."""
+        check_fields(self)
+        shapes = {(s.n, s.m) for s in self.surfaces if isinstance(s, Surface)}
+        if len(shapes) > 1 or not all(isinstance(s, Surface) for s in self.surfaces):
+            raise InvalidInputError(
+                "surfaces of a plan",
+                value=[type(s).__name__ for s in self.surfaces],
+                limit="undertow.Surface, all with the same n and m",
+                remedy="Build each with undertow.Surface(alpha_a, lambda_a, alpha_u, lambda_u)",
+            )
+        rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
+        if not self.surfaces or len(self.times) != len(self.surfaces) or self.times[0] != 0:
+            raise InvalidInputError(
+                "times of a plan",
+                value=list(self.times),
+                limit=f"{len(self.surfaces)} rising times from 0, one for each surface",
+                remedy="Give each surface the time at which it takes over",
+            )
+        if not rising or not np.isfinite(self.times).all():
+            raise InvalidInputError(
+                "times of a plan", value=list(self.times), limit="rising, finite"
+            )
+        if self.reaching is not None and len(self.reaching) != len(self.surfaces):
+            raise InvalidInputError(
+                "reaching laws of a plan",
+                value=len(self.reaching),
+                limit=f"{len(self.surfaces)}, one for each surface",
+                remedy="Leave reaching out to use the closed loop's law throughout",
+            )
+
+    @classmethod
+    @checked
+    def of(cls, what: Surface | Plan | Sequence[Surface], times: Iterable[float] = (0.0,)) -> Plan:
+        """Return a plan made of a surface, of several with their times, or as it is."""
+        times = tuple(times)
+        if isinstance(what, Plan):
+            if times != (0.0,):
+                raise InvalidInputError(
+                    "plan with times besides",
+                    value=list(times),
+                    limit="a plan alone",
+                    remedy="A plan has its own times: leave switch_times out",
+                )
+            return what
+        surfaces = (what,) if isinstance(what, Surface) else tuple(what)
+        return cls(surfaces, times)
+
+    def _index(self, t: float) -> int:
+        """Index of the surface in use at t; a nanosecond early counts as on time."""
+        return max(0, int(np.searchsorted(self.times, t + 1e-9, side="right")) - 1)
+
+    @checked
+    def at(self, t: float) -> tuple[Surface, ReachingLaw | None]:
+        """Return the surface in use t seconds after the start, and its reaching law."""
+        k = self._index(t)
+        return self.surfaces[k], None if self.reaching is None else self.reaching[k]
+
+    @checked
+    def shifted(self, t: float) -> Self:
+        """Return what is left of the plan t seconds after its start."""
+        k = self._index(t)
+        if k == 0 and len(self.surfaces) == 1:
+            return self
+        times = (0.0, *(round(later - t, 9) for later in self.times[k + 1 :]))
+        laws = None if self.reaching is None else self.reaching[k:]
+        return replace(self, surfaces=self.surfaces[k:], times=times, reaching=laws)
+
+    @staticmethod
+    @checked
+    def align(
+        plans: Sequence[Plan], otherwise: ReachingLaw
+    ) -> tuple[tuple[float, ...], FloatArray, FloatArray]:
+        """Return common times (S), surface vectors (N, S, 2mn) and gains (N, S, 2m)."""
+        at_least("number of plans", len(plans), 1, "Give at least one")
+        times = tuple(sorted({t for plan in plans for t in plan.times}))
+        vectors = [[plan.at(t)[0].vector for t in times] for plan in plans]
+        m = plans[0].surfaces[0].m
+        gains = [[(plan.at(t)[1] or otherwise).vector(m) for t in times] for plan in plans]
+        return times, np.array(vectors), np.array(gains)
+
+    @property
+    def vectors(self) -> FloatArray:
+        """Surface vectors, (S, 2mn)."""
+        return np.stack([surface.vector for surface in self.surfaces])
+
+    @checked
+    def gains(self, otherwise: ReachingLaw) -> FloatArray:
+        """Return η and ε of each surface, (S, 2m), with ``otherwise`` where none is given."""
+        m = self.surfaces[0].m
+        laws = self.reaching or (otherwise,) * len(self.surfaces)
+        return np.stack([law.vector(m) for law in laws])

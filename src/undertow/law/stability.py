@@ -1,0 +1,517 @@
+"""Stability on the surface: linearisation, sliding dynamics, margins, a first surface.
+
+On s = 0 the motion obeys ``E q̈_u = f_u + M_auᵀ α_a⁻¹ ṡ_r`` with
+``E = M_uu − M_auᵀ α_a⁻¹ α_u``, and q̇_a from s = 0.  Linearised at the target it is a
+system of order 2n − m in z = (q_a, q_u, q̇_u), whose eigenvalues decide local exponential
+stability exactly, for any n and m.  For one actuated and one free coordinate without
+damping the same condition reads (35)-(37) at the target.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+from sympy.core.function import Application
+
+from undertow.base import (
+    InvalidInputError,
+    ModelError,
+    SingularSurfaceError,
+    UnstableSurfaceError,
+    checked,
+)
+from undertow.law.sliding import check_surface_shape, coupling, gamma_determinant, singularity
+from undertow.law.surface import Surface
+from undertow.models import (
+    TIME,
+    FloatArray,
+    Mechanism,
+    kinks,
+    numbers,
+    require_mechanism,
+    require_smooth,
+    shortened,
+)
+from undertow.models.importers.equations import nearest_equilibrium
+from undertow.symbolic import content_key, recall, remember
+
+__all__ = [
+    "Linearisation",
+    "Margin",
+    "check_surface",
+    "controllability",
+    "first_surface",
+    "has_linear_model",
+    "linearise",
+    "placed_surface",
+    "sliding_matrix",
+    "stability_margin",
+    "surface_margins",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """``M q̈ = F q + D q̇ + (B u, 0)`` at the target, numbers.
+
+    ``M, F, D`` are (n, n), ``B`` (m, m).
+    """
+
+    M: FloatArray
+    F: FloatArray
+    D: FloatArray
+    B: FloatArray
+
+    @property
+    def A(self) -> FloatArray:
+        """State matrix of ẋ = A x + B u with x = (q, q̇), (2n, 2n)."""
+        n = len(self.M)
+        lower = np.linalg.solve(self.M, np.hstack([self.F, self.D]))
+        return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+
+    @property
+    def input(self) -> FloatArray:
+        """Input matrix of ẋ = A x + B u, (2n, m)."""
+        n, m = len(self.M), len(self.B)
+        force = np.vstack([self.B, np.zeros((n - m, m))])
+        return np.vstack([np.zeros((n, m)), np.linalg.solve(self.M, force)])
+
+
+@lru_cache(maxsize=128)
+def linearise(mechanism: Mechanism) -> Linearisation:
+    """Linearise a mechanism at its target x = 0, disturbances at t = 0 included.
+
+    Raises
+    ------
+    ModelError
+        When the target is no equilibrium for u = 0, or f has no derivative there.
+    """
+    n = mechanism.n
+    require_smooth(
+        f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
+    )
+    rest, jacobian = _force_at_target(mechanism)
+    if not (np.isfinite(rest).all() and np.isfinite(jacobian).all()):
+        raise ModelError(
+            f"force of '{mechanism.name}' at the target",
+            value=f"f = {rest}, with slopes that are no numbers"
+            if np.isfinite(rest).all()
+            else rest,
+            limit="finite, with its slopes",
+            remedy="Something is divided by zero there: write it so that it is not",
+        )
+    if np.abs(rest[mechanism.m :]).max() > 1e-9:
+        raise ModelError(
+            f"target of '{mechanism.name}'",
+            value=f"f_u(0, 0) = {rest[mechanism.m :]}",
+            limit="an equilibrium, f_u = 0",
+            remedy=nearest_equilibrium(mechanism),
+        )
+    return Linearisation(
+        M=mechanism.M(np.zeros(n)),
+        F=jacobian[:, :n],
+        D=jacobian[:, n:],
+        B=numbers(mechanism.input_matrix.subs(mechanism.substitution)),
+    )
+
+
+@lru_cache(maxsize=128)
+def has_linear_model(mechanism: Mechanism) -> bool:
+    """Whether f has a derivative at the target: :func:`linearise` refuses where it has none."""
+    return next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
+
+
+def _target(mechanism: Mechanism) -> dict[sp.Symbol, float]:
+    """All symbols of f to their values at the target, at t = 0."""
+    return mechanism.substitution | dict.fromkeys((*mechanism.x, TIME), 0.0)
+
+
+#: Functions that NumPy continues analytically to complex arguments.
+_ANALYTIC = (
+    sp.sin, sp.cos, sp.tan, sp.exp, sp.log, sp.sinh, sp.cosh, sp.tanh, sp.atan, sp.asinh,
+)  # fmt: skip
+
+
+def _force_at_target(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
+    """Return f, (n,), and ∂f/∂x, (n, 2n), at x = 0 and t = 0.
+
+    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives.
+    """
+    force, size = mechanism.force, 2 * mechanism.n
+    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(Application)) and all(
+        power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*mechanism.x)
+    )
+    if analytic:
+        step = 1e-200  # its square is nothing: what is flat to first order comes out as zero
+        x = np.vstack([np.zeros(size), 1j * step * np.eye(size)])
+        with np.errstate(all="ignore"):
+            entries = mechanism.function("force")(0.0, *x.T, *mechanism.parameter_values)
+            real = np.isfinite(mechanism.f(np.zeros(size))).all()
+        values = np.stack([np.broadcast_to(e, size + 1) for e in entries])
+        if np.isfinite(values).all() and real:  # of a negative number, a logarithm is complex
+            return values[:, 0].real, values[:, 1:].imag / step
+    at_target = dict.fromkeys(mechanism.x, 0)
+    numeric = sp.Matrix(force).subs(mechanism.substitution | {TIME: 0})
+    jacobian = numeric.jacobian(list(mechanism.x)).subs(at_target)
+    try:
+        return numbers(numeric.subs(at_target)).ravel(), numbers(jacobian)
+    except TypeError as error:  # zoo, or complex
+        raise ModelError(
+            f"force of '{mechanism.name}' at the target",
+            value=shortened(list(numeric.subs(at_target))),
+            limit="real and finite, with its slopes",
+            remedy="Something is divided by zero there, or a root or logarithm taken of a "
+            "negative number",
+        ) from error
+
+
+def controllability(mechanism: Mechanism) -> float:
+    """Distance of (A, B) at the target from an uncontrollable pair, relative, ≥ 0.
+
+    The smallest singular value of [λI − A, B] over the eigenvalues λ of A (Hautus test),
+    over ‖[A, B]‖₂; zero means that no linear surface can stabilise.
+    """
+    lin = linearise(mechanism)
+    A, B = lin.A, lin.input
+    scale = float(np.linalg.norm(np.hstack([A, B]), 2))
+    tests = [
+        np.linalg.svd(np.hstack([eigenvalue * np.eye(len(A)) - A, B]), compute_uv=False)[-1]
+        for eigenvalue in np.linalg.eigvals(A)
+    ]
+    return float(min(tests)) / scale
+
+
+def sliding_matrix(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> FloatArray:
+    """Return the matrix of the sliding dynamics at the target, (…, 2n−m, 2n−m).
+
+    Parameters
+    ----------
+    mechanism
+        The model.
+    surfaces
+        A surface or surface vectors, (…, 2mn).
+
+    Returns
+    -------
+    numpy.ndarray
+        A_s with ż = A_s z, z = (q_a, q_u, q̇_u).
+    """
+    lin = linearise(mechanism)
+    n, m = mechanism.n, mechanism.m
+    vectors = surfaces.vector if isinstance(surfaces, Surface) else np.asarray(surfaces, float)
+    lead = vectors.shape[:-1]
+    alpha_a, lambda_a, alpha_u, lambda_u = (
+        block.reshape(*lead, m, -1)
+        for block in np.split(vectors, [m * m, 2 * m * m, m * m + m * n], axis=-1)
+    )
+    free = n - m
+    M_ua, M_uu = lin.M[m:, :m], lin.M[m:, m:]
+    # q̇_a = G z on the surface; then E q̈_u = [F_a F_u D_u] z + D_a G z + M_uaα_a⁻¹ ṡ_r.
+    G = -np.linalg.solve(alpha_a, np.concatenate([lambda_a, lambda_u, alpha_u], axis=-1))
+    E = M_uu - M_ua @ np.linalg.solve(alpha_a, alpha_u)
+    pick_v = np.hstack([np.zeros((free, n)), np.eye(free)])
+    surface_rate = lambda_a @ G + lambda_u @ pick_v
+    right = (
+        np.hstack([lin.F[m:], lin.D[m:, m:]])
+        + lin.D[m:, :m] @ G
+        + M_ua @ np.linalg.solve(alpha_a, surface_rate)
+    )
+    acceleration = np.linalg.solve(E, right)
+    top = np.concatenate([G, np.broadcast_to(pick_v, (*lead, *pick_v.shape))], axis=-2)
+    return np.concatenate([top, acceleration], axis=-2)
+
+
+@lru_cache(maxsize=128)
+def _coupling_at_target(mechanism: Mechanism) -> FloatArray:
+    """Return X = M_uu⁻¹ M_auᵀ at the target, (n−m, m)."""
+    return coupling(mechanism, np.zeros(mechanism.n))
+
+
+def stability_margin(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> FloatArray:
+    """Return −max Re eig of the sliding dynamics, 1/s, (…,); positive means stable.
+
+    Exact local exponential stability on the surface; −inf where the surface is singular
+    at the target.
+    """
+    vectors = surfaces.vector if isinstance(surfaces, Surface) else np.asarray(surfaces, float)
+    gamma = gamma_determinant(_coupling_at_target(mechanism), vectors)
+    m = mechanism.m
+    alpha_a = vectors[..., : m * m].reshape(*vectors.shape[:-1], m, m)
+    sound = (np.abs(gamma) > 1e-9) & (np.abs(np.linalg.det(alpha_a)) > 1e-12)
+    if vectors.ndim == 1:
+        if not sound:
+            return np.array(-np.inf)
+        return np.asarray(-np.linalg.eigvals(sliding_matrix(mechanism, vectors)).real.max(-1))
+    margins = np.full(vectors.shape[:-1], -np.inf)
+    if sound.any():
+        eigenvalues = np.linalg.eigvals(sliding_matrix(mechanism, vectors[sound]))
+        margins[sound] = -eigenvalues.real.max(axis=-1)
+    return margins
+
+
+@dataclass(frozen=True)
+class Margin:
+    """A signed margin: ≥ 0 is satisfied."""
+
+    name: str
+    value: float
+    unit: str
+    remedy: str
+
+
+@checked
+def surface_margins(
+    mechanism: Mechanism, surface: Surface, q: ArrayLike | None = None
+) -> tuple[Margin, ...]:
+    """Return the stability margins of a surface, (35)-(37) and their generalisation.
+
+    Parameters
+    ----------
+    q
+        Positions at which (37), the non-singularity of Γ, is asked for, (n,) or (N, n);
+        the target by default.
+
+    Returns
+    -------
+    tuple of Margin
+        ``stability``: −max Re eig of the sliding dynamics, exact for any n and m;
+        ``singularity``: min det Γ(q)/det Γ(0), the general form of (37); and, where the
+        mechanism is of the paper's kind, the closed forms (35) and (36).
+    """
+    check_surface_shape(mechanism, surface)
+    positions = np.zeros((1, mechanism.n)) if q is None else np.atleast_2d(np.asarray(q, float))
+    gamma = singularity(mechanism, surface.vector, positions)
+    target = float(singularity(mechanism, surface.vector, np.zeros(mechanism.n)))
+    ratio = float(np.min(gamma / target)) if target != 0 else -np.inf
+    return (
+        *_paper_margins(mechanism, surface),
+        Margin(
+            "stability: −max Re eig of the sliding dynamics",
+            float(stability_margin(mechanism, surface)),
+            "1/s",
+            "Start from undertow.first_surface(mechanism)",
+        ),
+        Margin(
+            "(37) singularity: det Γ(q)/det Γ(0)",
+            ratio,
+            "",
+            "Start closer to the target, or choose a larger |α_u|",
+        ),
+    )
+
+
+def _paper_margins(mechanism: Mechanism, surface: Surface) -> tuple[Margin, ...]:
+    """(35)-(36) where n = 2, m = 1, q_a is cyclic, and nothing damps the free joint."""
+    if (mechanism.n, mechanism.m) != (2, 1):
+        return ()
+    lin = linearise(mechanism)
+    if abs(lin.F[1, 0]) > 0 or np.abs(lin.D[1]).max() > 0 or not lin.F[1, 1] > 0:
+        return ()
+    unit = surface.normalised()
+    side = -np.sign(lin.M[0, 1])  # the paper's b = −M_au is positive
+    lambda_a, alpha_u, lambda_u = (
+        float(unit.lambda_a[0, 0]),
+        float(side * unit.alpha_u[0, 0]),
+        float(side * unit.lambda_u[0, 0]),
+    )
+    sign = "" if side > 0 else "−"
+    return (
+        Margin("(35) λ_a < 0 at α_a = −1", -lambda_a, "1/s", "Take λ_a/α_a > 0"),
+        Margin(f"(35) {sign}α_u > 0 at α_a = −1", alpha_u, "", "Change the sign of α_u"),
+        Margin(f"(35) {sign}λ_u > 0 at α_a = −1", lambda_u, "1/s", "Change the sign of λ_u"),
+        Margin(
+            "(36) λ_a/α_a < λ_u/α_u",
+            lambda_u / alpha_u + lambda_a if alpha_u != 0 else -np.inf,
+            "1/s",
+            "Lower |λ_a| or raise |λ_u|",
+        ),
+    )
+
+
+@checked
+def check_surface(mechanism: Mechanism, surface: Surface, x0: ArrayLike | None = None) -> None:
+    """Refuse a surface that is unstable, or singular at the target or at ``x0``.
+
+    Raises
+    ------
+    UnstableSurfaceError
+        The exact stability condition fails; the message names which of (35)-(36) is to
+        blame where the mechanism is of the paper's kind.
+    SingularSurfaceError
+        (37) fails at the target or at the initial state.
+    """
+    margins = surface_margins(mechanism, surface)
+    target = float(singularity(mechanism, surface.vector, np.zeros(mechanism.n)))
+    if abs(target) < 1e-9:
+        raise SingularSurfaceError(
+            f"{surface} at the target",
+            value=f"det Γ = {target:.3g}",
+            limit="not zero",
+            remedy="Change α_u: the law does not exist there (37)",
+        )
+    stability = next(m for m in margins if m.name.startswith("stability"))
+    if not stability.value > 0:
+        broken = next((m for m in margins if not m.value > 0), stability)
+        detail = f"{broken.name}: margin"
+        if broken is not stability:
+            detail = f"exact stability margin {stability.value:.4g} 1/s, and {detail}"
+        raise UnstableSurfaceError(
+            f"{surface} for '{mechanism.name}', {detail}",
+            value=f"{broken.value:.4g} {broken.unit}".strip(),
+            limit="> 0",
+            remedy=broken.remedy,
+        )
+    if x0 is not None:
+        state = mechanism.check_state(x0)
+        margin = surface_margins(mechanism, surface, state[..., : mechanism.n])[-1]
+        if not margin.value > 0:
+            raise SingularSurfaceError(
+                f"{surface} at the initial state, {margin.name}",
+                value=f"{margin.value:.4g}",
+                limit="> 0",
+                remedy=margin.remedy,
+            )
+
+
+@checked
+def first_surface(
+    mechanism: Mechanism, weights: Sequence[float] | None = None, rate: float = 0.0
+) -> Surface:
+    """Design a stabilising surface by the quadratic method of Utkin and Young (1978).
+
+    In regular form (a QR factorisation of B) the sliding motion is a linear system whose
+    input is the remaining m states; one Riccati equation of order 2n − m minimises
+    ∫ xᵀQx dt on it and gives C = [λ, α] directly.
+
+    Parameters
+    ----------
+    weights
+        Diagonal of Q, (2n,), positive; by default 1 on q_a, 10 on q_u and 0.1 on the
+        velocities.
+    rate
+        Convergence rate asked for, 1/s: all eigenvalues left of −rate.
+
+    Raises
+    ------
+    ModelError
+        When (A, B) is not controllable, with the Hautus distance.
+    InvalidInputError
+        For weights or a rate that cannot be used.
+
+    Notes
+    -----
+    A design is kept on disk beside the kernels, so that a second start need not repeat it.
+    """
+    require_mechanism("mechanism of a first surface", mechanism)
+    n, m = mechanism.n, mechanism.m
+    if weights is None:
+        weights = [1.0] * m + [10.0] * (n - m) + [0.1] * n
+    diagonal = np.asarray(weights, dtype=float)
+    if diagonal.shape != (2 * n,) or not (np.isfinite(diagonal).all() and (diagonal > 0).all()):
+        raise InvalidInputError(
+            "weights of the quadratic design", value=list(weights), limit=f"{2 * n} numbers > 0"
+        )
+    if not (np.isfinite(rate) and rate >= 0):
+        raise InvalidInputError("convergence rate", value=rate, limit="finite and ≥ 0 1/s")
+    key = content_key(
+        mechanism.structure,
+        repr((mechanism.parameter_values.tolist(), diagonal.tolist(), float(rate))),
+    )
+    known = recall("surface", key)
+    if known is not None:
+        return Surface.from_vector(np.array(json.loads(known)), n, m)
+    import scipy.linalg  # slow to import: a known design does without
+
+    A, T = _regular_form(mechanism)
+    free = 2 * n - m
+    Q = T @ np.diag(diagonal) @ T.T
+    try:
+        P = scipy.linalg.solve_continuous_are(
+            A[:free, :free] + rate * np.eye(free),
+            A[:free, free:],
+            Q[:free, :free],
+            Q[free:, free:],
+            s=Q[:free, free:],
+        )
+    except np.linalg.LinAlgError as error:
+        raise _uncontrollable(mechanism) from error
+    K = np.linalg.solve(Q[free:, free:], A[:free, free:].T @ P + Q[:free, free:].T)
+    surface = _surface_of(mechanism, np.hstack([K, np.eye(m)]) @ T)
+    remember("surface", key, json.dumps(surface.vector.tolist()))
+    return surface
+
+
+@checked
+def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
+    """Design a surface whose sliding dynamics have the given 2n − m eigenvalues, 1/s.
+
+    Raises
+    ------
+    InvalidInputError
+        For a wrong number of poles or poles that are not left of the imaginary axis.
+    ModelError
+        When (A, B) is not controllable.
+    """
+    n, m = mechanism.n, mechanism.m
+    free = 2 * n - m
+    wanted = np.asarray(poles, dtype=complex)
+    if wanted.shape != (free,) or not (wanted.real < 0).all():
+        raise InvalidInputError(
+            "poles of the sliding dynamics",
+            value=list(poles),
+            limit=f"{free} numbers with negative real part",
+        )
+    import scipy.signal  # slow to import, and needed here alone
+
+    A, T = _regular_form(mechanism)
+    try:
+        with warnings.catch_warnings():
+            # The poles are placed; only the conditioning may not be the best there is.
+            warnings.filterwarnings("ignore", "Convergence was not reached", UserWarning)
+            placed = scipy.signal.place_poles(A[:free, :free], A[:free, free:], wanted)
+    except ValueError as error:
+        if controllability(mechanism) < 1e-9:
+            raise _uncontrollable(mechanism) from error
+        raise InvalidInputError(
+            "poles of the sliding dynamics", value=list(poles), limit=str(error)
+        ) from error
+    return _surface_of(mechanism, np.hstack([placed.gain_matrix, np.eye(m)]) @ T)
+
+
+def _regular_form(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
+    """Return T A Tᵀ and T, orthogonal, with T B = (0, R): the input acts last."""
+    lin = linearise(mechanism)
+    basis, _ = np.linalg.qr(lin.input, mode="complete")
+    m = mechanism.m
+    T = np.vstack([basis[:, m:].T, basis[:, :m].T])
+    return T @ lin.A @ T.T, T
+
+
+def _surface_of(mechanism: Mechanism, C: FloatArray) -> Surface:
+    n, m = mechanism.n, mechanism.m
+    if abs(np.linalg.det(C[:, n : n + m])) < 1e-9 * np.linalg.norm(C) ** m:
+        raise SingularSurfaceError(
+            f"designed surface for '{mechanism.name}'",
+            value="α_a singular",
+            limit="an invertible α_a",
+            remedy="Change the weights, or the poles",
+        )
+    surface = Surface(C[:, n : n + m], C[:, :m], C[:, n + m :], C[:, m:n]).normalised()
+    check_surface(mechanism, surface)
+    return surface
+
+
+def _uncontrollable(mechanism: Mechanism) -> ModelError:
+    return ModelError(
+        f"linearisation of '{mechanism.name}' at the target",
+        value=f"relative distance to an uncontrollable pair {controllability(mechanism):.2e}",
+        limit="> 0",
+        remedy="No linear surface stabilises it: choose another target or actuate another joint",
+    )

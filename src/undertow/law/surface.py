@@ -1,0 +1,252 @@
+"""Sliding surfaces and reaching laws: where to slide, and how to get there, as numbers.
+
+A surface is s = α_a q̇_a + λ_a q_a + α_u q̇_u + λ_u q_u, equation (10); the law that holds a
+mechanism on it is :mod:`undertow.law.sliding`'s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base import InvalidInputError, at_least, check_fields, checked, floats
+from undertow.models import FloatArray
+
+__all__ = ["ProvedSet", "ReachingLaw", "Surface", "Switching"]
+
+Switching = Literal["saturation", "tanh", "sign"]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A linear sliding surface, equation (10).
+
+    Parameters
+    ----------
+    alpha_a, lambda_a
+        (m, m), both invertible; weights of q̇_a and q_a.
+    alpha_u, lambda_u
+        (m, n−m); weights of q̇_u and q_u.  Numbers are accepted for m = n−m = 1.
+
+    Raises
+    ------
+    InvalidInputError
+        When shapes disagree, an entry is not finite, or α_a is singular.
+
+    Examples
+    --------
+    >>> base = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
+    >>> round(float(base.s([0.1, 0.2, 0.0, 0.0])[0]), 12)
+    1.95
+    """
+
+    alpha_a: FloatArray
+    lambda_a: FloatArray
+    alpha_u: FloatArray
+    lambda_u: FloatArray
+
+    @checked
+    def __init__(
+        self, alpha_a: ArrayLike, lambda_a: ArrayLike, alpha_u: ArrayLike, lambda_u: ArrayLike
+    ) -> None:
+        blocks = {
+            name: np.array(value, dtype=float, ndmin=2)
+            for name, value in (
+                ("alpha_a", alpha_a),
+                ("lambda_a", lambda_a),
+                ("alpha_u", alpha_u),
+                ("lambda_u", lambda_u),
+            )
+        }
+        m, free = blocks["alpha_a"].shape[0], blocks["alpha_u"].shape[1]
+        for name, block in blocks.items():
+            shape = (m, m) if name.endswith("_a") else (m, free)
+            if block.shape != shape:
+                raise InvalidInputError(
+                    f"surface block {name}",
+                    value=f"shape {block.shape}",
+                    limit=f"{shape}",
+                    remedy="Blocks with _a are (m, m), those with _u are (m, n−m)",
+                )
+            if not np.isfinite(block).all():
+                raise InvalidInputError(
+                    f"surface block {name}",
+                    value=block.tolist(),
+                    limit="finite numbers",
+                    remedy="Keep the surface that was in use before",
+                )
+            block.flags.writeable = False
+            object.__setattr__(self, name, block)
+        alpha = blocks["alpha_a"]
+        if abs(alpha[0, 0] if m == 1 else np.linalg.det(alpha)) < 1e-12:
+            raise InvalidInputError(
+                "surface block alpha_a",
+                value=blocks["alpha_a"].tolist(),
+                limit="invertible",
+                remedy="Use −1 (or −I), the paper's normalisation",
+            )
+
+    @property
+    def m(self) -> int:
+        """Number of surfaces, one per input."""
+        return int(self.alpha_a.shape[0])
+
+    @property
+    def n(self) -> int:
+        """Number of coordinates."""
+        return self.m + int(self.alpha_u.shape[1])
+
+    @property
+    def vector(self) -> FloatArray:
+        """All 2mn entries: α_a, λ_a, α_u, λ_u, each row by row."""
+        return np.concatenate(
+            [b.ravel() for b in (self.alpha_a, self.lambda_a, self.alpha_u, self.lambda_u)]
+        )
+
+    @classmethod
+    @checked
+    def from_vector(cls, vector: ArrayLike, n: int, m: int) -> Self:
+        """Rebuild a surface from its 2mn entries, the inverse of :attr:`vector`."""
+        at_least("number of inputs", m, 1, "One surface goes with each input")
+        at_least("number of coordinates", n, m + 1, "Fewer inputs than coordinates")
+        entries = floats("surface vector", vector)
+        if entries.shape != (2 * m * n,):
+            raise InvalidInputError(
+                "surface vector",
+                value=f"shape {entries.shape}",
+                limit=f"({2 * m * n},), 2mn numbers",
+                remedy="Give α_a, λ_a, α_u, λ_u, each row by row",
+            )
+        blocks = np.split(entries, [m * m, 2 * m * m, m * m + m * n])
+        shapes = [(m, m), (m, m), (m, n - m), (m, n - m)]
+        return cls(*(b.reshape(s) for b, s in zip(blocks, shapes, strict=True)))
+
+    @property
+    def position_row(self) -> FloatArray:
+        """[λ_a, λ_u], (m, n)."""
+        return np.hstack([self.lambda_a, self.lambda_u])
+
+    @property
+    def velocity_row(self) -> FloatArray:
+        """[α_a, α_u], (m, n)."""
+        return np.hstack([self.alpha_a, self.alpha_u])
+
+    @property
+    def matrix(self) -> FloatArray:
+        """C with s = C x, (m, 2n)."""
+        return np.hstack([self.position_row, self.velocity_row])
+
+    def normalised(self) -> Self:
+        """Return the same surface scaled to α_a = −I, the paper's normalisation."""
+        m = self.m
+        if np.array_equal(self.alpha_a, -np.eye(m)):
+            return self
+        scale = -np.linalg.inv(self.alpha_a)
+        return type(self)(
+            -np.eye(m), scale @ self.lambda_a, scale @ self.alpha_u, scale @ self.lambda_u
+        )
+
+    @checked
+    def s(self, x: ArrayLike) -> FloatArray:
+        """Return s at the states x: (…, 2n) to (…, m)."""
+        states = floats("states of a surface", x)
+        if states.ndim == 0 or states.shape[-1] != 2 * self.n:
+            raise InvalidInputError(
+                "states of a surface",
+                value=f"shape {states.shape}",
+                limit=f"(…, {2 * self.n})",
+                remedy="Set states by name: mechanism.state(name=value)",
+            )
+        return np.asarray(states @ self.matrix.T)
+
+    def __eq__(self, other: object) -> bool:
+        """Compare entry by entry."""
+        return isinstance(other, Surface) and np.array_equal(self.vector, other.vector)
+
+    def __hash__(self) -> int:
+        """Hash of the entries."""
+        return hash(self.vector.tobytes())
+
+    def __repr__(self) -> str:
+        """Show the blocks to four digits."""
+        names = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
+
+        def show(block: FloatArray) -> str:
+            if block.size == 1:
+                return f"{block.item():.4g}"
+            return str([[float(f"{v:.4g}") for v in row] for row in block])
+
+        return f"Surface({', '.join(f'{k}={show(getattr(self, k))}' for k in names)})"
+
+
+@dataclass(frozen=True)
+class ReachingLaw:
+    """How the surface is reached: gain, boundary layer and switching function.
+
+    Parameters
+    ----------
+    eta
+        Reaching gains η_i > 0 of (13), one per surface or one for all.
+    layer
+        Half-widths ε_i > 0 of the boundary layer (39), in the units of s.  Not used by
+        ``"sign"``.
+    switching
+        ``"saturation"`` (39), ``"tanh"`` or ``"sign"`` (12).
+    """
+
+    eta: float | tuple[float, ...] = 20.0
+    layer: float | tuple[float, ...] = 0.1
+    switching: Switching = "saturation"
+
+    def __post_init__(self) -> None:
+        """Refuse gains and layers that are not positive and finite."""
+        if self.switching not in ("saturation", "tanh", "sign"):
+            raise InvalidInputError(
+                "switching function",
+                value=repr(self.switching),
+                limit="'saturation', 'tanh' or 'sign'",
+                remedy="Choose 'saturation' for the paper's law (39)",
+            )
+        check_fields(self)
+        for name in ("eta", "layer"):
+            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
+            if not (np.isfinite(values).all() and (values > 0).all()):
+                raise InvalidInputError(
+                    f"reaching law {name}",
+                    value=getattr(self, name),
+                    limit="finite and > 0",
+                    remedy="The paper uses η = 20 and a layer of 0.1",
+                )
+
+    @checked
+    def vector(self, m: int) -> FloatArray:
+        """Return (η_1 … η_m, ε_1 … ε_m)."""
+        at_least("number of inputs", m, 1, "One surface goes with each input")
+        values = [np.atleast_1d(np.asarray(v, dtype=float)) for v in (self.eta, self.layer)]
+        for name, value in zip(("eta", "layer"), values, strict=True):
+            if value.size not in (1, m):
+                raise InvalidInputError(
+                    f"reaching law {name}",
+                    value=f"{value.size} numbers",
+                    limit="1" if m == 1 else f"1 or {m}",
+                    remedy="Give one number for all surfaces, or one per input",
+                )
+        return np.concatenate([np.broadcast_to(v, (m,)) for v in values])
+
+
+class ProvedSet(Protocol):
+    """A proved region of attraction of a full closed loop, for one surface and reaching law."""
+
+    @property
+    def surface(self) -> Surface:
+        """The surface it is for."""
+
+    @property
+    def reaching(self) -> ReachingLaw:
+        """Its reaching law."""
+
+    def contains(self, x: FloatArray) -> bool:
+        """Whether the state is inside for certain."""

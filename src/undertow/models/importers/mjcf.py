@@ -1,0 +1,396 @@
+"""Mechanisms from MJCF, MuJoCo's XML: bodies, joints, tendons as couplings, motors."""
+
+from __future__ import annotations
+
+import copy
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from undertow.base import InvalidInputError, ModelError, checked, near
+from undertow.models.importers.mjcf_bodies import Frame, link_of
+from undertow.models.importers.rigid_body import mechanism_from_tree
+from undertow.models.importers.tree import WORLD, Actuator, Coupling, Joint, Link, Tree, Vector
+from undertow.models.importers.xml_files import computable, numbers_of, parse_xml
+from undertow.models.mechanism import Mechanism
+
+__all__ = ["from_mjcf", "read_mjcf"]
+
+#: Sections that do not touch the equations of motion of a tree of bodies.
+_HARMLESS = {
+    "asset", "compiler", "contact", "custom", "default", "extension", "keyframe", "option",
+    "sensor", "size", "statistic", "visual",
+}  # fmt: skip
+_READ = {"worldbody", "actuator", "tendon", "equality"}
+_BODY_PARTS = {"body", "inertial", "joint", "freejoint", "geom", "site", "camera", "light"}
+
+
+@checked
+def from_mjcf(
+    source: str | Path,
+    *,
+    actuated: Sequence[str] | None = None,
+    equilibrium: Mapping[str, float] | None = None,
+    start: Mapping[str, float] | None = None,
+    effort: Mapping[str, float] | None = None,
+) -> Mechanism:
+    """Build a mechanism from an MJCF file or text.
+
+    Read are bodies with ``<inertial>`` or with spheres, capsules, cylinders, boxes and
+    ellipsoids of given mass or density; hinge and slide joints with range, damping,
+    stiffness, armature and ``frictionloss`` (a bound on the disturbance); default classes;
+    ``motor`` actuators on joints and on ``fixed`` tendons, whose own damping, stiffness and
+    armature count too.  Contacts are left out.  An input without a limit is unlimited, and the
+    description of the mechanism says so.
+
+    Parameters
+    ----------
+    source
+        Path of the file, or the text itself.
+    actuated
+        Names of the actuated joints, in the order of the inputs: torques or forces on them,
+        instead of the file's motors.
+    equilibrium
+        The target, joint name to rad or m; zero where left out.
+    start
+        A usual initial state, errors from the target, by state names.
+    effort
+        Joint name to actuator limit, N m or N (with ``actuated``).
+
+    Returns
+    -------
+    Mechanism
+        With the file's motors as inputs (in the units of ``ctrl``), or those of ``actuated``.
+
+    Raises
+    ------
+    InvalidInputError
+        For broken XML or numbers that are none, unknown or repeated actuated joints.
+    ModelError
+        For ball and free joints, equality constraints, massless moving bodies, inertias that no
+        body has, elements that change the motion in ways that are not read here, and more joints
+        than equations can be derived for.
+    """
+    with computable("MJCF"):
+        return mechanism_from_tree(
+            read_mjcf(source, motors=actuated is None),
+            actuated=actuated,
+            equilibrium=equilibrium,
+            start=start,
+            effort=effort,
+            source=str(source) if not str(source).lstrip().startswith("<") else "MJCF text",
+        )
+
+
+@np.errstate(all="ignore")  # what overflows is refused with the tree
+@checked
+def read_mjcf(source: str | Path, *, motors: bool = True) -> Tree:
+    """Read an MJCF file as a tree; ``motors=False`` leaves its actuators out.
+
+    Raises
+    ------
+    InvalidInputError, ModelError
+        As for :func:`from_mjcf`.
+    """
+    root = parse_xml(source, "mujoco")
+    for section in root:
+        if section.tag not in _HARMLESS | _READ:
+            raise _unread(f"<{section.tag}>", "Write the model out without it")
+    for equality in root.iterfind("equality/*"):
+        raise ModelError(
+            f"equality constraint <{equality.tag} name={equality.get('name', '')!r}>",
+            value="a closed loop or a coupled joint",
+            limit="a tree of independent joints",
+            remedy="Cut the loop, or eliminate it and give M, f and B",
+        )
+    reader = _Reader(root)
+    worldbody = root.find("worldbody")
+    if worldbody is not None:
+        reader.bodies(worldbody, WORLD, None)
+    kinds = {joint.name: joint.kind for joint in reader.joints}
+    couplings = {c.name: c for c in reader.tendons(kinds)}
+    actuators = reader.actuators(kinds, couplings) if motors else ()
+    return Tree(
+        root.get("model", "mujoco"),
+        tuple(reader.links),
+        tuple(reader.joints),
+        reader.gravity(),
+        tuple(couplings.values()),
+        tuple(actuators),
+    )
+
+
+def _unread(what: str, remedy: str) -> ModelError:
+    return ModelError(f"MJCF with {what}", limit="a tree of rigid bodies and motors", remedy=remedy)
+
+
+class _Reader:
+    """Walks the file once; defaults and conventions at hand."""
+
+    def __init__(self, root: ET.Element) -> None:
+        self.root = root
+        self.links: list[Link] = []
+        self.joints: list[Joint] = []
+        compiler = ET.Element("compiler")
+        for given in root.iterfind("compiler"):
+            compiler.attrib |= given.attrib
+        settings = compiler.attrib
+        for name in ("boundmass", "boundinertia", "settotalmass"):
+            if numbers_of(compiler, name, "0", 1)[0] > 0:
+                raise _unread(f"compiler {name}", "Write the masses out as they are meant")
+        if "inertiagrouprange" in settings:
+            raise _unread("compiler inertiagrouprange", "Give the bodies an <inertial>")
+        if settings.get("balanceinertia", "false") == "true":
+            raise _unread("compiler balanceinertia", "Write the inertias out as they are meant")
+        sequence = settings.get("eulerseq", "xyz")
+        if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
+            raise InvalidInputError(
+                "compiler eulerseq",
+                value=repr(sequence),
+                limit="three of x, y, z, X, Y, Z",
+                remedy="Leave it out for MuJoCo's usual one, xyz",
+            )
+        self.frame = Frame(settings.get("angle", "degree") == "degree", sequence)
+        self.autolimits = settings.get("autolimits", "true") == "true"
+        self.infer = settings.get("inertiafromgeom", "auto")
+        self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+        for default in root.iterfind("default"):
+            self._defaults(default, default.get("class", "main"), {})
+            # The outermost class is the main one, whatever its name.
+            self.classes["main"] = self.classes[default.get("class", "main")]
+
+    def _defaults(
+        self, element: ET.Element, name: str, inherited: Mapping[str, dict[str, str]]
+    ) -> None:
+        table = {tag: dict(attributes) for tag, attributes in inherited.items()}
+        for child in element:
+            if child.tag != "default":
+                table[child.tag] = table.get(child.tag, {}) | child.attrib
+        self.classes[name] = table
+        for child in element.iterfind("default"):
+            self._defaults(child, child.get("class", ""), table)
+
+    def _filled(
+        self, element: ET.Element, childclass: str | None, tag: str | None = None
+    ) -> ET.Element:
+        """A copy of the element with the attributes of its class filled in."""
+        name = element.get("class") or childclass or "main"
+        if name not in self.classes:
+            raise ModelError(
+                f"class of <{element.tag}>",
+                value=repr(name),
+                limit="declared in <default>",
+                remedy=near(name, self.classes) or "Declare it, or leave class= out",
+            )
+        filled = copy.copy(element)
+        defaults = self.classes[name].get(tag or element.tag, {})
+        filled.attrib = {**defaults, **element.attrib}
+        return filled
+
+    def gravity(self) -> Vector:
+        """Gravity, m/s²; refuses media that push on the bodies."""
+        gravity: Vector = (0.0, 0.0, -9.81)
+        for option in self.root.iterfind("option"):
+            for name in ("density", "viscosity", "wind"):
+                if any(numbers_of(option, name, "0")):
+                    raise _unread(f"option {name}", "Give drag as a disturbance of the plant")
+            x, y, z = numbers_of(option, "gravity", "0 0 -9.81", 3)
+            gravity = (x, y, z)
+            flag = option.find("flag")
+            if flag is not None and flag.get("gravity") == "disable":
+                gravity = (0.0, 0.0, 0.0)
+        return gravity
+
+    def bodies(self, parent: ET.Element, link: str, childclass: str | None) -> None:
+        """Read the bodies under an element, each as a chain of its joints."""
+        for body in parent.iterfind("body"):
+            for part in body:
+                if part.tag not in _BODY_PARTS:
+                    raise _unread(f"<{part.tag}> in a body", "Write the bodies out")
+            name = body.get("name") or f"body_{len(self.links) + 1}"
+            if numbers_of(body, "gravcomp", "0", 1)[0] != 0 or body.get("mocap") == "true":
+                raise _unread(f"gravcomp or mocap on body '{name}'", "Leave it out")
+            inner = body.get("childclass") or childclass
+            geoms = [self._filled(g, inner) for g in body.iterfind("geom")]
+            position = numbers_of(body, "pos", "0 0 0", 3)
+            rotation = self.frame.rotation(body)
+            carrier = link
+            joints = list(self._joints_of(body, name, inner))
+            for k, joint in enumerate(joints):
+                last = k == len(joints) - 1
+                child = name if last else f"{name}_frame_{k + 1}"
+                if not last:
+                    self.links.append(Link(child))
+                first = k == 0
+                self.joints.append(
+                    self._joint(
+                        joint,
+                        carrier,
+                        child,
+                        rotation if first else np.eye(3),
+                        (position[0], position[1], position[2]) if first else (0.0, 0.0, 0.0),
+                    )
+                )
+                carrier = child
+            if not joints:
+                place = (position[0], position[1], position[2])
+                self.joints.append(Joint(f"{name}_fixed", "fixed", carrier, name, rotation, place))
+            self.links.append(link_of(body, name, self.frame, geoms, self.infer))
+            self.bodies(body, name, inner)
+
+    def _joints_of(
+        self, body: ET.Element, name: str, childclass: str | None
+    ) -> Iterator[ET.Element]:
+        for element in body:
+            if element.tag == "freejoint":
+                raise _free(name, "freejoint")
+            if element.tag == "joint":
+                joint = self._filled(element, childclass)
+                if joint.get("type", "hinge") not in ("hinge", "slide"):
+                    raise _free(name, joint.get("type", ""))
+                yield joint
+
+    def _joint(
+        self, joint: ET.Element, parent: str, child: str, rotation: object, position: Vector
+    ) -> Joint:
+        kind = joint.get("type", "hinge")
+        name = joint.get("name") or f"{child}_{kind}"
+        turning = kind == "hinge"
+
+        def number(attribute: str, default: str = "0") -> float:
+            return numbers_of(joint, attribute, default, 1)[0]
+
+        def place(attribute: str) -> float:
+            value = number(attribute)
+            return self.frame.angle(value) if turning else value
+
+        low, high = -math.inf, math.inf
+        if self._limited(joint, "limited", "range"):
+            low, high = numbers_of(joint, "range", None, 2)
+            if turning:
+                low, high = self.frame.angle(low), self.frame.angle(high)
+        effort = math.inf
+        if self._limited(joint, "actuatorfrclimited", "actuatorfrcrange"):
+            effort = min(abs(v) for v in numbers_of(joint, "actuatorfrcrange", None, 2))
+        x, y, z = numbers_of(joint, "axis", "0 0 1", 3)
+        ax, ay, az = numbers_of(joint, "pos", "0 0 0", 3)
+        return Joint(
+            name,
+            "hinge" if turning else "slide",
+            parent,
+            child,
+            np.asarray(rotation, dtype=float),
+            position,
+            axis=(x, y, z),
+            anchor=(ax, ay, az),
+            damping=number("damping"),
+            stiffness=number("stiffness"),
+            rest=place("springref"),
+            armature=number("armature"),
+            friction=number("frictionloss"),
+            low=low,
+            high=high,
+            effort=effort,
+            reference=place("ref"),
+        )
+
+    def _limited(self, element: ET.Element, switch: str, values: str) -> bool:
+        given = element.get(switch, "auto")
+        if given == "auto":
+            return self.autolimits and element.get(values) is not None
+        return given == "true"
+
+    def tendons(self, kinds: Mapping[str, str]) -> Iterator[Coupling]:
+        """Read fixed tendons as linear couplings of joints."""
+        for element in self.root.iterfind("tendon/*"):
+            if element.tag != "fixed":
+                raise _unread(f"<{element.tag}> tendon", "Only fixed tendons are linear in q")
+            filled = self._filled(element, None, "tendon")
+            dry = numbers_of(filled, "frictionloss", "0", 1)[0] != 0
+            if dry or filled.get("range") is not None:
+                raise _unread("friction or limits on a tendon", "Put them on joints")
+            coefficients: dict[str, float] = {}
+            for part in element.iterfind("joint"):
+                joint = part.get("joint", "")
+                if joint not in kinds:
+                    raise ModelError(
+                        f"tendon '{element.get('name', '')}'",
+                        value=f"joint {joint!r}",
+                        limit=f"one of {', '.join(kinds)}",
+                        remedy=near(joint, kinds) or "Declare the joint, or correct its name",
+                    )
+                coefficients[joint] = numbers_of(part, "coef", None, 1)[0]
+            yield Coupling(
+                element.get("name", ""),
+                coefficients,
+                damping=numbers_of(filled, "damping", "0", 1)[0],
+                stiffness=numbers_of(filled, "stiffness", "0", 1)[0],
+                rest=self._springlength(filled),
+                armature=numbers_of(filled, "armature", "0", 1)[0],
+            )
+
+    def _springlength(self, tendon: ET.Element) -> float:
+        """Rest length; MuJoCo takes −1 for the length in the pose drawn, where q = ref."""
+        (rest,) = numbers_of(tendon, "springlength", "-1", 1)
+        if rest != -1:
+            return rest
+        reference = {joint.name: joint.reference for joint in self.joints}
+        return sum(
+            float(part.get("coef", "0")) * reference[part.get("joint", "")]
+            for part in tendon.iterfind("joint")
+        )
+
+    def actuators(
+        self, kinds: Mapping[str, str], couplings: Mapping[str, Coupling]
+    ) -> Iterator[Actuator]:
+        """Read motors on joints and fixed tendons; other actuators are refused."""
+        efforts = {joint.name: joint.effort for joint in self.joints}
+        for k, element in enumerate(self.root.iterfind("actuator/*")):
+            name = element.get("name") or f"u_{k + 1}"
+            if element.tag != "motor":
+                raise _unread(
+                    f"actuator <{element.tag} name={name!r}>",
+                    "Use <motor>, or name the actuated joints: actuated=['...']",
+                )
+            motor = self._filled(element, None)
+            gears = numbers_of(motor, "gear", "1")
+            if not gears or gears[0] == 0:
+                raise ModelError(
+                    f"gear of motor '{name}'",
+                    value=motor.get("gear"),
+                    limit="a first number that is not zero",
+                    remedy="A motor that moves nothing is no input: leave it out",
+                )
+            gear = gears[0]
+            joint, tendon = motor.get("joint"), motor.get("tendon")
+            if joint is not None:
+                coefficients = {joint: 1.0}
+                unit = {"hinge": "N m", "slide": "N"}.get(kinds.get(joint, ""), "")
+            elif tendon in couplings:
+                coefficients, unit = dict(couplings[str(tendon)].coefficients), ""
+            else:
+                raise _unread(
+                    f"motor '{name}' on neither joint nor fixed tendon", "Give joint= or tendon="
+                )
+            limits = [math.inf]
+            for switch, values in (("ctrllimited", "ctrlrange"), ("forcelimited", "forcerange")):
+                if self._limited(motor, switch, values):
+                    limits.append(min(abs(v) for v in numbers_of(motor, values, None, 2)))
+            if joint is not None:
+                limits.append(efforts.get(joint, math.inf) / abs(gear))
+            yield Actuator(
+                name, coefficients, gear, min(limits), unit if gear == 1 else "", tendon or ""
+            )
+
+
+def _free(body: str, kind: str) -> ModelError:
+    return ModelError(
+        f"body '{body}'",
+        value=f"a joint of type {kind!r}",
+        limit="hinge and slide joints",
+        remedy="A free base leaves infinitely many equilibria (Remark 3): fix it, or model the "
+        "joint by hinges and slides",
+    )

@@ -1,0 +1,244 @@
+"""Mechanisms from URDF files: links and joints, inertias, damping, limits, transmissions."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from undertow.base import ModelError, checked
+from undertow.models.importers.rigid_body import mechanism_from_tree
+from undertow.models.importers.tree import WORLD, Joint, Link, Tree, Vector
+from undertow.models.importers.xml_files import computable, numbers_of, parse_xml, rotation_from_rpy
+from undertow.models.mechanism import FloatArray, Mechanism
+
+__all__ = ["from_urdf", "read_urdf"]
+
+_KINDS: dict[str, Literal["hinge", "slide", "fixed"]] = {
+    "revolute": "hinge",
+    "continuous": "hinge",
+    "prismatic": "slide",
+    "fixed": "fixed",
+}
+
+
+@checked
+def from_urdf(
+    source: str | Path,
+    *,
+    actuated: Sequence[str] | None = None,
+    equilibrium: Mapping[str, float] | None = None,
+    gravity: Vector = (0.0, 0.0, -9.81),
+    start: Mapping[str, float] | None = None,
+    effort: Mapping[str, float] | None = None,
+) -> Mechanism:
+    """Build a mechanism from a URDF file or text.
+
+    Its root link is fixed to the world.  Masses, centres of mass, inertias, damping and the
+    strength of gravity become parameters; joint ranges become those of the coordinates;
+    effort limits those of the inputs (one without is unlimited, and the description of the
+    mechanism says so); dry friction a bound on the disturbance.  Shapes,
+    velocity limits and safety controllers are not read.
+
+    Parameters
+    ----------
+    source
+        Path of the file, or the text itself.
+    actuated
+        Names of the actuated joints, in the order of the inputs; those of the file's
+        ``<transmission>`` elements by default.
+    equilibrium
+        The target, joint name to rad or m; zero where left out.
+    gravity
+        m/s², in the frame of the root link.
+    start
+        A usual initial state, errors from the target, by state names.
+    effort
+        Joint name to actuator limit, N m or N, in place of the file's.
+
+    Returns
+    -------
+    Mechanism
+        With the actuated joints first; coordinates are named after the joints.
+
+    Raises
+    ------
+    InvalidInputError
+        For broken XML, numbers that are none, unknown or repeated actuated joints.
+    ModelError
+        For loops, massless moving links, inertias that no body has, floating or planar joints,
+        mimic joints, repeated names, and more joints than equations can be derived for.
+    """
+    with computable("URDF"):
+        tree, transmitted = read_urdf(source, gravity)
+        chosen = actuated if actuated is not None else transmitted or None
+        return mechanism_from_tree(
+            tree,
+            actuated=chosen,
+            equilibrium=equilibrium,
+            start=start,
+            effort=effort,
+            source=str(source) if not str(source).lstrip().startswith("<") else "URDF text",
+        )
+
+
+@np.errstate(all="ignore")  # what overflows is refused with the tree
+@checked
+def read_urdf(
+    source: str | Path, gravity: Vector = (0.0, 0.0, -9.81)
+) -> tuple[Tree, tuple[str, ...]]:
+    """Read a URDF: the tree, and the joints that its transmissions name.
+
+    Raises
+    ------
+    InvalidInputError, ModelError
+        As for :func:`from_urdf`.
+    """
+    robot = parse_xml(source, "robot")
+    name = robot.get("name", "robot")
+    links = [_link(element) for element in robot.findall("link")]
+    joints = [_joint(element) for element in robot.findall("joint")]
+    if not links:
+        raise ModelError(
+            f"URDF '{name}'",
+            value="no link",
+            limit="at least one",
+            remedy="Give the bodies as <link>, the way they move as <joint>",
+        )
+    children = {joint.child for joint in joints}
+    roots = [link.name for link in links if link.name not in children]
+    if len(roots) > 1:
+        raise ModelError(
+            f"URDF '{name}'",
+            value=f"{len(roots)} root links: {', '.join(roots)}",
+            limit="one",
+            remedy="Connect every link to the tree by a joint",
+        )
+    if roots and roots[0] != WORLD:
+        joints.append(Joint(f"{roots[0]}_to_world", "fixed", WORLD, roots[0]))
+    kept = tuple(link for link in links if link.name != WORLD)
+    tree = Tree(name, kept, tuple(joints), gravity)
+    transmitted = [joint.get("name", "") for joint in robot.iterfind("transmission/joint")]
+    return tree, tuple(transmitted)
+
+
+def _pose(element: ET.Element, of: str) -> tuple[FloatArray, Vector]:
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(3), (0.0, 0.0, 0.0)
+    x, y, z = numbers_of(origin, "xyz", "0 0 0", 3, of=of)
+    return rotation_from_rpy(numbers_of(origin, "rpy", "0 0 0", 3, of=of)), (x, y, z)
+
+
+def _name(element: ET.Element) -> str:
+    name = element.get("name")
+    if not name:
+        raise ModelError(
+            f"a <{element.tag}> of the URDF",
+            value="no name",
+            limit="a name",
+            remedy="Give every link and joint a name=",
+        )
+    return name
+
+
+def _child(element: ET.Element, tag: str, of: str) -> ET.Element:
+    found = element.find(tag)
+    if found is None:
+        raise ModelError(
+            f"<{element.tag}> of '{of}'",
+            value=f"no <{tag}>",
+            limit="one",
+            remedy=f"URDF wants a <{tag}> there",
+        )
+    return found
+
+
+def _link(element: ET.Element) -> Link:
+    link = Link(_name(element))
+    inertial = element.find("inertial")
+    if inertial is None:
+        return link
+    R, com = _pose(inertial, link.name)
+    (mass,) = numbers_of(_child(inertial, "mass", link.name), "value", None, 1, of=link.name)
+    tensor = np.zeros((3, 3))
+    given = inertial.find("inertia")
+    if given is not None:
+        for label, (i, j) in {
+            "ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2),
+            "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2),
+        }.items():  # fmt: skip
+            tensor[i, j] = tensor[j, i] = numbers_of(given, label, "0", 1, of=link.name)[0]
+    rotated = R @ tensor @ R.T
+    rotated[np.abs(rotated) < 1e-14 * max(np.abs(rotated).max(), 1e-300)] = 0.0
+    return replace(link, mass=mass, com=com, inertia=(rotated + rotated.T) / 2)
+
+
+def _joint(element: ET.Element) -> Joint:
+    name = _name(element)
+    kind = element.get("type", "")
+    if kind not in _KINDS:
+        raise ModelError(
+            f"joint '{name}'",
+            value=f"type {kind!r}",
+            limit=f"one of {', '.join(_KINDS)}",
+            remedy="A free base leaves infinitely many equilibria (Remark 3): fix it, or model the "
+            "joint by hinges and slides"
+            if kind in ("floating", "planar")
+            else "Model it by hinges and slides",
+        )
+    if element.find("mimic") is not None:
+        raise ModelError(
+            f"joint '{name}'",
+            value="a mimic joint, which is a constraint",
+            limit="independent joints",
+            remedy="Eliminate it and give M, f and B, or make the joint fixed",
+        )
+    R, position = _pose(element, name)
+    parent = _child(element, "parent", name).get("link", "")
+    child = _child(element, "child", name).get("link", "")
+    joint = Joint(name, _KINDS[kind], parent, child, R, position)
+    if joint.kind == "fixed":
+        return joint
+    axis_element = element.find("axis")
+    x, y, z = (
+        (1.0, 0.0, 0.0)
+        if axis_element is None
+        else numbers_of(axis_element, "xyz", "1 0 0", 3, of=name)
+    )
+    joint = replace(joint, axis=(x, y, z))
+    dynamics = element.find("dynamics")
+    if dynamics is not None:
+        (damping,) = numbers_of(dynamics, "damping", "0", 1, of=name)
+        (friction,) = numbers_of(dynamics, "friction", "0", 1, of=name)
+        joint = replace(joint, damping=damping, friction=friction)
+    limit = element.find("limit")
+    if limit is not None:
+        (effort,) = numbers_of(limit, "effort", "0", 1, of=name)
+        if effort < 0:
+            raise ModelError(
+                f"effort of joint '{name}'",
+                value=effort,
+                limit="≥ 0",
+                remedy="Give the largest magnitude, N m or N; 0 where it is not known",
+            )
+        # URDF demands an effort and writes 0 for "not known".
+        joint = replace(joint, effort=effort if effort > 0 else math.inf)
+        if kind != "continuous":
+            (low,) = numbers_of(limit, "lower", "0", 1, of=name)
+            (high,) = numbers_of(limit, "upper", "0", 1, of=name)
+            if low > high:
+                raise ModelError(
+                    f"limits of joint '{name}'",
+                    value=f"lower {low:g}, upper {high:g}",
+                    limit="lower ≤ upper",
+                    remedy="Give the lower end first; equal ends say that there is no limit",
+                )
+            if low < high:
+                joint = replace(joint, low=low, high=high)
+    return joint

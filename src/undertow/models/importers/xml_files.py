@@ -1,0 +1,195 @@
+"""What URDF and MJCF share: reading XML safely, and numbers out of attributes."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from undertow.base import ArtefactError, InvalidInputError, ModelError, read_file
+from undertow.models.mechanism import FloatArray
+
+__all__ = ["computable", "numbers_of", "parse_xml", "rotation_from_quaternion", "rotation_from_rpy"]
+
+#: Largest file, bytes; deepest nesting, and most elements, of one that is read.
+LARGEST, DEEPEST, MOST = 1 << 24, 64, 20_000
+
+
+def parse_xml(source: str | Path, root: str) -> ET.Element:
+    """Parse XML text (it starts with ``<``) or a file, and check the name of its root.
+
+    Raises
+    ------
+    ArtefactError
+        When the file cannot be read.
+    InvalidInputError
+        For XML that is not well formed, or declares entities.
+    ModelError
+        For another root element.
+    """
+    if not isinstance(source, str | Path):
+        raise InvalidInputError(
+            f"<{root}> file",
+            value=f"a {type(source).__name__}",
+            limit="a path, or XML text",
+            remedy="Give pathlib.Path('model.xml'), or the text itself",
+        )
+    text = source if isinstance(source, str) and source.lstrip().startswith("<") else None
+    if text is None:
+        try:
+            text = read_file(Path(source), "model file", most=LARGEST).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise ArtefactError(
+                f"model file '{source}'",
+                value="no UTF-8 text",
+                limit="a readable file, or XML text",
+                remedy="Save it as UTF-8",
+            ) from error
+    if "<!ENTITY" in text:
+        raise InvalidInputError(
+            f"<{root}> file",
+            value="entity declarations",
+            limit="plain XML",
+            remedy="Expand the entities first",
+        )
+    try:
+        _check_size(text, root)
+        element = ET.fromstring(text)
+    except ET.ParseError as error:
+        line, column = error.position
+        raise InvalidInputError(
+            f"<{root}> file is no well-formed XML",
+            value=f"{error.msg.split(':')[0]} at line {line}, column {column}",
+            limit="every tag closed and every attribute quoted",
+            remedy="Correct the file there",
+        ) from error
+    if element.tag != root:
+        raise ModelError(
+            "model file",
+            value=f"root <{element.tag}>",
+            limit=f"<{root}>",
+            remedy="URDF has <robot>: from_urdf; MJCF <mujoco>: from_mjcf",
+        )
+    return element
+
+
+def _check_size(text: str, root: str) -> None:
+    """Refuse what is nested or repeated beyond any mechanism, before a tree is built of it.
+
+    Raises
+    ------
+    InvalidInputError
+        Beyond :data:`DEEPEST` or :data:`MOST`.
+    """
+    depth = count = 0
+
+    def begin(_tag: str, _attributes: object) -> None:
+        nonlocal depth, count
+        depth, count = depth + 1, count + 1
+        if depth > DEEPEST or count > MOST:
+            raise InvalidInputError(
+                f"<{root}> file",
+                value=f"elements nested {depth} deep" if depth > DEEPEST else f"{count} elements",
+                limit=f"at most {DEEPEST} deep, {MOST} in all",
+                remedy="Keep the bodies of one mechanism alone",
+            )
+
+    def end(_tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    with contextlib.suppress(expat.ExpatError):  # the parser of the tree says where
+        parser.Parse(text, True)
+
+
+@contextlib.contextmanager
+def computable(what: str) -> Iterator[None]:
+    """Refuse numbers of a file from which no mechanism can be computed.
+
+    Raises
+    ------
+    InvalidInputError
+        Where arithmetic overflows or has no result.
+    """
+    try:
+        yield
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise InvalidInputError(
+            f"numbers of the {what}",
+            value=f"{type(error).__name__}: {error}",
+            limit="those of a mechanism, SI units",
+            remedy="Look for one that is far too large or too small",
+        ) from error
+
+
+def numbers_of(
+    element: ET.Element,
+    attribute: str,
+    default: str | None = None,
+    count: int | None = None,
+    *,
+    of: str = "",
+) -> list[float]:
+    """Return the numbers of an attribute; ``of`` names what the element belongs to.
+
+    Raises
+    ------
+    InvalidInputError
+        When the attribute is missing (and has no default), holds something else than finite
+        numbers, or another count of them.
+    """
+    text = element.get(attribute, default)
+    owner = of or element.get("name", "")
+    label = f"{attribute} of <{element.tag}>" + f" of '{owner}'" * bool(owner)
+    if text is None:
+        raise InvalidInputError(
+            label, value="missing", limit="given", remedy="The format has no default for it"
+        )
+    wanted, shown = "Write numbers, 0.5 or 1e-3, with spaces between", repr(text[:60])
+    try:
+        if not text.isascii() or "_" in text:  # of which Python, but no XML reader, makes numbers
+            raise ValueError(text)
+        values = [float(word) for word in text.split()]
+    except ValueError as error:
+        raise InvalidInputError(label, value=shown, limit="numbers", remedy=wanted) from error
+    if not all(math.isfinite(v) for v in values):
+        raise InvalidInputError(label, value=shown, limit="finite numbers", remedy=wanted)
+    if count is not None and len(values) != count:
+        raise InvalidInputError(label, value=shown, limit=f"{count} numbers", remedy=wanted)
+    return values
+
+
+def rotation_from_rpy(rpy: list[float]) -> FloatArray:
+    """URDF's fixed-axis roll, pitch, yaw: R = R_z(yaw) R_y(pitch) R_x(roll), (3, 3)."""
+    (cr, cp, cy), (sr, sp_, sy) = np.cos(rpy), np.sin(rpy)
+    Rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    Ry = np.array([[cp, 0, sp_], [0, 1, 0], [-sp_, 0, cp]])
+    Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return np.asarray(Rz @ Ry @ Rx)
+
+
+def rotation_from_quaternion(quaternion: list[float]) -> FloatArray:
+    """Rotation matrix of a quaternion (w, x, y, z) of any length but zero, (3, 3)."""
+    length = float(np.linalg.norm(quaternion))
+    if not 0 < length < math.inf:
+        raise InvalidInputError(
+            "quaternion",
+            value=quaternion,
+            limit="not zero, and finite",
+            remedy="1 0 0 0 turns nothing",
+        )
+    w, x, y, z = np.asarray(quaternion) / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

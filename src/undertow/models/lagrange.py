@@ -1,0 +1,97 @@
+"""Lagrange's equations of a mechanism's energies, derived once and kept on disk.
+
+f = −(Ṁ q̇ − ∂T/∂q) − ∂V/∂q − ∂D/∂q̇,     M = ∂²T/∂q̇²
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+
+import sympy as sp
+
+from undertow.base import ModelError
+from undertow.symbolic import content_key, parse_expression, recall, remember
+
+__all__ = ["derive", "derived"]
+
+
+def derived(
+    name: str,
+    q: Sequence[sp.Symbol],
+    qd: Sequence[sp.Symbol],
+    kinetic: sp.Expr,
+    potential: sp.Expr,
+    dissipation: sp.Expr,
+) -> tuple[sp.ImmutableDenseMatrix, sp.ImmutableDenseMatrix]:
+    """Return M and f as :func:`derive` does, from the disk where they were derived before.
+
+    The key holds the energies with the assumptions of their symbols, the order of the
+    coordinates, the versions of Python and SymPy and this file's own text: a change of any of
+    them derives afresh.
+    """
+    key = content_key(
+        *(sp.srepr(e) for e in (kinetic, potential, dissipation)),
+        sp.srepr([*q, *qd]),
+    )
+    stored = recall("equations", key)
+    if stored is not None:
+        # Whatever is wrong with the file, the equations can be derived again.
+        with contextlib.suppress(Exception):
+            mass, force = (parse_expression(line) for line in stored.splitlines())
+            return mass, force
+    mass, force = derive(name, q, qd, kinetic, potential, dissipation)
+    remember("equations", key, f"{sp.srepr(mass)}\n{sp.srepr(force)}")
+    return mass, force
+
+
+def derive(
+    name: str,
+    q: Sequence[sp.Symbol],
+    qd: Sequence[sp.Symbol],
+    kinetic: sp.Expr,
+    potential: sp.Expr,
+    dissipation: sp.Expr,
+) -> tuple[sp.ImmutableDenseMatrix, sp.ImmutableDenseMatrix]:
+    """Return M(q), (n, n), and f(q, q̇), (n, 1), of energies.
+
+    Parameters
+    ----------
+    name
+        Of the mechanism, for messages.
+    q, qd
+        Symbols of coordinates and velocities, n each.
+    kinetic, potential
+        T(q, q̇) and V(q), J.
+    dissipation
+        Rayleigh's function D(q, q̇), W.
+
+    Raises
+    ------
+    ModelError
+        When T is not a quadratic form in the velocities.
+    """
+    rows, speeds = sp.Matrix(q), sp.Matrix(qd)
+    mass = sp.hessian(kinetic, list(qd)).applyfunc(_tidy)
+    at_rest = dict.fromkeys(qd, 0)
+    if (
+        mass.free_symbols & set(qd)
+        or sp.simplify(sp.Matrix([kinetic]).jacobian(speeds).subs(at_rest)) != sp.zeros(1, len(qd))
+        or sp.simplify(kinetic.subs(at_rest)) != 0
+    ):
+        raise ModelError(
+            f"kinetic energy of '{name}'",
+            value=str(kinetic)[:80],
+            limit="a quadratic form in the velocities",
+            remedy="Move velocity-free terms to the potential; gyroscopic terms to force",
+        )
+    coriolis = (mass * speeds).jacobian(rows) * speeds - sp.Matrix([kinetic]).jacobian(rows).T
+    conservative = sp.Matrix([potential]).jacobian(rows).T
+    damping = sp.Matrix([dissipation]).jacobian(speeds).T
+    force = (-coriolis - conservative - damping).applyfunc(_tidy)
+    return sp.ImmutableDenseMatrix(mass), sp.ImmutableDenseMatrix(force)
+
+
+def _tidy(expression: sp.Expr) -> sp.Expr:
+    """Write trigonometry in the sines and cosines of single angles, expanded."""
+    return sp.expand_trig(sp.expand(expression))

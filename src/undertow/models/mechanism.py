@@ -1,0 +1,670 @@
+"""Mechanisms: what moves. ``M(q) q̈ = f(q, q̇) + B u``, symbolic, with parameters as data.
+
+The coordinates come actuated first, ``q = (q_a, q_u)`` as in (1), and the state is
+``x = (q, q̇)``.  Everything that runs later (kernels, laws, certificates, C) is generated
+from the expressions kept here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any, Self, cast
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+
+from undertow.base import REMEDIES, InvalidInputError, ModelError, checked, floats, near
+from undertow.models.lagrange import derived
+from undertow.models.partition import Partition, compiled
+from undertow.models.quantities import (
+    TIME,
+    Coordinate,
+    FloatArray,
+    Input,
+    Parameter,
+    number_of,
+    numbers,
+)
+from undertow.models.validity import (
+    by_names,
+    check_definite,
+    check_parts,
+    check_symbols,
+    check_symmetric,
+    expression_of,
+    require_smooth,
+    vocabulary,
+)
+from undertow.symbolic import Tape, compile_numpy
+
+__all__ = [
+    "TIME",
+    "Coordinate",
+    "FloatArray",
+    "Input",
+    "Mechanism",
+    "Parameter",
+    "Partition",
+    "energies",
+    "matrix_of",
+    "numbers",
+    "require_mechanism",
+]
+
+#: Stands for the identity of the right size until ``__post_init__`` knows m.
+_IDENTITY = cast(sp.ImmutableDenseMatrix, None)
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """An underactuated mechanism ``M(q) q̈ = f(q, q̇) + (B u, 0)``: immutable.
+
+    Parameters
+    ----------
+    name
+        Short identifier.
+    coordinates
+        The n coordinates, the m actuated ones first; the target is x = 0.
+    inputs
+        The m < n inputs, with their limits.
+    mass_matrix
+        M(q), (n, n), symmetric positive definite, as SymPy expressions.
+    force
+        f(q, q̇), (n,): Coriolis, centrifugal, conservative and dissipative forces.
+    input_matrix
+        B, (m, m), invertible; the identity by default.
+    parameters
+        All physical parameters that occur in the expressions.
+    disturbance_bounds
+        |g_i| ≤ bound, one per coordinate, in generalised force units (N m or N); the
+        gains (13)-(14) are computed from them.  Zero by default.
+    potential
+        Potential energy, J, where there is one (used by the energy balance).
+    start
+        A usual initial state, by names, for examples and the command line.
+    description, source
+        In words, and where the model comes from.
+
+    Raises
+    ------
+    ModelError
+        When shapes, symbols or definiteness are wrong; the message names the entry.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> rig.n, rig.m, rig.state_names
+    (2, 1, ('theta', 'phi', 'theta_dot', 'phi_dot'))
+    """
+
+    name: str
+    coordinates: tuple[Coordinate, ...]
+    inputs: tuple[Input, ...]
+    mass_matrix: sp.ImmutableDenseMatrix
+    force: sp.ImmutableDenseMatrix
+    input_matrix: sp.ImmutableDenseMatrix = _IDENTITY
+    parameters: tuple[Parameter, ...] = ()
+    disturbance_bounds: tuple[float, ...] = ()
+    potential: sp.Expr | None = None
+    start: Mapping[str, float] = field(default_factory=dict)
+    description: str = ""
+    source: str = ""
+
+    def __repr__(self) -> str:
+        """Show its name, its states and its inputs."""
+        return (
+            f"Mechanism({self.name!r}, coordinates={[c.name for c in self.coordinates]}, "
+            f"inputs={[i.name for i in self.inputs]})"
+        )
+
+    # -- construction -------------------------------------------------------------------
+
+    def __post_init__(self) -> None:
+        """Check shapes, names, symbols and the definiteness of M; freeze the matrices."""
+        for what, given, kind in (("name", self.name, str), ("start", self.start, Mapping)):
+            if not isinstance(given, kind):
+                raise InvalidInputError(
+                    f"{what} of a mechanism",
+                    value=f"{given!r}, a {type(given).__name__}",
+                    limit=f"a {'text' if kind is str else 'mapping of state names to numbers'}",
+                    remedy='Write Mechanism("my_rig", ..., start={"phi": 0.1})',
+                )
+        check_parts(self.name, self.coordinates, self.inputs, self.parameters)
+        for parts in ("coordinates", "inputs", "parameters"):
+            object.__setattr__(self, parts, tuple(getattr(self, parts)))
+        n, m = len(self.coordinates), len(self.inputs)
+        if not 0 < m < n:
+            raise ModelError(
+                f"'{self.name}' is not underactuated",
+                value=f"{n} coordinates and {m} inputs",
+                limit="at least one input and fewer inputs than coordinates",
+                remedy="Fully actuated mechanisms need no sliding surface of this kind",
+            )
+        given = sp.eye(m) if self.input_matrix is None else self.input_matrix
+        for attribute, value, shape in (
+            ("mass_matrix", self.mass_matrix, (n, n)),
+            ("force", self.force, (n, 1)),
+            ("input_matrix", given, (m, m)),
+        ):
+            matrix = matrix_of(f"{attribute} of '{self.name}'", value)
+            if matrix.shape != shape:
+                raise ModelError(
+                    f"shape of {attribute} of '{self.name}'",
+                    value=matrix.shape,
+                    limit=f"{shape}",
+                    remedy="Give one row per coordinate, the actuated ones first",
+                )
+            object.__setattr__(self, attribute, matrix)
+        given_bounds: Any = self.disturbance_bounds
+        if not isinstance(given_bounds, Iterable):
+            given_bounds = (given_bounds,)
+        bounds = (
+            tuple(number_of(f"disturbance_bounds of '{self.name}'", b) for b in given_bounds)
+            or (0.0,) * n
+        )
+        if len(bounds) != n or not all(math.isfinite(b) and b >= 0 for b in bounds):
+            raise InvalidInputError(
+                f"disturbance_bounds of '{self.name}'",
+                value=bounds,
+                limit=f"{n} finite numbers ≥ 0, one per coordinate",
+                remedy="Give bounds on |g_i|, 0 where nothing disturbs",
+            )
+        object.__setattr__(self, "disturbance_bounds", bounds)
+        self._check()
+        by_names(f"start of '{self.name}'", self.start)
+        self.state(**self.start)
+
+    def _check(self) -> None:
+        data = vocabulary(parameters=self.parameters, time=False)
+        places = vocabulary(self.coordinates, velocities=False, time=False) | data
+        for what, known in (
+            ("mass_matrix", places),
+            ("input_matrix", data),
+            ("force", vocabulary(self.coordinates, parameters=self.parameters)),
+        ):
+            check_symbols(f"{what} of '{self.name}'", getattr(self, what), known)
+        if self.potential is not None:
+            what = f"potential of '{self.name}'"
+            object.__setattr__(self, "potential", expression_of(what, self.potential))
+            check_symbols(what, [self.potential], places | {TIME: "undertow.models.mechanism.TIME"})
+        check_symmetric(f"mass_matrix of '{self.name}'", self.mass_matrix)
+        check_definite(f"mass_matrix of '{self.name}'", self.coordinates, self.M)
+        gain = numbers(self.input_matrix.subs(self.substitution))
+        if not abs(np.linalg.det(gain)) > 0:
+            raise ModelError(
+                f"input_matrix of '{self.name}'",
+                value=gain.tolist(),
+                limit="invertible",
+                remedy="Each input must act on an actuated coordinate of its own",
+            )
+
+    @classmethod
+    @checked
+    def from_energies(
+        cls,
+        name: str,
+        coordinates: Sequence[Coordinate],
+        inputs: Sequence[Input],
+        kinetic: sp.Expr,
+        potential: sp.Expr,
+        *,
+        dissipation: sp.Expr | float = 0,
+        **rest: Any,
+    ) -> Self:
+        """Derive M and f from energies by Lagrange's equations.
+
+        Parameters
+        ----------
+        name, coordinates, inputs
+            As for the class; the actuated coordinates come first.
+        kinetic
+            Kinetic energy T(q, q̇), J, a quadratic form in the velocities.
+        potential
+            Potential energy V(q), J.
+        dissipation
+            Rayleigh's dissipation function D(q, q̇), W; its force is −∂D/∂q̇.
+        **rest
+            Further fields of the class (``parameters``, ``input_matrix``, …).
+
+        Raises
+        ------
+        ModelError
+            When T is not a quadratic form in the velocities; for symbols that are not of this
+            mechanism, and kinks, whose derivatives are not what SymPy says; or as for the class.
+        """
+        T, V, D = energies(
+            name, coordinates, inputs, rest.get("parameters", ()), kinetic, potential, dissipation
+        )
+        q, qd = [c.symbol for c in coordinates], [c.velocity for c in coordinates]
+        mass, force = derived(name, q, qd, T, V, D)
+        return cls(
+            name,
+            tuple(coordinates),
+            tuple(inputs),
+            mass,
+            force,
+            potential=V,
+            **rest,
+        )
+
+    def with_parameters(self, /, **values: float) -> Self:
+        """Return the mechanism with some parameter values replaced, SI units.
+
+        Raises
+        ------
+        InvalidInputError
+            For an unknown name or a value outside the parameter's bounds.
+        """
+        if not values:
+            return self
+        known = {p.name: p for p in self.parameters}
+        values = by_names(f"parameters of '{self.name}'", values)
+        for name in values:
+            if name not in known:
+                raise InvalidInputError(
+                    f"unknown parameter of '{self.name}'",
+                    value=repr(name),
+                    limit=f"one of {', '.join(known)}",
+                    remedy=near(name, known) or "Use a declared name; values are in SI units",
+                )
+        changed = tuple(
+            replace(p, value=number_of(f"parameter '{p.name}', {p.unit}", values[p.name]))
+            if p.name in values
+            else p
+            for p in self.parameters
+        )
+        return replace(self, parameters=changed)
+
+    def with_input_limit(self, *limits: float) -> Self:
+        """Return the mechanism with other actuator limits, one per input, in its unit."""
+        if len(limits) != self.m:
+            raise InvalidInputError(
+                f"input limits of '{self.name}'",
+                value=limits,
+                limit=f"{self.m} numbers",
+                remedy="Give one limit per input",
+            )
+        inputs = tuple(
+            replace(i, limit=number_of(f"limit of input '{i.name}'", v))
+            for i, v in zip(self.inputs, limits, strict=True)
+        )
+        return replace(self, inputs=inputs)
+
+    def with_disturbance_bounds(self, *bounds: float) -> Self:
+        """Return the mechanism with declared bounds |g_i|, one per coordinate (N m or N)."""
+        return replace(self, disturbance_bounds=bounds)
+
+    @checked
+    def disturbed(
+        self, force: Mapping[str, sp.Expr | float], parameters: Iterable[Parameter] = ()
+    ) -> Self:
+        """Return a plant on which additional generalised forces g act, equation (1).
+
+        Parameters
+        ----------
+        force
+            Coordinate name to expression in states, parameters and :data:`TIME`, N m or N.
+        parameters
+            Further parameters that the expressions use.
+        """
+        force = by_names(f"forces on '{self.name}'", force)
+        names = [c.name for c in self.coordinates]
+        unknown = sorted(set(force) - set(names))
+        if unknown:
+            raise InvalidInputError(
+                f"unknown coordinate of '{self.name}'",
+                value=", ".join(unknown),
+                limit=f"one of {', '.join(names)}",
+                remedy=near(unknown[0], names) or "Forces act on coordinates, by their names",
+            )
+        g = sp.Matrix([expression_of(f"force on '{name}'", force.get(name, 0)) for name in names])
+        return replace(
+            self,
+            force=sp.ImmutableDenseMatrix(self.force + g),
+            parameters=(*self.parameters, *parameters),
+        )
+
+    # -- names and symbols --------------------------------------------------------------
+
+    @property
+    def n(self) -> int:
+        """Number of coordinates."""
+        return len(self.coordinates)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def q(self) -> tuple[sp.Symbol, ...]:
+        """Coordinate symbols, actuated first."""
+        return tuple(c.symbol for c in self.coordinates)
+
+    @property
+    def x(self) -> tuple[sp.Symbol, ...]:
+        """State symbols (q, q̇)."""
+        return (*self.q, *(c.velocity for c in self.coordinates))
+
+    @property
+    def u(self) -> tuple[sp.Symbol, ...]:
+        """Input symbols."""
+        return tuple(i.symbol for i in self.inputs)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in the order of x."""
+        return tuple(str(s) for s in self.x)
+
+    @property
+    def parameter_symbols(self) -> tuple[sp.Symbol, ...]:
+        """Parameter symbols, in order."""
+        return tuple(p.symbol for p in self.parameters)
+
+    @property
+    def parameter_values(self) -> FloatArray:
+        """Parameter values, SI units, in order."""
+        return np.array([p.value for p in self.parameters], dtype=float)
+
+    @property
+    def substitution(self) -> dict[sp.Symbol, float]:
+        """Parameter symbols to their values, for ``subs``."""
+        return {p.symbol: p.value for p in self.parameters}
+
+    @property
+    def input_limits(self) -> FloatArray:
+        """Actuator limits, (m,), in the units of the inputs."""
+        return np.array([i.limit for i in self.inputs], dtype=float)
+
+    @cached_property
+    def structure(self) -> str:
+        """Hash of everything that generated code depends on: equations and names, no values."""
+        text = "\n".join(
+            [
+                sp.srepr(self.mass_matrix),
+                sp.srepr(self.force),
+                sp.srepr(self.input_matrix),
+                repr([p.name for p in self.parameters]),
+                repr([i.name for i in self.inputs]),
+                repr(self.state_names),
+                repr(self.disturbance_bounds),
+            ]
+        )
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of everything that defines the equations and their numbers."""
+        limits = [i.limit for i in self.inputs]
+        values = [p.value for p in self.parameters]
+        return hashlib.sha256(f"{self.structure} {values} {limits}".encode()).hexdigest()
+
+    @property
+    def usual_start(self) -> FloatArray:
+        """The usual initial state, (2n,).
+
+        Raises
+        ------
+        InvalidInputError
+            Where the mechanism has none: a run from the target would show nothing.
+        """
+        if not self.start:
+            angle = self.coordinates[-1]
+            raise InvalidInputError(
+                f"start of '{self.name}'",
+                value="none, and the mechanism has no usual one",
+                limit="a state away from the target",
+                remedy=f"Give one, for instance {angle.name}=0.1 {angle.unit} "
+                f"(--start {angle.name}=0.1{angle.unit} on the command line), or give the "
+                "mechanism a start=",
+            )
+        return self.state(**self.start)
+
+    def state(self, /, **values: float) -> FloatArray:
+        """Return the state with the named entries set and all others zero, SI units.
+
+        Raises
+        ------
+        InvalidInputError
+            For an unknown state name or a value that is not finite.
+        """
+        x = np.zeros(2 * self.n)
+        for name, value in by_names(f"state of '{self.name}'", values).items():
+            if name not in self.state_names:
+                raise InvalidInputError(
+                    f"unknown state of '{self.name}'",
+                    value=repr(name),
+                    limit=f"one of {', '.join(self.state_names)}",
+                    remedy=near(name, self.state_names)
+                    or "Use a coordinate's name, or its velocity's",
+                )
+            x[self.state_names.index(name)] = number_of(
+                f"state '{name}' of '{self.name}'", value, limit="a number, in rad or m, per second"
+            )
+        return self.check_state(x)
+
+    def check_state(self, x: ArrayLike) -> FloatArray:
+        """Return ``x`` as a float array (…, 2n), refusing wrong lengths and NaN.
+
+        Raises
+        ------
+        InvalidInputError
+            With the offending entry.
+        """
+        state = floats(f"state of '{self.name}'", x)
+        if state.ndim == 0 or state.shape[-1] != 2 * self.n:
+            raise InvalidInputError(
+                f"state of '{self.name}'",
+                value=f"shape {state.shape}",
+                limit=f"(…, {2 * self.n}), in the order {', '.join(self.state_names)}",
+                remedy="Set states by name: mechanism.state(name=value)",
+            )
+        if not np.isfinite(state).all():
+            first = int(np.argwhere(~np.isfinite(state))[0][-1])
+            raise InvalidInputError(
+                f"state '{self.state_names[first]}' of '{self.name}'",
+                value=state[..., first].ravel()[0],
+                limit="a finite number",
+                remedy="A sensor or an earlier computation gave NaN or infinity",
+            )
+        return state
+
+    def _columns(self, what: str, values: ArrayLike, names: Sequence[str]) -> FloatArray:
+        """Return values as floats, (…, len(names)), or refuse them."""
+        what = f"{what} of '{self.name}'"
+        array = floats(what, values)
+        if array.ndim == 0 or array.shape[-1] != len(names):
+            raise InvalidInputError(
+                what,
+                value=f"shape {array.shape}",
+                limit=f"(…, {len(names)}), in the order {', '.join(names)}",
+                remedy=f"Of a state x = (q, q̇) the positions are x[:{self.n}]",
+            )
+        return array
+
+    # -- equations on a tape ------------------------------------------------------------
+
+    def partition(self, tape: Tape, rename: Mapping[sp.Symbol, sp.Expr] | None = None) -> Partition:
+        """Lay M, f and B on a tape and eliminate ``M_uu``, equations (1)-(4).
+
+        ``rename`` replaces symbols first: a controller's belief keeps its own parameters.
+        """
+        entries = [list(m) for m in (self.mass_matrix, self.force, self.input_matrix)]
+        if rename:
+            entries = [[e.xreplace(dict(rename)) for e in part] for part in entries]
+        return Partition.of(tape, *entries)
+
+    # -- numbers ------------------------------------------------------------------------
+
+    def _evaluate(self, which: str, t: ArrayLike, x: FloatArray, *more: object) -> FloatArray:
+        columns = [x[..., i] for i in range(x.shape[-1])]
+        values = self.function(which)(t, *columns, *more, *self.parameter_values)
+        shape = np.broadcast_shapes(x.shape[:-1], *(np.shape(v) for v in values))
+        return np.stack([np.broadcast_to(v, shape) for v in values], axis=-1).astype(float)
+
+    def function(self, which: str) -> Callable[..., list[Any]]:
+        """Return ``"dynamics"``, ``"mass"`` or ``"force"`` compiled to NumPy.
+
+        A function of t, x, (with ``"dynamics"``) u and the parameters, one argument each, that
+        returns the entries of q̈, M or f.
+        """
+        states = (TIME, *self.x)
+        if which == "dynamics":
+            return _compiled_dynamics(self)
+        matrix = self.mass_matrix if which == "mass" else self.force
+        return compiled(matrix, (*states, *self.parameter_symbols))
+
+    def M(self, q: ArrayLike) -> FloatArray:
+        """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like.
+
+        Raises
+        ------
+        InvalidInputError
+            For positions of another shape, a state (…, 2n) for instance.
+        """
+        q = self._columns("positions", q, [c.name for c in self.coordinates])
+        x = np.concatenate([q, np.zeros_like(q)], axis=-1)
+        values = self._evaluate("mass", 0.0, x)
+        return values.reshape(*values.shape[:-1], self.n, self.n)
+
+    def f(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
+        """Return f(q, q̇) at the states x: (…, 2n) to (…, n), N m or N."""
+        return self._evaluate("force", t, self.check_state(x))
+
+    def accelerations(self, t: float, x: ArrayLike, u: ArrayLike) -> FloatArray:
+        """Forward dynamics: q̈ at (t, x, u), (…, n), equations (3)-(4).
+
+        Parameters
+        ----------
+        t
+            Time, s (matters only to time-dependent disturbances).
+        x
+            States, (…, 2n).
+        u
+            Inputs, (…, m), not clipped here.
+        """
+        state = self.check_state(x)
+        inputs = self._columns("inputs", u, [i.name for i in self.inputs])
+        return self._evaluate("dynamics", floats("time", t), state, *np.moveaxis(inputs, -1, 0))
+
+    def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
+        """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
+        state = self.check_state(x)
+        qdd = self._columns("accelerations", qdd, [c.name for c in self.coordinates])
+        inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), qdd)
+        return np.asarray(inertial - self.f(state, t))
+
+    def energy(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
+        """Return T + V at the states x, (…,), J, at the time t, s.
+
+        Raises
+        ------
+        ModelError
+            When the mechanism was given without a potential.
+        """
+        if self.potential is None:
+            raise ModelError(
+                f"energy of '{self.name}'",
+                value="no potential energy",
+                limit="given at construction",
+                remedy="Build it with Mechanism.from_energies, or pass potential=",
+            )
+        state = self.check_state(x)
+        q, qd = state[..., : self.n], state[..., self.n :]
+        kinetic = 0.5 * np.einsum("...i,...ij,...j->...", qd, self.M(q), qd)
+        tape = Tape()
+        potential = compile_numpy(
+            tape, [TIME, *self.q, *self.parameter_symbols], [tape.let(self.potential)]
+        )
+        (value,) = potential(t, *np.moveaxis(q, -1, 0), *self.parameter_values)
+        return np.asarray(kinetic + value)
+
+
+def energies(
+    name: str,
+    coordinates: Sequence[Coordinate],
+    inputs: Sequence[Input],
+    parameters: Sequence[Parameter],
+    kinetic: sp.Expr,
+    potential: sp.Expr,
+    dissipation: sp.Expr | float,
+) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
+    """Return T, V and D as expressions, refused before anything is derived from what is wrong.
+
+    Raises
+    ------
+    ModelError
+        For symbols that are not of this mechanism, and what has no derivative where the
+        equations of motion need one.
+    InvalidInputError
+        For coordinates, inputs or parameters that are none.
+    """
+    check_parts(name, coordinates, inputs, parameters)
+    data = vocabulary(parameters=parameters, time=False)
+    q, qd = {c.symbol for c in coordinates}, {c.velocity for c in coordinates}
+    places = vocabulary(coordinates, velocities=False) | data
+    motion = vocabulary(coordinates, time=False) | data
+    found = []
+    for what, given, known, variables in (
+        ("kinetic energy", kinetic, motion, q | qd),
+        ("potential energy", potential, places, q),
+        ("dissipation", dissipation, motion | places, qd),
+    ):
+        whose = f"{what} of '{name}'"
+        expression = expression_of(whose, given)
+        check_symbols(whose, [expression], known)
+        require_smooth(whose, [expression], variables)
+        found.append(expression)
+    T, V, D = found
+    return T, V, D
+
+
+def matrix_of(what: str, value: object) -> sp.ImmutableDenseMatrix:
+    """Return a matrix of expressions; refuse text, which SymPy would run, and what is none."""
+    try:
+        if not isinstance(value, sp.MatrixBase):
+            rows = np.array(value, dtype=object)
+            value = sp.Matrix(*rows.shape, rows.ravel().tolist()) if rows.ndim == 2 else rows
+            for entry in rows.ravel():
+                expression_of(what, entry)
+        return sp.ImmutableDenseMatrix(value)
+    except ModelError:
+        raise
+    except (TypeError, ValueError, NotImplementedError) as error:
+        raise ModelError(
+            what,
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="a matrix of SymPy expressions",
+            remedy="Write sympy.Matrix([[...], [...]])",
+        ) from error
+
+
+def require_mechanism(what: str, value: object) -> None:
+    """Refuse what is no mechanism, a name of one for instance.
+
+    Raises
+    ------
+    InvalidInputError
+        With how to make one.
+    """
+    if not isinstance(value, Mechanism):
+        raise InvalidInputError(
+            what,
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="an undertow.Mechanism",
+            remedy=REMEDIES["Mechanism"],
+        )
+
+
+@lru_cache(maxsize=64)
+def _compiled_dynamics(mechanism: Mechanism) -> Callable[..., list[Any]]:
+    tape = Tape()
+    forward = mechanism.partition(tape).accelerations(sp.Matrix(mechanism.u))
+    arguments = [TIME, *mechanism.x, *mechanism.u, *mechanism.parameter_symbols]
+    return compile_numpy(tape, arguments, forward)

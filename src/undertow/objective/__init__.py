@@ -1,0 +1,27 @@
+"""What is best: cost, horizon, terminal set and constraints; and the word for each problem."""
+
+from undertow.objective.objective import (
+    TRAVEL,
+    Constraint,
+    MinimumEnergy,
+    MinimumTime,
+    Objective,
+    check_travel,
+    require_objective,
+    state_box,
+)
+from undertow.objective.words import Goal, finite_limits, objective_for
+
+__all__ = [
+    "TRAVEL",
+    "Constraint",
+    "Goal",
+    "MinimumEnergy",
+    "MinimumTime",
+    "Objective",
+    "check_travel",
+    "finite_limits",
+    "objective_for",
+    "require_objective",
+    "state_box",
+]

@@ -1,0 +1,664 @@
+"""Objectives: what is best. Stage cost, horizon, terminal set, constraints, (21)-(31).
+
+A stage cost Φ(x, u) and constraints w(x, u) ≤ 0 are SymPy expressions of the mechanism's
+own names, so they are compiled into the kernel with the rest of the loop.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Container, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import sympy as sp
+
+from undertow.base import (
+    REMEDIES,
+    InvalidInputError,
+    ModelError,
+    UndertowError,
+    check_fields,
+    checked,
+    near,
+    raised_at,
+)
+from undertow.models import (
+    FloatArray,
+    Mechanism,
+    by_names,
+    check_symbols,
+    expression_of,
+    normal_name,
+    number_of,
+    shortened,
+    vocabulary,
+)
+from undertow.symbolic import compile_expressions
+
+__all__ = [
+    "Constraint",
+    "MinimumEnergy",
+    "MinimumTime",
+    "Names",
+    "Objective",
+    "check_travel",
+    "require_objective",
+    "state_box",
+    "travel_box",
+]
+
+#: Part of a coordinate's declared travel that a motion may use: the rest is for what no model
+#: knows of, before the end stop.
+TRAVEL = 0.95
+
+#: Part of a bound on a state that large steps keep clear of, see :mod:`undertow.symbolic.settle`.
+SPARE = 0.05
+
+
+class Names:
+    """The states, inputs and parameters of a mechanism as attributes: ``v.phi``, ``v.voltage``.
+
+    ``v.states`` and ``v.inputs`` are the column matrices of all states and all inputs.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.states = sp.Matrix(mechanism.x)
+        self.inputs = sp.Matrix(mechanism.u)
+        self._symbols = {
+            str(s): s for s in (*mechanism.x, *mechanism.u, *mechanism.parameter_symbols)
+        }
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
+        return iter(self._symbols)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the symbol of that name."""
+        symbols = self.__dict__.get("_symbols", {})
+        name = normal_name(name)
+        if name in symbols:
+            return symbols[name]
+        hint = near(name, symbols)
+        message = f"no state, input or parameter '{name}'; there are {', '.join(symbols)}. {hint}"
+        raise AttributeError(message, name=name, obj=self)
+
+
+Formula = Callable[[Names], Any]
+
+_REMEDIES = {
+    "horizon": "Give the longest motion worth waiting for, s",
+    "terminal_radius": "Motions end in a small ball around the target; the paper's is 0.01",
+}
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A path constraint w(x, u) ≤ 0, equation (25).
+
+    Parameters
+    ----------
+    name
+        Shown when it is the one that fails.
+    formula
+        Function of :class:`Names` that returns w as a SymPy expression.
+    unit
+        Unit of w, for people.
+    state
+        Name of the state that it bounds, where it is one's range.
+    source
+        Where it comes from, where it is not the user's own.
+
+    Notes
+    -----
+    *Where it is tested.*  A rollout tests w at the start of each of its small Runge-Kutta steps,
+    ``ClosedLoop.step`` apart (2 ms unless told otherwise), at the state and the input applied
+    there; nothing is tested between them.  Large steps (:class:`undertow.ClosedLoop`, ``tail``) are
+    taken only where all constraints are bounds of states, :func:`state_box` or declared travel, and
+    only where they cannot come near a bound, nor as near as the small steps before them.  A motion
+    stops at the first test that fails.  The state at its end, where it enters the terminal set or
+    the horizon is over, is tested no more.
+
+    *What may happen in between.*  Where ẇ is Lipschitz, w exceeds its larger value at two
+    neighbouring tests, h apart, by at most (h²/8) max |ẅ| (the error of linear interpolation).
+    A bound on a coordinate has ẅ = ± q̈: at h = 2 ms and 200 rad/s², 1e-4 rad.  The input of a
+    continuous law has kinks where it saturates: for a bound on it (h/2) max |ẇ| holds.  Who
+    needs a bound at every instant tightens it by as much, or takes shorter steps.
+
+    Examples
+    --------
+    >>> arm = Constraint("arm within 60°", lambda v: v.theta**2 - math.radians(60) ** 2)
+    """
+
+    name: str
+    formula: Formula
+    unit: str = ""
+    state: str = ""
+    source: str = ""
+
+    @property
+    def words(self) -> str:
+        """Its name, and where it comes from."""
+        return f"{self.name}: {self.source}" if self.source else self.name
+
+
+@dataclass(frozen=True)
+class _Within:
+    """w of low ≤ x_i ≤ high, for a state by its name or number; one end may be infinite."""
+
+    state: str | int
+    low: float
+    high: float
+
+    def __call__(self, v: Names) -> sp.Expr:
+        x = v.states[self.state] if isinstance(self.state, int) else getattr(v, self.state)
+        if not math.isfinite(self.low):
+            return x - self.high
+        if not math.isfinite(self.high):
+            return self.low - x
+        return sp.Abs(x - (self.low + self.high) / 2) - (self.high - self.low) / 2
+
+    @property
+    def spare(self) -> float:
+        """How far from the bound large steps stay."""
+        ends = [abs(end) for end in (self.low, self.high) if math.isfinite(end)]
+        return SPARE * sum(ends) / len(ends)
+
+
+def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
+    """Return bounds on the named states, SI units, as constraints: (24)'s x ∈ 𝒳.
+
+    Parameters
+    ----------
+    **bounds
+        A number for |state| ≤ bound, or (low, high) around the target, low < 0 < high.
+
+    Raises
+    ------
+    InvalidInputError
+        For a bound that is not finite, or that excludes the target.
+
+    See Also
+    --------
+    Constraint : where in a motion they are tested.
+
+    Examples
+    --------
+    >>> [c.name for c in state_box(theta=1.047, phi=(-0.2, 0.5))]
+    ['|theta| ≤ 1.047', '-0.2 ≤ phi ≤ 0.5']
+    """
+
+    def bounded(name: str, bound: float | tuple[float, float]) -> Constraint:
+        ends = bound if isinstance(bound, tuple) else (bound, bound)
+        low, high = (number_of(f"bound of state '{name}'", end) for end in ends)
+        low = low if isinstance(bound, tuple) else -low
+        if not (math.isfinite(low) and math.isfinite(high) and low < 0 < high):
+            alone = not isinstance(bound, tuple)
+            raise InvalidInputError(
+                f"bound of state '{name}'",
+                value=bound,
+                limit="finite and > 0" if alone else "finite, low < 0 < high",
+                remedy="The box is |state| ≤ bound, or low ≤ state ≤ high around the target; leave "
+                "out states without a bound",
+            )
+        words = f"|{name}| ≤ {high:g}" if low == -high else f"{low:g} ≤ {name} ≤ {high:g}"
+        return Constraint(words, _Within(name, low, high), state=name)
+
+    named = by_names("bounds of states", bounds)
+    return tuple(bounded(name, bound) for name, bound in named.items())
+
+
+def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constraint, ...]:
+    """Return the ranges of travel that a mechanism declares, as constraints: 95 % of each side.
+
+    The equations know no end stop; what is planned keeps clear of it all the same.  ``but`` names
+    coordinates to leave out.
+
+    Raises
+    ------
+    InvalidInputError
+        For a range that does not hold the target.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> [c.words for c in travel_box(ut.mechanisms.cart_pendulum())]
+    ['|x| ≤ 1.425 m: 95 % of the travel that cart_pendulum declares']
+    """
+    found = []
+    for index, c in enumerate(mechanism.coordinates):
+        if c.name in but or (math.isinf(c.low) and math.isinf(c.high)):
+            continue
+        if not c.low <= 0 <= c.high:
+            raise InvalidInputError(
+                f"travel of '{c.name}' that '{mechanism.name}' declares",
+                value=f"[{c.low:g}, {c.high:g}] {c.unit}",
+                limit="around the target, low ≤ 0 ≤ high",
+                remedy="Move the target into it, or let the objective have travel=False",
+            )
+        low, high = TRAVEL * c.low, TRAVEL * c.high
+        factor, unit = (180 / math.pi, "°") if c.unit == "rad" else (1.0, f" {c.unit}")
+        ends = [f"{factor * end:.4g}{unit}" for end in (low, high)]
+        if low == -high:
+            name = f"|{c.name}| ≤ {ends[1]}"
+        else:
+            name = f"{ends[0]} ≤ " * math.isfinite(low) + c.name
+            name += f" ≤ {ends[1]}" * math.isfinite(high)
+        source = f"{100 * TRAVEL:g} % of the travel that {mechanism.name} declares"
+        found.append(Constraint(name, _Within(index, low, high), c.unit, c.name, source))
+    return tuple(found)
+
+
+def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown: str) -> None:
+    """Refuse a box, ``shown`` in words, that reaches beyond the travel of its coordinate.
+
+    Raises
+    ------
+    InvalidInputError
+        With the travel that the mechanism declares.
+    """
+    for c in mechanism.coordinates:
+        if c.name == name and (low < c.low or high > c.high):
+            raise InvalidInputError(
+                f"box of '{name}'",
+                value=repr(shown),
+                limit=f"within the travel that {mechanism.name} declares, "
+                f"{c.low:g} to {c.high:g} {c.unit}",
+                remedy="A longer one is a mechanism of your own, with other ends: FILE.py:NAME; "
+                "in Python an objective with travel=False ignores what is declared",
+            )
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A stage cost with its horizon, terminal set and constraints.
+
+    Parameters
+    ----------
+    name
+        Short name for tables.
+    stage
+        Φ(x, u) of (21) as a function of :class:`Names`; must be ≥ 0.
+    unit
+        Unit of the total cost.
+    horizon
+        Longest prediction, s; a motion that has not reached the terminal set by then is
+        not admissible.
+    terminal_radius
+        ν of the terminal set ‖x‖₂ ≤ ν, (31); the cost is counted until it is reached.
+    constraints
+        Path constraints w(x, u) ≤ 0, (25); :class:`Constraint` says where they are tested.
+    hard_input
+        False: the actuator clips (38).  True: |u| ≤ u_max is a constraint on the
+        *unclipped* law, and a motion that would saturate is not admissible.  It is tested where
+        the others are; in a sampled loop at the samples.
+    travel
+        True: the ranges of travel that the mechanism declares are constraints too, 95 % of each
+        side, but for a coordinate that a :func:`state_box` among the constraints bounds anew,
+        up to all of the travel; one that reaches beyond it is refused.
+        False: only what ``constraints`` say.
+    formula
+        What is integrated, in words; by default the expression itself.
+
+    Examples
+    --------
+    >>> quadratic = Objective("quadratic", lambda v: v.voltage**2 + 10 * v.phi**2)
+    """
+
+    name: str
+    stage: Formula
+    unit: str = ""
+    horizon: float = 60.0
+    terminal_radius: float = 0.01
+    constraints: tuple[Constraint, ...] = ()
+    hard_input: bool = False
+    travel: bool = True
+    formula: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a stage cost that is no function, and a horizon or radius that is not positive."""
+        if not callable(self.stage):
+            raise InvalidInputError(
+                f"stage cost of '{self.name}'",
+                value=f"{self.stage!r}, a {type(self.stage).__name__}",
+                limit="a function of the mechanism's names that returns an expression",
+                remedy="Write lambda v: v.inputs[0]**2, or lambda v: 1 for a constant",
+            )
+        several = isinstance(self.constraints, Iterable)
+        odd = [c for c in self.constraints if not isinstance(c, Constraint)] if several else [self]
+        if odd:
+            raise InvalidInputError(
+                f"constraints of objective '{self.name}'",
+                value=f"a {type(odd[0] if several else self.constraints).__name__}",
+                limit="a tuple of undertow.Constraint",
+                remedy="Write constraints=(*undertow.state_box(phi=1.0), Constraint(...))",
+            )
+        object.__setattr__(self, "constraints", tuple(self.constraints))
+        for field in ("horizon", "terminal_radius"):
+            value = number_of(f"{field} of objective '{self.name}'", getattr(self, field))
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidInputError(
+                    f"{field} of objective '{self.name}'",
+                    value=value,
+                    limit="finite and > 0",
+                    remedy=_REMEDIES[field],
+                )
+
+    @checked
+    def on(self, mechanism: Mechanism) -> Self:
+        """Return the problem as it is for a mechanism: with the travel that it declares.
+
+        The one rule for ranges of travel: :class:`undertow.ClosedLoop`, the cascade and the bound
+        all apply it to what they are given, and applying it twice changes nothing.
+
+        Raises
+        ------
+        InvalidInputError
+            For a declared range that does not hold the target, and for a :func:`state_box` that
+            reaches beyond one.
+        """
+        own = tuple(c for c in self.constraints if not c.source)
+        boxes = {c.state: c for c in own if isinstance(c.formula, _Within)}
+        declared = travel_box(mechanism, boxes) if self.travel else ()
+        for state, box in boxes.items() if self.travel else ():
+            ends: Any = box.formula
+            check_travel(mechanism, state, ends.low, ends.high, box.name)
+        constraints = own + declared
+        return self if constraints == self.constraints else replace(self, constraints=constraints)
+
+    @checked
+    def meaning(self, mechanism: Mechanism) -> str:
+        """Return in one line what is minimised, until when, and within which bounds.
+
+        Examples
+        --------
+        >>> import undertow as ut
+        >>> ut.MinimumEnergy(unit="N² s").meaning(ut.mechanisms.cart_pendulum())
+        ... # doctest: +NORMALIZE_WHITESPACE
+        'energy: ∫ uᵀu dt, N² s, to ‖x‖ ≤ 0.01 within 60 s;
+         |x| ≤ 1.425 m: 95 % of the travel that cart_pendulum declares'
+        """
+        problem = self.on(mechanism)
+        unit = f", {self.unit}" if self.unit else ""
+        bounds = [c.words for c in problem.constraints]
+        if self.hard_input:
+            bounds += [
+                f"|{i.name}| ≤ {i.limit:g} {i.unit} before clipping" for i in mechanism.inputs
+            ]
+        return "; ".join(
+            (
+                f"{self.name}: {self._formula(mechanism)}{unit}, "
+                f"to ‖x‖ ≤ {self.terminal_radius:g} within {self.horizon:g} s",
+                *bounds,
+            )
+        )
+
+    def _formula(self, mechanism: Mechanism) -> str:
+        return self.formula or f"∫ ({self.stage_cost(mechanism)}) dt"
+
+    @checked
+    def written(self, mechanism: Mechanism) -> Self:
+        """Return the same objective with what no other process can import as expressions.
+
+        A lambda cannot be pickled; its expression in a mechanism's own names can.
+        """
+        stage = self.stage
+        if not _importable(stage):
+            stage = _Written(self._expression(mechanism, "stage cost", stage))
+        constraints = tuple(
+            c
+            if _importable(c.formula)
+            else replace(c, formula=_Written(self._expression(mechanism, c.name, c.formula)))
+            for c in self.constraints
+        )
+        if stage is self.stage and constraints == self.constraints:
+            return self
+        return replace(self, stage=stage, constraints=constraints)
+
+    def __getstate__(self) -> dict[str, Any]:
+        for what, formula in (
+            ("stage cost", self.stage),
+            *((c.name, c.formula) for c in self.constraints),
+        ):
+            if not _importable(formula):
+                raise InvalidInputError(
+                    f"'{what}' of objective '{self.name}' for another process or a file",
+                    value=getattr(formula, "__qualname__", type(formula).__name__),
+                    limit="a function that can be imported there",
+                    remedy="Write it as a def at the top of a module, or send the ClosedLoop or "
+                    "the Cascade, which take its expression along",
+                )
+        return dict(vars(self))
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, _memo: object) -> Self:
+        return self
+
+    @checked
+    def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
+        """Return Φ(x, u) as an expression.
+
+        Raises
+        ------
+        InvalidInputError
+            For unknown names, and where Φ is negative or no number at one of 256 random
+            states and inputs.
+        """
+        what = f"stage cost of '{self.name}'"
+        stage = self._expression(mechanism, what, self.stage)
+        lowest = _lowest(mechanism, stage)
+        if not lowest >= 0:
+            raise InvalidInputError(
+                what,
+                value=f"{lowest:.3g} for some states and inputs",
+                limit="≥ 0 everywhere: (21) is a cost that only grows",
+                remedy="Use squares or moduli",
+            )
+        return stage
+
+    @checked
+    def path_margins(self, mechanism: Mechanism) -> list[sp.Expr]:
+        """Return −w(x, u) of every constraint: signed margins, ≥ 0 is satisfied."""
+        return [
+            -self._expression(mechanism, f"constraint '{c.name}'", c.formula)
+            for c in self.constraints
+        ]
+
+    def boxes(self, mechanism: Mechanism) -> tuple[tuple[int, float], ...]:
+        """Return which state each constraint bounds, and how far large steps stay from the bound.
+
+        Empty where there are none, and where one is no :func:`state_box` and no travel.
+        """
+        found = []
+        for constraint, margin in zip(self.constraints, self.path_margins(mechanism), strict=True):
+            bounded = [i for i, x in enumerate(mechanism.x) if margin.free_symbols == {x}]
+            if not (bounded and isinstance(constraint.formula, _Within)):
+                return ()
+            found.append((bounded[0], constraint.formula.spare))
+        return tuple(found)
+
+    @checked
+    def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
+        """Refuse an initial state that breaks a path constraint, whatever the input does.
+
+        Parameters
+        ----------
+        mechanism
+            Whose state it is.
+        x
+            State, (2n,).
+
+        Raises
+        ------
+        InvalidInputError
+            With the constraint and its margin.
+        """
+        problem = self.on(mechanism)
+        values = mechanism.substitution | dict(
+            zip(mechanism.x, mechanism.check_state(x).tolist(), strict=True)
+        )
+        margins = zip(problem.constraints, problem.path_margins(mechanism), strict=True)
+        for constraint, margin in margins:
+            at_start = margin.subs(values)
+            if at_start.is_number and float(at_start) < 0:
+                raise InvalidInputError(
+                    f"initial state of '{mechanism.name}' breaks '{constraint.words}'",
+                    value=f"margin {float(at_start):.4g} {constraint.unit}".rstrip(),
+                    limit="≥ 0",
+                    remedy="Start inside the constraints, or widen them",
+                )
+
+    @staticmethod
+    def _expression(mechanism: Mechanism, what: str, formula: Formula) -> sp.Expr:
+        names = Names(mechanism)
+        try:
+            value = formula(names)
+        except UndertowError:
+            raise
+        except AttributeError as error:
+            if error.obj is not names:
+                raise _failed(what, error) from error
+            raise InvalidInputError(
+                f"{what} for '{mechanism.name}'",
+                value=f"'{error.name}'",
+                limit=f"among {', '.join(names)}",
+                remedy=near(str(error.name), names) or "Use the mechanism's own names",
+            ) from error
+        except Exception as error:  # a user's function may do anything
+            raise _failed(what, error) from error
+        try:
+            expression = expression_of(what, value)
+            known = vocabulary(
+                mechanism.coordinates, mechanism.inputs, mechanism.parameters, time=False
+            )
+            check_symbols(what, [expression], known)
+        except ModelError as error:
+            raise InvalidInputError(
+                what,
+                value=f"{shortened(value)}, with {error.value}",
+                limit="one expression in the mechanism's states and inputs",
+                remedy=f"Take symbols from the argument: lambda v: v.phi**2. {error.remedy}",
+            ) from error
+        return expression
+
+
+def require_objective(value: object) -> None:
+    """Refuse what is no objective, a word for one for instance.
+
+    Raises
+    ------
+    InvalidInputError
+        With how to make one.
+    """
+    if not isinstance(value, Objective):
+        raise InvalidInputError(
+            "objective",
+            value=f"{value!r}, a {type(value).__name__}",
+            limit="an undertow.Objective",
+            remedy=REMEDIES["Objective"],
+        )
+
+
+@dataclass(frozen=True)
+class _Written:
+    """A formula that was written down as an expression in a mechanism's own names."""
+
+    expression: sp.Expr
+
+    def __call__(self, _v: Names) -> sp.Expr:
+        return self.expression
+
+
+def _importable(formula: Formula) -> bool:
+    """Whether another process can have a formula by its name, or as data."""
+    try:
+        pickle.dumps(formula)
+    except Exception:  # pickle raises what it likes
+        return False
+    return True
+
+
+def _squares(v: Names) -> sp.Expr:
+    """Return uᵀu."""
+    return (v.inputs.T * v.inputs)[0]
+
+
+def _one(_v: Names) -> sp.Expr:
+    """Return 1."""
+    return sp.Integer(1)
+
+
+@dataclass(frozen=True)
+class MinimumEnergy(Objective):
+    """Minimum control energy ∫ uᵀu dt, (40), plus optional state weights.
+
+    The paper's Φ = u² is zero wherever u = 0 and so breaks (27)-(28): Theorem 1 does not
+    cover it.  With ``state_weight`` > 0, Φ = uᵀu + w xᵀx, and the theorem applies.
+    ``unit`` is that of voltage inputs; pass another one for forces or torques.
+    """
+
+    name: str = "energy"
+    stage: Formula = _squares
+    unit: str = "V² s"
+    state_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a negative weight, besides what every objective refuses."""
+        check_fields(self)
+        super().__post_init__()
+        if not (math.isfinite(self.state_weight) and self.state_weight >= 0):
+            raise InvalidInputError(
+                f"state_weight of objective '{self.name}'",
+                value=self.state_weight,
+                limit="finite and ≥ 0",
+                remedy="Theorem 1 wants a small positive one; the paper has 0",
+            )
+
+    @checked
+    def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
+        """Return Φ(x, u) = uᵀu + w xᵀx."""
+        x = sp.Matrix(mechanism.x)
+        return super().stage_cost(mechanism) + self.state_weight * (x.T * x)[0]
+
+    def _formula(self, mechanism: Mechanism) -> str:
+        if self.formula or self.stage is not _squares:
+            return super()._formula(mechanism)
+        weight = self.state_weight
+        return f"∫ (uᵀu + {weight:g} xᵀx) dt" if weight else "∫ uᵀu dt"
+
+
+@dataclass(frozen=True)
+class MinimumTime(Objective):
+    """Minimum time to the terminal set, ∫ 1 dt = t_f, (29) and (41)."""
+
+    name: str = "time"
+    stage: Formula = _one
+    unit: str = "s"
+    formula: str = "∫ 1 dt"
+
+
+def _failed(what: str, error: Exception) -> InvalidInputError:
+    """A formula of the user's that raised, with what it said and where."""
+    return InvalidInputError(
+        what,
+        value=f"{type(error).__name__}: {error}{raised_at(error)}",
+        limit="a function that returns a SymPy expression of its argument's names",
+        remedy="Write it with SymPy's functions, sympy.sin(v.phi) for math.sin or numpy.sin, and "
+        "sympy.Piecewise for conditions",
+    )
+
+
+def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
+    """Return the smallest of 256 random values of a stage cost; NaN where one is no number."""
+    rng = np.random.default_rng(0)
+    symbols = [*mechanism.x, *mechanism.u]
+    function = compile_expressions(symbols, [stage.subs(mechanism.substitution)])
+    reach = np.ones(len(symbols)) * math.pi
+    reach[2 * mechanism.n :] = np.minimum(mechanism.input_limits, 100.0)
+    samples = rng.uniform(-1, 1, (256, len(symbols))) * reach
+    with np.errstate(all="ignore"):
+        return float(np.min(np.real_if_close(function(*samples.T)[0])))

@@ -1,0 +1,153 @@
+"""Objectives by their words: one home, so that a word means the same problem everywhere.
+
+``energy`` and ``time`` are the paper's.  A rig with stiction and counting encoders ends in no
+ball as small as theirs, and leaves its driven coordinates where no cost asks for them: what suits
+a bench has words of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+import sympy as sp
+
+from undertow.base import InvalidInputError, checked, near
+from undertow.models import FloatArray, Mechanism
+from undertow.objective.objective import Constraint, MinimumEnergy, MinimumTime, Names, Objective
+
+__all__ = ["Goal", "finite_limits", "objective_for"]
+
+#: The words.
+Goal = Literal["energy", "time", "bench-energy", "bench-time", "effort"]
+
+#: w of minimum energy on a bench: Theorem 1 holds and the driven coordinates come home.
+STATE_WEIGHT = 0.05
+#: Price of effort in minimum time on a bench, 0.01/V² at 15 V: keeps surfaces from asking what no
+#: sampled, delayed loop can do.
+ENERGY_PRICE = 2.25
+#: Radius of the ball in which a motion ends on a bench: a rig with stiction and counting encoders
+#: stays in no smaller one.
+TERMINAL = 0.05
+#: What xᵀx costs beside the effort, and the radius of the ball, of ``effort``.
+ERROR_PRICE, EFFORT_TERMINAL = 0.01, 0.02
+
+
+def finite_limits(mechanism: Mechanism) -> FloatArray:
+    """Input limits, 1 where there is none, (m,)."""
+    limits = mechanism.input_limits
+    return np.where(np.isfinite(limits), limits, 1.0)
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """Σ (u_i/u_max,i)² of inputs with these limits."""
+
+    limits: tuple[float, ...]
+
+    def __call__(self, v: Names) -> sp.Expr:
+        return sum((u / limit) ** 2 for u, limit in zip(v.inputs, self.limits, strict=True))
+
+
+@dataclass(frozen=True)
+class _TimeAndEffort(_Effort):
+    """1 + r Σ (u_i/u_max,i)²."""
+
+    def __call__(self, v: Names) -> sp.Expr:
+        return 1 + ENERGY_PRICE * super().__call__(v)
+
+
+@dataclass(frozen=True)
+class _EffortAndError(_Effort):
+    """Σ (u_i/u_max,i)² + 0.01 xᵀx."""
+
+    def __call__(self, v: Names) -> sp.Expr:
+        return super().__call__(v) + ERROR_PRICE * (v.states.T * v.states)[0]
+
+
+def _energy_unit(mechanism: Mechanism) -> str:
+    """Return the unit of ∫uᵀu dt."""
+    units = {channel.unit for channel in mechanism.inputs}
+    unit = units.pop() if len(units) == 1 else "mixed units"
+    return f"({unit})² s" if " " in unit else f"{unit}² s"
+
+
+@checked
+def objective_for(
+    mechanism: Mechanism,
+    word: str = "energy",
+    *,
+    horizon: float = 60.0,
+    constraints: Sequence[Constraint] = (),
+    hard_input: bool = False,
+) -> Objective:
+    """Return the objective that a word means for a mechanism, its unit that of the inputs.
+
+    Whoever takes a word takes it from here: the command line, surveys, trials, recipes of runs.
+    The travel that the mechanism declares is among its constraints, see
+    :meth:`undertow.Objective.on`.
+
+    Parameters
+    ----------
+    mechanism
+        Whose inputs and states are meant.
+    word
+        ``energy``: ∫ uᵀu dt, and ``time``: ∫ 1 dt, the paper's (40) and (41), until ‖x‖ ≤ 0.01.
+        ``bench-energy``: ∫ (uᵀu + 0.05 xᵀx) dt, and ``bench-time``: ∫ (1 + 2.25 Σ (u/u_max)²) dt,
+        until ‖x‖ ≤ 0.05.  ``effort``: ∫ (Σ (u/u_max)² + 0.01 xᵀx) dt, until ‖x‖ ≤ 0.02: the same
+        for every mechanism.
+    horizon
+        Longest motion, s.
+    constraints
+        Path constraints, besides the travel.
+    hard_input
+        Whether a motion whose law asks for more than the actuator gives is refused.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown word, or a horizon that is not positive.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> objective_for(rig, "bench-energy").meaning(rig)
+    'bench-energy: ∫ (uᵀu + 0.05 xᵀx) dt, V² s, to ‖x‖ ≤ 0.05 within 60 s'
+    """
+    limits, unit = tuple(finite_limits(mechanism).tolist()), _energy_unit(mechanism)
+    made: Objective
+    if word == "energy":
+        made = MinimumEnergy(unit=unit)
+    elif word == "time":
+        made = MinimumTime()
+    elif word == "bench-energy":
+        made = MinimumEnergy(
+            "bench-energy", unit=unit, terminal_radius=TERMINAL, state_weight=STATE_WEIGHT
+        )
+    elif word == "bench-time":
+        formula = f"∫ (1 + {ENERGY_PRICE:g} Σ (u/u_max)²) dt"
+        made = Objective(
+            "bench-time", _TimeAndEffort(limits), "s", terminal_radius=TERMINAL, formula=formula
+        )
+    elif word == "effort":
+        formula = f"∫ (Σ (u/u_max)² + {ERROR_PRICE:g} xᵀx) dt"
+        made = Objective(
+            "effort",
+            _EffortAndError(limits),
+            "s",
+            terminal_radius=EFFORT_TERMINAL,
+            formula=formula,
+        )
+    else:
+        words = get_args(Goal)
+        raise InvalidInputError(
+            "objective",
+            value=repr(word),
+            limit=f"one of {', '.join(words)}",
+            remedy=near(str(word), words),
+        )
+    own = tuple(constraints)
+    return replace(made, horizon=horizon, constraints=own, hard_input=hard_input).on(mechanism)

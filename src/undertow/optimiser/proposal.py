@@ -1,0 +1,157 @@
+"""What an optimisation of the surface may spend, and what it answers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from undertow.base import InvalidInputError, SingularSurfaceError, check_fields
+from undertow.closed_loop import ClosedLoop, Event
+from undertow.law import Margin, Plan, Surface, surface_margins
+from undertow.models import FloatArray
+
+__all__ = ["Budget", "Proposal", "Status", "motion_margins"]
+
+Status = Literal["converged", "budget spent", "infeasible", "failed"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What one optimisation may spend; it returns its best answer when either is used up.
+
+    Parameters
+    ----------
+    evaluations
+        Rollouts.  With ``seconds`` infinite the answer depends on the seed alone.
+    seconds
+        Wall-clock time, s.
+    """
+
+    evaluations: int
+    seconds: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Refuse budgets that allow nothing."""
+        check_fields(self)
+        whole = isinstance(self.evaluations, int | np.integer) and self.evaluations >= 1
+        if not whole or not self.seconds > 0:
+            raise InvalidInputError(
+                "budget of an optimisation",
+                value=f"{self.evaluations} evaluations, {self.seconds} s",
+                limit="at least 1 evaluation, whole, and more than 0 s",
+                remedy="Budget(1024) is usual for a re-optimisation",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """An answer of the optimiser, with what is needed to judge it.
+
+    Attributes
+    ----------
+    plan
+        The best plan found, ``None`` when there is none.
+    status
+        ``converged``, ``budget spent``, ``infeasible`` (no admissible surface) or
+        ``failed`` (the optimiser raised; see ``message``).
+    cost
+        Predicted cost from ``x`` on; ``inf`` without an admissible surface.
+    incumbent_cost
+        Predicted cost of keeping the old surface; ``inf`` at the first optimisation.
+    margins
+        Signed margins of the surface and of its predicted motion, ≥ 0 is satisfied.  A
+        re-optimisation that found a plan leaves them out: its gate judges for itself, and
+        :func:`motion_margins` tells them.
+    evaluations, seconds
+        What it took.
+    sequence
+        Running number of the proposal.
+    computed_for
+        Time for which ``x`` was given, s.
+    message, remedy
+        What went wrong, and what could help, in words.
+    """
+
+    plan: Plan | None
+    status: Status
+    cost: float
+    incumbent_cost: float
+    margins: tuple[Margin, ...]
+    evaluations: int
+    seconds: float
+    sequence: int
+    computed_for: float
+    message: str = ""
+    remedy: str = ""
+
+    def __repr__(self) -> str:
+        """Show the answer: the plan, its cost, how it was found."""
+        plan = self.message if self.plan is None else self.plan
+        return (
+            f"Proposal({self.status}, cost {self.cost:.6g}, {self.evaluations} evaluations, {plan})"
+        )
+
+    @property
+    def surface(self) -> Surface | None:
+        """The first surface of the plan."""
+        return None if self.plan is None else self.plan.surfaces[0]
+
+
+def motion_margins(
+    loop: ClosedLoop, plan: Plan, x: FloatArray, horizon: float
+) -> tuple[tuple[Margin, ...], str, str]:
+    """Return the margins of a plan and of its predicted motion, how it ends, and a remedy."""
+    objective = loop.objective
+    try:
+        margins = list(surface_margins(loop.mechanism, plan.surfaces[-1]))
+    except SingularSurfaceError as error:
+        return (), str(error), error.remedy
+    batch = loop.batch(x, plan, duration=horizon)
+    margins.append(
+        Margin(
+            "(37) along the motion: min det Γ(q)/det Γ(0)",
+            float(batch.singular[0]),
+            "",
+            "Start closer to the target",
+        )
+    )
+    if objective.hard_input:
+        margins.append(
+            Margin(
+                "(38) hard input limit: min u_max − |demand|",
+                float(batch.input[0]),
+                " or ".join(dict.fromkeys(i.unit for i in loop.mechanism.inputs)),
+                "Raise the actuator limit, start closer to the target, lower η, or let the "
+                "actuator clip (hard_input=False)",
+            )
+        )
+    margins += [
+        Margin(
+            constraint.name,
+            float(value),
+            constraint.unit,
+            "Relax the constraint or start elsewhere",
+        )
+        for constraint, value in zip(objective.constraints, batch.path[0], strict=True)
+    ]
+    event = Event(int(batch.event[0]))
+    broken = next((m for m in margins if not m.value >= 0), margins[-1])
+    ending = {
+        Event.REACHED: f"reaches the terminal set at {batch.time[0]:.3g} s",
+        Event.HORIZON: f"is still at ‖x‖ = {batch.radius[0]:.3g} after {batch.time[0]:.3g} s",
+        Event.UNSTABLE: "is unstable",
+        Event.COSTLY: "costs too much",
+        Event.DIVERGED: f"diverges at {batch.time[0]:.3g} s",
+        Event.SINGULAR: f"meets the singularity (37) at {batch.time[0]:.3g} s",
+        Event.CONSTRAINT: f"breaks '{broken.name}' by {-broken.value:.3g} {broken.unit}".rstrip()
+        + f" at {batch.time[0]:.3g} s",
+    }[event]
+    remedy = {
+        Event.HORIZON: "Lengthen the horizon, widen the terminal set, or spend a larger budget",
+        Event.COSTLY: "Spend a larger budget",
+        Event.CONSTRAINT: broken.remedy,
+    }.get(event, "Start closer to the target, or spend a larger budget")
+    return tuple(margins), f"the best candidate {ending}", remedy

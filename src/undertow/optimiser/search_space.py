@@ -1,0 +1,156 @@
+"""What the optimiser may choose, and the coordinates in which it searches.
+
+Surface entries are searched in symmetric-logarithmic coordinates z with p = w sinh z, entry
+by entry, around a first surface: entries may change sign, and small and large values are
+resolved alike.  Reaching gains are searched as ln η, and the boundary layer through the
+rate η/ε, kept between 1/s and what the integration step can bear.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from undertow.base import InvalidInputError, check_fields
+from undertow.closed_loop import ClosedLoop
+from undertow.law import Plan, ReachingLaw, Surface
+from undertow.models import FloatArray
+from undertow.symbolic import numba
+
+__all__ = ["DecisionVariables", "SearchSpace"]
+
+
+@dataclass(frozen=True)
+class DecisionVariables:
+    """What may be chosen besides the paper's surface parameters λ_a, α_u, λ_u.
+
+    Parameters
+    ----------
+    reaching
+        Also the reaching gains η_i and the layers ε_i.
+    times
+        Times at which further surfaces take over, s; the first is 0: a schedule.
+    alpha_a
+        Also the off-diagonal entries of α_a (m > 1); its diagonal stays −1.
+    """
+
+    reaching: bool = False
+    times: tuple[float, ...] = (0.0,)
+    alpha_a: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse times that do not rise from 0."""
+        check_fields(self)
+        rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
+        if not self.times or self.times[0] != 0 or not rising:
+            raise InvalidInputError(
+                "times of a schedule", value=self.times, limit="rising times from 0 s"
+            )
+
+
+class SearchSpace:
+    """Search coordinates z for plans of one closed loop.
+
+    Parameters
+    ----------
+    loop
+        The closed loop: its reaching law is the centre of the reaching coordinates.
+    anchor
+        First surface: sets the scale of each entry.
+    freedom
+        What may be chosen.
+    """
+
+    def __init__(self, loop: ClosedLoop, anchor: Surface, freedom: DecisionVariables) -> None:
+        self.loop, self.freedom = loop, freedom
+        n, m = loop.mechanism.n, loop.mechanism.m
+        self.n, self.m = n, m
+        base = anchor.normalised().vector
+        scale = np.abs(base)
+        scale[: m * m] = 1.0
+        off_diagonal = ~np.eye(m, dtype=bool).ravel()
+        self._free = np.concatenate(
+            [off_diagonal & freedom.alpha_a, np.ones(2 * m * n - m * m, dtype=bool)]
+        )
+        largest = scale[m * m :].max()
+        self._width = 0.1 * np.maximum(scale, 0.05 * largest)[self._free]
+        self._base = -np.eye(m).ravel()
+        self._places = np.flatnonzero(self._free)
+        # Runge-Kutta is stable up to a rate of 2.8/step; the law is resolved up to 0.8/step.
+        self._fastest = 0.8 / (loop.step * max(1, loop.hold))
+
+    @property
+    def segments(self) -> int:
+        """Surfaces in a plan."""
+        return len(self.freedom.times)
+
+    @property
+    def _entries(self) -> int:
+        return int(self._free.sum())
+
+    @property
+    def size(self) -> int:
+        """Dimension of z."""
+        return self.segments * (self._entries + 2 * self.m * self.freedom.reaching)
+
+    def steps(self, rng: np.random.Generator, spread: FloatArray) -> FloatArray:
+        """Draw steps in z, (N, d), of standard deviations ``spread``, (N,).
+
+        The surfaces of a schedule move together, and each a little by itself.
+        """
+        size = (len(spread), self.segments, self.size // self.segments)
+        drawn = rng.standard_normal((size[0], 1, size[2])).repeat(self.segments, axis=1)
+        if self.segments > 1:
+            drawn = drawn + 0.4 * rng.standard_normal(size)
+        return spread[:, None] * drawn.reshape(len(spread), -1)
+
+    def encode(self, plan: Plan) -> FloatArray:
+        """Return the coordinates of a plan, sampled at the times of the schedule, (d,)."""
+        parts = []
+        for t in self.freedom.times:
+            surface, law = plan.at(t)
+            parts.append(np.arcsinh(surface.normalised().vector[self._free] / self._width))
+            if self.freedom.reaching:
+                eta, layer = np.split((law or self.loop.reaching).vector(self.m), 2)
+                part = np.clip((eta / layer - 1.0) / (self._fastest - 1.0), 1e-6, 1 - 1e-6)
+                parts += [np.log(eta), np.log(part / (1 - part))]
+        return np.concatenate(parts)
+
+    def decode(self, z: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """Return surface vectors (N, S, 2mn) and gains (N, S, 2m) of coordinates (N, d)."""
+        rows = z.reshape(len(z), self.segments, -1)
+        vectors = np.empty((len(z), self.segments, 2 * self.m * self.n))
+        gains = np.empty((len(z), self.segments, 2 * self.m * self.freedom.reaching))
+        _decode(rows, self._base, self._places, self._width, self._fastest, vectors, gains)
+        return vectors, gains if self.freedom.reaching else None
+
+    def plan(self, vectors: FloatArray, gains: FloatArray | None) -> Plan:
+        """Return the plan of one decoded row: (S, 2mn) and (S, 2m)."""
+        surfaces = tuple(Surface.from_vector(v, self.n, self.m) for v in vectors)
+        laws = None
+        if gains is not None:
+            switching = self.loop.reaching.switching
+            laws = tuple(
+                ReachingLaw(tuple(row[: self.m]), tuple(row[self.m :]), switching) for row in gains
+            )
+        return Plan(surfaces, self.freedom.times, laws)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _decode(rows, base, places, width, fastest, vectors, gains):  # type: ignore[no-untyped-def]
+    m = gains.shape[2] // 2
+    for k in range(rows.shape[0]):
+        for segment in range(rows.shape[1]):
+            row, vector = rows[k, segment], vectors[k, segment]
+            vector[:] = 0.0
+            vector[: len(base)] = base
+            for j in range(len(places)):
+                vector[places[j]] = width[j] * math.sinh(max(-15.0, min(15.0, row[j])))
+            for j in range(m):
+                eta = math.exp(max(-5.0, min(10.0, row[len(places) + j])))
+                logit = max(-14.0, min(14.0, row[len(places) + m + j]))
+                rate = 1.0 + (fastest - 1.0) / (1.0 + math.exp(-logit))
+                gains[k, segment, j] = eta
+                gains[k, segment, m + j] = eta / rate

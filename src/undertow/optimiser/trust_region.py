@@ -1,0 +1,209 @@
+"""Quadratic-model search behind the ask/tell face of :mod:`undertow.optimiser.cma_es`.
+
+Derivative-free trust-region search in the manner of Powell's NEWUOA, but for populations:
+each generation is one batch, spread around the place where a quadratic model, fitted to
+everything seen so far, expects the minimum.  A smooth cost of a few coordinates needs
+fewer generations than a covariance takes to adapt; a rough one is better left to
+:class:`undertow.optimiser.CMAES`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from undertow.optimiser.cma_es import FloatArray, check_start
+from undertow.symbolic import numba
+
+__all__ = ["TrustRegion"]
+
+#: Lengths tried along a step of the model.
+STRETCHES = np.array([0.35, 0.7, 1.0, 1.4, 2.0, 3.0])
+
+#: Costs from here on are penalties and stay out of the model.
+PENALTY = 1e8
+
+
+class TrustRegion:
+    """Minimise a smooth function of few coordinates, a batch at a time.
+
+    Parameters
+    ----------
+    mean
+        First guess, (d,).
+    radius
+        First spread of the samples around it.
+    population
+        Candidates per generation; the first one has as many as the model needs.
+    rng
+        Source of randomness: the same generator state gives the same search.
+
+    Raises
+    ------
+    InvalidInputError
+        For a mean that is not finite, or radius or population out of range.
+    """
+
+    def __init__(
+        self, mean: FloatArray, radius: float, population: int, rng: np.random.Generator
+    ) -> None:
+        self.mean = np.array(mean, dtype=float)
+        check_start(self.mean, np.array([radius]), population)
+        self.radius, self.rng = float(radius), rng
+        self.best_x, self.best_f = self.mean.copy(), math.inf
+        self.generation = 0
+        self.converged = False
+        self.step = np.zeros_like(self.mean)
+        d = self.mean.size
+        self.terms = (d + 1) * (d + 2) // 2
+        self.population = population
+        self._count = 0
+        self._x, self._f = np.empty((8 * population, d)), np.empty(8 * population)
+
+    @property
+    def spread(self) -> float:
+        """How far the next samples lie from the best one."""
+        return max(self.radius, float(np.abs(self.step).max()))
+
+    def ask(self) -> FloatArray:
+        """Return the next candidates, (N, d).
+
+        The first time the mean and a design around it; later steps of several lengths, and a
+        design around the place where the model expects the minimum.  A design goes both ways
+        along random orthogonal axes, then beyond.
+        """
+        d, lengths = self.mean.size, STRETCHES[: self.population // 2]
+        count = self.population - len(lengths)
+        if self.generation == 0:
+            lengths = STRETCHES[:1]  # along no step at all: the mean itself
+            count = self.population * math.ceil(1.2 * self.terms / self.population) - 1
+        drawn = self.rng.standard_normal((1 + max(count - 2 * d, 0), d))
+        x = np.empty((len(lengths) + count, d))
+        _spread_out(self.best_x, self.step, lengths, self.radius, drawn, x)
+        return x
+
+    def tell(self, x: FloatArray, f: FloatArray) -> None:
+        """Learn the costs ``f``, (N,), of candidates ``x``, (N, d); NaN counts as +∞."""
+        while self._count + len(f) > len(self._f):
+            self._x, self._f = np.repeat(self._x, 2, axis=0), np.repeat(self._f, 2)
+        self.generation += 1
+        self._count, best = _learn(x, f, self._x, self._f, self._count)
+        if best >= 0 and f[best] < self.best_f:
+            self.best_f, self.best_x = float(f[best]), x[best].copy()
+        if self._count < self.terms:
+            self.step[:] = 0.0
+            self.radius *= 0.5
+            return
+        length = _model_step(self._x[: self._count], self._f, self.best_x, self.best_f, self.step)
+        self.radius = min(max(0.5 * length, 0.01), 0.3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _spread_out(centre, step, lengths, radius, drawn, x):  # type: ignore[no-untyped-def]
+    """Write candidates: lengths along the step, then a design around its end."""
+    d, first = len(centre), len(lengths)
+    for k in range(first):
+        for j in range(d):
+            x[k, j] = centre[j] + lengths[k] * step[j]
+    norm = np.empty(len(drawn))
+    for k in range(len(drawn)):
+        norm[k] = math.sqrt(np.sum(drawn[k] * drawn[k]))
+    for k in range(first, len(x)):
+        axis = k - first
+        for j in range(d):
+            if axis < 2 * d:  # columns of a reflection: orthogonal
+                i = axis % d
+                way = (1.0 if i == j else 0.0) - 2.0 * drawn[0, i] * drawn[0, j] / norm[0] ** 2
+                way = way if axis < d else -way
+            else:
+                beyond = 1 + axis - 2 * d
+                way = 1.5 * drawn[beyond, j] / norm[beyond]
+            x[k, j] = centre[j] + step[j] + radius * way
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _learn(x, f, known_x, known_f, count):  # type: ignore[no-untyped-def]
+    """Keep what is no penalty; return how many are known now, and the best of the new ones."""
+    best = -1
+    for k in range(len(f)):
+        if f[k] < np.inf and (best < 0 or f[k] < f[best]):
+            best = k
+        if f[k] < PENALTY:
+            known_x[count] = x[k]
+            known_f[count] = f[k]
+            count += 1
+    return count, best
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _model_step(known_x, known_f, best_x, best_f, step):  # type: ignore[no-untyped-def]
+    """Fit a quadratic to the costs near the best one; write its trust-region step.
+
+    Returns the length of the step.
+    """
+    known, d = known_x.shape
+    terms = (d + 1) * (d + 2) // 2
+    count, scale = min(known, 3 * terms), abs(best_f)
+    away = np.empty(known)
+    for i in range(known):
+        away[i] = math.sqrt(np.sum((known_x[i] - best_x) ** 2))
+    near = np.argsort(away, kind="mergesort")[:count]
+    distance, f, x = away[near], known_f[near] - best_f, np.empty((count, d))
+    for i in range(count):
+        x[i] = known_x[near[i]] - best_x
+    reach = max(distance[min(count - 1, terms + 3)], 1e-6)
+    normal = np.zeros((terms, terms))
+    right = np.zeros(terms)
+    row = np.empty(terms)
+    for i in range(count):
+        far, high = distance[i] / reach, f[i] / (0.5 * scale + 1e-9)
+        weight = (1.0 / (1.0 + far**4) + 1e-3) / (1.0 + high * high)
+        row[0] = 1.0
+        k = d + 1
+        for a in range(d):
+            row[1 + a] = x[i, a] / reach
+            for b in range(a, d):
+                row[k] = (x[i, a] / reach) * (x[i, b] / reach)
+                k += 1
+        for a in range(terms):
+            w = weight * row[a]
+            right[a] += w * f[i]
+            for b in range(terms):
+                normal[a, b] += w * row[b]
+    trace = 0.0
+    for a in range(terms):
+        trace += normal[a, a]
+    for a in range(terms):
+        normal[a, a] += 1e-9 * trace / terms
+    c = np.linalg.solve(normal, right)
+    H = np.zeros((d, d))
+    k = d + 1
+    for a in range(d):
+        for b in range(a, d):
+            H[a, b] += c[k]
+            H[b, a] += c[k]
+            k += 1
+    curvature, basis = np.linalg.eigh(H)
+    slope = basis.T @ c[1 : d + 1]
+    top = max(abs(curvature[0]), abs(curvature[-1]), 1e-300)
+    push, size = 0.0, 0.0
+    y = np.empty(d)
+    for _ in range(60):
+        size = 0.0
+        for a in range(d):
+            y[a] = -slope[a] / (max(curvature[a], 1e-3 * top) + push)
+            size += y[a] * y[a]
+        size = math.sqrt(size)
+        if size <= 1.5:
+            break
+        push = max(1.5 * push, 1e-3 * top)
+    if not size < 1e3:
+        y[:] = 0.0
+    length = 0.0
+    for a in range(d):
+        step[a] = 0.0
+        for b in range(d):
+            step[a] += basis[a, b] * y[b] * reach
+        length += step[a] * step[a]
+    return math.sqrt(length)

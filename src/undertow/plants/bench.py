@@ -1,0 +1,364 @@
+"""What makes a bench differ from its model, as data: every number with its source.
+
+A :class:`Bench` is the truth that a controller meets: a mechanism, and what stands between
+it and the numbers that a computer reads and writes.  It holds no state: a
+:class:`undertow.plants.RealisticRig` runs it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self
+
+import numpy as np
+
+from undertow.base import InvalidInputError
+from undertow.models import FloatArray, Mechanism
+
+__all__ = ["Amplifier", "Backlash", "Bench", "Encoder", "Friction", "Push", "Timing"]
+
+
+def _at_least_zero(what: str, owner: Any, names: Iterable[str], *, infinite: bool = False) -> None:
+    for name in names:
+        value = getattr(owner, name)
+        if not (value >= 0 and (infinite or value < math.inf)):
+            raise InvalidInputError(
+                f"{name} of {what}",
+                value=value,
+                limit="≥ 0" if infinite else "finite and ≥ 0",
+                remedy="0 turns it off",
+            )
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Friction of a joint: Coulomb, breakaway (Stribeck's curve), viscous.
+
+    At velocity v the joint resists with up to ``F_c + (F_s − F_c) exp(−(v/v_s)²)``, as far
+    as that is needed to hold it, and with ``b v`` besides (Armstrong-Hélouvry, Dupont,
+    Canudas de Wit, *Automatica* 30(7), 1994).
+
+    Parameters
+    ----------
+    coulomb
+        F_c, N m (N for a slide joint).
+    breakaway
+        F_s ≥ F_c, N m or N; equal to ``coulomb`` where left out.
+    stribeck_speed
+        v_s, rad/s or m/s.
+    viscous
+        b, N m s/rad or N s/m, besides what the mechanism has itself.
+    source
+        Where the numbers come from.
+    """
+
+    coulomb: float = 0.0
+    breakaway: float | None = None
+    stribeck_speed: float = 0.05
+    viscous: float = 0.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse negative numbers, and a breakaway below Coulomb's level."""
+        _at_least_zero("friction", self, ("coulomb", "viscous"))
+        if not 0 < self.stribeck_speed < math.inf or not self.F_s >= self.coulomb:
+            raise InvalidInputError(
+                "friction",
+                value=f"breakaway {self.F_s}, stribeck_speed {self.stribeck_speed}",
+                limit="breakaway ≥ coulomb, stribeck_speed > 0 and finite",
+                remedy="A joint breaks away at no less than it slides with",
+            )
+
+    @property
+    def F_s(self) -> float:
+        """Level at standstill, N m or N."""
+        return self.coulomb if self.breakaway is None else self.breakaway
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A position sensor.
+
+    Parameters
+    ----------
+    resolution
+        One count, rad or m; 0 reads continuously.  Where zero lies within a count is drawn
+        by the rig's seed.
+    noise
+        Standard deviation before counting, rad or m.
+    source
+        Where the numbers come from.
+    """
+
+    resolution: float = 0.0
+    noise: float = 0.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse negative numbers."""
+        _at_least_zero("an encoder", self, ("resolution", "noise"))
+
+
+@dataclass(frozen=True)
+class Amplifier:
+    """What stands between the number written and what drives the joint.
+
+    Parameters
+    ----------
+    limit
+        Largest magnitude, in the input's unit; the input's own limit applies besides.
+    resolution
+        One step of the converter, in the input's unit; 0 is continuous.
+    dead_band
+        Magnitudes up to here give nothing.
+    time_constant
+        First-order lag of amplifier and motor winding, s.
+    source
+        Where the numbers come from.
+    """
+
+    limit: float = math.inf
+    resolution: float = 0.0
+    dead_band: float = 0.0
+    time_constant: float = 0.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse negative numbers."""
+        _at_least_zero("an amplifier", self, ("resolution", "dead_band", "time_constant"))
+        _at_least_zero("an amplifier", self, ("limit",), infinite=True)
+
+
+@dataclass(frozen=True)
+class Backlash:
+    """Play between motor and joint.
+
+    Rotor and joint are two bodies.  While the rotor crosses the gap, the joint feels neither
+    the motor nor the rotor's inertia; on landing they share their momentum, without a
+    rebound, and they stay together for as long as the rotor presses.
+
+    Parameters
+    ----------
+    gap
+        Whole play at the joint, rad or m.
+    inertia
+        Of the motor as felt at the joint, kg m² or kg; the mechanism's own inertia holds it.
+    source
+        Where the numbers come from.
+    """
+
+    gap: float
+    inertia: float
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse negative numbers, and a motor without inertia."""
+        _at_least_zero("a backlash", self, ("gap",))
+        if not 0 < self.inertia < math.inf:
+            raise InvalidInputError(
+                "inertia of a backlash",
+                value=self.inertia,
+                limit="finite and > 0",
+                remedy="η_g K_g² J_m of the motor, see DCMotor.reflected_inertia",
+            )
+
+
+@dataclass(frozen=True)
+class Push:
+    """A knock: an impulse on one coordinate.
+
+    Parameters
+    ----------
+    t
+        When, s on the rig's clock.
+    coordinate
+        Its name.
+    impulse
+        Generalised impulse, N m s or N s.
+    """
+
+    t: float
+    coordinate: str
+    impulse: float
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When things happen.
+
+    Parameters
+    ----------
+    period
+        Of the inner loop, s.
+    jitter
+        Samples come late by up to this, uniformly, s; lateness does not add up.
+    input_delay
+        From a write to the amplifier, s.
+    measurement_delay
+        Age of what is read, s.
+    steps
+        Integration steps per period; delays are rounded to one of these.
+    source
+        Where the numbers come from.
+    """
+
+    period: float = 0.001
+    jitter: float = 0.0
+    input_delay: float = 0.0
+    measurement_delay: float = 0.0
+    steps: int = 4
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a period that is not positive, jitter that overtakes it, endless delays."""
+        _at_least_zero("the timing", self, ("jitter", "input_delay", "measurement_delay"))
+        if not 0 < self.period < math.inf or self.steps < 1 or self.jitter >= self.period:
+            raise InvalidInputError(
+                "timing of a rig",
+                value=f"period {self.period} s, jitter {self.jitter} s, {self.steps} steps",
+                limit="0 ≤ jitter < period, at least one step",
+                remedy="1 ms with 4 steps is usual",
+            )
+        longest = 1000 * self.period
+        if max(self.input_delay, self.measurement_delay) > longest:
+            raise InvalidInputError(
+                "delay of a rig",
+                value=f"{max(self.input_delay, self.measurement_delay):g} s",
+                limit=f"at most 1000 periods, {longest:g} s",
+                remedy="Give delays in seconds",
+            )
+
+    @property
+    def step(self) -> float:
+        """Integration step, s."""
+        return self.period / self.steps
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A mechanism with everything that its model leaves out.
+
+    Parameters
+    ----------
+    mechanism
+        The truth, with its equations and mean parameters.
+    friction, backlash
+        By coordinate; what is not named has none.
+    encoders
+        By coordinate; what is not named is read as it is.
+    amplifiers
+        By input.
+    tachometers
+        Standard deviation of measured velocities by coordinate, rad/s or m/s; ``None``:
+        positions alone are measured.
+    timing
+        Sampling, jitter, delays.
+    pushes
+        Impulses.
+    tolerance
+        Parameter name to the relative half-width within which the seed draws its value.
+    hand
+        State name to the standard deviation of where a hand lets go, SI units.
+    source
+        Where the whole comes from.
+
+    Raises
+    ------
+    InvalidInputError
+        For a name that the mechanism does not have.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> bench = Bench(ut.mechanisms.cart_pendulum(), friction={"x": Friction(coulomb=0.5)})
+    >>> bench.timing.period
+    0.001
+    """
+
+    mechanism: Mechanism
+    friction: Mapping[str, Friction] = field(default_factory=dict)
+    backlash: Mapping[str, Backlash] = field(default_factory=dict)
+    encoders: Mapping[str, Encoder] = field(default_factory=dict)
+    amplifiers: Mapping[str, Amplifier] = field(default_factory=dict)
+    tachometers: Mapping[str, float] | None = None
+    timing: Timing = Timing()
+    pushes: tuple[Push, ...] = ()
+    tolerance: Mapping[str, float] = field(default_factory=dict)
+    hand: Mapping[str, float] = field(default_factory=dict)
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse names that the mechanism does not have."""
+        mechanism = self.mechanism
+        coordinates = [c.name for c in mechanism.coordinates]
+        for what, names, known in (
+            ("friction", self.friction, coordinates),
+            ("backlash", self.backlash, coordinates[: mechanism.m]),
+            ("encoders", self.encoders, coordinates),
+            ("amplifiers", self.amplifiers, [i.name for i in mechanism.inputs]),
+            ("tachometers", self.tachometers or {}, coordinates),
+            ("pushes", [p.coordinate for p in self.pushes], coordinates),
+            ("tolerance", self.tolerance, [p.name for p in mechanism.parameters]),
+            ("hand", self.hand, list(mechanism.state_names)),
+        ):
+            unknown = sorted(set(names) - set(known))
+            if unknown:
+                raise InvalidInputError(
+                    f"{what} of a bench of '{mechanism.name}'",
+                    value=", ".join(unknown),
+                    limit=f"among {', '.join(known)}",
+                    remedy="Use the mechanism's own names",
+                )
+        wild = {k: v for k, v in self.tolerance.items() if not 0 <= v < 1}
+        if wild:
+            raise InvalidInputError(
+                "tolerance of a bench", value=wild, limit="in [0, 1)", remedy="0.05 is 5 %"
+            )
+
+    def drawn(self, rng: np.random.Generator) -> Mechanism:
+        """Return the mechanism with parameters drawn within their tolerances."""
+        values = {p.name: p.value for p in self.mechanism.parameters}
+        return self.mechanism.with_parameters(
+            **{
+                name: values[name] * (1.0 + width * rng.uniform(-1.0, 1.0))
+                for name, width in sorted(self.tolerance.items())
+            }
+        )
+
+    def released(self, x0: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Return where the hand lets go when it means x0, (2n,)."""
+        x = np.array(x0, dtype=float)
+        for name, spread in sorted(self.hand.items()):
+            x[self.mechanism.state_names.index(name)] += spread * rng.standard_normal()
+        return x
+
+    def with_friction(self, factor: float, joints: Collection[str] | None = None) -> Self:
+        """Return the bench with so many times the friction, in all joints or in these."""
+        changed = {
+            name: replace(
+                f,
+                coulomb=factor * f.coulomb,
+                breakaway=factor * f.F_s,
+                viscous=factor * f.viscous,
+            )
+            if joints is None or name in joints
+            else f
+            for name, f in self.friction.items()
+        }
+        return replace(self, friction=changed)
+
+    def with_timing(self, **changes: Any) -> Self:
+        """Return the bench with another period, jitter or delay."""
+        return replace(self, timing=replace(self.timing, **changes))
+
+    def sources(self) -> dict[str, str]:
+        """Return what is known of where each part's numbers come from."""
+        parts: dict[str, Any] = {"bench": self, "timing": self.timing}
+        for group in fields(self):
+            value = getattr(self, group.name)
+            if isinstance(value, Mapping):
+                parts |= {f"{group.name} of {name}": part for name, part in value.items()}
+        found = {name: getattr(part, "source", "") for name, part in parts.items()}
+        return {name: source for name, source in found.items() if source}

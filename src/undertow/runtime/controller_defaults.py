@@ -1,0 +1,109 @@
+"""What a controller is set to where it meets a rig: one home for runs, drills and trials.
+
+Nothing here is fitted to a rig.  Estimator, gate and reaching law follow from the limits of the
+mechanism, from the sampling period, and from what a bench tells of its sensors and of its delays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+
+from undertow.base import MissingExtraError
+from undertow.cascade import Gate, cost_gate, noise_share, robustness_gate
+from undertow.estimators import KalmanFilter
+from undertow.law import ProvedSet, ReachingLaw, Surface, first_surface
+from undertow.models import Mechanism
+from undertow.objective import finite_limits
+from undertow.plants import Bench, Encoder
+
+__all__ = ["default_gate", "estimator_for", "provable", "reaching_for"]
+
+#: What every admitted surface must bear: periods of delay, and so much less of the input; and
+#: the part of the input that noise of the sensors may take, standard deviation.
+BEARS, RESERVE, NOISE = 6, 0.15, 0.2
+
+#: The paper's boundary layer ε, and how often it may be doubled for the noise: η/ε from 200 to
+#: 25 per second.
+LAYER, DOUBLED = 0.1, 3
+
+#: Density of the drift of a matched disturbance, parts of the smallest input limit per √s.
+DRIFT = 0.1
+
+#: Standard deviation of a position that is read as it is, rad or m.
+EXACT = 1e-6
+
+
+def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -> KalmanFilter:
+    """Return the Kalman filter that knows a bench's encoders, period and delays, nothing else.
+
+    Parameters
+    ----------
+    belief
+        The controller's model.
+    bench
+        The bench.
+    drift
+        Density of the matched disturbance's drift, input units per √s; ``DRIFT`` of the
+        smallest limit by default.  0 estimates none.
+    """
+    sigmas = []
+    for c in belief.coordinates:
+        encoder = bench.encoders.get(c.name, Encoder())
+        sigmas.append(max(math.hypot(encoder.resolution / math.sqrt(12), encoder.noise), EXACT))
+    timing = bench.timing
+    return KalmanFilter(
+        belief,
+        timing.period,
+        position_noise=sigmas,
+        disturbance_drift=DRIFT * float(finite_limits(belief).min()) if drift is None else drift,
+        delay=timing.input_delay + timing.measurement_delay,
+    )
+
+
+def default_gate(estimator: KalmanFilter | None = None) -> Gate:
+    """Return the gate that a surface must pass where nobody asks for another: everywhere.
+
+    With exact states, :func:`undertow.cascade.cost_gate`: stable, feasible from here, the cost
+    not raised.  Before a rig may meet a surface the same, and the surface must bear ``BEARS`` = 6
+    periods of delay, do with ``RESERVE`` = 15 % less input, and spend no more than ``NOISE`` = 20 %
+    of the input on noise.
+
+    Parameters
+    ----------
+    estimator
+        That of the rig: its period, and what it does not know of the state at the target.
+        ``None``: states are exact, as in a simulation.
+    """
+    if estimator is None:
+        return cost_gate
+    period, size = estimator.period, 2 * estimator.mechanism.n
+    covariance = estimator.settled()[:size, :size]
+    return robustness_gate(
+        BEARS * period, RESERVE, period=period, covariance=covariance, noise=NOISE
+    )
+
+
+def reaching_for(estimator: KalmanFilter) -> ReachingLaw:
+    """Return the paper's reaching law, its boundary layer as thick as the sensors need.
+
+    The gains near the target go with η/ε: ε is doubled until what the estimator does not know
+    takes no more than ``NOISE`` of the input on the first surface, ``DOUBLED`` times at most.
+    """
+    mechanism, size = estimator.mechanism, 2 * estimator.mechanism.n
+    covariance, surface = estimator.settled()[:size, :size], first_surface(estimator.mechanism)
+    laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
+    quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)
+    return next(quiet, laws[-1])
+
+
+def provable(
+    mechanism: Mechanism, surfaces: Sequence[Surface], reaching: ReachingLaw
+) -> tuple[ProvedSet, ...]:
+    """Return the sets that are proved for a catch: none can be without ``undertow[certify]``."""
+    from undertow.certify import terminal_sets
+
+    with contextlib.suppress(MissingExtraError):
+        return terminal_sets(mechanism, surfaces, reaching)
+    return ()

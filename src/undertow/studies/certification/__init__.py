@@ -1,0 +1,32 @@
+"""What `undertow certify` and `undertow verify` do: claims composed, shown, drawn, written."""
+
+from undertow.studies.certification.figure import region_figure
+from undertow.studies.certification.loop_figure import loop_figure
+from undertow.studies.certification.report import (
+    appendix_report,
+    certificate_files,
+    run_report,
+    subject_report,
+    verification_report,
+)
+from undertow.studies.certification.subjects import (
+    Certified,
+    certify_appendix,
+    certify_run,
+    certify_surface,
+)
+
+__all__ = [
+    "Certified",
+    "appendix_report",
+    "certificate_files",
+    "certify_appendix",
+    "certify_run",
+    "certify_surface",
+    "loop_figure",
+    "mechanism_from_file",
+    "region_figure",
+    "run_report",
+    "subject_report",
+    "verification_report",
+]

@@ -1,0 +1,105 @@
+"""How far off the target the whole closed loop is proved to start, among simulated motions."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from undertow.certify.closed_loop.claim import LoopClaim
+from undertow.certify.closed_loop.loop import LoopMotion
+from undertow.certify.closed_loop.search import follow
+from undertow.display.plot import COLOURS, display, style
+from undertow.law import ReachingLaw, Surface
+from undertow.models import FloatArray, Mechanism
+
+__all__ = ["loop_figure"]
+
+#: Starts on one side, up to this many times the proved ones.
+STARTS, BEYOND = 100, 4.0
+
+
+def loop_figure(
+    mechanism: Mechanism, surface: Surface, reaching: ReachingLaw, claim: LoopClaim, title: str
+) -> Figure:
+    """Draw proved and unproved starts at rest with their motions under the clipped law.
+
+    Left: the coordinate over time.  Right: the same coordinate and its p, with the shadow of the
+    terminal set.  The motions are those of the law that acts at every instant on the plant that
+    it knows; a held input or another plant of the claim's box moves a little differently.
+
+    Parameters
+    ----------
+    claim
+        Proved.
+    title
+        Of the figure.
+    """
+    motion = LoopMotion(mechanism, surface, reaching)
+    index = [c.name for c in mechanism.coordinates].index(claim.coordinate)
+    ratio = np.linspace(0.0, BEYOND, STARTS + 1)[1:]
+    x = np.zeros((STARTS, motion.size))
+    x[:, index] = ratio * claim.extent
+    shown_time = max(1.0, 1.25 * claim.horizon)
+    duration = 3 * shown_time
+    path, times = follow(motion, motion.from_state(x), duration, 0.001, 5)
+    with np.errstate(all="ignore"):
+        home = np.any(claim.terminal.value(path) <= 1.0, axis=0)
+    # Beyond the first start that fails nothing is promised: one more is shown, no others.
+    last = STARTS - 1 if home.all() else int(np.argmin(home))
+    factor, unit = display(mechanism.coordinates[index].unit)
+    rate, rate_unit = display(mechanism.coordinates[index].unit, True)
+    name = {"phi": "φ", "theta": "θ"}.get(claim.coordinate, claim.coordinate)
+    with style():
+        figure = Figure(figsize=(8.6, 4.0), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        partner = mechanism.n + max(0, index - mechanism.m)
+        for k in range(1, last, max(1, last // 16)):
+            _motion(left, times, factor * path[:, k, index], ratio[k], bool(home[k]))
+            _motion(right, factor * path[:, k, index], rate * path[:, k, partner], ratio[k], True)
+        if not home.all():
+            _motion(left, times, factor * path[:, last, index], ratio[last], False)
+        wide = factor * claim.extent
+        left.plot([0, 0], [-wide, wide], color=COLOURS["blue"], lw=6, clip_on=False, zorder=4)
+        shown = factor * path[:, :last, index]
+        left.set_ylim(1.1 * min(shown.min(), -wide), 1.1 * factor * x[last, index])
+        left.set_xlim(0.0, shown_time)
+        left.set_xlabel("t (s)")
+        left.set_ylabel(f"{name} ({unit})")
+        right.plot([-wide, wide], [0.0, 0.0], color=COLOURS["blue"], lw=4, solid_capstyle="butt")
+        edge = _shadow(claim.terminal.scale[[index, partner]])
+        right.fill(
+            factor * edge[0], rate * edge[1], color=to_rgba(COLOURS["green"], 0.35), zorder=3
+        )
+        right.plot(0, 0, "+", color=COLOURS["black"], ms=7, zorder=4)
+        right.set_xlabel(f"{name} ({unit})")
+        right.set_ylabel(f"p ({rate_unit})")
+        handles = [
+            Line2D([], [], color=COLOURS["blue"], lw=5, label="proved starts"),
+            Line2D([], [], color=COLOURS["blue"], lw=1.2, label="from there"),
+            Line2D([], [], color=COLOURS["sky"], lw=1.2, label="from beyond, arrives"),
+            Line2D(
+                [], [], color=COLOURS["vermilion"], lw=1.2, label=f"not within {duration:.3g} s"
+            ),
+            Patch(color=to_rgba(COLOURS["green"], 0.35), label="proved terminal set"),
+        ]
+        if home.all():
+            del handles[3]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _motion(axes: Axes, a: FloatArray, b: FloatArray, ratio: float, home: bool) -> None:
+    colour = COLOURS["blue"] if ratio <= 1 else COLOURS["sky"] if home else COLOURS["vermilion"]
+    axes.plot(a, b, color=colour, lw=0.9)
+
+
+def _shadow(rows: FloatArray, count: int = 181) -> FloatArray:
+    """Edge of {rows x, ‖x‖ ≤ 1} in the plane, (2, count)."""
+    u, s, _ = np.linalg.svd(rows, full_matrices=False)
+    angle = np.linspace(0, 2 * np.pi, count)
+    return np.asarray(u @ (s[:, None] * np.array([np.cos(angle), np.sin(angle)])))

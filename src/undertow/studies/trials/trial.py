@@ -1,0 +1,219 @@
+"""One controller on one rig, and the same over many seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.closed_loop import Event, Trajectory
+from undertow.estimators import Controller, Estimator, Record, compensated, drive
+from undertow.models import FloatArray, Mechanism
+from undertow.objective import Objective
+from undertow.plants import Bench, RealisticRig
+from undertow.runtime.controller_defaults import estimator_for
+from undertow.symbolic import compile_expressions
+
+__all__ = [
+    "MakeController",
+    "Outcome",
+    "Result",
+    "Spread",
+    "balanced",
+    "judge",
+    "motion",
+    "spread",
+    "trial",
+    "undisturbed",
+]
+
+#: Belief and estimated start, (2n,), to a controller for one run.
+MakeController = Callable[[FloatArray], Controller]
+
+#: Within these of the target a coordinate counts as home: free ones, driven ones (rad or m).
+HOME_FREE, HOME_DRIVEN = math.radians(2.0), math.radians(20.0)
+
+#: A run is balanced when everything is home for its last second, s.
+LAST = 1.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one run, in numbers.
+
+    Attributes
+    ----------
+    seed
+        Of the rig.
+    balanced
+        Whether every coordinate was home for the last second.
+    caught
+        Whether the free coordinates were, wherever the driven ones had got to.
+    settled
+        Time after which every coordinate stayed home, s; infinite if one did not.
+    cost
+        Of the objective, along the true motion with the inputs written; NaN without one.
+    effort
+        ∫ uᵀu dt.
+    chatter
+        Total variation of the inputs per second, in their unit.
+    """
+
+    seed: int
+    balanced: bool
+    caught: bool
+    settled: float
+    cost: float
+    effort: float
+    chatter: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome(Result):
+    """What came of one run, and the ``record`` of it."""
+
+    record: Record
+
+
+def trial(
+    belief: Mechanism,
+    bench: Bench,
+    make: MakeController,
+    x0: ArrayLike,
+    seconds: float,
+    seed: int,
+    *,
+    objective: Objective | None = None,
+    estimator: Estimator | None = None,
+    compensates: Callable[[], bool] = lambda: True,
+) -> Outcome:
+    """Run a controller on a rig, once.
+
+    Parameters
+    ----------
+    belief
+        The controller's model.
+    bench
+        The truth.
+    make
+        Returns the controller, told where the sensors say that the mechanism is held.
+    x0
+        Where the hand means to let go, (2n,).
+    seconds
+        Length of the run, s.
+    seed
+        Of the rig.
+    objective
+        What the cost is counted by.
+    estimator
+        By default :func:`undertow.runtime.controller_defaults.estimator_for` the bench.  What it
+        knows of a matched disturbance is taken off the controller's output.
+    compensates
+        Asked at each step: whether it is.
+    """
+    rig = RealisticRig(bench, x0, seed)
+    seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
+    estimator = estimator_for(belief, bench) if estimator is None else estimator
+    estimator.reset(seen)
+    controller = compensated(make(seen), estimator, belief.input_limits, compensates)
+    record = drive(rig, estimator, controller, seconds)
+    return judge(belief, record, seed, objective)
+
+
+def judge(
+    mechanism: Mechanism, record: Record, seed: int = 0, objective: Objective | None = None
+) -> Outcome:
+    """Return what came of a recorded run."""
+    settled = _settled(mechanism, record, 0)
+    last = record.t[-1] - LAST
+    return Outcome(
+        seed=seed,
+        balanced=bool(settled <= last),
+        caught=bool(_settled(mechanism, record, mechanism.m) <= last),
+        settled=settled,
+        cost=math.nan if objective is None else _cost(mechanism, objective, record),
+        effort=record.effort,
+        chatter=record.chatter / float(record.t[-1]),
+        record=record,
+    )
+
+
+def balanced(outcomes: Sequence[Result]) -> int:
+    """Count the runs that ended balanced."""
+    return sum(outcome.balanced for outcome in outcomes)
+
+
+def _settled(mechanism: Mechanism, record: Record, first: int) -> float:
+    """Return when the last of the coordinates from ``first`` on came home for good, s."""
+    home = np.where(np.arange(mechanism.n) < mechanism.m, HOME_DRIVEN, HOME_FREE)
+    at_home = np.abs(record.truth[:, first : mechanism.n]) <= home[first:]
+    away = np.logical_not(np.asarray(at_home).all(axis=1))
+    if away[-1]:
+        return math.inf
+    return float(record.t[np.flatnonzero(away)[-1] + 1]) if away.any() else 0.0
+
+
+def _cost(mechanism: Mechanism, objective: Objective, record: Record) -> float:
+    """Integrate the stage cost from sample to sample, until the terminal set is reached."""
+    stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
+    function = compile_expressions([*mechanism.x, *mechanism.u], [stage])
+    radius = np.linalg.norm(record.truth, axis=1)
+    inside = np.flatnonzero(radius <= objective.terminal_radius)
+    end = int(inside[0]) if len(inside) else len(record.t)
+    if end == 0:
+        return 0.0
+    values = np.broadcast_to(function(*record.truth.T, *record.u.T)[0], record.t.shape)
+    steps = np.diff(record.t, append=2 * record.t[-1] - record.t[-2])
+    return float((values * steps)[:end].sum())
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation of a number over the balanced runs; 0 where there is one."""
+
+    mean: float
+    deviation: float
+
+    def __str__(self) -> str:
+        """Show as mean ± deviation: two digits of it, and no more than three of the mean."""
+        if not math.isfinite(self.mean):
+            return "—"
+        digits = 2 - math.floor(math.log10(max(abs(self.mean), 1e-9)))
+        if not self.deviation > 0:
+            return f"{self.mean:.{max(0, digits)}f}"
+        digits = max(0, min(digits, 1 - math.floor(math.log10(self.deviation))))
+        return f"{self.mean:.{digits}f} ± {self.deviation:.{digits}f}"
+
+
+def spread(outcomes: Sequence[Result], what: str) -> Spread:
+    """Return mean and standard deviation of an attribute over the balanced runs."""
+    values = [float(getattr(o, what)) for o in outcomes if o.balanced]
+    if not values:
+        return Spread(math.nan, math.nan)
+    return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0)
+
+
+def motion(mechanism: Mechanism, record: Record, every: int = 5) -> Trajectory:
+    """Return the true motion of a record for plotting, every so many samples."""
+    rows = slice(None, None, every)
+    count, m = len(record.t[rows]), mechanism.m
+    nothing = np.zeros(count)
+    return Trajectory(
+        mechanism,
+        record.t[rows],
+        record.truth[rows],
+        record.u[rows],
+        np.zeros((count, m)),
+        nothing,
+        np.ones(count),
+        Event.HORIZON,
+    )
+
+
+def undisturbed(mechanism: Mechanism, period: float = 0.001) -> Bench:
+    """Return the bench on which belief is truth: nothing but sampling at the same period."""
+    bench = Bench(mechanism)
+    return replace(bench, timing=replace(bench.timing, period=period))

@@ -1,0 +1,196 @@
+"""From hanging at rest to balanced on realistic rigs; and MuJoCo as the truth, no retuning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from undertow.cascade import Cascade
+from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
+from undertow.cascade.swing_up.search import Found, found_for
+from undertow.estimators import Controller, compensated, drive
+from undertow.models import FloatArray, Mechanism
+from undertow.objective import objective_for
+from undertow.optimiser import Budget
+from undertow.plants import Bench, MuJoCoRig, plausible_rig, srv02_rig
+from undertow.runtime.controller_defaults import default_gate, estimator_for
+from undertow.studies.trials.steering import CascadeSteering
+from undertow.studies.trials.trial import Outcome, judge, trial
+
+__all__ = [
+    "ENGINES",
+    "SWINGING",
+    "SWING_SECONDS",
+    "EngineResult",
+    "SwingResult",
+    "all_of",
+    "bench_of",
+    "engine_trial",
+    "searched",
+    "swing_trials",
+]
+
+Progress = Callable[[str, float], None]
+
+#: Length of a swing-up run, s.
+SWING_SECONDS = 30.0
+#: Mechanisms of the library that a swing-up is shown for, and that MuJoCo stands in for.
+SWINGING = ("rotary_pendulum", "cart_pendulum", "pendubot")
+ENGINES = ("rotary_pendulum", "cart_pendulum", "double_pendulum_on_a_cart")
+
+
+def bench_of(mechanism: Mechanism) -> Bench:
+    """Return the SRV02 for the rotary pendulum, a bench of usual quality for any other."""
+    if mechanism.name == "rotary_pendulum":
+        return replace(srv02_rig(), mechanism=mechanism)
+    return plausible_rig(mechanism)
+
+
+def searched(
+    names: Sequence[str], fresh: int | None = None, progress: Progress = lambda _what, _part: None
+) -> dict[Mechanism, tuple[Found, ...]]:
+    """Return the swing-up gains of mechanisms of the library, kept or searched for.
+
+    Parameters
+    ----------
+    names
+        Of the mechanisms.
+    fresh
+        Seed of a new search; ``None``: what is kept is taken.
+    progress
+        Called with what is being done and the part done.
+    """
+    found = {}
+    for mechanism in all_of(names):
+        what = f"gains of {mechanism.name}"
+        found[mechanism] = found_for(
+            mechanism, seed=fresh or 0, fresh=fresh is not None, progress=partial(progress, what)
+        )
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class SwingResult:
+    """Swing-ups of one mechanism.
+
+    Attributes
+    ----------
+    mechanism
+        The belief.
+    outcomes
+        The runs, angles counted from the upright that they ended in.
+    catches
+        Times of the last catch, s, of the runs that had one.
+    thrown
+        How often a run was thrown out, in all.
+    stops
+        Runs that hit an end stop.
+    """
+
+    mechanism: Mechanism
+    outcomes: list[Outcome]
+    catches: list[float]
+    thrown: int
+    stops: int
+
+
+def swing_trials(
+    mechanism: Mechanism,
+    *,
+    swing: SwingUp | None = None,
+    bench: Bench | None = None,
+    seeds: int = 20,
+    seconds: float = SWING_SECONDS,
+    progress: Callable[[float], None] = lambda _: None,
+) -> SwingResult:
+    """Swing a mechanism up on realistic rigs, from hanging at rest, one for each seed.
+
+    Parameters
+    ----------
+    mechanism
+        The belief.
+    swing
+        The energy law; with the gains that are kept by default.
+    bench
+        The truth; :func:`bench_of` by default.
+    seeds
+        Rigs.
+    seconds
+        Length of a run, s.
+    progress
+        Called with the part done.
+    """
+    bench = bench_of(mechanism) if bench is None else bench
+    swing = designed(mechanism) if swing is None else swing
+    region = CatchRegion(mechanism)
+    outcomes, catches, thrown, stops = [], [], 0, 0
+    edges = np.array([[c.low, c.high] for c in mechanism.coordinates])
+    for seed in range(seeds):
+        progress(seed / seeds)
+        controller = SwingUpAndCatch(swing, region)
+        run = trial(
+            mechanism,
+            bench,
+            partial(_given, controller),
+            hanging(mechanism),
+            seconds,
+            seed,
+            compensates=partial(getattr, controller, "balancing"),
+        )
+        truth = run.record.truth - controller.offset
+        outcomes.append(judge(mechanism, replace(run.record, truth=truth), seed))
+        caught = [t for t, what in controller.events if what == "catch"]
+        thrown += sum(what == "lost" for _, what in controller.events)
+        catches += caught[-1:] if controller.balancing else []
+        positions = run.record.truth[:, : mechanism.n]
+        stops += bool(((positions <= edges[:, 0]) | (positions >= edges[:, 1])).any())
+    return SwingResult(mechanism, outcomes, catches, thrown, stops)
+
+
+@dataclass(frozen=True, eq=False)
+class EngineResult:
+    """A run of the cascade in MuJoCo."""
+
+    mechanism: Mechanism
+    outcome: Outcome
+    admitted: int
+
+
+def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 256) -> EngineResult:
+    """Balance a mechanism of the library in MuJoCo, from its usual start, positions only.
+
+    The same settings for all of them.
+
+    Parameters
+    ----------
+    mechanism
+        The belief; the engine gets its parameters, and none of its equations.
+    seconds
+        Length of the run, s.
+    budget
+        Rollouts that one re-optimisation may spend.
+    """
+    x0 = mechanism.state(**mechanism.start)
+    rig = MuJoCoRig(mechanism, x0)
+    objective = objective_for(mechanism, "effort")
+    kalman = estimator_for(mechanism, Bench(mechanism))
+    cascade = Cascade(mechanism, objective, gate=default_gate(kalman), warm=Budget(budget))
+    steering = CascadeSteering(cascade, cascade.start(x0))
+    kalman.reset(x0)
+    controller = compensated(steering, kalman, mechanism.input_limits)
+    record = drive(rig, kalman, controller, seconds)
+    return EngineResult(mechanism, judge(mechanism, record, 0, objective), steering.admitted)
+
+
+def _given(controller: Controller, _start: FloatArray) -> Controller:
+    return controller
+
+
+def all_of(names: Sequence[str]) -> list[Mechanism]:
+    """Return mechanisms of the library by name."""
+    from undertow import mechanisms
+
+    return [mechanisms.LIBRARY[name]() for name in names]

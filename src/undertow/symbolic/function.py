@@ -1,0 +1,72 @@
+"""Tape to one scalar numba function: arrays in, arrays filled, nothing allocated.
+
+For code that runs once a sample, where :mod:`undertow.symbolic.block` is for batches.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+
+import sympy as sp
+
+from undertow.symbolic.names import distinct
+from undertow.symbolic.scalar import Emitter
+from undertow.symbolic.tape import Tape
+
+__all__ = ["COMPILED", "PREAMBLE", "function_source"]
+
+#: Head of a generated module.
+PREAMBLE = "import math\n\nimport numba\nimport numpy as np\n"
+
+#: Decorator of every function that is compiled: no lock of the interpreter, no exceptions.  What
+#: another one calls is inlined there: else the process that compiles it calls it in its own
+#: library, later ones the copy that was stored with its caller, and the two round otherwise.
+COMPILED = (
+    "@numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True, "
+    "fastmath={'contract', 'nsz', 'arcp'})"
+)
+
+
+def function_source(
+    name: str,
+    tape: Tape,
+    inputs: Mapping[str, Sequence[sp.Symbol] | sp.Symbol],
+    outputs: Mapping[str, Sequence[sp.Expr]],
+) -> str:
+    """Return the source of ``name(*inputs, *outputs)``, compiled by numba when it is imported.
+
+    Parameters
+    ----------
+    name
+        Name of the function.
+    tape
+        Where the expressions were laid.
+    inputs
+        Argument name to the symbols that its entries stand for, in order, or to the one
+        symbol that it stands for as a number.
+    outputs
+        Argument name to the expressions that fill its entries, in order: one-dimensional
+        float arrays, written last, so that an output may be the same array as an input.
+    """
+    places = [place for group in inputs.items() for place in _places(*group)]
+    distinct(symbol for symbol, _ in places)
+    emit = Emitter(tape)
+    wanted = [expression for group in outputs.values() for expression in group]
+    code, needs = emit.lines(wanted, set())
+    loads = [f"{emit.text(symbol)} = {place}" for symbol, place in places if symbol in needs]
+    stores = [
+        f"{argument}[{j}] = {emit.text(expression)}"
+        for argument, group in outputs.items()
+        for j, expression in enumerate(group)
+    ]
+    body = "\n".join([*loads, *code, *stores])
+    arguments = ", ".join([*inputs, *outputs])
+    return f"{COMPILED}\ndef {name}({arguments}):\n{textwrap.indent(body, '    ')}\n"
+
+
+def _places(argument: str, symbols: Sequence[sp.Symbol] | sp.Symbol) -> list[tuple[sp.Symbol, str]]:
+    """Return the symbols of an argument, each with where it is found."""
+    if isinstance(symbols, sp.Symbol):
+        return [(symbols, argument)]
+    return [(symbol, f"{argument}[{j}]") for j, symbol in enumerate(symbols)]

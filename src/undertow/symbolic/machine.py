@@ -1,0 +1,102 @@
+"""numba, set up for the widest vectors that the processor has, with a cache of one's own.
+
+LLVM avoids 512-bit registers on most processors that have them, because they once lowered
+the clock.  For lane loops of double arithmetic they are a quarter faster, see
+``benchmarks/kernel.py``.  A user's own ``NUMBA_CPU_FEATURES`` is left alone, and numba's
+cache keys on the features, so kernels of either kind never mix.
+
+What numba keeps of compiled functions are pickles, and to load one is to run it.  By itself it
+keeps them beside the source, or in a folder that is named by the environment, whoever may write
+there, and refuses to decorate a function where it finds no place.  Those of this package and of
+its generated modules are kept where nobody else can write, see :mod:`undertow.symbolic.private`.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+from numba.core import caching as numba_caching
+
+from undertow.symbolic.private import is_private, private_folder
+
+__all__ = ["numba", "processor"]
+
+PACKAGE = Path(__file__).resolve().parent.parent
+
+#: numba's own rooms have no types.
+caching: Any = numba_caching
+
+
+def _widen() -> None:
+    features = llvm.get_host_cpu_features()
+    if features.get("avx512f") and "NUMBA_CPU_FEATURES" not in os.environ:
+        vars(numba.config)["CPU_FEATURES"] = features.flatten() + ",-prefer-256-bit"
+
+
+class _PrivateLocator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  # type: ignore[misc]
+    """Where numba keeps what it compiles of this package and of its generated modules."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        self._py_file, self._lineno = file, function.__code__.co_firstlineno
+        self._cache_path = _cache_of(str(Path(file).resolve().parent))
+
+    def get_cache_path(self) -> str:
+        return self._cache_path
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> Any:
+        path = Path(file).resolve()
+        ours = path.is_relative_to(PACKAGE) or path.parent == private_folder()
+        return super().from_function(function, file) if ours else None
+
+
+@lru_cache(maxsize=64)
+def _cache_of(folder: str) -> str:
+    """Return the folder of what is compiled of the sources in a folder: beside them if private."""
+    beside = Path(folder) / "__pycache__"
+    if os.access(beside if beside.exists() else folder, os.W_OK):
+        try:
+            beside.mkdir(mode=0o700, exist_ok=True)
+        except OSError:
+            pass
+        else:
+            if is_private(beside):
+                return str(beside)
+    name = caching._CacheLocator.get_suitable_cache_subpath(str(Path(folder) / "of.py"))
+    return str(private_folder() / "numba" / name)
+
+
+def processor() -> dict[str, str]:
+    """Return what of the processor shapes machine code: its name, and what LLVM compiles for.
+
+    ``features`` are those of LLVM that are switched on.
+    """
+    features = vars(numba.config).get("CPU_FEATURES") or llvm.get_host_cpu_features().flatten()
+    return {
+        "processor": _model(),
+        "target": str(vars(numba.config).get("CPU_NAME") or llvm.get_host_cpu_name()),
+        "features": " ".join(sorted(f[1:] for f in features.split(",") if f.startswith("+"))),
+    }
+
+
+def _model() -> str:
+    """Return the name that the processor has for people."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, "") or platform.processor() or platform.machine()
+
+
+_widen()
+# The list is searched from its beginning; other people's functions pass ours by.
+(getattr(caching, "CacheImpl", None) or caching._CacheImpl)._locator_classes.insert(
+    0, _PrivateLocator
+)

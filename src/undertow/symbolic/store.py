@@ -1,0 +1,140 @@
+"""Generated modules on disk: written once, named by their content, compiled once.
+
+numba's cache needs a real file and does not notice changed globals, so the file's name
+carries a hash of its source and of the versions that shape the machine code.  All of it lies
+in a folder that nobody else can write, see :mod:`undertow.symbolic.private`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import os
+import platform
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import sympy as sp
+
+from undertow.symbolic.machine import numba
+from undertow.symbolic.private import cache_folder, private_folder
+
+__all__ = [
+    "cache_folder",
+    "content_key",
+    "generated",
+    "load_module",
+    "recall",
+    "remember",
+    "sources_digest",
+]
+
+PACKAGE = Path(__file__).resolve().parent.parent
+
+
+def content_key(*texts: str) -> str:
+    """Return a hash of texts, of the sources of this package, and of versions.
+
+    Parameters
+    ----------
+    *texts
+        Everything else that a stored result depends on.
+    """
+    digest = hashlib.sha256(_versions().encode())
+    for text in (*texts, sources_digest()):
+        digest.update(f"{len(text)} {text}".encode())
+    return digest.hexdigest()
+
+
+@lru_cache(maxsize=1)
+def sources_digest() -> str:
+    """Return a hash of the text of every Python file of this package."""
+    digest = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _versions() -> str:
+    libraries = f"{numba.__version__} {sp.__version__} {np.__version__}"
+    return f"{libraries} {sys.version} {platform.machine()}"
+
+
+def recall(name: str, key: str) -> str | None:
+    """Return the text that was remembered under a key, ``None`` where there is none."""
+    try:
+        seal, _, text = (
+            (private_folder() / f"{name}_{key[:32]}.txt")
+            .read_text(encoding="utf-8")
+            .partition("\n")
+        )
+    except (OSError, UnicodeDecodeError):
+        return None
+    return text if seal == _seal(key, text) else None
+
+
+def remember(name: str, key: str, text: str) -> None:
+    """Keep a text under a key; a disk that refuses only costs time later."""
+    with contextlib.suppress(OSError, UnicodeEncodeError):
+        path = private_folder() / f"{name}_{key[:32]}.txt"
+        _write(path, f"{_seal(key, text)}\n{text}")
+
+
+def generated(kind: str, name: str, key: str, write: Callable[[], str]) -> ModuleType:
+    """Import a generated module, writing its source only where none is kept under the key.
+
+    Parameters
+    ----------
+    kind, name
+        What is generated, and for which mechanism: the module's name.
+    key
+        Everything that the source depends on, see :func:`content_key`.
+    write
+        Returns the source.
+    """
+    source = recall(kind, key)
+    if source is None:
+        source = write()
+        remember(kind, key, source)
+    return load_module(f"{kind}_{name}", source)
+
+
+def _seal(key: str, text: str) -> str:
+    """Hash that ties a stored text to its whole key and shows that it is whole."""
+    return hashlib.sha256(f"{key} {text}".encode()).hexdigest()
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file that appears whole or not at all."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    with os.fdopen(handle, "w", encoding="utf-8") as file:
+        file.write(text)
+    os.replace(temporary, path)
+
+
+def load_module(name: str, source: str) -> ModuleType:
+    """Import ``source`` from the cache, writing it first if it is new.
+
+    The file appears whole or not at all, so several processes may ask at once.
+    """
+    digest = hashlib.sha256((_versions() + source).encode()).hexdigest()[:16]
+    module_name = f"{re.sub(r'[^A-Za-z0-9_]', '_', name)[:80]}_{digest}"
+    if module_name in sys.modules:
+        return sys.modules[module_name]
+    path = private_folder() / f"{module_name}.py"
+    if not path.exists() or path.read_bytes() != source.encode():
+        _write(path, source)
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    assert spec is not None  # a plain .py file always has a spec and a loader
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    spec.loader.exec_module(module)
+    return module
