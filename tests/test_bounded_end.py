@@ -26,7 +26,7 @@ def _prepared(loop: ClosedLoop, surfaces: FloatArray) -> Prepared:
     lanes = np.hstack([surfaces, law, np.ones((len(surfaces), 1))])[:, None]
     end = loop.linear_end
     assert end is not None
-    prepared = end.room(len(surfaces))
+    prepared = end.buffers(len(surfaces))
     end.prepare(lanes, None, prepared)
     return prepared
 

@@ -28,7 +28,7 @@ def _prepared(loop: ClosedLoop, spread: float) -> tuple[Prepared, TerminalLinear
     assert end is not None
     law = np.repeat(loop.reaching.vector(rig.m)[None], LANES, axis=0)
     lanes = np.hstack([surfaces, law, np.ones((LANES, 1))])[:, None]
-    prepared = end.room(LANES)
+    prepared = end.buffers(LANES)
     end.prepare(lanes, None, prepared)
     return prepared, end
 

@@ -257,17 +257,18 @@ def kernel(subject: Subject, *, sampled: bool = False) -> Iterator[Difference]:
     kernels = compile_loop(mechanism, None, objective, subject.reaching.switching, sampled=sampled)
     at_target = coupling(mechanism, np.zeros(n))
     constraints = len(objective.path_margins(mechanism))
-    room = RolloutBuffers(
+    buffers = RolloutBuffers(
         Shape(n, m, constraints, at_target, None, sampled), len(subject.states), 1
     )
-    room.fill(subject.states, subject.surface.vector, subject.reaching.vector(m))
-    record = np.zeros((room.padded, 1, 2 * n + 2 * m + 2))
+    buffers.fill(subject.states, subject.surface.vector, subject.reaching.vector(m))
+    record = np.zeros((buffers.padded, 1, 2 * n + 2 * m + 2))
     parameters, limits = mechanism.parameter_values, mechanism.input_limits
     kernels.rollout(
-        room.states, room.live, room.lanes, np.zeros(1, dtype=np.int64), parameters, parameters,
-        limits, room.quiet, 0.0, STEP, 1, 1, 0.0, math.inf, math.inf, 0.0, 1, 1, record, room.out,
+        buffers.states, buffers.live, buffers.lanes, np.zeros(1, dtype=np.int64),
+        parameters, parameters, limits, buffers.quiet,
+        0.0, STEP, 1, 1, 0.0, math.inf, math.inf, 0.0, 1, 1, record, buffers.out,
     )  # fmt: skip
-    after = room.batch(0.0)
+    after = buffers.batch(0.0)
     stage = objective.stage_cost(mechanism)
 
     def rates(x: list[Number], held: list[Number]) -> list[Number]:
@@ -317,10 +318,10 @@ def settling(subject: Subject, objective: Objective | None = None) -> Iterator[D
     ends = [reference.motion(x, LONGEST, radius) for x in starts]
     half = 0.5 * min(time for _, time, _ in ends)
     for what, span in (("arrival", LONGEST), ("on the way", half)):
-        room = RolloutBuffers(loop._shape, len(starts), 1)
-        room.fill(starts, surface.vector[None, None], loop._numbers.law)
+        buffers = RolloutBuffers(loop._shape, len(starts), 1)
+        buffers.fill(starts, surface.vector[None, None], loop._numbers.law)
         steps = round(span / loop.step)
-        found = loop._launch(room, np.zeros(1, dtype=np.int64), steps, terminal=radius)
+        found = loop._launch(buffers, np.zeros(1, dtype=np.int64), steps, terminal=radius)
         for k, x in enumerate(starts):
             late = float(found.time[k])
             state, time, cost = ends[k]

@@ -48,7 +48,7 @@ class RolloutBuffers:
         self.lanes = np.empty((self.padded, segments, self.width + 2 * m + 1))
         self.states = np.empty((self.padded, 2 * n))
         self.live = np.ones(self.padded)
-        self.ends = None if shape.linear_end is None else shape.linear_end.room(self.padded)
+        self.ends = None if shape.linear_end is None else shape.linear_end.buffers(self.padded)
         self.out = np.empty((self.padded, 9 + w + 4 * n))
         # A sampled kernel reads the noise of every lane.
         self.quiet = np.zeros((1, self.padded, 2 * n)) if shape.sampled else NOTHING
@@ -81,10 +81,10 @@ class RolloutBuffers:
 
     def part(self, which: NDArray[np.intp]) -> RolloutBuffers:
         """Return room for some of the lanes, filled alike."""
-        room = RolloutBuffers(self.shape, len(which), self.lanes.shape[1])
+        buffers = RolloutBuffers(self.shape, len(which), self.lanes.shape[1])
         lanes, width = self.lanes[which], self.width
-        room.fill(self.states[which], lanes[:, :, :width], lanes[:, :, width:-1])
-        return room
+        buffers.fill(self.states[which], lanes[:, :, :width], lanes[:, :, width:-1])
+        return buffers
 
     def batch(self, start: float) -> Batch:
         """Return the results as named views."""

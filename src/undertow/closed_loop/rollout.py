@@ -151,14 +151,14 @@ class ClosedLoop(UncheckedLoop):
     ) -> tuple[Batch, FloatArray]:
         """Roll out states (N, 2n) and surfaces (N, S, 2mn), or one of either, in new buffers."""
         steps = self._steps(self.objective.horizon if duration is None else duration)
-        room = RolloutBuffers(self._shape, max(len(x0), len(surfaces)), surfaces.shape[1])
-        room.fill(x0, surfaces, self._numbers.law if reaching is None else reaching)
+        buffers = RolloutBuffers(self._shape, max(len(x0), len(surfaces)), surfaces.shape[1])
+        buffers.fill(x0, surfaces, self._numbers.law if reaching is None else reaching)
         columns = 2 * self.mechanism.n + 2 * self.mechanism.m + 2
-        shape = (room.padded, -(-steps // every), columns) if every else (0, 0, 0)
+        shape = (buffers.padded, -(-steps // every), columns) if every else (0, 0, 0)
         record = np.zeros(shape)
         switches = self._switch_steps(switch_times)
         batch = self._launch(
-            room, switches, steps, start=start, every=every, record=record, **options
+            buffers, switches, steps, start=start, every=every, record=record, **options
         )
         return batch, record
 

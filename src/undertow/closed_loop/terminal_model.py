@@ -123,7 +123,7 @@ class TerminalLinearModel:
         self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
         self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
 
-    def room(self, count: int) -> Prepared:
+    def buffers(self, count: int) -> Prepared:
         """Return room for the ends of ``count`` closed loops, a multiple of the lanes."""
         n = self.X.shape[0] + self.X.shape[1]
         N = 2 * n
@@ -148,7 +148,7 @@ class TerminalLinearModel:
         gains
             k_i at the target, (C, m), where that is not η_i.
         into
-            What is filled, see :meth:`room`.
+            What is filled, see :meth:`buffers`.
         """
         stage = self._weights
         _close(

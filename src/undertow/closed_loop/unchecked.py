@@ -109,20 +109,23 @@ class UncheckedLoop:
         end = self.linear_end
         return end is not None and end.stage is not None
 
-    def _prepare(self, room: RolloutBuffers) -> Prepared | None:
+    def _prepare(self, buffers: RolloutBuffers) -> Prepared | None:
         """Linearise the last surface of every lane."""
-        if self.linear_end is None or room.ends is None:
+        if self.linear_end is None or buffers.ends is None:
             return None
         gains = None
         if any(self.mechanism.disturbance_bounds):
-            surfaces, eta = room.lanes[:, -1, : room.width], room.lanes[:, -1, room.width :]
+            surfaces, eta = (
+                buffers.lanes[:, -1, : buffers.width],
+                buffers.lanes[:, -1, buffers.width :],
+            )
             gains = gains_at_target(self.mechanism, surfaces, eta[:, : self.mechanism.m])
-        self.linear_end.prepare(room.lanes, gains, room.ends)
-        return room.ends
+        self.linear_end.prepare(buffers.lanes, gains, buffers.ends)
+        return buffers.ends
 
     def _launch(
         self,
-        room: RolloutBuffers,
+        buffers: RolloutBuffers,
         switches: NDArray[np.int64],
         steps: int,
         *,
@@ -132,16 +135,16 @@ class UncheckedLoop:
         seek: bool = False,
         **options: Any,
     ) -> Batch:
-        """Roll out what the room holds; the results live there too."""
+        """Roll out what the buffers hold; the results live there too."""
         end_radius = self.objective.terminal_radius if terminal is None else terminal
         # Large steps see no closest approach, and leave nothing to record.
         calm_from = 0 if self._hands_over and not every and not seek else steps
-        self._roll(room, switches, steps, calm_from, start, end_radius, seek, every, **options)
-        return room.batch(start)
+        self._roll(buffers, switches, steps, calm_from, start, end_radius, seek, every, **options)
+        return buffers.batch(start)
 
     def _roll(
         self,
-        room: RolloutBuffers,
+        buffers: RolloutBuffers,
         switches: NDArray[np.int64],
         steps: int,
         calm_from: int,
@@ -156,31 +159,31 @@ class UncheckedLoop:
         noise: FloatArray | None = None,
     ) -> None:
         """Call the kernel; from the step ``calm_from`` on, lanes may go on in large steps."""
-        numbers, live, out = self._numbers, room.live, room.out
+        numbers, live, out = self._numbers, buffers.live, buffers.out
         live.fill(1.0)
-        self._check_gains(room.lanes, live, stable_only)
+        self._check_gains(buffers.lanes, live, stable_only)
         hands_over = calm_from < steps
-        prepared = self._prepare(room) if hands_over or stable_only else None
+        prepared = self._prepare(buffers) if hands_over or stable_only else None
         if prepared is not None and stable_only:
             live *= prepared.stable
         self._kernels.rollout(
-            room.states, live, room.lanes, switches, numbers.plant, numbers.belief,
-            numbers.limits, room.quiet if noise is None else noise, start, self.step, steps,
+            buffers.states, live, buffers.lanes, switches, numbers.plant, numbers.belief,
+            numbers.limits, buffers.quiet if noise is None else noise, start, self.step, steps,
             max(1, self.hold), terminal, self.escape, cap, 1.0 if seek else 0.0, calm_from,
             every, record, out,
         )  # fmt: skip
         if not hands_over or prepared is None or self.linear_end is None:
             return
         self._kernels.settle(
-            room.lanes, numbers.plant, numbers.belief, numbers.limits, start + steps * self.step,
+            buffers.lanes, numbers.plant, numbers.belief, numbers.limits, start + steps * self.step,
             terminal, self.escape, self.tail, 1.0 if self.linear_end.counts_cost else 0.0,
             prepared.A, prepared.P, prepared.powers, prepared.forced, prepared.reach, out,
         )  # fmt: skip
-        again = np.flatnonzero(out[: room.count, 2] == UNSETTLED)
+        again = np.flatnonzero(out[: buffers.count, 2] == UNSETTLED)
         if not len(again):
             return
         # Too fast for large steps, or at a limit again: small steps until later.
-        part = room.part(again)
+        part = buffers.part(again)
         failed = round((float(out[again, 1].max()) - start) / self.step)
         later = failed + max(round(CALMER / self.step), calm_from)
         self._roll(
@@ -238,8 +241,10 @@ class RolloutEvaluator:
         :meth:`undertow.ClosedLoop.batch`: ``terminal``, ``cap``, ``stable_only``, ``seek``.
         """
         count = len(surfaces)
-        room = self._rooms.get(count)
-        if room is None:
-            room = self._rooms[count] = RolloutBuffers(self.loop._shape, count, len(self.switches))
-        room.fill(self.x, surfaces, self.loop._numbers.law if laws is None else laws)
-        return self.loop._launch(room, self.switches, self.steps, **options)
+        buffers = self._rooms.get(count)
+        if buffers is None:
+            buffers = self._rooms[count] = RolloutBuffers(
+                self.loop._shape, count, len(self.switches)
+            )
+        buffers.fill(self.x, surfaces, self.loop._numbers.law if laws is None else laws)
+        return self.loop._launch(buffers, self.switches, self.steps, **options)

@@ -29,7 +29,7 @@ __all__ = ["numba", "processor"]
 
 PACKAGE = Path(__file__).resolve().parent.parent
 
-#: numba's own rooms have no types.
+#: numba's own modules have no types.
 caching: Any = numba_caching
 
 
