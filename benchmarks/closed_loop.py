@@ -26,7 +26,7 @@ from harness import Clock, clock, command_line, need, progress, table  # isort: 
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -128,6 +128,29 @@ def tuned(scene: Scene) -> dict[str, FloatArray]:
 Result = tuple[Outcome | None, list[float]]
 
 
+@dataclass
+class Timed:
+    """An optimiser, and the seconds that each of its answers took."""
+
+    optimiser: ut.Optimiser
+    now: Clock
+    seconds: list[float]
+
+    def require(self, x: FloatArray, /) -> ut.Proposal:
+        """Time the first optimisation."""
+        began = self.now()
+        proposal = self.optimiser.require(x)
+        self.seconds.append(self.now() - began)
+        return proposal
+
+    def propose(self, x: FloatArray, /, **settings: Any) -> ut.Proposal:
+        """Time a re-optimisation."""
+        began = self.now()
+        proposal = self.optimiser.propose(x, **settings)
+        self.seconds.append(self.now() - began)
+        return proposal
+
+
 def cascade(
     scene: Scene,
     plant: ut.Mechanism,
@@ -137,17 +160,10 @@ def cascade(
 ) -> Result:
     """Run undertow's cascade; also return the seconds of each optimisation."""
     controller = ut.Cascade(scene.rig, objective, freedom=freedom)
-    propose, seconds = controller.optimiser.propose, []
+    seconds: list[float] = []
     for incumbent in (None, ut.first_surface(scene.rig)):  # compile
-        propose(scene.x0, incumbent=incumbent, budget=ut.Budget(64))
-
-    def timed(*arguments: Any, **settings: Any) -> ut.Proposal:
-        began = now()
-        proposal = propose(*arguments, **settings)
-        seconds.append(now() - began)
-        return proposal
-
-    vars(controller.optimiser)["propose"] = timed
+        controller.optimiser.propose(scene.x0, incumbent=incumbent, budget=ut.Budget(64))
+    controller = replace(controller, planner=Timed(controller.optimiser, now, seconds))
     truth = None if plant is scene.rig else plant
     try:
         run = controller.simulate(scene.x0, plant=truth)

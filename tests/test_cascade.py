@@ -164,9 +164,7 @@ def stale(answer: Proposal) -> Proposal:
 
 def with_fault(cascade: ut.Cascade, fault: Callable[[Proposal], Proposal]) -> ut.Cascade:
     """The same cascade with an optimiser whose answers pass through ``fault``."""
-    broken = replace(cascade)
-    vars(broken)["optimiser"] = Faulty(cascade.optimiser, fault)
-    return broken
+    return replace(cascade, planner=Faulty(cascade.optimiser, fault))
 
 
 @pytest.mark.parametrize(

@@ -64,9 +64,8 @@ class Fake:
 def cascade(answers: Sequence[ut.Surface | None], **settings: Any) -> ut.Cascade:
     """A cascade whose optimiser lies: it claims cost 0 for everything."""
     goal = ut.MinimumTime(horizon=20.0)
-    made = ut.Cascade(RIG, goal, gate=certified_gate(Policy()), first=GOOD, **settings)
-    vars(made)["optimiser"] = Fake(answers)
-    return made
+    gate = certified_gate(Policy())
+    return ut.Cascade(RIG, goal, gate=gate, first=GOOD, planner=Fake(answers), **settings)
 
 
 def test_bad_proposals_are_refused_and_the_run_converges() -> None:
@@ -113,9 +112,7 @@ THRIFTY = [ut.Surface(-1, -0.7, 2.3, 21.8), ut.Surface(-1, -0.69, 2.5, 22.2), SL
 )
 def test_the_switching_sequence_descends(goal: ut.Objective, surfaces: list[ut.Surface]) -> None:
     """Lemma 3 along the run, with switches in it: J̃ falls by what is spent at least."""
-    made = replace(cascade([]), objective=goal)
-    vars(made)["optimiser"] = Fake(surfaces)
-    run = made.simulate(phi=0.3)
+    run = replace(cascade([]), objective=goal, planner=Fake(surfaces)).simulate(phi=0.3)
     assert run.reached
     assert len(set(run.surfaces)) > 1
     assert run.lemma3_slack.min() >= -1e-6 * run.cost

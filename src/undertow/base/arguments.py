@@ -36,7 +36,7 @@ REMEDIES = {
     "Surface": "Design one: undertow.first_surface(mechanism)",
     "ReachingLaw": "Write undertow.ReachingLaw(eta=20.0, layer=0.1)",
     "Budget": "Write undertow.Budget(1024)",
-    "Freedom": "Write undertow.DecisionVariables(times=(0.0, 0.1))",
+    "DecisionVariables": "Write undertow.DecisionVariables(times=(0.0, 0.1))",
     "Plan": "Write undertow.Plan((surface,)), or take the plan of a proposal",
     "CascadeState": "Take the one that Cascade.start returned",
     "Proposal": "Take the one that Cascade.propose returned",

@@ -29,7 +29,7 @@ from undertow.law import (
 )
 from undertow.models import TIME, FloatArray, Mechanism, number_of, require_mechanism
 from undertow.objective import MinimumEnergy, Objective, require_objective
-from undertow.optimiser import Budget, DecisionVariables, Optimiser, Proposal
+from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Proposal
 
 __all__ = [
     "Admission",
@@ -282,6 +282,9 @@ class Cascade:
         margins.
     seed
         Seed of the optimiser.
+    planner
+        Proposes plans in the place of :attr:`optimiser`: one of your own.  The gate judges what
+        it proposes as it judges the library's.
 
     Raises
     ------
@@ -312,6 +315,7 @@ class Cascade:
     resolution: float = 1e-4
     gate: Gate = cost_gate
     seed: int = 0
+    planner: Planner | None = None
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
@@ -403,8 +407,9 @@ class Cascade:
         InfeasibleError
             When no admissible surface was found.
         """
-        proposal, plan, cost = self._global(self.optimiser, x)
-        if not math.isfinite(cost):  # large steps were too hopeful: small ones throughout
+        proposal, plan, cost = self._global(self.planner or self.optimiser, x)
+        if not math.isfinite(cost) and self.planner is None:
+            # Large steps were too hopeful: small ones throughout.
             exact = replace(self.optimiser, loop=self.loop)
             proposal, plan, cost = self._global(exact, x)
         begun = CascadeState(plan, 0, cost, cost, x=_kept(self.mechanism.check_state(x)))
@@ -421,9 +426,9 @@ class Cascade:
         reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
         return Admission(True, reason, state.predicted, asked.verdict)
 
-    def _global(self, optimiser: Optimiser, x: ArrayLike) -> tuple[Proposal, Plan, float]:
+    def _global(self, planner: Planner, x: ArrayLike) -> tuple[Proposal, Plan, float]:
         """Return a global optimum, its plan and its cost integrated to the end."""
-        proposal = optimiser.require(x)
+        proposal = planner.require(self.mechanism.check_state(x))
         plan = proposal.plan
         assert plan is not None  # require() raises otherwise
         return proposal, plan, self._exact_cost(plan, x, self.objective.horizon)
@@ -468,8 +473,8 @@ class Cascade:
         """
         sequence = state.sequence + 1
         try:
-            return self.optimiser.propose(
-                x,
+            return (self.planner or self.optimiser).propose(
+                self.mechanism.check_state(x),
                 incumbent=state.at(t),
                 horizon=horizon,
                 sequence=sequence,

@@ -1,7 +1,7 @@
 """The search for a surface: decision variables, CMA-ES, trust region, task and result."""
 
 from undertow.optimiser.cma_es import CMAES
-from undertow.optimiser.optimiser import Optimiser
+from undertow.optimiser.optimiser import Optimiser, Planner
 from undertow.optimiser.proposal import Budget, Proposal
 from undertow.optimiser.search_space import DecisionVariables
 
@@ -10,5 +10,6 @@ __all__ = [
     "Budget",
     "DecisionVariables",
     "Optimiser",
+    "Planner",
     "Proposal",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,11 +12,35 @@ from numpy.typing import ArrayLike
 from undertow.base import InfeasibleError, at_least, check_fields, checked
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, Surface, check_surface, first_surface
+from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
 from undertow.optimiser.search_space import DecisionVariables
 from undertow.optimiser.task import Optimisation, Problem
 
-__all__ = ["Optimiser"]
+__all__ = ["Optimiser", "Planner"]
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """Whatever proposes plans to a cascade: :class:`Optimiser`, or one of your own."""
+
+    def require(self, x: FloatArray, /) -> Proposal:
+        """Return the first plan from the state x, (2n,), or raise."""
+        ...
+
+    def propose(
+        self,
+        x: FloatArray,
+        /,
+        *,
+        incumbent: Surface | Plan | None,
+        horizon: float | None,
+        sequence: int,
+        computed_for: float,
+        resolution: float,
+    ) -> Proposal:
+        """Return a plan for the state x, see :meth:`Optimiser.propose`."""
+        ...
 
 
 @dataclass(eq=False)

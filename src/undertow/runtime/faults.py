@@ -16,7 +16,7 @@ import numpy as np
 
 from undertow.cascade import Cascade
 from undertow.models import FloatArray
-from undertow.optimiser import Optimiser, Proposal
+from undertow.optimiser import Planner, Proposal
 from undertow.plants.interface import Measurement, Rig
 from undertow.runtime.clock import SimulatedClock
 from undertow.runtime.slow import Answer, Request, Worker
@@ -46,25 +46,24 @@ Change = Callable[[Answer], list[tuple[float, Answer]]]
 Spoil = Callable[[Proposal], Any]
 
 
-class _SpoiltOptimiser:
+class _SpoiltPlanner:
     """An optimiser that goes wrong from some time on."""
 
-    def __init__(self, honest: Optimiser, spoil: Spoil, since: float) -> None:
+    def __init__(self, honest: Planner, spoil: Spoil, since: float) -> None:
         self._honest, self._spoil, self._since = honest, spoil, since
 
-    def propose(self, x: FloatArray, **rest: Any) -> Any:
+    def require(self, x: FloatArray, /) -> Proposal:
+        return self._honest.require(x)
+
+    def propose(self, x: FloatArray, /, **rest: Any) -> Any:
         proposal = self._honest.propose(x, **rest)
         return self._spoil(proposal) if rest["computed_for"] >= self._since else proposal
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._honest, name)
 
 
 def spoil_optimiser(cascade: Cascade, spoil: Spoil, since: float) -> Cascade:
     """Return a cascade whose optimiser goes wrong from ``since``, s; its gate is as it was."""
-    spoilt = replace(cascade)
-    vars(spoilt)["optimiser"] = _SpoiltOptimiser(cascade.optimiser, spoil, since)
-    return spoilt
+    honest = cascade.planner or cascade.optimiser
+    return replace(cascade, planner=_SpoiltPlanner(honest, spoil, since))
 
 
 class FaultyWorker:
