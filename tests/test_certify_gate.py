@@ -125,8 +125,7 @@ def test_without_the_gate_the_same_proposals_do_harm() -> None:
     def open_gate(*arguments: Any) -> Admission:
         return Admission(True, "anything goes", math.inf)
 
-    made = replace(cascade([]), gate=open_gate)
-    vars(made)["optimiser"] = Fake([UNSTABLE])
+    made = replace(cascade([UNSTABLE]), gate=open_gate)
     assert not made.simulate(phi=0.3).reached
 
 
@@ -252,7 +251,6 @@ def test_the_first_plan_is_used_and_judged() -> None:
     """There is no other: the log says what the gate thinks of it."""
     strict = certified_gate(Policy(("region",)))
     made = replace(cascade([None]), gate=strict)
-    vars(made)["optimiser"] = Fake([None])
     run = made.simulate(phi=0.3)
     first = run.updates[0].admission
     assert first.accepted
