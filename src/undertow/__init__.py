@@ -1,10 +1,9 @@
 """Undertow: optimal sliding-mode cascade control of underactuated mechanisms."""
 
-from undertow.base import at_once
+# isort: off
+import undertow.base  # noqa: F401 - first: Ctrl-C ends what follows, which takes a second
 
-at_once()
-
-# ruff: noqa: E402 - what follows takes a second to import
+# isort: on
 from math import radians as deg
 
 from undertow import mechanisms

@@ -1,5 +1,11 @@
 """What every other package stands on: errors, files, what is written, verdicts."""
 
+from undertow.base.interrupt import INTERRUPTED, at_once, by_exception
+
+at_once()
+
+# ruff: noqa: E402 - what follows, here and in other packages, takes a second to import
+
 from undertow.base.arguments import REMEDIES, at_least, check_fields, checked, floats
 from undertow.base.artefacts import to_csv, versions
 from undertow.base.errors import (
@@ -17,7 +23,6 @@ from undertow.base.errors import (
     raised_at,
 )
 from undertow.base.files import check_file, file_hash, parse_json, read_file
-from undertow.base.interrupt import INTERRUPTED, at_once, by_exception
 from undertow.base.verdict import Verdict, inward
 
 __all__ = [

@@ -61,6 +61,7 @@ class EmbeddedController:
     Examples
     --------
     >>> import undertow as ut
+    >>> from undertow.export import files
     >>> rig = ut.mechanisms.rotary_pendulum()
     >>> controller = EmbeddedController(rig, ut.first_surface(rig))
     >>> sorted(files(controller))[:2]

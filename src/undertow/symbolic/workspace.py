@@ -43,7 +43,7 @@ class Workspace:
 
     Examples
     --------
-    >>> memory = Memory({"x": "n", "P": "n, n"}, n=2)
+    >>> memory = Workspace({"x": "n", "P": "n, n"}, n=2)
     >>> memory["P"][1, 0] = 7.0
     >>> memory.block.tolist()
     [0.0, 0.0, 0.0, 0.0, 7.0, 0.0]
