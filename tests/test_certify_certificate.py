@@ -42,7 +42,7 @@ from undertow.certify.reaching import reaching
 from undertow.certify.region import verify_region
 from undertow.certify.sets import ProvedStarts, proved_sets
 from undertow.certify.surface import hurwitz, nonsingular
-from undertow.certify.verify import reaches, verify
+from undertow.certify.verify import CHECKS, reaches, verify
 from undertow.cli import app
 from undertow.errors import ArtefactError, CertificateError, InvalidInputError, ModelError
 from undertow.modelling import mechanism_from_file
@@ -770,6 +770,25 @@ def test_a_mechanism_of_ones_own_is_certified_and_verified(tmp_path: Path) -> No
     answer = run(app, ["verify", file, "--mechanism", f"{model}:bar"])
     assert answer.exit_code == 1
     assert "equations" in answer.output
+
+
+def test_a_claim_that_stands_twice_is_decided_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, surface = ut.mechanisms.rotary_pendulum(), ut.Surface(-1, -1.59, 1.96, 12.1)
+    one = certify_surface(rig, surface, rig.state(phi=0.5), seconds=0.0, predict=False).subject
+    other = replace(one, surface=ut.Surface(-1, -1.6, 1.96, 12.1))
+    decided: list[str] = []
+    check = CHECKS["stability"]
+
+    def note(*asked: Any) -> Verdict:
+        decided.append(str(asked[1].surface))
+        return check(*asked)
+
+    monkeypatch.setitem(CHECKS, "stability", note)
+    claim = next(c for c in one.claims if c.kind == "stability")
+    subjects = [replace(s, claims=(claim,)) for s in (one, one, other, one)]
+    checked = verify(Certificate.of(rig, subjects, {}), rig)
+    assert len(decided) == 2
+    assert checked[0].verdict == checked[1].verdict == checked[3].verdict != checked[2].verdict
 
 
 def test_own_mechanisms_are_loaded_or_named(tmp_path: Path) -> None:

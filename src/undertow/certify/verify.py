@@ -201,11 +201,14 @@ def verify(
             limit=f"one of {', '.join(CHECKS)}",
             remedy="It was made by a later version of Undertow",
         )
-    done = []
+    done: list[Checked] = []
     for index, (subject, claim) in enumerate(tasks):
         if progress is not None:
             progress(claim.kind, index / len(tasks))
-        verdict = _decide(model, subject, claim, max_seconds)
+        asked = subject.surface, subject.reaching, claim
+        known = (c for c in done if (c.subject.surface, c.subject.reaching, c.claim) == asked)
+        same = next(known, None)  # what stands there again is not decided again
+        verdict = _decide(model, subject, claim, max_seconds) if same is None else same.verdict
         done.append(Checked(subject, claim, verdict, matched.fingerprint))
     return tuple(done)
 

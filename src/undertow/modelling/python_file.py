@@ -80,6 +80,13 @@ def object_from_file(text: str, what: str, suits: Callable[[object], bool] = cal
             remedy=f"Name the {what} after the file, like my_file.py:my_{what}",
         )
     path = Path(file)
+    if not (name or path.is_file()):
+        raise InvalidInputError(
+            f"{what} of one's own",
+            value=f"{text!r}, which is no file here",
+            limit="FILE.py:NAME",
+            remedy=f"Check the path, and name the {what} after it, like my_file.py:my_{what}",
+        )
     module = ModuleType(f"undertow_user_{what}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # dataclasses look there
