@@ -175,6 +175,10 @@ REST: dict[str, tuple[Callable[[Subject], Iterator[Difference]], float]] = {
     "large steps, energy": (settling, SETTLED),
     "large steps, time": (partial(settling, objective=ut.MinimumTime(travel=False)), SETTLED),
 }
+#: Mechanisms whose motions here all end in large steps.
+IN_LARGE_STEPS = {
+    "cart_pendulum", "pendubot", "rotary_pendulum", "tora", "two_motor_three_link",
+}  # fmt: skip
 EVERY = [
     pytest.param(name, marks=() if name == "rotary_pendulum" else pytest.mark.slow)
     for name in sorted(LIBRARY)
@@ -189,7 +193,10 @@ def test_compiled_code_of_the_library_is_that_of_the_symbols(name: str, what: st
     if what == "swing-up" and (mechanism.m > 1 or mechanism.potential is None):
         pytest.skip("no such swing-up")
     compare, limit = REST[what]
-    agree(compare(Subject(mechanism)), limit)
+    found = list(compare(Subject(mechanism)))
+    if name not in IN_LARGE_STEPS:  # small steps take over where large ones are given up
+        found = [one for one in found if "[number of steps]" not in one.what]
+    agree(iter(found), limit)
 
 
 @pytest.mark.parametrize("real", ["double", "float"])

@@ -1,4 +1,4 @@
-"""What every other package stands on: errors, files, what is written, verdicts."""
+"""What every other package stands on: checks of arguments, errors, verdicts, files."""
 
 from undertow.base.interrupt import INTERRUPTED, at_once, by_exception
 

@@ -1,11 +1,11 @@
-"""Certificates: claims about a surface with a verdict, a margin and a witness.
+"""Certificates: claims about a surface, a region or the closed loop, each with its verdict.
 
 Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when first used.
 """
 
+from undertow.base.verdict import Verdict
 from undertow.certify.claims.certificate import Certificate, Claim, Subject, read_certificate
 from undertow.certify.claims.gate import Policy, assess, certified_gate
-from undertow.certify.intervals.verdict import Verdict
 from undertow.certify.region.region import LyapunovFunction, SurfaceMotion, verify_region
 from undertow.certify.region.search import ProvedRegion, prove_region
 from undertow.certify.surface.ellipsoid import TerminalEllipsoid, verify_ellipsoid

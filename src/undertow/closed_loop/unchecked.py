@@ -232,7 +232,7 @@ class RolloutEvaluator:
         self, loop: UncheckedLoop, x: FloatArray, switches: NDArray[np.int64], steps: int
     ) -> None:
         self.loop, self.x, self.switches, self.steps = loop, x, switches, steps
-        self._rooms: dict[int, RolloutBuffers] = {}
+        self._buffers: dict[int, RolloutBuffers] = {}
 
     def __call__(self, surfaces: FloatArray, laws: FloatArray | None, **options: Any) -> Batch:
         """Roll out surfaces (N, S, 2mn) with reaching laws (N, S, 2m).
@@ -241,9 +241,9 @@ class RolloutEvaluator:
         :meth:`undertow.ClosedLoop.batch`: ``terminal``, ``cap``, ``stable_only``, ``seek``.
         """
         count = len(surfaces)
-        buffers = self._rooms.get(count)
+        buffers = self._buffers.get(count)
         if buffers is None:
-            buffers = self._rooms[count] = RolloutBuffers(
+            buffers = self._buffers[count] = RolloutBuffers(
                 self.loop._shape, count, len(self.switches)
             )
         buffers.fill(self.x, surfaces, self.loop._numbers.law if laws is None else laws)

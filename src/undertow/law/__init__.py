@@ -1,4 +1,4 @@
-"""How it slides: surfaces and their schedule, reaching law, sliding-mode law, stability margins."""
+"""The control law: surfaces and their schedule, reaching law, stability margins."""
 
 from undertow.law.inner_loop import LAYOUT, InnerLoop, law_module, pack_law_parameters
 from undertow.law.schedule import Plan

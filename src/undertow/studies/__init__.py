@@ -1,1 +1,1 @@
-"""What is measured with all of it: the paper, the survey, trials and certification."""
+"""Studies made with the library: the paper, the survey, trials and certification."""

@@ -1,1 +1,1 @@
-"""A certificate: what is claimed of what, how it is read, written and verified."""
+"""A certificate: what is claimed of what, how it is read, written and verified; the gate."""

@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import inward, within
+from undertow.base.verdict import Kind, Verdict, inward, within
 from undertow.certify.closed_loop.loop import LoopMotion, LoopRates
 from undertow.certify.closed_loop.sampled_data import SampledDataLoop
 from undertow.certify.closed_loop.terminal import TerminalSet, exact_inverse, verify_terminal
 from undertow.certify.closed_loop.tube import Tubes, bracket
 from undertow.certify.intervals.batch import Interval
-from undertow.certify.intervals.verdict import Kind, Verdict
 from undertow.certify.surface.ellipsoid import limits_in_words
 from undertow.law.sliding import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism

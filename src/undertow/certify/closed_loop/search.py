@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.base.errors import InfeasibleError
+from undertow.base.verdict import Verdict
 from undertow.certify.closed_loop.claim import LoopClaim, run_tubes, start_tubes, verify_loop
 from undertow.certify.closed_loop.loop import LoopMotion
 from undertow.certify.closed_loop.terminal import TerminalSet
 from undertow.certify.closed_loop.terminal_search import jacobian, search_terminal
-from undertow.certify.intervals.verdict import Verdict
 from undertow.law.sliding import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 

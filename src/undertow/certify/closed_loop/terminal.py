@@ -36,11 +36,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.base.errors import InvalidInputError
+from undertow.base.verdict import Verdict
 from undertow.certify.closed_loop.loop import LoopMotion
 from undertow.certify.closed_loop.terminal_set import TerminalSet, exact_inverse, negative_by
 from undertow.certify.closed_loop.tube import matmul
 from undertow.certify.intervals.batch import Interval
-from undertow.certify.intervals.verdict import Verdict
 
 __all__ = ["TerminalSet", "exact_inverse", "verify_terminal"]
 

@@ -15,10 +15,10 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from undertow.base.errors import InfeasibleError, UnstableSurfaceError
+from undertow.base.verdict import Verdict
 from undertow.certify.closed_loop.loop import LoopMotion
 from undertow.certify.closed_loop.terminal import HOLD_SHARE, TerminalSet, verify_terminal
 from undertow.certify.intervals.batch import Interval
-from undertow.certify.intervals.verdict import Verdict
 
 __all__ = ["jacobian", "search_terminal"]
 

@@ -41,8 +41,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.base.errors import InvalidInputError
+from undertow.base.verdict import Kind, Verdict
 from undertow.certify.intervals.batch import Interval
-from undertow.certify.intervals.verdict import Kind, Verdict
 from undertow.certify.region.lyapunov import LyapunovFunction, first_crossing
 from undertow.certify.region.motion import Motion, SurfaceMotion, VectorField
 from undertow.certify.region.stage import Chart, Stage, stretched_alike

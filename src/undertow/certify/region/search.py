@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base.errors import InfeasibleError
-from undertow.certify.intervals.verdict import Verdict
+from undertow.base.verdict import Verdict
 from undertow.certify.region.chain import Budget, Progress, grow
 from undertow.certify.region.chart import natural_stretch
 from undertow.certify.region.lyapunov import LyapunovFunction, extent

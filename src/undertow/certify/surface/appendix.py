@@ -30,9 +30,8 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import inward
+from undertow.base.verdict import Verdict, inward
 from undertow.certify.intervals.interval import ball, flint, lower_float, upper_float
-from undertow.certify.intervals.verdict import Verdict
 from undertow.certify.surface.surface import exact_linearisation
 from undertow.law.sliding import Surface
 from undertow.models.mechanism import Mechanism

@@ -26,11 +26,10 @@ import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import inward
+from undertow.base.verdict import Verdict, inward
 from undertow.certify.intervals.exact_model import exact_mechanism, vanishes
 from undertow.certify.intervals.outward import add, down, magnitude, mul, up
 from undertow.certify.intervals.program import Program, run
-from undertow.certify.intervals.verdict import Verdict
 from undertow.law.sliding import (
     LawSymbols,
     ReachingLaw,

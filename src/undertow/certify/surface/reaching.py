@@ -25,11 +25,10 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import inward
+from undertow.base.verdict import Verdict, inward
 from undertow.certify.intervals.branch import BallFunction, Minimum, minimise_proved
 from undertow.certify.intervals.exact_model import exact_mechanism
 from undertow.certify.intervals.interval import ball, compile_outward
-from undertow.certify.intervals.verdict import Verdict
 from undertow.certify.surface.surface import Region, nonsingular, region_box, region_words
 from undertow.law.sliding import (
     LawSymbols,

@@ -14,7 +14,7 @@ import scipy.stats
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base.errors import InvalidInputError
-from undertow.certify.intervals.verdict import Verdict
+from undertow.base.verdict import Verdict
 from undertow.closed_loop.rollout import ClosedLoop
 from undertow.closed_loop.trajectory import Event
 from undertow.law.sliding import Surface

@@ -23,11 +23,10 @@ import numpy as np
 import sympy as sp
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import inward, within
+from undertow.base.verdict import Verdict, inward, within
 from undertow.certify.intervals.branch import BallFunction, Minimum, minimise_proved
 from undertow.certify.intervals.exact_model import exact_mechanism, vanishes
 from undertow.certify.intervals.interval import ball, compile_outward, flint
-from undertow.certify.intervals.verdict import Verdict
 from undertow.law.sliding import Surface, check_surface_shape
 from undertow.law.stability import sliding_matrix
 from undertow.models.mechanism import TIME, Mechanism

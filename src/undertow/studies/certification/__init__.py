@@ -24,7 +24,6 @@ __all__ = [
     "certify_run",
     "certify_surface",
     "loop_figure",
-    "mechanism_from_file",
     "region_figure",
     "run_report",
     "subject_report",

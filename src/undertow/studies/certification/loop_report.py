@@ -22,11 +22,11 @@ from pathlib import Path
 import sympy
 
 from undertow.base import InfeasibleError, inward
+from undertow.base.verdict import Verdict
 from undertow.certify.claims.certificate import Certificate, Claim, Subject
 from undertow.certify.claims.verify import verify
 from undertow.certify.closed_loop.claim import LoopClaim, verify_loop
 from undertow.certify.closed_loop.search import ProvedLoop, prove_loop
-from undertow.certify.intervals.verdict import Verdict
 from undertow.certify.surface.appendix import CASES, AppendixCase
 from undertow.certify.surface.sampled import sampled_extent
 from undertow.closed_loop import ClosedLoop

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from undertow import mechanisms
 from undertow.base import InfeasibleError, inward
+from undertow.base.verdict import Verdict
 from undertow.certify.claims.certificate import function_data, function_of
-from undertow.certify.intervals.verdict import Verdict
 from undertow.certify.region.chain import Progress
 from undertow.certify.region.chart import singular_distance_on_axis
 from undertow.certify.region.lyapunov import LyapunovFunction, extent

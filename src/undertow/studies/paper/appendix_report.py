@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from undertow.base import inward
-from undertow.certify.intervals.verdict import Verdict
+from undertow.base.verdict import Verdict
 from undertow.certify.surface.appendix import (
     CASES,
     PRINTED,

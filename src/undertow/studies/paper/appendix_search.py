@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.base import InfeasibleError, MissingExtraError
+from undertow.base.verdict import Verdict
 from undertow.certify.intervals.interval import flint
-from undertow.certify.intervals.verdict import Verdict
 from undertow.certify.surface.appendix import (
     BITS,
     Lyapunov,
