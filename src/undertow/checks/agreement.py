@@ -351,9 +351,10 @@ class _Written:
         self.n, self.m, self.surface = mechanism.n, mechanism.m, surface
         self._terms = sp.lambdify([x], [
             entry.subs(values) for entry in (mechanism.mass_matrix, mechanism.force)
-        ], "numpy", cse=True)  # fmt: skip
+        ], "numpy", cse=True, dummify=True)  # fmt: skip
         self._B = np.array(mechanism.input_matrix.subs(values), dtype=float)
-        self._cost = sp.lambdify([x, mechanism.u], goal.stage_cost(mechanism).subs(values), "numpy")
+        cost = goal.stage_cost(mechanism).subs(values)
+        self._cost = sp.lambdify([x, mechanism.u], cost, "numpy", dummify=True)
         self._eta, self._layer = np.split(reaching.vector(mechanism.m), 2)
         self._limit = mechanism.input_limits
 
