@@ -186,7 +186,13 @@ def whatever_its_steps(differences: Iterator[Difference]) -> Iterator[Difference
     return (one for one in differences if "[number of steps]" not in one.what)
 
 
-@pytest.mark.parametrize("what", sorted(REST))
+@pytest.mark.parametrize(
+    "what",
+    [
+        pytest.param(what, marks=pytest.mark.slow if what == "large steps, time" else ())
+        for what in sorted(REST)
+    ],
+)
 @pytest.mark.parametrize("name", EVERY)
 def test_compiled_code_of_the_library_is_that_of_the_symbols(name: str, what: str) -> None:
     """Claim: rig, estimator, swing-up and the programmes of proofs compute M, f, B and the law."""

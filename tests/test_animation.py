@@ -159,6 +159,7 @@ def test_still_shows_ghosts() -> None:
     assert len({line.get_alpha() for line in axes.lines}) >= 4
 
 
+@pytest.mark.slow
 def test_animate_on_the_command_line(tmp_path: Path) -> None:
     """Claim: one command leaves the film and the still, from the listed start."""
     words = ["animate", "pendubot", "--out", str(tmp_path)]

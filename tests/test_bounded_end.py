@@ -64,7 +64,9 @@ def test_the_reach_of_a_step_bounds_what_scipy_integrates() -> None:
                 assert reach[level, 0, 0, lane] <= 1.1 * exact[0, 0]
 
 
-@pytest.mark.parametrize("goal", [ut.MinimumEnergy(), ut.MinimumTime()])
+@pytest.mark.parametrize(
+    "goal", [ut.MinimumEnergy(), pytest.param(ut.MinimumTime(), marks=pytest.mark.slow)]
+)
 def test_a_loop_with_travel_ends_in_large_steps(goal: ut.Objective) -> None:
     """Verdicts and margins are those of small steps, costs agree to 0.1 %; far fewer steps."""
     rig = ut.mechanisms.cart_pendulum()
@@ -105,7 +107,9 @@ def _swinging(loop: ClosedLoop, count: int) -> FloatArray:
     return np.asarray(surfaces[swings & calm][:count])
 
 
-@pytest.mark.parametrize("name", ["cart_pendulum", "overhead_crane"])
+@pytest.mark.parametrize(
+    "name", ["cart_pendulum", pytest.param("overhead_crane", marks=pytest.mark.slow)]
+)
 def test_a_late_touch_is_seen_and_a_near_miss_is_none(name: str) -> None:
     """Starts scaled until an overshoot meets the bound, then by 1e-9 to 0.3 less and more."""
     rig: ut.Mechanism = getattr(ut.mechanisms, name)()

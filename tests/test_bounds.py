@@ -207,6 +207,7 @@ def test_rotary_pendulum_table(
     assert least_time(d_e, degrees).cost == pytest.approx(duration, rel=1e-3, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_halving_the_mesh_does_not_move_the_cost() -> None:
     """First meshes of 80 and 160 intervals agree within 0.1 %, as ``change`` foretells."""
     for coarse, fine in (

@@ -291,6 +291,7 @@ def test_fast_step_is_bounded_and_never_nan(cascade: ut.Cascade) -> None:
     assert np.abs(control.u).max() <= 15.0
 
 
+@pytest.mark.slow
 def test_hard_input_limit_that_no_surface_meets_is_refused(rig: ut.Mechanism) -> None:
     """The first optimisation raises, with value, limit and remedy, before anything moves."""
     cascade = ut.Cascade(

@@ -754,6 +754,7 @@ bar = ut.Mechanism.from_energies(
 """
 
 
+@pytest.mark.slow
 def test_a_mechanism_of_ones_own_is_certified_and_verified(tmp_path: Path) -> None:
     """Nothing of the library is needed: the file brings the model both times."""
     run = CliRunner().invoke

@@ -279,6 +279,7 @@ def test_a_terminal_set_of_the_sampled_loop() -> None:
     assert not verify_terminal(HELD, thin, max_seconds=30)
 
 
+@pytest.mark.slow
 def test_a_hold_that_is_too_long_is_not_proved(claim: LoopClaim) -> None:
     """At 20 ms the law is past its stable period 2 ε/η = 10 ms: simulation rings, no proof."""
     loop = ut.ClosedLoop(RIG, ut.MinimumEnergy(), LAW, hold=1)
@@ -312,6 +313,7 @@ BLUNT = TerminalSet(
 )
 
 
+@pytest.mark.slow
 def test_a_plant_in_a_box_is_proved_and_a_larger_box_is_not(claim: LoopClaim) -> None:
     """The mass within 5 %: a terminal set, and tubes that end in it.  Within 40 %: none."""
     near = replace(claim, edges=claim.edges[:7], terminal=BLUNT, uncertain=BOX)

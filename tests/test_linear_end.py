@@ -39,7 +39,11 @@ def _full(rows: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    "build", [ut.mechanisms.rotary_pendulum, ut.mechanisms.double_pendulum_on_a_cart]
+    "build",
+    [
+        ut.mechanisms.rotary_pendulum,
+        pytest.param(ut.mechanisms.double_pendulum_on_a_cart, marks=pytest.mark.slow),
+    ],
 )
 def test_linear_ends_agree_with_scipy(build: Callable[[], ut.Mechanism]) -> None:
     """Lyapunov integrals, decay rates, stability and e^{At} of sixteen loops at once."""

@@ -134,6 +134,7 @@ def test_margins_of_the_answer_are_satisfied(optimisers: dict[str, ut.Optimiser]
     assert min(m.value for m in proposal.margins) > 0
 
 
+@pytest.mark.slow
 def test_state_constraint_binds_and_is_kept(rig: ut.Mechanism) -> None:
     """(24): the arm stays within ±25° where the free optimum swings further, at a price."""
     x = rig.state(phi=ut.deg(12))

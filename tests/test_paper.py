@@ -187,6 +187,7 @@ def test_bound_at_40_degrees_is_above_the_printed_totals() -> None:
 # -- Figure 3 ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_repeats_are_seeded_disturbed_and_come_home() -> None:
     """Same seed, same bits; another seed, another motion; friction and noise do not topple it."""
     condition = CONDITIONS["matched"]
