@@ -178,6 +178,7 @@ def test_margins_of_the_policy_count() -> None:
     assert "input margin" in answer(input_margin=1.1 * spare)
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_has_no_terminal_set() -> None:
     """The sets are proved for the continuous law; with a held input the gate says so."""
     held = replace(LOOP, hold=1)

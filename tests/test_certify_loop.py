@@ -232,6 +232,7 @@ def held_motion(x: FloatArray, period: float, count: int) -> FloatArray:
     return np.array(path)
 
 
+@pytest.mark.slow
 def test_held_tubes_hold_the_motions_of_the_sampled_loop() -> None:
     """Far off, and through the edge of the layer; no room for a continuous law's motions."""
     edges = np.radians([0.8, 0.81, 25.0, 25.05])
@@ -258,6 +259,7 @@ def test_held_tubes_hold_the_motions_of_the_sampled_loop() -> None:
     assert np.abs(continuous[-1] - path[10]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_a_terminal_set_of_the_sampled_loop() -> None:
     """Proved at 1 kHz, where W falls from sample to sample; thin or slow sets are not."""
     verdict = verify_terminal(HELD, THICK, max_seconds=60)

@@ -83,6 +83,7 @@ def test_what_an_estimator_does_not_know_comes_out_as_input(
     assert robustness_gate(0.001, 0.0, covariance=P, noise=9.0)(loop, *plans, x, 60.0).accepted
 
 
+@pytest.mark.slow
 def test_the_boundary_layer_is_as_thick_as_the_sensors_need(arm: ut.Mechanism) -> None:
     """The paper's where that is quiet; else the thinnest that is, of halves."""
     assert reaching_for(estimator_for(arm, srv02_rig())) == ut.ReachingLaw()

@@ -106,6 +106,7 @@ def test_a_matched_disturbance_is_found(arm: ut.Mechanism) -> None:
     assert kalman.disturbance[0] == pytest.approx(0.7, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_observer_lowers_the_gain_that_is_needed(arm: ut.Mechanism, base: ut.Surface) -> None:
     """A constant matched force; with d̂ taken off, a quarter of η keeps |s| as small."""
     a_e = next(p.value for p in arm.parameters if p.name == "a_e")
