@@ -25,9 +25,9 @@ import numpy as np
 
 import undertow as ut
 from undertow.cascade import cost_gate
-from undertow.cascade.cascade import TAIL
-from undertow.certify.claims.gate import Policy, assess, certified_gate
-from undertow.certify.surface.ellipsoid_search import search_for
+from undertow.cascade.cascade import TAIL_RTOL
+from undertow.proofs.gate import Policy, assess, certified_gate
+from undertow.proofs.search.terminal_ellipsoid import search_for
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 
@@ -35,7 +35,7 @@ RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 def questions(objective: ut.Objective, budget: ut.Budget) -> list[Any]:
     """Return what the gate of one run was asked: loop, old plan, new plan, state, horizon."""
     asked: list[Any] = []
-    gate = certified_gate(tail=TAIL)
+    gate = certified_gate(tail=TAIL_RTOL)
 
     def listening(*question: Any) -> Any:
         asked.append(question)
@@ -68,7 +68,7 @@ def main() -> int:
     options = command_line(__doc__).parse_args()
     now = clock(options.clock)
     sizes, rounds = ((32, 64, 128, 256), 1) if options.quick else ((256,), 5)
-    ended = certified_gate(tail=TAIL)
+    ended = certified_gate(tail=TAIL_RTOL)
     met, judged = True, True
     for objective in (ut.MinimumEnergy(), ut.MinimumTime()):
         # The smallest search that proposes anything: a quick run must judge something too.
@@ -79,7 +79,7 @@ def main() -> int:
             print(f"minimum {objective.name}: no proposal to judge with {sizes[-1]} rollouts")
             met = judged = False
             continue
-        quick = replace(asked[0][0], tail=TAIL)
+        quick = replace(asked[0][0], tail_rtol=TAIL_RTOL)
 
         def modes(loop: Any, old: Any, new: Any, x: Any, horizon: float) -> None:
             search_for.__wrapped__(RIG, new.surfaces[-1], loop.reaching)

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL
+from undertow.cascade.cascade import TAIL_RTOL
 from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
@@ -50,8 +50,8 @@ def main() -> int:
     seconds = 1e-3 * options.budget_ms
     rows, kept = [], True
     for objective in (ut.MinimumEnergy(), ut.MinimumTime()):
-        loop = ut.ClosedLoop(RIG, objective, tail=TAIL)
-        exact = replace(loop, tail=0.0)
+        loop = ut.ClosedLoop(RIG, objective, tail_rtol=TAIL_RTOL)
+        exact = replace(loop, tail_rtol=0.0)
         optimiser = ut.Optimiser(loop)
         tasks = situations(objective, min(calls, 500))
         budget = ut.Budget(1_000_000, seconds)
@@ -69,7 +69,7 @@ def main() -> int:
                 continue
             old, new = exact.batch(x, [ut.Plan((incumbent,)), plan]).score(objective.horizon)
             gains.append(1 - new / old)
-            worse += bool(new > (1 + TAIL) * old)
+            worse += bool(new > (1 + TAIL_RTOL) * old)
         ms = 1e3 * np.array(late)
         kept &= worse == 0 and float(np.quantile(ms, 0.99)) <= 0.5
         rows.append(

@@ -37,8 +37,7 @@ import sympy as sp
 import undertow as ut
 from rivals import DoMPC, Outcome, Plant, ShootingMPC
 from undertow.base import UndertowError
-from undertow.law import linearise
-from undertow.models import FloatArray, Parameter
+from undertow.models import FloatArray, Parameter, linearise
 
 HORIZON, RADIUS = 60.0, 0.01
 
@@ -136,15 +135,8 @@ class Timed:
     now: Clock
     seconds: list[float]
 
-    def require(self, x: FloatArray, /) -> ut.Proposal:
-        """Time the first optimisation."""
-        began = self.now()
-        proposal = self.optimiser.require(x)
-        self.seconds.append(self.now() - began)
-        return proposal
-
     def propose(self, x: FloatArray, /, **settings: Any) -> ut.Proposal:
-        """Time a re-optimisation."""
+        """Time an optimisation."""
         began = self.now()
         proposal = self.optimiser.propose(x, **settings)
         self.seconds.append(self.now() - began)

@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL
+from undertow.cascade.cascade import TAIL_RTOL
 from undertow.models import FloatArray
 
 FAMILY: dict[int, Callable[[], ut.Mechanism]] = {
@@ -38,7 +38,7 @@ class Task:
 
     def __init__(self, rig: ut.Mechanism, x0: FloatArray, horizon: float = 60.0) -> None:
         exact = ut.ClosedLoop(rig, ut.MinimumEnergy(horizon=horizon, travel=False))
-        self.loop = replace(exact, tail=TAIL)
+        self.loop = replace(exact, tail_rtol=TAIL_RTOL)
         self.optimiser = ut.Optimiser(self.loop)
         first = self.optimiser.require(x0)
         assert first.surface is not None  # require() raises otherwise
@@ -75,7 +75,7 @@ def dimensions(rounds: int, now: Clock) -> float:
     steps = 500
 
     def stepping(task: Task) -> Callable[[], object]:
-        loop = replace(task.loop, tail=0.0)
+        loop = replace(task.loop, tail_rtol=0.0)
         vectors = np.tile(task.surface.vector, (256, 1))
 
         def run() -> object:
@@ -92,7 +92,7 @@ def dimensions(rounds: int, now: Clock) -> float:
         step = float(np.median(single[str(n)])) / (256 * steps)
         base = float(np.median(single["2"])) / (256 * steps)
         rows.append(
-            [f"{n}  {task.loop.mechanism.name}", str(task.optimiser.problem.decision.size),
+            [f"{n}  {task.loop.mechanism.name}", str(task.optimiser.space.size),
              f"{np.median(task.evaluations):.0f}", f"{1e3 * medians[n]:.2f}",
              f"{medians[n] / medians[2]:.2f}", f"{1e9 * step:.1f}", f"{step / base:.2f}"]
         )  # fmt: skip
@@ -111,7 +111,7 @@ def horizons(values: list[float], rounds: int, now: Clock) -> None:
     tasks = {h: Task(rig, x, h) for h in progress(values, "horizons")}
     plain = {h: Task(rig, x, h) for h in values}
     for task in plain.values():
-        task.optimiser = replace(task.optimiser, loop=replace(task.loop, tail=0.0))
+        task.optimiser = replace(task.optimiser, loop=replace(task.loop, tail_rtol=0.0))
         task.reoptimise()
     entrants = {f"{h} end": task.reoptimise for h, task in tasks.items()}
     entrants |= {f"{h} plain": task.reoptimise for h, task in plain.items()}
@@ -136,10 +136,8 @@ def populations(rounds: int, now: Clock) -> None:
     task = Task(rig, rig.state(phi=ut.deg(38)))
     rng = np.random.default_rng(0)
     sizes = (1, 16, 64, 256, 1024)
-    z = task.optimiser.problem.decision.encode(ut.Plan((task.surface,)))
-    vectors, _ = task.optimiser.problem.decision.decode(
-        z + 0.1 * rng.standard_normal((max(sizes), z.size))
-    )
+    z = task.optimiser.space.encode(ut.Plan((task.surface,)))
+    vectors, _ = task.optimiser.space.decode(z + 0.1 * rng.standard_normal((max(sizes), z.size)))
 
     def batch(size: int) -> Callable[[], object]:
         return lambda: task.loop.batch(task.x, vectors[:size], stable_only=True)

@@ -16,8 +16,7 @@ import scipy.integrate
 import scipy.linalg
 
 import undertow as ut
-from undertow.law import linearise
-from undertow.models import FloatArray
+from undertow.models import FloatArray, linearise
 
 WEIGHTS = 10.0 ** np.arange(-9.0, 1.0)
 HORIZON = 60.0

@@ -24,8 +24,7 @@ import sympy as sp
 import undertow as ut
 from harness import Clock, need
 from undertow.bounds.expressions import translate
-from undertow.law import linearise
-from undertow.models import TIME, FloatArray
+from undertow.models import TIME, FloatArray, linearise
 from undertow.symbolic import Tape
 
 __all__ = ["DoMPC", "Outcome", "Plant", "ShootingMPC", "riccati"]

@@ -34,11 +34,11 @@ import numpy as np
 import scipy.optimize
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL
+from undertow.cascade.cascade import TAIL_RTOL
+from undertow.closed_loop import LANES
 from undertow.models import FloatArray
 from undertow.optimiser import CMAES
 from undertow.optimiser.trust_region import TrustRegion
-from undertow.symbolic import LANES
 
 Cost = Callable[[FloatArray], FloatArray]
 POPULATION, WIDTH, REACH = 32, 0.5, 4.0
@@ -260,8 +260,8 @@ def main() -> int:
     rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
     x0 = rig.state(phi=ut.deg(38))
     for objective in (ut.MinimumEnergy(), ut.MinimumTime()):
-        loop = ut.ClosedLoop(rig, objective, tail=TAIL)
-        decision = ut.Optimiser(loop).problem.decision
+        loop = ut.ClosedLoop(rig, objective, tail_rtol=TAIL_RTOL)
+        decision = ut.Optimiser(loop).space
         start = decision.encode(ut.Plan((ut.first_surface(rig),)))
 
         def cost(z: FloatArray, loop: ut.ClosedLoop = loop, decision: Any = decision) -> FloatArray:

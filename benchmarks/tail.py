@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL
+from undertow.cascade.cascade import TAIL_RTOL
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import sliding_matrix
 from undertow.models import FloatArray
@@ -49,7 +49,7 @@ def fastest(vectors: FloatArray) -> FloatArray:
 def compare(objective: ut.Objective, count: int, rounds: int, now: Clock) -> tuple[list[str], bool]:
     """Return one row of the table, and whether what is wanted was met."""
     exact = ut.ClosedLoop(RIG, objective)
-    ended = replace(exact, tail=TAIL)
+    ended = replace(exact, tail_rtol=TAIL_RTOL)
     states, vectors, plain = admissible(exact, count)
     batch = ended.batch(states, vectors)
     missed = ~batch.reached

@@ -12,9 +12,6 @@ import sympy as sp
 
 import undertow as ut
 from undertow.cascade.swing_up import law as swing_law
-from undertow.certify.closed_loop.loop import LoopMotion
-from undertow.certify.intervals.batch import Interval
-from undertow.certify.region.motion import SurfaceMotion
 from undertow.checks.agreement import Difference, Subject
 from undertow.checks.exact import Number, evaluate, product, runge_kutta, solve
 from undertow.estimators import kalman
@@ -22,6 +19,9 @@ from undertow.export import EmbeddedController, KalmanStep
 from undertow.export.host import Build
 from undertow.models import FloatArray
 from undertow.plants.stepping import stepping
+from undertow.proofs.closed_loop.loop import LoopMotion
+from undertow.proofs.intervals.batch import Interval
+from undertow.proofs.region.motion import SurfaceMotion
 
 STEP = 0.002
 
@@ -64,7 +64,7 @@ def rig_stepping(subject: Subject) -> Iterator[Difference]:
         module.gains(parameters, b)
         yield from subject.compared("rig: B", x, b, [B[i][i] for i in range(m)])
         after = x.copy()
-        module.smooth(0.0, STEP, after, u, viscous, parameters, work)
+        module.rk4_step(0.0, STEP, 1.0, n, after, u, viscous, parameters, *work[:3])
         true = _moved(subject, x, u, damping)
         yield from subject.compared("rig: next state", x, after, true, mechanism.state_names)
 

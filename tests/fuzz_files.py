@@ -51,7 +51,7 @@ from undertow.runtime import (
     replay,
     respond,
 )
-from undertow.studies.trials.ledger import Ledger
+from undertow.studies.trials.robustness import run_ledger
 from undertow.symbolic import store
 from undertow.symbolic.private import private_folder
 
@@ -303,7 +303,7 @@ MEMORY = CascadeState(Plan.of(ut.Surface(alpha_a=-1, lambda_a=-0.25, alpha_u=1.6
 
 def make_log(path: Path, mechanism: str = "rotary_pendulum", **settings: Any) -> None:
     """Write the log of a short run."""
-    quick = Settings(lead=0.04)
+    quick = Settings(lead_time=0.04)
     start = (0.0, 0.2, 0.0, 0.0)
     recipe = Recipe(mechanism=mechanism, evaluations=16, start=start, settings=quick)
     controller = recipe.make_controller(MEMORY)
@@ -315,9 +315,16 @@ def make_log(path: Path, mechanism: str = "rotary_pendulum", **settings: Any) ->
 
 
 def change_log(path: Path, rng: random.Random) -> None:
-    """Change what an SQLite file holds, through SQLite."""
-    hopeless = (sqlite3.Error, LookupError, ValueError)
+    """Change what an SQLite file holds, through SQLite.
+
+    A second change may meet what the first has put there: a view without an end, values of 200 MB,
+    lists in lists that no parser follows.  SQLite is told when to give up.
+    """
+    hopeless = (sqlite3.Error, LookupError, ValueError, RecursionError)
+    left = iter(range(1000))
     with closing(sqlite3.connect(path, isolation_level=None)) as file, suppress(*hopeless):
+        file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 80_000_000)
+        file.set_progress_handler(lambda: next(left, None) is None, 10_000)
         for _ in range(rng.choice((1, 1, 2))):
             _change(file, rng)
 
@@ -347,7 +354,7 @@ def _change(file: sqlite3.Connection, rng: random.Random) -> None:
     elif what == 8:
         file.execute(f"DELETE FROM {table} WHERE rowid % {rng.choice((1, 2, 50))} = 0")
     elif what == 9:
-        file.execute(f"PRAGMA user_version = {rng.choice((-1, 0, 3, 2**31 - 1))}")
+        file.execute(f"PRAGMA user_version = {rng.choice((-1, 0, 4, 2**31 - 1))}")
     elif what == 10:
         file.execute(f'ALTER TABLE {table} RENAME COLUMN "{column}" TO "{rng.choice(PAYLOADS)}"')
     elif what == 11:
@@ -427,20 +434,25 @@ class Certificates:
 
     def __init__(self, _folder: Path) -> None:
         from undertow.base import Verdict
-        from undertow.certify.claims.certificate import Certificate, Claim, Subject
-        from undertow.certify.claims.verify import verify
+        from undertow.proofs.claims.certificate import (
+            Certificate,
+            StatedClaim,
+            Subject,
+            read_certificate,
+        )
+        from undertow.proofs.claims.verify import verify
         from undertow.studies.certification import certify_surface
 
         rig, surface = ut.mechanisms.rotary_pendulum(), ut.Surface(-1, -1.59, 1.96, 12.1)
         one = certify_surface(rig, surface, rig.state(phi=0.5), seconds=0.0, predict=False)
         data = Path(__file__).parent / "data"
-        known = (("surface region", "region_claims.json"), ("closed loop", "loop_claims.json"))
         more = []
-        for kind, name in known:
-            found = next(iter(json.loads((data / name).read_text(encoding="utf-8")).values()))
+        for name in ("regions.json", "loops.json"):
+            stated = read_certificate(data / name).subjects[0].claims[0]
+            kind, found = stated.kind, dict(stated.data)
             if kind == "surface region":
                 found = {"functions": found["functions"][:2], "start": [1e-3, 0.0, 0.0]}
-            more.append(Claim(kind, found, Verdict(kind, "proved", 1e-3, "rad")))
+            more.append(StatedClaim(kind, found, Verdict(kind, "proved", 1e-3, "rad")))
         self.samples = []
         for claims in (one.subject.claims, *((claim,) for claim in one.subject.claims), *more):
             given = claims if isinstance(claims, tuple) else (claims,)
@@ -450,9 +462,9 @@ class Certificates:
             verify(Certificate.from_bytes(content), rig, max_seconds=1.0)  # compiles what it needs
 
     def make(self, case: Path, rng: random.Random) -> Callable[[], object]:
-        from undertow.certify.claims.certificate import _checksum, read_certificate
-        from undertow.certify.claims.verify import verify
         from undertow.mechanisms import LIBRARY
+        from undertow.proofs.claims.certificate import _checksum, read_certificate
+        from undertow.proofs.claims.verify import verify
 
         document, target = mutated(rng.choice(self.samples), rng), case / "certificate.json"
         text = written(document)
@@ -494,7 +506,7 @@ class Ledgers:
         content = "\n".join(map(written, lines)).encode("utf-8", "surrogatepass") + b"\n"
         target = case / "ledger.jsonl"
         target.write_bytes(flipped(content, rng) if rng.random() < 0.2 else content)
-        return lambda: Ledger(target, SETTINGS)
+        return lambda: run_ledger(target, SETTINGS)
 
 
 class Manifests:
@@ -507,13 +519,13 @@ class Manifests:
         self.sample = json.loads(to_json(facts))
 
     def make(self, case: Path, rng: random.Random) -> Callable[[], object]:
-        from undertow.certify.claims.certificate import read_certificate
+        from undertow.proofs.claims.certificate import read_certificate
 
         target = case / "manifest.json"
         content = written(mutated(self.sample, rng)).encode("utf-8", "surrogatepass")
         target.write_bytes(flipped(content, rng) if rng.random() < 0.3 else content)
         readers: tuple[Callable[[Path], object], ...] = (
-            read_certificate, replay, lambda path: Ledger(path, SETTINGS),
+            read_certificate, replay, lambda path: run_ledger(path, SETTINGS),
             modelling.from_urdf, modelling.from_mjcf,
         )  # fmt: skip
         reader = rng.choice(readers)

@@ -46,9 +46,9 @@ from undertow.runtime.log import Log
 from undertow.runtime.session import session
 
 Log.__init__.__kwdefaults__["part_bytes"] = int(sys.argv[3])
-patient = Settings(stall=5.0, patience=5.0)
+patient = Settings(max_step_interval=5.0, sensor_timeout=5.0)
 recipe = Recipe(evaluations=64, start=(0.0, 0.2, 0.0, 0.0), settings=patient)
-with session(recipe, log=Path(sys.argv[1]), processes=1, shadow=False) as runtime:
+with session(recipe, log=Path(sys.argv[1]), processes=1, lockstep=False) as runtime:
     print("ready", flush=True)
     runtime.run(float(sys.argv[2]))
 """

@@ -1,11 +1,12 @@
-"""Arguments of another type, refused at the door by what their annotations say.
+"""Checks of arguments against their annotations.
 
-One rule for all that is public: :func:`checked` reads the annotations of a function or method,
-:func:`check_fields` those of a dataclass.  Ranges and shapes are for who uses the values.
+All public functions use them: :func:`checked` reads the annotations of a function or method,
+:func:`check_fields` those of a dataclass.  Ranges and shapes are checked where values are used.
 """
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -17,9 +18,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base.errors import InvalidInputError
-
-__all__ = ["REMEDIES", "at_least", "check_fields", "checked", "floats"]
+from undertow.base.errors import InvalidInputError, UndertowError, near
 
 #: What to give for a type, by its name.
 REMEDIES = {
@@ -33,6 +32,7 @@ REMEDIES = {
     "Parameter": 'Write [Parameter("mass", 0.5, "kg")]',
     "Objective": "Make one: undertow.MinimumTime(), undertow.MinimumEnergy(), or "
     'undertow.Objective("my cost", lambda v: v.phi**2)',
+    "Constraint": "Write constraints=(*undertow.state_box(phi=1.0), Constraint(...))",
     "Surface": "Design one: undertow.first_surface(mechanism)",
     "ReachingLaw": "Write undertow.ReachingLaw(eta=20.0, layer=0.1)",
     "Budget": "Write undertow.Budget(1024)",
@@ -132,6 +132,58 @@ def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
         )
 
 
+def positive(
+    what: str, value: ArrayLike, remedy: str = "", *, zero: bool = False, infinite: bool = False
+) -> None:
+    """Refuse numbers that are not finite and > 0, NaN always.
+
+    Parameters
+    ----------
+    what
+        What the number is, for the message.
+    value
+        A number or an array.
+    remedy
+        What to do, as a sentence.
+    zero, infinite
+        Allow 0; allow infinity.
+
+    Raises
+    ------
+    InvalidInputError
+        With the value and the limit.
+    """
+    numbers = np.asarray(value, dtype=np.float64)
+    good = (numbers >= 0 if zero else numbers > 0) & (infinite | np.isfinite(numbers))
+    if not good.all():
+        limit = f"{'' if infinite else 'finite and '}{'≥ 0' if zero else '> 0'}"
+        raise InvalidInputError(what, value=value, limit=limit, remedy=remedy)
+
+
+def one_of(
+    what: str,
+    name: str,
+    names: Iterable[str],
+    remedy: str = "",
+    error: type[UndertowError] = InvalidInputError,
+) -> None:
+    """Refuse a name that is none of those known; the message names those that are like it.
+
+    Raises
+    ------
+    InvalidInputError
+        Or another ``error``, with all that are known.
+    """
+    known = list(names)
+    if name not in known:
+        raise error(
+            what,
+            value=repr(name),
+            limit=f"one of {', '.join(known)}",
+            remedy=f"{near(str(name), known)} {remedy}".strip(),
+        )
+
+
 def check_fields(instance: Any, *names: str) -> None:
     """Check the fields of a dataclass, all or those named, against their annotations.
 
@@ -149,7 +201,15 @@ def check_fields(instance: Any, *names: str) -> None:
 
 @cache
 def _hints(of: Any) -> dict[str, Any]:
-    return get_type_hints(of)
+    try:
+        return get_type_hints(of)
+    except NameError:  # a name that is imported for type checkers alone: that one is not checked
+        found: dict[str, Any] = {}
+        for name, hint in of.__annotations__.items():
+            alone = types.SimpleNamespace(__annotations__={name: hint})
+            with contextlib.suppress(NameError):
+                found |= get_type_hints(alone, of.__globals__)
+        return found
 
 
 def _check(what: str, value: object, hint: Any) -> None:
@@ -201,7 +261,13 @@ def _words(hint: Any) -> str:
         return f"a sequence of {_several(inner[0])}"
     if origin is Callable or callable is hint:
         return "a function"
-    plain = {float: "a number", complex: "a number", int: "a whole number", str: "text"}
+    plain = {
+        float: "a number",
+        complex: "a number",
+        int: "a whole number",
+        str: "text",
+        bool: "True or False",
+    }
     name = plain.get(hint) or _name(hint)
     return (
         f"an undertow.{name}"
@@ -233,12 +299,9 @@ def _fits(value: Any, hint: Any) -> bool:
         return _is_sequence(value, inner)
     if hint in (float, int, complex):
         return _is_number(value, hint)
-    if (
-        hint is Any
-        or not isinstance(hint, type)
-        or hint is bool
-        or hint.__module__.startswith("sympy")
-    ):
+    if hint is bool:
+        return isinstance(value, bool | np.bool_)
+    if hint is Any or not isinstance(hint, type) or hint.__module__.startswith("sympy"):
         return True  # expressions are for those who know the symbols
     if getattr(hint, "_is_protocol", False):
         return True

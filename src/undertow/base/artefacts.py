@@ -1,7 +1,7 @@
-"""A folder of results: checked before long work, written whole, never overwritten.
+"""Results as tables, text and files: one look, written whole, never overwritten.
 
 Files of an earlier run under the same names are moved into ``earlier-1``, ``earlier-2``, …
-inside the folder, so no result is lost.
+inside the folder, so no result is lost.  Figures are saved by :mod:`undertow.display.plot`.
 """
 
 from __future__ import annotations
@@ -9,16 +9,20 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 import platform
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from undertow.base.errors import ArtefactError
+from undertow.base.errors import ArtefactError, or_refused
 
-__all__ = ["check_folder", "to_csv", "to_json", "versions", "write_files"]
+if TYPE_CHECKING:  # Rich takes time to import, which a table is worth and an import is not
+    from rich.console import RenderableType
+    from rich.table import Table
 
 PACKAGES = ("undertow", "numpy", "scipy", "sympy", "numba", "matplotlib", "casadi")
 
@@ -51,6 +55,117 @@ def to_csv(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
     return text.getvalue().encode()
 
 
+def manifest(what: str, request: Mapping[str, object], **more: object) -> bytes:
+    """Return as JSON what made a result: the command, its versions and request, and more facts.
+
+    Paths in the request are written as text.
+    """
+    asked = {k: str(v) if isinstance(v, Path) else v for k, v in request.items()}
+    return to_json({"what": what, "versions": versions(), "request": asked, **more})
+
+
+def finite(value: float) -> float | None:
+    """Return a number for a file; ``None``, an empty cell, where it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def number(value: float | None, form: str, missing: str = "—") -> str:
+    """Return a number for people in a format like ``".2f"``; a dash where there is none.
+
+    >>> number(2.345, ".1f"), number(math.inf, ".4g"), number(None, "")
+    ('2.3', '—', '—')
+    """
+    return missing if value is None or not math.isfinite(value) else format(value, form)
+
+
+def table(
+    heads: Sequence[str],
+    rows: Iterable[Sequence[RenderableType]] = (),
+    *,
+    title: str = "",
+    note: str = "",
+    left: Collection[str] = (),
+    whole: Collection[str] = (),
+    ruled: bool = False,
+    **look: Any,
+) -> Table:
+    """Return a table for the terminal, without a frame.
+
+    Parameters
+    ----------
+    heads
+        Of the columns.
+    rows
+        Cells; text is shown as it is, without markup.
+    title, note
+        Above and below the table; the title is bold.
+    left
+        Heads of columns that begin at the left, besides the first; numbers end at the right.
+    whole
+        Heads of columns whose cells are never broken, besides the first.
+    ruled
+        Draw a line below the heads, which are bold then, and dim without it.
+    **look
+        Further properties of :class:`rich.table.Table`.
+    """
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    shape: dict[str, Any] = {"padding": (0, 2, 0, 0), "pad_edge": False, "box": None}
+    if ruled:
+        shape |= {"padding": (0, 1, 0, 0), "show_edge": False, "box": box.SIMPLE_HEAD}
+    else:
+        shape["header_style"] = "dim"
+    if title:
+        shown = f"{title}\n" if ruled else title
+        shape |= {"title": shown, "title_style": "bold", "title_justify": "left"}
+        shape["min_width"] = max(map(len, title.splitlines()))
+    if note:
+        shape |= {"caption": f"\n{note}\n", "caption_justify": "left"}
+    made = Table(**shape | look)
+    for index, head in enumerate(heads):
+        first = index == 0
+        made.add_column(
+            head,
+            justify="left" if first or head in left else "right",
+            no_wrap=first or head in whole,
+        )
+    for row in rows:
+        made.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    return made
+
+
+def facts(rows: Iterable[tuple[RenderableType, RenderableType]], gap: int = 2) -> Table:
+    """Return names, dim, and what they are, as two columns without heads."""
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, gap))
+    grid.add_column(style="dim")
+    grid.add_column()
+    for row in rows:
+        grid.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    return grid
+
+
+def as_text(*shown: RenderableType) -> bytes:
+    """Return what a terminal of 100 columns would show, as plain text."""
+    from rich.console import Console
+
+    text = io.StringIO()
+    Console(width=100, highlight=False, file=text).print(*shown, sep="\n")
+    return text.getvalue().encode()
+
+
+def markdown_table(
+    heads: Sequence[str], rows: Iterable[Sequence[object]], right: Collection[str] = ()
+) -> list[str]:
+    """Return the lines of a Markdown table; ``right`` are the heads of columns of numbers."""
+    rule = ["---:" if head in right else "---" for head in heads]
+    return [f"| {' | '.join(map(str, row))} |" for row in (heads, rule, *rows)]
+
+
 def check_folder(folder: Path) -> None:
     """Make the folder and prove that it can be written, before any long work.
 
@@ -59,17 +174,24 @@ def check_folder(folder: Path) -> None:
     ArtefactError
         When it cannot.
     """
-    try:
+    refusal = "a folder that can be written", "Name another one with --out"
+    with or_refused(f"results folder '{folder}'", *refusal):
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ArtefactError(
-            f"results folder '{folder}'",
-            value=error.strerror or str(error),
-            limit="a folder that can be written",
-            remedy="Name another one with --out",
-        ) from error
+        tempfile.TemporaryFile(dir=folder).close()
+
+
+def write_file(path: Path, content: bytes) -> Path:
+    """Write one file in place of any earlier one, and return where it is.
+
+    Raises
+    ------
+    ArtefactError
+        When it cannot be written.
+    """
+    refusal = "a file that can be written", "Choose another folder or name"
+    with or_refused(f"file '{path}'", *refusal):
+        path.write_bytes(content)
+    return path
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:

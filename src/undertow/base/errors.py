@@ -6,26 +6,13 @@ One root, :class:`UndertowError`; a few conditions below it. Every message reads
 
 from __future__ import annotations
 
+import importlib
 import os
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
-
-__all__ = [
-    "ArtefactError",
-    "CertificateError",
-    "InfeasibleError",
-    "InvalidInputError",
-    "MissingExtraError",
-    "ModelError",
-    "ResourceError",
-    "SingularSurfaceError",
-    "UndertowError",
-    "UnstableSurfaceError",
-    "near",
-    "printable",
-    "raised_at",
-]
+from typing import Any
 
 #: This package: lines of its own are not where a user's file raised.
 PACKAGE = os.path.dirname(os.path.dirname(__file__))
@@ -83,11 +70,25 @@ class InfeasibleError(UndertowError):
 
 
 class CertificateError(UndertowError):
-    """A certificate that says nothing: damaged, of another model, or of an unknown version."""
+    """A certificate that cannot be used: damaged, of another model, or of an unknown version."""
 
 
 class MissingExtraError(UndertowError, ImportError):
     """An optional dependency is not installed."""
+
+
+def require_extra(module: str, extra: str, need: str) -> Any:
+    """Import an optional dependency, or say in one line what needs it and how to install it.
+
+    Raises
+    ------
+    MissingExtraError
+        When it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(need, remedy=f"pip install 'undertow[{extra}]'") from error
 
 
 class ArtefactError(UndertowError, OSError):
@@ -98,8 +99,24 @@ class ResourceError(UndertowError, OSError):
     """The system refuses memory, a thread, a process, a descriptor or room on its disk."""
 
 
+@contextmanager
+def or_refused(what: str, limit: str, remedy: str) -> Iterator[None]:
+    """Turn what the system refuses about a file into one condition.
+
+    Raises
+    ------
+    ArtefactError
+        With the system's own words.
+    """
+    try:
+        yield
+    except OSError as error:
+        said = error.strerror or str(error)
+        raise ArtefactError(what, value=said, limit=limit, remedy=remedy) from error
+
+
 def printable(text: str) -> str:
-    r"""Return a text with "?" for every character that a terminal would obey instead of showing.
+    r"""Return a text with "?" for every control character, which a terminal would obey.
 
     >>> printable("an escape: \x1b[2J")
     'an escape: ?[2J'

@@ -1,4 +1,4 @@
-"""Files that others wrote: opened as data, of a bounded size, and never anything but files."""
+"""Reading of files: plain files only, of a bounded size, checked before they are opened."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from undertow.base.errors import ArtefactError
-
-__all__ = ["check_file", "file_hash", "parse_json", "read_file"]
+from undertow.base.errors import ArtefactError, or_refused
 
 #: Longest whole number in JSON, digits.
 DIGITS = 40
@@ -22,10 +20,10 @@ HASHED = 1 << 24
 
 
 def check_file(path: Path, what: str, *, most: int = 1 << 40, remedy: str = "") -> int:
-    """Return the size of a file, bytes; refuse what is no plain file before it is opened.
+    """Return the size of a plain file, bytes; anything else is refused before it is opened.
 
-    To open a pipe waits for whoever writes to it, to read a device may never end, and to open
-    some does something.
+    Opening a pipe waits for its writer, reading a device may never end, and opening some devices
+    changes their state.
 
     Parameters
     ----------
@@ -87,18 +85,11 @@ def read_file(path: Path, what: str, *, most: int, remedy: str = "") -> bytes:
         For what cannot be read, is no plain file, or too large.
     """
     check_file(path, what, most=most, remedy=remedy)
-    try:
+    with or_refused(f"{what} '{path}'", "a file that can be read", remedy or "Check the path"):
         # What was a file a moment ago may be a pipe now: do not wait for its writer.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
         with open(handle, "rb") as file:
             content = file.read(most + 1)
-    except OSError as error:
-        raise ArtefactError(
-            f"{what} '{path}'",
-            value=error.strerror or str(error),
-            limit="a file that can be read",
-            remedy=remedy or "Check the path",
-        ) from error
     if len(content) > most:
         raise ArtefactError(f"{what} '{path}'", value="still growing", limit=f"at most {most}")
     return content
@@ -116,7 +107,7 @@ def file_hash(path: Path, what: str) -> str:
 
 
 def parse_json(content: str | bytes, *, finite: bool = True) -> Any:
-    """Parse JSON that means one thing: no repeated keys, no numbers without end.
+    """Parse JSON strictly: no repeated keys, no overlong numbers, no deep nesting.
 
     Parameters
     ----------

@@ -12,8 +12,6 @@ import sys
 from contextlib import suppress
 from types import FrameType
 
-__all__ = ["INTERRUPTED", "at_once", "by_exception"]
-
 #: Exit status of a command that Ctrl-C ended, as shells have it.
 INTERRUPTED = 130
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from decimal import ROUND_CEILING, ROUND_DOWN, ROUND_FLOOR, Context, Decimal
 from typing import Any, Literal
 
-__all__ = ["Kind", "Verdict", "inward", "within"]
-
 #: ``proved``: exact or outward-rounded arithmetic over the whole set.  ``sampled``: a
 #: statement about random trials with its confidence.  ``refuted``: a counterexample.
 #: ``undecided``: the method gave up; the witness says where.
@@ -17,7 +15,7 @@ Kind = Literal["proved", "sampled", "refuted", "undecided"]
 
 
 def inward(value: float, digits: int = 4) -> str:
-    """Return a margin or extent as text, rounded towards 0: no more is said than was shown.
+    """Return a margin or extent as text, rounded towards 0, so that it claims no more.
 
     Examples
     --------
@@ -36,7 +34,7 @@ def within(low: float, high: float, digits: int = 6) -> str:
 
 
 def _rounded(value: float, digits: int, rounding: str) -> str:
-    """A decimal of so many digits; what has no more of them in its shortest form stays."""
+    """Round to a number of decimal digits; a value with fewer digits stays as it is."""
     if not math.isfinite(value):
         return f"{value:g}"
     shortest = Decimal(repr(float(value)))

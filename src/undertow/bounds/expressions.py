@@ -13,32 +13,12 @@ from undertow.base import InvalidInputError
 
 __all__ = ["smooth", "translate"]
 
+_SAME = "acos asin atan atan2 cos cosh exp log sign sin sinh tan tanh"
 FUNCTIONS = {
-    sp.Abs: "fabs",
-    sp.acos: "acos",
-    sp.asin: "asin",
-    sp.atan: "atan",
-    sp.atan2: "atan2",
-    sp.cos: "cos",
-    sp.cosh: "cosh",
-    sp.exp: "exp",
-    sp.log: "log",
-    sp.Max: "fmax",
-    sp.Min: "fmin",
-    sp.sign: "sign",
-    sp.sin: "sin",
-    sp.sinh: "sinh",
-    sp.tan: "tan",
-    sp.tanh: "tanh",
-    sp.StrictLessThan: "lt",
-    sp.LessThan: "le",
-    sp.StrictGreaterThan: "gt",
-    sp.GreaterThan: "ge",
-    sp.Equality: "eq",
-    sp.Unequality: "ne",
-    sp.And: "logic_and",
-    sp.Or: "logic_or",
-    sp.Not: "logic_not",
+    **{getattr(sp, name): name for name in _SAME.split()},
+    **{sp.Abs: "fabs", sp.Max: "fmax", sp.Min: "fmin"},
+    **{sp.Lt: "lt", sp.Le: "le", sp.Gt: "gt", sp.Ge: "ge", sp.Eq: "eq", sp.Ne: "ne"},
+    **{sp.And: "logic_and", sp.Or: "logic_or", sp.Not: "logic_not"},
 }
 
 

@@ -12,8 +12,7 @@ import scipy.linalg
 
 from undertow.base import InvalidInputError
 from undertow.closed_loop import Trajectory
-from undertow.law import linearise
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, linearise
 
 __all__ = ["Guess", "built_in", "recorded", "rests", "time_scale"]
 
@@ -53,7 +52,7 @@ def recorded(mechanism: Mechanism, guess: Trajectory | Sequence[Trajectory] | No
         shape = (motion.x.shape[-1], motion.u.shape[-1])
         wanted = (2 * mechanism.n, mechanism.m)
         finite = np.isfinite(motion.x).all() and np.isfinite(motion.u).all()
-        if shape != wanted or not finite or motion.duration <= motion.t[0]:
+        if shape != wanted or not finite or motion.time <= motion.t[0]:
             raise InvalidInputError(
                 f"guess {index}",
                 value=f"{shape[0]} states, {shape[1]} inputs, {len(motion.t)} samples",
@@ -85,12 +84,9 @@ def built_in(
         return np.asarray(x0 * np.exp(-4.0 * t[:, None] / scale))
 
     yield Guess("exponential decay", scale, decay, lambda t: np.zeros((len(t), m)))
-    feedback = _regulated(mechanism, x0, scale, longest)
-    if feedback is not None:
-        yield feedback
-    coasting = _coasting(mechanism, x0, longest)
-    if coasting is not None:
-        yield coasting
+    for found in (_regulated(mechanism, x0, scale, longest), _coasting(mechanism, x0, longest)):
+        if found is not None:
+            yield found
     if swing:
         yield from _swings(mechanism, x0, scale, longest)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InfeasibleError, InvalidInputError, MissingExtraError
+from undertow.base import InfeasibleError, InvalidInputError, at_least, checked, require_extra
 from undertow.bounds.guesses import built_in, recorded
 from undertow.bounds.mesh import hermite
 from undertow.bounds.programme import Programme, Solution
@@ -80,6 +80,13 @@ class Bound:
     iterations: int
     seconds: float
 
+    def __repr__(self) -> str:
+        """Show the cost, the time and how good the number is."""
+        return (
+            f"Bound({self.mechanism.name}, cost {self.cost:.6g}, time {self.time:.4g} s, "
+            f"{self.status}, {self.intervals} intervals, last refinement {self.change:.1e})"
+        )
+
     @property
     def intervals(self) -> int:
         """Number of intervals N of the final mesh."""
@@ -103,15 +110,17 @@ class Bound:
         return hermite(self.mechanism, self.t[::2], self.x[::2], self.u[::2])
 
 
+@checked
 def bound(
     mechanism: Mechanism,
     objective: Objective,
-    x0: ArrayLike,
+    x0: ArrayLike | None = None,
     *,
     horizon: float | None = None,
     intervals: int = 100,
     guess: Trajectory | Sequence[Trajectory] | None = None,
     swing: bool = False,
+    **state: float,
 ) -> Bound:
     """Return the optimal-control bound on an objective from a state.
 
@@ -123,7 +132,8 @@ def bound(
         Stage cost Φ, terminal radius ν and path constraints, which hold at nodes and
         midpoints.
     x0
-        Initial state (q, q̇), (2n,), SI units.
+        Initial state (q, q̇), (2n,), SI units; or give its non-zero entries by name
+        (``phi=0.7``).  With neither, the mechanism's usual ``start``.
     horizon
         Final time, or the longest one, s; the objective's by default.
     intervals
@@ -172,17 +182,19 @@ def bound(
     --------
     >>> import undertow as ut
     >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
-    >>> found = bound(rig, ut.MinimumTime(), rig.state(phi=ut.deg(41)))
+    >>> found = bound(rig, ut.MinimumTime(), phi=ut.deg(41))
     >>> round(found.cost, 2)
     0.51
     """
     began = time.perf_counter()
     objective = objective.on(mechanism)
-    start, longest = _check(mechanism, objective, x0, horizon, intervals)
+    start = mechanism.initial_state(x0, state)
+    longest = _check(mechanism, objective, start, horizon, intervals)
     given = recorded(mechanism, guess)
     if float(np.linalg.norm(start)) <= objective.terminal_radius:
-        return _at_target(mechanism, start, began)
-    programme = Programme(_casadi(), mechanism, objective, start, longest)
+        return _bound(mechanism, _at_target(mechanism, start), began)
+    casadi = require_extra("casadi", "bounds", "optimal-control bounds need CasADi")
+    programme = Programme(casadi, mechanism, objective, start, longest)
     programme.unit = min([1.0, *(c for c in map(programme.spent, given) if c > 0)])
     candidates: list[Solution] = []
     failures: list[str] = []
@@ -212,38 +224,23 @@ def bound(
             f"within {longest:g} s and the input limits",
             remedy="Pass guess= a motion that arrives, try swing=True, or relax the limits",
         )
-    return Bound(
-        mechanism=mechanism,
-        cost=best.cost,
-        time=best.time,
-        status=best.status,
-        message=best.message,
-        guess=best.name,
-        t=best.times,
-        x=best.x,
-        u=best.u,
-        defect=best.defect,
-        violation=best.violation,
-        stationarity=best.stationarity,
-        change=best.change,
-        iterations=iterations,
-        seconds=time.perf_counter() - began,
-    )
+    return _bound(mechanism, replace(best, iterations=iterations), began)
+
+
+def _bound(mechanism: Mechanism, found: Solution, began: float) -> Bound:
+    shared = {f.name: getattr(found, f.name) for f in fields(Bound) if hasattr(found, f.name)}
+    seconds = time.perf_counter() - began
+    return Bound(mechanism, guess=found.name, t=found.times, seconds=seconds, **shared)
 
 
 def _check(
     mechanism: Mechanism,
     objective: Objective,
-    x0: ArrayLike,
+    start: FloatArray,
     horizon: float | None,
     intervals: int,
-) -> tuple[FloatArray, float]:
-    """Refuse what cannot be solved before any long work; return the state and the horizon."""
-    start = mechanism.check_state(x0)
-    if start.ndim != 1:
-        raise InvalidInputError(
-            "initial state", value=f"shape {start.shape}", limit=f"({2 * mechanism.n},), one state"
-        )
+) -> float:
+    """Refuse what cannot be solved before any long work; return the horizon."""
     for coordinate, value in zip(mechanism.coordinates, start, strict=False):
         if not coordinate.low <= value <= coordinate.high:
             raise InvalidInputError(
@@ -254,37 +251,23 @@ def _check(
     longest = objective.horizon if horizon is None else float(horizon)
     if not (math.isfinite(longest) and longest > 0):
         raise InvalidInputError("horizon of the bound", value=longest, limit="finite and > 0 s")
-    if intervals < 10:
-        raise InvalidInputError("intervals of the first mesh", value=intervals, limit="≥ 10")
+    at_least("intervals of the first mesh", intervals, 10)
     objective.check_start(mechanism, start)
-    return start, longest
+    return longest
 
 
-def _at_target(mechanism: Mechanism, start: FloatArray, began: float) -> Bound:
-    return Bound(
-        mechanism=mechanism,
-        cost=0.0,
-        time=0.0,
+def _at_target(mechanism: Mechanism, start: FloatArray) -> Solution:
+    return Solution(
+        name="none needed",
         status="optimal",
         message="the initial state is inside the terminal set",
-        guess="none needed",
-        t=np.zeros(1),
+        cost=0.0,
+        times=np.zeros(1),
         x=start[None],
         u=np.zeros((1, mechanism.m)),
-        defect=0.0,
         violation=0.0,
         stationarity=0.0,
-        change=0.0,
         iterations=0,
-        seconds=time.perf_counter() - began,
+        defect=0.0,
+        change=0.0,
     )
-
-
-def _casadi() -> Any:
-    try:
-        import casadi
-    except ImportError as error:
-        raise MissingExtraError(
-            "optimal-control bounds need CasADi", remedy="pip install 'undertow[bounds]'"
-        ) from error
-    return casadi

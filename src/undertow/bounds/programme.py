@@ -41,6 +41,7 @@ HASTE = 60
 #: Mean of (u_i/u_max,i)² below which a motion could clearly be run faster.
 IDLE = 0.05
 
+_IPOPT = {"print_level": 0, "sb": "yes", "tol": 1e-8}
 _STATUS: dict[str, Literal["optimal", "acceptable"]] = {
     "Solve_Succeeded": "optimal",
     "Solved_To_Acceptable_Level": "acceptable",
@@ -168,15 +169,9 @@ class Programme:
         ca, n, m, count = self.ca, 2 * self.mechanism.n, self.mechanism.m, len(mesh) - 1
         x, c = ca.MX.sym("x", n, count + 1), ca.MX.sym("c", n, count)
         u, end = ca.MX.sym("u", m, count + 1), ca.MX.sym("t_f")
-        defects, costs, margins = self._interval(dynamics).map(count)(
-            ca.DM(mesh[:-1]).T * end,
-            ca.DM(np.diff(mesh)).T * end,
-            x[:, :-1],
-            c,
-            x[:, 1:],
-            u[:, :-1],
-            u[:, 1:],
-        )
+        starts, steps = ca.DM(mesh[:-1]).T * end, ca.DM(np.diff(mesh)).T * end
+        each = (starts, steps, x[:, :-1], c, x[:, 1:], u[:, :-1], u[:, 1:])
+        defects, costs, margins = self._interval(dynamics).map(count)(*each)
         at_start = dynamics(0.0, x[:, 0], u[:, 0])[2]
         reach = 1 - ca.sumsqr(x[:, -1]) / self.radius**2  # of order 1, as the tolerances expect
         return _Transcription(
@@ -211,22 +206,11 @@ class Programme:
         middles = (mesh[:-1] + mesh[1:]) / 2
         first = [guess.x(mesh * end), guess.x(middles * end), guess.u(mesh * end)]
         first[0][0], first[2] = self.x0, np.clip(first[2], -limits, limits)
-        solver = ca.nlpsol(
-            "bound",
-            "ipopt",
-            {"x": written.unknowns, "f": written.cost, "g": constraints},
-            {
-                "print_time": False,
-                "show_eval_warnings": False,
-                "ipopt": {
-                    "print_level": 0,
-                    "sb": "yes",
-                    "tol": 1e-8,
-                    "max_iter": patience,
-                    "obj_scaling_factor": 1.0 / self.unit if dynamics is self.cost else 1.0,
-                },
-            },
-        )
+        scaling = 1.0 / self.unit if dynamics is self.cost else 1.0
+        ipopt = {**_IPOPT, "max_iter": patience, "obj_scaling_factor": scaling}
+        programme = {"x": written.unknowns, "f": written.cost, "g": constraints}
+        options = {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
+        solver = ca.nlpsol("bound", "ipopt", programme, options)
         found = solver(
             x0=np.concatenate([*(part.ravel() for part in first), [end]]),
             lbx=lower,
@@ -300,13 +284,8 @@ class Programme:
             shorter = tried
             while shorter.status is not None and shorter.cost < IDLE * shorter.time:
                 tried = shorter
-                shorter = self.solve(
-                    mesh,
-                    tried.as_guess(pace=2.0),
-                    self.effort,
-                    fixed=tried.time / 2.0,
-                    patience=HASTE,
-                )
+                faster, half = tried.as_guess(pace=2.0), tried.time / 2.0
+                shorter = self.solve(mesh, faster, self.effort, fixed=half, patience=HASTE)
                 spent += shorter.iterations
             if shorter.status is not None:
                 tried = shorter

@@ -2,19 +2,18 @@
 
 from undertow.bring_up.faults import Miswired, miswired, rubbing
 from undertow.bring_up.identify import Estimate, Identification, identify
-from undertow.bring_up.motion import GuardError, Record, doublets, perform
-from undertow.bring_up.rest import rest_state
+from undertow.bring_up.motion import GuardError, MotionRecord, doublets, perform, rest_state
 from undertow.bring_up.wiring import Wiring, explain
-from undertow.bring_up.wizard import BringUp, Finding, bring_up
+from undertow.bring_up.wizard import BringUp, RigFinding, bring_up
 
 __all__ = [
     "BringUp",
     "Estimate",
-    "Finding",
     "GuardError",
     "Identification",
     "Miswired",
-    "Record",
+    "MotionRecord",
+    "RigFinding",
     "Wiring",
     "bring_up",
     "doublets",

@@ -1,4 +1,4 @@
-"""A rig that is wired wrongly, to see whether the wizard finds it."""
+"""The rig that a word of ``undertow bench`` means; wired wrongly, to see whether that is found."""
 
 from __future__ import annotations
 
@@ -10,13 +10,20 @@ import numpy as np
 
 from undertow.base import InvalidInputError
 from undertow.models import FloatArray, Mechanism
-from undertow.plants.bench import Bench
-from undertow.plants.interface import Measurement, Rig
+from undertow.models.importers.python_file import in_a_file
+from undertow.plants import (
+    IdealRig,
+    Measurement,
+    Paced,
+    RealisticRig,
+    Rig,
+    RigWrapper,
+    rig_from_file,
+)
+from undertow.plants.bench import Bench, bench_for
 
-__all__ = ["Miswired", "miswired", "rubbing"]
 
-
-class Miswired:
+class Miswired(RigWrapper):
     """A rig with factors on its inputs and encoders, in another order, and late.
 
     Parameters
@@ -39,7 +46,7 @@ class Miswired:
         delay: float = 0.0,
         order: Sequence[int] = (),
     ) -> None:
-        self.rig, self.period = rig, rig.period
+        super().__init__(rig)
         self._order = list(order) or slice(None)
         self._inputs, self._encoders = np.asarray(inputs), np.asarray(encoders)
         late = round(delay / rig.period)
@@ -56,10 +63,6 @@ class Miswired:
         """Write what the wrong wiring lets through."""
         self._queue.append(np.asarray(u) * self._inputs)
         self.rig.write(self._queue.popleft())
-
-    def close(self) -> None:
-        """Let go of the rig."""
-        self.rig.close()
 
 
 def miswired(rig: Rig, mechanism: Mechanism, faults: Sequence[str]) -> Rig:
@@ -128,3 +131,52 @@ def _read(mechanism: Mechanism, faults: Sequence[str]) -> tuple[dict[str, float]
                 remedy="Write for instance --fault theta=-1",
             )
     return factors, order
+
+
+def rig_named(
+    word: str,
+    belief: Mechanism,
+    truth: Mechanism,
+    rest: FloatArray,
+    faults: Sequence[str] = (),
+    seed: int = 0,
+) -> Rig:
+    """Return a simulated rig, or the driver of one's own, to be closed by who asks.
+
+    Parameters
+    ----------
+    word
+        ``realistic``, ``ideal`` or ``FILE.py:NAME``.
+    belief, truth
+        What is believed of the mechanism, and how a simulated one moves.
+    rest
+        State at rest, (2n,), in which a simulated one begins.
+    faults
+        Friction among them is put into a simulated bench, see :func:`.faults.rubbing`.
+    seed
+        Of a realistic rig.
+
+    Raises
+    ------
+    InvalidInputError
+        For another word, and for faults on a rig of one's own.
+    """
+    if in_a_file(word):
+        if faults:
+            raise InvalidInputError(
+                "--fault",
+                value=", ".join(faults),
+                limit="a simulated rig",
+                remedy="Leave it out: undertow bench finds what is wrong with your own rig",
+            )
+        return Paced(rig_from_file(word, belief))
+    if word == "realistic":
+        return RealisticRig(rubbing(bench_for(truth), faults), rest, seed)
+    if word == "ideal":
+        return IdealRig(truth, rest)
+    raise InvalidInputError(
+        "rig",
+        value=repr(word),
+        limit="realistic, ideal or FILE.py:NAME",
+        remedy="A driver of your own: see examples/serial_rig.py",
+    )

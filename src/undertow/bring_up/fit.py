@@ -3,26 +3,213 @@
 Which parameters are free is decided first: one whose column of the Jacobian is nearly a
 combination of those already chosen is held (subset selection; Brun, Reichert, Künsch, *Water
 Resources Research* 37(4), 2001).
+
+What a reading is worth: an encoder's error is the same for as long as nothing moves by a count,
+unless noise stirs it: a hundred readings at rest are one reading.  Least squares that take them
+for a hundred follow the encoder's zero, and their residuals, small and white, do not show it.  How
+long a motion dwells is known from its prediction, and each reading weighs accordingly.  J is the
+Jacobian of the weighed residuals, (N n, p), its rows coordinate by coordinate.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import scipy.optimize
 import scipy.signal
+import scipy.stats
 
 from undertow.base import InvalidInputError
-from undertow.bring_up.intervals import readings
-from undertow.bring_up.motion import Record
-from undertow.bring_up.predict import Predictor
-from undertow.bring_up.quantities import RATE, START, Quantity, candidates
-from undertow.models import FloatArray, Mechanism
+from undertow.bring_up.motion import MotionRecord, Predictor
+from undertow.models import FloatArray, Mechanism, Parameter
 
-__all__ = ["Fit"]
+#: Encoder zeros from which a predicted motion is counted.
+ZEROS = 200
+
+#: Terms of the Fourier series of a counting error: beyond them less than a hundredth is left.
+TERMS = 60
+
+
+def dwell(y: FloatArray, reach: float) -> FloatArray:
+    """Return how many samples around each one stay within reach of it without a break, (N,)."""
+    length = np.ones(len(y))
+    for way in (1, -1):
+        rows, many = y[::way], length[::way]
+        staying, k = np.arange(len(y)), 1
+        while len(staying):
+            staying = staying[staying + k < len(y)]
+            staying = staying[np.abs(rows[staying + k] - rows[staying]) < reach]
+            many[staying] += 1
+            k += 1
+    return length
+
+
+def readings(
+    predicted: FloatArray, away: FloatArray, sigma: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return noise beyond counting, (n,), and the variance each reading counts with, (N, n).
+
+    The counting error of a place is a sawtooth of it.  With noise s before a counter of step Δ,
+    the part of it that stays is what is left of the sawtooth after smoothing, of variance
+    Σ (Δ/(√2 π k))² exp(−(2π k s/Δ)²); all else is new in every sample (Widrow and Kollár,
+    *Quantization Noise*, Cambridge 2008, ch. 4 and 17).  Readings that share an error count as
+    one: its variance is taken times their number.
+
+    Parameters
+    ----------
+    predicted
+        Motion, (N, n), rad or m.
+    away
+        Measured less predicted, (N, n).
+    sigma
+        Standard deviation of a count, (n,): its size by √12.
+    """
+    step = sigma * math.sqrt(12)
+    shared = np.column_stack(
+        [dwell(row, 0.5 * size) for row, size in zip(predicted.T, step, strict=True)]
+    )
+    centred = away - np.average(away, axis=0, weights=1 / shared)
+    excess = np.average(centred**2, axis=0, weights=1 / shared) - sigma**2
+    noise = np.sqrt(np.maximum(excess, 0.0))
+    k = np.arange(1, TERMS + 1)[:, None]
+    waves = 0.5 * (step / (np.pi * k)) ** 2 * np.exp(-((2 * np.pi * k * noise / step) ** 2))
+    stays = np.minimum(waves.sum(axis=0), sigma**2)
+    return noise, noise**2 + sigma**2 - stays + stays * shared
+
+
+def correlated(J: FloatArray, r: FloatArray, n: int) -> FloatArray:
+    """Return variances that residuals correlated in time make, (p,): Newey and West.
+
+    The diagonal of (JᵀJ)⁻¹ S (JᵀJ)⁻¹, S with Bartlett's weights; rows coordinate by coordinate.
+    How far the weights reach follows from the residuals (Andrews, *Econometrica* 59(3), 1991,
+    (5.3), (6.2) and (6.4)): a reach that white ones do not need only makes S smaller.
+    """
+    inverse = np.linalg.pinv(J.T @ J)
+    S = np.zeros_like(inverse)
+    for part, rest in zip(np.split(J, n), np.split(r, n), strict=True):
+        scores = part * rest[:, None]
+        S += scores.T @ scores
+        power = float(rest @ rest)
+        near = float(rest[1:] @ rest[:-1]) / power if power > 0 else 0.0
+        alpha = 4 * near**2 / max((1 - near**2) ** 2, 1e-12)
+        window = min(math.ceil(1.1447 * (alpha * len(rest)) ** (1 / 3)), len(rest) // 4)
+        for lag in range(1, window):
+            overlap = scores[lag:].T @ scores[:-lag]
+            S += (1 - lag / window) * (overlap + overlap.T)
+    freedom = len(r) / max(1, len(r) - J.shape[1])
+    return np.asarray(np.diag(freedom * inverse @ S @ inverse))
+
+
+def counted(
+    predicted: FloatArray, noise: FloatArray, sigma: FloatArray, variance: FloatArray, J: FloatArray
+) -> FloatArray:
+    """Return variances that the encoders alone would make of a predicted motion, (p,).
+
+    The predicted motion is counted from many zeros, with the noise that there is, and each
+    time the least squares are followed to first order.
+
+    Parameters
+    ----------
+    predicted
+        Motion, (N, n), rad or m.
+    noise, variance
+        See :func:`readings`.
+    sigma
+        Standard deviation of a count, (n,): its size by √12.
+    J
+        See above.
+    """
+    rng = np.random.default_rng(0)
+    step, solve, draws = sigma * math.sqrt(12), np.linalg.pinv(J), []
+    for _ in range(ZEROS):
+        zero = rng.uniform(size=len(step))
+        true = predicted + noise * rng.standard_normal(predicted.shape)
+        error = (np.floor(true / step + zero) - zero + 0.5) * step - predicted
+        error -= np.average(error, axis=0, weights=1 / variance)
+        draws.append(solve @ (error / np.sqrt(variance)).T.ravel())
+    return np.asarray(np.var(draws, axis=0, ddof=1))
+
+
+#: Names of what a record begins with: fitted, not reported.
+START, RATE = "_start", "_rate"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A free quantity: scaled by ``scale``, counted from ``start``."""
+
+    name: str
+    unit: str
+    description: str
+    start: float
+    scale: float
+    nominal: float = math.nan
+    low: float = 0.0
+    high: float = math.inf
+
+
+def _beginning(record: MotionRecord) -> tuple[FloatArray, FloatArray]:
+    """Return where a motion begins about its middle, and how fast, (n,) each: a first guess."""
+    late = min(len(record), 20)
+    slope = np.polyfit(record.t[:late] - record.t[0], record.q[:late], 1)[0]
+    return record.q[:late].mean(axis=0) - record.q.mean(axis=0), slope
+
+
+def candidates(mechanism: Mechanism, coulomb: float, record: MotionRecord) -> list[Quantity]:
+    """Return what may be free, in order of preference.
+
+    Delay, dry friction, damping, inertias and motor constants first; then damping that the
+    model leaves out, factors of the inputs, lengths, and masses last.
+    """
+    levels = (
+        np.abs(np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=float))
+        @ mechanism.input_limits
+    )
+    what = "from a write to its effect in a reading"
+    variables = [Quantity("delay", "s", what, 1e-3, 1e-3, high=0.1)]
+    for i, c in enumerate(mechanism.coordinates):
+        unit = "N m" if c.unit == "rad" else "N"
+        size = 0.01 * float(levels[i]) if i < mechanism.m else coulomb
+        what = f"dry friction of {c.name}"
+        variables.append(Quantity(f"friction_{c.name}", unit, what, 0.3 * size, size))
+        if i < mechanism.m:
+            what = f"what it takes besides to break {c.name} away"
+            variables.append(Quantity(f"breakaway_{c.name}", unit, what, 0.1 * size, size))
+
+    def of(p: Parameter) -> Quantity:
+        scale = abs(p.value) or 1e-3
+        return Quantity(p.name, p.unit, p.description, p.value, scale, p.value, p.low, p.high)
+
+    ranks = {"m": 1, "kg": 2, "m/s²": 3, "": 3}
+    named = [
+        [of(p) for p in mechanism.parameters if ranks.get(p.unit, 0) == rank and p.value]
+        for rank in range(3)
+    ]
+    gains = [
+        Quantity(f"gain_{i.name}", "", f"factor of {i.name}", 1.0, 1.0, 1.0)
+        for i in mechanism.inputs
+    ]
+    dampers = []
+    for c in mechanism.coordinates[mechanism.m :]:
+        unit = "N m s/rad" if c.unit == "rad" else "N s/m"
+        what = f"damping of {c.name} besides the model's"
+        dampers.append(Quantity(f"damping_{c.name}", unit, what, 0.0, coulomb, 0.0))
+    # A passive joint may still swing when the record begins.
+    place, speed = _beginning(record)
+    begins = [
+        Quantity(f"{stem}_{c.name}", c.unit + unit, "", guess[i], scale, 0.0, -np.inf)
+        for i, c in enumerate(mechanism.coordinates)
+        for stem, unit, scale, guess in ((START, "", 0.01, place), (RATE, "/s", 0.05, speed))
+        if i >= mechanism.m
+    ]
+    motors = {str(symbol) for symbol in mechanism.input_matrix.free_symbols}
+    named[0].sort(key=lambda v: v.name not in motors)
+    return [*begins, *variables, *named[0], *dampers, *gains, *named[1], *named[2]]
+
 
 #: Sine of the angle to the chosen columns below which a parameter is held.
 INDEPENDENT = 0.15
@@ -68,7 +255,7 @@ def _tell(progress: Callable[[str, float], None], part: float, what: str) -> Non
 class Fit:
     """Residuals and Jacobians of one record."""
 
-    def __init__(self, mechanism: Mechanism, x0: FloatArray, record: Record) -> None:
+    def __init__(self, mechanism: Mechanism, x0: FloatArray, record: MotionRecord) -> None:
         self.mechanism, self.whole = mechanism, record
         self.predictor = Predictor(mechanism, x0)
         self.look_at(math.inf, 1.0)
@@ -108,7 +295,7 @@ class Fit:
             self.read = np.hstack(smooth)
         begins = int(np.argmax(np.abs(whole.u).max(axis=1) > 0))
         count = begins + math.ceil(part * (len(whole) - begins))
-        self.record = Record(whole.t[:count], whole.q[:count], whole.u[:count])
+        self.record = MotionRecord(whole.t[:count], whole.q[:count], whole.u[:count])
         self.moved = whole.moved[:count]
 
     def _simulate(self, values: Mapping[str, float]) -> FloatArray:
@@ -127,7 +314,7 @@ class Fit:
             rows = np.empty((len(self.record), mechanism.n))
             for first in range(0, len(rows), self.length):
                 few = slice(first, first + self.length)
-                record = Record(self.record.t[few], self.record.q[few], self.record.u[few])
+                record = MotionRecord(self.record.t[few], self.record.q[few], self.record.u[few])
                 states = self.predictor.states(
                     record, parameters, friction, viscous, gain, self.read[first]
                 )

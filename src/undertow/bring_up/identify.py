@@ -8,18 +8,18 @@ ones (output error: noise on the measurement does not bias it; Ljung, *System Id
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.optimize
+import scipy.signal
 import scipy.stats
 
-from undertow.bring_up.fit import Fit
-from undertow.bring_up.intervals import correlated, counted
-from undertow.bring_up.motion import Record
+from undertow.base import Progress, no_progress
+from undertow.bring_up.fit import Fit, correlated, counted
+from undertow.bring_up.motion import MotionRecord
 from undertow.models import FloatArray, Mechanism
-
-__all__ = ["Estimate", "Identification", "identify"]
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,6 @@ class Estimate:
     high: float
     nominal: float = math.nan
     matters: float = math.nan
-
-    @property
-    def covers_nominal(self) -> bool:
-        """Whether the interval holds the model's value."""
-        return self.low <= self.nominal <= self.high
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +88,10 @@ class Identification:
 def identify(
     mechanism: Mechanism,
     x0: FloatArray,
-    record: Record,
+    record: MotionRecord,
     *,
     confidence: float = 0.95,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress = no_progress,
 ) -> Identification:
     """Identify parameters of a mechanism from a motion that begins at rest.
 
@@ -117,7 +112,7 @@ def identify(
     -------
     Identification
         Estimates by least squares in which every reading counts for what it is worth
-        (:func:`undertow.bring_up.intervals.readings`), with confidence intervals from the
+        (:func:`undertow.bring_up.fit.readings`), with confidence intervals from the
         Jacobian, corrected for residuals that are correlated in time (Newey and West,
         *Econometrica* 55(3), 1987), and no narrower than what the counting of the encoders
         alone would make them.
@@ -128,7 +123,7 @@ def identify(
         When nothing moved.
     """
     fit = Fit(mechanism, x0, record)
-    free, z = fit.search(progress or (lambda _what, _fraction: None))
+    free, z = fit.search(progress)
     z = fit.weigh(free, z)
     J, r = fit.jacobian(free, z), fit.residual(free, z)
     predicted = fit.moved - fit.difference(free, z)

@@ -1,18 +1,62 @@
-"""Small safe motions: doublets, played on a rig and recorded."""
+"""Small safe motions from rest: played on a rig and recorded, and as a bench model has them."""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import UndertowError
-from undertow.models import FloatArray
-from undertow.plants.interface import Rig
+from undertow.base import InfeasibleError, UndertowError
+from undertow.models import FloatArray, Mechanism
+from undertow.plants import Rig, control_loop
+from undertow.plants.stepping import stepping
 
-__all__ = ["GuardError", "Record", "doublets", "perform", "ramp"]
+
+def rest_state(mechanism: Mechanism) -> FloatArray:
+    """Return the state, (2n,), in which a mechanism stays with its inputs at zero.
+
+    Angles are tried at 0 and π, slides at 0, for an equilibrium without a growing mode: a
+    pendulum hangs.
+
+    Raises
+    ------
+    InfeasibleError
+        When there is none: a ball rolls off its beam.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rest_state(ut.mechanisms.rotary_pendulum()).round(3).tolist()
+    [0.0, 3.142, 0.0, 0.0]
+    """
+    n = mechanism.n
+    choices = [(0.0, math.pi) if c.unit == "rad" else (0.0,) for c in mechanism.coordinates]
+    for q in itertools.product(*choices):
+        x = np.concatenate([q, np.zeros(n)])
+        inside = all(c.low <= v <= c.high for c, v in zip(mechanism.coordinates, q, strict=True))
+        still = np.abs(mechanism.accelerations(0.0, x, np.zeros(mechanism.m))).max() < 1e-6
+        if inside and still and _growth(mechanism, x) < 1e-3:
+            return x
+    raise InfeasibleError(
+        f"rest of '{mechanism.name}'",
+        value="no equilibrium without a growing mode",
+        limit="one at angles of 0 or π",
+        remedy="Such a mechanism cannot be left alone: hold it, or check it in parts",
+    )
+
+
+def _growth(mechanism: Mechanism, x: FloatArray) -> float:
+    """Largest real part of the eigenvalues at an equilibrium, 1/s, by differences."""
+    n, step = mechanism.n, 1e-5
+    rows = np.vstack([x + step * np.eye(2 * n), x - step * np.eye(2 * n)])
+    a = mechanism.accelerations(0.0, rows, np.zeros(mechanism.m))
+    below = ((a[: 2 * n] - a[2 * n :]) / (2 * step)).T
+    A = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), below])
+    return float(np.linalg.eigvals(A).real.max())
 
 
 class GuardError(UndertowError):
@@ -20,7 +64,7 @@ class GuardError(UndertowError):
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class MotionRecord:
     """What was written to a rig and what it measured.
 
     Attributes
@@ -50,11 +94,8 @@ class Record:
 
 
 def perform(
-    rig: Rig,
-    u: FloatArray,
-    guard: Sequence[float] | FloatArray,
-    until: FloatArray | None = None,
-) -> Record:
+    rig: Rig, u: FloatArray, guard: Sequence[float] | FloatArray, until: FloatArray | None = None
+) -> MotionRecord:
     """Write a sequence of inputs, (N, m), and record what is measured.
 
     Parameters
@@ -69,16 +110,14 @@ def perform(
     GuardError
         When one goes further, or is not measured any more: the inputs are zero then.
     """
-    times, positions = np.empty(len(u)), []
-    home: FloatArray | None = None
+    times: list[float] = []
+    positions: list[FloatArray] = []
+    inputs = iter(u)
     try:
-        for k, inputs in enumerate(u):
-            measured = rig.read()
-            times[k] = measured.t
+        for measured, _ in control_loop(rig, lambda _: next(inputs), len(u)):
+            times.append(measured.t)
             positions.append(np.array(measured.q, dtype=float))
-            if home is None:
-                home = positions[0]
-            away = np.abs(positions[-1] - home)
+            away = np.abs(positions[-1] - positions[0])
             if not (away <= guard).all():
                 worst = int(np.argmax(~(away <= guard)))
                 raise GuardError(
@@ -88,15 +127,14 @@ def perform(
                     remedy="The inputs are zero now: look at the rig before going on",
                 )
             if until is not None and (away > until).any():
-                rig.write(np.zeros_like(inputs))
+                rig.write(np.zeros(u.shape[1]))
                 break
-            rig.write(inputs)
     except BaseException:  # a guard, a driver that fails, Ctrl-C
         with contextlib.suppress(Exception):
             rig.write(np.zeros(u.shape[1]))
         raise
     count = len(positions)
-    return Record(times[:count], np.array(positions), np.array(u[:count]))
+    return MotionRecord(np.array(times), np.array(positions), np.array(u[:count]))
 
 
 def doublets(amplitude: float, widths: Sequence[float], pause: float, period: float) -> FloatArray:
@@ -117,3 +155,86 @@ def doublets(amplitude: float, widths: Sequence[float], pause: float, period: fl
 def ramp(level: float, seconds: float, period: float) -> FloatArray:
     """Return a slow rise from nothing to a level, (N,)."""
     return np.linspace(0.0, level, max(2, round(seconds / period)))
+
+
+#: Integration steps per sample.
+STEPS = 2
+
+#: Speed at which breaking away turns into sliding, rad/s or m/s.
+STRIBECK = 0.05
+
+
+class Predictor:
+    """Plays recorded inputs on a mechanism with joint friction, from rest.
+
+    Parameters
+    ----------
+    mechanism
+        The model; parameters and frictions are given to each call.
+    x0
+        Where it rests, (2n,).
+    """
+
+    def __init__(self, mechanism: Mechanism, x0: FloatArray) -> None:
+        self.mechanism, self.x0 = mechanism, np.array(x0, dtype=float)
+        self._module = stepping(mechanism)
+        n, m = mechanism.n, mechanism.m
+        limits = mechanism.input_limits
+        self._amplifier = np.array([[v, 0.0, 0.0, 0.0] for v in limits])
+        self._gap = np.tile([0.0, 1.0], (m, 1))
+        self._stops = np.tile([-np.inf, np.inf], (n, 1))
+        self._encoder, self._phase, self._noise = np.zeros((n, 2)), np.zeros(n), np.zeros(n)
+        self._pushes, self._delays = np.zeros((0, 1 + n)), np.zeros(2, dtype=np.int64)
+
+    def states(
+        self,
+        record: MotionRecord,
+        parameters: FloatArray,
+        coulomb: FloatArray,
+        viscous: FloatArray,
+        gain: FloatArray,
+        start: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the states at the times of the record, (N, 2n).
+
+        Parameters
+        ----------
+        record
+            Whose times and inputs are played.
+        parameters
+            Of the mechanism, in its order.
+        coulomb
+            Dry friction of the joints, (2, n): when sliding and when breaking away.
+        viscous
+            Damping of the joints besides the mechanism's own, (n,).
+        gain
+            Factor of each input, (m,).
+        start
+            State at the first sample, (2n,); at rest by default.
+        """
+        n, m = self.mechanism.n, self.mechanism.m
+        friction = np.column_stack([*coulomb, np.full(n, STRIBECK), viscous])
+        x = np.array(self.x0 if start is None else start)
+        q, applied = np.zeros(n), np.zeros(m)
+        counts = np.array([0, STEPS, 0], dtype=np.int64)
+        drive, held = np.zeros((3, m)), np.zeros((1, m))
+        past, work = np.tile(x[:n], (1, 1)), np.zeros((8, max(n * n, 2 * n)))
+        rows = np.empty((len(record), 2 * n))
+        self._module.play(
+            record.t, record.u * gain, rows, counts, x, drive, held, past, self._delays,
+            parameters, friction, self._stops, self._amplifier, self._gap, self._encoder,
+            self._phase, self._pushes, self._noise, q, applied, work,
+        )  # fmt: skip
+        return rows
+
+    def positions(self, record: MotionRecord, states: FloatArray, delay: float) -> FloatArray:
+        """Return what is measured a delay late, (N, n): cubic between the samples."""
+        n = self.mechanism.n
+        at = record.t - delay
+        k = np.clip(np.searchsorted(record.t, at, side="right") - 1, 0, len(record) - 2)
+        h = record.t[k + 1] - record.t[k]
+        part = np.clip((at - record.t[k]) / h, 0.0, 1.0)[:, None]
+        a, b = states[k, :n], states[k + 1, :n]
+        da, db = states[k, n:] * h[:, None], states[k + 1, n:] * h[:, None]
+        c = b - a
+        return np.asarray(a + part * (da + part * (3 * c - 2 * da - db + part * (da + db - 2 * c))))

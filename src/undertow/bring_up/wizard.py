@@ -9,16 +9,28 @@ from typing import Literal
 
 import numpy as np
 
+from undertow.base import Progress, no_progress
 from undertow.bring_up.identify import Identification, identify
-from undertow.bring_up.motion import GuardError, Record, doublets, perform, ramp
-from undertow.bring_up.predict import Predictor
-from undertow.bring_up.response import Response, Understood, respond, understand
-from undertow.bring_up.rest import rest_state
-from undertow.bring_up.wiring import KNOWN, Wiring, known_factor
+from undertow.bring_up.motion import (
+    GuardError,
+    MotionRecord,
+    Predictor,
+    doublets,
+    perform,
+    ramp,
+    rest_state,
+)
+from undertow.bring_up.wiring import (
+    KNOWN,
+    Response,
+    Wiring,
+    WiringEstimate,
+    estimate_wiring,
+    known_factor,
+    push_response,
+)
 from undertow.models import FloatArray, Mechanism
-from undertow.plants.interface import Rig
-
-__all__ = ["BringUp", "Finding", "bring_up"]
+from undertow.plants import Rig, control_loop
 
 #: Shares of an input's limit that are tried, from the smallest, until something moves.
 SHARES = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5)
@@ -39,11 +51,11 @@ LOOK = 1.0
 #: Longest wait for rest between two motions, s: a good joint swings for minutes.
 CALM = 240.0
 
-Verdict = Literal["right", "wrong", "unclear"]
+Assessment = Literal["right", "wrong", "unclear"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class RigFinding:
     """What one check found.
 
     Attributes
@@ -62,7 +74,7 @@ class Finding:
     part: str
     measured: str
     expected: str
-    verdict: Verdict
+    verdict: Assessment
     remedy: str = ""
 
 
@@ -82,13 +94,13 @@ class BringUp:
         The motion that they were identified from, in the model's signs and scales.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[RigFinding, ...]
     wiring: Wiring | None
     identification: Identification | None
-    record: Record | None
+    record: MotionRecord | None
 
     @property
-    def wrong(self) -> tuple[Finding, ...]:
+    def wrong(self) -> tuple[RigFinding, ...]:
         """What is wrong."""
         return tuple(f for f in self.findings if f.verdict == "wrong")
 
@@ -100,7 +112,7 @@ def bring_up(
     delay: float | None = None,
     rest: FloatArray | None = None,
     learn: bool = True,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress = no_progress,
 ) -> BringUp:
     """Check a rig against its model by small safe motions from rest.
 
@@ -125,19 +137,18 @@ def bring_up(
         When the model has no rest to start from.
     """
     wizard = _Wizard(rig, belief, rest_state(belief) if rest is None else rest)
-    tell = progress or (lambda _what, _fraction: None)
-    tell("listening", 0.0)
+    progress("listening", 0.0)
     if not wizard.listen():
         return wizard.result()
-    tell("small pushes", 0.1)
+    progress("small pushes", 0.1)
     if not wizard.push():
         return wizard.result()
-    tell("slow ramps", 0.25)
+    progress("slow ramps", 0.25)
     wizard.break_away()
     if not learn:
         return wizard.result()
-    tell("a longer motion", 0.3)
-    wizard.learn(delay, lambda what, part: tell(what, 0.35 + 0.65 * part))
+    progress("a longer motion", 0.3)
+    wizard.learn(delay, lambda what, part: progress(what, 0.35 + 0.65 * part))
     return wizard.result()
 
 
@@ -146,10 +157,10 @@ class _Wizard:
 
     def __init__(self, rig: Rig, belief: Mechanism, rest: FloatArray) -> None:
         self.rig, self.belief, self.rest = rig, belief, rest
-        self.findings: list[Finding] = []
+        self.findings: list[RigFinding] = []
         self.wiring: Wiring | None = None
         self.identification: Identification | None = None
-        self.record: Record | None = None
+        self.record: MotionRecord | None = None
         self.share, self.breakaway = np.full(belief.m, SHARES[0]), np.zeros(belief.m)
         self.predictor = Predictor(belief, rest)
         units = [c.unit for c in belief.coordinates]
@@ -162,26 +173,21 @@ class _Wizard:
         return BringUp(tuple(self.findings), self.wiring, self.identification, self.record)
 
     def _add(
-        self,
-        check: str,
-        part: str,
-        measured: str,
-        expected: str,
-        *,
-        verdict: Verdict,
-        remedy: str = "",
-    ) -> None:
-        self.findings.append(Finding(check, part, measured, expected, verdict, remedy))
+        self, check: str, part: str, measured: str, expected: str, verdict: Assessment | bool,
+        remedy: str,
+    ) -> None:  # fmt: skip
+        """Add a finding; True is right, False wrong, and what is right needs no remedy."""
+        said: Assessment = verdict if isinstance(verdict, str) else "right" if verdict else "wrong"
+        remedy = "" if said == "right" else remedy
+        self.findings.append(RigFinding(check, part, measured, expected, said, remedy))
 
-    def _settle(self, rig: Rig, seconds: float = CALM) -> FloatArray:
+    def _wait_for_rest(self, rig: Rig, seconds: float = CALM) -> FloatArray:
         """Leave the inputs at zero until nothing moves, or for so long: the last motion, (n,)."""
         count = round(LOOK / self.rig.period)
         moved = np.full(self.belief.n, np.inf)
         for _ in range(max(1, round(seconds / LOOK))):
-            rows = []
-            for _ in range(count):
-                rows.append(np.array(rig.read().q, dtype=float))
-                rig.write(np.zeros(self.belief.m))
+            loop = control_loop(rig, lambda _: np.zeros(self.belief.m), count)
+            rows = [np.array(measured.q, dtype=float) for measured, _ in loop]
             moved = np.ptp(np.array(rows), axis=0)
             if not (moved > self.enough / 40).any():
                 break
@@ -193,22 +199,21 @@ class _Wizard:
         """Whether every encoder answers and nothing moves by itself."""
         good = True
         for c, moved, enough in zip(
-            self.belief.coordinates, self._settle(self.rig), self.enough, strict=True
+            self.belief.coordinates, self._wait_for_rest(self.rig), self.enough, strict=True
         ):
             if np.isnan(moved):
                 good = False
                 self._add(
-                    "signal", c.name, "readings that are no numbers", "all numbers",
-                    verdict="wrong", remedy="Look at the encoder's cable and supply",
+                    "signal", c.name, "readings that are no numbers", "all numbers", False,
+                    "Look at the encoder's cable and supply",
                 )  # fmt: skip
                 continue
             calm = bool(moved < enough / 4)
             good &= calm
             self._add(
                 "at rest", c.name, f"moves by {_quantity(moved, c.unit)} in {LOOK:g} s",
-                f"below {_quantity(enough / 4, c.unit)}",
-                verdict="right" if calm else "wrong",
-                remedy="" if calm else "Let it come to rest, with the inputs at zero",
+                f"below {_quantity(enough / 4, c.unit)}", calm,
+                "Let it come to rest, with the inputs at zero",
             )  # fmt: skip
         return good
 
@@ -227,14 +232,14 @@ class _Wizard:
             most = SHARES[-1] * min(1.0, abs(inputs[i]) or 1.0)
             response = Response.none(belief.n)
             for share in [s for s in SHARES if s <= most] or [most]:
-                calm = self._settle(rig)
+                calm = self._wait_for_rest(rig)
                 push = doublets(share * channel.limit, [0.1], 0.15, self.rig.period)
                 try:
                     record = perform(rig, self._one(i, push), 30.0 * self.guard)
                 except GuardError:
                     break
                 self.share[i] = share
-                response = respond(self.predictor, record, i, calm)
+                response = push_response(self.predictor, record, i, calm)
                 far = np.abs(response.moved).max(axis=0) > FAR * self.enough
                 if far[driven].any() or (response.reach > self.guard).any():
                     break
@@ -243,11 +248,11 @@ class _Wizard:
 
     def push(self) -> bool:
         """Whether every input moves something and every encoder follows; else what is wrong."""
-        found = understand(self._respond(self.rig, np.ones(self.belief.m)), self.enough)
+        found = estimate_wiring(self._respond(self.rig, np.ones(self.belief.m)), self.enough)
         if found.wiring.scaled:
             # A wrong scale also misleads about what is motion enough: once more without it.
             behind = found.wiring.corrected(self.rig)
-            again = understand(self._respond(behind, found.wiring.inputs), self.enough)
+            again = estimate_wiring(self._respond(behind, found.wiring.inputs), self.enough)
             found = replace(again, wiring=found.wiring.then(again.wiring))
         self.wiring = found.wiring
         self._tell(found)
@@ -255,19 +260,19 @@ class _Wizard:
         if not whole:
             self._add(
                 "identification", "the rig", "left out", "every input and encoder at work",
-                verdict="unclear", remedy="Mend what is wrong above, and come again",
+                "unclear", "Mend what is wrong above, and come again",
             )  # fmt: skip
         return whole
 
-    def _tell(self, found: Understood) -> None:
+    def _tell(self, found: WiringEstimate) -> None:
         names = [c.name for c in self.belief.coordinates]
         moved = [j for j, k in enumerate(found.wiring.order) if j != k]
         if moved:
             here, there = (", ".join(names[k] for k in row) for row in
                            (moved, [found.wiring.order[j] for j in moved]))  # fmt: skip
             self._add(
-                "encoder order", here, f"come in as {there}", f"as {here}", verdict="wrong",
-                remedy=f"Swap the plugs of {here}, or the readings in the driver",
+                "encoder order", here, f"come in as {there}", f"as {here}", False,
+                f"Swap the plugs of {here}, or the readings in the driver",
             )  # fmt: skip
         parts = [("input", i.name, f, "amplifier and motor") for i, f in
                  zip(self.belief.inputs, found.wiring.inputs, strict=True)]  # fmt: skip
@@ -279,29 +284,25 @@ class _Wizard:
             if factor == 0.0:
                 verb = "moves nothing" if kind == "input" else "does not move"
                 self._add(
-                    kind, name, verb, "moves", verdict="wrong",
-                    remedy=f"Look at cable, supply and enable of the {what}, and for what holds "
-                    "the joint fast",
+                    kind, name, verb, "moves", False,
+                    f"Look at cable, supply and enable of the {what}, and for what holds the joint "
+                    "fast",
                 )  # fmt: skip
                 continue
             if j >= 0 and not reached[j]:
-                self._add(kind, name, "nothing reaches it", "moves", verdict="unclear",
-                          remedy="No input moves it from rest: check it by hand")  # fmt: skip
+                by_hand = "No input moves it from rest: check it by hand"
+                self._add(kind, name, "nothing reaches it", "moves", "unclear", by_hand)
                 continue
             seen = abs(factor) * self._typical(found, index)
-            sign_right, scale_right = factor > 0, abs(factor) == 1.0
-            self._add(f"{kind} sign", name, "as the model" if sign_right else "reversed",
-                      "as the model", verdict="right" if sign_right else "wrong",
-                      remedy="" if sign_right else f"Swap the leads of {name}, or negate it"
-                      " in the driver")  # fmt: skip
-            words = known_factor(factor)
-            remedy = f"Divide by {abs(factor):.3g}" + f": it looks like {words}" * bool(words)
-            self._add(f"{kind} scale", name, f"{abs(seen):.3g} times the model's",
-                      "1 within 45 %",
-                      verdict="right" if scale_right else "wrong",
-                      remedy="" if scale_right else remedy)  # fmt: skip
+            sign = "as the model" if factor > 0 else "reversed"
+            swap = f"Swap the leads of {name}, or negate it in the driver"
+            self._add(f"{kind} sign", name, sign, "as the model", bool(factor > 0), swap)
+            words, times = known_factor(factor), f"{abs(seen):.3g} times the model's"
+            divide = f"Divide by {abs(factor):.3g}" + f": it looks like {words}" * bool(words)
+            right = abs(factor) == 1.0
+            self._add(f"{kind} scale", name, times, "1 within 45 %", bool(right), divide)
 
-    def _typical(self, found: Understood, index: int) -> float:
+    def _typical(self, found: WiringEstimate, index: int) -> float:
         """The measured factor of a part that is within tolerance."""
         m = self.belief.m
         at = (index,) if index < m else (slice(None), index - m)
@@ -320,23 +321,20 @@ class _Wizard:
             levels = []
             most = 0.3 * channel.limit * min(1.0, abs(self.wiring.inputs[i]))
             for side in (1.0, -1.0):
-                self._settle(rig)
+                self._wait_for_rest(rig)
                 rise = ramp(side * most, 1.5, self.rig.period)
                 record = perform(rig, self._one(i, rise), 30 * self.guard, until=until)
                 levels.append(abs(float(record.u[-1, i])))
             up, down = levels
-            self.breakaway[i] = 0.5 * (up + down)
+            self.breakaway[i] = level = 0.5 * (up + down)
             even = max(up, down) < 2.0 * min(up, down) + 0.02 * channel.limit
-            level = 0.5 * (up + down)
             light = level < 0.25 * channel.limit
             self._add(
                 "breakaway", channel.name,
                 f"{up:.3g} to, {down:.3g} {channel.unit} fro",
                 f"alike, below {0.25 * channel.limit:.3g} {channel.unit}",
-                verdict="wrong" if not light else "right" if even else "unclear",
-                remedy=""
-                if even and light
-                else "Look for what rubs, for a cable that pulls, or for a load that still swings",
+                light and ("right" if even else "unclear"),
+                "Look for what rubs, for a cable that pulls, or for a load that still swings",
             )  # fmt: skip
 
     def _modest(self, u: FloatArray) -> FloatArray:
@@ -348,7 +346,7 @@ class _Wizard:
         t = np.arange(len(u), dtype=np.float64) * self.rig.period
         for _ in range(20):
             states = self.predictor.states(
-                Record(t, np.zeros((len(u), n)), u), belief.parameter_values, coulomb,
+                MotionRecord(t, np.zeros((len(u), n)), u), belief.parameter_values, coulomb,
                 np.zeros(n), np.ones(belief.m),
             )  # fmt: skip
             if (np.abs(states[:, :n] - self.rest[:n]).max(axis=0) <= 0.5 * self.guard).all():
@@ -368,15 +366,15 @@ class _Wizard:
             parts.append(self._one(i, doublets(level, widths, 0.3, self.rig.period)))
         u = self._modest(np.vstack(parts))
         for _ in range(6):
-            self._settle(rig)
+            self._wait_for_rest(rig)
             try:
                 self.record = perform(rig, u, self.guard)
                 break
             except GuardError:
                 u = 0.6 * u
         if self.record is None:
-            self._add("identification", "the rig", "went too far", "a small motion",
-                      verdict="unclear", remedy="Give it more room")  # fmt: skip
+            far = "identification", "the rig", "went too far", "a small motion"
+            self._add(*far, "unclear", "Give it more room")
             return
         found = identify(self.belief, self.rest, self.record, progress=progress)
         self.identification = found
@@ -385,17 +383,14 @@ class _Wizard:
             room = max(0.4 * delay, 0.5 * self.rig.period, 2 * (late.high - late.value))
             good = abs(late.value - delay) <= room
             self._add(
-                "delay", "the loop", f"{1e3 * late.value:.2f} ms", f"{1e3 * delay:.2f} ms",
-                verdict="right" if good else "wrong",
-                remedy="" if good else f"It is {late.value / delay:.1f} times what is expected: "
-                "look for a buffer, a filter, a slower bus",
+                "delay", "the loop", f"{1e3 * late.value:.2f} ms", f"{1e3 * delay:.2f} ms", good,
+                f"It is {late.value / delay:.1f} times what is expected: look for a buffer, a "
+                "filter, a slower bus",
             )  # fmt: skip
         for c, part in zip(self.belief.coordinates, found.explained, strict=True):
-            good = part > 0.95
             self._add(
-                "model", c.name, f"explains {100 * part:.2f} %", "95 % or more",
-                verdict="right" if good else "wrong",
-                remedy="" if good else "Something moves that the model does not have",
+                "model", c.name, f"explains {100 * part:.2f} %", "95 % or more", bool(part > 0.95),
+                "Something moves that the model does not have",
             )  # fmt: skip
         # A scale that was only measured by small pushes is not exact enough to blame others.
         sure = all(
@@ -412,8 +407,8 @@ class _Wizard:
                     "parameter", estimate.name,
                     f"{estimate.value:.4g} ± {estimate.high - estimate.value:.2g} {estimate.unit}",
                     f"{estimate.nominal:.4g} {estimate.unit}, within a third",
-                    verdict="right" if good else "wrong" if apart else "unclear",
-                    remedy="" if good else "Weigh and measure it again, or take the identified one",
+                    "right" if good else "wrong" if apart else "unclear",
+                    "Weigh and measure it again, or take the identified one",
                 )  # fmt: skip
 
 

@@ -7,17 +7,29 @@ a function of its arguments, so a recorded run can be replayed.  The runtime, or
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, lru_cache
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, Verdict, at_least, check_fields, checked
+from undertow.base import (
+    InvalidInputError,
+    Verdict,
+    at_least,
+    check_fields,
+    checked,
+    positive,
+    write_file,
+)
 from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event, Trajectory
+from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import (
     Control,
     Plan,
@@ -27,21 +39,13 @@ from undertow.law import (
     check_surface,
     stability_margin,
 )
-from undertow.models import TIME, FloatArray, Mechanism, number_of, require_mechanism
-from undertow.objective import MinimumEnergy, Objective, require_objective
+from undertow.models import TIME, FloatArray, Mechanism, number_of
+from undertow.objective import MinimumEnergy, Objective
 from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Proposal
 
-__all__ = [
-    "Admission",
-    "Cascade",
-    "CascadeState",
-    "Gate",
-    "Run",
-    "Update",
-    "cost_gate",
-    "gate_words",
-    "problem_words",
-]
+if TYPE_CHECKING:
+    from undertow.closed_loop.figures import MotionFigure
+    from undertow.display.sketches import Sketch
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class Admission:
 
 
 #: Relative tolerance of the linear tail in the optimiser's rollouts.
-TAIL = 2e-3
+TAIL_RTOL = 2e-3
 
 #: Largest step times rate of the boundary layer in the optimiser's rollouts.
 RESOLVED = 1.0
@@ -135,7 +139,8 @@ class CascadeState:
 
     ``plan`` is in use since the time ``since``; ``sequence`` is the number of the last
     proposal considered; ``predicted`` is the predicted cost J̃_k at the last decision;
-    ``scale`` that of the first; ``x`` the state at ``since``, empty where it is not known.
+    ``scale`` that of the first; ``x`` the state at ``since``, empty where it is not known;
+    ``estimate`` what is known of the plant's parameters, where the cascade learns them.
     """
 
     plan: Plan
@@ -144,6 +149,7 @@ class CascadeState:
     scale: float = 0.0
     since: float = 0.0
     x: tuple[float, ...] = ()
+    estimate: ParameterEstimate | None = None
 
     @property
     def surface(self) -> Surface:
@@ -208,18 +214,77 @@ class Run:
 
     @property
     def cost(self) -> float:
-        """Total cost of the motion; that of its trajectory is ``trajectory.total``."""
-        return self.trajectory.total
+        """Cost of the whole motion."""
+        return self.trajectory.cost
 
     @property
     def time(self) -> float:
         """Time at which the terminal set was reached, or the run ended, s."""
-        return self.trajectory.duration
+        return self.trajectory.time
 
     @property
     def reached(self) -> bool:
         """Whether the terminal set was reached."""
         return self.trajectory.event == Event.REACHED
+
+    def plot(self) -> MotionFigure:
+        """Return a figure of the motion; dotted lines mark where another surface took over.
+
+        A Matplotlib figure: save it with ``.savefig("motion.png")``; a notebook shows it.
+        """
+        motion = self.trajectory
+        cost = f"{self.cost:.4g} {motion.cost_unit}".strip()
+        end = f"{motion.event.name.lower()} at {self.time:.4g} s"
+        figure = motion.plot(f"{motion.mechanism.name}: {end}, cost {cost}")
+        figure.axes[-1].set_xlabel("time (s); dotted: another surface takes over")
+        for before, update in itertools.pairwise(self.updates):
+            if update.surface != before.surface:
+                for axes in figure.axes:
+                    axes.axvline(update.t, color="black", linewidth=0.7, linestyle=":")
+        return figure
+
+    @checked
+    def animate(
+        self,
+        path: str | Path,
+        *,
+        fps: float = 25.0,
+        longest: float = 8.0,
+        speed: float = 1.0,
+        figure: Sketch | None = None,
+    ) -> Path:
+        """Write a film of the motion, a GIF, and return where it is.
+
+        Parameters
+        ----------
+        path
+            The file, for instance ``"film.gif"``.
+        fps, longest, speed
+            Frames in a second, the longest film, s, and seconds of motion in a second of film.
+        figure
+            What to draw; by default the mechanism's own stick figure, or dials.
+
+        Raises
+        ------
+        ArtefactError
+            When the file cannot be written.
+        InvalidInputError
+            For a frame rate, length or speed that is not positive.
+        """
+        from undertow.display.animation import Film, gif
+        from undertow.display.sketches import Sketch
+
+        if not (figure is None or isinstance(figure, Sketch)):
+            raise InvalidInputError(
+                "figure of an animation", value=repr(figure), limit="an undertow.display Sketch"
+            )
+
+        film = Film.of(self.trajectory, fps=fps, longest=longest, speed=speed, figure=figure)
+        return write_file(Path(path), gif(film))
+
+    def _repr_html_(self) -> str:
+        """Show its end and its motion in a notebook."""
+        return f"<p>{escape(repr(self))}</p>{self.trajectory._repr_html_()}"
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:
@@ -264,7 +329,7 @@ class Cascade:
         Δt between re-optimisations, s.
     first
         First surface, checked; designed by itself by default.
-    step, hold
+    step, zoh_steps
         Runge-Kutta step of the predictions, s, and steps per sample of the inner loop
         (0: continuous), as for :class:`undertow.ClosedLoop`.
     freedom
@@ -285,6 +350,10 @@ class Cascade:
     planner
         Proposes plans in the place of :attr:`optimiser`: one of your own.  The gate judges what
         it proposes as it judges the library's.
+    belief
+        What is not known of the mechanism.  Plans are then judged on an ensemble of plausible
+        plants, and what the motion shows narrows it: law, search and gate go on with the
+        estimated parameters.  Without it the mechanism is taken to be exact.
 
     Raises
     ------
@@ -308,7 +377,7 @@ class Cascade:
     period: float = 0.1
     first: Surface | None = None
     step: float = 0.002
-    hold: int = 0
+    zoh_steps: int = 0
     freedom: DecisionVariables = DecisionVariables()
     cold: Budget | None = None
     warm: Budget | None = None
@@ -316,12 +385,11 @@ class Cascade:
     gate: Gate = cost_gate
     seed: int = 0
     planner: Planner | None = None
+    belief: Belief | None = None
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
         check_fields(self)
-        require_mechanism("mechanism of a cascade", self.mechanism)
-        require_objective(self.objective)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         if TIME in self.mechanism.force.free_symbols:
             raise InvalidInputError(
@@ -330,16 +398,15 @@ class Cascade:
                 limit="autonomous",
                 remedy="Predictions have no clock: give disturbances to plant= alone",
             )
-        if not (math.isfinite(self.resolution) and self.resolution >= 0):
-            raise InvalidInputError(
-                "resolution of the cascade",
-                value=self.resolution,
-                limit="finite and ≥ 0",
-                remedy="1e-4 is a ten-thousandth of the first cost",
-            )
+        positive(
+            "resolution of the cascade",
+            self.resolution,
+            "1e-4 is a ten-thousandth of the first cost",
+            zero=True,
+        )
         at_least("seed", self.seed, 0)
         assert self.loop is not None  # built here, so that its checks run first
-        stride = self.step * max(1, self.hold)
+        stride = self.step * max(1, self.zoh_steps)
         count = number_of("period of the cascade", self.period) / stride
         if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
             raise InvalidInputError(
@@ -357,13 +424,59 @@ class Cascade:
             )
         if self.first is not None:
             check_surface(self.mechanism, self.first)
+        if self.belief is not None and self.belief.mechanism is not self.mechanism:
+            raise InvalidInputError(
+                "belief of the cascade",
+                value=f"about '{self.belief.mechanism.name}', another object",
+                limit=f"about the cascade's own mechanism, '{self.mechanism.name}'",
+                remedy="Write Cascade(rig, belief=Belief.relative(rig, m=0.2))",
+            )
 
     @cached_property
     def loop(self) -> ClosedLoop:
         """The predicted closed loop, belief as plant, integrated to its end: the gate's."""
+        belief = self.belief
         return ClosedLoop(
-            self.mechanism, self.objective, self.reaching, step=self.step, hold=self.hold
+            self.mechanism,
+            self.objective,
+            self.reaching,
+            step=self.step,
+            zoh_steps=self.zoh_steps,
+            ensemble=None if belief is None else belief.ensemble(belief.prior),
         )
+
+    @checked
+    def loop_at(self, state: CascadeState) -> ClosedLoop:
+        """The predicted closed loop with what is known by now of the plant."""
+        return self._loops(state.estimate)
+
+    @cached_property
+    def _loops(self) -> Callable[[ParameterEstimate | None], ClosedLoop]:
+        """The predicted closed loop for an estimate; the latest are kept."""
+        belief, prior = self.belief, self.loop
+
+        @lru_cache(maxsize=2)
+        def loop(estimate: ParameterEstimate | None) -> ClosedLoop:
+            if belief is None or estimate is None or estimate is belief.prior:
+                return prior
+            return prior.believing(belief.believed(estimate), belief.ensemble(estimate))
+
+        return loop
+
+    @checked
+    def learn(self, state: CascadeState, t: ArrayLike, x: ArrayLike, u: ArrayLike) -> CascadeState:
+        """Return the state with what a recorded piece of motion shows of the plant.
+
+        Parameters
+        ----------
+        state
+            Memory of the cascade.
+        t, x, u
+            Times, (N,), s; states, (N, 2n); inputs after the actuator, (N, m).
+        """
+        if self.belief is None or state.estimate is None:
+            return state
+        return replace(state, estimate=self.belief.learn(state.estimate, t, x, u))
 
     @cached_property
     def optimiser(self) -> Optimiser:
@@ -373,7 +486,7 @@ class Cascade:
         what it finds again.  A time of arrival is a matter of milliseconds, and is not searched
         for with longer steps than it is judged with.
         """
-        loop = replace(self.loop, tail=TAIL)
+        loop = replace(self.loop, tail_rtol=TAIL_RTOL)
         end = loop.linear_end
         smooth = end is not None and end.counts_cost and not self.freedom.reaching
         eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
@@ -382,6 +495,17 @@ class Cascade:
         if smooth and slow and even and not any(self.mechanism.disturbance_bounds):
             loop = replace(loop, step=2 * self.step)
         return Optimiser(loop, self.first, self.cold, self.warm, self.freedom, seed=self.seed)
+
+    def _planner(self, state: CascadeState | None = None) -> Planner:
+        """Who is asked for plans: ``planner``, or else the optimiser with what is known by now."""
+        if self.planner is not None:
+            return self.planner
+        optimiser = self.optimiser
+        exact = self.loop if state is None else self.loop_at(state)
+        if exact is self.loop:
+            return optimiser
+        loop = optimiser.loop.believing(exact.mechanism, exact.ensemble)
+        return replace(optimiser, loop=loop, first=optimiser.anchor)
 
     def __repr__(self) -> str:
         """Show what is controlled, for what, and how often it is planned anew."""
@@ -407,13 +531,24 @@ class Cascade:
         InfeasibleError
             When no admissible surface was found.
         """
-        proposal, plan, cost = self._global(self.planner or self.optimiser, x)
-        if not math.isfinite(cost) and self.planner is None:
+        return self._start(self.mechanism.check_state(x))
+
+    def _start(self, x: FloatArray) -> tuple[CascadeState, Proposal]:
+        self.objective.check_start(self.mechanism, x)
+        planner = self._planner()
+        while True:
+            proposal = planner.propose(
+                x, incumbent=None, horizon=None, sequence=0, computed_for=0.0, resolution=0.0
+            ).required(self.loop)
+            plan, horizon = proposal.plan, self.objective.horizon
+            assert plan is not None  # required
+            cost = float(self.loop.batch(x, plan, duration=horizon).score(horizon)[0])
+            cost = cost if cost < INADMISSIBLE else math.inf
+            if math.isfinite(cost) or planner is not self.optimiser:
+                known = None if self.belief is None else self.belief.prior
+                return CascadeState(plan, 0, cost, cost, x=_kept(x), estimate=known), proposal
             # Large steps were too hopeful: small ones throughout.
-            exact = replace(self.optimiser, loop=self.loop)
-            proposal, plan, cost = self._global(exact, x)
-        begun = CascadeState(plan, 0, cost, cost, x=_kept(self.mechanism.check_state(x)))
-        return begun, proposal
+            planner = replace(self.optimiser, loop=self.loop)
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
@@ -422,20 +557,9 @@ class Cascade:
         The admission says what the gate would have said; ``accepted`` is always true.
         """
         current = self.mechanism.check_state(x)
-        asked = self.gate(self.loop, state.plan, state.plan, current, horizon)
+        asked = self.gate(self.loop_at(state), state.plan, state.plan, current, horizon)
         reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
         return Admission(True, reason, state.predicted, asked.verdict)
-
-    def _global(self, planner: Planner, x: ArrayLike) -> tuple[Proposal, Plan, float]:
-        """Return a global optimum, its plan and its cost integrated to the end."""
-        proposal = planner.require(self.mechanism.check_state(x))
-        plan = proposal.plan
-        assert plan is not None  # require() raises otherwise
-        return proposal, plan, self._exact_cost(plan, x, self.objective.horizon)
-
-    def _exact_cost(self, plan: Plan, x: ArrayLike, horizon: float) -> float:
-        score = float(self.loop.batch(x, plan, duration=horizon).score(horizon)[0])
-        return score if score < INADMISSIBLE else math.inf
 
     @checked
     def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
@@ -445,7 +569,8 @@ class Cascade:
         :meth:`start`.
         """
         surface, law = state.plan.at(t - state.since)
-        return SlidingModeLaw(self.mechanism, surface, law or self.reaching)(t, x)
+        believed = self.loop_at(state).mechanism
+        return SlidingModeLaw(believed, surface, law or self.reaching)(t, x)
 
     @checked
     def propose(
@@ -471,9 +596,14 @@ class Cascade:
         The search is warm: it looks near the plan in use.  Where the state has jumped, or the
         target, the optimum may be far from it: :meth:`apply_gate` says so, :meth:`start` finds it.
         """
+        return self._propose(state, x, t, horizon)
+
+    def _propose(
+        self, state: CascadeState, x: ArrayLike, t: float, horizon: float | None
+    ) -> Proposal:
         sequence = state.sequence + 1
         try:
-            return (self.planner or self.optimiser).propose(
+            return self._planner(state).propose(
                 self.mechanism.check_state(x),
                 incumbent=state.at(t),
                 horizon=horizon,
@@ -511,13 +641,14 @@ class Cascade:
         t = proposal.computed_for
         old = state.at(t)
         jump = self._jump(state, t, current)
+        loop = self.loop_at(state)
         state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
         if proposal.plan is None:
-            kept = self.gate(self.loop, old, old, current, span)
+            kept = self.gate(loop, old, old, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
             admission = replace(kept, accepted=False, reason=reason)
             return replace(state, predicted=kept.cost), admission
-        admission = self.gate(self.loop, old, proposal.plan, current, span)
+        admission = self.gate(loop, old, proposal.plan, current, span)
         admission = replace(admission, reason=f"{admission.reason}{jump}")
         plan = proposal.plan if admission.accepted else old
         return replace(state, plan=plan, predicted=admission.cost), admission
@@ -527,34 +658,13 @@ class Cascade:
         if not state.x or not 0 <= t - state.since <= self.objective.horizon:
             return ""
         span = round((t - state.since) / self.step) * self.step
-        ahead = self.loop.batch(state.x, state.plan, duration=span, terminal=0.0).x[0]
+        ahead = self.loop_at(state).batch(state.x, state.plan, duration=span, terminal=0.0).x[0]
         n = self.mechanism.n
         off = float(np.linalg.norm((x - ahead)[:n]))
         moved = float(np.linalg.norm((ahead - state.x)[:n]))
         if not off > JUMP + PART * moved:  # a prediction that ended in NaN says nothing
             return ""
         return f"; the state is {off:.3g} off the plan's prediction: after a jump, call start again"
-
-    def _start_state(self, x0: ArrayLike | None, names: dict[str, float]) -> FloatArray:
-        """Return the initial state that was given one way or the other."""
-        if x0 is None:
-            return self.mechanism.state(**names) if names else self.mechanism.usual_start
-        if names:
-            raise InvalidInputError(
-                "initial state",
-                value=f"x0 and {', '.join(names)}",
-                limit="x0 or names, not both",
-                remedy="Leave one of them out",
-            )
-        x = self.mechanism.check_state(x0)
-        if x.ndim != 1:
-            raise InvalidInputError(
-                "initial state",
-                value=f"shape {x.shape}",
-                limit=f"({2 * self.mechanism.n},)",
-                remedy="A run has one start; ClosedLoop.batch takes many",
-            )
-        return x
 
     # -- simulation -----------------------------------------------------------------------
 
@@ -589,35 +699,34 @@ class Cascade:
         InvalidInputError
             For an unknown state name, a state that is not finite, or no start at all.
         """
-        x = self._start_state(x0, state)
+        x = self.mechanism.initial_state(x0, state)
         total = self.objective.horizon if duration is None else duration
-        if not (math.isfinite(total) and total > 0):
-            raise InvalidInputError(
-                "duration of a run",
-                value=f"{total} s",
-                limit="finite and > 0",
-                remedy="Leave it out for the objective's horizon",
-            )
-        truth = replace(self.loop, plant=plant)
-        memory, proposal = self.start(x)
+        positive("duration of a run, s", total, "Leave it out for the objective's horizon")
+        moving = plant or (None if self.belief is None else self.mechanism)
+        truth = replace(self.loop, plant=moving, ensemble=None)
+        memory, proposal = self._start(x)
         admission = self.first_admission(memory, x, total)
         updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
         pieces: list[Trajectory] = []
         for k in range(math.ceil(total / self.period - 1e-9)):
             t = k * self.period
             if k > 0:
-                proposal = self.propose(memory, x, t, total - t)
+                proposal = self._propose(memory, x, t, total - t)
                 memory, admission = self.apply_gate(memory, proposal, x, total - t)
                 updates.append(
                     Update(
                         t, x, proposal, admission, memory.plan, memory.predicted,
-                        pieces[-1].total,
+                        pieces[-1].cost,
                     )
                 )  # fmt: skip
             pieces.append(
                 truth.simulate(x, memory.plan, duration=min(self.period, total - t), start=t)
             )
             x = pieces[-1].x[-1]
+            if self.belief is not None:
+                motion = pieces[-1]
+                memory = self.learn(memory, motion.t, motion.x, motion.u)
+                truth = truth.believing(self.loop_at(memory).mechanism)
             if progress is not None:
                 progress(t + self.period, total)
             if pieces[-1].event != Event.HORIZON:

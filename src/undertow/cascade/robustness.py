@@ -21,19 +21,8 @@ import scipy.linalg
 from undertow.base import InvalidInputError
 from undertow.cascade.cascade import Admission, cost_gate, gate_words
 from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
-from undertow.law import InnerLoop, Plan, ReachingLaw, Surface, linearise
-from undertow.models import FloatArray, Mechanism
-
-__all__ = [
-    "BenchGate",
-    "DelayGate",
-    "delay_gate",
-    "delay_margin",
-    "derate_actuator",
-    "feedback",
-    "noise_share",
-    "robustness_gate",
-]
+from undertow.law import InnerLoop, Plan, ReachingLaw, Surface
+from undertow.models import FloatArray, Mechanism, linearise
 
 
 def feedback(law: InnerLoop) -> FloatArray:
@@ -159,10 +148,19 @@ def noise_share(
 
 @dataclass(frozen=True)
 class DelayGate:
-    """The gate that :func:`delay_gate` returns; a plain record, so it can be pickled."""
+    """A gate that, besides the cost, asks every surface to bear a delay.
+
+    Parameters
+    ----------
+    least
+        Smallest :func:`delay_margin` that is admitted, s: three times what is known of the
+        delays leaves room for what is not.
+    period
+        Sampling period of the inner loop, s.
+    """
 
     least: float
-    period: float
+    period: float = 0.001
 
     @property
     def words(self) -> str:
@@ -173,16 +171,14 @@ class DelayGate:
         self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float
     ) -> Admission:
         """Decide on a plan, as :func:`undertow.cascade.cost_gate` does."""
-        laws = new.reaching or (loop.reaching,) * len(new.surfaces)
-        if new is not old and new != old:
-            for surface, law in zip(new.surfaces, laws, strict=True):
-                margin = delay_margin(
-                    loop.mechanism, surface, law, period=self.period, longest=self.least
-                )
-                if margin < self.least - 1e-9:
-                    wanted = f"wanted {1e3 * self.least:.3g} ms"
-                    reason = f"bears {1e3 * margin:.3g} ms of delay, {wanted}"
-                    return _refused(loop, old, x, horizon, reason)
+        limits = {"period": self.period, "longest": self.least}
+        laws = zip(new.surfaces, new.laws(loop.reaching), strict=True)
+        for surface, law in () if new == old else laws:
+            margin = delay_margin(loop.mechanism, surface, law, **limits)
+            if margin < self.least - 1e-9:
+                wanted = f"wanted {1e3 * self.least:.3g} ms"
+                reason = f"bears {1e3 * margin:.3g} ms of delay, {wanted}"
+                return _refused(loop, old, x, horizon, reason)
         return cost_gate(loop, old, new, x, horizon)
 
 
@@ -192,24 +188,10 @@ def _refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: st
     return Admission(False, why, score if score < INADMISSIBLE else math.inf)
 
 
-def delay_gate(least: float, period: float = 0.001) -> DelayGate:
-    """Return a gate that, besides the cost, asks every surface to bear a delay.
-
-    Parameters
-    ----------
-    least
-        Smallest :func:`delay_margin` that is admitted, s: three times what is known of the
-        delays leaves room for what is not.
-    period
-        Sampling period of the inner loop, s.
-    """
-    return DelayGate(least, period)
-
-
 def derate_actuator(loop: ClosedLoop, reserve: float) -> ClosedLoop:
     """Return the loop on a plant whose input limits are lower by a part of them."""
     limits = (1.0 - reserve) * loop.mechanism.input_limits
-    return replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail=0.0)
+    return replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail_rtol=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +216,7 @@ class BenchGate:
     def _noisiest(self, loop: ClosedLoop, plan: Plan) -> float:
         if self.covariance is None:
             return 0.0
-        laws = plan.reaching or (loop.reaching,) * len(plan.surfaces)
-        pairs = zip(plan.surfaces, laws, strict=True)
+        pairs = zip(plan.surfaces, plan.laws(loop.reaching), strict=True)
         return max(noise_share(loop.mechanism, s, self.covariance, law) for s, law in pairs)
 
     def __call__(
@@ -285,4 +266,4 @@ def robustness_gate(
     noise
         Largest :func:`noise_share` that this may cause, where the old plan causes less.
     """
-    return BenchGate(delay_gate(least, period), reserve, seconds, covariance, noise)
+    return BenchGate(DelayGate(least, period), reserve, seconds, covariance, noise)

@@ -1,4 +1,4 @@
-"""Whether a mechanism of one's own is sound, and what is compiled is the model that was meant."""
+"""Checks of a mechanism: of its model, and of the compiled code against that model."""
 
 from undertow.checks.check import MechanismReport, check_mechanism
 

@@ -1,4 +1,4 @@
-"""Whether compiled code computes what the symbols say: each compared with exact values.
+"""Comparison of compiled code with exact values of the same expressions.
 
 Every function here runs one compiled thing at states of all kinds (near the target, at the edge
 of the boundary layer, where the input saturates, far away) and returns its worst
@@ -17,12 +17,12 @@ import numpy as np
 import sympy as sp
 
 from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
-from undertow.certify.surface.ellipsoid import ClosedLoopProgram
 from undertow.checks.exact import ExactLaw, ExactModel, Number, evaluate, runge_kutta
-from undertow.closed_loop import RolloutBuffers, Shape, UncheckedLoop, compile_loop
+from undertow.closed_loop import ClosedLoop, RolloutBuffers, compile_loop
 from undertow.law import InnerLoop, ReachingLaw, SlidingModeLaw, Surface, coupling, first_surface
 from undertow.models import TIME, FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Objective
+from undertow.proofs import ClosedLoopProgram
 
 __all__ = [
     "LIMIT", "SETTLED", "Difference", "Subject", "inner_loop", "kernel", "numpy_functions",
@@ -255,12 +255,9 @@ def kernel(subject: Subject, *, sampled: bool = False) -> Iterator[Difference]:
     mechanism, model = subject.mechanism, subject.model
     n, m, objective = mechanism.n, mechanism.m, MinimumEnergy().on(mechanism)
     kernels = compile_loop(mechanism, None, objective, subject.reaching.switching, sampled=sampled)
-    at_target = coupling(mechanism, np.zeros(n))
-    constraints = len(objective.path_margins(mechanism))
-    buffers = RolloutBuffers(
-        Shape(n, m, constraints, at_target, None, sampled), len(subject.states), 1
-    )
-    buffers.fill(subject.states, subject.surface.vector, subject.reaching.vector(m))
+    loop = ClosedLoop(mechanism, objective, subject.reaching, step=STEP, zoh_steps=int(sampled))
+    buffers = RolloutBuffers(loop, len(subject.states), 1)
+    buffers.fill(subject.states, subject.surface.vector)
     record = np.zeros((buffers.padded, 1, 2 * n + 2 * m + 2))
     parameters, limits = mechanism.parameter_values, mechanism.input_limits
     kernels.rollout(
@@ -310,18 +307,16 @@ def settling(subject: Subject, objective: Objective | None = None) -> Iterator[D
         return
     reference = _Written(mechanism, surface, subject.reaching, goal)
     # Small steps come first, as long as s changes fast: they are judged by :func:`kernel`.
-    loop = UncheckedLoop(mechanism, goal, subject.reaching, step=STEP, tail=FINE)
-    if not loop._hands_over:
+    loop = ClosedLoop(mechanism, goal, subject.reaching, step=STEP, tail_rtol=FINE)
+    if not loop.takes_large_steps:
         return
     starts = np.array([reference.calm(x) for x in subject.motions()])
     radius = 0.1 * float(np.linalg.norm(starts, axis=1).min())
     ends = [reference.motion(x, LONGEST, radius) for x in starts]
     half = 0.5 * min(time for _, time, _ in ends)
     for what, span in (("arrival", LONGEST), ("on the way", half)):
-        buffers = RolloutBuffers(loop._shape, len(starts), 1)
-        buffers.fill(starts, surface.vector[None, None], loop._numbers.law)
         steps = round(span / loop.step)
-        found = loop._launch(buffers, np.zeros(1, dtype=np.int64), steps, terminal=radius)
+        found = loop.batch(starts, surface, duration=span, terminal=radius)
         for k, x in enumerate(starts):
             late = float(found.time[k])
             state, time, cost = ends[k]

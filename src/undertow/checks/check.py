@@ -8,14 +8,14 @@ surface of this kind can stabilise the target, and the condition says why and wh
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
 
 from undertow.base import ModelError, at_least, checked
-from undertow.law import controllability, has_linear_model, linearise
-from undertow.models import FloatArray, Mechanism, require_mechanism
+from undertow.models import FloatArray, Mechanism, controllability, has_linear_model, linearise
 from undertow.models.importers.equations import nearest_equilibrium
 from undertow.symbolic import Tape, compile_numpy
 
@@ -143,7 +143,6 @@ def check_mechanism(
     >>> check_mechanism(ut.mechanisms.rotary_pendulum()).passed
     True
     """
-    require_mechanism("mechanism to check", mechanism)
     at_least("samples", samples, 1, "64 are usual")
     at_least("seed", seed, 0)
     rng = np.random.default_rng(seed)
@@ -171,6 +170,21 @@ def check_mechanism(
     return report
 
 
+def _small(name: str, value: float, of: str, remedy: str) -> Check:
+    """Check that a number is zero but for rounding, relative to what ``of`` says."""
+    return Check(name, value <= _ROUNDING, value, f"≤ {_ROUNDING:g} {of}", remedy)
+
+
+def _large(name: str, value: float, of: str, remedy: str) -> Check:
+    """Check that a number is above what rounding makes of zero."""
+    return Check(name, value > _ROUNDING, value, f"> {_ROUNDING:g} {of}".rstrip(), remedy)
+
+
+def _none(name: str, found: Collection[object], remedy: str) -> Check:
+    """Check that nothing of a kind was found."""
+    return Check(name, not found, float(len(found)), "0", remedy)
+
+
 def _solvable(checks: tuple[Check, ...]) -> bool:
     """Whether M is what every later formula takes it for."""
     return all(check.passed for check in checks if check.name.startswith("M "))
@@ -181,27 +195,27 @@ def _agreement(mechanism: Mechanism, seed: int) -> tuple[Check, ...]:
     # Not wanted by a mere ``import undertow``: the programmes of the proofs come with it.
     from undertow.checks.agreement import LIMIT, QUICK, Subject, numpy_functions, worst
 
-    found = []
     try:
         subject = Subject(mechanism, count=1, seed=seed)
     except ModelError as error:
         return (Check("compiled code as the symbols", False, math.nan, "comparable", str(error)),)
-    for what, compare in QUICK.items():
-        if subject.autonomous or compare is numpy_functions:
-            difference = worst(compare(subject))
-            if difference is None:
-                continue
-            found.append(
-                Check(
-                    f"{what} as the symbols in 50 digits, largest difference",
-                    difference.relative <= LIMIT,
-                    difference.relative,
-                    f"≤ {LIMIT:g}, relative to what rounding scales with",
-                    f"{difference}. Empty the cache of generated code ($UNDERTOW_CACHE, or "
-                    "undertow in the user's); report it if it stays",
-                )
-            )
-    return tuple(found)
+    differences = {
+        what: worst(compare(subject))
+        for what, compare in QUICK.items()
+        if subject.autonomous or compare is numpy_functions
+    }
+    return tuple(
+        Check(
+            f"{what} as the symbols in 50 digits, largest difference",
+            difference.relative <= LIMIT,
+            difference.relative,
+            f"≤ {LIMIT:g}, relative to what rounding scales with",
+            f"{difference}. Empty the cache of generated code ($UNDERTOW_CACHE, or "
+            "undertow in the user's); report it if it stays",
+        )
+        for what, difference in differences.items()
+        if difference is not None
+    )
 
 
 def _positions(mechanism: Mechanism, rng: np.random.Generator, samples: int) -> FloatArray:
@@ -224,25 +238,21 @@ def _inertia(mechanism: Mechanism, q: FloatArray) -> tuple[Check, ...]:
         smallest = float(np.linalg.eigvalsh(scaled)[..., 0].min())
     foreign = mechanism.mass_matrix.free_symbols - {*mechanism.q, *mechanism.parameter_symbols}
     return (
-        Check(
+        _small(
             "M is symmetric, |M − Mᵀ|",
-            gap <= _ROUNDING,
             gap,
-            f"≤ {_ROUNDING:g} of |M|",
+            "of |M|",
             "Multiply the equations so that they are Lagrange's, row by row",
         ),
-        Check(
+        _large(
             "M > 0, smallest eigenvalue with M scaled to unit diagonal",
-            smallest > _ROUNDING,
             smallest,
-            f"> {_ROUNDING:g}",
+            "",
             "Check masses, lengths and inertias: a massless link has no M > 0",
         ),
-        Check(
+        _none(
             "M depends on q only, other symbols",
-            not foreign,
-            float(len(foreign)),
-            "0",
+            foreign,
             "Move what depends on velocity or time to f",
         ),
     )
@@ -255,7 +265,8 @@ def _forces(mechanism: Mechanism, q: FloatArray, qd: FloatArray) -> tuple[Check,
     back = mechanism.f(np.hstack([q, -qd]))
     rest = mechanism.f(np.hstack([q, np.zeros_like(q)]))
     even, odd = (ahead + back) / 2, (ahead - back) / 2
-    slopes = _mass_slopes(mechanism, q)
+    entries = [sp.diff(M, symbol) for M in mechanism.mass_matrix for symbol in mechanism.q]
+    slopes = _evaluated(mechanism, entries, q).astype(float).reshape(len(q), n, n, n)
     # c_i = Σ_jk (∂M_ij/∂q_k − ½ ∂M_jk/∂q_i) q̇_j q̇_k
     c = np.einsum("sijk,sj,sk->si", slopes, qd, qd)
     c -= np.einsum("sjki,sj,sk->si", slopes, qd, qd) / 2
@@ -263,59 +274,44 @@ def _forces(mechanism: Mechanism, q: FloatArray, qd: FloatArray) -> tuple[Check,
     coriolis = float(np.abs(even - rest + c).max()) / scale
     power = np.einsum("si,si->s", odd, qd)
     checks = [
-        Check(
+        _small(
             "velocity-dependent forces are Lagrange's (Ṁ − 2C skew-symmetric), residual",
-            coriolis <= _ROUNDING,
             coriolis,
-            f"≤ {_ROUNDING:g} of |f|",
+            "of |f|",
             "Derive f from M: Mechanism.from_energies does it",
         )
     ]
     if mechanism.potential is not None:
         gradient = [sp.diff(mechanism.potential, symbol) for symbol in mechanism.q]
-        tape = Tape()
-        run = compile_numpy(
-            tape, [*mechanism.q, *mechanism.parameter_symbols], tape.let_all(gradient)
-        )
-        values = run(*q.T, *mechanism.parameter_values)
-        dV = np.stack([np.broadcast_to(v, len(q)) for v in values], axis=-1)
+        dV = _evaluated(mechanism, gradient, q)
         balance = float(np.abs(rest + dV).max()) / scale
         checks.append(
-            Check(
+            _small(
                 "forces at rest are −∂V/∂q, so the rate of energy is the power, residual",
-                balance <= _ROUNDING,
                 balance,
-                f"≤ {_ROUNDING:g} of |f|",
+                "of |f|",
                 "Correct the potential, or leave it out",
             )
         )
     worst = float(power.max()) / (scale * float(np.abs(qd).max()) * n)
     checks.append(
-        Check(
+        _small(
             "damping takes energy, largest power",
-            worst <= _ROUNDING,
             worst,
-            f"≤ {_ROUNDING:g} of |f| |q̇|",
+            "of |f| |q̇|",
             "Check the signs of damping: forces odd in q̇ must oppose the motion",
         )
     )
     return tuple(checks)
 
 
-def _mass_slopes(mechanism: Mechanism, q: FloatArray) -> FloatArray:
-    """∂M_ij/∂q_k at the positions, (samples, n, n, n)."""
-    n = mechanism.n
-    slopes = [
-        sp.diff(mechanism.mass_matrix[i, j], symbol)
-        for i in range(n)
-        for j in range(n)
-        for symbol in mechanism.q
-    ]
+def _evaluated(mechanism: Mechanism, expressions: Iterable[sp.Expr], q: FloatArray) -> FloatArray:
+    """Return expressions in q at the positions, (samples, expressions)."""
     tape = Tape()
-    run = compile_numpy(tape, [*mechanism.q, *mechanism.parameter_symbols], tape.let_all(slopes))
+    inputs = [*mechanism.q, *mechanism.parameter_symbols]
+    run = compile_numpy(tape, inputs, tape.let_all(expressions))
     values = run(*q.T, *mechanism.parameter_values)
-    stacked = np.stack([np.broadcast_to(v, len(q)) for v in values], axis=-1)
-    return stacked.astype(float).reshape(len(q), n, n, n)
+    return np.stack([np.broadcast_to(v, len(q)) for v in values], axis=-1)
 
 
 def _inverse(
@@ -330,11 +326,10 @@ def _inverse(
     wanted = np.hstack([u @ B.T, np.zeros((len(q), mechanism.n - mechanism.m))])
     scale = float(np.abs(forces).max() + np.abs(mechanism.f(x)).max()) or 1.0
     residual = float(np.abs(forces - wanted).max()) / scale
-    return Check(
+    return _small(
         "inverse dynamics undo forward dynamics, residual",
-        residual <= _ROUNDING,
         residual,
-        f"≤ {_ROUNDING:g} of |f|",
+        "of |f|",
         "M is close to singular somewhere: check masses and inertias",
     )
 
@@ -347,18 +342,15 @@ def _target(mechanism: Mechanism) -> tuple[Check, ...]:
     B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=np.float64)
     effort = float(np.max(np.abs(np.linalg.solve(B, rest[:m])) / mechanism.input_limits))
     checks = [
-        Check(
+        _none(
             "target x = 0 lies within the ranges, coordinates outside",
-            not outside,
-            float(len(outside)),
-            "0",
+            outside,
             f"Range of {', '.join(outside)}: move the target, or correct the range",
         ),
-        Check(
+        _small(
             "target x = 0 is an equilibrium of the free coordinates, |f_u(0, 0)|",
-            left <= _ROUNDING,
             left,
-            f"≤ {_ROUNDING:g} N m or N",
+            "N m or N",
             ("" if left <= _ROUNDING else f"{nearest_equilibrium(mechanism)}. ")
             + "Shift the coordinates: undertow.models.importers.find_equilibrium and move_target",
         ),
@@ -419,28 +411,22 @@ def _equilibria(mechanism: Mechanism) -> Check:
 
 def _controllable(mechanism: Mechanism) -> Check:
     distance = controllability(mechanism)
-    return Check(
+    return _large(
         "linearisation at the target is controllable, Hautus distance",
-        distance > _ROUNDING,
         distance,
-        f"> {_ROUNDING:g} of ‖[A, B]‖",
+        "of ‖[A, B]‖",
         "No linear surface stabilises it: choose another target or actuate another joint",
     )
 
 
 def _limits(mechanism: Mechanism) -> tuple[Check, ...]:
-    """Say which inputs nothing limits: no failure, but minimum time has no meaning with them."""
+    """Report inputs without a limit: they are allowed, but minimum time needs limits."""
     endless = [i.name for i in mechanism.inputs if math.isinf(i.limit)]
     if not endless:
         return ()
-    return (
-        Check(
-            f"inputs without a limit ({', '.join(endless)}), number",
-            True,
-            float(len(endless)),
-            "0 of a real actuator: with_input_limit gives one",
-        ),
-    )
+    name = f"inputs without a limit ({', '.join(endless)}), number"
+    limit = "0 of a real actuator: with_input_limit gives one"
+    return (Check(name, True, float(len(endless)), limit),)
 
 
 def _start(mechanism: Mechanism) -> tuple[Check, ...]:
@@ -454,11 +440,9 @@ def _start(mechanism: Mechanism) -> tuple[Check, ...]:
     ]
     size = float(np.linalg.norm(x))
     return (
-        Check(
+        _none(
             "start state lies within the ranges, coordinates outside",
-            not outside,
-            float(len(outside)),
-            "0",
+            outside,
             f"Range of {', '.join(outside)}: start closer, or correct the range",
         ),
         Check(

@@ -35,7 +35,7 @@ _NEAR = 1e-11
 
 
 class Number:
-    """A value to 50 digits, and its size: what its rounding in float64 is relative to.
+    """A value to 50 digits, and its size, to which its rounding error in float64 is relative.
 
     Parameters
     ----------

@@ -8,23 +8,20 @@ from typing import Annotated
 
 import typer
 
-from undertow.base import INTERRUPTED, at_once, by_exception
-from undertow.base import artefacts as results
-from undertow.cli import bench, certify, control, export, library, paper, rig, trials
-from undertow.cli.terminal import app, examples
+from undertow.base import INTERRUPTED, at_once, by_exception, versions
+from undertow.cli import (  # noqa: F401 - each registers its commands
+    bench,
+    certify,
+    control,
+    export,
+    library,
+    paper,
+    rig,
+    trials,
+)
+from undertow.cli.terminal import app, folded
 
-__all__ = [
-    "app",
-    "bench",
-    "certify",
-    "control",
-    "export",
-    "library",
-    "main",
-    "paper",
-    "rig",
-    "trials",
-]
+__all__ = ["app", "main"]
 
 #: The order in which help shows the commands: look, steer, prove, run, repeat.
 _ORDER = (
@@ -39,14 +36,12 @@ app.registered_commands.sort(
 
 def _version(asked: bool) -> None:
     if asked:
-        typer.echo(f"undertow {results.versions()['undertow'] or '(from source)'}")
+        typer.echo(f"undertow {versions()['undertow'] or '(from source)'}")
         raise typer.Exit
 
 
 @app.callback(
-    epilog=examples(
-        "undertow simulate rotary_pendulum --start phi=35deg", "undertow simulate --help"
-    )
+    epilog=folded("undertow simulate rotary_pendulum --start phi=35deg", "undertow simulate --help")
 )
 def root(
     version: Annotated[
@@ -65,6 +60,9 @@ def main() -> None:
         sys.stderr.write("interrupted\n")
         raise SystemExit(INTERRUPTED) from None
     finally:  # what is left is to end
+        # An interrupt that met somebody's exec() stays marked as unhandled, and Python would end
+        # by the signal instead of the exit status.  The next exec unmarks it.
+        exec("")
         with suppress(OSError, ValueError):  # a pipe may be closed
             sys.stdout.flush()
         at_once()

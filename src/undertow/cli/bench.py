@@ -2,61 +2,47 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import typer
+from rich.console import Group
 
-from undertow.base import InvalidInputError
-from undertow.base import artefacts as results
-from undertow.cli import parsing as inputs
+from undertow.cli import options
+from undertow.cli.options import folder, option
+from undertow.cli.parsing import mechanism_named
 from undertow.cli.terminal import (
-    AnyName,
-    Seed,
-    Settings,
-    app,
-    examples,
+    check_out,
+    command,
+    enter_pressed,
+    exit_unless,
     progress_bar,
-    reports_errors,
-    say,
-    terminal,
+    show,
     write,
 )
 from undertow.models.importers.python_file import in_a_file
 
-if TYPE_CHECKING:
-    from undertow.models import FloatArray, Mechanism
-    from undertow.plants import Rig
 
-__all__ = ["bench"]
-
-
-@app.command(
-    epilog=examples(
-        "undertow bench rotary_pendulum",
-        "undertow bench rotary_pendulum --fault voltage=-1",
-        "undertow bench cart_pendulum --fault x=4 --fault delay=0.001 --out findings",
-        "undertow bench my_arm.py:arm --rig my_driver.py:Driver --out findings",
-    )
+@command(
+    "undertow bench rotary_pendulum",
+    "undertow bench rotary_pendulum --fault voltage=-1",
+    "undertow bench cart_pendulum --fault x=4 --fault delay=0.001 --out findings",
+    "undertow bench my_arm.py:arm --rig my_driver.py:Driver --out findings",
 )
-@reports_errors
 def bench(
-    name: AnyName,
+    name: options.AnyName,
     rig: Annotated[
         str,
-        typer.Option(
-            help="realistic: a simulated bench with all its flaws. ideal: the model. "
-            "FILE.py:NAME: a driver of your own, a class or a function that makes one.",
+        option(
+            "realistic: a simulated bench with friction, delay and encoders. ideal: the "
+            "model. FILE.py:NAME: your own driver, a class or a function that returns one.",
             metavar="RIG",
         ),
     ] = "realistic",
     fault: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Wire the simulated rig wrongly: INPUT=-1 or COORDINATE=2 (a factor, 0: cable "
+        option(
+            "Wire the simulated rig wrongly: INPUT=-1 or COORDINATE=2 (a factor, 0: cable "
             "off), swap=COORDINATE,COORDINATE (two encoders), delay=0.0015 (s, besides its own), "
             "friction=12 (times its own). Repeatable.",
             metavar="PART=VALUE",
@@ -64,39 +50,34 @@ def bench(
     ] = None,
     delay: Annotated[
         float | None,
-        typer.Option(
-            help="From a write to its effect in a reading, s, as it should be. Default: the "
-            "simulated rig's own; of your own rig it is measured, and compared with nothing."
+        option(
+            "From a write to its effect in a reading, s, as it should be. Default: the "
+            "simulated rig's own. On your own rig, without this option, the delay is measured "
+            "and not judged."
         ),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Signs, scales and breakaway alone.")
-    ] = False,
-    setting: Settings = None,
-    seed: Seed = 0,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for findings.json, motion.csv and motion.png.")
-    ] = None,
+    quick: Annotated[bool, option("--quick", "Check signs, scales and breakaway only.")] = False,
+    setting: options.Settings = None,
+    seed: options.Seed = 0,
+    out: Annotated[Path | None, folder("findings.json, motion.csv and motion.png")] = None,
 ) -> None:
     """Check a rig at rest by small safe motions: signs, scales, delay, friction, parameters."""
     from undertow.bring_up import bring_up, miswired, rest_state
-    from undertow.bring_up.report import files, findings_table, parameter_table, summary
+    from undertow.bring_up.faults import rig_named
     from undertow.plants import RealisticRig
+    from undertow.studies.rigs.bring_up import files, findings_table, parameter_table, summary
 
     request = {"mechanism": name, "rig": rig, "fault": fault or [], "seed": seed}
-    belief = inputs.mechanism_named(name, setting or ())
-    rest = rest_state(belief)
-    if out is not None:
-        results.check_folder(out)
-    faults = fault or ()
-    plant = _plant(rig, name, belief, rest, faults, seed)
+    belief = mechanism_named(name, setting)
+    rest, faults = rest_state(belief), fault or ()
+    check_out(out)
+    plant = rig_named(rig, belief, mechanism_named(name), rest, faults, seed)
     if delay is None and isinstance(plant, RealisticRig):
         delay = plant.bench.timing.input_delay + plant.bench.timing.measurement_delay
     with closing(plant):
-        if in_a_file(rig) and sys.stdin.isatty():
-            say(terminal(), f"Ready. Let {name} come to rest, hands off, and press Enter.")
-            if not sys.stdin.readline():  # the end of the input is no yes
-                raise typer.Exit(1)
+        if in_a_file(rig):
+            ready = f"Ready. Let {name} come to rest, hands off, and press Enter."
+            exit_unless(enter_pressed(ready))
         with progress_bar() as progress:
             found = bring_up(
                 miswired(plant, belief, faults),
@@ -106,44 +87,9 @@ def bench(
                 learn=not quick,
                 progress=progress,
             )
-    console = terminal()
-    console.print(findings_table(found))
+    written = write(out, lambda: files(request, belief, rest, found))
+    show(findings_table(found))
     if found.identification is not None:
-        console.print()
-        console.print(parameter_table(found.identification))
-    for line in summary(found):
-        say(console, line)
-    if out is not None:
-        say(console, write(out, files(request, belief, rest, found)))
-    if found.wrong:
-        raise typer.Exit(1)
-
-
-def _plant(
-    rig: str, name: str, belief: Mechanism, rest: FloatArray, faults: Sequence[str], seed: int
-) -> Rig:
-    """Return the rig that was asked for; a simulated one moves as the library's numbers say."""
-    from undertow.bring_up import rubbing
-    from undertow.plants import IdealRig, Paced, RealisticRig, rig_from_file
-    from undertow.plants.presets import bench_for
-
-    if in_a_file(rig):
-        if faults:
-            raise InvalidInputError(
-                "--fault",
-                value=", ".join(faults),
-                limit="a simulated rig",
-                remedy="What is wrong with your own is for the wizard to find",
-            )
-        return Paced(rig_from_file(rig, belief))
-    model = inputs.mechanism_named(name)
-    if rig == "realistic":
-        return RealisticRig(rubbing(bench_for(model), faults), rest, seed)
-    if rig == "ideal":
-        return IdealRig(model, rest)
-    raise InvalidInputError(
-        "rig",
-        value=repr(rig),
-        limit="realistic, ideal or FILE.py:NAME",
-        remedy="A driver of your own: see examples/serial_rig.py",
-    )
+        show(Group("", parameter_table(found.identification)))
+    show(*summary(found), *written)
+    exit_unless(not found.wrong)

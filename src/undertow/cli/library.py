@@ -9,106 +9,74 @@ from typing import Annotated
 import typer
 
 from undertow.base import INTERRUPTED
-from undertow.base import artefacts as results
 from undertow.cascade import problem_words
-from undertow.cli import parsing as inputs
-from undertow.cli.terminal import (
-    AnyName,
-    Box,
-    Goal,
-    HardInput,
-    Horizon,
-    Limits,
-    Seed,
-    Settings,
-    Start,
-    app,
-    examples,
-    progress_bar,
-    reports_errors,
-    say,
-    terminal,
-    write,
-)
+from undertow.cli import options
+from undertow.cli.options import folder, option
+from undertow.cli.parsing import mechanism_named, parse_task
+from undertow.cli.terminal import check_out, command, progress_bar, show, terminal, write
 from undertow.closed_loop import ClosedLoop
 from undertow.mechanisms import LIBRARY
 from undertow.optimiser import Optimiser
 
-__all__ = ["animate", "derive", "list_mechanisms", "survey"]
 
-
-@app.command(
-    name="mechanisms", epilog=examples("undertow mechanisms", "undertow mechanisms --out pictures")
-)
-@reports_errors
+@command("undertow mechanisms", "undertow mechanisms --out pictures", name="mechanisms")
 def list_mechanisms(
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for mechanisms.png: all on their way to the target.")
-    ] = None,
+    out: Annotated[Path | None, folder("mechanisms.png: all on their way to the target")] = None,
 ) -> None:
     """List the mechanisms of the library; with --out also draw them."""
-    from undertow.cli import commands
+    from undertow.studies.gallery import library_picture, mechanism_table
 
-    console = terminal()
-    console.width = max(console.width, 80)
-    console.print(commands.mechanism_table(console.width))
+    width = max(terminal().width, 80)
+    show(mechanism_table(width), least=width)
     if out is not None:
-        results.check_folder(out)
+        check_out(out)
         with progress_bar() as progress:
-            picture = commands.library_picture(progress)
-        say(console, write(out, {"mechanisms.png": picture}))
+            written = write(out, lambda: {"mechanisms.png": library_picture(progress)})
+        show(*written)
 
 
-@app.command(
-    epilog=examples(
-        "undertow derive rotary_pendulum",
-        "undertow derive gantry_crane --latex",
-        "undertow derive acrobot --out formulas",
-        "undertow derive model.py:bar",
-    )
+@command(
+    "undertow derive rotary_pendulum",
+    "undertow derive gantry_crane --latex",
+    "undertow derive acrobot --out formulas",
+    "undertow derive model.py:bar",
 )
-@reports_errors
 def derive(
-    name: AnyName,
-    latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX document.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for NAME.txt and NAME.tex.")] = None,
+    name: options.AnyName,
+    latex: Annotated[bool, option("--latex", "Print a LaTeX document.")] = False,
+    out: Annotated[Path | None, folder("NAME.txt and NAME.tex")] = None,
 ) -> None:
     """Show M, f, the law and the surface conditions as formulas."""
-    from undertow.cli import commands
+    from undertow.display.derivation import derivation
 
-    mechanism = inputs.mechanism_named(name)
-    if out is not None:
-        results.check_folder(out)
-    files = commands.derivation_files(mechanism)
-    typer.echo(files[f"{mechanism.name}.{'tex' if latex else 'txt'}"].decode(), nl=False)
-    if out is not None:
-        say(terminal(stderr=True), write(out, files))
+    mechanism = mechanism_named(name)
+    check_out(out)
+    formulas = derivation(mechanism)
+    written = write(out, formulas.files)
+    typer.echo(formulas.latex() if latex else formulas.text(), nl=False)
+    show(*written, stderr=True)
 
 
-@app.command(
-    epilog=examples(
-        "undertow survey",
-        "undertow survey --out survey",
-        "undertow survey --only acrobot --only tora --no-bounds",
-    )
+@command(
+    "undertow survey",
+    "undertow survey --out survey",
+    "undertow survey --only acrobot --only tora --no-bounds",
 )
-@reports_errors
 def survey(
     only: Annotated[
-        list[str] | None, typer.Option(help="This mechanism alone. Repeatable.", metavar="NAME")
+        list[str] | None, option("Survey this mechanism only. Repeatable.", metavar="NAME")
     ] = None,
-    objective: Goal = "energy",
-    horizon: Horizon = 60.0,
-    bounds: Annotated[bool, typer.Option(help="Also the optimal-control bounds.")] = True,
-    seed: Seed = 0,
-    out: Annotated[Path | None, typer.Option(help="Folder for survey.csv and survey.md.")] = None,
+    objective: options.Goal = "energy",
+    horizon: options.Horizon = 60.0,
+    bounds: Annotated[bool, option("Also compute the optimal-control bounds.")] = True,
+    seed: options.Seed = 0,
+    out: Annotated[Path | None, folder("survey.csv and survey.md")] = None,
 ) -> None:
     """Bring every mechanism to its target: cost, time, bound and gap of all in one table."""
+    request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.studies import survey as study
 
-    request = {k: v for k, v in locals().items() if k not in ("study", "out")}
-    if out is not None:
-        results.check_folder(out)
+    check_out(out)
     began, entries, interrupted = time.perf_counter(), list[study.Entry](), False
     names = only or list(LIBRARY)
     try:
@@ -126,70 +94,52 @@ def survey(
         if not entries:
             raise
         interrupted = True
-    console = terminal()
-    written = None if out is None else write(out, study.files(request, entries))
-    console.width = max(console.width, 80)
-    console.print(study.table(entries), crop=False, soft_wrap=True)
-    for line in study.summary(entries):
-        say(console, line)
-    if written is not None:
-        say(console, written)
-    say(console, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
+    written = write(out, lambda: study.files(request, entries))
+    show(study.survey_table(entries), least=80, crop=False, soft_wrap=True)
+    took = f"Took {time.perf_counter() - began:.0f} s, seed {seed}."
+    show(*study.summary(entries), *written, took)
     if interrupted:
         left = " ".join(f"--only {name}" for name in names[len(entries) :])
         words = f"interrupted: {len(entries)} of {len(names)} are done. The others: undertow survey"
-        say(terminal(stderr=True), f"{words} {left} and the options as before")
+        show(f"{words} {left} and the options as before", stderr=True)
         raise typer.Exit(INTERRUPTED)
 
 
-@app.command(
-    epilog=examples(
-        "undertow animate acrobot",
-        "undertow animate rotary_pendulum --start phi=40deg --speed 0.5 --out film",
-    )
+@command(
+    "undertow animate acrobot",
+    "undertow animate rotary_pendulum --start phi=40deg --speed 0.5 --out film",
 )
-@reports_errors
 def animate(
-    name: AnyName,
-    start: Start = None,
-    objective: Goal = "energy",
-    setting: Settings = None,
-    limit: Limits = None,
-    hard_input: HardInput = False,
-    box: Box = None,
-    horizon: Horizon = 20.0,
-    speed: Annotated[float, typer.Option(help="Motion seconds in a second of film.")] = 1.0,
-    longest: Annotated[
-        float, typer.Option(help="Longest film, s: a longer motion is cut there, and it is said.")
-    ] = 8.0,
-    seed: Seed = 0,
-    out: Annotated[Path, typer.Option(help="Folder for NAME.gif and NAME.png.")] = Path("."),
+    name: options.AnyName,
+    start: options.Start = None,
+    objective: options.Goal = "energy",
+    setting: options.Settings = None,
+    limit: options.Limits = None,
+    hard_input: options.HardInput = False,
+    box: options.Box = None,
+    horizon: options.Horizon = 20.0,
+    speed: Annotated[float, option("Seconds of motion per second of film.")] = 1.0,
+    longest: Annotated[float, option("Longest film, s. A longer motion is cut there.")] = 8.0,
+    seed: options.Seed = 0,
+    out: Annotated[Path, folder("NAME.gif and NAME.png")] = Path("."),
 ) -> None:
     """Draw a mechanism on its way to the target, under a surface optimised at the start.
 
     The film ends where the motion has settled, or after 8 s, see --longest.
     """
-    from undertow.cli import commands
-    from undertow.cli.report import ended
-    from undertow.display.animation import Film
+    request = {k: v for k, v in locals().items() if k != "out"}
+    from undertow.display.animation import Film, film_files
+    from undertow.studies.motion import ended
 
-    request = {k: v for k, v in locals().items() if k not in ("commands", "out", "Film", "ended")}
-    belief = inputs.mechanism_named(name, setting or (), limit or ())
-    x0 = inputs.parse_start(belief, start or ())
-    goal = inputs.objective_named(objective, belief, horizon, box or (), hard_input=hard_input)
-    goal.check_start(belief, x0)
-    results.check_folder(out)
+    belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
+    check_out(out)
     loop = ClosedLoop(belief, goal)
     plan = Optimiser(loop, seed=seed).require(x0).plan
     assert plan is not None  # require() raises otherwise
     motion = loop.simulate(x0, plan)
     film = Film.of(motion, speed=speed, longest=longest)
-    files = commands.animation_files(request, film)
-    console = terminal()
-    say(console, problem_words(belief, goal))
-    say(console, f"{ended(motion, goal)}. Shown: {film.span}")
-    if " of " in film.span:
-        say(
-            console, "The film is cut: --longest shows more of the motion, --speed all of it faster"
-        )
-    say(console, write(out, files))
+    written = write(out, lambda: film_files(film, request))
+    show(problem_words(belief, goal), f"{ended(motion, goal)}. Shown: {film.span}")
+    if film.cut:
+        show("The film is cut: --longest shows more of the motion, --speed all of it faster")
+    show(*written)

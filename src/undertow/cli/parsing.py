@@ -13,20 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from undertow.base import InvalidInputError, near
+from undertow.base import InvalidInputError, one_of
 from undertow.law import Surface
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, normal_name
 from undertow.objective import Constraint, Objective, check_travel, objective_for, state_box
-
-__all__ = [
-    "mechanism_named",
-    "objective_named",
-    "parse_box",
-    "parse_start",
-    "parse_surface",
-    "parse_values",
-]
 
 #: Unit as typed to (SI unit of the coordinate, whether it is a rate, factor to SI).
 UNITS: Mapping[str, tuple[str, bool, float]] = {
@@ -42,7 +33,7 @@ _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)
 
 
 def mechanism_named(
-    name: str, settings: Sequence[str] = (), limits: Sequence[str] = ()
+    name: str, settings: Sequence[str] | None = (), limits: Sequence[str] | None = ()
 ) -> Mechanism:
     """Return a mechanism of the library or of a file, its parameters and input limits replaced.
 
@@ -68,14 +59,9 @@ def mechanism_named(
         return mechanism
     new = parse_values(limits, "limit of input", "voltage=10")
     known = {channel.name: channel.limit for channel in mechanism.inputs}
+    example = f"Write for instance --limit {next(iter(known))}=10"
     for channel in new:
-        if channel not in known:
-            raise InvalidInputError(
-                f"input of '{mechanism.name}'",
-                value=repr(channel),
-                limit=f"one of {', '.join(known)}",
-                remedy=near(channel, known) or f"Write for instance --limit {next(iter(known))}=10",
-            )
+        one_of(f"input of '{mechanism.name}'", channel, known, example)
     return mechanism.with_input_limit(*(known | new).values())
 
 
@@ -83,7 +69,7 @@ def objective_named(
     name: str,
     mechanism: Mechanism,
     horizon: float,
-    box: Sequence[str] = (),
+    box: Sequence[str] | None = (),
     *,
     hard_input: bool = False,
 ) -> Objective:
@@ -113,6 +99,32 @@ def objective_named(
     )
 
 
+def parse_task(
+    name: str,
+    start: Sequence[str] | None,
+    objective: str,
+    horizon: float,
+    settings: Sequence[str] | None = (),
+    limits: Sequence[str] | None = (),
+    box: Sequence[str] | None = (),
+    hard_input: bool = False,
+) -> tuple[Mechanism, FloatArray, Objective]:
+    """Return what is to be steered, from where, and what is minimised on the way.
+
+    See :func:`mechanism_named`, :func:`parse_start` and :func:`objective_named`.
+
+    Raises
+    ------
+    InvalidInputError
+        For a word that means nothing, and a start that the objective does not admit.
+    """
+    mechanism = mechanism_named(name, settings, limits)
+    x0 = parse_start(mechanism, start)
+    goal = objective_named(objective, mechanism, horizon, box, hard_input=hard_input)
+    goal.check_start(mechanism, x0)
+    return mechanism, x0, goal
+
+
 def _split(word: str, example: str) -> tuple[str, str]:
     name, equals, value = word.partition("=")
     if not (equals and name.strip() and value.strip()):
@@ -120,10 +132,10 @@ def _split(word: str, example: str) -> tuple[str, str]:
     return normal_name(name.strip()), value.strip()
 
 
-def _pairs(words: Sequence[str], example: str) -> dict[str, str]:
+def _pairs(words: Sequence[str] | None, example: str) -> dict[str, str]:
     """Split ``name=value`` words, refusing a name that is given twice."""
     found: dict[str, str] = {}
-    for word in words:
+    for word in words or ():
         name, value = _split(word, example)
         if name in found:
             raise InvalidInputError(
@@ -144,7 +156,7 @@ def _number(text: str, what: str) -> float:
 
 
 def parse_values(
-    words: Sequence[str], what: str = "parameter", example: str = "d_e=0.025"
+    words: Sequence[str] | None, what: str = "parameter", example: str = "d_e=0.025"
 ) -> dict[str, float]:
     """Read ``name=value`` words, SI units.
 
@@ -157,13 +169,7 @@ def parse_values(
 
 def _units_of(mechanism: Mechanism, name: str, what: str) -> tuple[str, ...]:
     """Return the units in which a state may be typed."""
-    if name not in mechanism.state_names:
-        raise InvalidInputError(
-            f"{what} of '{mechanism.name}'",
-            value=repr(name),
-            limit=f"one of {', '.join(mechanism.state_names)}",
-            remedy=near(name, mechanism.state_names),
-        )
+    one_of(f"{what} of '{mechanism.name}'", name, mechanism.state_names)
     index = mechanism.state_names.index(name)
     kind = (mechanism.coordinates[index % mechanism.n].unit, index >= mechanism.n)
     return tuple(unit for unit, (si, rate, _) in UNITS.items() if (si, rate) == kind)
@@ -191,7 +197,7 @@ def _quantity(text: str, units: Sequence[str], what: str, example: str) -> tuple
     return float(match[1]), match[2]
 
 
-def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
+def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray:
     """Read an initial state from ``name=value`` words with units; the rest is zero.
 
     Parameters
@@ -226,7 +232,7 @@ def parse_start(mechanism: Mechanism, words: Sequence[str]) -> FloatArray:
     return mechanism.state(**values)
 
 
-def parse_box(mechanism: Mechanism, words: Sequence[str]) -> tuple[Constraint, ...]:
+def parse_box(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[Constraint, ...]:
     """Read bounds on states from words with units.
 
     Parameters
@@ -294,10 +300,7 @@ def parse_surface(mechanism: Mechanism, text: str) -> Surface:
     example = "lambda_a=-0.5 alpha_u=5 lambda_u=10"
     for word in text.split():
         name, value = _split(word, example)
-        if name not in names:
-            raise InvalidInputError(
-                "surface block", value=repr(name), limit=f"one of {', '.join(names)}"
-            )
+        one_of("surface block", name, names)
         rows = [
             [_number(v, f"surface block {name}") for v in r.split(",")] for r in value.split(";")
         ]

@@ -1,50 +1,33 @@
-"""What all commands share: the application, options, errors in one line, progress, writing."""
+"""What all commands share: the application, errors in one line, progress, showing, writing."""
 
 from __future__ import annotations
 
-import io
 import re
+import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec
 
 import typer
+from rich import progress as bars
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
-from undertow.base import INTERRUPTED, InvalidInputError, UndertowError, near, printable
-from undertow.base import artefacts as results
-
-__all__ = [
-    "AnyName",
-    "Application",
-    "Box",
-    "Goal",
-    "HardInput",
-    "Horizon",
-    "Limits",
-    "Name",
-    "Seed",
-    "Settings",
-    "Start",
-    "app",
-    "as_text",
-    "check_control",
-    "examples",
-    "progress_bar",
-    "reports_errors",
-    "say",
-    "terminal",
-    "write",
-]
+from undertow.base import (
+    INTERRUPTED,
+    Progress,
+    UndertowError,
+    check_folder,
+    near,
+    printable,
+    write_files,
+)
 
 P = ParamSpec("P")
-R = TypeVar("R")
 
 #: Longest line of an example, so that a terminal of 80 columns need not break it.
 WIDTH = 76
@@ -99,17 +82,38 @@ class Application(typer.Typer):
             **options,
         )
 
-    def command(self, name: str | None = None, **options: Any) -> Any:
-        """Register a command, as :class:`typer.Typer` does."""
-        return super().command(name, cls=_Command, **options)
-
 
 app = Application()
 
 
-def examples(*lines: str) -> str:
-    """Return the examples that end a command's help, folded so that they can be pasted."""
-    return "\n".join(map(_folded, lines))
+def command(
+    *examples: str, name: str | None = None, of: Application = app
+) -> Callable[[Callable[P, None]], Callable[P, None]]:
+    """Register a command: its errors are one line, its help ends with the examples.
+
+    Parameters
+    ----------
+    *examples
+        Lines as they are typed.
+    name
+        Of the command; the function's by default.
+    of
+        The group that it belongs to.
+    """
+
+    def register(function: Callable[P, None]) -> Callable[P, None]:
+        end = folded(*examples)
+        made: Callable[P, None] = of.command(name, cls=_Command, epilog=end)(
+            _with_errors_in_one_line(function)
+        )
+        return made
+
+    return register
+
+
+def folded(*examples: str) -> str:
+    """Return the examples that end a help, broken so that they can be pasted."""
+    return "\n".join(map(_folded, examples))
 
 
 def _folded(line: str) -> str:
@@ -122,16 +126,16 @@ def _folded(line: str) -> str:
     return " \\\n".join(rows)
 
 
-def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
+def _with_errors_in_one_line(function: Callable[P, None]) -> Callable[P, None]:
     """Turn a condition into one line on standard error; exit 2 for bad input, else 1.
 
     Ctrl-C is one line as well, exit 130.
     """
 
-    @wraps(command)
-    def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
+    @wraps(function)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
-            return command(*args, **kwargs)
+            function(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
             raise typer.Exit(INTERRUPTED) from None
@@ -150,7 +154,7 @@ def terminal(*, stderr: bool = False) -> Console:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None]]:
+def progress_bar() -> Iterator[Progress]:
     """Show progress on standard error: a bar on a terminal, else a line for each new part."""
     console = terminal(stderr=True)
     if not console.is_terminal:
@@ -159,103 +163,57 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
         def tell(what: str, _fraction: float) -> None:
             if what not in told:
                 told.append(what)
-                say(console, f"… {what}")
+                show(f"… {what}", stderr=True)
 
         yield tell
         return
-    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True) as bar:
+    columns = (
+        bars.SpinnerColumn(),
+        bars.BarColumn(),
+        bars.TimeElapsedColumn(),
+        bars.TextColumn("{task.description}"),
+    )
+    with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
 
 
-def write(out: Path, files: Mapping[str, bytes]) -> str:
-    """Write results and return the sentence that says where they went."""
-    earlier = results.write_files(out, files)
-    moved = "" if earlier is None else f"Earlier results moved to {earlier}/\n"
-    return f"{moved}Written to {out}/: {', '.join(files)}"
+def show(*parts: RenderableType, stderr: bool = False, least: int = 0, **how: Any) -> None:
+    """Print tables, at least so many columns wide, and text without markup or folding."""
+    console = terminal(stderr=stderr)
+    console.width = max(console.width, least)
+    for part in parts:
+        if isinstance(part, str):
+            console.print(part, soft_wrap=True, markup=False)
+        else:
+            console.print(part, **how)
 
 
-def check_control(word: str | None, words: Sequence[str]) -> None:
-    """Refuse a word of ``--control`` that is none of these."""
-    if word is None or word in words:
-        return
-    both = "The surface that is designed is 'designed', the first optimum is 'one-time'"
-    raise InvalidInputError(
-        "--control",
-        value=repr(word),
-        limit=f"one of {', '.join(words)}",
-        remedy=both if word == "first" else near(word, words),
-    )
+def check_out(out: Path | None) -> None:
+    """Refuse a folder that cannot be written, before any long work."""
+    if out is not None:
+        check_folder(out)
 
 
-def as_text(shown: RenderableType) -> bytes:
-    """Return what a terminal of 100 columns would show, as plain text."""
-    console = Console(width=100, highlight=False, file=io.StringIO())
-    console.print(shown)
-    return str(console.file.getvalue()).encode()  # type: ignore[attr-defined]
+def write(out: Path | None, files: Callable[[], Mapping[str, bytes]]) -> tuple[str, ...]:
+    """Write results where a folder is named, and return the sentences that say where they are."""
+    if out is None:
+        return ()
+    made = files()
+    earlier = write_files(out, made)
+    written = f"Written to {out}/: {', '.join(made)}"
+    return (written,) if earlier is None else (f"Earlier results moved to {earlier}/", written)
 
 
-def say(console: Console, text: str) -> None:
-    """Print plain text, as long as it is."""
-    console.print(text, soft_wrap=True, markup=False)
+def enter_pressed(question: str) -> bool:
+    """Ask for Enter; false at the end of the input, true where there is no terminal to ask."""
+    if not sys.stdin.isatty():
+        return True
+    show(question)
+    return bool(sys.stdin.readline())
 
 
-Name = Annotated[str, typer.Argument(help="Mechanism, e.g. rotary_pendulum.", metavar="NAME")]
-AnyName = Annotated[
-    str,
-    typer.Argument(
-        help="Mechanism, e.g. rotary_pendulum, or your own as FILE.py:NAME, FILE.urdf or FILE.xml; "
-        "with :JOINT,JOINT behind the last two where they do not say what is actuated.",
-        metavar="NAME",
-    ),
-]
-Start = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Initial state, with its unit: phi=40deg, theta_dot=10deg/s, x=0.2m. Repeatable; "
-        "what is not named is zero. Default: the mechanism's usual start, where it has one.",
-        metavar="STATE=VALUE",
-    ),
-]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Parameter in SI units. Repeatable.", metavar="NAME=VALUE"),
-]
-Limits = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--limit",
-        help="Largest magnitude of an input, in its own unit: voltage=10. Repeatable. Default: "
-        "the mechanism's.",
-        metavar="INPUT=VALUE",
-    ),
-]
-HardInput = Annotated[
-    bool,
-    typer.Option(
-        "--hard-input",
-        help="Refuse motions whose law asks for more than the limit. Default: the actuator clips.",
-    ),
-]
-Box = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Bounds that a state must keep on its way, with units: theta=60deg for both sides, "
-        "or x=-0.2m:0.5m. Repeatable. Tested every 2 ms. Default: 95 % of the travel that the "
-        "mechanism declares.",
-        metavar="STATE=LOW:HIGH",
-    ),
-]
-Goal = Annotated[
-    str,
-    typer.Option(
-        "--objective",
-        help="What is minimised. energy: ∫uᵀu dt, and time: as the paper has them, to a radius of "
-        "0.01. bench-energy, bench-time: ∫(uᵀu + 0.05 xᵀx)dt and ∫(1 + 2.25 Σ(u/u_max)²)dt, to "
-        "0.05. effort: ∫(Σ(u/u_max)² + 0.01 xᵀx)dt, to 0.02.",
-        metavar="WORD",
-    ),
-]
-Horizon = Annotated[float, typer.Option(help="Longest motion, s.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
+def exit_unless(good: bool, code: int = 1) -> None:
+    """End the command with an exit code where a result is not as it should be."""
+    if not good:
+        raise typer.Exit(code)

@@ -1,18 +1,25 @@
-"""Mechanism and law integrated: the kernel, many runs at once, and what one run was."""
+"""Mechanism and law integrated: the kernel, many runs at once, and what one run was.
 
-from undertow.closed_loop.buffers import RolloutBuffers, Shape
+:mod:`.kernel` compiles what :mod:`.kernel_source` writes: small Runge-Kutta steps, and the large
+ones of :mod:`.etd`, with the linear model of :mod:`.terminal_model`.
+"""
+
+from undertow.closed_loop.buffers import RolloutBuffers
+from undertow.closed_loop.ensemble import Ensemble, Risk
 from undertow.closed_loop.kernel import compile_loop
 from undertow.closed_loop.rollout import ClosedLoop
-from undertow.closed_loop.trajectory import INADMISSIBLE, Event, Trajectory
-from undertow.closed_loop.unchecked import UncheckedLoop
+from undertow.closed_loop.rows import LANES
+from undertow.closed_loop.trajectory import INADMISSIBLE, UNSTABLE, Event, Trajectory
 
 __all__ = [
     "INADMISSIBLE",
+    "LANES",
+    "UNSTABLE",
     "ClosedLoop",
+    "Ensemble",
     "Event",
+    "Risk",
     "RolloutBuffers",
-    "Shape",
     "Trajectory",
-    "UncheckedLoop",
     "compile_loop",
 ]

@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.closed_loop.terminal_model import TerminalLinearModel
+from undertow.closed_loop.rows import LANES
+from undertow.closed_loop.terminal_model import NOBODY, Prepared
 from undertow.closed_loop.trajectory import Batch
-from undertow.law import gamma_determinant
+from undertow.law import LawLayout, gamma_determinant
 from undertow.models import FloatArray
-from undertow.symbolic import LANES
 
-__all__ = ["NOTHING", "RolloutBuffers", "Shape"]
+if TYPE_CHECKING:
+    from undertow.closed_loop.rollout import ClosedLoop
 
 #: Stands in for arrays that are not there.
 NOTHING = np.zeros((1, 1, 1))
-
-
-class Shape(NamedTuple):
-    """What of a closed loop its buffers depend on.
-
-    Numbers of coordinates, inputs and path constraints; X = M_uu⁻¹ M_auᵀ at the target; the
-    linear model, if there is one; whether the inner loop is sampled.
-    """
-
-    n: int
-    m: int
-    constraints: int
-    at_target: FloatArray
-    linear_end: TerminalLinearModel | None
-    sampled: bool
 
 
 class RolloutBuffers:
@@ -39,19 +26,34 @@ class RolloutBuffers:
 
     A lane is a row of ``lanes``: for each of S surfaces its vector, η and ε, and det Γ at the
     target.
+
+    Parameters
+    ----------
+    loop
+        The closed loop.
+    count
+        Rollouts, N; what is added to fill whole blocks repeats the last of them.
+    segments
+        Surfaces of each, S.
+    plants
+        Whether each lane brings a plant: its parameters lie behind the law vector, and
+        ``member``, (N,), says which of the ensemble it is.
     """
 
-    def __init__(self, shape: Shape, count: int, segments: int) -> None:
-        n, m, w = shape.n, shape.m, shape.constraints
-        self.shape, self.width = shape, 2 * m * n
+    def __init__(
+        self, loop: ClosedLoop, count: int, segments: int, *, plants: bool = False
+    ) -> None:
+        n, m, w = loop.mechanism.n, loop.mechanism.m, len(loop.objective.constraints)
+        self.loop, self.layout = loop, LawLayout(n, m)
         self.count, self.padded = count, -(-count // LANES) * LANES
-        self.lanes = np.empty((self.padded, segments, self.width + 2 * m + 1))
+        self.member = np.zeros(self.padded, dtype=np.int64) if plants else NOBODY
+        behind = len(loop.truth.parameters) if plants else 0
+        self.lanes = np.empty((self.padded, segments, self.layout.size + behind))
         self.states = np.empty((self.padded, 2 * n))
         self.live = np.ones(self.padded)
-        self.ends = None if shape.linear_end is None else shape.linear_end.buffers(self.padded)
         self.out = np.empty((self.padded, 9 + w + 4 * n))
         # A sampled kernel reads the noise of every lane.
-        self.quiet = np.zeros((1, self.padded, 2 * n)) if shape.sampled else NOTHING
+        self.quiet = np.zeros((1, self.padded, 2 * n)) if loop.zoh_steps else NOTHING
         out = self.out[:count]
         self._batch = Batch(
             cost=out[:, 0],
@@ -68,22 +70,55 @@ class RolloutBuffers:
             steps=out[:, -1],
         )
 
-    def fill(self, states: FloatArray, surfaces: FloatArray, laws: FloatArray) -> None:
-        """Take states (…, 2n), surfaces (…, S, 2mn) and laws (…, S, 2m); the last fills up."""
-        lanes, count = self.lanes, self.count
-        lanes[:count, :, : self.width] = surfaces
-        lanes[:count, :, self.width : -1] = laws
-        lanes[:count, :, -1] = gamma_determinant(self.shape.at_target, surfaces)
+    @cached_property
+    def ends(self) -> Prepared | None:
+        """Where the linear ends of the lanes are written, for loops that have them."""
+        end = self.loop.linear_end
+        return None if end is None else end.buffers(self.padded)
+
+    def fill(
+        self, states: FloatArray, surfaces: FloatArray, laws: FloatArray | None = None
+    ) -> RolloutBuffers:
+        """Take states (…, 2n), surfaces (…, S, 2mn) and laws (…, S, 2m), by default the loop's."""
+        lanes, count, layout = self.lanes, self.count, self.layout
+        lanes[:count, :, layout.surface] = surfaces
+        lanes[:count, :, layout.reaching] = self.loop.numbers.law if laws is None else laws
+        lanes[:count, :, layout.size - 1] = gamma_determinant(self.loop.numbers.coupling, surfaces)
         self.states[:count] = states
         if self.padded > count:
             lanes[count:] = lanes[count - 1]
             self.states[count:] = self.states[count - 1]
+        return self
 
     def part(self, which: NDArray[np.intp]) -> RolloutBuffers:
-        """Return room for some of the lanes, filled alike."""
-        buffers = RolloutBuffers(self.shape, len(which), self.lanes.shape[1])
-        lanes, width = self.lanes[which], self.width
-        buffers.fill(self.states[which], lanes[:, :, :width], lanes[:, :, width:-1])
+        """Return new buffers with some of the lanes."""
+        plants = len(self.member) > 0
+        buffers = RolloutBuffers(self.loop, len(which), self.lanes.shape[1], plants=plants)
+        pad = np.append(which, np.repeat(which[-1:], buffers.padded - len(which)))
+        buffers.lanes[:], buffers.states[:] = self.lanes[pad], self.states[pad]
+        if plants:
+            buffers.member[:] = self.member[pad]
+        return buffers
+
+    @cached_property
+    def members(self) -> RolloutBuffers:
+        """Buffers of every plan on every member of the loop's ensemble, (N·K,) lanes."""
+        ensemble = self.loop.ensemble
+        assert ensemble is not None
+        count, size = self.count * len(ensemble), self.layout.size
+        buffers = RolloutBuffers(self.loop, count, self.lanes.shape[1], plants=True)
+        buffers.member[:count] = np.tile(np.arange(len(ensemble)), self.count)
+        buffers.member[count:] = buffers.member[count - 1]
+        buffers.lanes[:, :, size:] = ensemble.values[buffers.member][:, None]
+        return buffers
+
+    def spread(self) -> RolloutBuffers:
+        """Fill :attr:`members` with the plans of these buffers."""
+        buffers, size = self.members, self.layout.size
+        size_of_ensemble = buffers.count // self.count
+        plan = np.minimum(np.arange(buffers.padded) // size_of_ensemble, self.count - 1)
+        buffers.lanes[:, :, :size] = self.lanes[plan]
+        buffers.states[:] = self.states[plan]
         return buffers
 
     def batch(self, start: float) -> Batch:

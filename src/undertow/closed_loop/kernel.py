@@ -7,30 +7,27 @@ from typing import Any
 
 import sympy as sp
 
+from undertow.closed_loop.kernel_source import kernel_source
+from undertow.closed_loop.rows import LANES, LoopGraph
 from undertow.law import LawSymbols, Switching, build_law_graph
 from undertow.models import TIME, Mechanism
 from undertow.objective import Objective
-from undertow.symbolic import (
-    LANES,
-    LoopProgram,
-    Tape,
-    block_source,
-    content_key,
-    load_module,
-    recall,
-    remember,
-)
-
-__all__ = ["build_loop_graph", "compile_loop"]
+from undertow.symbolic import Tape, content_key, generated
 
 
 def build_loop_graph(
-    belief: Mechanism, plant: Mechanism | None, objective: Objective, switching: Switching
-) -> LoopProgram:
+    belief: Mechanism,
+    plant: Mechanism | None,
+    objective: Objective,
+    switching: Switching,
+    *,
+    many_plants: bool = False,
+) -> LoopGraph:
     """Compose law, plant and objective on one tape.
 
     With ``plant=None`` both share symbols, so everything they have in common is computed
-    once; otherwise the belief keeps its own parameter symbols.
+    once; otherwise the belief keeps its own parameter symbols.  With ``many_plants`` each lane
+    brings the parameters of its plant.
     """
     tape = Tape()
     truth = belief if plant is None else plant
@@ -57,15 +54,15 @@ def build_loop_graph(
     if objective.hard_input:
         margins = [limit - sp.Abs(d) for limit, d in zip(limits, law.u, strict=True)]
         input_margin = tape.let(sp.Min(*margins))
-    return LoopProgram(
+    return LoopGraph(
         tape=tape,
         time=TIME,
         state=x,
         applied=applied,
         limits=limits,
-        plant_parameters=truth.parameter_symbols,
+        plant_parameters=() if many_plants else truth.parameter_symbols,
         belief_parameters=belief_parameters,
-        lane_inputs=(*symbols.surface, *symbols.eta, *symbols.layer, symbols.gamma_target),
+        lane_inputs=(*symbols.vector, *(truth.parameter_symbols if many_plants else ())),
         demand=tuple(law.u),
         s=tuple(law.s),
         singular=law.margin,
@@ -84,10 +81,11 @@ def compile_loop(
     objective: Objective,
     switching: Switching,
     sampled: bool,
+    many_plants: bool = False,
 ) -> Any:
     """Return the kernel of a closed loop, from the cache where it is known.
 
-    A module with the functions ``rollout`` and, for continuous loops, ``settle``; each is
+    A module with the functions ``rollout`` and, for continuous loops, ``etd_integrate``; each is
     compiled when it is first called.
     """
     truth = belief if plant is None else plant
@@ -96,15 +94,13 @@ def compile_loop(
         "the belief" if plant is None else plant.structure,
         sp.srepr([objective.stage_cost(truth), *objective.path_margins(truth)]),
         repr((belief.name, objective.name, objective.hard_input, switching, sampled, LANES)),
+        "many plants" if many_plants else "",
         repr(objective.boxes(truth)),
     )
-    source = recall("loop", key)
-    if source is None:
-        program = build_loop_graph(belief, plant, objective, switching)
-        source = block_source(
-            program,
-            sampled=sampled,
-            header=f"Closed loop of {belief.name}, {objective.name}; generated, do not edit.",
-        )
-        remember("loop", key, source)
-    return load_module(f"loop_{belief.name}", source)
+
+    def write() -> str:
+        program = build_loop_graph(belief, plant, objective, switching, many_plants=many_plants)
+        header = f"Closed loop of {belief.name}, {objective.name}; generated, do not edit."
+        return kernel_source(program, sampled=sampled, header=header)
+
+    return generated("loop", belief.name, key, write)

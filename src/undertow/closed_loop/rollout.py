@@ -2,38 +2,68 @@
 
 The controller's *belief* (the model its law was derived from) and the *truth* (the plant
 that moves) are separate arguments everywhere; by default they are the same.
+
+Rollouts are read from buffers and written there (:mod:`undertow.closed_loop.buffers`).  They go in
+small Runge-Kutta steps until the law is in its boundary layer and then, where the loop has a
+linear model, in large ones (:mod:`undertow.closed_loop.etd`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.base import InvalidInputError, check_fields, checked, floats
-from undertow.closed_loop.buffers import RolloutBuffers
+from undertow.base import InvalidInputError, at_least, check_fields, checked, floats, positive
+from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
+from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
+from undertow.closed_loop.etd import GIVEN_BACK
+from undertow.closed_loop.kernel import compile_loop
+from undertow.closed_loop.rows import LANES
+from undertow.closed_loop.terminal_model import Prepared, TerminalLinearModel
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory
-from undertow.closed_loop.unchecked import RolloutEvaluator, UncheckedLoop
-from undertow.law import Plan, Surface, check_surface_shape
-from undertow.models import FloatArray, require_mechanism
-from undertow.objective import require_objective
-from undertow.symbolic import LANES
-
-__all__ = ["ClosedLoop"]
+from undertow.law import (
+    LawLayout,
+    Plan,
+    ReachingLaw,
+    Surface,
+    check_surface_shape,
+    coupling,
+    gains_at_target,
+)
+from undertow.models import FloatArray, Mechanism, has_linear_model
+from undertow.objective import MinimumEnergy, Objective
 
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
+
+#: Small steps before large ones are tried again, s; each time as long again as all before.
+CALMER = 0.5
 
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
 
 
+class LoopNumbers(NamedTuple):
+    """Numbers of a closed loop that its kernels read.
+
+    Plant and belief parameters, input limits, η and ε of the law; X = M_uu⁻¹ M_auᵀ at the target.
+    """
+
+    plant: FloatArray
+    belief: FloatArray
+    limits: FloatArray
+    law: FloatArray
+    coupling: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
-class ClosedLoop(UncheckedLoop):
+class ClosedLoop:
     """A mechanism under its sliding-mode law, compiled for batches of rollouts.
 
     Parameters
@@ -49,16 +79,19 @@ class ClosedLoop(UncheckedLoop):
         The truth.  The belief itself by default; must have as many coordinates and inputs.
     step
         Runge-Kutta step, s.
-    hold
-        Sampled inner loop: the law is evaluated every ``hold`` steps and held.
+    zoh_steps
+        Sampled inner loop: the law is evaluated every ``zoh_steps`` steps and held.
         0: continuous law, evaluated in every Runge-Kutta stage.
     escape
         ‖x‖₂ beyond which a motion counts as diverged.
-    tail
+    tail_rtol
         Relative tolerance of the large steps that a batch takes once the law is in its
-        boundary layer, see :mod:`undertow.symbolic.settle`; 0: small steps to the end.  Used by
+        boundary layer, see :mod:`undertow.closed_loop.etd`; 0: small steps to the end.  Used by
         :meth:`batch` where belief and truth agree, the loop is continuous, all path
         constraints are bounds of states and the stage cost has a second-order model.
+    ensemble
+        Plausible plants instead of one: every plan is rolled out on all of them, and a batch has
+        one result for each plan, see :mod:`undertow.closed_loop.ensemble`.
 
     Examples
     --------
@@ -70,44 +103,46 @@ class ClosedLoop(UncheckedLoop):
     'REACHED'
     """
 
+    mechanism: Mechanism
+    objective: Objective = MinimumEnergy()
+    reaching: ReachingLaw = ReachingLaw()
+    plant: Mechanism | None = None
+    step: float = 0.002
+    zoh_steps: int = 0
+    escape: float = 200.0
+    tail_rtol: float = 0.0
+    ensemble: Ensemble | None = None
+
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
         check_fields(self)
-        require_mechanism("mechanism of a closed loop", self.mechanism)
-        if self.plant is not None:
-            require_mechanism("plant of a closed loop", self.plant)
-        require_objective(self.objective)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
-        for name, low in (("escape", 0.0), ("tail", 0.0)):
-            value = getattr(self, name)
-            if not value >= low:
-                raise InvalidInputError(
-                    f"{name} of a closed loop",
-                    value=value,
-                    limit="a number ≥ 0",
-                    remedy="Leave it out for the usual value",
-                )
-        if not (math.isfinite(self.step) and self.step > 0):
-            raise InvalidInputError("rollout step", value=self.step, limit="finite and > 0 s")
-        if self.hold < 0 or self.hold != int(self.hold):
-            raise InvalidInputError(
-                "rollout hold",
-                value=self.hold,
-                limit="a whole number ≥ 0 of steps",
-                remedy="0 is the continuous law",
-            )
+        for name, remedy in (
+            ("escape", "Leave it out for the usual value"),
+            ("tail_rtol", "Leave it out for the usual value"),
+            ("zoh_steps", "0 is the continuous law"),
+        ):
+            at_least(f"{name} of a closed loop", getattr(self, name), 0, remedy)
+        positive("rollout step, s", self.step)
         vector = self.reaching.vector(self.mechanism.m)
         if self.reaching.switching != "sign":
             eta, layer = np.split(vector, 2)
-            period = self.step * max(1, self.hold)
+            period = self.step * max(1, self.zoh_steps)
             limit = float(np.min(2 * layer / eta))
             if period >= limit:
                 raise InvalidInputError(
-                    "sample period of the inner loop" if self.hold else "rollout step",
+                    "sample period of the inner loop" if self.zoh_steps else "rollout step",
                     value=f"{period:g} s",
                     limit=f"below 2 ε/η = {limit:g} s",
                     remedy="Use a shorter step, a thicker boundary layer or a smaller η",
                 )
+        if self.plant is not None and self.ensemble is not None:
+            raise InvalidInputError(
+                "plant of a closed loop",
+                value=f"'{self.plant.name}', beside an ensemble",
+                limit="one plant, or an ensemble",
+                remedy="Leave one of them out",
+            )
         plant = self.truth
         if (plant.n, plant.m) != (self.mechanism.n, self.mechanism.m):
             raise InvalidInputError(
@@ -123,6 +158,71 @@ class ClosedLoop(UncheckedLoop):
             f"ClosedLoop({self.mechanism.name}, {self.objective.name}{plant}, step={self.step:g} s)"
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What it was made from: a copy compiles, or finds, the same kernels."""
+        made = {field.name: getattr(self, field.name) for field in fields(self)}
+        return made | {"objective": self.objective.written(self.mechanism)}
+
+    @property
+    def truth(self) -> Mechanism:
+        """The plant that moves; of an ensemble its structure."""
+        return self._given or self.mechanism
+
+    @property
+    def _given(self) -> Mechanism | None:
+        return self.plant if self.ensemble is None else self.ensemble.plant
+
+    @cached_property
+    def _kernels(self) -> Any:
+        return compile_loop(
+            self.mechanism,
+            self._given,
+            self.objective,
+            self.reaching.switching,
+            self.zoh_steps > 0,
+            self.ensemble is not None,
+        )
+
+    @cached_property
+    def numbers(self) -> LoopNumbers:
+        """The numbers that the kernels read."""
+        belief, truth = self.mechanism, self.truth
+        return LoopNumbers(
+            truth.parameter_values,
+            belief.parameter_values,
+            truth.input_limits,
+            self.reaching.vector(belief.m),
+            coupling(belief, np.zeros(belief.n)),
+        )
+
+    @cached_property
+    def linear_end(self) -> TerminalLinearModel | None:
+        """The linear model of this loop at the target, where it has one."""
+        if self.zoh_steps or self.reaching.switching == "sign" or self.plant is not None:
+            return None
+        if not (has_linear_model(self.mechanism) and has_linear_model(self.truth)):
+            return None
+        return TerminalLinearModel(self.mechanism, self.objective, self.ensemble)
+
+    @cached_property
+    def takes_large_steps(self) -> bool:
+        """Whether rollouts end in large steps, with the linear model."""
+        problem = self.objective
+        if not self.tail_rtol > 0 or (problem.constraints and not problem.boxes(self.mechanism)):
+            return False
+        end = self.linear_end
+        return end is not None and end.stage is not None
+
+    @checked
+    def believing(self, mechanism: Mechanism, ensemble: Ensemble | None = None) -> ClosedLoop:
+        """Return this loop with other parameters believed, and another ensemble of its kind.
+
+        The equations stay, and so do the kernels: nothing is compiled or looked up again.
+        """
+        other = replace(self, mechanism=mechanism, ensemble=ensemble)
+        other.__dict__["_kernels"] = self._kernels
+        return other
+
     def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:
         """Return the steps at which surfaces take over; the kernel meets them one by one."""
         if len(switch_times) == 1 and switch_times[0] == 0:
@@ -137,46 +237,120 @@ class ClosedLoop(UncheckedLoop):
             )
         return steps
 
-    def _run(
+    def roll_out(
         self,
-        x0: FloatArray,
-        surfaces: FloatArray,
+        buffers: RolloutBuffers,
+        switch_times: Sequence[float],
+        duration: float,
         *,
-        reaching: FloatArray | None = None,
-        switch_times: Sequence[float] = (0.0,),
-        duration: float | None = None,
         start: float = 0.0,
+        terminal: float | None = None,
+        cap: float = math.inf,
+        stable_only: bool = False,
+        seek: bool = False,
         every: int = 0,
-        **options: Any,
-    ) -> tuple[Batch, FloatArray]:
-        """Roll out states (N, 2n) and surfaces (N, S, 2mn), or one of either, in new buffers."""
-        steps = self._steps(self.objective.horizon if duration is None else duration)
-        buffers = RolloutBuffers(self._shape, max(len(x0), len(surfaces)), surfaces.shape[1])
-        buffers.fill(x0, surfaces, self._numbers.law if reaching is None else reaching)
-        columns = 2 * self.mechanism.n + 2 * self.mechanism.m + 2
-        shape = (buffers.padded, -(-steps // every), columns) if every else (0, 0, 0)
-        record = np.zeros(shape)
-        switches = self._switch_steps(switch_times)
-        batch = self._launch(
-            buffers, switches, steps, start=start, every=every, record=record, **options
-        )
-        return batch, record
+        record: FloatArray = NOTHING,
+        noise: FloatArray | None = None,
+    ) -> Batch:
+        """Roll out what buffers hold; their numbers are not checked again.
 
-    def probe(
-        self, x: FloatArray, times: Sequence[float] = (0.0,), horizon: float = 0.0
-    ) -> RolloutEvaluator:
-        """Return a function that rolls out plans from x, again and again, without checks.
+        This is what searches call thousands of times.
 
         Parameters
         ----------
-        x
-            State, (2n,).
-        times
-            Switch times of the plans, s.
-        horizon
-            Length, s.
+        buffers
+            States, surfaces and laws; what is returned is a view of them.
+        switch_times, duration
+            When surfaces take over, and the length, s.
+        start, terminal, cap, stable_only, seek
+            As for :meth:`batch` and :meth:`simulate`.
+        every, record
+            Where every so many steps leave a row, (N, rows, 2n + 2m + 2); 0: nowhere.
+        noise
+            Measurement noise, (samples, N, 2n).
         """
-        return RolloutEvaluator(self, x, self._switch_steps(times), self._steps(horizon))
+        switches, steps = self._switch_steps(switch_times), self._steps(duration)
+        if self.ensemble is not None and not len(buffers.member):
+            members = buffers.spread()
+            self.roll_out(
+                members, switch_times, duration, start=start, terminal=terminal, cap=cap,
+                stable_only=stable_only, seek=seek,
+            )  # fmt: skip
+            count, size = buffers.count, len(self.ensemble)
+            tail = {"mean": size, "cvar": math.ceil(TAIL * size), "worst": 1}[self.ensemble.risk]
+            margins = 2 + len(self.objective.constraints)
+            summarise(members.out[: count * size], size, tail, margins, buffers.out[:count])
+            return buffers.batch(start)
+        numbers, end = self.numbers, self.linear_end
+        radius = self.objective.terminal_radius if terminal is None else terminal
+        # Large steps see no closest approach, and leave nothing to record.
+        large = self.takes_large_steps and not every and not seek
+        part, calm_from, where = buffers, 0 if large else steps, np.arange(buffers.count)
+        while True:
+            live, out = part.live, part.out
+            live.fill(1.0)
+            self._check_gains(part.lanes, live, stable_only)
+            goes_on = calm_from < steps
+            prepared = None
+            if goes_on or stable_only:
+                prepared = self._linearised(part)
+            if prepared is not None and stable_only:
+                live *= prepared.stable
+            self._kernels.rollout(
+                part.states, live, part.lanes, switches, numbers.plant, numbers.belief,
+                numbers.limits, part.quiet if noise is None else noise, start, self.step, steps,
+                max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
+                every, record, out,
+            )  # fmt: skip
+            if goes_on and prepared is not None and end is not None:
+                self._kernels.etd_integrate(
+                    part.lanes, numbers.plant, numbers.belief, numbers.limits,
+                    start + steps * self.step, radius, self.escape, self.tail_rtol,
+                    1.0 if end.counts_cost else 0.0, prepared.A, prepared.P, prepared.powers,
+                    prepared.forced, prepared.reach, out,
+                )  # fmt: skip
+            if part is not buffers:
+                taken = buffers.out[where, -1]
+                buffers.out[where] = out[: part.count]
+                buffers.out[where, -1] += taken
+            again = np.flatnonzero(out[: part.count, 2] == GIVEN_BACK)
+            if not (goes_on and len(again)):
+                return buffers.batch(start)
+            # Too fast for large steps, or at a limit again: small steps until later.
+            failed = round((float(out[again, 1].max()) - start) / self.step)
+            calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
+            part, where = part.part(again), where[again]
+
+    def _linearised(self, buffers: RolloutBuffers) -> Prepared | None:
+        """Linearise the last surface of every lane."""
+        if self.linear_end is None or buffers.ends is None:
+            return None
+        gains = None
+        if any(self.mechanism.disturbance_bounds):
+            last, layout = buffers.lanes[:, -1], buffers.layout
+            gains = gains_at_target(self.mechanism, last[:, layout.surface], last[:, layout.eta])
+        self.linear_end.prepare(buffers.lanes, gains, buffers.ends, buffers.member)
+        return buffers.ends
+
+    def _check_gains(self, lanes: FloatArray, live: FloatArray, stable_only: bool) -> None:
+        """Refuse gains (13) that this step cannot follow, or switch their lanes off."""
+        if not any(self.mechanism.disturbance_bounds) or self.reaching.switching == "sign":
+            return
+        layout = LawLayout(self.mechanism.n, self.mechanism.m)
+        flat = lanes.reshape(-1, lanes.shape[-1])
+        gains = gains_at_target(self.mechanism, flat[:, layout.surface], flat[:, layout.eta])
+        rate = (gains / flat[:, layout.layer]).max(axis=1).reshape(lanes.shape[:2]).max(axis=1)
+        period = self.step * max(1, self.zoh_steps)
+        fast = rate * period >= 2.0
+        if stable_only:
+            live[fast] = 0.0
+        elif fast.any():
+            raise InvalidInputError(
+                "step for the gains (13) that the disturbance bounds ask for",
+                value=f"{period:g} s at k/ε = {rate.max():.4g} 1/s",
+                limit=f"below 2 ε/k = {2 / rate.max():.3g} s",
+                remedy="Use a shorter step, a thicker boundary layer or smaller bounds",
+            )
 
     @checked
     def batch(
@@ -249,20 +423,11 @@ class ClosedLoop(UncheckedLoop):
                 limit="finite numbers",
                 remedy="An earlier computation went wrong: look at where they come from",
             )
-        if reaching is not None and not (np.asarray(reaching) > 0).all():
-            raise InvalidInputError(
-                "reaching gains of a batch",
-                value=float(np.min(reaching)),
-                limit="> 0",
-                remedy="η and ε are positive",
-            )
-        if not (terminal is None or terminal >= 0) or not cap >= 0:
-            raise InvalidInputError(
-                "terminal and cap of a batch",
-                value=(terminal, cap),
-                limit="both ≥ 0",
-                remedy="Leave them out for the usual values",
-            )
+        if reaching is not None:
+            least = float(np.min(reaching))
+            positive("reaching gains of a batch", least, "η and ε are positive", infinite=True)
+        for what, value in (("terminal", terminal or 0.0), ("cap", cap)):
+            at_least(f"{what} of a batch", value, 0, "Leave it out for the usual value")
         count = max(states.shape[0], vectors.shape[0])
         if states.ndim != 2 or {states.shape[0], vectors.shape[0]} - {1, count}:
             raise InvalidInputError(
@@ -271,17 +436,15 @@ class ClosedLoop(UncheckedLoop):
                 limit="equal numbers, or one of either",
                 remedy="Repeat the states or the surfaces",
             )
-        return self._run(
-            states,
-            vectors,
-            reaching=reaching,
-            switch_times=switch_times,
-            duration=duration,
+        return self.roll_out(
+            RolloutBuffers(self, count, len(switch_times)).fill(states, vectors, reaching),
+            switch_times,
+            self.objective.horizon if duration is None else duration,
             terminal=terminal,
             cap=cap,
             stable_only=stable_only,
             seek=seek,
-        )[0]
+        )
 
     @checked
     def simulate(
@@ -319,18 +482,24 @@ class ClosedLoop(UncheckedLoop):
             units; for a sampled inner loop only.
         """
         self._check_duration(duration)
-        if every < 1:
-            raise InvalidInputError("every", value=every, limit="≥ 1", remedy="Record each step: 1")
+        at_least("every", every, 1, "Record each step: 1")
+        if self.ensemble is not None:
+            raise InvalidInputError(
+                "simulation of a closed loop",
+                value=f"an ensemble of {len(self.ensemble)} plants",
+                limit="one plant",
+                remedy="Give plant= the one that moves, or take batch for what a plan is worth",
+            )
         plan = Plan.of(surfaces, switch_times)
         for surface in plan.surfaces:
             check_surface_shape(self.mechanism, surface)
         if noise is not None:
-            if not self.hold:
+            if not self.zoh_steps:
                 raise InvalidInputError(
                     "measurement noise",
                     value="a continuous inner loop",
                     limit="a sampled one",
-                    remedy="Build the loop with hold ≥ 1",
+                    remedy="Build the loop with zoh_steps ≥ 1",
                 )
             noise = np.asarray(noise, dtype=float)
             if noise.ndim != 2 or noise.shape[1] != 2 * self.mechanism.n or noise.size == 0:
@@ -340,27 +509,25 @@ class ClosedLoop(UncheckedLoop):
                     limit=f"(samples, {2 * self.mechanism.n})",
                 )
             noise = np.repeat(self.mechanism.check_state(noise)[:, None, :], LANES, axis=1)
-        x0 = self.mechanism.check_state(x0)
-        if x0.ndim != 1:
-            raise InvalidInputError(
-                "initial state of a simulation",
-                value=f"shape {x0.shape}",
-                limit=f"({2 * self.mechanism.n},)",
-                remedy="ClosedLoop.batch takes many starts",
-            )
-        batch, record = self._run(
-            x0[None],
-            plan.vectors[None],
-            reaching=plan.gains(self.reaching)[None],
-            switch_times=plan.times,
-            duration=duration,
+        x0 = self.mechanism.initial_state(x0, {})
+        span = self.objective.horizon if duration is None else duration
+        buffers = RolloutBuffers(self, 1, len(plan.times))
+        record = self._record(buffers, -(-self._steps(span) // every))
+        batch = self.roll_out(
+            buffers.fill(x0, plan.vectors, plan.gains(self.reaching)),
+            plan.times,
+            span,
             start=start,
             terminal=terminal,
             every=every,
+            record=record,
             noise=noise,
         )
         last = self._ending(plan, batch, start)
         return self._trajectory(batch, record[0], last, start, every)
+
+    def _record(self, buffers: RolloutBuffers, rows: int) -> FloatArray:
+        return np.zeros((buffers.padded, rows, 2 * self.mechanism.n + 2 * self.mechanism.m + 2))
 
     def _steps(self, duration: float) -> int:
         """Return the number of steps of a rollout, refusing what memory or patience forbid."""
@@ -376,28 +543,21 @@ class ClosedLoop(UncheckedLoop):
         return steps
 
     def _check_duration(self, duration: float | None) -> None:
-        if duration is not None and not (math.isfinite(duration) and duration >= 0):
-            raise InvalidInputError(
-                "duration of a rollout",
-                value=f"{duration} s",
-                limit="finite and ≥ 0",
-                remedy="Leave it out for the objective's horizon",
-            )
+        if duration is not None:
+            remedy = "Leave it out for the objective's horizon"
+            positive("duration of a rollout, s", duration, remedy, zero=True)
 
     def _ending(self, plan: Plan, batch: Batch, start: float) -> FloatArray | None:
         """Return the line of a record for the end of a motion, where the law acts there."""
-        if self.hold or not np.isfinite(batch.x).all():
+        if self.zoh_steps or not np.isfinite(batch.x).all():
             return None
         end = float(batch.time[0])
         surface, law = plan.at(end)
-        _, record = self._run(
-            batch.x,
-            surface.vector[None, None],
-            reaching=(law or self.reaching).vector(self.mechanism.m)[None, None],
-            duration=self.step,
-            start=start + end,
-            terminal=0.0,
-            every=1,
+        gains = (law or self.reaching).vector(self.mechanism.m)
+        buffers = RolloutBuffers(self, 1, 1).fill(batch.x, surface.vector, gains)
+        record = self._record(buffers, 1)
+        self.roll_out(
+            buffers, (0.0,), self.step, start=start + end, terminal=0.0, every=1, record=record
         )
         line = record[0, 0]
         return line if np.isfinite(line).all() else None
@@ -423,7 +583,15 @@ class ClosedLoop(UncheckedLoop):
             rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1
         )
         return Trajectory(
-            self.truth, t + start, x, u, s, cost[:, 0], margin[:, 0], Event(int(batch.event[0]))
+            self.truth,
+            t + start,
+            x,
+            u,
+            s,
+            cost[:, 0],
+            margin[:, 0],
+            Event(int(batch.event[0])),
+            self.objective.unit,
         )
 
 

@@ -6,25 +6,27 @@ the stage cost is Φ₀ + xᵀQx to second order.  With AᵀP + PA = −Q,
     ∫ xᵀQx dt from x to x_f  =  xᵀPx − x_fᵀPx_f.
 
 A rollout that has come into its boundary layer goes on from there in large steps that take A
-and P exactly, and what they leave over by quadrature: :mod:`undertow.symbolic.settle`.
+and P exactly, and what they leave over by quadrature: :mod:`undertow.closed_loop.etd`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import sympy as sp
+from numpy.typing import NDArray
 
-from undertow.law import linearise
-from undertow.models import FloatArray, Mechanism, is_smooth, numbers
+from undertow.closed_loop.ensemble import Ensemble
+from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT, linear_source
+from undertow.closed_loop.rows import LANES
+from undertow.law import LawLayout
+from undertow.models import FloatArray, Mechanism, is_smooth, linear_numbers, linearise, numbers
 from undertow.objective import Objective
-from undertow.symbolic import LANES, SETTLING, UNIT, linear_source, load_module, numba
-
-__all__ = ["QuadraticStage", "TerminalLinearModel", "quadratic_stage"]
-
+from undertow.symbolic import load_module, numba
 
 #: Terms of the series of e^{|A|t} before a loop is too fast to bound.
 TERMS = 60
@@ -48,9 +50,16 @@ def quadratic_stage(mechanism: Mechanism, objective: Objective) -> QuadraticStag
 
     There is none when Φ is not twice differentiable at 0 (|u|, say) or has a slope there.
     """
-    symbols = [*mechanism.x, *mechanism.u]
-    origin = dict.fromkeys(symbols, 0)
     stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
+    return _second_order(stage, mechanism.x, mechanism.u)
+
+
+@lru_cache(maxsize=64)
+def _second_order(
+    stage: sp.Expr, x: tuple[sp.Symbol, ...], u: tuple[sp.Symbol, ...]
+) -> QuadraticStage | None:
+    symbols = [*x, *u]
+    origin = dict.fromkeys(symbols, 0)
     if not is_smooth(stage):
         return None
     slope = sp.Matrix([stage]).jacobian(symbols).subs(origin)
@@ -59,7 +68,7 @@ def quadratic_stage(mechanism: Mechanism, objective: Objective) -> QuadraticStag
     if not all(v.is_finite and v.is_real for v in values) or any(slope):
         return None
     half = numbers(hessian) / 2
-    k = 2 * mechanism.n
+    k = len(x)
     return QuadraticStage(
         float(stage.subs(origin)), half[:k, :k].copy(), half[:k, k:].copy(), half[k:, k:].copy()
     )
@@ -68,14 +77,30 @@ def quadratic_stage(mechanism: Mechanism, objective: Objective) -> QuadraticStag
 #: Stands for gains that are η.
 _SAME = np.empty((0, 0))
 
+#: Of lanes that bring no plant.
+NOBODY = np.zeros(0, dtype=np.int64)
+
+#: Stands for the plants of a law that acts on its own belief.
+_ITSELF = np.empty((0, 0, 0)), np.empty((0, 0, 0))
+
+
+def _linear_plants(ensemble: Ensemble) -> tuple[FloatArray, FloatArray]:
+    """Return q̈ = drift x + push u of every member at the target, (K, n, 2n) and (K, n, m)."""
+    plant = ensemble.plant
+    n, m = plant.n, plant.m
+    members = [linear_numbers(plant, values) for values in ensemble.values]
+    drift = [np.linalg.solve(mass, forces) for mass, forces, _ in members]
+    push = [np.linalg.solve(mass, np.vstack([B, np.zeros((n - m, m))])) for mass, _, B in members]
+    return np.stack(drift), np.stack(push)
+
 
 class Prepared(NamedTuple):
     """Linear ends of C closed loops.
 
     ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
     ``P`` (C, 2n, 2n); ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and ``forced`` responses,
-    see :mod:`undertow.symbolic.linear`; ``reach`` of bounded states (C/16, SETTLING, w·2n·16), see
-    :mod:`undertow.symbolic.settle`.
+    see :mod:`.linear_blocks`; ``reach`` of bounded states (C/16, STEP_SIZES, w·2n·16), see
+    :mod:`.etd`.
     """
 
     A: FloatArray
@@ -94,6 +119,8 @@ class TerminalLinearModel:
     ----------
     mechanism, objective
         The closed loop's.
+    ensemble
+        Plants that the law of ``mechanism`` acts on, instead of it.
 
     Attributes
     ----------
@@ -102,12 +129,15 @@ class TerminalLinearModel:
         stability can be read off.
     """
 
-    def __init__(self, mechanism: Mechanism, objective: Objective) -> None:
+    def __init__(
+        self, mechanism: Mechanism, objective: Objective, ensemble: Ensemble | None = None
+    ) -> None:
         lin = linearise(mechanism)
         m = mechanism.m
         self.objective = objective
         self.stage = quadratic_stage(mechanism, objective)
         n = mechanism.n
+        self._layout = LawLayout(n, m)
         self._weights = self.stage or QuadraticStage(
             0.0, np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m)), np.zeros((m, m))
         )
@@ -120,6 +150,7 @@ class TerminalLinearModel:
         self.B_inverse = np.linalg.inv(lin.B)
         # Where Φ has no quadratic part (minimum time) the state itself must be exact.
         self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
+        self._plants = _ITSELF if ensemble is None else _linear_plants(ensemble)
         self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
         self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
 
@@ -132,28 +163,37 @@ class TerminalLinearModel:
             np.empty((count, N, N)) if self.counts_cost else np.eye(N)[None],
             np.empty((count, N, N)),
             np.empty(count),
-            np.empty((count // LANES, SETTLING, N * N * LANES)),
-            np.empty((count // LANES, SETTLING, 2, N * N * LANES)),
-            np.empty((count // LANES, SETTLING, len(self._bounded) * N * LANES)),
+            np.empty((count // LANES, STEP_SIZES, N * N * LANES)),
+            np.empty((count // LANES, STEP_SIZES, 2, N * N * LANES)),
+            np.empty((count // LANES, STEP_SIZES, len(self._bounded) * N * LANES)),
         )
 
-    def prepare(self, lanes: FloatArray, gains: FloatArray | None, into: Prepared) -> None:
+    def prepare(
+        self,
+        lanes: FloatArray,
+        gains: FloatArray | None,
+        into: Prepared,
+        member: NDArray[np.int64] = NOBODY,
+    ) -> None:
         """Linearise closed loops and integrate what their linear ends need.
 
         Parameters
         ----------
         lanes
-            Rows of loops, (C, S, 2mn + 2m + 1), as the kernel reads them: surface vector, η
-            and ε of each of S surfaces, of which the last counts.
+            Law vectors, (C, S, 2mn + 2m + 1), see :class:`undertow.law.LawLayout`, of each of S
+            surfaces, of which the last counts.
         gains
             k_i at the target, (C, m), where that is not η_i.
         into
             What is filled, see :meth:`buffers`.
+        member
+            Which plant of the ensemble each lane has, (C,).
         """
         stage = self._weights
         _close(
-            lanes, _SAME if gains is None else gains, self.X, self.Y, self.H, self.S,
-            self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, into.A, into.Q,
+            lanes, self._layout.starts, _SAME if gains is None else gains, self.X, self.Y, self.H,
+            self.S, self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, member,
+            *self._plants, into.A, into.Q,
         )  # fmt: skip
         self._blocks.double(into.A, into.Q, into.P, into.stable, into.powers, into.forced)
         if len(self._bounded):
@@ -162,20 +202,23 @@ class TerminalLinearModel:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _close(  # type: ignore[no-untyped-def]
-    lanes, gains, X, Y, H, S, B_inverse, xx, xu, uu, counts_cost, A, Q
+    lanes, starts, gains, X, Y, H, S, B_inverse, xx, xu, uu, counts_cost, member, drift, push, A, Q
 ):
-    """Write the acceleration rows A and the stage cost Q of each closed loop; NaN if singular."""
+    """Write the acceleration rows A and the stage cost Q of each closed loop; NaN if singular.
+
+    The law is that of the belief; with a ``member`` for each lane it acts on that plant, whose
+    accelerations are ``drift`` x + ``push`` u.
+    """
     free, m = X.shape
     n = m + free
     N = 2 * n
-    width = 2 * m * n
+    _, lambda_a, alpha_u, lambda_u, eta, layer = starts
     gamma, drive = np.empty((m, m)), np.empty((m, N))
     K, D = np.empty((m, N)), np.empty((m, N))
     for lane in range(lanes.shape[0]):
         p = lanes[lane, lanes.shape[1] - 1]
-        lambda_a, alpha_u, lambda_u = m * m, 2 * m * m, m * m + m * n
         for i in range(m):
-            k = (p[width + i] if gains.size == 0 else gains[lane, i]) / p[width + m + i]
+            k = (p[eta + i] if gains.size == 0 else gains[lane, i]) / p[layer + i]
             for j in range(m):
                 value = p[i * m + j]
                 for f in range(free):
@@ -201,7 +244,7 @@ def _close(  # type: ignore[no-untyped-def]
                 for i in range(m):
                     value -= X[f, i] * drive[i, j]
                 A[lane, m + f, j] = value
-        if not counts_cost:
+        if not counts_cost and member.size == 0:
             continue
         for i in range(m):
             for j in range(N):
@@ -214,6 +257,16 @@ def _close(  # type: ignore[no-untyped-def]
                 K[i, j] = 0.0
                 for k in range(m):
                     K[i, j] += B_inverse[i, k] * D[k, j]
+        if member.size > 0:
+            which = member[lane]
+            for i in range(n):
+                for j in range(N):
+                    value = drift[which, i, j]
+                    for k in range(m):
+                        value += push[which, i, k] * K[k, j]
+                    A[lane, i, j] = value
+        if not counts_cost:
+            continue
         for i in range(N):
             for j in range(N):
                 value = xx[i, j]
@@ -282,7 +335,7 @@ def _reach(A, powers, forced, bounded, reach):  # type: ignore[no-untyped-def]
                     break
             else:
                 row[:] = math.inf
-            for level in range(SETTLING):
+            for level in range(STEP_SIZES):
                 for j in range(N):
                     reach[block, level, (b * N + j) * LANES + i] = row[j]
                     value = abs(forced[block, level, 0, (bound * N + j) * LANES + i])

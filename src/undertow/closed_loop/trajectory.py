@@ -6,18 +6,25 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from html import escape
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.base import InvalidInputError, at_least, checked
+from undertow.base import at_least, checked, one_of, require_extra
 from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import numba
 
-__all__ = ["INADMISSIBLE", "Batch", "Event", "Trajectory"]
+if TYPE_CHECKING:
+    from undertow.closed_loop.figures import MotionFigure
 
-#: Scores from here on mark inadmissible motions, see :meth:`Batch.score`.
-INADMISSIBLE = 1e8
+#: Scores from here on mark inadmissible motions, see :meth:`Batch.score`; the highest an unstable
+#: surface.
+INADMISSIBLE, UNSTABLE = 1e8, 1e10
+
+#: Rows at either end of a trajectory that a notebook shows.
+SHOWN = 3
 
 
 class Event(IntEnum):
@@ -86,37 +93,39 @@ class Batch:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _score(cost, time, event, radius, horizon, scores):  # type: ignore[no-untyped-def]
     for i in range(len(scores)):
-        if event[i] == 1:  # reached
+        if event[i] == Event.REACHED:
             scores[i] = cost[i]
-        elif event[i] == 0:  # horizon
+        elif event[i] == Event.HORIZON:
             near = math.tanh(radius[i]) if math.isfinite(radius[i]) else 1.0
             scores[i] = 1e9 * (1.0 + near)
-        elif event[i] == 6:  # unstable
-            scores[i] = 1e10
+        elif event[i] == Event.UNSTABLE:
+            scores[i] = UNSTABLE
         else:
             scores[i] = 1e9 * (3.0 - time[i] / horizon)
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One recorded motion.
+    """One recorded motion: named columns over time.
 
     Attributes
     ----------
     t
         Times, (N,), s.
     x
-        States (q, q̇), (N, 2n), SI units.
+        States (q, q̇), (N, 2n), SI units; ``trajectory["phi"]`` is one of them by name.
     u
         Inputs after the actuator, (N, m).
     s
         Surface values, (N, m).
-    cost
+    accumulated_cost
         Cost so far, (N,).
     margin
         det Γ(q)/det Γ(0), (N,): positive where the law exists.
     event
         Why it ended.
+    cost_unit
+        Unit of the cost, as text.
     """
 
     mechanism: Mechanism
@@ -124,36 +133,121 @@ class Trajectory:
     x: FloatArray
     u: FloatArray
     s: FloatArray
-    cost: FloatArray
+    accumulated_cost: FloatArray
     margin: FloatArray
     event: Event
+    cost_unit: str = ""
 
     def __repr__(self) -> str:
         """Show whose it is, how long it is and how it ended."""
         return (
             f"Trajectory({self.mechanism.name}, {len(self.t)} rows, {self.t[0]:g} to "
-            f"{self.t[-1]:.4g} s, {self.event.name.lower()}, cost {self.total:.6g})"
+            f"{self.time:.4g} s, {self.event.name.lower()}, "
+            f"cost {self.cost:.6g}{f' {self.cost_unit}' if self.cost_unit else ''})"
         )
 
-    @property
-    def total(self) -> float:
-        """Total cost; that of a cascade's run is also ``run.cost``."""
-        return float(self.cost[-1])
+    def _repr_html_(self) -> str:
+        """Show the first and the last rows in a notebook, with units."""
+        rows = range(len(self.t))
+        shown = [*rows] if len(rows) <= 2 * SHOWN else [*rows[:SHOWN], -1, *rows[-SHOWN:]]
+        columns = {"t": (self.t, "s"), **self.columns}
+        heads = "".join(
+            f"<th>{escape(name)}{f'<br>{escape(unit)}' if unit else ''}</th>"
+            for name, (_, unit) in columns.items()
+        )
+
+        def line(row: int) -> str:
+            cells = ("…" if row < 0 else f"{values[row]:.4g}" for values, _ in columns.values())
+            return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+
+        body = "".join(line(row) for row in shown)
+        return f"<p>{escape(repr(self))}</p><table><tr>{heads}</tr>{body}</table>"
 
     @property
-    def duration(self) -> float:
+    def cost(self) -> float:
+        """Cost of the whole motion, in ``cost_unit``."""
+        return float(self.accumulated_cost[-1])
+
+    @property
+    def time(self) -> float:
         """Time at the end, s."""
         return float(self.t[-1])
 
     def __getitem__(self, name: str) -> FloatArray:
         """Return the time series of a named state."""
-        if name not in self.mechanism.state_names:
-            raise InvalidInputError(
-                "state of a trajectory",
-                value=repr(name),
-                limit=f"one of {', '.join(self.mechanism.state_names)}",
-            )
+        one_of("state of a trajectory", name, self.mechanism.state_names)
         return np.asarray(self.x[:, self.mechanism.state_names.index(name)])
+
+    @property
+    def columns(self) -> dict[str, tuple[FloatArray, str]]:
+        """Everything over time but ``t``: name to values, (N,), and unit.
+
+        States and inputs have the mechanism's names; then come ``s_0`` …, ``cost`` (so far) and
+        ``margin``.
+        """
+        mechanism = self.mechanism
+        units = [c.unit for c in mechanism.coordinates]
+        units += [f"{unit}/s" for unit in units]
+        named = [
+            *zip(mechanism.state_names, self.x.T, units, strict=True),
+            *((i.name, self.u[:, k], i.unit) for k, i in enumerate(mechanism.inputs)),
+            *((f"s_{k}", self.s[:, k], "") for k in range(mechanism.m)),
+            ("cost", self.accumulated_cost, self.cost_unit),
+            ("margin", self.margin, ""),
+        ]
+        columns: dict[str, tuple[FloatArray, str]] = {}
+        for name, values, unit in named:
+            free = name
+            while free in columns or free == "t":  # a mechanism may have a state called cost
+                free += "_"
+            columns[free] = values, unit
+        return columns
+
+    @checked
+    def plot(self, title: str = "") -> MotionFigure:
+        """Return a figure of the motion: a row for each coordinate and each input, over time.
+
+        A Matplotlib figure: save it with ``.savefig("motion.png")``; a notebook shows it.
+        """
+        from undertow.closed_loop.figures import motion_figure
+
+        return motion_figure({"motion": self}, title=title)
+
+    def to_pandas(self) -> Any:
+        """Return a ``pandas.DataFrame`` with the index t, s; ``.attrs["units"]`` has the units.
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas.
+        """
+        pandas = require_extra("pandas", "interop", "data frames need pandas")
+        columns = self.columns
+        table = pandas.DataFrame(
+            {name: values for name, (values, _) in columns.items()},
+            index=pandas.Index(self.t, name="t"),
+        )
+        table.attrs = {**self._facts, "units": {k: unit for k, (_, unit) in columns.items()}}
+        return table
+
+    def to_xarray(self) -> Any:
+        """Return an ``xarray.Dataset`` over t; each variable has its unit in ``.attrs["units"]``.
+
+        Raises
+        ------
+        MissingExtraError
+            Without xarray.
+        """
+        xarray = require_extra("xarray", "interop", "labelled arrays need xarray")
+        return xarray.Dataset(
+            {k: ("t", values, {"units": unit}) for k, (values, unit) in self.columns.items()},
+            coords={"t": ("t", self.t, {"units": "s"})},
+            attrs=self._facts,
+        )
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        return {"mechanism": self.mechanism.name, "event": self.event.name.lower()}
 
     @classmethod
     @checked
@@ -167,7 +261,13 @@ class Trajectory:
             end = len(piece.t) if index == len(pieces) - 1 else -1
             for key, parts in columns.items():
                 parts.append(getattr(piece, key)[:end])
-            costs.append(piece.cost[:end] + spent)
-            spent += piece.total
+            costs.append(piece.accumulated_cost[:end] + spent)
+            spent += piece.cost
         joined = {key: np.concatenate(parts) for key, parts in columns.items()}
-        return cls(first.mechanism, **joined, cost=np.concatenate(costs), event=pieces[-1].event)
+        return cls(
+            first.mechanism,
+            **joined,
+            accumulated_cost=np.concatenate(costs),
+            event=pieces[-1].event,
+            cost_unit=first.cost_unit,
+        )

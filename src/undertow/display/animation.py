@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,14 +20,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from PIL import Image
 
-from undertow.base import InvalidInputError
+from undertow.base import manifest, positive
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, style
+from undertow.display.plot import COLOURS, figure_bytes, style
 from undertow.display.sketches import Box, Disc, Label, Line, Sketch, sketch
 from undertow.models import FloatArray, Mechanism, check_symbols, vocabulary
 from undertow.symbolic import compile_expressions
 
-__all__ = ["Film", "gif", "still"]
+__all__ = ["Film", "film_files", "gif", "still"]
 
 #: A motion is shown until all of it stays within this part of where it has been.
 SETTLED = 0.03
@@ -109,8 +109,7 @@ class Film:
             For a frame rate, length or speed that is not positive.
         """
         for name, value in (("frame rate", fps), ("length", longest), ("speed", speed)):
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidInputError(f"{name} of an animation", value=value, limit="> 0")
+            positive(f"{name} of an animation", value)
         mechanism = trajectory.mechanism
         drawn = sketch(mechanism) if figure is None else figure
         start = trajectory.t[0]
@@ -136,8 +135,13 @@ class Film:
         What settles sooner than it ends is shown until then.
         """
         shown = float(self.t[-1] - self.t[0])
-        cut = self.whole - shown > self.t[1] - self.t[0]
-        return f"0 to {shown:.3g} s" + (f" of {self.whole:.3g} s" if cut else "")
+        return f"0 to {shown:.3g} s" + (f" of {self.whole:.3g} s" if self.cut else "")
+
+    @property
+    def cut(self) -> bool:
+        """Whether the motion takes longer to settle than the film shows."""
+        frames = self.t - self.t[0]
+        return bool(self.whole - frames[-1] > frames[1])
 
     @property
     def window(self) -> tuple[float, float, float, float]:
@@ -208,12 +212,11 @@ class Film:
 
 
 #: Positions (F, n) to points of each part (F, k, 3), angle and radius (F, 2), tip (F, 3).
-Evaluator = Callable[
-    [FloatArray], tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray]
-]
+#: Points of the parts, angles and radii of the discs, and the tip, over time.
+Places = tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray]
 
 
-def evaluator(mechanism: Mechanism, figure: Sketch) -> Evaluator:
+def evaluator(mechanism: Mechanism, figure: Sketch) -> Callable[[FloatArray], Places]:
     """Compile the points of a sketch for positions (F, n)."""
     points: list[list[sp.Expr]] = []
     discs: list[list[sp.Expr]] = []
@@ -231,9 +234,7 @@ def evaluator(mechanism: Mechanism, figure: Sketch) -> Evaluator:
     values = mechanism.substitution
     function = compile_expressions(mechanism.q, [e.xreplace(values) for e in everything])
 
-    def place(
-        q: FloatArray,
-    ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray]:
+    def place(q: FloatArray) -> Places:
         columns = [np.broadcast_to(v, len(q)).astype(float) for v in function(*q.T)]
         taken = iter(columns)
 
@@ -267,7 +268,7 @@ def _settled(trajectory: Trajectory) -> float:
     return min(float(last) + 0.5, float(trajectory.t[-1]))
 
 
-def gif(film: Film, *, width: float = 4.2, dpi: int = 72) -> bytes:
+def gif(film: Film, *, width: float = 4.2) -> bytes:
     """Return a film as an endless GIF: the figure, the time, and the inputs as bars.
 
     Parameters
@@ -276,8 +277,6 @@ def gif(film: Film, *, width: float = 4.2, dpi: int = 72) -> bytes:
         What to show.
     width
         Width, inches.
-    dpi
-        Pixels in an inch.
     """
     left, right, bottom, top = film.window
     height = float(np.clip(width * (top - bottom) / (right - left), 0.5 * width, 1.3 * width))
@@ -349,3 +348,17 @@ def still(axes: Axes, film: Film, ghosts: int = 6) -> None:
             film.draw(axes, frame, alpha=0.15 + 0.25 * place / max(1, ghosts), trace=False)
     film.draw(axes, last)
     film.frame(axes)
+
+
+def film_files(film: Film, request: Mapping[str, object]) -> dict[str, bytes]:
+    """Return a film as ``NAME.gif`` and ``NAME.png``, and how it was made as ``NAME.json``."""
+    with style():
+        figure = Figure(figsize=(4.5, 4.5))
+        still(figure.add_subplot(), film)
+        picture = figure_bytes(figure)
+    name = film.mechanism.name
+    return {
+        f"{name}.gif": gif(film),
+        f"{name}.png": picture,
+        f"{name}.json": manifest("undertow animate", request, frames=len(film.t), shows=film.span),
+    }

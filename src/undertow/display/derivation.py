@@ -12,15 +12,16 @@ with v = q̈_a and w = q̈_u: (1), (10) and (12) without a disturbance, equal to
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
 
-from undertow.display.formulas import plain, readable, rounded, tex, tex_words
-from undertow.law import first_surface, linearise, sliding_matrix
-from undertow.models import Mechanism
+from undertow.base import checked
+from undertow.law import first_surface, sliding_matrix
+from undertow.models import Mechanism, linearise
+from undertow.symbolic.formulas import plain, readable, rounded, tex, tex_words
 
 __all__ = ["Derivation", "Equation", "Section", "derivation"]
 
@@ -114,6 +115,11 @@ class Derivation:
                 lines += [r"\begin{align*}", " \\\\\n".join(rows), r"\end{align*}"]
         return "\n".join([*lines, r"\end{document}"]) + "\n"
 
+    def files(self) -> dict[str, bytes]:
+        """Return the formulas as ``NAME.txt`` and ``NAME.tex``."""
+        name = self.mechanism.name
+        return {f"{name}.txt": self.text().encode(), f"{name}.tex": self.latex().encode()}
+
 
 _RELATIONS = {"=": "=", "!=": "≠", ">": ">", "<": "<", "<=": "≤"}
 _TEX_RELATIONS = {"=": "=", "!=": r"\neq", ">": ">", "<": "<", "<=": r"\leq"}
@@ -129,6 +135,10 @@ def _symbol(mechanism: Mechanism, name: str) -> sp.Symbol:
     while plain(sp.Symbol(name)) in taken:
         name += "'"
     return sp.Symbol(name, real=True)
+
+
+def _named(mechanism: Mechanism, stem: str, rows: int, columns: int) -> sp.Matrix:
+    return sp.Matrix(rows, columns, lambda i, j: _symbol(mechanism, f"{stem}_{i + 1}{j + 1}"))
 
 
 def _rate(mechanism: Mechanism) -> sp.Symbol:
@@ -161,17 +171,11 @@ class Symbols:
         def grid(stem: str, rows: int, columns: int) -> sp.Matrix:
             if rows == 1:
                 return column(stem, columns).T
-            return sp.Matrix(
-                rows, columns, lambda i, j: _symbol(mechanism, f"{stem}_{i + 1}{j + 1}")
-            )
+            return _named(mechanism, stem, rows, columns)
 
         def column(stem: str, count: int) -> sp.Matrix:
-            return sp.Matrix(
-                [
-                    _symbol(mechanism, stem if count == 1 else f"{stem}_{i + 1}")
-                    for i in range(count)
-                ]
-            )
+            names = [stem] if count == 1 else [f"{stem}_{i + 1}" for i in range(count)]
+            return sp.Matrix([_symbol(mechanism, name) for name in names])
 
         M, B = mechanism.mass_matrix, mechanism.input_matrix
         return cls(
@@ -200,6 +204,7 @@ def _entry(mechanism: Mechanism, stem: str, i: int, j: int | None, matrix: sp.Ma
 # -- the derivation ------------------------------------------------------------------------------
 
 
+@checked
 def derivation(mechanism: Mechanism) -> Derivation:
     """Return the formulas of a mechanism, in the order of the theory.
 
@@ -231,9 +236,13 @@ def derivation(mechanism: Mechanism) -> Derivation:
         mechanism,
         (
             _coordinates(mechanism),
-            Section("Mass matrix M(q)", "M q̈ = f + (B u, 0), symmetric.", _mass(mechanism)),
+            Section(
+                "Mass matrix M(q)",
+                "M q̈ = f + (B u, 0), symmetric.",
+                _entries(mechanism, "M", mechanism.mass_matrix, readable),
+            ),
             Section("Forces f(q, q̇)", "", _force(mechanism)),
-            Section("Inputs B", "", _inputs(mechanism)),
+            Section("Inputs B", "", _entries(mechanism, "B", mechanism.input_matrix, readable)),
             _surface(mechanism, symbols),
             _law(mechanism, symbols),
             _existence(mechanism, symbols),
@@ -258,30 +267,27 @@ def _coordinates(mechanism: Mechanism) -> Section:
     return Section("Coordinates, inputs, parameters", "\n".join(lines))
 
 
-def _mass(mechanism: Mechanism) -> tuple[Equation, ...]:
-    n = mechanism.n
+def _rows(left: Iterable[sp.Expr], right: Iterable[sp.Expr]) -> tuple[Equation, ...]:
+    """Two columns as equations, row by row."""
+    return tuple(Equation(*row) for row in zip(left, right, strict=True))
+
+
+def _entries(
+    mechanism: Mechanism, stem: str, matrix: sp.Matrix, shown: Callable[[sp.Expr], sp.Expr]
+) -> tuple[Equation, ...]:
+    """The entries of a matrix with their names, above the diagonal alone where it is symmetric."""
+    rows, columns = matrix.shape
     return tuple(
-        Equation(_symbol(mechanism, f"M_{i + 1}{j + 1}"), readable(mechanism.mass_matrix[i, j]))
-        for i in range(n)
-        for j in range(i, n)
+        Equation(_symbol(mechanism, f"{stem}_{i + 1}{j + 1}"), shown(matrix[i, j]))
+        for i in range(rows)
+        for j in range(i if stem == "M" else 0, columns)
     )
 
 
 def _force(mechanism: Mechanism) -> tuple[Equation, ...]:
     rates = mechanism.x[mechanism.n :]
-    return tuple(
-        Equation(_symbol(mechanism, f"f_{i + 1}"), readable(mechanism.force[i], rates))
-        for i in range(mechanism.n)
-    )
-
-
-def _inputs(mechanism: Mechanism) -> tuple[Equation, ...]:
-    m = mechanism.m
-    return tuple(
-        Equation(_symbol(mechanism, f"B_{i + 1}{j + 1}"), readable(mechanism.input_matrix[i, j]))
-        for i in range(m)
-        for j in range(m)
-    )
+    names = [_symbol(mechanism, f"f_{i + 1}") for i in range(mechanism.n)]
+    return _rows(names, [readable(f, rates) for f in mechanism.force])
 
 
 def _surface(mechanism: Mechanism, y: Symbols) -> Section:
@@ -289,38 +295,20 @@ def _surface(mechanism: Mechanism, y: Symbols) -> Section:
     q_a, q_u = sp.Matrix(mechanism.q[:m]), sp.Matrix(mechanism.q[m:])
     qd_a, qd_u = sp.Matrix(mechanism.x[n : n + m]), sp.Matrix(mechanism.x[n + m :])
     s = y.alpha_a * qd_a + y.lambda_a * q_a + y.alpha_u * qd_u + y.lambda_u * q_u
-    return Section(
-        "Sliding surface (10)",
-        "Normalised, α_a = −I.",
-        tuple(Equation(left, right) for left, right in zip(y.surface, s, strict=True)),
-    )
+    return Section("Sliding surface (10)", "Normalised, α_a = −I.", _rows(y.surface, s))
 
 
 def _law(mechanism: Mechanism, y: Symbols) -> Section:
     """The law as the linear equations that it solves; explicit for n = 2, m = 1."""
     n, m = mechanism.n, mechanism.m
     qd_a, qd_u = sp.Matrix(mechanism.x[n : n + m]), sp.Matrix(mechanism.x[n + m :])
-    switch = sp.Matrix(
-        [
-            e * sp.Function("sat")(s / width)
-            for e, s, width in zip(y.eta, y.surface, y.layer, strict=True)
-        ]
-    )
+    sat, rows = sp.Function("sat"), zip(y.eta, y.surface, y.layer, strict=True)
+    switch = sp.Matrix([e * sat(s / width) for e, s, width in rows])
     reach = -(y.lambda_a * qd_a + y.lambda_u * qd_u + switch)
     M_aa, M_au, M_uu = y.M[:m, :m], y.M[:m, m:], y.M[m:, m:]
-    free = [
-        Equation(left, right)
-        for left, right in zip(M_au.T * y.v + M_uu * y.w, y.f[m:, :], strict=True)
-    ]
-    sliding = [
-        Equation(left, right)
-        for left, right in zip(y.alpha_a * y.v + y.alpha_u * y.w, reach, strict=True)
-    ]
-    force = M_aa * y.v + M_au * y.w - y.f[:m, :]
-    inputs = [
-        Equation(left, right)
-        for left, right in zip(y.B * sp.Matrix(mechanism.u), force, strict=True)
-    ]
+    free = _rows(M_au.T * y.v + M_uu * y.w, y.f[m:, :])
+    sliding = _rows(y.alpha_a * y.v + y.alpha_u * y.w, reach)
+    inputs = _rows(y.B * sp.Matrix(mechanism.u), M_aa * y.v + M_au * y.w - y.f[:m, :])
     words = (
         "Wanted accelerations from the free rows of (1) and from ṡ = −η sat(s/ε) (12); then the "
         "input that makes them (5). Gains: η where no disturbance is declared, else (13)."
@@ -328,7 +316,7 @@ def _law(mechanism: Mechanism, y: Symbols) -> Section:
     if (n, m) == (2, 1):
         row = y.alpha_a[0] * y.M[1, 1] - y.alpha_u[0] * y.M[0, 1]
         explicit = (y.M[1, 1] * reach[0] - y.alpha_u[0] * y.f[1]) / row
-        sliding.append(Equation(y.v[0], explicit))
+        sliding = (*sliding, Equation(y.v[0], explicit))
     return Section("Law (5), (12)", words, (*free, *sliding, *inputs))
 
 
@@ -343,12 +331,8 @@ def _existence(mechanism: Mechanism, y: Symbols) -> Section:
     )
     if n - m == 1:
         return Section("Existence of the law (37)", words, (Equation(readable(E[0]), 0, "!="),))
-    entries = tuple(
-        Equation(_symbol(mechanism, f"E_{i + 1}{j + 1}"), readable(E[i, j]))
-        for i in range(n - m)
-        for j in range(n - m)
-    )
-    names = sp.Matrix(n - m, n - m, lambda i, j: _symbol(mechanism, f"E_{i + 1}{j + 1}"))
+    entries = _entries(mechanism, "E", E, readable)
+    names = _named(mechanism, "E", n - m, n - m)
     whole = Equation(names.det(method="berkowitz").expand(), sp.Integer(0), "!=")
     return Section("Existence of the law (37)", words, (*entries, whole))
 
@@ -382,13 +366,8 @@ def _stability(mechanism: Mechanism, y: Symbols) -> Section:
         f"det P(σ) have negative real parts; degree {degree}."
     )
     if m > 1:
-        P = polynomial_matrix(mechanism, symbolic=False).applyfunc(rounded)
-        entries = tuple(
-            Equation(_symbol(mechanism, f"P_{i + 1}{j + 1}"), P[i, j])
-            for i in range(n)
-            for j in range(n)
-        )
-        return Section(title, general, entries)
+        P = polynomial_matrix(mechanism, symbolic=False)
+        return Section(title, general, _entries(mechanism, "P", P, rounded))
     symbolic = n == 2
     P = polynomial_matrix(mechanism, symbolic=symbolic)
     polynomial = sp.Poly(P.det(method="berkowitz").expand(), rate)
@@ -445,11 +424,7 @@ def _example(mechanism: Mechanism) -> Section:
     y = Symbols.of(mechanism)
     pairs: list[Equation] = []
     for name in ("lambda_a", "alpha_u", "lambda_u"):
-        pairs += [
-            Equation(symbol, rounded(sp.Float(value)))
-            for symbol, value in zip(
-                getattr(y, name), getattr(surface, name).ravel().tolist(), strict=True
-            )
-        ]
+        values = getattr(surface, name).ravel().tolist()
+        pairs += _rows(getattr(y, name), [rounded(sp.Float(value)) for value in values])
     words = f"Quadratic design of Utkin and Young; eigenvalues of its sliding motion, 1/s: {shown}."
     return Section("A first surface", words, tuple(pairs))

@@ -156,23 +156,11 @@ def _rotary_pendulum(v: _Symbols) -> Sketch:
     return Sketch((pillar, Line(((0, 0, 0), hinge)), Line((hinge, tip))), tip, "oblique")
 
 
-def _cart_pendulum(v: _Symbols) -> Sketch:
-    return _on_a_cart(v, [v.phi], [2 * v.l])
-
-
 def _overhead_crane(v: _Symbols) -> Sketch:
     x = v.x
     load = (x + v.l * sp.sin(v.theta), 0, -v.l * sp.cos(v.theta))
     rope = Line(((x, 0, 0), load), "rope")
     return Sketch((_ground(0.05), Box((x, 0, 0), 0.12, 0.05), rope, Disc(load, 0.05)), load)
-
-
-def _pendubot(v: _Symbols) -> Sketch:
-    return _standing([v.q_1, v.q_1 + v.q_2], [v.l_1, 2 * v.a_2])
-
-
-def _acrobot(v: _Symbols) -> Sketch:
-    return _standing([v.q_1, v.q_1 + v.q_2], [v.l_1, 2 * v.a_2])
 
 
 def _reaction_wheel_pendulum(v: _Symbols) -> Sketch:
@@ -210,26 +198,11 @@ def _wheeled_inverted_pendulum(v: _Symbols) -> Sketch:
     return Sketch((_ground(0.0), *links, Disc(axle, v.R, turn)), tip)
 
 
-def _double_pendulum_on_a_cart(v: _Symbols) -> Sketch:
-    return _on_a_cart(v, [v.phi_1, v.phi_2], [v.l_1, 2 * v.a_2])
-
-
-def _two_motor_three_link(v: _Symbols) -> Sketch:
-    leans = [v.q_1, v.q_1 + v.q_2, v.q_1 + v.q_2 + v.q_3]
-    return _standing(leans, [v.l_1, v.l_2, 2 * v.a_3])
-
-
 def _gantry_crane(v: _Symbols) -> Sketch:
     x, y, a, b = v.x, v.y, v.theta_x, v.theta_y
-    load = (
-        x + v.l * sp.sin(a) * sp.cos(b),
-        y + v.l * sp.sin(b),
-        -v.l * sp.cos(a) * sp.cos(b),
-    )
-    rails = (
-        Line(((-0.8, -0.6, 0), (0.8, -0.6, 0)), "frame"),
-        Line(((-0.8, 0.6, 0), (0.8, 0.6, 0)), "frame"),
-    )
+    swing = v.l * sp.cos(b)
+    load = (x + swing * sp.sin(a), y + v.l * sp.sin(b), -swing * sp.cos(a))
+    rails = (Line(((-0.8, side, 0), (0.8, side, 0)), "frame") for side in (-0.6, 0.6))
     bridge = Line(((x, -0.6, 0), (x, 0.6, 0)))
     rope = Line(((x, y, 0), load), "rope")
     return Sketch(
@@ -237,25 +210,26 @@ def _gantry_crane(v: _Symbols) -> Sketch:
     )
 
 
-def _triple_pendulum_on_a_cart(v: _Symbols) -> Sketch:
-    return _on_a_cart(v, [v.phi_1, v.phi_2, v.phi_3], [v.l_1, v.l_2, 2 * v.a_3])
+def _two_link(v: _Symbols) -> Sketch:
+    return _standing([v.q_1, v.q_1 + v.q_2], [v.l_1, 2 * v.a_2])
 
 
 _SKETCHES: dict[str, Callable[[_Symbols], Sketch]] = {
-    draw.__name__[1:]: draw
-    for draw in (
-        _rotary_pendulum,
-        _cart_pendulum,
-        _overhead_crane,
-        _pendubot,
-        _acrobot,
-        _reaction_wheel_pendulum,
-        _tora,
-        _ball_and_beam,
-        _wheeled_inverted_pendulum,
-        _double_pendulum_on_a_cart,
-        _two_motor_three_link,
-        _gantry_crane,
-        _triple_pendulum_on_a_cart,
-    )
+    "rotary_pendulum": _rotary_pendulum,
+    "cart_pendulum": lambda v: _on_a_cart(v, [v.phi], [2 * v.l]),
+    "overhead_crane": _overhead_crane,
+    "pendubot": _two_link,
+    "acrobot": _two_link,
+    "reaction_wheel_pendulum": _reaction_wheel_pendulum,
+    "tora": _tora,
+    "ball_and_beam": _ball_and_beam,
+    "wheeled_inverted_pendulum": _wheeled_inverted_pendulum,
+    "double_pendulum_on_a_cart": lambda v: _on_a_cart(v, [v.phi_1, v.phi_2], [v.l_1, 2 * v.a_2]),
+    "two_motor_three_link": lambda v: _standing(
+        [v.q_1, v.q_1 + v.q_2, v.q_1 + v.q_2 + v.q_3], [v.l_1, v.l_2, 2 * v.a_3]
+    ),
+    "gantry_crane": _gantry_crane,
+    "triple_pendulum_on_a_cart": lambda v: _on_a_cart(
+        v, [v.phi_1, v.phi_2, v.phi_3], [v.l_1, v.l_2, 2 * v.a_3]
+    ),
 }

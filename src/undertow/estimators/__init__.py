@@ -1,18 +1,19 @@
-"""Estimators: from positions, measured one sample after another, to states."""
+"""Estimators: states from measured positions, parameters from motions."""
 
-from undertow.estimators.compensation import compensated
-from undertow.estimators.differentiators import FilteredDerivative, SuperTwisting
-from undertow.estimators.drive import Controller, Record, drive
-from undertow.estimators.interface import Estimator, Measured
+from undertow.estimators.belief import Belief, ParameterEstimate
+from undertow.estimators.drive import Record, StateFeedback, compensated, drive
+from undertow.estimators.interface import Estimator, FilteredDerivative, Measured, SuperTwisting
 from undertow.estimators.kalman import KalmanFilter
 
 __all__ = [
-    "Controller",
+    "Belief",
     "Estimator",
     "FilteredDerivative",
     "KalmanFilter",
     "Measured",
+    "ParameterEstimate",
     "Record",
+    "StateFeedback",
     "SuperTwisting",
     "compensated",
     "drive",

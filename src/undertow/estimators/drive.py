@@ -1,4 +1,11 @@
-"""Rig, estimator and controller in one loop of simulated time, recorded."""
+"""Rig, estimator and controller in one loop of simulated time, recorded.
+
+What an estimator knows of a matched disturbance is taken off the controller's output.  What
+enters where the input does (dry friction of a driven joint, a motor that is weaker than its data
+sheet, a cable that pulls) can be undone by the input itself, as far as it is known.  An observer
+that keeps counting while a joint sticks also sets it free: integral action.  (Ohnishi's
+disturbance observer; Chen, Yang, Guo, Li, *IEEE Trans. Ind. Electronics* 63(2), 2016.)
+"""
 
 from __future__ import annotations
 
@@ -10,12 +17,11 @@ import numpy as np
 from undertow.base import InvalidInputError
 from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray
-from undertow.plants.interface import Rig
-
-__all__ = ["Controller", "Record", "drive"]
+from undertow.plants import Measurement, Rig, control_loop
+from undertow.symbolic import numba
 
 #: What steers: (t, x̂) to the inputs, (m,).
-Controller = Callable[[float, FloatArray], FloatArray]
+StateFeedback = Callable[[float, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +64,7 @@ class Record:
         return Record(*(column[-1:] for column in (self.t, self.q, self.x, self.u, self.truth)))
 
 
-def drive(rig: Rig, estimator: Estimator, controller: Controller, seconds: float) -> Record:
+def drive(rig: Rig, estimator: Estimator, controller: StateFeedback, seconds: float) -> Record:
     """Run a controller on a rig for some time, as fast as it goes.
 
     Parameters
@@ -84,15 +90,66 @@ def drive(rig: Rig, estimator: Estimator, controller: Controller, seconds: float
             value=f"{seconds:g} s",
             limit=f"{rig.period:g} s to {1e7 * rig.period:g} s, 1 to 10000000 samples",
         )
-    u: FloatArray = np.zeros(0)
-    rows: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = []
+    last: FloatArray = np.zeros(0)
     nothing = np.full(1, np.nan)
-    for _ in range(count):
-        measurement = rig.read()
-        x = estimator.estimate(measurement, u)
-        u = np.array(controller(measurement.t, x))
+    rows: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = []
+
+    def step(measurement: Measurement) -> FloatArray:
+        nonlocal last
+        x = estimator.estimate(measurement, last)
+        last = np.array(controller(measurement.t, x))
         truth = getattr(rig, "truth", nothing)
-        rows.append((measurement.t, measurement.q, x.copy(), u, truth))
-        rig.write(u)
+        rows.append((measurement.t, measurement.q, x.copy(), last, truth))
+        return last
+
+    for _ in control_loop(rig, step, count):
+        pass
     t, q, x, u, truth = (np.asarray(column) for column in zip(*rows, strict=True))
     return Record(t, q, x, u, np.broadcast_to(truth, x.shape))
+
+
+#: Largest part of an input's limit that an estimated disturbance may claim: of a sensor or an
+#: actuator that has failed an observer believes anything.
+SHARE = 0.5
+
+
+@numba.njit(cache=True, error_model="numpy")
+def subtract_disturbance(
+    u: FloatArray, disturbance: FloatArray, limits: FloatArray, out: FloatArray
+) -> None:
+    """Write u − d̂, (m,), into ``out``: |d̂| at most ``SHARE`` of the limits, the sum within them."""
+    for i in range(u.shape[0]):
+        most = SHARE * limits[i]
+        wanted = u[i] - max(-most, min(most, disturbance[i]))
+        out[i] = max(-limits[i], min(limits[i], wanted))
+
+
+def compensated(
+    controller: StateFeedback,
+    estimator: Estimator,
+    limits: FloatArray,
+    when: Callable[[], bool] = lambda: True,
+) -> StateFeedback:
+    """Return a controller whose output lacks what the estimator knows of the disturbance.
+
+    Parameters
+    ----------
+    controller
+        (t, x̂) to the inputs.
+    estimator
+        Whose ``disturbance`` is taken off.
+    limits
+        Largest |u_i|, (m,).
+    when
+        Asked after each step of the controller: whether its output shall lack it.
+    """
+    out = np.zeros_like(limits)
+
+    def both(t: float, x: FloatArray) -> FloatArray:
+        u = controller(t, x)
+        if not when():
+            return u
+        subtract_disturbance(u, estimator.disturbance, limits, out)
+        return out
+
+    return both

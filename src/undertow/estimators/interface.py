@@ -1,7 +1,8 @@
-"""From measurements to states: the face that all estimators share."""
+"""From measurements to states: the face that all estimators share, and those without a model."""
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -9,9 +10,8 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError
 from undertow.models import FloatArray, Mechanism
-from undertow.plants.interface import Measurement
-
-__all__ = ["Estimator", "Measured"]
+from undertow.plants import Measurement
+from undertow.symbolic import numba
 
 
 class Estimator(Protocol):
@@ -93,3 +93,126 @@ def positive(what: str, values: ArrayLike, n: int) -> FloatArray:
             remedy="One number serves all coordinates",
         )
     return np.array(np.broadcast_to(array, (n,)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _filtered(x: FloatArray, last: FloatArray, q: FloatArray, h: float, rest: FloatArray) -> None:
+    """Tustin's form of s/(τ s + 1), coordinate by coordinate."""
+    n = q.shape[0]
+    for i in range(n):
+        if q[i] == q[i]:
+            x[i] = q[i]
+            tau = rest[i]
+            v = x[n + i]
+            x[n + i] = ((2.0 * tau - h) * v + 2.0 * (q[i] - last[i])) / (2.0 * tau + h)
+            last[i] = q[i]
+        else:
+            x[i] += h * x[n + i]
+            last[i] = x[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _twisted(x: FloatArray, q: FloatArray, h: float, bound: FloatArray) -> None:
+    """Implicit Euler step of Levant's differentiator, λ₀ = 1.1, λ₁ = 1.5."""
+    n = q.shape[0]
+    for i in range(n):
+        ahead = x[i] + h * x[n + i]
+        if q[i] != q[i]:
+            x[i] = ahead
+            continue
+        error = ahead - q[i]
+        step = 1.1 * h * h * bound[i]
+        if abs(error) <= step:
+            x[i] = q[i]
+            x[n + i] -= error / h
+            continue
+        slope = 1.5 * h * math.sqrt(bound[i])
+        root = 0.5 * (math.sqrt(slope * slope + 4.0 * (abs(error) - step)) - slope)
+        side = 1.0 if error > 0.0 else -1.0
+        x[i] = q[i] + side * root * root
+        x[n + i] -= side * step / h
+
+
+class _Differentiator:
+    """What both share: a state, a clock, a first measurement."""
+
+    def __init__(self, mechanism: Mechanism, period: float) -> None:
+        self.mechanism = mechanism
+        self.period = float(positive("period of an estimator", [period], 1)[0])
+        self._x = np.zeros(2 * mechanism.n)
+        self._t = math.nan
+        self.disturbance = np.zeros(mechanism.m)
+
+    def reset(self, x0: ArrayLike) -> None:
+        """Start again from the state x0, (2n,)."""
+        self._x[:] = x0
+        self._t = math.nan
+
+    def _elapsed(self, t: float) -> float:
+        """Return the time since the last measurement, s; one period where there is none."""
+        h = t - self._t
+        self._t = t
+        return h if 0.0 < h < 100.0 * self.period else self.period
+
+
+class FilteredDerivative(_Differentiator):
+    """Differences behind a first-order filter, s/(τ s + 1).
+
+    Parameters
+    ----------
+    mechanism
+        Whose coordinates they are.
+    period
+        Usual time between samples, s.
+    time_constant
+        τ, s, one or one per coordinate: a longer one is quieter and later.
+    """
+
+    def __init__(
+        self, mechanism: Mechanism, period: float = 0.001, time_constant: ArrayLike = 0.01
+    ) -> None:
+        super().__init__(mechanism, period)
+        self._rest = positive("time_constant of a derivative", time_constant, mechanism.n)
+        self._last = np.zeros(mechanism.n)
+
+    def reset(self, x0: ArrayLike) -> None:
+        """Start again from the state x0, (2n,)."""
+        super().reset(x0)
+        self._last[:] = self._x[: self.mechanism.n]
+
+    def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
+        """Return (q measured, q̇ filtered); the inputs are not used."""
+        h = self._elapsed(measurement.t)
+        _filtered(self._x, self._last, measurement.q, h, self._rest)
+        return self._x
+
+
+class SuperTwisting(_Differentiator):
+    """Levant's robust exact differentiator, ẑ̇₀ = z₁ − λ₁ √(L|e|) sign e, ż₁ = −λ₀ L sign e.
+
+    Exact after a finite time for noiseless positions whose acceleration stays below L
+    (Levant, *Automatica* 34(3), 1998).  Discretised by the implicit Euler method, which does
+    not chatter (Mojallizadeh, Brogliato, Acary, *Int. J. Robust Nonlinear Control* 31(17),
+    2021): the step has a closed form.
+
+    Parameters
+    ----------
+    mechanism
+        Whose coordinates they are.
+    period
+        Usual time between samples, s.
+    acceleration
+        L, rad/s² or m/s², one or one per coordinate: a larger one follows faster and lets
+        more noise through.
+    """
+
+    def __init__(
+        self, mechanism: Mechanism, period: float = 0.001, acceleration: ArrayLike = 200.0
+    ) -> None:
+        super().__init__(mechanism, period)
+        self._bound = positive("acceleration of a differentiator", acceleration, mechanism.n)
+
+    def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
+        """Return the differentiator's (z₀, z₁); the inputs are not used."""
+        _twisted(self._x, measurement.q, self._elapsed(measurement.t), self._bound)
+        return self._x

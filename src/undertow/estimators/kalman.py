@@ -19,20 +19,50 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError
 from undertow.estimators.interface import positive
 from undertow.models import FloatArray, Mechanism, require_smooth
-from undertow.plants.interface import Measurement
-from undertow.plants.stepping import dynamics_source
-from undertow.symbolic import (
-    BRIEF,
-    COMPILED,
-    PREAMBLE,
-    Workspace,
-    content_key,
-    docstring,
-    generated,
-    unpacked,
-)
+from undertow.plants import Measurement
+from undertow.plants.stepping import compiled_module
+from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 
-__all__ = ["KalmanFilter"]
+
+@numba.njit(cache=True, error_model="numpy")
+def predict_covariance(
+    F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: float
+) -> None:
+    """Turn P into F P Fᵀ + h diag(noise), exactly symmetric; A, of P's size, is scratch."""
+    size = P.shape[0]
+    for i in range(size):
+        for j in range(size):
+            total = 0.0
+            for k in range(size):
+                total += F[i, k] * P[k, j]
+            A[i, j] = total
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(size):
+                total += A[i, k] * F[j, k]
+            P[i, j] = total
+            P[j, i] = total
+        P[i, i] += h * noise[i]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def measurement_update(
+    x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray
+) -> None:
+    """Take in positions one by one, nothing inverted; a missing one (NaN) is left out."""
+    size = x.shape[0]
+    for i in range(q.shape[0]):
+        if q[i] != q[i]:
+            continue
+        spread = P[i, i] + variance[i]
+        error = q[i] - x[i]
+        column[:size] = P[:, i]
+        for k in range(size):
+            x[k] += column[k] * (error / spread)
+            for j in range(size):
+                P[k, j] -= column[k] * column[j] / spread
+
 
 #: What the filter remembers: ``size`` numbers are estimated, inputs act ``lead`` periods late.
 _LAYOUT = {
@@ -47,21 +77,7 @@ def move(h, x, u, n, m, parameters, stage, total, qdd, viscous, driven):
     # Runge-Kutta's step of the mean; x may end with the estimated disturbance.
     for i in range(m):
         driven[i] = u[i] + (x[2 * n + i] if x.shape[0] > 2 * n else 0.0)
-    for i in range(2 * n):
-        stage[i] = x[i]
-        total[i] = 0.0
-    for k in range(4):
-        reach = h if k == 2 else 0.5 * h
-        weight = 1.0 if k == 0 or k == 3 else 2.0
-        forward(0.0, stage, driven, viscous, parameters, qdd)
-        for i in range(n):
-            d, dd = stage[n + i], qdd[i]
-            total[i] += weight * d
-            total[n + i] += weight * dd
-            stage[i] = x[i] + reach * d
-            stage[n + i] = x[n + i] + reach * dd
-    for i in range(2 * n):
-        x[i] += h / 6.0 * total[i]
+    rk4_step(0.0, h, 0.0, n, x, driven, viscous, parameters, stage, total, qdd)
 
 
 {COMPILED}
@@ -71,9 +87,9 @@ def jacobian(h, x, u, n, m, parameters, F, A, qdd, base, viscous, driven):
     for i in range(m):
         driven[i] = u[i] + (x[2 * n + i] if size > 2 * n else 0.0)
     forward(0.0, x, driven, viscous, parameters, base)
-    for i in range(size):
-        for j in range(size):
-            A[i, j] = 1.0 if i < n and j == n + i else 0.0
+    A[:] = 0.0
+    for i in range(n):
+        A[i, n + i] = 1.0
     for j in range(size):
         small = 1e-6
         if j < 2 * n:
@@ -111,8 +127,7 @@ def estimate(h, q, u, block, size, lead):
     predict_covariance(F, P, A, noise, h)
     measurement_update(x, P, q, variance, total)
     count[0] = start + 1.0
-    for i in range(size):
-        out[i] = x[i]
+    out[:] = x
     for k in range(lead):
         then = past[(start + 2 + k) % (lead + 1)]
         move(h, out, then, n, m, parameters, stage, total, qdd, viscous, driven)
@@ -121,18 +136,8 @@ def estimate(h, q, u, block, size, lead):
 
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
-    key = content_key(mechanism.structure, mechanism.name)
-
-    def write() -> str:
-        # numba's cache does not notice that an imported function has changed: the key does.
-        header = docstring(f"Kalman filter of {mechanism.name}; generated, do not edit. {key[:16]}")
-        parts = (
-            "from undertow.estimators.covariance import predict_covariance, measurement_update\n"
-        )
-        parts += f"\nn, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
-        return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
-
-    return generated("kalman", mechanism.name, key, write)
+    parts = "from undertow.estimators.kalman import predict_covariance, measurement_update\n"
+    return compiled_module(mechanism, "kalman", "Kalman filter", _BODY, parts)
 
 
 class KalmanFilter:
@@ -253,7 +258,7 @@ class KalmanFilter:
         self._estimate(h, measurement.q, u, self._block, self._size, self._lead)
         return self._state
 
-    def settled(self, seconds: float = 0.5) -> FloatArray:
+    def steady_covariance(self, seconds: float = 0.5) -> FloatArray:
         """Return the covariance that a filter like this one comes to, at rest at the target.
 
         It is the filter's own, after so long, s.

@@ -1,11 +1,15 @@
 """The inner loop for a microcontroller: heap-free C99 from the kernel's own expressions."""
 
 from undertow.export.controller import EmbeddedController
-from undertow.export.differentiators import DerivativeStep, DifferentiatorStep, SuperTwistingStep
-from undertow.export.host import Agreement, Build, Footprint, HostProcess
-from undertow.export.observer import KalmanStep
-from undertow.export.sources import files
-from undertow.export.status import Status, Verdict
+from undertow.export.estimate import (
+    DerivativeStep,
+    DifferentiatorStep,
+    KalmanStep,
+    SuperTwistingStep,
+)
+from undertow.export.host import Agreement, Build, Footprint, HostProcess, RigRun, run_on_rig
+from undertow.export.names import PlanAnswer, Status
+from undertow.export.sources import export_c, files
 from undertow.export.twin import Twin
 
 __all__ = [
@@ -17,9 +21,12 @@ __all__ = [
     "Footprint",
     "HostProcess",
     "KalmanStep",
+    "PlanAnswer",
+    "RigRun",
     "Status",
     "SuperTwistingStep",
     "Twin",
-    "Verdict",
+    "export_c",
     "files",
+    "run_on_rig",
 ]

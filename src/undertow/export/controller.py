@@ -1,24 +1,28 @@
-"""What is exported: a mechanism, its law and plan, an estimator, and how fast it runs."""
+"""What is exported: a mechanism, its law and plan, an estimator, and how fast it runs.
+
+Plans are rounded to the numbers that the C holds, with checksums, which ``ut_plan_seal`` computes
+in C.  A change of any single word changes that of its row for certain, since every step of the sum
+can be undone; other damage does but for one case in 2³² (single precision) or 2⁶⁴.
+"""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError
-from undertow.export.differentiators import DerivativeStep
-from undertow.export.estimate import EstimatorStep
+from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
-from undertow.export.observer import KalmanStep
-from undertow.law import Plan, ReachingLaw, SlidingModeLaw, Surface, check_surface
+from undertow.law import LawLayout, Plan, ReachingLaw, SlidingModeLaw, Surface, check_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import Real, literal
-
-__all__ = ["EmbeddedController"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,3 +195,92 @@ class EmbeddedController:
                 single = np.nextafter(single, np.float32(0))
             value = float(single)
         return literal(value, self.real)
+
+
+#: Bits of a word, and the odd factor of each step, by precision.
+WIDTH = {"double": 64, "float": 32}
+FACTOR = {"double": 0x9E3779B97F4A7C15, "float": 0x9E3779B1}
+
+
+def as_held(value: float, real: Real) -> float:
+    """Return a number as the C holds it."""
+    return float(np.float32(literal(value, real).rstrip("f")) if real == "float" else value)
+
+
+def checksums(
+    number: int, starts: Sequence[int], rows: Sequence[tuple[ArrayLike, ...]], real: Real
+) -> list[int]:
+    """Return the checksum of each row.
+
+    Parameters
+    ----------
+    number
+        Of the plan.
+    starts
+        Periods at which the rows take over, ascending from 0.
+    rows
+        Numbers of each row, as ``as_held`` gives them: surface (2mn,), η (m,) and ε (m,).
+    real
+        Floating-point type of the C.
+    """
+    width = WIDTH[real]
+    mask = (1 << width) - 1
+    kind, unsigned = (np.float32, np.uint32) if real == "float" else (np.float64, np.uint64)
+
+    def folded(value: int) -> int:
+        return (value ^ value >> 32) & mask
+
+    words = []
+    for k, ((start, following), (surface, eta, layer)) in enumerate(
+        zip(pairwise([*starts, 0]), rows, strict=True)
+    ):
+        gains = np.stack([np.asarray(eta), np.asarray(layer)], axis=1)
+        values = np.concatenate([np.asarray(surface), gains.ravel()]).astype(kind)
+        total = folded(number)
+        for word in (
+            len(rows),
+            k,
+            folded(start),
+            folded(following),
+            *values.view(unsigned).tolist(),
+        ):
+            turned = (total << 5 | total >> width - 5) & mask
+            total = (turned ^ word) * FACTOR[real] & mask
+        words.append(total)
+    return words
+
+
+def plan_numbers(
+    controller: EmbeddedController, plan: Plan
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Return what the C holds of each row of a plan: surface (2mn,), η (m,) and ε (m,)."""
+    m = controller.mechanism.m
+    layout = LawLayout(controller.mechanism.n, m)
+    rows = []
+    for surface, t in zip(plan.surfaces, plan.times, strict=True):
+        law = plan.at(t)[1] or controller.reaching
+        values = np.concatenate([surface.vector, law.vector(m)])
+        held = np.array([as_held(v, controller.real) for v in values.tolist()])
+        rows.append((held[layout.surface], held[layout.eta], held[layout.layer]))
+    return rows
+
+
+def plan_text(controller: EmbeddedController, plan: Plan, number: int) -> dict[str, str]:
+    """Return the C initialisers of a plan: count, starts and rows with their checksums."""
+    whole = controller if plan is controller.plan else replace(controller, surface=plan)
+    starts, numbers = whole.starts(plan), plan_numbers(whole, plan)
+    checks = checksums(number, starts, numbers, controller.real)
+    rows = []
+    for law, row, check in zip(whole.laws, numbers, checks, strict=True):
+        parts = [f"{{{_listed(v, controller.real)}}}" for v in row]
+        gamma = literal(law.gamma_target, controller.real)
+        rows.append(f"        {{{', '.join([*parts, gamma, f'{check:#x}u'])}}},")
+    return {
+        "count": str(len(rows)),
+        "starts": ", ".join(f"{k}UL" for k in starts),
+        "rows": "\n".join(rows),
+    }
+
+
+def _listed(values: Iterable[float], real: Real) -> str:
+    return ", ".join(literal(v, real) for v in values)

@@ -1,87 +1,227 @@
-"""C of where the state comes from: a differentiator for each coordinate, or the model itself."""
+"""Where the state of the exported controller comes from: one step of an estimator, and its C.
+
+A differentiator follows the same rules as in :mod:`undertow.estimators`, for a fixed period: each
+coordinate has a memory of two numbers, a position and the estimated velocity; a step maps (gain,
+q, memory) to the new memory, which is the estimate.
+
+The observer of fixed gain moves the state as the model says under the last output; each measured
+position then corrects it.  The gain is that to which :class:`undertow.estimators.KalmanFilter`
+settles at the target, K = P Hᵀ R⁻¹ (Kalman, *Journal of Basic Engineering* 82(1), 1960), so
+nothing is inverted on the target.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol
 
+import numpy as np
 import sympy as sp
+from numpy.typing import ArrayLike
 
-from undertow.export.differentiators import DifferentiatorStep, StepSymbols
-from undertow.export.observer import KalmanStep, lay_accelerations
-from undertow.models import Mechanism
+from undertow.estimators import Estimator, FilteredDerivative, KalmanFilter, SuperTwisting
+from undertow.estimators.interface import positive
+from undertow.export.names import LARGEST, template
+from undertow.models import FloatArray, Mechanism
+from undertow.plants import Measurement
 from undertow.symbolic import C99Emitter, Real, Tape, literal
 
-__all__ = ["EstimatorStep", "estimate_code"]
+
+class StepSymbols(NamedTuple):
+    """Symbols of one step for one coordinate."""
+
+    gain: sp.Symbol
+    q: sp.Symbol
+    position: sp.Symbol
+    velocity: sp.Symbol
+    period: sp.Symbol
+
+    @classmethod
+    def new(cls) -> StepSymbols:
+        """Return the symbols."""
+        return cls(*(sp.Symbol(f"_{name}", real=True) for name in cls._fields))
+
+
+class DifferentiatorStep(Protocol):
+    """A differentiator that can be exported."""
+
+    @property
+    def description(self) -> str:
+        """What it is, in a few words."""
+        ...
+
+    @property
+    def meaning(self) -> str:
+        """What the gains are, with their unit."""
+        ...
+
+    def gains(self, n: int) -> FloatArray:
+        """Return one gain for each of n coordinates, (n,)."""
+        ...
+
+    def build(self, tape: Tape, symbols: StepSymbols) -> tuple[sp.Expr, sp.Expr]:
+        """Return the new position and velocity of the memory."""
+        ...
+
+    def estimator(self, mechanism: Mechanism, period: float) -> Estimator:
+        """Return the library's own, which the exported one must agree with."""
+        ...
+
+
+@dataclass(frozen=True)
+class DerivativeStep:
+    """Differences behind a first-order filter, s/(τ s + 1), by Tustin's rule.
+
+    ``v⁺ = ((2τ − T) v + 2 (q − q⁻))/(2τ + T)``.
+
+    Parameters
+    ----------
+    time_constant
+        τ, s: one for all coordinates, or one for each.
+    """
+
+    time_constant: float | tuple[float, ...] = 0.01
+
+    @property
+    def description(self) -> str:
+        """What it is, in a few words."""
+        shown = ", ".join(f"{v:g}" for v in np.atleast_1d(self.time_constant))
+        return f"filtered derivative, time constant {shown} s"
+
+    meaning: ClassVar[str] = "time constants, s"
+
+    def gains(self, n: int) -> FloatArray:
+        """Return τ for each coordinate, (n,)."""
+        return positive("time_constant of a derivative", self.time_constant, n)
+
+    def build(self, tape: Tape, symbols: StepSymbols) -> tuple[sp.Expr, sp.Expr]:
+        """Return the new position and velocity of the memory."""
+        gain, q, position, velocity, period = symbols
+        ahead = (2 * gain - period) * velocity + 2 * (q - position)
+        return q, tape.let(ahead / (2 * gain + period))
+
+    def estimator(self, mechanism: Mechanism, period: float) -> Estimator:
+        """Return :class:`undertow.estimators.FilteredDerivative`."""
+        return FilteredDerivative(mechanism, period, self.time_constant)
+
+
+@dataclass(frozen=True)
+class SuperTwistingStep:
+    """Levant's super-twisting differentiator, discretised implicitly: it does not chatter.
+
+    With ``e = z₀ + T z₁ − q``, ``d = 1.1 L T²`` and ``c = 1.5 √L T`` the backward Euler step is
+    explicit: ``√|σ⁺| = (−c + √(c² + 4 max(0, |e| − d)))/2``, ``z₀⁺ = q + σ⁺`` and
+    ``z₁⁺ = z₁ − clip(e, ±d)/T``; sources: :class:`undertow.estimators.SuperTwisting`.
+
+    Parameters
+    ----------
+    acceleration
+        L, a bound on |q̈|, rad/s² or m/s²: one for all coordinates, or one for each.
+    """
+
+    acceleration: float | tuple[float, ...] = 200.0
+
+    description: ClassVar[str] = "super-twisting differentiator, implicit"
+    meaning: ClassVar[str] = "bounds on the accelerations, rad/s^2 or m/s^2"
+
+    def gains(self, n: int) -> FloatArray:
+        """Return L for each coordinate, (n,)."""
+        return positive("acceleration of a differentiator", self.acceleration, n)
+
+    def build(self, tape: Tape, symbols: StepSymbols) -> tuple[sp.Expr, sp.Expr]:
+        """Return the new position and velocity of the memory."""
+        gain, q, position, velocity, period = symbols
+        error = tape.let(position + period * velocity - q)
+        inside = tape.let(sp.Rational(11, 10) * gain * period**2)
+        slope = tape.let(sp.Rational(3, 2) * sp.sqrt(gain) * period)
+        excess = tape.let(sp.Max(0, tape.let(sp.Abs(error) - inside)))
+        root = tape.let((tape.let(sp.sqrt(slope**2 + 4 * excess)) - slope) / 2)
+        clipped = tape.let(sp.Max(-inside, sp.Min(inside, error)))
+        return tape.let(q + root**2 * sp.sign(error)), tape.let(velocity - clipped / period)
+
+    def estimator(self, mechanism: Mechanism, period: float) -> Estimator:
+        """Return :class:`undertow.estimators.SuperTwisting`."""
+        return SuperTwisting(mechanism, period, self.acceleration)
+
+
+@dataclass(frozen=True)
+class KalmanStep:
+    """The observer of fixed gain: a step of the model, corrected by the positions.
+
+    ``x⁻ = (q + T v + ½ T² q̈(x, u), v + T q̈(x, u))``, ``x⁺ = x⁻ + K (q_measured − q⁻)``.
+
+    Parameters
+    ----------
+    position_noise
+        Standard deviation of a position, rad or m, one or one for each coordinate; an encoder
+        of resolution r has r/√12.
+    acceleration_noise
+        Density of what the model does not know of the accelerations, rad/s²/√Hz or m/s²/√Hz,
+        one or one for each coordinate.
+    """
+
+    position_noise: float | tuple[float, ...] = 4.5e-4
+    acceleration_noise: float | tuple[float, ...] = 0.5
+
+    description: ClassVar[str] = "Kalman filter of fixed gain on the model"
+    meaning: ClassVar[str] = "state on position, rows of the state"
+
+    def noises(self, n: int) -> tuple[FloatArray, FloatArray]:
+        """Return the noises of positions and accelerations, (n,) each; both must be positive."""
+        return (
+            positive("position_noise", self.position_noise, n),
+            positive("acceleration_noise", self.acceleration_noise, n),
+        )
+
+    def gains(self, mechanism: Mechanism, period: float) -> FloatArray:
+        """Return K, (2n, n), settled at the target."""
+        n = mechanism.n
+        noise, unknown = self.noises(n)
+        filter_ = KalmanFilter(mechanism, period, position_noise=noise, acceleration_noise=unknown)
+        return np.asarray(filter_.steady_covariance()[: 2 * n, :n] / noise**2)
+
+    def estimator(self, mechanism: Mechanism, period: float) -> Observer:
+        """Return the same in Python."""
+        return Observer(mechanism, period, self.gains(mechanism, period))
+
+
+class Observer:
+    """What the exported observer must agree with: an :class:`undertow.estimators.Estimator`."""
+
+    def __init__(self, mechanism: Mechanism, period: float, gains: FloatArray) -> None:
+        self.mechanism, self.period, self.gains = mechanism, period, gains
+        self.disturbance = np.zeros(mechanism.m)
+        self._x = np.zeros(2 * mechanism.n)
+
+    def reset(self, x0: ArrayLike) -> None:
+        """Start again from the state x0, (2n,)."""
+        self._x = np.array(x0, dtype=float)
+
+    def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
+        """Return the state after a measurement that is whole, (2n,)."""
+        n, T, q = self.mechanism.n, self.period, measurement.q
+        rate = self.mechanism.accelerations(0.0, self._x, u)
+        v = self._x[n:]
+        ahead = np.concatenate([self._x[:n] + T * (v + 0.5 * T * rate), v + T * rate])
+        x: FloatArray = ahead + self.gains @ (q - ahead[:n])
+        if not (np.abs(x) < LARGEST).all():
+            x = np.concatenate([q, np.zeros(n)])
+        self._x = x
+        return x
+
+
+def build_acceleration_graph(mechanism: Mechanism, tape: Tape) -> list[sp.Expr]:
+    """Return q̈(x, u), (3)-(4), on a tape."""
+    n, m = mechanism.n, mechanism.m
+    M = sp.Matrix(n, n, tape.let_all(list(mechanism.mass_matrix)))
+    factor = tape.cholesky(sp.Matrix(n, n, lambda i, j: M[min(i, j), max(i, j)]))
+    driven = mechanism.input_matrix * sp.Matrix(mechanism.u)
+    total = [f + (driven[i] if i < m else 0) for i, f in enumerate(mechanism.force)]
+    return list(factor.solve(sp.Matrix(tape.let_all(total))))
+
 
 EstimatorStep = DifferentiatorStep | KalmanStep
-
-_DIFFERENTIATOR = """static const ut_real ut_gain[UT_N] = {{{gains}}};
-
-static void ut_differentiate(ut_real gain, ut_real q, ut_real filter[2])
-{{
-{step}
-}}
-
-static void ut_estimate(ut_controller *c, const ut_real q[UT_N])
-{{
-    for (int i = 0; i < UT_N; i++) {{
-        /* The estimate is the memory: where they differ, one was upset. */
-        const int same = c->filter[i][0] == c->x[i] && c->filter[i][1] == c->x[UT_N + i];
-        if (!c->running || !same) {{
-            c->filter[i][0] = q[i];
-            c->filter[i][1] = 0;
-        }}
-        ut_differentiate(ut_gain[i], q[i], c->filter[i]);
-        if (!ut_sound(c->filter[i][0]) || !ut_sound(c->filter[i][1])) {{
-            c->filter[i][0] = q[i];
-            c->filter[i][1] = 0;
-        }}
-        c->x[i] = c->filter[i][0];
-        c->x[UT_N + i] = c->filter[i][1];
-    }}
-}}"""
-
-_OBSERVER = """static const ut_real ut_gain[UT_X][UT_N] = {{
-{gains}
-}};
-
-/* The accelerations of the model. */
-static void ut_model(const ut_real x[UT_X], const ut_real u[UT_M], ut_real rate[UT_N])
-{{
-{step}
-}}
-
-static void ut_estimate(ut_controller *c, const ut_real q[UT_N])
-{{
-    ut_real ahead[UT_X];
-    ut_real rate[UT_N];
-    int good = 1;
-    for (int i = 0; i < UT_N; i++) {{
-        if (!c->running) {{
-            c->x[i] = q[i];
-            c->x[UT_N + i] = 0;
-        }}
-    }}
-    ut_model(c->x, c->u, rate);
-    for (int i = 0; i < UT_N; i++) {{
-        const ut_real v = c->x[UT_N + i];
-        ahead[i] = c->x[i] + UT_PERIOD * (v + {half} * UT_PERIOD * rate[i]);
-        ahead[UT_N + i] = v + UT_PERIOD * rate[i];
-    }}
-    for (int i = 0; i < UT_X; i++) {{
-        c->x[i] = ahead[i];
-        for (int k = 0; k < UT_N; k++) {{
-            c->x[i] += ut_gain[i][k] * (q[k] - ahead[k]);
-        }}
-        good &= ut_sound(c->x[i]);
-    }}
-    for (int i = 0; i < UT_N; i++) {{
-        if (!good) {{
-            c->x[i] = q[i];
-            c->x[UT_N + i] = 0;
-        }}
-    }}
-}}"""
 
 
 def estimate_code(
@@ -112,13 +252,14 @@ def estimate_code(
     if isinstance(step, KalmanStep):
         names = {x: f"x[{i}]" for i, x in enumerate(mechanism.x)}
         names |= {u: f"u[{i}]" for i, u in enumerate(mechanism.u)}
-        rates = {f"rate[{i}]": a for i, a in enumerate(lay_accelerations(mechanism, tape))}
+        rates = {f"rate[{i}]": a for i, a in enumerate(build_acceleration_graph(mechanism, tape))}
         body = C99Emitter(tape, {**names, **parameters}, real).statements(rates)
         rows = [f"    {{{row(r)}}}," for r in step.gains(mechanism, period).tolist()]
-        text = _OBSERVER.format(gains="\n".join(rows), step=body, half=literal(0.5, real))
-        return {"estimate": text, "memory": "", "place": "", "remember": ""}
+        values = {"gains": "\n".join(rows), "step": body, "half": literal(0.5, real)}
+        text = template("observer.c").substitute(values)
+        return {"estimate": text.rstrip(), "memory": "", "place": "", "remember": ""}
     symbols = StepSymbols.new()
-    position, velocity = step.lay(tape, symbols)
+    position, velocity = step.build(tape, symbols)
     names = {
         symbols.gain: "gain",
         symbols.q: "q",
@@ -128,8 +269,11 @@ def estimate_code(
     }
     places = {"filter[0]": position, "filter[1]": velocity}
     body = C99Emitter(tape, names, real).statements(places)
+    text = template("differentiator.c").substitute(
+        gains=row(step.gains(mechanism.n).tolist()), step=body
+    )
     return {
-        "estimate": _DIFFERENTIATOR.format(gains=row(step.gains(mechanism.n).tolist()), step=body),
+        "estimate": text.rstrip(),
         "memory": "    ut_real filter[UT_N][2];       "
         "/* memory of the estimator, for each coordinate */\n",
         "place": "UT_PLACE(filter), ",

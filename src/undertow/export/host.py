@@ -12,23 +12,19 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base import ArtefactError, MissingExtraError
-from undertow.export.controller import EmbeddedController
-from undertow.export.plans import plan_numbers
-from undertow.export.seal import seals
+from undertow.export.controller import EmbeddedController, checksums, plan_numbers
+from undertow.export.names import PlanAnswer, Status
 from undertow.export.sources import files
-from undertow.export.status import Status, Verdict
-from undertow.export.vectors import random_states
+from undertow.export.twin import random_states
 from undertow.law import Plan
 from undertow.models import FloatArray
-
-__all__ = ["FLAGS", "NEAREST", "Agreement", "Build", "Footprint", "HostProcess", "tool", "version"]
+from undertow.plants import Measurement, Rig, control_loop
 
 #: How the C is compiled: every warning is an error.
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2")
@@ -306,14 +302,14 @@ class HostProcess:
         """One period from a state that is measured whole, (2n,)."""
         return self._period("x", x)
 
-    def offer(self, plan: Plan, number: int) -> Verdict:
+    def offer(self, plan: Plan, number: int) -> PlanAnswer:
         """Offer another plan; it is in use from the next step on."""
         starts, rows = self.controller.starts(plan), plan_numbers(self.controller, plan)
         words = ["p", str(number), str(len(rows))]
         for start, row in zip(starts, rows, strict=True):
             words += [str(start), *map(repr, np.concatenate(row).tolist())]
-        words += map(str, seals(number, starts, rows, self.controller.real))
-        return Verdict(int(self._ask(" ".join(words))[0]))
+        words += map(str, checksums(number, starts, rows, self.controller.real))
+        return PlanAnswer(int(self._ask(" ".join(words))[0]))
 
     def arm(self) -> None:
         """Let the output on again after a lost sensor or a fault."""
@@ -342,11 +338,59 @@ class HostProcess:
         """Use it in a ``with`` block."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End the process."""
+    def __exit__(self, *_: object) -> None:
         self.close()
+
+
+#: Distance of an unactuated coordinate from the target up to which it counts as held, rad or m.
+HELD = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class RigRun:
+    """One run on a rig, period by period.
+
+    Attributes
+    ----------
+    q
+        Measured positions, (N, n).
+    u
+        Outputs, (N, m).
+    status
+        What the controller said of each period.
+    held
+        Whether the unactuated coordinates stayed within :data:`HELD` in the last second.
+    """
+
+    q: FloatArray
+    u: FloatArray
+    status: tuple[Status, ...]
+    held: bool
+
+
+def run_on_rig(process: HostProcess, rig: Rig, seconds: float) -> RigRun:
+    """Let an exported controller steer a rig, from measured positions alone.
+
+    Parameters
+    ----------
+    process
+        The controller's process.
+    rig
+        Whose period is the controller's.
+    seconds
+        How long, on the rig's clock.
+    """
+    m = process.controller.mechanism.m
+    positions, outputs, status = [], [], []
+
+    def step(measurement: Measurement) -> FloatArray:
+        u, said = process.step(measurement.q)
+        status.append(said)
+        return u
+
+    for measurement, u in control_loop(rig, step, round(seconds / rig.period)):
+        positions.append(measurement.q)
+        outputs.append(u)
+    last = np.array(positions[-max(1, round(1.0 / rig.period)) :])[:, m:]
+    held = bool((np.abs(last) <= HELD).all())
+    return RigRun(np.array(positions), np.array(outputs), tuple(status), held)

@@ -1,11 +1,44 @@
-"""Names and words of a mechanism in C: ASCII, one of a kind, harmless in a comment."""
+"""What the C and Python share: names and words in ASCII, status bits, answers to a plan."""
 
 from __future__ import annotations
 
 import re
 import unicodedata
+from enum import IntEnum, IntFlag
+from importlib import resources
+from string import Template
 
-__all__ = ["HEADERS", "ascii_words", "c_name", "macro"]
+#: A measurement beyond is no number either.
+LARGEST = 1e9
+
+#: So many numbers up to the last accepted plan's are stale; every other one is a later one's, so
+#: that none locks out the next. Numbers count modulo 2³².
+STALE_SPAN = 2**16
+
+
+class Status(IntFlag):
+    """What happened in a period; the bits that the C returns."""
+
+    OK = 0
+    CLIPPED = 1
+    SLEWED = 2
+    BRIDGED = 4
+    LOST = 8
+    SINGULAR = 16
+    SWITCHED = 32
+    FAULT = 64
+    FALLBACK = 128
+
+
+class PlanAnswer(IntEnum):
+    """Answer to an offered plan."""
+
+    ACCEPTED = 0
+    BUSY = 1
+    STALE = 2
+    INVALID = 3
+    CORRUPT = 4
+
 
 #: Headers that the generated C includes: a file of its own under such a name would hide them.
 HEADERS = {"math", "signal", "stdio", "stdlib"}
@@ -38,3 +71,15 @@ def ascii_words(text: str) -> str:
         text = text.replace(sign, words)
     plain = "".join(map(_letter, text)).replace("\\", "/")  # first: "*\" would become an end
     return " ".join(re.sub(r"[*](?=/)|/(?=[*])|[?](?=[?])", r"\g<0> ", plain).split())
+
+
+def template(name: str, prefix: str = "ut") -> Template:
+    """Return a template of C, the names in it with their prefix."""
+    source = resources.files("undertow.export") / "templates" / name
+    return Template(prefixed(source.read_text(encoding="ascii"), prefix))
+
+
+def prefixed(text: str, prefix: str) -> str:
+    """Give the names of C their prefix."""
+    text = re.sub(r"\but_", f"{prefix}_", text)
+    return re.sub(r"\bUT_", f"{prefix.upper()}_", text)

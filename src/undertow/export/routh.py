@@ -11,16 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 import sympy as sp
 
-from undertow.law import linearise
-from undertow.models import Mechanism
-
-__all__ = ["lay_polynomial"]
+from undertow.law import LawLayout
+from undertow.models import Mechanism, linearise
 
 #: A polynomial in s: coefficients, the constant first.
 _Polynomial = list[sp.Expr]
 
 
-def lay_polynomial(mechanism: Mechanism, surface: Sequence[sp.Symbol]) -> list[sp.Expr]:
+def characteristic_polynomial(mechanism: Mechanism, surface: Sequence[sp.Symbol]) -> list[sp.Expr]:
     """Return the coefficients, the highest power first, (2n − m + 1,), scaled to at most 1.
 
     Parameters
@@ -31,10 +29,8 @@ def lay_polynomial(mechanism: Mechanism, surface: Sequence[sp.Symbol]) -> list[s
         Symbols of the numbers of a surface, (2mn,), as they lie in its vector.
     """
     n, m, lin = mechanism.n, mechanism.m, linearise(mechanism)
-    sizes = np.cumsum([m * m, m * m, m * (n - m)])
-    alpha_a, lambda_a, alpha_u, lambda_u = (
-        block.reshape(m, -1) for block in np.split(np.array(surface, dtype=object), sizes)
-    )
+    vector = np.array(surface, dtype=object)
+    alpha_a, lambda_a, alpha_u, lambda_u = LawLayout(n, m).blocks(vector)
     alpha, lambda_ = np.hstack([alpha_a, alpha_u]), np.hstack([lambda_a, lambda_u])
     rows = [[[lambda_[i, j], alpha[i, j]] for j in range(n)] for i in range(m)]
     rows += [

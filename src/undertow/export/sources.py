@@ -8,41 +8,30 @@ from __future__ import annotations
 
 import math
 import re
-from importlib import metadata, resources
-from string import Template
+from importlib import metadata
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from undertow.export.controller import EmbeddedController
+from undertow.base import checked, write_files
+from undertow.export.controller import FACTOR, WIDTH, EmbeddedController, plan_text
 from undertow.export.estimate import estimate_code
-from undertow.export.names import ascii_words, c_name, macro
-from undertow.export.plans import plan_text
-from undertow.export.routh import lay_polynomial
-from undertow.export.seal import FACTOR, WIDTH
-from undertow.export.status import LARGEST
-from undertow.export.vectors import vectors
-from undertow.law import LawSymbols, build_law_graph
+from undertow.export.names import LARGEST, ascii_words, c_name, macro, prefixed, template
+from undertow.export.routh import characteristic_polynomial
+from undertow.export.twin import vectors
+from undertow.law import LawSymbols, Plan, Surface, build_law_graph
 from undertow.models import Mechanism
 from undertow.symbolic import C99Emitter, Tape, literal
-
-__all__ = ["files", "prefixed", "render"]
-
 
 #: Values of the templates that hold a user's words: their ``ut_`` stays as it is.
 _WORDS = {"name", "title", "coordinates", "inputs", "estimator", "gain_meaning"}
 
 
-def prefixed(text: str, prefix: str) -> str:
-    """Give the names of C their prefix."""
-    text = re.sub(r"\but_", f"{prefix}_", text)
-    return re.sub(r"\bUT_", f"{prefix.upper()}_", text)
-
-
 def render(name: str, values: dict[str, str], prefix: str) -> bytes:
     """Fill a template and give its names their prefix."""
-    source = resources.files("undertow.export") / "templates" / name
-    text = Template(prefixed(source.read_text(encoding="ascii"), prefix)).substitute(
+    text = template(name, prefix).substitute(
         {key: value if key in _WORDS else prefixed(value, prefix) for key, value in values.items()}
     )
     return re.sub(r"[ \t]+$", "", text, flags=re.MULTILINE).encode("ascii")
@@ -62,6 +51,40 @@ def common(controller: EmbeddedController) -> dict[str, str]:
     return {"name": controller.stem, "title": ascii_words(title), "version": _version()}
 
 
+@checked
+def export_c(
+    mechanism: Mechanism, surface: Surface | Plan, folder: str | Path, **settings: Any
+) -> Path:
+    """Write the inner loop in C99: no heap, no dependencies, limits, estimator, surface table.
+
+    Parameters
+    ----------
+    mechanism, surface
+        The controller's belief, whose inputs have limits, and the surface or plan that is built in.
+    folder
+        Where NAME.c, NAME.h and what tests them go; earlier files are moved aside.
+    **settings
+        Further fields of :class:`undertow.export.EmbeddedController`: ``period``, ``reaching``,
+        ``differentiator``, ``slew``, ``real``, ….
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    ArtefactError
+        When the files cannot be written.
+    InvalidInputError
+        When a number cannot be used or an input has no limit.
+    SingularSurfaceError, UnstableSurfaceError
+        When the law does not exist at the target, or the motion does not die out there.
+    """
+    write_files(Path(folder), files(EmbeddedController(mechanism, surface, **settings)))
+    return Path(folder)
+
+
 def files(controller: EmbeddedController) -> dict[str, bytes]:
     """Return the C of a controller: file names to contents, ASCII.
 
@@ -72,7 +95,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     name, prefix = controller.stem, controller.prefix
     shared = common(controller)
     plan = plan_text(controller, controller.plan, controller.number)
-    code = _lay(controller)
+    code = _generated_parts(controller)
     used = "\n".join(code.values())
     sharp = controller.reaching.switching == "sign"
     limits = mechanism.input_limits
@@ -105,7 +128,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         "tiny": literal(1e-12, real),
         "fabs": "fabsf" if real == "float" else "fabs",
         "rate_check": "1" if sharp else "UT_PERIOD * out.gain[i] < 2 * row->layer[i]",
-        "helpers": "\n".join(v for k, v in _HELPERS.items() if f"{k}(" in used),
+        "helpers": _helpers(used),
         **code,
     }
     return {
@@ -148,7 +171,7 @@ def _parameters(controller: EmbeddedController) -> str:
 # -- the generated parts --------------------------------------------------------------------------
 
 
-def _lay(controller: EmbeddedController) -> dict[str, str]:
+def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
     """Return the statements of the law and of det Γ(0), and the estimator."""
     mechanism, switching = controller.mechanism, controller.reaching.switching
     n, m = mechanism.n, mechanism.m
@@ -172,10 +195,8 @@ def _lay(controller: EmbeddedController) -> dict[str, str]:
 
     tape = Tape()
     target = mechanism.partition(tape, dict.fromkeys(mechanism.x, sp.Integer(0)))
-    entries = list(symbols.surface)
-    alpha_a = sp.Matrix(m, m, entries[: m * m])
-    alpha_u = sp.Matrix(m, n - m, entries[2 * m * m : m * m + m * n])
-    _, determinant = tape.adjugate(tape.matrix(alpha_a - alpha_u * target.X))
+    blocks = symbols.blocks
+    _, determinant = tape.adjugate(tape.matrix(blocks.alpha_a - blocks.alpha_u * target.X))
     gamma = C99Emitter(tape, names, controller.real).statements({"value": determinant})
 
     estimate = estimate_code(
@@ -186,7 +207,7 @@ def _lay(controller: EmbeddedController) -> dict[str, str]:
         controller.real,
     )
     tape = Tape()
-    powers = tape.let_all(lay_polynomial(mechanism, symbols.surface))
+    powers = tape.let_all(characteristic_polynomial(mechanism, symbols.surface))
     powers += [sp.Integer(0)] * (2 * n + 2 - len(powers))
     polynomial = C99Emitter(tape, names, controller.real).statements(
         {f"a[{k}]": a for k, a in enumerate(powers)}
@@ -194,25 +215,9 @@ def _lay(controller: EmbeddedController) -> dict[str, str]:
     return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **estimate}
 
 
-_HELPERS = {
-    "ut_max": """static ut_real ut_max(ut_real a, ut_real b)
-{
-    return a > b || isnan(a) ? a : b;
-}
-""",
-    "ut_min": """static ut_real ut_min(ut_real a, ut_real b)
-{
-    return a < b || isnan(a) ? a : b;
-}
-""",
-    "ut_mod": """static ut_real ut_mod(ut_real remainder, ut_real b)
-{
-    return (remainder < 0 && b > 0) || (remainder > 0 && b < 0) ? remainder + b : remainder;
-}
-""",
-    "ut_sign": """static ut_real ut_sign(ut_real a)
-{
-    return (ut_real)((a > 0) - (a < 0));
-}
-""",
-}
+def _helpers(used: str) -> str:
+    """Return the functions that C99 lacks, of those that are used."""
+    functions = template("helpers.c").template.rstrip().split("\n\n")
+    names = (re.findall(r"ut_\w+\(", function)[0] for function in functions)
+    wanted = zip(names, functions, strict=True)
+    return "\n".join(f"{function}\n" for name, function in wanted if name in used)

@@ -1,7 +1,7 @@
 """The control law: surfaces and their schedule, reaching law, stability margins."""
 
 from undertow.law.inner_loop import LAYOUT, InnerLoop, law_module, pack_law_parameters
-from undertow.law.schedule import Plan
+from undertow.law.schedule import Plan, rising_from_zero
 from undertow.law.sliding import (
     Control,
     LawSymbols,
@@ -15,21 +15,19 @@ from undertow.law.sliding import (
 from undertow.law.stability import (
     Margin,
     check_surface,
-    controllability,
     first_surface,
-    has_linear_model,
-    linearise,
     placed_surface,
     sliding_matrix,
     stability_margin,
     surface_margins,
 )
-from undertow.law.surface import ProvedSet, ReachingLaw, Surface, Switching
+from undertow.law.surface import LawLayout, ProvedSet, ReachingLaw, Surface, Switching
 
 __all__ = [
     "LAYOUT",
     "Control",
     "InnerLoop",
+    "LawLayout",
     "LawSymbols",
     "Margin",
     "Plan",
@@ -41,16 +39,14 @@ __all__ = [
     "build_law_graph",
     "check_surface",
     "check_surface_shape",
-    "controllability",
     "coupling",
     "first_surface",
     "gains_at_target",
     "gamma_determinant",
-    "has_linear_model",
     "law_module",
-    "linearise",
     "pack_law_parameters",
     "placed_surface",
+    "rising_from_zero",
     "sliding_matrix",
     "stability_margin",
     "surface_margins",

@@ -28,8 +28,6 @@ from undertow.symbolic import (
     unpacked,
 )
 
-__all__ = ["LAYOUT", "InnerLoop", "law_memory", "law_module", "pack_law_parameters"]
-
 
 @dataclass(eq=False)
 class InnerLoop:
@@ -141,7 +139,7 @@ def law_module(mechanism: Mechanism, switching: Switching) -> Any:
             tape,
             {
                 "x": mechanism.x,
-                "lane": [*symbols.surface, *symbols.eta, *symbols.layer, symbols.gamma_target],
+                "lane": symbols.vector,
                 "parameters": mechanism.parameter_symbols,
             },
             {"demand": law.u, "s": law.s, "margin": [law.margin]},

@@ -7,17 +7,23 @@ switching is planned and not only re-planned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
 
 from undertow.base import InvalidInputError, at_least, check_fields, checked
-from undertow.law.sliding import ReachingLaw, Surface
+from undertow.law.surface import ReachingLaw, Surface
 from undertow.models import FloatArray
 
-__all__ = ["Plan"]
+
+def rising_from_zero(times: Sequence[float]) -> bool:
+    """Whether times begin at 0 and rise, all of them finite."""
+    rising = all(a < b for a, b in pairwise(times))
+    return len(times) > 0 and times[0] == 0 and rising and math.isfinite(times[-1])
 
 
 @dataclass(frozen=True)
@@ -61,17 +67,13 @@ class Plan:
                 limit="undertow.Surface, all with the same n and m",
                 remedy="Build each with undertow.Surface(alpha_a, lambda_a, alpha_u, lambda_u)",
             )
-        rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
-        if not self.surfaces or len(self.times) != len(self.surfaces) or self.times[0] != 0:
+        fits = self.surfaces and len(self.times) == len(self.surfaces)
+        if not (fits and rising_from_zero(self.times)):
             raise InvalidInputError(
                 "times of a plan",
                 value=list(self.times),
-                limit=f"{len(self.surfaces)} rising times from 0, one for each surface",
+                limit=f"{len(self.surfaces)} rising, finite times from 0, one for each surface",
                 remedy="Give each surface the time at which it takes over",
-            )
-        if not rising or not np.isfinite(self.times).all():
-            raise InvalidInputError(
-                "times of a plan", value=list(self.times), limit="rising, finite"
             )
         if self.reaching is not None and len(self.reaching) != len(self.surfaces):
             raise InvalidInputError(
@@ -136,9 +138,12 @@ class Plan:
         """Surface vectors, (S, 2mn)."""
         return np.stack([surface.vector for surface in self.surfaces])
 
+    def laws(self, otherwise: ReachingLaw) -> tuple[ReachingLaw, ...]:
+        """Return the reaching law of each surface, ``otherwise`` where none is given."""
+        return self.reaching or (otherwise,) * len(self.surfaces)
+
     @checked
     def gains(self, otherwise: ReachingLaw) -> FloatArray:
         """Return η and ε of each surface, (S, 2m), with ``otherwise`` where none is given."""
         m = self.surfaces[0].m
-        laws = self.reaching or (otherwise,) * len(self.surfaces)
-        return np.stack([law.vector(m) for law in laws])
+        return np.stack([law.vector(m) for law in self.laws(otherwise)])

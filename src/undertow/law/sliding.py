@@ -13,7 +13,7 @@ The formulas are for any n and m and are laid on a tape once; all else is genera
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -23,16 +23,15 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from undertow.base import REMEDIES, InvalidInputError, SingularSurfaceError, check_fields
-from undertow.law.surface import ReachingLaw, Surface, Switching
+from undertow.law.surface import LawLayout, ReachingLaw, Surface, SurfaceBlocks, Switching
 from undertow.models import TIME, FloatArray, Mechanism, Partition
 from undertow.symbolic import Tape, compile_numpy
-
-__all__ = ["Control", "ReachingLaw", "SlidingModeLaw", "Surface", "Switching"]
 
 
 class LawSymbols(NamedTuple):
     """The symbols a law on a tape is written in."""
 
+    layout: LawLayout
     surface: tuple[sp.Symbol, ...]
     eta: tuple[sp.Symbol, ...]
     layer: tuple[sp.Symbol, ...]
@@ -46,11 +45,22 @@ class LawSymbols(NamedTuple):
             return tuple(sp.Symbol(f"_{stem}_{i}", real=True) for i in range(count))
 
         return cls(
+            LawLayout(n, m),
             row("surface", 2 * m * n),
             row("eta", m),
             row("layer", m),
             sp.Symbol("_gamma_target", real=True),
         )
+
+    @property
+    def vector(self) -> tuple[sp.Symbol, ...]:
+        """All of them, in the order of a law vector."""
+        return (*self.surface, *self.eta, *self.layer, self.gamma_target)
+
+    @property
+    def blocks(self) -> SurfaceBlocks:
+        """The surface's as matrices."""
+        return self.layout.matrices(self.surface)
 
 
 class LawOnTape(NamedTuple):
@@ -79,11 +89,7 @@ def build_law_graph(
     m = part.B.rows
     free = part.M_uu.rows
     n = m + free
-    entries = list(symbols.surface)
-    alpha_a = sp.Matrix(m, m, entries[: m * m])
-    lambda_a = sp.Matrix(m, m, entries[m * m : 2 * m * m])
-    alpha_u = sp.Matrix(m, free, entries[2 * m * m : m * m + m * n])
-    lambda_u = sp.Matrix(m, free, entries[m * m + m * n :])
+    alpha_a, lambda_a, alpha_u, lambda_u = symbols.blocks
     q_a, q_u = sp.Matrix(x[:m]), sp.Matrix(x[m:n])
     qd_a, qd_u = sp.Matrix(x[n : n + m]), sp.Matrix(x[n + m :])
 
@@ -262,10 +268,7 @@ class _LawFunction:
         )
         inputs = [
             *mechanism.x,
-            *symbols.surface,
-            *symbols.eta,
-            *symbols.layer,
-            symbols.gamma_target,
+            *symbols.vector,
             *mechanism.parameter_symbols,
         ]
         self.run = compile_numpy(tape, inputs, [*law.u, *law.s, *law.gains, law.margin])
@@ -338,10 +341,8 @@ def coupling(mechanism: Mechanism, q: ArrayLike) -> FloatArray:
 def gamma_determinant(X: FloatArray, surfaces: FloatArray) -> FloatArray:
     """Return det(α_a − α_u X) for surface vectors, (…, 2mn); leading shapes broadcast."""
     free, m = X.shape[-2:]
-    lead = surfaces.shape[:-1]
-    alpha_a = surfaces[..., : m * m].reshape(*lead, m, m)
-    alpha_u = surfaces[..., 2 * m * m : 2 * m * m + m * free].reshape(*lead, m, free)
-    gamma = alpha_a - alpha_u @ X
+    blocks = LawLayout(m + free, m).blocks(surfaces)
+    gamma = blocks.alpha_a - blocks.alpha_u @ X
     return np.asarray(gamma[..., 0, 0] if m == 1 else np.linalg.det(gamma))
 
 
@@ -358,14 +359,6 @@ def singularity(mechanism: Mechanism, surfaces: FloatArray, q: ArrayLike) -> Flo
     return gamma_determinant(coupling(mechanism, q), surfaces)
 
 
-def reaching_time_bound(s0: ArrayLike, eta: ArrayLike) -> float:
-    """Upper bound on the reaching time from (16): ‖s(0)‖₂ / min η_i, s.
-
-    Valid for ``switching="sign"``, unsaturated inputs and a non-singular path.
-    """
-    return float(np.linalg.norm(np.atleast_1d(s0)) / np.min(np.asarray(eta, dtype=float)))
-
-
 def gains_at_target(mechanism: Mechanism, surfaces: FloatArray, eta: FloatArray) -> FloatArray:
     """Return the gains (13) at the target for surface vectors (N, 2mn) and η (N, m)."""
     function = _law_function(mechanism, "saturation")
@@ -373,44 +366,3 @@ def gains_at_target(mechanism: Mechanism, surfaces: FloatArray, eta: FloatArray)
     reaching = np.concatenate([eta, np.ones_like(eta)], axis=-1)
     origin = np.zeros((len(surfaces), 2 * mechanism.n))
     return function(origin, surfaces.T, reaching.T, np.ones(len(surfaces))).gains.reshape(-1, m)
-
-
-def constant_gains(
-    mechanism: Mechanism,
-    surface: Surface,
-    reaching: ReachingLaw,
-    region: Mapping[str, tuple[float, float]],
-    samples: int = 4096,
-) -> FloatArray:
-    """Constant gains (14): the largest k_i of (13) over a region of positions.
-
-    Parameters
-    ----------
-    region
-        Coordinate name to (low, high); coordinates left out stay at the target.
-    samples
-        Random positions searched besides the corners; the result is their maximum, a
-        sampled value and no certified supremum.
-
-    Returns
-    -------
-    numpy.ndarray
-        k, (m,), never below the state-dependent gains of (13) at the samples.
-    """
-    low, high = np.zeros(mechanism.n), np.zeros(mechanism.n)
-    names = [c.name for c in mechanism.coordinates]
-    for name, (a, b) in region.items():
-        if name not in names:
-            raise InvalidInputError(
-                "region of positions",
-                value=repr(name),
-                limit=f"one of {', '.join(names)}",
-                remedy="Name coordinates; those left out stay at the target",
-            )
-        low[names.index(name)], high[names.index(name)] = a, b
-    rng = np.random.default_rng(0)
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(mechanism.n, -1).T
-    inside = rng.uniform(low, high, (samples, mechanism.n))
-    q = np.vstack([corners, inside, np.zeros((1, mechanism.n))])
-    law = SlidingModeLaw(mechanism, surface, reaching)
-    return np.asarray(law(0.0, np.hstack([q, np.zeros_like(q)])).gains.max(axis=0))

@@ -1,4 +1,4 @@
-"""Stability on the surface: linearisation, sliding dynamics, margins, a first surface.
+"""Stability on the surface: sliding dynamics, margins, a first surface.
 
 On s = 0 the motion obeys ``E q̈_u = f_u + M_auᵀ α_a⁻¹ ṡ_r`` with
 ``E = M_uu − M_auᵀ α_a⁻¹ α_u``, and q̇_a from s = 0.  Linearised at the target it is a
@@ -16,9 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import sympy as sp
 from numpy.typing import ArrayLike
-from sympy.core.function import Application
 
 from undertow.base import (
     InvalidInputError,
@@ -28,164 +26,9 @@ from undertow.base import (
     checked,
 )
 from undertow.law.sliding import check_surface_shape, coupling, gamma_determinant, singularity
-from undertow.law.surface import Surface
-from undertow.models import (
-    TIME,
-    FloatArray,
-    Mechanism,
-    kinks,
-    numbers,
-    require_mechanism,
-    require_smooth,
-    shortened,
-)
-from undertow.models.importers.equations import nearest_equilibrium
+from undertow.law.surface import LawLayout, Surface
+from undertow.models import FloatArray, Mechanism, controllability, linearise
 from undertow.symbolic import content_key, recall, remember
-
-__all__ = [
-    "Linearisation",
-    "Margin",
-    "check_surface",
-    "controllability",
-    "first_surface",
-    "has_linear_model",
-    "linearise",
-    "placed_surface",
-    "sliding_matrix",
-    "stability_margin",
-    "surface_margins",
-]
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """``M q̈ = F q + D q̇ + (B u, 0)`` at the target, numbers.
-
-    ``M, F, D`` are (n, n), ``B`` (m, m).
-    """
-
-    M: FloatArray
-    F: FloatArray
-    D: FloatArray
-    B: FloatArray
-
-    @property
-    def A(self) -> FloatArray:
-        """State matrix of ẋ = A x + B u with x = (q, q̇), (2n, 2n)."""
-        n = len(self.M)
-        lower = np.linalg.solve(self.M, np.hstack([self.F, self.D]))
-        return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
-
-    @property
-    def input(self) -> FloatArray:
-        """Input matrix of ẋ = A x + B u, (2n, m)."""
-        n, m = len(self.M), len(self.B)
-        force = np.vstack([self.B, np.zeros((n - m, m))])
-        return np.vstack([np.zeros((n, m)), np.linalg.solve(self.M, force)])
-
-
-@lru_cache(maxsize=128)
-def linearise(mechanism: Mechanism) -> Linearisation:
-    """Linearise a mechanism at its target x = 0, disturbances at t = 0 included.
-
-    Raises
-    ------
-    ModelError
-        When the target is no equilibrium for u = 0, or f has no derivative there.
-    """
-    n = mechanism.n
-    require_smooth(
-        f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
-    )
-    rest, jacobian = _force_at_target(mechanism)
-    if not (np.isfinite(rest).all() and np.isfinite(jacobian).all()):
-        raise ModelError(
-            f"force of '{mechanism.name}' at the target",
-            value=f"f = {rest}, with slopes that are no numbers"
-            if np.isfinite(rest).all()
-            else rest,
-            limit="finite, with its slopes",
-            remedy="Something is divided by zero there: write it so that it is not",
-        )
-    if np.abs(rest[mechanism.m :]).max() > 1e-9:
-        raise ModelError(
-            f"target of '{mechanism.name}'",
-            value=f"f_u(0, 0) = {rest[mechanism.m :]}",
-            limit="an equilibrium, f_u = 0",
-            remedy=nearest_equilibrium(mechanism),
-        )
-    return Linearisation(
-        M=mechanism.M(np.zeros(n)),
-        F=jacobian[:, :n],
-        D=jacobian[:, n:],
-        B=numbers(mechanism.input_matrix.subs(mechanism.substitution)),
-    )
-
-
-@lru_cache(maxsize=128)
-def has_linear_model(mechanism: Mechanism) -> bool:
-    """Whether f has a derivative at the target: :func:`linearise` refuses where it has none."""
-    return next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
-
-
-def _target(mechanism: Mechanism) -> dict[sp.Symbol, float]:
-    """All symbols of f to their values at the target, at t = 0."""
-    return mechanism.substitution | dict.fromkeys((*mechanism.x, TIME), 0.0)
-
-
-#: Functions that NumPy continues analytically to complex arguments.
-_ANALYTIC = (
-    sp.sin, sp.cos, sp.tan, sp.exp, sp.log, sp.sinh, sp.cosh, sp.tanh, sp.atan, sp.asinh,
-)  # fmt: skip
-
-
-def _force_at_target(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
-    """Return f, (n,), and ∂f/∂x, (n, 2n), at x = 0 and t = 0.
-
-    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives.
-    """
-    force, size = mechanism.force, 2 * mechanism.n
-    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(Application)) and all(
-        power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*mechanism.x)
-    )
-    if analytic:
-        step = 1e-200  # its square is nothing: what is flat to first order comes out as zero
-        x = np.vstack([np.zeros(size), 1j * step * np.eye(size)])
-        with np.errstate(all="ignore"):
-            entries = mechanism.function("force")(0.0, *x.T, *mechanism.parameter_values)
-            real = np.isfinite(mechanism.f(np.zeros(size))).all()
-        values = np.stack([np.broadcast_to(e, size + 1) for e in entries])
-        if np.isfinite(values).all() and real:  # of a negative number, a logarithm is complex
-            return values[:, 0].real, values[:, 1:].imag / step
-    at_target = dict.fromkeys(mechanism.x, 0)
-    numeric = sp.Matrix(force).subs(mechanism.substitution | {TIME: 0})
-    jacobian = numeric.jacobian(list(mechanism.x)).subs(at_target)
-    try:
-        return numbers(numeric.subs(at_target)).ravel(), numbers(jacobian)
-    except TypeError as error:  # zoo, or complex
-        raise ModelError(
-            f"force of '{mechanism.name}' at the target",
-            value=shortened(list(numeric.subs(at_target))),
-            limit="real and finite, with its slopes",
-            remedy="Something is divided by zero there, or a root or logarithm taken of a "
-            "negative number",
-        ) from error
-
-
-def controllability(mechanism: Mechanism) -> float:
-    """Distance of (A, B) at the target from an uncontrollable pair, relative, ≥ 0.
-
-    The smallest singular value of [λI − A, B] over the eigenvalues λ of A (Hautus test),
-    over ‖[A, B]‖₂; zero means that no linear surface can stabilise.
-    """
-    lin = linearise(mechanism)
-    A, B = lin.A, lin.input
-    scale = float(np.linalg.norm(np.hstack([A, B]), 2))
-    tests = [
-        np.linalg.svd(np.hstack([eigenvalue * np.eye(len(A)) - A, B]), compute_uv=False)[-1]
-        for eigenvalue in np.linalg.eigvals(A)
-    ]
-    return float(min(tests)) / scale
 
 
 def sliding_matrix(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> FloatArray:
@@ -207,10 +50,7 @@ def sliding_matrix(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> Float
     n, m = mechanism.n, mechanism.m
     vectors = surfaces.vector if isinstance(surfaces, Surface) else np.asarray(surfaces, float)
     lead = vectors.shape[:-1]
-    alpha_a, lambda_a, alpha_u, lambda_u = (
-        block.reshape(*lead, m, -1)
-        for block in np.split(vectors, [m * m, 2 * m * m, m * m + m * n], axis=-1)
-    )
+    alpha_a, lambda_a, alpha_u, lambda_u = LawLayout(n, m).blocks(vectors)
     free = n - m
     M_ua, M_uu = lin.M[m:, :m], lin.M[m:, m:]
     # q̇_a = G z on the surface; then E q̈_u = [F_a F_u D_u] z + D_a G z + M_uaα_a⁻¹ ṡ_r.
@@ -242,8 +82,7 @@ def stability_margin(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> Flo
     """
     vectors = surfaces.vector if isinstance(surfaces, Surface) else np.asarray(surfaces, float)
     gamma = gamma_determinant(_coupling_at_target(mechanism), vectors)
-    m = mechanism.m
-    alpha_a = vectors[..., : m * m].reshape(*vectors.shape[:-1], m, m)
+    alpha_a = LawLayout(mechanism.n, mechanism.m).blocks(vectors).alpha_a
     sound = (np.abs(gamma) > 1e-9) & (np.abs(np.linalg.det(alpha_a)) > 1e-12)
     if vectors.ndim == 1:
         if not sound:
@@ -409,7 +248,6 @@ def first_surface(
     -----
     A design is kept on disk beside the kernels, so that a second start need not repeat it.
     """
-    require_mechanism("mechanism of a first surface", mechanism)
     n, m = mechanism.n, mechanism.m
     if weights is None:
         weights = [1.0] * m + [10.0] * (n - m) + [0.1] * n

@@ -6,18 +6,100 @@ mechanism on it is :mod:`undertow.law.sliding`'s.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, Self
+from typing import Any, Literal, NamedTuple, Protocol, Self, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+import sympy as sp
+from numpy.typing import ArrayLike, NDArray
 
-from undertow.base import InvalidInputError, at_least, check_fields, checked, floats
+from undertow.base import (
+    InvalidInputError,
+    at_least,
+    check_fields,
+    checked,
+    floats,
+    one_of,
+    positive,
+)
 from undertow.models import FloatArray
 
-__all__ = ["ProvedSet", "ReachingLaw", "Surface", "Switching"]
-
 Switching = Literal["saturation", "tanh", "sign"]
+
+
+class SurfaceBlocks(NamedTuple):
+    """The blocks of a surface: α_a and λ_a (…, m, m), α_u and λ_u (…, m, n−m)."""
+
+    alpha_a: Any
+    lambda_a: Any
+    alpha_u: Any
+    lambda_u: Any
+
+
+class LawLayout(NamedTuple):
+    """Where everything lies in the vectors of a surface and of a law.
+
+    A surface vector is α_a, λ_a, α_u, λ_u, each row by row: 2mn numbers.  The law vector that
+    kernels read goes on with η_1 … η_m, ε_1 … ε_m and, last, det Γ at the target.
+
+    Examples
+    --------
+    >>> layout = LawLayout(n=2, m=1)
+    >>> layout.blocks(np.array([-1.0, -0.5, 5.0, 10.0])).alpha_u
+    array([[5.]])
+    >>> layout.eta, layout.layer, layout.size
+    (slice(4, 5, None), slice(5, 6, None), 7)
+    """
+
+    n: int
+    m: int
+
+    @property
+    def starts(self) -> tuple[int, int, int, int, int, int]:
+        """Where α_a, λ_a, α_u, λ_u, η and ε begin: what compiled code is given."""
+        m, mn = self.m, self.m * self.n
+        return 0, m * m, 2 * m * m, m * m + mn, 2 * mn, 2 * mn + m
+
+    @property
+    def surface(self) -> slice:
+        """The surface vector within a law vector."""
+        return slice(0, 2 * self.m * self.n)
+
+    @property
+    def eta(self) -> slice:
+        """The gains η_i."""
+        return slice(*self.starts[4:])
+
+    @property
+    def layer(self) -> slice:
+        """The half-widths ε_i of the layer."""
+        return slice(self.starts[5], self.size - 1)
+
+    @property
+    def reaching(self) -> slice:
+        """Both, as :meth:`ReachingLaw.vector` gives them."""
+        return slice(self.starts[4], self.size - 1)
+
+    @property
+    def size(self) -> int:
+        """Numbers of a law vector."""
+        return 2 * self.m * self.n + 2 * self.m + 1
+
+    def blocks(self, vectors: NDArray[Any]) -> SurfaceBlocks:
+        """Return the blocks of surface or law vectors, (…, 2mn or more), as views."""
+        a, b, c, d, end, _ = self.starts
+        lead = vectors.shape[:-1]
+        return SurfaceBlocks(
+            vectors[..., a:b].reshape(*lead, self.m, self.m),
+            vectors[..., b:c].reshape(*lead, self.m, self.m),
+            vectors[..., c:d].reshape(*lead, self.m, self.n - self.m),
+            vectors[..., d:end].reshape(*lead, self.m, self.n - self.m),
+        )
+
+    def matrices(self, entries: Sequence[sp.Expr]) -> SurfaceBlocks:
+        """Return the blocks of the 2mn entries of a surface as SymPy's matrices."""
+        return SurfaceBlocks(*(sp.Matrix(b) for b in self.blocks(np.array(entries, dtype=object))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +134,8 @@ class Surface:
     def __init__(
         self, alpha_a: ArrayLike, lambda_a: ArrayLike, alpha_u: ArrayLike, lambda_u: ArrayLike
     ) -> None:
-        blocks = {
-            name: np.array(value, dtype=float, ndmin=2)
-            for name, value in (
-                ("alpha_a", alpha_a),
-                ("lambda_a", lambda_a),
-                ("alpha_u", alpha_u),
-                ("lambda_u", lambda_u),
-            )
-        }
+        given = zip(SurfaceBlocks._fields, (alpha_a, lambda_a, alpha_u, lambda_u), strict=True)
+        blocks = {name: np.array(value, dtype=float, ndmin=2) for name, value in given}
         m, free = blocks["alpha_a"].shape[0], blocks["alpha_u"].shape[1]
         for name, block in blocks.items():
             shape = (m, m) if name.endswith("_a") else (m, free)
@@ -89,6 +164,23 @@ class Surface:
                 remedy="Use −1 (or −I), the paper's normalisation",
             )
 
+    def _repr_latex_(self) -> str:
+        """Show its equation in a notebook: numbers for one surface, else matrices."""
+        terms = zip(self._blocks, (r"\dot{q}_a", "q_a", r"\dot{q}_u", "q_u"), strict=True)
+
+        def shown(block: FloatArray) -> str:
+            if block.size == 1:
+                return f"{block.item():+.4g}"
+            rows = r" \\ ".join(" & ".join(f"{v + 0.0:.4g}" for v in row) for row in block)
+            return rf"+ \begin{{pmatrix}} {rows} \end{{pmatrix}}"
+
+        text = " ".join(rf"{shown(block)}\,{name}" for block, name in terms)
+        return rf"$\displaystyle s = {text.lstrip('+ ')}$"
+
+    @property
+    def _blocks(self) -> SurfaceBlocks:
+        return SurfaceBlocks(self.alpha_a, self.lambda_a, self.alpha_u, self.lambda_u)
+
     @property
     def m(self) -> int:
         """Number of surfaces, one per input."""
@@ -102,9 +194,7 @@ class Surface:
     @property
     def vector(self) -> FloatArray:
         """All 2mn entries: α_a, λ_a, α_u, λ_u, each row by row."""
-        return np.concatenate(
-            [b.ravel() for b in (self.alpha_a, self.lambda_a, self.alpha_u, self.lambda_u)]
-        )
+        return np.concatenate([block.ravel() for block in self._blocks])
 
     @classmethod
     @checked
@@ -120,9 +210,7 @@ class Surface:
                 limit=f"({2 * m * n},), 2mn numbers",
                 remedy="Give α_a, λ_a, α_u, λ_u, each row by row",
             )
-        blocks = np.split(entries, [m * m, 2 * m * m, m * m + m * n])
-        shapes = [(m, m), (m, m), (m, n - m), (m, n - m)]
-        return cls(*(b.reshape(s) for b, s in zip(blocks, shapes, strict=True)))
+        return cls(*LawLayout(n, m).blocks(entries))
 
     @property
     def position_row(self) -> FloatArray:
@@ -172,14 +260,13 @@ class Surface:
 
     def __repr__(self) -> str:
         """Show the blocks to four digits."""
-        names = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
 
         def show(block: FloatArray) -> str:
             if block.size == 1:
                 return f"{block.item():.4g}"
             return str([[float(f"{v:.4g}") for v in row] for row in block])
 
-        return f"Surface({', '.join(f'{k}={show(getattr(self, k))}' for k in names)})"
+        return f"Surface({', '.join(f'{k}={show(b)}' for k, b in self._blocks._asdict().items())})"
 
 
 @dataclass(frozen=True)
@@ -203,23 +290,12 @@ class ReachingLaw:
 
     def __post_init__(self) -> None:
         """Refuse gains and layers that are not positive and finite."""
-        if self.switching not in ("saturation", "tanh", "sign"):
-            raise InvalidInputError(
-                "switching function",
-                value=repr(self.switching),
-                limit="'saturation', 'tanh' or 'sign'",
-                remedy="Choose 'saturation' for the paper's law (39)",
-            )
+        known, remedy = get_args(Switching), "Choose 'saturation' for the paper's law (39)"
+        one_of("switching function", self.switching, known, remedy)
         check_fields(self)
         for name in ("eta", "layer"):
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            if not (np.isfinite(values).all() and (values > 0).all()):
-                raise InvalidInputError(
-                    f"reaching law {name}",
-                    value=getattr(self, name),
-                    limit="finite and > 0",
-                    remedy="The paper uses η = 20 and a layer of 0.1",
-                )
+            remedy = "The paper uses η = 20 and a layer of 0.1"
+            positive(f"reaching law {name}", getattr(self, name), remedy)
 
     @checked
     def vector(self, m: int) -> FloatArray:

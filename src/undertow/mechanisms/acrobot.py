@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanisms.chain import two_link
-from undertow.models import Mechanism, Parameter
-
-__all__ = ["acrobot"]
+from undertow.mechanisms.chain import standing_links
+from undertow.models import Input, Mechanism, Parameter
 
 SPONG = "Spong, The swing up control problem for the Acrobot, IEEE Control Systems 15 (1995) 49"
 DRAKE = "Drake, examples/acrobot (Russ Tedrake and the Drake Development Team)"
@@ -50,10 +48,9 @@ def acrobot(**values: float) -> Mechanism:
         Parameter("b_2", 0.1, "N m s/rad", "damping of the elbow", -1e-12, math.inf, DRAKE),
         Parameter("g", 9.81, "m/s²", "gravity", 0, math.inf, "standard"),
     )
-    return two_link(
+    return standing_links(
         "acrobot",
-        "elbow",
-        30.0,
+        {2: Input("torque", "N m", 30.0)},
         parameters,
         start={"q_1": math.radians(3), "q_2": math.radians(-3)},
         description="two links, the motor at the elbow, balanced upright (limit chosen)",

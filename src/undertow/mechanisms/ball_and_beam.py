@@ -14,8 +14,6 @@ import sympy as sp
 
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 
-__all__ = ["ball_and_beam"]
-
 HAUSER = (
     "Hauser, Sastry, Kokotović, Nonlinear control via approximate input-output linearization: "
     "the ball and beam example, IEEE Trans. Automatic Control 37 (1992) 392"

@@ -13,8 +13,6 @@ import math
 from undertow.mechanisms.chain import chain_energies
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 
-__all__ = ["cart_pendulum"]
-
 CTMS = "University of Michigan, Control Tutorials for MATLAB and Simulink, Inverted Pendulum"
 
 
@@ -49,7 +47,8 @@ def cart_pendulum(**values: float) -> Mechanism:
     x = Coordinate("x", "m", "cart position", -1.5, 1.5)
     phi = Coordinate("phi", "rad", "lean of the pendulum from the upright, towards +x")
     v, w = x.velocity, phi.velocity
-    kinetic, potential = chain_energies([phi.symbol], [w], [m_p], [J_p], [l], [l], g, v)
+    link = {"m_1": m_p, "J_1": J_p, "a_1": l, "g": g}
+    kinetic, potential = chain_energies(link, [phi.symbol], [w], v)
     return Mechanism.from_energies(
         "cart_pendulum",
         [x, phi],

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import product
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from itertools import accumulate, count, pairwise, product, takewhile
+from typing import Any
 
 import sympy as sp
 
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 
-__all__ = ["chain_energies", "two_link"]
-
 
 def chain_energies(
+    p: Mapping[str, sp.Expr | float],
     angles: Sequence[sp.Expr],
     rates: Sequence[sp.Expr],
-    masses: Sequence[sp.Expr],
-    inertias: Sequence[sp.Expr],
-    centres: Sequence[sp.Expr],
-    lengths: Sequence[sp.Expr],
-    gravity: sp.Expr,
     base_rate: sp.Expr | int = 0,
 ) -> tuple[sp.Expr, sp.Expr]:
     """Return T and V, J, of links that stand on one another on a base that moves along x.
@@ -34,78 +28,116 @@ def chain_energies(
 
     Parameters
     ----------
+    p
+        ``m_1`` …, kg; ``J_1`` … about the centres of mass, kg m²; ``a_1`` … from a link's joint to
+        its centre of mass and ``l_1`` … to the next joint where there is one, m; ``g``, m/s².
     angles, rates
         φ_i and φ̇_i as expressions in the coordinates and their velocities, rad, rad/s.
-    masses, inertias
-        m_i, kg; J_i about the centre of mass, kg m².
-    centres, lengths
-        From a link's joint to its centre of mass and to the next joint, m; the last length is
-        not used.
-    gravity
-        m/s².
     base_rate
         ẋ of the first joint, m/s.
     """
     kinetic, potential = sp.Integer(0), sp.Integer(0)
-    for i, (m, J) in enumerate(zip(masses, inertias, strict=True)):
-        arms = [*lengths[:i], centres[i]]
-        reach = range(i + 1)
+    for i, rate in enumerate(rates, 1):
+        m, J = p[f"m_{i}"], p[f"J_{i}"]
+        arms = [*(p[f"l_{j}"] for j in range(1, i)), p[f"a_{i}"]]
+        reach = range(i)
         coupled = sum(arms[j] * sp.cos(angles[j]) * rates[j] for j in reach)
         turning = sum(
             arms[j] * arms[k] * sp.cos(angles[j] - angles[k]) * rates[j] * rates[k]
             for j, k in product(reach, reach)
         )
-        kinetic += (
-            m * (base_rate**2 + 2 * base_rate * coupled + turning) / 2 + J * rates[i] ** 2 / 2
-        )
-        potential += m * gravity * sum(arms[j] * sp.cos(angles[j]) for j in reach)
+        kinetic += m * (base_rate**2 + 2 * base_rate * coupled + turning) / 2 + J * rate**2 / 2
+        potential += m * p["g"] * sum(arms[j] * sp.cos(angles[j]) for j in reach)
     return kinetic, potential
 
 
-def two_link(
-    name: str,
-    motor: Literal["shoulder", "elbow"],
-    limit: float,
-    parameters: Sequence[Parameter],
-    **rest: Any,
-) -> Mechanism:
-    """Return two links on a fixed shoulder, upright at the target, with one motor.
+def _links(p: Mapping[str, sp.Symbol]) -> list[int]:
+    """Return the numbers of the links that parameters describe."""
+    return list(takewhile(lambda i: f"m_{i}" in p, count(1)))
 
-    Link 1 leans by q_1 from the upright, link 2 by q_2 against link 1.
+
+def standing_links(
+    name: str, motors: Mapping[int, Input], parameters: Sequence[Parameter], **rest: Any
+) -> Mechanism:
+    """Return links that stand on one another on a fixed joint, upright at the target.
+
+    Link 1 leans by q_1 from the upright, link i by q_i against the one before.
 
     Parameters
     ----------
     name
         Of the mechanism.
-    motor
-        The joint that is turned, whose angle is the actuated coordinate.
-    limit
-        Of its torque, N m.
+    motors
+        The number of each joint that is turned, whose angle is an actuated coordinate, to the
+        torque that turns it.
     parameters
-        ``m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g``: masses, length of link 1, joint to
-        centre of mass, inertias about the centre, damping of the joints, gravity.
+        ``m_i, l_i, a_i, J_i`` of each link as for :func:`chain_energies`, damping of its joint
+        ``b_i``; gravity ``g``.
     **rest
         Further fields of :class:`undertow.Mechanism`.
     """
-    v = {p.name: p.symbol for p in parameters}
-    shoulder = Coordinate("q_1", "rad", "lean of link 1 from the upright")
-    elbow = Coordinate("q_2", "rad", "angle of link 2 against link 1")
+    p = {one.name: one.symbol for one in parameters}
+    links = {
+        i: Coordinate(
+            f"q_{i}",
+            "rad",
+            f"angle of link {i} against link {i - 1}"
+            if i > 1
+            else "lean of link 1 from the upright",
+        )
+        for i in _links(p)
+    }
     kinetic, potential = chain_energies(
-        [shoulder.symbol, shoulder.symbol + elbow.symbol],
-        [shoulder.velocity, shoulder.velocity + elbow.velocity],
-        [v["m_1"], v["m_2"]],
-        [v["J_1"], v["J_2"]],
-        [v["a_1"], v["a_2"]],
-        [v["l_1"], v["l_1"]],
-        v["g"],
+        p,
+        list(accumulate(link.symbol for link in links.values())),
+        list(accumulate(link.velocity for link in links.values())),
     )
     return Mechanism.from_energies(
         name,
-        [shoulder, elbow] if motor == "shoulder" else [elbow, shoulder],
-        [Input("torque", "N m", limit)],
+        [*(links[i] for i in motors), *(links[i] for i in links if i not in motors)],
+        list(motors.values()),
         kinetic=kinetic,
         potential=potential,
-        dissipation=v["b_1"] * shoulder.velocity**2 / 2 + v["b_2"] * elbow.velocity**2 / 2,
+        dissipation=sum(p[f"b_{i}"] * link.velocity**2 / 2 for i, link in links.items()),
+        parameters=tuple(parameters),
+        **rest,
+    )
+
+
+def links_on_a_cart(
+    name: str, limit: float, parameters: Sequence[Parameter], **rest: Any
+) -> Mechanism:
+    """Return links that stand on a cart, upright at the target, moved by a force on the cart.
+
+    Parameters
+    ----------
+    name
+        Of the mechanism.
+    limit
+        Of the force, N.
+    parameters
+        Of the cart ``m_c, b_c``, mass and damping; of the links as for :func:`standing_links`.
+    **rest
+        Further fields of :class:`undertow.Mechanism`.
+    """
+    p = {one.name: one.symbol for one in parameters}
+    numbers = _links(p)
+    x = Coordinate("x", "m", "cart position", -1.5, 1.5)
+    links = [
+        Coordinate(f"phi_{i}", "rad", f"lean of link {i} from the upright, towards +x")
+        for i in numbers
+    ]
+    v, rates = x.velocity, [link.velocity for link in links]
+    kinetic, potential = chain_energies(p, [link.symbol for link in links], rates, v)
+    turns = [rates[0], *(after - before for before, after in pairwise(rates))]
+    damping = sum(p[f"b_{i}"] * w**2 / 2 for i, w in zip(numbers, turns, strict=True))
+    return Mechanism.from_energies(
+        name,
+        [x, *links],
+        [Input("force", "N", limit)],
+        kinetic=kinetic + p["m_c"] * v**2 / 2,
+        potential=potential,
+        dissipation=p["b_c"] * v**2 / 2 + damping,
         parameters=tuple(parameters),
         **rest,
     )

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanisms.chain import chain_energies
-from undertow.models import Coordinate, Input, Mechanism, Parameter
-
-__all__ = ["double_pendulum_on_a_cart"]
+from undertow.mechanisms.chain import links_on_a_cart
+from undertow.models import Mechanism, Parameter
 
 GRAICHEN = (
     "Graichen, Treuer, Zeitz, Swing-up of the double pendulum on a cart by feedforward and "
@@ -52,29 +50,10 @@ def double_pendulum_on_a_cart(**values: float) -> Mechanism:
         Parameter("b_2", 0.005, "N m s/rad", "damping of joint 2", -1e-12, math.inf, GRAICHEN),
         Parameter("g", 9.81, "m/s²", "gravity", 0, math.inf, "standard"),
     )
-    m_c, m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_c, b_1, b_2, g = (p.symbol for p in parameters)
-    x = Coordinate("x", "m", "cart position", -1.5, 1.5)
-    first = Coordinate("phi_1", "rad", "lean of link 1 from the upright, towards +x")
-    second = Coordinate("phi_2", "rad", "lean of link 2 from the upright, towards +x")
-    v, w_1, w_2 = x.velocity, first.velocity, second.velocity
-    kinetic, potential = chain_energies(
-        [first.symbol, second.symbol],
-        [w_1, w_2],
-        [m_1, m_2],
-        [J_1, J_2],
-        [a_1, a_2],
-        [l_1, l_1],
-        g,
-        v,
-    )
-    return Mechanism.from_energies(
+    return links_on_a_cart(
         "double_pendulum_on_a_cart",
-        [x, first, second],
-        [Input("force", "N", 40.0)],
-        kinetic=kinetic + m_c * v**2 / 2,
-        potential=potential,
-        dissipation=b_c * v**2 / 2 + b_1 * w_1**2 / 2 + b_2 * (w_2 - w_1) ** 2 / 2,
-        parameters=parameters,
+        40.0,
+        parameters,
         start={"phi_1": math.radians(4), "phi_2": math.radians(4)},
         description="double pendulum on a cart (cart, limit and range chosen)",
         source=GRAICHEN,

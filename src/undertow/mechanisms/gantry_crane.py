@@ -17,8 +17,6 @@ import sympy as sp
 
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 
-__all__ = ["gantry_crane"]
-
 FANG = (
     "Fang, Dixon, Dawson, Zergeroglu, Nonlinear coupling control laws for an underactuated "
     "overhead crane system, IEEE/ASME Trans. Mechatronics 8 (2003) 418"

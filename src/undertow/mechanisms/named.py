@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from undertow.base import InvalidInputError, near
+from undertow.base import one_of
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
 from undertow.models.importers.mjcf import from_mjcf
 from undertow.models.importers.python_file import in_a_file, mechanism_from_file
 from undertow.models.importers.urdf import from_urdf
-
-__all__ = ["from_anywhere", "named"]
 
 #: Ends of the names of files that are data.
 _FILES = {".urdf": from_urdf, ".xml": from_mjcf, ".mjcf": from_mjcf}
@@ -41,14 +39,8 @@ def named(name: str) -> Mechanism:
     file, joints = _in_data(name)
     if file is not None:
         return _FILES[file.suffix](file, actuated=joints)
-    if name not in LIBRARY:
-        own = "One of your own is FILE.py:NAME, FILE.urdf or FILE.xml"
-        raise InvalidInputError(
-            "mechanism",
-            value=repr(name),
-            limit=f"one of {', '.join(LIBRARY)}",
-            remedy=f"{near(name, LIBRARY)} {own}".strip(),
-        )
+    own = "One of your own is FILE.py:NAME, FILE.urdf or FILE.xml"
+    one_of("mechanism", name, LIBRARY, own)
     return LIBRARY[name]()
 
 

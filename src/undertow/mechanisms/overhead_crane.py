@@ -1,4 +1,4 @@
-"""The overhead crane: a trolley with a hanging load; a stable target, to be reached calmly.
+"""The overhead crane: a trolley with a hanging load; a stable target.
 
 A trolley of mass m_c moves along x; the load of mass m_p hangs at l below it and swings by θ
 towards +x.  Energies:
@@ -13,8 +13,6 @@ import math
 import sympy as sp
 
 from undertow.models import Coordinate, Input, Mechanism, Parameter
-
-__all__ = ["overhead_crane"]
 
 FANG = (
     "trolley, load and rope of the laboratory crane in Fang, Dixon, Dawson, Zergeroglu, "

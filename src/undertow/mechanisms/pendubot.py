@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanisms.chain import two_link
-from undertow.models import Mechanism, Parameter
-
-__all__ = ["pendubot"]
+from undertow.mechanisms.chain import standing_links
+from undertow.models import Input, Mechanism, Parameter
 
 PILCO = (
     "Deisenroth, McHutchon, Hall, Rasmussen, PILCO code v0.9, dynamics_pendubot.m and its scenario"
@@ -50,10 +48,9 @@ def pendubot(**values: float) -> Mechanism:
         Parameter("b_2", 0.01, "N m s/rad", "damping of joint 2", -1e-12, math.inf, "chosen"),
         Parameter("g", 9.82, "m/s²", "gravity", 0, math.inf, PILCO),
     )
-    return two_link(
+    return standing_links(
         "pendubot",
-        "shoulder",
-        3.5,
+        {1: Input("torque", "N m", 3.5)},
         parameters,
         start={"q_1": math.radians(5), "q_2": math.radians(-5)},
         description="two links, the motor at the shoulder, balanced upright",

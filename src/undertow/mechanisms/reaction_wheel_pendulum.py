@@ -20,8 +20,6 @@ import sympy as sp
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 from undertow.models.importers.drives import DCMotor, voltage_driven
 
-__all__ = ["reaction_wheel_pendulum"]
-
 BOOK = "Block, Åström, Spong, The Reaction Wheel Pendulum, Morgan & Claypool 2007"
 
 #: Motor on the wheel's axle.

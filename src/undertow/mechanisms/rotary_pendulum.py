@@ -25,11 +25,9 @@ from dataclasses import dataclass, replace
 
 import sympy as sp
 
-from undertow.base import InvalidInputError, checked
+from undertow.base import checked, one_of
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 from undertow.models.importers.drives import DCMotor
-
-__all__ = ["PARAMETER_SETS", "rotary_pendulum"]
 
 PAPER = "Sec. 4 of doi:10.1115/1.4005367 (Quanser SRV-02)"
 
@@ -173,12 +171,7 @@ def rotary_pendulum(parameter_set: str = "paper", **values: float) -> Mechanism:
 
 def _quanser(rig: Mechanism, name: str) -> Mechanism:
     """The paper's equations with the numbers of one of Quanser's rigs."""
-    if name not in PARAMETER_SETS:
-        raise InvalidInputError(
-            "parameter set of the rotary pendulum",
-            value=repr(name),
-            limit=f"one of 'paper', {', '.join(repr(k) for k in PARAMETER_SETS)}",
-        )
+    one_of("parameter set of the rotary pendulum", name, ["paper", *PARAMETER_SETS])
     chosen = PARAMETER_SETS[name]
     numbers = chosen.values()
     parameters = tuple(

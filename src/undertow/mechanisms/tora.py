@@ -14,8 +14,6 @@ import sympy as sp
 
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 
-__all__ = ["tora"]
-
 RTAC = (
     "Bupp, Bernstein, Coppola, A benchmark problem for nonlinear control design, "
     "Int. J. Robust Nonlinear Control 8 (1998) 307"

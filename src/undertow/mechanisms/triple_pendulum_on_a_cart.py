@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanisms.chain import chain_energies
-from undertow.models import Coordinate, Input, Mechanism, Parameter
-
-__all__ = ["triple_pendulum_on_a_cart"]
+from undertow.mechanisms.chain import links_on_a_cart
+from undertow.models import Mechanism, Parameter
 
 GLUECK = (
     "Glück, Eder, Kugi, Swing-up control of a triple pendulum on a cart with experimental "
@@ -58,35 +56,10 @@ def triple_pendulum_on_a_cart(**values: float) -> Mechanism:
         Parameter("b_3", 0.002, "N m s/rad", "damping of joint 3", -1e-12, inf, "chosen"),
         Parameter("g", 9.81, "m/s²", "gravity", 0, inf, "standard"),
     )
-    symbol = {p.name: p.symbol for p in parameters}
-    x = Coordinate("x", "m", "cart position", -1.5, 1.5)
-    links = [
-        Coordinate(f"phi_{i}", "rad", f"lean of link {i} from the upright, towards +x")
-        for i in (1, 2, 3)
-    ]
-    v = x.velocity
-    w_1, w_2, w_3 = (link.velocity for link in links)
-    kinetic, potential = chain_energies(
-        [link.symbol for link in links],
-        [w_1, w_2, w_3],
-        [symbol[k] for k in ("m_1", "m_2", "m_3")],
-        [symbol[k] for k in ("J_1", "J_2", "J_3")],
-        [symbol[k] for k in ("a_1", "a_2", "a_3")],
-        [symbol[k] for k in ("l_1", "l_2", "l_2")],
-        symbol["g"],
-        v,
-    )
-    return Mechanism.from_energies(
+    return links_on_a_cart(
         "triple_pendulum_on_a_cart",
-        [x, *links],
-        [Input("force", "N", 100.0)],
-        kinetic=kinetic + symbol["m_c"] * v**2 / 2,
-        potential=potential,
-        dissipation=symbol["b_c"] * v**2 / 2
-        + symbol["b_1"] * w_1**2 / 2
-        + symbol["b_2"] * (w_2 - w_1) ** 2 / 2
-        + symbol["b_3"] * (w_3 - w_2) ** 2 / 2,
-        parameters=parameters,
+        100.0,
+        parameters,
         start={"phi_1": math.radians(1), "phi_2": math.radians(1), "phi_3": math.radians(1)},
         description="triple pendulum on a cart (cart, damping, limit and range chosen)",
         source=GLUECK,

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import math
 
-from undertow.mechanisms.chain import chain_energies
-from undertow.models import Coordinate, Input, Mechanism, Parameter
-
-__all__ = ["two_motor_three_link"]
+from undertow.mechanisms.chain import standing_links
+from undertow.models import Input, Mechanism, Parameter
 
 
 def two_motor_three_link(**values: float) -> Mechanism:
@@ -56,31 +54,10 @@ def two_motor_three_link(**values: float) -> Mechanism:
         ),
         Parameter("g", 9.81, "m/s²", "gravity", 0, inf, "standard"),
     )
-    symbol = {p.name: p.symbol for p in parameters}
-    ankle = Coordinate("q_1", "rad", "lean of link 1 from the upright")
-    knee = Coordinate("q_2", "rad", "angle of link 2 against link 1")
-    hip = Coordinate("q_3", "rad", "angle of link 3 against link 2")
-    q_1, q_2, q_3 = ankle.symbol, knee.symbol, hip.symbol
-    w_1, w_2, w_3 = ankle.velocity, knee.velocity, hip.velocity
-    kinetic, potential = chain_energies(
-        [q_1, q_1 + q_2, q_1 + q_2 + q_3],
-        [w_1, w_1 + w_2, w_1 + w_2 + w_3],
-        [symbol[f"m_{i}"] for i in links],
-        [symbol[f"J_{i}"] for i in links],
-        [symbol[f"a_{i}"] for i in links],
-        [symbol["l_1"], symbol["l_2"], symbol["l_2"]],
-        symbol["g"],
-    )
-    return Mechanism.from_energies(
+    return standing_links(
         "two_motor_three_link",
-        [knee, hip, ankle],
-        [Input("torque_2", "N m", 30.0), Input("torque_3", "N m", 20.0)],
-        kinetic=kinetic,
-        potential=potential,
-        dissipation=sum(
-            symbol[f"b_{i}"] * w**2 / 2 for i, w in zip(links, (w_1, w_2, w_3), strict=True)
-        ),
-        parameters=parameters,
+        {2: Input("torque_2", "N m", 30.0), 3: Input("torque_3", "N m", 20.0)},
+        parameters,
         start={"q_1": math.radians(4), "q_2": math.radians(-6)},
         description="three links on a free joint, two motors, balanced upright (all chosen)",
         source="chosen",

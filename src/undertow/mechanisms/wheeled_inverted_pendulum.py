@@ -18,8 +18,6 @@ import sympy as sp
 from undertow.models import Coordinate, Input, Mechanism, Parameter
 from undertow.models.importers.drives import DCMotor, voltage_driven
 
-__all__ = ["wheeled_inverted_pendulum"]
-
 NXT = "Yamamoto, NXTway-GS Model-Based Design, MATLAB Central File Exchange 19147 (2008)"
 
 #: Both motors at one voltage: half the resistance, twice the friction and rotor.

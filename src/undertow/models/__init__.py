@@ -1,6 +1,13 @@
 """What moves: a mechanism, its physical parameters, and whether its model is valid."""
 
-from undertow.models.mechanism import Mechanism, require_mechanism
+from undertow.models.linearisation import (
+    Linearisation,
+    controllability,
+    has_linear_model,
+    linear_numbers,
+    linearise,
+)
+from undertow.models.mechanism import Mechanism
 from undertow.models.partition import Partition
 from undertow.models.quantities import (
     TIME,
@@ -28,18 +35,22 @@ __all__ = [
     "Coordinate",
     "FloatArray",
     "Input",
+    "Linearisation",
     "Mechanism",
     "Parameter",
     "Partition",
     "by_names",
     "check_symbols",
+    "controllability",
     "expression_of",
+    "has_linear_model",
     "is_smooth",
     "kinks",
+    "linear_numbers",
+    "linearise",
     "normal_name",
     "number_of",
     "numbers",
-    "require_mechanism",
     "require_smooth",
     "shortened",
     "vocabulary",

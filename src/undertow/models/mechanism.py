@@ -10,15 +10,15 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
-from typing import Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base import REMEDIES, InvalidInputError, ModelError, checked, floats, near
+from undertow.base import InvalidInputError, ModelError, check_fields, checked, floats, one_of
 from undertow.models.lagrange import derived
 from undertow.models.partition import Partition, compiled
 from undertow.models.quantities import (
@@ -42,6 +42,9 @@ from undertow.models.validity import (
 )
 from undertow.symbolic import Tape, compile_numpy
 
+if TYPE_CHECKING:
+    from undertow.models.linearisation import Linearisation
+
 __all__ = [
     "TIME",
     "Coordinate",
@@ -53,7 +56,6 @@ __all__ = [
     "energies",
     "matrix_of",
     "numbers",
-    "require_mechanism",
 ]
 
 #: Stands for the identity of the right size until ``__post_init__`` knows m.
@@ -82,7 +84,7 @@ class Mechanism:
         All physical parameters that occur in the expressions.
     disturbance_bounds
         |g_i| ≤ bound, one per coordinate, in generalised force units (N m or N); the
-        gains (13)-(14) are computed from them.  Zero by default.
+        gains (13) are computed from them.  Zero by default.
     potential
         Potential energy, J, where there is one (used by the energy balance).
     start
@@ -123,18 +125,25 @@ class Mechanism:
             f"inputs={[i.name for i in self.inputs]})"
         )
 
+    def _repr_latex_(self) -> str:
+        """Show M, f and B as formulas in a notebook."""
+        from undertow.symbolic.formulas import readable, tex
+
+        rates = [c.velocity for c in self.coordinates]
+        shown = []
+        for name, matrix in (("M", self.mass_matrix), ("f", self.force), ("B", self.input_matrix)):
+            entries = sp.ImmutableDenseMatrix(
+                *matrix.shape, [readable(entry, rates) for entry in matrix]
+            )
+            shown.append(f"{name} &= {tex(entries)}")
+        lines = r" \\ ".join([r"M \ddot{q} &= f + (B u, 0)", *shown])
+        return rf"$\displaystyle \begin{{aligned}} {lines} \end{{aligned}}$"
+
     # -- construction -------------------------------------------------------------------
 
     def __post_init__(self) -> None:
         """Check shapes, names, symbols and the definiteness of M; freeze the matrices."""
-        for what, given, kind in (("name", self.name, str), ("start", self.start, Mapping)):
-            if not isinstance(given, kind):
-                raise InvalidInputError(
-                    f"{what} of a mechanism",
-                    value=f"{given!r}, a {type(given).__name__}",
-                    limit=f"a {'text' if kind is str else 'mapping of state names to numbers'}",
-                    remedy='Write Mechanism("my_rig", ..., start={"phi": 0.1})',
-                )
+        check_fields(self, "name", "start")
         check_parts(self.name, self.coordinates, self.inputs, self.parameters)
         for parts in ("coordinates", "inputs", "parameters"):
             object.__setattr__(self, parts, tuple(getattr(self, parts)))
@@ -235,23 +244,15 @@ class Mechanism:
         Raises
         ------
         ModelError
-            When T is not a quadratic form in the velocities; for symbols that are not of this
-            mechanism, and kinks, whose derivatives are not what SymPy says; or as for the class.
+            When T is not a quadratic form in the velocities; for undeclared symbols; for kinks,
+            where SymPy's derivatives are wrong; or as for the class.
         """
         T, V, D = energies(
             name, coordinates, inputs, rest.get("parameters", ()), kinetic, potential, dissipation
         )
         q, qd = [c.symbol for c in coordinates], [c.velocity for c in coordinates]
         mass, force = derived(name, q, qd, T, V, D)
-        return cls(
-            name,
-            tuple(coordinates),
-            tuple(inputs),
-            mass,
-            force,
-            potential=V,
-            **rest,
-        )
+        return cls(name, tuple(coordinates), tuple(inputs), mass, force, potential=V, **rest)
 
     def with_parameters(self, /, **values: float) -> Self:
         """Return the mechanism with some parameter values replaced, SI units.
@@ -263,16 +264,11 @@ class Mechanism:
         """
         if not values:
             return self
-        known = {p.name: p for p in self.parameters}
+        known = [p.name for p in self.parameters]
         values = by_names(f"parameters of '{self.name}'", values)
+        remedy = "Use a declared name; values are in SI units"
         for name in values:
-            if name not in known:
-                raise InvalidInputError(
-                    f"unknown parameter of '{self.name}'",
-                    value=repr(name),
-                    limit=f"one of {', '.join(known)}",
-                    remedy=near(name, known) or "Use a declared name; values are in SI units",
-                )
+            one_of(f"unknown parameter of '{self.name}'", name, known, remedy)
         changed = tuple(
             replace(p, value=number_of(f"parameter '{p.name}', {p.unit}", values[p.name]))
             if p.name in values
@@ -280,6 +276,31 @@ class Mechanism:
             for p in self.parameters
         )
         return replace(self, parameters=changed)
+
+    def with_values(self, values: ArrayLike) -> Self:
+        """Return the mechanism with other values of all its parameters, (P,), SI units.
+
+        Unlike :meth:`with_parameters` it checks nothing but the mass matrix: for estimates that
+        change many times a second.
+
+        Raises
+        ------
+        InvalidInputError
+            For values of another shape, or outside the parameter's bounds.
+        ModelError
+            When the mass matrix is not positive definite with them.
+        """
+        numbers = self._columns("parameter values", values, [p.name for p in self.parameters])
+        copy = object.__new__(type(self))
+        copy.__dict__.update(
+            {each.name: getattr(self, each.name) for each in fields(self)},
+            parameters=tuple(
+                replace(p, value=float(v)) for p, v in zip(self.parameters, numbers, strict=True)
+            ),
+            structure=self.structure,
+        )
+        check_definite(f"mass_matrix of '{self.name}'", self.coordinates, copy.M)
+        return copy
 
     def with_input_limit(self, *limits: float) -> Self:
         """Return the mechanism with other actuator limits, one per input, in its unit."""
@@ -315,14 +336,9 @@ class Mechanism:
         """
         force = by_names(f"forces on '{self.name}'", force)
         names = [c.name for c in self.coordinates]
-        unknown = sorted(set(force) - set(names))
-        if unknown:
-            raise InvalidInputError(
-                f"unknown coordinate of '{self.name}'",
-                value=", ".join(unknown),
-                limit=f"one of {', '.join(names)}",
-                remedy=near(unknown[0], names) or "Forces act on coordinates, by their names",
-            )
+        remedy = "Forces act on coordinates, by their names"
+        for name in force:
+            one_of(f"unknown coordinate of '{self.name}'", name, names, remedy)
         g = sp.Matrix([expression_of(f"force on '{name}'", force.get(name, 0)) for name in names])
         return replace(
             self,
@@ -385,17 +401,9 @@ class Mechanism:
     @cached_property
     def structure(self) -> str:
         """Hash of everything that generated code depends on: equations and names, no values."""
-        text = "\n".join(
-            [
-                sp.srepr(self.mass_matrix),
-                sp.srepr(self.force),
-                sp.srepr(self.input_matrix),
-                repr([p.name for p in self.parameters]),
-                repr([i.name for i in self.inputs]),
-                repr(self.state_names),
-                repr(self.disturbance_bounds),
-            ]
-        )
+        equations = (self.mass_matrix, self.force, self.input_matrix)
+        names = [p.name for p in self.parameters], [i.name for i in self.inputs], self.state_names
+        text = "\n".join([*map(sp.srepr, equations), *map(repr, (*names, self.disturbance_bounds))])
         return hashlib.sha256(text.encode()).hexdigest()
 
     @cached_property
@@ -435,19 +443,42 @@ class Mechanism:
             For an unknown state name or a value that is not finite.
         """
         x = np.zeros(2 * self.n)
+        names, remedy = self.state_names, "Use a coordinate's name, or its velocity's"
         for name, value in by_names(f"state of '{self.name}'", values).items():
-            if name not in self.state_names:
-                raise InvalidInputError(
-                    f"unknown state of '{self.name}'",
-                    value=repr(name),
-                    limit=f"one of {', '.join(self.state_names)}",
-                    remedy=near(name, self.state_names)
-                    or "Use a coordinate's name, or its velocity's",
-                )
-            x[self.state_names.index(name)] = number_of(
+            one_of(f"unknown state of '{self.name}'", name, names, remedy)
+            x[names.index(name)] = number_of(
                 f"state '{name}' of '{self.name}'", value, limit="a number, in rad or m, per second"
             )
         return self.check_state(x)
+
+    @checked
+    def initial_state(self, x0: ArrayLike | None, names: Mapping[str, float]) -> FloatArray:
+        """Return an initial state, (2n,), from a vector, from names, or the usual one.
+
+        Raises
+        ------
+        InvalidInputError
+            For both a vector and names, for several states, and with neither where the mechanism
+            has no usual start.
+        """
+        if x0 is None:
+            return self.state(**names) if names else self.usual_start
+        if names:
+            raise InvalidInputError(
+                "initial state",
+                value=f"x0 and {', '.join(names)}",
+                limit="x0 or names, not both",
+                remedy="Leave one of them out",
+            )
+        x = self.check_state(x0)
+        if x.ndim != 1:
+            raise InvalidInputError(
+                "initial state",
+                value=f"shape {x.shape}",
+                limit=f"({2 * self.n},), one state",
+                remedy="A run has one start; ClosedLoop.batch takes many",
+            )
+        return x
 
     def check_state(self, x: ArrayLike) -> FloatArray:
         """Return ``x`` as a float array (…, 2n), refusing wrong lengths and NaN.
@@ -457,14 +488,8 @@ class Mechanism:
         InvalidInputError
             With the offending entry.
         """
-        state = floats(f"state of '{self.name}'", x)
-        if state.ndim == 0 or state.shape[-1] != 2 * self.n:
-            raise InvalidInputError(
-                f"state of '{self.name}'",
-                value=f"shape {state.shape}",
-                limit=f"(…, {2 * self.n}), in the order {', '.join(self.state_names)}",
-                remedy="Set states by name: mechanism.state(name=value)",
-            )
+        remedy = "Set states by name: mechanism.state(name=value)"
+        state = self._columns("state", x, self.state_names, remedy)
         if not np.isfinite(state).all():
             first = int(np.argwhere(~np.isfinite(state))[0][-1])
             raise InvalidInputError(
@@ -475,7 +500,9 @@ class Mechanism:
             )
         return state
 
-    def _columns(self, what: str, values: ArrayLike, names: Sequence[str]) -> FloatArray:
+    def _columns(
+        self, what: str, values: ArrayLike, names: Sequence[str], remedy: str = ""
+    ) -> FloatArray:
         """Return values as floats, (…, len(names)), or refuse them."""
         what = f"{what} of '{self.name}'"
         array = floats(what, values)
@@ -484,14 +511,14 @@ class Mechanism:
                 what,
                 value=f"shape {array.shape}",
                 limit=f"(…, {len(names)}), in the order {', '.join(names)}",
-                remedy=f"Of a state x = (q, q̇) the positions are x[:{self.n}]",
+                remedy=remedy or f"Of a state x = (q, q̇) the positions are x[:{self.n}]",
             )
         return array
 
     # -- equations on a tape ------------------------------------------------------------
 
     def partition(self, tape: Tape, rename: Mapping[sp.Symbol, sp.Expr] | None = None) -> Partition:
-        """Lay M, f and B on a tape and eliminate ``M_uu``, equations (1)-(4).
+        """Record M, f and B on a tape and eliminate ``M_uu``, equations (1)-(4).
 
         ``rename`` replaces symbols first: a controller's belief keeps its own parameters.
         """
@@ -560,6 +587,18 @@ class Mechanism:
         inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), qdd)
         return np.asarray(inertial - self.f(state, t))
 
+    def linearise(self) -> Linearisation:
+        """Linearise at the target x = 0: ẋ = A x + B u; ``.ss()`` is python-control's.
+
+        Raises
+        ------
+        ModelError
+            When the target is no equilibrium for u = 0, or f has no derivative there.
+        """
+        from undertow.models.linearisation import linearise
+
+        return linearise(self)
+
     def energy(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
         """Return T + V at the states x, (…,), J, at the time t, s.
 
@@ -595,15 +634,15 @@ def energies(
     potential: sp.Expr,
     dissipation: sp.Expr | float,
 ) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
-    """Return T, V and D as expressions, refused before anything is derived from what is wrong.
+    """Check T, V and D before anything is derived from them, and return them as expressions.
 
     Raises
     ------
     ModelError
-        For symbols that are not of this mechanism, and what has no derivative where the
-        equations of motion need one.
+        For undeclared symbols, and for expressions without the derivatives that the equations of
+        motion need.
     InvalidInputError
-        For coordinates, inputs or parameters that are none.
+        For coordinates, inputs or parameters of another type.
     """
     check_parts(name, coordinates, inputs, parameters)
     data = vocabulary(parameters=parameters, time=False)
@@ -626,7 +665,7 @@ def energies(
 
 
 def matrix_of(what: str, value: object) -> sp.ImmutableDenseMatrix:
-    """Return a matrix of expressions; refuse text, which SymPy would run, and what is none."""
+    """Return a matrix of SymPy expressions; refuse text, which SymPy would evaluate."""
     try:
         if not isinstance(value, sp.MatrixBase):
             rows = np.array(value, dtype=object)
@@ -643,23 +682,6 @@ def matrix_of(what: str, value: object) -> sp.ImmutableDenseMatrix:
             limit="a matrix of SymPy expressions",
             remedy="Write sympy.Matrix([[...], [...]])",
         ) from error
-
-
-def require_mechanism(what: str, value: object) -> None:
-    """Refuse what is no mechanism, a name of one for instance.
-
-    Raises
-    ------
-    InvalidInputError
-        With how to make one.
-    """
-    if not isinstance(value, Mechanism):
-        raise InvalidInputError(
-            what,
-            value=f"{value!r}, a {type(value).__name__}",
-            limit="an undertow.Mechanism",
-            remedy=REMEDIES["Mechanism"],
-        )
 
 
 @lru_cache(maxsize=64)

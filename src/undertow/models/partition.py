@@ -12,8 +12,6 @@ import sympy as sp
 
 from undertow.symbolic import Tape, compile_numpy
 
-__all__ = ["Partition", "compiled"]
-
 
 @dataclass(frozen=True, eq=False)
 class Partition:
@@ -24,10 +22,8 @@ class Partition:
     """
 
     tape: Tape
-    M_aa: sp.Matrix
     M_au: sp.Matrix
     M_uu: sp.Matrix
-    f_a: sp.Matrix
     f_u: sp.Matrix
     B: sp.Matrix
     X: sp.Matrix
@@ -43,7 +39,7 @@ class Partition:
         force: Sequence[sp.Expr],
         gain: Sequence[sp.Expr],
     ) -> Self:
-        """Lay the entries of M, f and B on a tape, row by row, and eliminate ``M_uu``."""
+        """Record the entries of M, f and B on a tape, row by row, and eliminate ``M_uu``."""
         n, m = len(force), math.isqrt(len(gain))
         atoms = tape.let_all([*mass, *force, *gain])
         M = sp.Matrix(n, n, atoms[: n * n])
@@ -57,7 +53,7 @@ class Partition:
         S = tape.matrix(M_aa - M_au * X)
         S = sp.Matrix(m, m, lambda i, j: S[min(i, j), max(i, j)])
         h = tape.matrix(f_a - M_au * y)
-        return cls(tape, M_aa, M_au, M_uu, f_a, f_u, B, X, y, S, h)
+        return cls(tape, M_au, M_uu, f_u, B, X, y, S, h)
 
     def accelerations(self, u: sp.Matrix) -> list[sp.Expr]:
         """Return q̈ = (q̈_a, q̈_u) for the inputs u, equations (3)-(4), as tape atoms."""

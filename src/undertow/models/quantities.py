@@ -14,19 +14,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from undertow.base import InvalidInputError
-
-__all__ = [
-    "TIME",
-    "Coordinate",
-    "FloatArray",
-    "Input",
-    "Parameter",
-    "code_points",
-    "normal_name",
-    "number_of",
-    "numbers",
-]
+from undertow.base import InvalidInputError, one_of
 
 FloatArray = NDArray[np.float64]
 
@@ -37,12 +25,12 @@ TIME = sp.Symbol("t", real=True)
 #: Longest name.
 LONGEST = 200
 
-#: Names of symbols that derivations make up.
+#: Names of symbols that derivations introduce.
 _RESERVED = re.compile(r"_(v|y|cse_|viscous_)\d+")
 
 
-#: Letters that nobody sees, besides those whose category says so: fillers, joiners, selectors.
-_UNSEEN = re.compile(
+#: Invisible characters that Unicode counts among letters and marks: fillers, joiners, selectors.
+_INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
 )
 
@@ -60,7 +48,7 @@ def normal_name(name: str) -> str:
 
 
 def code_points(name: str) -> str:
-    """Return a name with the code points of what is not ASCII in it, which tell look-alikes apart.
+    """Return a name with the code points of its non-ASCII characters, to tell look-alikes apart.
 
     >>> code_points("k_µ")
     'k_µ (U+00B5)'
@@ -70,18 +58,17 @@ def code_points(name: str) -> str:
 
 
 def _name(what: str, given: object) -> str:
-    """Return a name in its normal form; refuse what is no name that Python's code could bear.
+    """Return a name in normal form; refuse what cannot be an identifier in generated Python.
 
-    Refused is also what a derivation could take for a symbol of its own, and letters that cannot
-    be seen.
+    Names that derivations introduce, and invisible characters, are refused too.
     """
     name = normal_name(given) if isinstance(given, str) else ""
-    unseen = _UNSEEN.search(name)
-    if not name.isidentifier() or unseen or _RESERVED.fullmatch(name) or len(name) > LONGEST:
+    invisible = _INVISIBLE.search(name)
+    if not name.isidentifier() or invisible or _RESERVED.fullmatch(name) or len(name) > LONGEST:
         raise InvalidInputError(
             what,
-            value=f"{given!r} with U+{ord(unseen[0]):04X}, which is not seen"
-            if unseen
+            value=f"{given!r} with U+{ord(invisible[0]):04X}, which is invisible"
+            if invisible
             else repr(given)[: LONGEST + 2],
             limit="a Python identifier; not _v0, _y0, _cse_0 or the like; "
             f"at most {LONGEST} characters",
@@ -91,7 +78,7 @@ def _name(what: str, given: object) -> str:
 
 
 def number_of(what: str, value: object, *, limit: str = "a number", remedy: str = "") -> float:
-    """Return a real number as a float, and refuse all else: text, None, arrays, truth values.
+    """Return a real number as a float; refuse everything else: text, None, arrays, booleans.
 
     Raises
     ------
@@ -113,8 +100,24 @@ def number_of(what: str, value: object, *, limit: str = "a number", remedy: str 
     )
 
 
+class _Named:
+    """What has a name in Python's own spelling, and a symbol of that name."""
+
+    name: str
+
+    @property
+    def symbol(self) -> sp.Symbol:
+        """The SymPy symbol that stands for it."""
+        return sp.Symbol(self.name, real=True)
+
+    def _take_name(self, what: str) -> None:
+        """Keep the name that was given as ``spelling``, and its normal form."""
+        object.__setattr__(self, "spelling", self.name)
+        object.__setattr__(self, "name", _name(f"{what} name", self.name))
+
+
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(_Named):
     """A physical parameter: a number with its unit, its bounds and where it comes from.
 
     Parameters
@@ -146,8 +149,7 @@ class Parameter:
 
     def __post_init__(self) -> None:
         """Refuse a value that is not finite or not inside its interval."""
-        object.__setattr__(self, "spelling", self.name)
-        object.__setattr__(self, "name", _name("parameter name", self.name))
+        self._take_name("parameter")
         for end in ("value", "low", "high"):
             given = getattr(self, end)
             number = number_of(
@@ -167,14 +169,9 @@ class Parameter:
                 remedy="Give a value inside the interval",
             )
 
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The SymPy symbol that stands for this parameter."""
-        return sp.Symbol(self.name, real=True)
-
 
 @dataclass(frozen=True)
-class Coordinate:
+class Coordinate(_Named):
     """A generalised coordinate; its velocity is named ``<name>_dot``.
 
     Parameters
@@ -198,18 +195,12 @@ class Coordinate:
     spelling: str = field(default="", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse a name or unit of another kind, and an empty range of travel."""
-        object.__setattr__(self, "spelling", self.name)
-        object.__setattr__(self, "name", _name("coordinate name", self.name))
+        """Refuse an invalid name or unit, and an empty range of travel."""
+        self._take_name("coordinate")
         for end in ("low", "high"):
             number_of(f"{end} end of coordinate '{self.name}'", getattr(self, end))
-        if self.unit not in ("rad", "m"):
-            raise InvalidInputError(
-                f"unit of coordinate '{self.name}'",
-                value=repr(self.unit),
-                limit="rad or m",
-                remedy="Scale other units to SI first",
-            )
+        whose = f"unit of coordinate '{self.name}'"
+        one_of(whose, self.unit, ("rad", "m"), "Scale other units to SI first")
         if not self.low < self.high:
             raise InvalidInputError(
                 f"range of coordinate '{self.name}'",
@@ -219,18 +210,13 @@ class Coordinate:
             )
 
     @property
-    def symbol(self) -> sp.Symbol:
-        """The SymPy symbol of the coordinate."""
-        return sp.Symbol(self.name, real=True)
-
-    @property
     def velocity(self) -> sp.Symbol:
         """The SymPy symbol of its time derivative."""
         return sp.Symbol(f"{self.name}_dot", real=True)
 
 
 @dataclass(frozen=True)
-class Input:
+class Input(_Named):
     """An actuator input u_i with its symmetric limit ``|u_i| ≤ limit``, (38).
 
     Parameters
@@ -249,26 +235,13 @@ class Input:
     spelling: str = field(default="", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse a name that is no identifier and a limit that is not positive."""
-        object.__setattr__(self, "spelling", self.name)
-        object.__setattr__(self, "name", _name("input name", self.name))
-        number_of(
-            f"limit of input '{self.name}'",
-            self.limit,
-            remedy="Give the largest magnitude that the actuator can deliver, in its unit",
-        )
-        if not self.limit > 0:
-            raise InvalidInputError(
-                f"limit of input '{self.name}'",
-                value=f"{self.limit:g} {self.unit}",
-                limit="positive",
-                remedy="Give the largest magnitude that the actuator can deliver",
-            )
-
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The SymPy symbol of the input."""
-        return sp.Symbol(self.name, real=True)
+        """Refuse a name that is not an identifier and a limit that is not positive."""
+        self._take_name("input")
+        whose = f"limit of input '{self.name}'"
+        remedy = "Give the largest magnitude that the actuator can deliver, in its unit"
+        if not number_of(whose, self.limit, remedy=remedy) > 0:
+            value = f"{self.limit:g} {self.unit}"
+            raise InvalidInputError(whose, value=value, limit="positive", remedy=remedy)
 
 
 def numbers(matrix: Any) -> FloatArray:

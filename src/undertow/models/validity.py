@@ -1,4 +1,4 @@
-"""Conditions on the parts of a mechanism; each failure names the entry, the limit, the remedy."""
+"""Checks of the parts of a mechanism; each error names the entry, the limit and the remedy."""
 
 from __future__ import annotations
 
@@ -24,25 +24,9 @@ from undertow.models.quantities import (
     normal_name,
 )
 
-__all__ = [
-    "by_names",
-    "check_definite",
-    "check_names",
-    "check_parts",
-    "check_symbols",
-    "check_symmetric",
-    "expression_of",
-    "is_smooth",
-    "kinks",
-    "require_smooth",
-    "shortened",
-    "twins",
-    "vocabulary",
-]
-
 T = TypeVar("T")
 
-#: Functions that are smooth wherever they are finite: a derivative of theirs is never wrong.
+#: Functions that are smooth wherever they are finite: SymPy's derivatives of them are right.
 _SMOOTH = (
     sp.sin, sp.cos, sp.sinc, sp.atan, sp.sinh, sp.cosh, sp.tanh, sp.sech, sp.asinh, sp.exp,
     sp.Add, sp.Mul, sp.Symbol, sp.Number, sp.NumberSymbol,
@@ -54,68 +38,59 @@ _POLES: Mapping[Any, Callable[[sp.Expr], sp.Expr]] = {
     sp.coth: lambda e: e, sp.csch: lambda e: e,
 }  # fmt: skip
 
-#: What has no derivative at isolated points, and none there that is a number.
+#: Functions without a derivative at isolated points, where SymPy's is not finite either.
 _SINGULAR = (
     sp.Pow, sp.log, sp.asin, sp.acos, sp.atan2, sp.acosh, sp.atanh, *_POLES,
 )  # fmt: skip
 
-#: Functions with kinks and jumps that code is written for, and the conditions of Piecewise.
+#: Functions with kinks and jumps for which code can be generated; conditions of Piecewise.
 #: SymPy's acot jumps at 0, from −π/2 to π/2; its derivative there is −1 all the same.
 _BROKEN = (
     sp.acot, sp.Abs, sp.sign, sp.Max, sp.Min, sp.Piecewise, sp.Heaviside, sp.floor, sp.ceiling,
     sp.frac, sp.Mod, Boolean,
 )  # fmt: skip
 
-#: What stands for an expression that is not there.
+#: Placeholders for expressions that are not given.
 _UNDEFINED = (AppliedUndef, sp.Derivative, sp.Integral)
 
-#: A point is on a kink that is not further from it than this.
+#: A point closer to a kink than this is on it.
 _NEAR = 1e-9
 
 
 def check_names(owner: str, names: Sequence[str]) -> None:
-    """Refuse names that meet each other, the time's, or those of generated code.
+    """Refuse names that clash with each other, with the time t, or with generated code.
 
     Parameters
     ----------
     owner
         Whose names.
     names
-        As they were spelt: two that Python takes for one, of the same form NFKC, meet.
+        As they were spelt: two that are the same to Python (in Unicode's form NFKC) clash.
     """
     every = [*names, TIME.name]
-    repeated = twins(every)
-    if repeated:
-        raise ModelError(
-            f"a name of '{owner}' is used twice",
-            value=repeated,
-            limit="unique among coordinates, inputs, parameters and the time t",
-            remedy="Rename one of them",
-        )
-    vectors = sorted({"states", "inputs"} & {normal_name(name) for name in names})
-    if vectors:
-        raise ModelError(
-            f"a name of '{owner}' is that of a vector",
-            value=", ".join(vectors),
-            limit="another one: v.states and v.inputs are all of them in a stage cost",
-            remedy="Rename it",
-        )
-    private = sorted(name for name in map(normal_name, every) if name.startswith("_"))
-    if private:
-        raise ModelError(
-            f"a name of '{owner}' starts with an underscore",
-            value=", ".join(private),
-            limit="a letter first",
-            remedy="Rename it: such names are kept for generated code",
-        )
+    normal = sorted(map(normal_name, names))
+    unique = "unique among coordinates, inputs, parameters and the time t"
+    another = "another one: v.states and v.inputs are all of them in a stage cost"
+    kept = "Rename it: such names are kept for generated code"
+    vectors = ", ".join(name for name in normal if name in ("inputs", "states"))
+    private = ", ".join(name for name in normal if name.startswith("_"))
+    for wrong, found, limit, remedy in (
+        ("is used twice", repeated_names(every), unique, "Rename one of them"),
+        ("is that of a vector", vectors, another, "Rename it"),
+        ("starts with an underscore", private, "a letter first", kept),
+    ):
+        if found:
+            raise ModelError(
+                f"a name of '{owner}' {wrong}", value=found, limit=limit, remedy=remedy
+            )
 
 
-def twins(names: Sequence[str]) -> str:
-    """Return the names that occur twice, or that Python takes for one; empty where none do.
+def repeated_names(names: Sequence[str]) -> str:
+    """Return the names that occur twice, or are the same to Python; empty where none do.
 
-    >>> twins(["x", "y", "x"])
+    >>> repeated_names(["x", "y", "x"])
     'x'
-    >>> twins(["µ", "x", "μ"])
+    >>> repeated_names(["µ", "x", "μ"])
     "µ (U+00B5) and μ (U+03BC), which are one name in Unicode's form NFKC"
     """
     groups: dict[str, list[str]] = {}
@@ -138,7 +113,7 @@ def by_names(what: str, values: Mapping[str, T]) -> dict[str, T]:
     Raises
     ------
     InvalidInputError
-        For two names that Python takes for one, and for what is no name.
+        For two names that are the same to Python, and for keys that are not text.
 
     Examples
     --------
@@ -146,7 +121,7 @@ def by_names(what: str, values: Mapping[str, T]) -> dict[str, T]:
     True
     """
     odd = [name for name in values if not isinstance(name, str)]
-    repeated = "" if odd else twins(list(values))
+    repeated = "" if odd else repeated_names(list(values))
     if odd or repeated:
         raise InvalidInputError(
             what,
@@ -163,14 +138,14 @@ def check_parts(
     inputs: Sequence[Input],
     parameters: Sequence[Parameter],
 ) -> None:
-    """Refuse what are no coordinates, inputs and parameters, and names that meet.
+    """Check that the parts are coordinates, inputs and parameters whose names do not clash.
 
     Raises
     ------
     InvalidInputError
         For a part of another kind, text for instance.
     ModelError
-        For names that are one, see :func:`check_names`.
+        For names that clash, see :func:`check_names`.
     """
     for what, kind, parts in (
         ("coordinates", Coordinate, coordinates),
@@ -210,12 +185,12 @@ def vocabulary(
 
 
 def expression_of(what: str, value: object) -> sp.Expr:
-    """Return a number or an expression as SymPy's; refuse all else, text too: SymPy would run it.
+    """Return a number or an expression as SymPy's; refuse text, which SymPy would evaluate.
 
     Raises
     ------
     ModelError
-        For what is no expression.
+        For anything that is not an expression.
     """
     try:
         expression = sp.sympify(value, strict=True)
@@ -236,10 +211,10 @@ def expression_of(what: str, value: object) -> sp.Expr:
 def check_symbols(
     what: str, expressions: Iterable[sp.Expr] | sp.MatrixBase, known: Mapping[sp.Symbol, str]
 ) -> None:
-    """Refuse symbols that nobody declared, undefined functions, and what is no real number.
+    """Refuse undeclared symbols, undefined functions, and values that are not real and finite.
 
-    SymPy takes ``Symbol("a")`` and ``Symbol("a", real=True)`` for two: the derivative of one by
-    the other is zero, and what holds the wrong one would drop out of the equations.
+    To SymPy ``Symbol("a")`` and ``Symbol("a", real=True)`` are different variables: the derivative
+    of one by the other is zero, and terms with the wrong one would drop out of the equations.
 
     Parameters
     ----------
@@ -253,7 +228,7 @@ def check_symbols(
     Raises
     ------
     ModelError
-        With what is unknown, and what may have been meant.
+        With the unknown symbols, and what was probably meant.
     """
     unknown: set[sp.Basic] = set()
     for expression in expressions:
@@ -363,8 +338,8 @@ def require_smooth(
 ) -> None:
     """Refuse expressions that have no derivative where one is about to be taken.
 
-    SymPy differentiates what has a kink, too, and gives it a slope there that it has not:
-    that of |x| at 0 is 0.
+    SymPy also differentiates expressions with kinks, and returns a slope that does not exist:
+    0 for |x| at 0.
 
     Parameters
     ----------
@@ -412,7 +387,7 @@ def kinks(
     """Yield the parts of expressions that have no derivative, as :func:`require_smooth` says.
 
     Where no point is given, roots, logarithms and inverse sines count as smooth: where they are
-    not, their derivatives are no numbers, and so cannot pass for right ones.
+    not, their derivatives are not finite, and cannot be mistaken for correct ones.
     """
     moving = set(variables)
     values = None if at is None else {s: sp.Rational(float(v)) for s, v in at.items()}

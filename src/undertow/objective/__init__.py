@@ -7,7 +7,6 @@ from undertow.objective.objective import (
     MinimumTime,
     Objective,
     check_travel,
-    require_objective,
     state_box,
 )
 from undertow.objective.words import Goal, finite_limits, objective_for
@@ -22,6 +21,5 @@ __all__ = [
     "check_travel",
     "finite_limits",
     "objective_for",
-    "require_objective",
     "state_box",
 ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -16,13 +16,13 @@ import numpy as np
 import sympy as sp
 
 from undertow.base import (
-    REMEDIES,
     InvalidInputError,
     ModelError,
     UndertowError,
     check_fields,
     checked,
     near,
+    positive,
     raised_at,
 )
 from undertow.models import (
@@ -38,23 +38,11 @@ from undertow.models import (
 )
 from undertow.symbolic import compile_expressions
 
-__all__ = [
-    "Constraint",
-    "MinimumEnergy",
-    "MinimumTime",
-    "Names",
-    "Objective",
-    "check_travel",
-    "require_objective",
-    "state_box",
-    "travel_box",
-]
-
 #: Part of a coordinate's declared travel that a motion may use: the rest is for what no model
 #: knows of, before the end stop.
 TRAVEL = 0.95
 
-#: Part of a bound on a state that large steps keep clear of, see :mod:`undertow.symbolic.settle`.
+#: Part of a bound on a state that large steps keep clear of, see :mod:`undertow.closed_loop.etd`.
 SPARE = 0.05
 
 
@@ -84,6 +72,21 @@ class Names:
         hint = near(name, symbols)
         message = f"no state, input or parameter '{name}'; there are {', '.join(symbols)}. {hint}"
         raise AttributeError(message, name=name, obj=self)
+
+
+class _AnyNames(Names):
+    """Names of whatever mechanism a formula is for: each is the symbol that it has there."""
+
+    def __init__(self) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError("the names are not known without a mechanism")
+
+    def __getattr__(self, name: str) -> sp.Symbol:
+        if name in ("states", "inputs"):
+            raise TypeError(f"{name} are not known without a mechanism")
+        return sp.Symbol(normal_name(name), real=True)
 
 
 Formula = Callable[[Names], Any]
@@ -271,7 +274,7 @@ def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown
             )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Objective:
     """A stage cost with its horizon, terminal set and constraints.
 
@@ -326,25 +329,11 @@ class Objective:
                 limit="a function of the mechanism's names that returns an expression",
                 remedy="Write lambda v: v.inputs[0]**2, or lambda v: 1 for a constant",
             )
-        several = isinstance(self.constraints, Iterable)
-        odd = [c for c in self.constraints if not isinstance(c, Constraint)] if several else [self]
-        if odd:
-            raise InvalidInputError(
-                f"constraints of objective '{self.name}'",
-                value=f"a {type(odd[0] if several else self.constraints).__name__}",
-                limit="a tuple of undertow.Constraint",
-                remedy="Write constraints=(*undertow.state_box(phi=1.0), Constraint(...))",
-            )
+        check_fields(self, "constraints")
         object.__setattr__(self, "constraints", tuple(self.constraints))
         for field in ("horizon", "terminal_radius"):
             value = number_of(f"{field} of objective '{self.name}'", getattr(self, field))
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidInputError(
-                    f"{field} of objective '{self.name}'",
-                    value=value,
-                    limit="finite and > 0",
-                    remedy=_REMEDIES[field],
-                )
+            positive(f"{field} of objective '{self.name}'", value, _REMEDIES[field])
 
     @checked
     def on(self, mechanism: Mechanism) -> Self:
@@ -395,8 +384,12 @@ class Objective:
             )
         )
 
+    def _words(self) -> str:
+        """Return what is integrated as far as it can be said without a mechanism."""
+        return self.formula
+
     def _formula(self, mechanism: Mechanism) -> str:
-        return self.formula or f"∫ ({self.stage_cost(mechanism)}) dt"
+        return self._words() or f"∫ ({self.stage_cost(mechanism)}) dt"
 
     @checked
     def written(self, mechanism: Mechanism) -> Self:
@@ -404,33 +397,46 @@ class Objective:
 
         A lambda cannot be pickled; its expression in a mechanism's own names can.
         """
-        stage = self.stage
-        if not _importable(stage):
-            stage = _Written(self._expression(mechanism, "stage cost", stage))
-        constraints = tuple(
-            c
-            if _importable(c.formula)
-            else replace(c, formula=_Written(self._expression(mechanism, c.name, c.formula)))
-            for c in self.constraints
+        changed = self._formulas(lambda what, f: self._expression(mechanism, what, f))
+        same = changed == {"stage": self.stage, "constraints": self.constraints}
+        return self if same else replace(self, **changed)
+
+    def _formulas(self, write: Callable[[str, Formula], sp.Expr]) -> dict[str, Any]:
+        """Return stage and constraints, written down where no other process can import them."""
+
+        def taken(what: str, formula: Formula) -> Formula:
+            return formula if _importable(formula) else _Written(write(what, formula))
+
+        constraints = (replace(c, formula=taken(c.name, c.formula)) for c in self.constraints)
+        return {"stage": taken("stage cost", self.stage), "constraints": tuple(constraints)}
+
+    def __repr__(self) -> str:
+        """Show its name, what is integrated, where a motion ends, and the constraints."""
+        words = self._words()
+        what = f"{words}, " if words else ""
+        unit = f"{self.unit}, " if self.unit else ""
+        bounds = "".join(f"; {c.name}" for c in self.constraints)
+        return (
+            f"{type(self).__name__}({self.name}: {what}{unit}to ‖x‖ ≤ {self.terminal_radius:g} "
+            f"within {self.horizon:g} s{bounds})"
         )
-        if stage is self.stage and constraints == self.constraints:
-            return self
-        return replace(self, stage=stage, constraints=constraints)
 
     def __getstate__(self) -> dict[str, Any]:
-        for what, formula in (
-            ("stage cost", self.stage),
-            *((c.name, c.formula) for c in self.constraints),
-        ):
-            if not _importable(formula):
-                raise InvalidInputError(
-                    f"'{what}' of objective '{self.name}' for another process or a file",
-                    value=getattr(formula, "__qualname__", type(formula).__name__),
-                    limit="a function that can be imported there",
-                    remedy="Write it as a def at the top of a module, or send the ClosedLoop or "
-                    "the Cascade, which take its expression along",
-                )
-        return dict(vars(self))
+        """Take along formulas that no other process can import as expressions in plain names."""
+        return {**vars(self), **self._formulas(self._portable)}
+
+    def _portable(self, what: str, formula: Formula) -> sp.Expr:
+        try:
+            return expression_of(what, formula(_AnyNames()))
+        except Exception as error:  # a user's function may do anything
+            raise InvalidInputError(
+                f"'{what}' of objective '{self.name}' for another process or a file",
+                value=getattr(formula, "__qualname__", type(formula).__name__),
+                limit="a function of states, inputs and parameters by name, or one that can be "
+                "imported there",
+                remedy="Write it as a def at the top of a module, or send the ClosedLoop or "
+                "the Cascade, which take its expression along",
+            ) from error
 
     def __copy__(self) -> Self:
         return self
@@ -546,23 +552,6 @@ class Objective:
         return expression
 
 
-def require_objective(value: object) -> None:
-    """Refuse what is no objective, a word for one for instance.
-
-    Raises
-    ------
-    InvalidInputError
-        With how to make one.
-    """
-    if not isinstance(value, Objective):
-        raise InvalidInputError(
-            "objective",
-            value=f"{value!r}, a {type(value).__name__}",
-            limit="an undertow.Objective",
-            remedy=REMEDIES["Objective"],
-        )
-
-
 @dataclass(frozen=True)
 class _Written:
     """A formula that was written down as an expression in a mechanism's own names."""
@@ -592,7 +581,7 @@ def _one(_v: Names) -> sp.Expr:
     return sp.Integer(1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MinimumEnergy(Objective):
     """Minimum control energy ∫ uᵀu dt, (40), plus optional state weights.
 
@@ -610,13 +599,12 @@ class MinimumEnergy(Objective):
         """Refuse a negative weight, besides what every objective refuses."""
         check_fields(self)
         super().__post_init__()
-        if not (math.isfinite(self.state_weight) and self.state_weight >= 0):
-            raise InvalidInputError(
-                f"state_weight of objective '{self.name}'",
-                value=self.state_weight,
-                limit="finite and ≥ 0",
-                remedy="Theorem 1 wants a small positive one; the paper has 0",
-            )
+        positive(
+            f"state_weight of objective '{self.name}'",
+            self.state_weight,
+            "Theorem 1 wants a small positive one; the paper has 0",
+            zero=True,
+        )
 
     @checked
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
@@ -624,14 +612,14 @@ class MinimumEnergy(Objective):
         x = sp.Matrix(mechanism.x)
         return super().stage_cost(mechanism) + self.state_weight * (x.T * x)[0]
 
-    def _formula(self, mechanism: Mechanism) -> str:
+    def _words(self) -> str:
         if self.formula or self.stage is not _squares:
-            return super()._formula(mechanism)
+            return self.formula
         weight = self.state_weight
         return f"∫ (uᵀu + {weight:g} xᵀx) dt" if weight else "∫ uᵀu dt"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MinimumTime(Objective):
     """Minimum time to the terminal set, ∫ 1 dt = t_f, (29) and (41)."""
 

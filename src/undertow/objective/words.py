@@ -14,11 +14,9 @@ from typing import Literal, get_args
 import numpy as np
 import sympy as sp
 
-from undertow.base import InvalidInputError, checked, near
+from undertow.base import checked, one_of
 from undertow.models import FloatArray, Mechanism
 from undertow.objective.objective import Constraint, MinimumEnergy, MinimumTime, Names, Objective
-
-__all__ = ["Goal", "finite_limits", "objective_for"]
 
 #: The words.
 Goal = Literal["energy", "time", "bench-energy", "bench-time", "effort"]
@@ -43,28 +41,19 @@ def finite_limits(mechanism: Mechanism) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Effort:
-    """Σ (u_i/u_max,i)² of inputs with these limits."""
+    """A price of time, one of the effort Σ (u_i/u_max,i)², and one of the error xᵀx."""
 
     limits: tuple[float, ...]
+    time: int
+    effort: float
+    error: float
 
     def __call__(self, v: Names) -> sp.Expr:
-        return sum((u / limit) ** 2 for u, limit in zip(v.inputs, self.limits, strict=True))
-
-
-@dataclass(frozen=True)
-class _TimeAndEffort(_Effort):
-    """1 + r Σ (u_i/u_max,i)²."""
-
-    def __call__(self, v: Names) -> sp.Expr:
-        return 1 + ENERGY_PRICE * super().__call__(v)
-
-
-@dataclass(frozen=True)
-class _EffortAndError(_Effort):
-    """Σ (u_i/u_max,i)² + 0.01 xᵀx."""
-
-    def __call__(self, v: Names) -> sp.Expr:
-        return super().__call__(v) + ERROR_PRICE * (v.states.T * v.states)[0]
+        inputs = zip(v.inputs, self.limits, strict=True)
+        effort = sum((u / limit) ** 2 for u, limit in inputs)
+        weighed = effort if self.effort == 1 else self.effort * effort
+        error = self.error * (v.states.T * v.states)[0] if self.error else 0
+        return self.time + weighed + error
 
 
 def _energy_unit(mechanism: Mechanism) -> str:
@@ -117,37 +106,32 @@ def objective_for(
     >>> objective_for(rig, "bench-energy").meaning(rig)
     'bench-energy: ∫ (uᵀu + 0.05 xᵀx) dt, V² s, to ‖x‖ ≤ 0.05 within 60 s'
     """
-    limits, unit = tuple(finite_limits(mechanism).tolist()), _energy_unit(mechanism)
-    made: Objective
-    if word == "energy":
-        made = MinimumEnergy(unit=unit)
-    elif word == "time":
-        made = MinimumTime()
-    elif word == "bench-energy":
-        made = MinimumEnergy(
-            "bench-energy", unit=unit, terminal_radius=TERMINAL, state_weight=STATE_WEIGHT
-        )
-    elif word == "bench-time":
-        formula = f"∫ (1 + {ENERGY_PRICE:g} Σ (u/u_max)²) dt"
-        made = Objective(
-            "bench-time", _TimeAndEffort(limits), "s", terminal_radius=TERMINAL, formula=formula
-        )
-    elif word == "effort":
-        formula = f"∫ (Σ (u/u_max)² + {ERROR_PRICE:g} xᵀx) dt"
-        made = Objective(
-            "effort",
-            _EffortAndError(limits),
-            "s",
-            terminal_radius=EFFORT_TERMINAL,
-            formula=formula,
-        )
-    else:
-        words = get_args(Goal)
-        raise InvalidInputError(
-            "objective",
-            value=repr(word),
-            limit=f"one of {', '.join(words)}",
-            remedy=near(str(word), words),
-        )
-    own = tuple(constraints)
-    return replace(made, horizon=horizon, constraints=own, hard_input=hard_input).on(mechanism)
+    one_of("objective", word, get_args(Goal))
+    limits = tuple(finite_limits(mechanism).tolist())
+    energy = MinimumEnergy(unit=_energy_unit(mechanism))
+    time = Objective(
+        word,
+        _Effort(limits, 1, ENERGY_PRICE, 0.0),
+        "s",
+        formula=f"∫ (1 + {ENERGY_PRICE:g} Σ (u/u_max)²) dt",
+    )
+    effort = Objective(
+        word,
+        _Effort(limits, 0, 1.0, ERROR_PRICE),
+        "s",
+        formula=f"∫ (Σ (u/u_max)² + {ERROR_PRICE:g} xᵀx) dt",
+    )
+    made: dict[str, Objective] = {
+        "energy": energy,
+        "time": MinimumTime(),
+        "bench-energy": replace(energy, terminal_radius=TERMINAL, state_weight=STATE_WEIGHT),
+        "bench-time": replace(time, terminal_radius=TERMINAL),
+        "effort": replace(effort, terminal_radius=EFFORT_TERMINAL),
+    }
+    return replace(
+        made[word],
+        name=word,
+        horizon=horizon,
+        constraints=tuple(constraints),
+        hard_input=hard_input,
+    ).on(mechanism)

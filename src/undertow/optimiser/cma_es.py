@@ -15,10 +15,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, at_least, positive
 from undertow.symbolic import numba
-
-__all__ = ["CMAES", "Search", "check_start", "minimise"]
 
 FloatArray = NDArray[np.float64]
 
@@ -47,17 +45,8 @@ def check_start(mean: FloatArray, spread: FloatArray, population: int) -> None:
         raise InvalidInputError(
             "mean of the search", value=mean, limit="finite numbers", remedy="Start elsewhere"
         )
-    if not (np.isfinite(spread).all() and (spread > 0).all()):
-        raise InvalidInputError(
-            "sigma of the search", value=spread, limit="finite and > 0", remedy="0.1 is usual"
-        )
-    if population < 4:
-        raise InvalidInputError(
-            "population of the search",
-            value=population,
-            limit="≥ 4",
-            remedy="16 fills a block of rollouts",
-        )
+    positive("sigma of the search", spread, "0.1 is usual")
+    at_least("population of the search", population, 4, "16 fills a block of rollouts")
 
 
 class CMAES:

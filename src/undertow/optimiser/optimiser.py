@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from functools import cached_property
+from typing import Protocol
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InfeasibleError, at_least, check_fields, checked
+from undertow.base import at_least, check_fields, checked
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, Surface, check_surface, first_surface
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
-from undertow.optimiser.search_space import DecisionVariables
-from undertow.optimiser.task import Optimisation, Problem
-
-__all__ = ["Optimiser", "Planner"]
+from undertow.optimiser.search_space import DecisionVariables, SearchSpace
+from undertow.optimiser.task import Optimisation
 
 
-@runtime_checkable
 class Planner(Protocol):
     """Whatever proposes plans to a cascade: :class:`Optimiser`, or one of your own."""
-
-    def require(self, x: FloatArray, /) -> Proposal:
-        """Return the first plan from the state x, (2n,), or raise."""
-        ...
 
     def propose(
         self,
@@ -39,11 +31,14 @@ class Planner(Protocol):
         computed_for: float,
         resolution: float,
     ) -> Proposal:
-        """Return a plan for the state x, see :meth:`Optimiser.propose`."""
+        """Return a plan for the state x, the first one without an incumbent.
+
+        See :meth:`Optimiser.propose`.
+        """
         ...
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Optimiser:
     """Selects the plan that minimises the predicted cost of a closed loop.
 
@@ -74,33 +69,48 @@ class Optimiser:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Design the first surface and the coordinates of the search around it."""
+        """Check the settings, and that the first surface can be used."""
         check_fields(self)
-        if self.first is None:
-            self.first = first_surface(self.loop.mechanism)
-        check_surface(self.loop.mechanism, self.first)
+        check_surface(self.loop.mechanism, self.anchor)
         at_least(
             "population of the optimiser", self.population, 4, "32 fills two blocks of rollouts"
         )
         at_least("seed", self.seed, 0)
-        self.problem = Problem(self.loop, self.first, self.freedom, self.population)
+
+    @cached_property
+    def anchor(self) -> Surface:
+        """The surface to start from, given or designed."""
+        return self.first or first_surface(self.loop.mechanism)
+
+    @cached_property
+    def space(self) -> SearchSpace:
+        """The coordinates of the search, around that surface."""
+        return SearchSpace(self.loop, self.anchor, self.freedom)
+
+    @cached_property
+    def counts_time(self) -> bool:
+        """Whether the cost is the time of arrival, a discontinuous function of the plan."""
+        end = self.loop.linear_end
+        if end is None or end.stage is None:
+            return False
+        return end.stage.rest > 0 and not end.counts_cost
+
+    @cached_property
+    def shoots(self) -> bool:
+        """Whether this is a minimum-time task with enough parameters to aim with."""
+        return self.counts_time and self.space.size >= 2 * self.loop.mechanism.n
 
     def _budget(self, warm: bool) -> Budget:
         given = self.warm if warm else self.cold
         if given is not None:
             return given
-        if self.problem.shoots:
+        if self.shoots:
             return Budget(40_000 if warm else 800_000)
         if warm:
-            return Budget(576 if self.problem.counts_time else 1024)
+            return Budget(576 if self.counts_time else 1024)
         # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
         n, m = self.loop.mechanism.n, self.loop.mechanism.m
         return Budget(1024 * (2 * m * n - m * m) ** 2 // 3)
-
-    @property
-    def _promptness(self) -> float:
-        """Part of the horizon to plan for: a prediction may be early by its tolerance."""
-        return 1.0 - min(0.5 * self.loop.tail, 0.1)
 
     @checked
     def propose(
@@ -137,26 +147,28 @@ class Optimiser:
         Proposal
             Always; an infeasible task is a status and not an exception.
         """
-        began = time.perf_counter()
         at_least("sequence of a proposal", sequence, 0)
-        state = self.loop.mechanism.check_state(x)
+        warm = incumbent is not None
+        longest = self.loop.objective.horizon if horizon is None else horizon
+        early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
         task = Optimisation(
-            self.problem,
-            state,
-            (self.loop.objective.horizon if horizon is None else horizon) * self._promptness,
-            budget or self._budget(incumbent is not None),
-            resolution,
-            began,
-            np.random.default_rng([self.seed, sequence]),
+            self,
+            self.loop.mechanism.check_state(x),
+            longest * early,
+            budget or self._budget(warm),
+            resolution=resolution,
+            sequence=sequence,
+            warm=warm,
         )
-        task.warm = incumbent is not None
         if incumbent is None:
             converged = task.global_search()
+        elif self.counts_time:
+            converged = task.search_earlier(Plan.of(incumbent))
         else:
             converged = task.local_search(Plan.of(incumbent))
-        if self.problem.shoots:
+        if self.shoots:
             converged = task.shoot()
-        return task.answer(converged, sequence, computed_for)
+        return task.answer(converged, computed_for)
 
     @checked
     def require(self, x: ArrayLike) -> Proposal:
@@ -169,16 +181,6 @@ class Optimiser:
         InfeasibleError
             When no candidate was admissible; says what the best of them broke.
         """
-        mechanism = self.loop.mechanism
-        self.loop.objective.check_start(mechanism, mechanism.check_state(x))
-        proposal = self.propose(x)
-        if proposal.plan is None:
-            raise InfeasibleError(
-                f"no admissible surface for '{self.loop.mechanism.name}' "
-                f"({self.loop.objective.name}) among {proposal.evaluations}",
-                value=proposal.message,
-                limit="every margin ≥ 0 and the terminal set reached within "
-                f"{self.loop.objective.horizon:g} s",
-                remedy=proposal.remedy,
-            )
-        return proposal
+        loop = self.loop
+        loop.objective.check_start(loop.mechanism, loop.mechanism.check_state(x))
+        return self.propose(x).required(loop)

@@ -8,12 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from undertow.base import InvalidInputError, SingularSurfaceError, check_fields
+from undertow.base import InfeasibleError, InvalidInputError, SingularSurfaceError, check_fields
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Margin, Plan, Surface, surface_margins
 from undertow.models import FloatArray
-
-__all__ = ["Budget", "Proposal", "Status", "motion_margins"]
 
 Status = Literal["converged", "budget spent", "infeasible", "failed"]
 
@@ -98,6 +96,25 @@ class Proposal:
     def surface(self) -> Surface | None:
         """The first surface of the plan."""
         return None if self.plan is None else self.plan.surfaces[0]
+
+    def required(self, loop: ClosedLoop) -> Proposal:
+        """Return it as it is, or raise with the evidence where there is no plan for a loop.
+
+        Raises
+        ------
+        InfeasibleError
+            When no candidate was admissible; says what the best of them broke.
+        """
+        if self.plan is None:
+            raise InfeasibleError(
+                f"no admissible surface for '{loop.mechanism.name}' "
+                f"({loop.objective.name}) among {self.evaluations}",
+                value=self.message,
+                limit="every margin ≥ 0 and the terminal set reached within "
+                f"{loop.objective.horizon:g} s",
+                remedy=self.remedy,
+            )
+        return self
 
 
 def motion_margins(

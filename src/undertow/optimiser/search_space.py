@@ -15,11 +15,9 @@ import numpy as np
 
 from undertow.base import InvalidInputError, check_fields
 from undertow.closed_loop import ClosedLoop
-from undertow.law import Plan, ReachingLaw, Surface
+from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray
 from undertow.symbolic import numba
-
-__all__ = ["DecisionVariables", "SearchSpace"]
 
 
 @dataclass(frozen=True)
@@ -43,8 +41,7 @@ class DecisionVariables:
     def __post_init__(self) -> None:
         """Refuse times that do not rise from 0."""
         check_fields(self)
-        rising = all(a < b for a, b in zip(self.times, self.times[1:], strict=False))
-        if not self.times or self.times[0] != 0 or not rising:
+        if not rising_from_zero(self.times):
             raise InvalidInputError(
                 "times of a schedule", value=self.times, limit="rising times from 0 s"
             )
@@ -66,20 +63,17 @@ class SearchSpace:
     def __init__(self, loop: ClosedLoop, anchor: Surface, freedom: DecisionVariables) -> None:
         self.loop, self.freedom = loop, freedom
         n, m = loop.mechanism.n, loop.mechanism.m
-        self.n, self.m = n, m
-        base = anchor.normalised().vector
-        scale = np.abs(base)
-        scale[: m * m] = 1.0
-        off_diagonal = ~np.eye(m, dtype=bool).ravel()
-        self._free = np.concatenate(
-            [off_diagonal & freedom.alpha_a, np.ones(2 * m * n - m * m, dtype=bool)]
-        )
-        largest = scale[m * m :].max()
+        self.n, self.m, layout = n, m, LawLayout(n, m)
+        scale, searched = np.abs(anchor.normalised().vector), np.ones(2 * m * n, dtype=bool)
+        largest = scale[layout.starts[1] :].max()
+        layout.blocks(scale).alpha_a[:] = 1.0
+        layout.blocks(searched).alpha_a[:] = ~np.eye(m, dtype=bool) & freedom.alpha_a
+        self._free = searched
         self._width = 0.1 * np.maximum(scale, 0.05 * largest)[self._free]
         self._base = -np.eye(m).ravel()
         self._places = np.flatnonzero(self._free)
         # Runge-Kutta is stable up to a rate of 2.8/step; the law is resolved up to 0.8/step.
-        self._fastest = 0.8 / (loop.step * max(1, loop.hold))
+        self._fastest = 0.8 / (loop.step * max(1, loop.zoh_steps))
 
     @property
     def segments(self) -> int:

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Shooting"]
-
 FloatArray = NDArray[np.float64]
 
 #: Miss of N parameter vectors at time T: (N, d), T to (N, k).
@@ -107,27 +105,3 @@ class Shooting:
             if hit is not None:
                 return hit, T
         return None
-
-    def hop(
-        self,
-        z: FloatArray,
-        T: float,
-        mutants: Callable[[FloatArray], FloatArray],
-        rng: np.random.Generator,
-        count: int,
-    ) -> tuple[FloatArray, float]:
-        """Mutate, correct and shrink ``count`` times, keeping what is shorter.
-
-        Of the mutants (N, d) of z the one that misses least at a slightly shorter time is
-        corrected: most of them are far off, and one batch tells.
-        """
-        for _ in range(count):
-            if self.stop():
-                break
-            shot = self.nearest(mutants(z), self.on_grid(T * rng.uniform(0.93, 1.0)), 1, 12)
-            if shot is None:
-                continue
-            shorter, earlier = self.shrink(*shot)
-            if earlier < T:
-                z, T = shorter, earlier
-        return z, T

@@ -16,8 +16,6 @@ import numpy as np
 from undertow.optimiser.cma_es import FloatArray, check_start
 from undertow.symbolic import numba
 
-__all__ = ["TrustRegion"]
-
 #: Lengths tried along a step of the model.
 STRETCHES = np.array([0.35, 0.7, 1.0, 1.4, 2.0, 3.0])
 

@@ -1,11 +1,27 @@
 """Rigs, plants to meet: the ideal model, a realistic bench, MuJoCo, hardware of one's own."""
 
-from undertow.plants.bench import Amplifier, Backlash, Bench, Encoder, Friction, Push, Timing
-from undertow.plants.interface import Measurement, OutputOnError, Rig
+from undertow.plants.bench import (
+    Amplifier,
+    Backlash,
+    Bench,
+    Encoder,
+    Friction,
+    Push,
+    Timing,
+    plausible_rig,
+    srv02_rig,
+)
+from undertow.plants.interface import (
+    Measurement,
+    OutputOnError,
+    Paced,
+    Rig,
+    RigWrapper,
+    check_rig,
+    control_loop,
+    rig_from_file,
+)
 from undertow.plants.mujoco_rig import MuJoCoRig
-from undertow.plants.paced import Paced
-from undertow.plants.presets import plausible_rig, srv02_rig
-from undertow.plants.python_file import check_rig, rig_from_file
 from undertow.plants.simulated import IdealRig, RealisticRig
 
 __all__ = [
@@ -22,8 +38,10 @@ __all__ = [
     "Push",
     "RealisticRig",
     "Rig",
+    "RigWrapper",
     "Timing",
     "check_rig",
+    "control_loop",
     "plausible_rig",
     "rig_from_file",
     "srv02_rig",

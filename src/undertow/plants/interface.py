@@ -1,13 +1,20 @@
-"""What every rig offers, simulated or real: read a measurement, write an input."""
+"""What every rig offers, simulated or real: read, write, close; and the plainest control loop."""
 
 from __future__ import annotations
 
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
+from numbers import Real
+from typing import Any, Protocol
 
-from undertow.models import FloatArray
+import numpy as np
 
-__all__ = ["Measurement", "OutputOnError", "Rig"]
+from undertow.base import ArtefactError, InvalidInputError, UndertowError, raised_at
+from undertow.models import FloatArray, Mechanism
+from undertow.models.importers.python_file import object_from_file
 
 
 class OutputOnError(OSError):
@@ -64,3 +71,167 @@ class Rig(Protocol):
             When it is known that they did not.
         """
         ...
+
+
+class RigWrapper:
+    """A rig before another one: what a subclass does not change is passed on.
+
+    Parameters
+    ----------
+    rig
+        The rig behind it.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig, self.period = rig, rig.period
+
+    def read(self) -> Measurement:
+        """Return the measurement."""
+        return self.rig.read()
+
+    def write(self, u: FloatArray) -> None:
+        """Apply the inputs u, (m,)."""
+        self.rig.write(u)
+
+    def close(self) -> None:
+        """Let go of the rig."""
+        self.rig.close()
+
+
+class Paced(RigWrapper):
+    """A rig whose steps come one period of the wall clock apart.
+
+    A simulated rig advances when it is written to, hardware by itself: here each
+    :meth:`write` waits until the next reading is due.  After a late one the pace starts anew.
+
+    Parameters
+    ----------
+    rig
+        The driver.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> from undertow.plants import IdealRig
+    >>> rig = Paced(IdealRig(ut.mechanisms.rotary_pendulum()))
+    >>> rig.write([0.0])
+    >>> rig.read().t
+    0.001
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        super().__init__(rig)
+        self._due = time.perf_counter()
+
+    def write(self, u: FloatArray) -> None:
+        """Apply the inputs u, (m,), and wait until the next reading is due."""
+        self.rig.write(u)
+        self._due += self.period
+        rest = self._due - time.perf_counter()
+        if rest > 0:
+            time.sleep(rest)
+        else:
+            self._due -= rest
+
+
+def control_loop(
+    rig: Rig, controller: Callable[[Measurement], FloatArray], periods: int
+) -> Iterator[tuple[Measurement, FloatArray]]:
+    """Let a controller steer a rig, as fast as the rig's own calls return.
+
+    The one loop of simulations, trials and bring-up.  :class:`undertow.runtime.Runtime` has its
+    own: it keeps to a clock, and goes on when a rig fails.
+
+    Parameters
+    ----------
+    rig
+        Simulated, or hardware whose calls keep the pace, as behind
+        :class:`undertow.plants.Paced`.
+    controller
+        Measurement to inputs, (m,).
+    periods
+        How many.
+
+    Yields
+    ------
+    Measurement, numpy.ndarray
+        Of each period, before its inputs are written: who leaves the loop there writes none.
+    """
+    for _ in range(periods):
+        measurement = rig.read()
+        u = controller(measurement)
+        yield measurement, u
+        rig.write(u)
+
+
+def rig_from_file(text: str, mechanism: Mechanism) -> Rig:
+    """Load a rig of one's own: ``FILE.py:NAME``, a class or function that makes one, or a rig.
+
+    It is called without arguments, and read once.
+
+    Raises
+    ------
+    ArtefactError
+        When the file cannot be read or fails, or the rig cannot be read.
+    InvalidInputError
+        When what is there has not what a rig has, see :class:`undertow.plants.Rig`.
+    """
+    rig: Rig = object_from_file(text, "rig", lambda v: callable(v) or hasattr(v, "read"))
+    try:
+        check_rig(rig, mechanism, text)
+    except UndertowError:
+        with suppress(Exception):  # it may be no rig at all
+            rig.close()
+        raise
+    return rig
+
+
+def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") -> None:
+    """Refuse what is no rig of a mechanism, before it moves; it is read once.
+
+    Parameters
+    ----------
+    rig
+        What is to be one.
+    mechanism
+        Whose positions it must read.
+    name
+        For messages.
+
+    Raises
+    ------
+    ArtefactError
+        When it cannot be read.
+    InvalidInputError
+        When it has not what a rig has, see :class:`undertow.plants.Rig`.
+    """
+    lacking = [part for part in ("read", "write", "close") if not callable(getattr(rig, part, 0))]
+    period = getattr(rig, "period", None)
+    if not isinstance(period, Real) or not 0 < float(period) < math.inf:
+        lacking.append("period > 0, s")
+    if lacking:
+        raise InvalidInputError(
+            f"'{name}', a {type(rig).__name__}",
+            value=f"without {', '.join(lacking)}",
+            limit="read(), write(u), close() and a period",
+            remedy="See undertow.plants.Rig and examples/serial_rig.py",
+        )
+    try:
+        measurement: Any = rig.read()
+    except Exception as error:  # a driver may do anything
+        raise ArtefactError(
+            f"first reading of '{name}'",
+            value=f"{type(error).__name__}: {error}{raised_at(error)}",
+            limit="an undertow.plants.Measurement",
+            remedy="Is it connected, and switched on?",
+        ) from error
+    q: Any = getattr(measurement, "q", None)
+    shape = np.shape(q)
+    names = [c.name for c in mechanism.coordinates]
+    if shape != (mechanism.n,):
+        raise InvalidInputError(
+            f"first reading of '{name}'",
+            value=f"{type(measurement).__name__} with q of shape {shape}",
+            limit=f"undertow.plants.Measurement with q = ({', '.join(names)})",
+            remedy="Positions in rad or m, in that order, NaN where a sensor gave nothing",
+        )

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, MissingExtraError, check_file
-from undertow.mechanisms.scenes import Scene, mujoco_scene
+from undertow.base import InvalidInputError, check_file, require_extra
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.rigid_body import identifier
 from undertow.plants.interface import Measurement
-
-__all__ = ["MuJoCoRig"]
+from undertow.plants.scenes import Scene, mujoco_scene
 
 
 class MuJoCoRig:
@@ -34,7 +32,7 @@ class MuJoCoRig:
         ``u_2``, … where they have none, as in :func:`undertow.models.importers.from_mjcf`) or else
         by the joints that they drive, in any order.  Ranges of joints, contacts, dry friction and
         gears of the file act; its time step and integrator do not.  Or a
-        :class:`~undertow.mechanisms.scenes.Scene`, where coordinates are no joints.
+        :class:`~undertow.plants.scenes.Scene`, where coordinates are no joints.
     target
         Joint positions at the target, coordinate name to rad or m, zero where left out: the
         ``equilibrium`` of :func:`undertow.models.importers.from_mjcf`.  For MJCF of your own.
@@ -61,12 +59,7 @@ class MuJoCoRig:
         period: float = 0.001,
         steps: int = 1,
     ) -> None:
-        try:
-            import mujoco
-        except ImportError as error:
-            raise MissingExtraError(
-                "MuJoCo is not installed", remedy="pip install 'undertow[mujoco]'"
-            ) from error
+        mujoco = require_extra("mujoco", "mujoco", "MuJoCo is not installed")
         if not 0 < period < math.inf or steps < 1:
             raise InvalidInputError(
                 "timing of a MuJoCo rig",

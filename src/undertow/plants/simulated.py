@@ -11,10 +11,7 @@ from undertow.base import InvalidInputError
 from undertow.models import FloatArray, Mechanism
 from undertow.plants.bench import Amplifier, Backlash, Bench, Encoder, Friction, Timing
 from undertow.plants.interface import Measurement
-from undertow.plants.parts import measure
-from undertow.plants.stepping import stepping
-
-__all__ = ["IdealRig", "RealisticRig"]
+from undertow.plants.stepping import measure, stepping
 
 #: Periods for which noise is drawn at once.
 _BLOCK = 4096

@@ -14,12 +14,13 @@ q⁺ = q* + ½ h M⁻¹ p, so that what sticks does not creep.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any
 
 import sympy as sp
 
-from undertow.models import TIME, Mechanism
+from undertow.models import TIME, FloatArray, Mechanism
 from undertow.symbolic import (
     COMPILED,
     PREAMBLE,
@@ -28,24 +29,209 @@ from undertow.symbolic import (
     docstring,
     function_source,
     generated,
+    numba,
 )
 
-__all__ = ["SMOOTH", "dynamics_source", "stepping"]
 
-#: Calls what :func:`dynamics_source` compiles.
-SMOOTH = f"""
-{COMPILED}
-def smooth(t, h, x, u, viscous, parameters, work):
-    # Runge-Kutta's step of the smooth dynamics, in place.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def transmit(
+    j: int,
+    h: float,
+    u: FloatArray,
+    held: FloatArray,
+    delay: int,
+    amplifier: FloatArray,
+    gap: FloatArray,
+    gain: FloatArray,
+    drive: FloatArray,
+    applied: FloatArray,
+) -> None:
+    """Amplifier and gear: what of the inputs u reaches the joints in step j, ``applied``.
+
+    ``drive`` holds the amplifier's output, the rotor's place in the gap and its speed there,
+    the joint's last acceleration, and whether rotor and joint are apart.  They stay together
+    while the rotor pushes: while what the motor gives and its own inertia does not take,
+    f − J a, presses it on its side of the gap.
+    """
+    for i in range(u.shape[0]):
+        held[j % held.shape[0], i] = u[i]
+        wanted = held[(j - delay) % held.shape[0], i] if j >= delay else 0.0
+        limit, resolution, dead_band, rest = amplifier[i]
+        if abs(wanted) <= dead_band:
+            wanted = 0.0
+        if resolution > 0.0:
+            wanted = math.floor(wanted / resolution + 0.5) * resolution
+        wanted = max(-limit, min(limit, wanted))
+        part = 1.0 if rest == 0.0 else 1.0 - math.exp(-h / rest)
+        drive[0, i] += part * (wanted - drive[0, i])
+        applied[i] = drive[0, i]
+        play, inertia = gap[i]
+        if play > 0.0:
+            pressing = gain[i] * drive[0, i] - inertia * drive[3, i]
+            together = (drive[1, i] >= 0.5 * play and pressing >= 0.0) or (
+                drive[1, i] <= -0.5 * play and pressing <= 0.0
+            )
+            drive[4, i] = 0.0 if together else 1.0
+            if not together:
+                applied[i] = 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def backlash_separation(
+    h: float,
+    x: FloatArray,
+    before: FloatArray,
+    drive: FloatArray,
+    gap: FloatArray,
+    mobility: FloatArray,
+) -> None:
+    """Take the rotors that are apart off the step from ``before`` to x, and off the mobility.
+
+    A joint without the rotor's inertia J has, by Sherman and Morrison's formula,
+    W + J W e eᵀ W/(1 − J eᵀ W e) for its mobility W.
+    """
     n = x.shape[0] // 2
-    stage, total, qdd = work[0], work[1], work[2]
+    for i in range(gap.shape[0]):
+        play, inertia = gap[i]
+        if play > 0.0 and drive[4, i] != 0.0:
+            lighter = inertia / (1.0 - inertia * mobility[i * n + i])
+            change = lighter * (x[n + i] - before[n + i])
+            for k in range(n):
+                x[n + k] += mobility[k * n + i] * change
+                x[k] += 0.5 * h * mobility[k * n + i] * change
+            for k in range(n):
+                for j in range(n):
+                    if i not in (k, j):
+                        more = lighter * mobility[k * n + i] * mobility[i * n + j]
+                        mobility[k * n + j] += more
+            scale = 1.0 + lighter * mobility[i * n + i]
+            for k in range(n):
+                if k != i:
+                    mobility[k * n + i] *= scale
+                    mobility[i * n + k] *= scale
+            mobility[i * n + i] *= scale
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def backlash_impact(
+    h: float,
+    x: FloatArray,
+    before: FloatArray,
+    drive: FloatArray,
+    gap: FloatArray,
+    gain: FloatArray,
+    mobility: FloatArray,
+) -> None:
+    """Move the rotors that are apart; who lands shares his momentum, without a rebound.
+
+    The mobility is that of :func:`backlash_separation`: the rotor's speed w relative to the joint
+    ends by the impulse w/(1/J + eᵀ W e).
+    """
+    n = x.shape[0] // 2
+    for i in range(gap.shape[0]):
+        play, inertia = gap[i]
+        if play > 0.0:
+            rise = x[n + i] - before[n + i]
+            drive[3, i] = rise / h
+            if drive[4, i] != 0.0:
+                drive[2, i] += h * gain[i] * drive[0, i] / inertia - rise
+                drive[1, i] += h * drive[2, i]
+                if abs(drive[1, i]) >= 0.5 * play:
+                    drive[1, i] = max(-0.5 * play, min(0.5 * play, drive[1, i]))
+                    knock = drive[2, i] / (1.0 / inertia + mobility[i * n + i])
+                    for k in range(n):
+                        x[n + k] += mobility[k * n + i] * knock
+                    drive[2, i] = 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def dry_friction(
+    h: float,
+    x: FloatArray,
+    before: FloatArray,
+    friction: FloatArray,
+    mobility: FloatArray,
+    impulse: FloatArray,
+) -> None:
+    """Change velocities by the impulses of dry friction in a step from ``before`` to x.
+
+    Projected Gauss-Seidel.  What sticks has a velocity of exactly zero, and what stuck
+    before stays where it was.
+    """
+    n = x.shape[0] // 2
+    impulse[:n] = 0.0
+    for _ in range(30):
+        largest = 0.0
+        for i in range(n):
+            coulomb, breakaway, speed = friction[i, 0], friction[i, 1], friction[i, 2]
+            if breakaway == 0.0:
+                continue
+            ratio = before[n + i] / speed
+            level = h * (coulomb + (breakaway - coulomb) * math.exp(-ratio * ratio))
+            new = impulse[i] - x[n + i] / mobility[i * n + i]
+            new = max(-level, min(level, new))
+            change = new - impulse[i]
+            impulse[i] = new
+            for k in range(n):
+                x[n + k] += mobility[k * n + i] * change
+                x[k] += 0.5 * h * mobility[k * n + i] * change
+            if abs(new) < level:
+                x[n + i] = 0.0
+                if before[n + i] == 0.0:
+                    x[i] = before[i]
+            largest = max(largest, abs(change) / level)
+        if largest < 1e-12:
+            break
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def end_stops(x: FloatArray, stops: FloatArray, mobility: FloatArray) -> int:
+    """Hold the coordinates within their ranges, without a rebound; how many ran into a stop."""
+    n, hits = x.shape[0] // 2, 0
+    for i in range(n):
+        low, high = stops[i]
+        if low <= x[i] <= high:
+            continue
+        x[i] = max(low, min(high, x[i]))
+        if (x[n + i] > 0.0) == (x[i] == high):
+            hits += 1
+            knock = -x[n + i] / mobility[i * n + i]
+            for k in range(n):
+                x[n + k] += mobility[k * n + i] * knock
+            x[n + i] = 0.0
+    return hits
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def measure(
+    index: int,
+    past: FloatArray,
+    delay: int,
+    encoder: FloatArray,
+    phase: FloatArray,
+    noise: FloatArray,
+    q: FloatArray,
+) -> None:
+    """Read positions of ``delay`` steps ago, disturbed and counted, into q."""
+    for i in range(q.shape[0]):
+        value = past[max(0, index - delay) % past.shape[0], i] + encoder[i, 1] * noise[i]
+        resolution = encoder[i, 0]
+        if resolution > 0.0:
+            value = (math.floor(value / resolution + phase[i]) - phase[i] + 0.5) * resolution
+        q[i] = value
+
+
+#: Runge-Kutta's step of the smooth dynamics, in place; time goes on by ``elapse`` times the step:
+#: 1, or 0 for a model that is taken as it is at the time t.
+_RK4 = f"""{COMPILED}
+def rk4_step(t, h, elapse, n, x, u, viscous, parameters, stage, total, qdd):
     for i in range(2 * n):
         stage[i] = x[i]
         total[i] = 0.0
     for k in range(4):
         reach = h if k == 2 else 0.5 * h
         weight = 1.0 if k == 0 or k == 3 else 2.0
-        forward(t + (0.0 if k == 0 else (h if k == 3 else 0.5 * h)),
+        forward(t + elapse * (0.0 if k == 0 else (h if k == 3 else 0.5 * h)),
                 stage, u, viscous, parameters, qdd)
         for i in range(n):
             d, dd = stage[n + i], qdd[i]
@@ -58,8 +244,6 @@ def smooth(t, h, x, u, viscous, parameters, work):
 """
 
 _BODY = f"""
-{SMOOTH}
-
 {COMPILED}
 def advance(
     t, length, counts, x, u, drive, held, past, delays, parameters, friction, stops, amplifier,
@@ -87,11 +271,10 @@ def advance(
                 for i in range(n):
                     for l in range(n):
                         x[n + i] += W[i * n + l] * pushes[k, 1 + l]
-        for i in range(2 * n):
-            before[i] = x[i]
+        before[: 2 * n] = x
         if rough or bounded or loose:
             mobility(x, parameters, W)
-        smooth(t, h, x, applied, viscous, parameters, work)
+        rk4_step(t, h, 1.0, n, x, applied, viscous, parameters, work[0], work[1], work[2])
         if loose:
             backlash_separation(h, x, before, drive, gap, W)
         if rough:
@@ -102,8 +285,7 @@ def advance(
             backlash_impact(h, x, before, drive, gap, gain, W)
         t += h
         counts[0] = j + 1
-        for i in range(past.shape[1]):
-            past[(j + 1) % past.shape[0], i] = x[i]
+        past[(j + 1) % past.shape[0]] = x[: past.shape[1]]
     measure(counts[0], past, delays[1], encoder, phase, noise, q)
     return t
 
@@ -126,10 +308,12 @@ def play(
 
 
 def dynamics_source(mechanism: Mechanism) -> str:
-    """Return compiled ``forward``, ``mobility`` and ``gains`` of a mechanism, as source.
+    """Return compiled ``forward``, ``mobility``, ``gains``, ``rk4_step`` of a mechanism, as source.
 
     ``forward(t, x, u, viscous, parameters, qdd)`` gives q̈ with joint damping besides;
-    ``mobility(x, parameters, W)`` M⁻¹, row by row; ``gains(parameters, b)`` the diagonal of B.
+    ``mobility(x, parameters, W)`` M⁻¹, row by row; ``gains(parameters, b)`` the diagonal of B;
+    ``rk4_step(t, h, elapse, n, x, u, viscous, parameters, stage, total, qdd)`` moves x, whose first
+    2n numbers are the state, in place.
     """
     n, m = mechanism.n, mechanism.m
     tape = Tape()
@@ -154,20 +338,39 @@ def dynamics_source(mechanism: Mechanism) -> str:
             function_source("forward", tape, forward, {"qdd": list(qdd)}),
             function_source("mobility", tape, state | parameters, {"W": list(inverse)}),
             function_source("gains", tape, parameters, {"b": diagonal}),
+            _RK4,
         ]
     )
+
+
+def compiled_module(
+    mechanism: Mechanism, kind: str, title: str, body: str, imports: str = ""
+) -> Any:
+    """Return a compiled module of a mechanism's :func:`dynamics_source` and a body that uses it.
+
+    Parameters
+    ----------
+    mechanism
+        Whose n, m and p are known in the body.
+    kind, title
+        Of the file, and in its first line.
+    body, imports
+        Source; imports of compiled functions, whose changes numba's cache does not notice: the
+        key in the first line does.
+    """
+    key = content_key(mechanism.structure, mechanism.name)
+
+    def write() -> str:
+        header = docstring(f"{title} of {mechanism.name}; generated, do not edit. {key[:16]}")
+        sizes = f"n, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
+        return f"{header}{PREAMBLE}{imports}{sizes}\n\n{dynamics_source(mechanism)}\n{body}"
+
+    return generated(kind, mechanism.name, key, write)
 
 
 @lru_cache(maxsize=64)
 def stepping(mechanism: Mechanism) -> Any:
     """Return the compiled module that advances a rig of this mechanism: ``advance``, ``play``."""
-    key = content_key(mechanism.structure, mechanism.name)
-
-    def write() -> str:
-        # numba's cache does not notice that an imported function has changed: the key does.
-        header = docstring(f"Rig of {mechanism.name}; generated, do not edit. {key[:16]}")
-        names = "backlash_impact, dry_friction, end_stops, measure, backlash_separation, transmit"
-        parts = f"from undertow.plants.parts import {names}\n"
-        return f"{header}{PREAMBLE}{parts}\n\n{dynamics_source(mechanism)}\n{_BODY}"
-
-    return generated("rig", mechanism.name, key, write)
+    names = "backlash_impact, dry_friction, end_stops, measure, backlash_separation, transmit"
+    parts = f"from undertow.plants.stepping import {names}\n"
+    return compiled_module(mechanism, "rig", "Rig", _BODY, parts)

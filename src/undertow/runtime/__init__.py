@@ -1,20 +1,37 @@
-"""The runtime: the controller against the clock, its log and replay, and the fault drill."""
+"""The runtime: the controller against the clock, the log of a run and its replay."""
 
-from undertow.runtime.clock import SimulatedClock, WallClock
+from undertow.runtime.clock import Histogram, SimulatedClock, WallClock
 from undertow.runtime.controller import Controller, Inputs
-from undertow.runtime.log import Columns, Log, Recording, read_log
+from undertow.runtime.controller_defaults import default_gate, estimator_for, reaching_for
+from undertow.runtime.encoding import Columns
+from undertow.runtime.log import Log, Recording, read_log
 from undertow.runtime.loop import Runtime
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import Replay, about, replay, replay_controller
+from undertow.runtime.session import run, session
 from undertow.runtime.settings import Settings
-from undertow.runtime.slow import InlineWorker, Worker, background_worker, respond
-from undertow.runtime.verdict import Report, RunVerdict
+from undertow.runtime.slow_loop import (
+    Answer,
+    BackgroundWorker,
+    InlineWorker,
+    Request,
+    Worker,
+    background_worker,
+    respond,
+)
+from undertow.runtime.supervisor import SupervisedRig
+from undertow.runtime.verdict import EXIT_CODES, Ending, Report, RunVerdict
 
 __all__ = [
+    "EXIT_CODES",
+    "Answer",
+    "BackgroundWorker",
     "Columns",
     "Command",
     "Controller",
+    "Ending",
+    "Histogram",
     "InlineWorker",
     "Inputs",
     "Log",
@@ -23,16 +40,23 @@ __all__ = [
     "Recording",
     "Replay",
     "Report",
+    "Request",
     "RunVerdict",
     "Runtime",
     "Settings",
     "SimulatedClock",
+    "SupervisedRig",
     "WallClock",
     "Worker",
     "about",
     "background_worker",
+    "default_gate",
+    "estimator_for",
+    "reaching_for",
     "read_log",
     "replay",
     "replay_controller",
     "respond",
+    "run",
+    "session",
 ]

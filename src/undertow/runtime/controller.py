@@ -21,25 +21,17 @@ from undertow.cascade import Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray
-from undertow.plants.interface import Measurement
+from undertow.plants import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
-from undertow.runtime.routh import PlanTest
-from undertow.runtime.sensors import LAST_HARMLESS, SensorWatch
+from undertow.runtime.plan_check import PlanCheck
+from undertow.runtime.sensors import LAST_HARMLESS, SensorMonitor
 from undertow.runtime.settings import Settings
-from undertow.runtime.slow import Answer, Request, lanes_of
-from undertow.runtime.steps import (
-    PAST,
-    confine,
-    sound,
-    step_memory,
-    step_module,
-)
-
-__all__ = ["UNSOUND", "Controller", "Inputs", "Note"]
+from undertow.runtime.slow_loop import Answer, Request, law_vectors_of
+from undertow.runtime.steps import BEYOND_TRAVEL, all_finite, limit_output, step_memory, step_module
 
 #: Least time from asking for a catch to its use, s; and how far the state may be off the one
 #: it was made for, in units of 1 + |entry|.
-CATCH_LEAD, CATCH_SURPRISE = 0.02, 0.1
+CATCH_LEAD, CATCH_PREDICTION_ERROR = 0.02, 0.1
 
 #: How the reason begins for which an answer is refused that no sound slow loop gives.
 UNSOUND = "unsound: "
@@ -92,7 +84,7 @@ class Controller:
     period
         Of the fast loop, s.
     settings
-        Limits and patience.
+        Limits and timeouts.
     swing_up
         Brings the mechanism up, and says from where it may be caught; the slow loop is asked for
         the surface that catches it.  ``None``: the law waits until the mechanism is brought
@@ -102,7 +94,7 @@ class Controller:
     ----------
     u, x, s, demand
         Of the last step: output (m,), estimate (2n,), surface values (m,), unlimited law (m,).
-    home
+    wrapped
         The estimate less whole turns of freely turning joints: what the law acts on, (2n,).
     margin
         det Γ(q)/det Γ(0) of the last step, (1,).
@@ -112,7 +104,7 @@ class Controller:
         What happened in the last step.
     request
         What the last step asks of the slow loop.
-    gives_up
+    optimiser_timed_out
         Whether the last step gave up on the present computation of the slow loop.
     """
 
@@ -130,38 +122,41 @@ class Controller:
         settings = Settings() if settings is None else settings
         self.cascade, self.estimator, self.period = cascade, estimator, period
         self.settings, self.swing_up = settings, swing_up
-        lost = settings.lost if swing_up is None else swing_up.lost
-        fast = step_memory(mechanism, settings, period, lost)
+        fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
+        fast = step_memory(mechanism, settings, period, fall_angle)
         self._block = fast.block
         self.u: FloatArray = fast["output"]
-        self.x, self.home, self.s = fast["x"], fast["home"], fast["s"]
+        self.x, self.wrapped, self.s = fast["x"], fast["wrapped"], fast["s"]
         self.demand, self.margin = fast["demand"], fast["margin"]
         self.limits, self.slew = fast["limits"], fast["slew"]
         self._turn, self._wanted = fast["turn"], fast["wanted"]
-        confine(self._wanted, self.u, self.limits, self.slew)  # compiled before a stop needs it
+        limit_output(
+            self._wanted, self.u, self.limits, self.slew
+        )  # compiled before a stop needs it
         self._act = step_module(mechanism, cascade.reaching.switching).act
         self._swings = swing_up is not None
         self.mode, self.stopped_by = Mode.IDLE, ""
         self.memory = memory
         self.notes: list[Note] = []
         self.request: Request | None = None
-        self.gives_up = False
-        self.sensors = SensorWatch(mechanism, settings, period)
+        self.optimiser_timed_out = False
+        self.sensors = SensorMonitor(mechanism, settings, period)
         self._names = [c.name for c in mechanism.coordinates]
-        self._plans = PlanTest(mechanism, cascade.reaching)
-        self._lanes, self._times = lanes_of(cascade, memory.plan), memory.plan.times
-        self._segment, self._lane = 0, self._lanes[0]
-        self._next = memory, self._lanes, self._times
-        self._packed = self._lanes
+        self._plans = PlanCheck(mechanism, cascade.reaching)
+        self._law_vectors, self._times = law_vectors_of(cascade, memory.plan), memory.plan.times
+        self._segment, self._law_vector = 0, self._law_vectors[0]
+        self._next = memory, self._law_vectors, self._times
+        self._packed = self._law_vectors
         self._since = fast["since"]
-        self._expected, self._off, self._most, self._due = fast["expected"], fast["off"], 0.0, 0.0
+        self._expected, self._off = fast["expected"], fast["off"]
+        self._max_error = self._due = 0.0
         self._asked: Request | None = None
         self._pending: Answer | None = None
         self._arrived: Answer | None = None
         self._used: Answer | None = None
         self._followed, self._free, self._t = True, False, 0.0
         self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
-        self._lead = settings.lead
+        self._lead = settings.lead_time
         self._catch_lead = CATCH_LEAD
 
     # -- one step --------------------------------------------------------------------------
@@ -182,13 +177,13 @@ class Controller:
         self._followed = False
         if self.notes:
             self.notes.clear()
-        self.request, self.gives_up = None, False
+        self.request, self.optimiser_timed_out = None, False
         self._t, self._free = inputs.t, False
         try:
-            self._think(inputs)
+            self._compute(inputs)
         except Exception as error:  # whatever it was, the output goes to zero within its slew
             self._stop(f"{type(error).__name__}: {error}")
-            confine(self._wanted, self.u, self.limits, self.slew)
+            limit_output(self._wanted, self.u, self.limits, self.slew)
         return self.u
 
     def follow_up(self) -> None:
@@ -198,40 +193,40 @@ class Controller:
         used, self._used = self._used, None
         try:
             if used is not None:
-                self._tell(used)
+                self._note_outcome(used)
             if answer is not None:
-                self._receive(self._t, answer)
+                self._take_answer(self._t, answer)
             elif self._free:
                 self._ask(self._t)
         except Exception as error:
             self._stop(f"{type(error).__name__}: {error}")
 
-    def _think(self, inputs: Inputs) -> None:
+    def _compute(self, inputs: Inputs) -> None:
         t, sensors, mode, pending = inputs.t, self.sensors, self.mode, self._pending
         self._arrived = inputs.answer
         if mode is Mode.IDLE:
             sensors.forget()
-        believed, found, sensor = sensors.check(inputs.measurement, self.x, self.u)
+        accepted, found, sensor = sensors.check(inputs.measurement, self.x, self.u)
         estimate = self.x
-        if believed is not None:
+        if accepted is not None:
             if sensors.first:
-                self.estimator.reset(np.concatenate([believed.q, np.zeros_like(believed.q)]))
-            estimate = self.estimator.estimate(believed, self.u)
+                self.estimator.reset(np.concatenate([accepted.q, np.zeros_like(accepted.q)]))
+            estimate = self.estimator.estimate(accepted, self.u)
         if self._segment + 1 < len(self._times):
             self._proceed(t)
-        new, most = self._lane, -1.0
+        new, most = self._law_vector, -1.0
         due = pending is not None and t >= self._due
         if due:
-            new, most = self._next[1][0], self._most
+            new, most = self._next[1][0], self._max_error
             if mode is Mode.SWING_UP and self.swing_up is not None:
                 self._turn[:] = self.swing_up.region.turns(estimate)
         waited = ""
-        if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up:
+        if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up_timeout:
             waited = self._waiting()
         used, number, why, wrong, place = self._act(
             estimate,
             self.estimator.disturbance,
-            self._lane,
+            self._law_vector,
             new,
             most,
             self._block,
@@ -246,8 +241,8 @@ class Controller:
         if due:
             self._used, self._pending = pending, None
             if used:
-                self.memory, self._lanes, self._times = self._next
-                self._segment, self._lane = 0, new
+                self.memory, self._law_vectors, self._times = self._next
+                self._segment, self._law_vector = 0, new
         if why:
             reason = Reason(why).text
             if why == Reason.FAULT:
@@ -257,34 +252,35 @@ class Controller:
             mode = self.mode
         if mode is Mode.SWING_UP:
             assert self.swing_up is not None  # else nothing leads to this state
-            self._wanted[:] = self.swing_up.swing(self.x, self._choice(t))
-            confine(self._wanted, self.u, self.limits, self.slew)
+            self._wanted[:] = self.swing_up.swing(self.x, self._gains_in_use(t))
+            limit_output(self._wanted, self.u, self.limits, self.slew)
         elif mode is not Mode.BALANCE and mode is not Mode.CATCH:
             self._free = False
 
     def _describe(self, wrong: int, place: int) -> str:
         """Return in words what a step found wrong with the estimate."""
-        if wrong == PAST:
+        if wrong == BEYOND_TRAVEL:
             return f"'{self._names[place]}' at {self.x[place]:.3g}, past its travel"
         return "the estimate is not finite"
 
     def _waiting(self) -> str:
         """Return in words what a bring-up waited for in vain."""
         settings, m = self.settings, len(self.u)
-        what = f"no {1e3 * settings.settle:g} ms of sound readings"
-        if self._since[0] >= settings.settle:
-            pairs = zip(self._names[m:], self.home[m:], strict=False)
+        what = f"no {1e3 * settings.sensor_settling_time:g} ms of sound readings"
+        if self._since[0] >= settings.sensor_settling_time:
+            pairs = zip(self._names[m:], self.wrapped[m:], strict=False)
             where = ", ".join(f"{name} = {value:.3g}" for name, value in pairs)
             what = f"not where the law can take over, {where}"
         lacking = self.sensors.worst(self._t - self._began)
-        return f"bring-up: {what} within {settings.bring_up:g} s{lacking and f'; {lacking}'}"
+        what = f"{what} within {settings.bring_up_timeout:g} s"
+        return f"bring-up: {what}{lacking and f'; {lacking}'}"
 
     def _proceed(self, t: float) -> None:
         """Go on to the surface of a schedule that is in force at the time t."""
         elapsed, times = t - self.memory.since + 1e-9, self._times
         while self._segment + 1 < len(times) and elapsed >= times[self._segment + 1]:
             self._segment += 1
-        self._lane = self._lanes[self._segment]
+        self._law_vector = self._law_vectors[self._segment]
 
     def _change(self, t: float, mode: Mode, reason: str) -> None:
         if mode is self.mode:
@@ -298,7 +294,7 @@ class Controller:
             self._swinging, self._pending = t, None
         elif mode is Mode.CATCH and self.mode is Mode.BRING_UP:
             self.memory = replace(self.memory, since=t)  # a schedule starts with the catch
-            self._segment, self._lane = 0, self._lanes[0]
+            self._segment, self._law_vector = 0, self._law_vectors[0]
         self.mode = mode
 
     def _stop(self, reason: str) -> None:
@@ -307,7 +303,7 @@ class Controller:
         if self.mode is not Mode.SAFE_STOP:
             self._change(0.0, Mode.SAFE_STOP, reason)
 
-    def _choice(self, t: float) -> int:
+    def _gains_in_use(self, t: float) -> int:
         """Which of the swing-up's gains are in use: others after a while without a catch."""
         assert self.swing_up is not None  # nothing else leads to this state
         return int((t - self._swinging) / self.swing_up.patience)
@@ -317,72 +313,77 @@ class Controller:
     def _ask(self, t: float) -> None:
         """Ask for the next proposal, or give up on one that is long overdue."""
         if self._asked is not None:
-            if t > self._asked.use + self.settings.silence:
+            if t > self._asked.use + self.settings.optimiser_timeout:
                 self.notes.append(Note("answer", f"{self._asked.sequence}: never came"))
                 self._sequence = max(self._sequence, self._asked.sequence)
-                self._asked, self.gives_up = None, True
-                self._plan_ahead(1.5)
+                self._asked, self.optimiser_timed_out = None, True
+                self._adapt_lead_time(1.5)
             return
         if self._pending is not None:
             return
         if self.memory.sequence != self._sequence:
             self.memory = replace(self.memory, sequence=self._sequence)
         if self.mode is not Mode.SWING_UP:
-            self._asked = Request(t, self.home.copy(), t + self._lead, self.memory)
+            self._asked = Request(t, self.wrapped.copy(), t + self._lead, self.memory)
         elif self.swing_up is not None and self.swing_up.worth_asking(self.x):
             use = t + self._catch_lead
-            self._asked = Request(t, self.x.copy(), use, self.memory, self._choice(t))
+            self._asked = Request(t, self.x.copy(), use, self.memory, self._gains_in_use(t))
         self.request = self._asked
 
-    def _plan_ahead(self, factor: float) -> None:
+    def _adapt_lead_time(self, factor: float) -> None:
         """Change how far ahead proposals are computed, in whole steps of the predictions."""
         step, settings = self.cascade.step, self.settings
-        most = max(settings.lead, settings.longest_lead)
+        most = max(settings.lead_time, settings.max_lead_time)
         if self.mode is Mode.SWING_UP:
             lead = max(CATCH_LEAD, min(0.1, factor * self._catch_lead))
             self._catch_lead = math.ceil(lead / step - 1e-9) * step
             return
-        lead = max(settings.lead, min(most, factor * self._lead))
+        lead = max(settings.lead_time, min(most, factor * self._lead))
         self._lead = math.ceil(lead / step - 1e-9) * step
 
-    def _receive(self, t: float, answer: Answer) -> None:
+    def _take_answer(self, t: float, answer: Answer) -> None:
         """Keep an answer for its time of use, or refuse it: the first line of defence."""
         try:
-            fault = self._unfit(t, answer) or self._unsound(answer)
+            fault = self._mismatch(t, answer) or self._invalid(answer)
         except Exception as error:  # what came may be anything
             fault = f"{UNSOUND}{type(error).__name__}: {error}"
         if fault:
             self.notes.append(Note("answer", f"{answer.sequence}: refused, {fault}"))
             if self._asked is not None and answer.sequence == self._asked.sequence:
                 if t > self._asked.use:
-                    self._plan_ahead(1.5)
+                    self._adapt_lead_time(1.5)
                 self._sequence = max(self._sequence, answer.sequence)
                 self._asked = None
         else:
             if answer.use - t > 0.5 * self._lead:
-                self._plan_ahead(0.9)
+                self._adapt_lead_time(0.9)
             self._asked, self._pending = None, answer
             self._make_ready(answer)
 
     def _make_ready(self, answer: Answer) -> None:
         """Bring what the step of its use needs of an answer to where that step finds it."""
-        memory, surprise = answer.memory, self.settings.surprise
+        memory = answer.memory
         self._due = answer.use - 0.5 * self.period
         self._next = memory, self._packed, memory.plan.times
         self._expected[:] = answer.x
-        most = CATCH_SURPRISE if answer.swing >= 0 else surprise
-        self._most = most if answer.admission.accepted else -1.0
+        allowed = self.settings.max_prediction_error
+        most = CATCH_PREDICTION_ERROR if answer.swing >= 0 else allowed
+        self._max_error = most if answer.admission.accepted else -1.0
 
-    def _unfit(self, t: float, answer: Answer) -> str:
+    def _mismatch(self, t: float, answer: Answer) -> str:
         if self._asked is None or answer.sequence != self._asked.sequence:
             known = answer.sequence <= self._sequence or self._pending is not None
             return "stale, out of order or twice" if known else "not asked for"
         if t > self._asked.use + 0.5 * self.period:
             return f"late by {1e3 * (t - self._asked.use):.1f} ms"
-        lanes = answer.lanes
+        law_vectors = answer.law_vectors
         plan = answer.memory.plan
-        shape = len(plan.times), self._lanes.shape[1]
-        if lanes.shape != shape or answer.x.shape != self.x.shape or not sound(lanes):
+        shape = len(plan.times), self._law_vectors.shape[1]
+        if (
+            law_vectors.shape != shape
+            or answer.x.shape != self.x.shape
+            or not all_finite(law_vectors)
+        ):
             return f"{UNSOUND}not a plan for this mechanism"
         if answer.use != self._asked.use or answer.memory.sequence != answer.sequence:
             return f"{UNSOUND}not what was asked for"
@@ -390,7 +391,7 @@ class Controller:
             return "for another state"
         return ""
 
-    def _unsound(self, answer: Answer) -> str:
+    def _invalid(self, answer: Answer) -> str:
         """Pack the law's numbers anew from the plan that was judged, and test its stability.
 
         What runs are these numbers: those that came must be the same.  det Γ(0), their last,
@@ -402,20 +403,20 @@ class Controller:
             return f"{UNSOUND}its plan is of another time"
         plan = answer.memory.plan
         self._packed = self._plans.pack(plan)
-        if not np.array_equal(self._packed[:, :-1], answer.lanes[:, :-1]):
+        if not np.array_equal(self._packed[:, :-1], answer.law_vectors[:, :-1]):
             return f"{UNSOUND}its numbers are not those of its plan"
         fault = self._plans.fault(self._packed)
         return fault and f"{UNSOUND}{fault}"
 
-    def _tell(self, answer: Answer) -> None:
+    def _note_outcome(self, answer: Answer) -> None:
         """Note what became of an answer at its time of use."""
-        (off, margin), most = self._off.tolist(), self._most
+        (off, margin), most = self._off.tolist(), self._max_error
         self._sequence = max(self._sequence, answer.sequence)
         if not answer.admission.accepted:
             verdict = f"kept the old plan, {answer.admission.reason}"
         elif not off <= most:
             verdict = f"refused, the state is off its prediction by {off:.2g}"
-        elif not margin > self.settings.margin:
+        elif not margin > self.settings.min_margin:
             verdict = f"refused, det Γ(q)/det Γ(0) would be {margin:.2g}"
         else:
             verdict = f"applied, off by {off:.2g}"

@@ -18,8 +18,6 @@ from undertow.models import Mechanism
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
 
-__all__ = ["default_gate", "estimator_for", "provable", "reaching_for"]
-
 #: What every admitted surface must bear: periods of delay, and so much less of the input; and
 #: the part of the input that noise of the sensors may take, standard deviation.
 BEARS, RESERVE, NOISE = 6, 0.15, 0.2
@@ -79,7 +77,7 @@ def default_gate(estimator: KalmanFilter | None = None) -> Gate:
     if estimator is None:
         return cost_gate
     period, size = estimator.period, 2 * estimator.mechanism.n
-    covariance = estimator.settled()[:size, :size]
+    covariance = estimator.steady_covariance()[:size, :size]
     return robustness_gate(
         BEARS * period, RESERVE, period=period, covariance=covariance, noise=NOISE
     )
@@ -92,7 +90,8 @@ def reaching_for(estimator: KalmanFilter) -> ReachingLaw:
     takes no more than ``NOISE`` of the input on the first surface, ``DOUBLED`` times at most.
     """
     mechanism, size = estimator.mechanism, 2 * estimator.mechanism.n
-    covariance, surface = estimator.settled()[:size, :size], first_surface(estimator.mechanism)
+    covariance = estimator.steady_covariance()[:size, :size]
+    surface = first_surface(mechanism)
     laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
     quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)
     return next(quiet, laws[-1])
@@ -102,7 +101,7 @@ def provable(
     mechanism: Mechanism, surfaces: Sequence[Surface], reaching: ReachingLaw
 ) -> tuple[ProvedSet, ...]:
     """Return the sets that are proved for a catch: none can be without ``undertow[certify]``."""
-    from undertow.certify import terminal_sets
+    from undertow.proofs import terminal_sets
 
     with contextlib.suppress(MissingExtraError):
         return terminal_sets(mechanism, surfaces, reaching)

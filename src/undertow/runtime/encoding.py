@@ -1,20 +1,173 @@
-"""Plans, memories and answers to JSON and back, number by number: floats survive exactly."""
+"""What a log holds of a run: columns of its steps; plans, memories and answers as JSON."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Mapping
-from typing import Any, TypeGuard
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self, TypeGuard
 
 import numpy as np
 
 from undertow.cascade import Admission, CascadeState
 from undertow.law import Plan, ReachingLaw, Surface
+from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import Proposal
-from undertow.runtime.slow import Answer
+from undertow.plants import Measurement
+from undertow.runtime.controller import Controller, Inputs
+from undertow.runtime.slow_loop import Answer
 
-__all__ = ["answer_from", "answer_row", "memory_from", "memory_to"]
+#: Columns that are no floating-point numbers, with their types in SQL.
+_SQL = {"k": "INTEGER PRIMARY KEY", "mode": "INTEGER", "surface": "INTEGER"}
+
+#: What the names of columns are made of: measured states, demanded inputs, surface values.
+_MEASURED, _DEMAND, _SURFACE = "_measured", "_demand", "s_"
+
+
+class Stamps(NamedTuple):
+    """When the parts of a step were due or done, s, on the clock of the loop."""
+
+    due: float
+    began: float
+    read: float
+    computed: float
+    written: float
+
+
+def sql_type(name: str) -> str:
+    """Return the type in SQL of a column."""
+    return _SQL.get(name, "REAL")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where each quantity stands in a row of ``steps``.
+
+    Every name of a coordinate, state or input of the mechanism gives a column.
+
+    Attributes
+    ----------
+    names
+        Of all columns, in their order.
+    k, t, clock
+        Number of the step, its time since the start of the run, s, and on the clock, s.
+    mode, surface
+        State of the run, and sequence number of the plan in use.
+    rig_t, q, v
+        The measurement: time on the rig's clock, s, positions (n,) and velocities (n,).
+    x, s, demand, u
+        Estimate (2n,), surface values (m,), unlimited output of the law (m,), output (m,).
+    margin
+        det Γ(q)/det Γ(0).
+    late_us, read_us, step_us, write_us
+        How late the step began, and how long reading, computing and writing took, µs.
+    """
+
+    names: tuple[str, ...]
+    k: int
+    t: int
+    clock: int
+    mode: int
+    surface: int
+    rig_t: int
+    q: slice
+    v: slice
+    x: slice
+    s: slice
+    demand: slice
+    u: slice
+    margin: int
+    late_us: int
+    read_us: int
+    step_us: int
+    write_us: int
+
+    @classmethod
+    def of(cls, mechanism: Mechanism) -> Self:
+        """Return the columns for a mechanism."""
+        n, states = mechanism.n, mechanism.state_names
+        inputs = [i.name for i in mechanism.inputs]
+        single = {name: name for name in cls.__dataclass_fields__ if name != "names"}
+        groups: dict[str, str | list[str]] = single | {
+            "q": [f"{name}{_MEASURED}" for name in states[:n]],
+            "v": [f"{name}{_MEASURED}" for name in states[n:]],
+            "x": list(states),
+            "s": [f"{_SURFACE}{i}" for i in range(mechanism.m)],
+            "demand": [f"{name}{_DEMAND}" for name in inputs],
+            "u": inputs,
+        }
+        names: list[str] = []
+        places: dict[str, int | slice] = {}
+        for key, group in groups.items():
+            if isinstance(group, str):
+                places[key] = len(names)
+                names.append(group)
+            else:
+                places[key] = slice(len(names), len(names) + len(group))
+                names += group
+        return cls(tuple(names), **places)  # type: ignore[arg-type]
+
+    def fill(self, row: FloatArray, k: int, at: Stamps, inputs: Inputs, after: Controller) -> None:
+        """Write a step into a row.
+
+        Parameters
+        ----------
+        row
+            Numbers of all columns; written over.
+        k
+            Number of the step.
+        at
+            When its parts were due or done.
+        inputs, after
+            What it was given, and the controller after it.
+        """
+        row[self.k], row[self.t], row[self.clock] = k, inputs.t, at.began
+        row[self.mode], row[self.surface] = after.mode, after.memory.sequence
+        measurement = inputs.measurement
+        if measurement is None:
+            row[self.rig_t] = row[self.q] = row[self.v] = np.nan
+        else:
+            row[self.rig_t], row[self.q] = measurement.t, measurement.q
+            row[self.v] = np.nan if measurement.v is None else measurement.v
+        row[self.x], row[self.s] = after.x, after.s
+        row[self.demand], row[self.u] = after.demand, after.u
+        row[self.margin] = after.margin[0]
+        row[self.late_us] = 1e6 * (at.began - at.due)
+        row[self.read_us] = 1e6 * (at.read - at.began)
+        row[self.step_us] = 1e6 * (at.computed - at.read)
+        row[self.write_us] = 1e6 * (at.written - at.computed)
+
+    def measurement(self, row: FloatArray) -> Measurement | None:
+        """Return the measurement of a step; ``None`` where the rig had failed."""
+        if math.isnan(row[self.rig_t]) and np.isnan(row[self.q]).all():
+            return None
+        v = row[self.v]
+        return Measurement(float(row[self.rig_t]), row[self.q], None if np.isnan(v).all() else v)
+
+    def agrees(self, row: FloatArray, controller: Controller) -> bool:
+        """Whether a controller is, bit for bit, where the step of a row had left it."""
+        pairs = (
+            (controller.u, self.u),
+            (controller.x, self.x),
+            (controller.s, self.s),
+            (controller.demand, self.demand),
+        )
+        same = all(np.array_equal(values, row[at], equal_nan=True) for values, at in pairs)
+        same = same and controller.mode == row[self.mode]
+        return same and controller.memory.sequence == row[self.surface]
+
+    @staticmethod
+    def shown(names: tuple[str, ...]) -> tuple[list[str], list[str], list[str]]:
+        """Return which columns of a log are positions, inputs and surface values, by name."""
+        states = [n.removesuffix(_MEASURED) for n in names if n.endswith(_MEASURED)]
+        positions = [name for name in states if not name.endswith("_dot")]
+        inputs = [n.removesuffix(_DEMAND) for n in names if n.endswith(_DEMAND)]
+        return positions, inputs, [name for name in names if name.startswith(_SURFACE)]
+
+
+#: Keys of an answer's ``body`` in logs before version 0.2.0, and what they are now.
+OLD_KEYS = {"lanes": "law_vectors"}
 
 
 def _plan_to(plan: Plan) -> dict[str, Any]:
@@ -75,7 +228,7 @@ def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
         "x": answer.x.tolist(),
         "before": memory_to(answer.before),
         "after": memory_to(answer.memory),
-        "lanes": answer.lanes.tolist(),
+        "law_vectors": answer.law_vectors.tolist(),
         # What an optimiser says may be anything: only what can be judged again is kept.
         "plan": _plan_to(plan) if _is_sound(plan) else None,
         "number": proposal.sequence,
@@ -96,7 +249,7 @@ def answer_from(row: Mapping[str, Any]) -> Answer:
     def number(name: str) -> float:
         return math.nan if row[name] is None else float(row[name])
 
-    body = json.loads(row["body"])
+    body = {OLD_KEYS.get(key, key): value for key, value in json.loads(row["body"]).items()}
     proposal = Proposal(
         None if body["plan"] is None else _plan_from(body["plan"]),
         row["status"],
@@ -117,7 +270,7 @@ def answer_from(row: Mapping[str, Any]) -> Answer:
         Admission(bool(row["accepted"]), row["reason"], number("predicted")),
         memory_from(body["before"]),
         memory_from(body["after"]),
-        np.array(body["lanes"]),
+        np.array(body["law_vectors"]),
         row["seconds"],
         body["swing"],
     )

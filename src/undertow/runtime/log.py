@@ -31,16 +31,14 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
 from undertow.base import ArtefactError, ResourceError, check_file, parse_json
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray
+from undertow.runtime.encoding import Columns, sql_type
 from undertow.runtime.processes import Background
-
-__all__ = ["Columns", "Log", "Recording", "check_log", "part_path", "read_log"]
 
 #: Columns of ``answers``, with their types.
 ANSWERS = {
@@ -52,73 +50,37 @@ ANSWERS = {
 #: Columns of ``events``.
 EVENTS = ("k", "t", "kind", "text")
 
-#: Layout of the file, SQLite's ``user_version``; logs of before it was kept have 0.
-VERSION = 2
+#: Layout of the file, SQLite's ``user_version``; logs of before it was kept have 0; those of
+#: before Undertow 0.2.0, with other names of settings, at most 2.
+VERSION = 3
 
 #: Rows that wait in memory at most.
-RING = 8192
+RING_ROWS = 8192
 
 #: Time between transactions, s; and rows, where no thread writes.
-FLUSH, BATCH = 0.025, 250
+FLUSH_INTERVAL, BATCH_ROWS = 0.025, 250
 
 #: Time from what was written to when the disk is asked to take it, s.
-SYNC = 0.5
+SYNC_INTERVAL = 0.5
 
 #: Size at which a log goes on in another file, bytes: about an hour at 1 kHz.
-PART = 1 << 30
+PART_BYTES = 1 << 30
 
 #: How long a disk may take over the last rows, s.
-PATIENCE = 5.0
+CLOSE_TIMEOUT = 5.0
 
 #: Free space without which no log is begun, bytes.
-LEAST = 1 << 24
+MIN_FREE_SPACE = 1 << 24
 
 #: What ends a journal of SQLite that belongs to another one.
 JOURNAL = bytes.fromhex("d9d505f920a163d7")
 
 #: Largest value in a file that is read, bytes.
-LONGEST = 1 << 26
+MAX_VALUE_BYTES = 1 << 26
 
 
 #: Values of one line of a table.
 Line = tuple[object, ...]
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Where each quantity stands in a row of ``steps``.
-
-    Every name of a coordinate, state or input of the mechanism gives a column.
-    """
-
-    names: tuple[str, ...]
-    q: slice
-    v: slice
-    x: slice
-    s: slice
-    demand: slice
-    u: slice
-
-    @classmethod
-    def of(cls, mechanism: Mechanism) -> Self:
-        """Return the columns for a mechanism."""
-        names = ["k", "t", "clock", "mode", "surface", "rig_t"]
-        places = {}
-        states = mechanism.state_names
-        inputs = [i.name for i in mechanism.inputs]
-        n = mechanism.n
-        for key, group in (
-            ("q", [f"{name}_measured" for name in states[:n]]),
-            ("v", [f"{name}_measured" for name in states[n:]]),
-            ("x", list(states)),
-            ("s", [f"s_{i}" for i in range(mechanism.m)]),
-            ("demand", [f"{name}_demand" for name in inputs]),
-            ("u", inputs),
-        ):
-            places[key] = slice(len(names), len(names) + len(group))
-            names += group
-        names += ["margin", "late_us", "read_us", "step_us", "write_us"]
-        return cls(tuple(names), **places)
 
 
 class Log:
@@ -134,7 +96,7 @@ class Log:
         What the run was: JSON values.
     threaded
         Write in a thread, every 25 ms.  Otherwise write every 250 rows, for simulated time.
-    most_bytes
+    max_bytes
         Size that the file may grow to; the log ends there, and the run goes on.
     part_bytes
         Size at which the log goes on in another file, :func:`part_path`.
@@ -161,20 +123,20 @@ class Log:
         meta: Mapping[str, Any],
         *,
         threaded: bool = True,
-        most_bytes: int | None = None,
-        part_bytes: int = PART,
+        max_bytes: int | None = None,
+        part_bytes: int = PART_BYTES,
     ) -> None:
         self.path, self.columns = path, columns
         self.failure, self.dropped = "", 0
         self.row = np.zeros(len(columns.names))
-        self._ring = np.zeros((RING, len(columns.names)))
+        self._ring = np.zeros((RING_ROWS, len(columns.names)))
         self._head = self._tail = 0
         self._waiting: deque[tuple[str, Callable[[], Line]]] = deque()
         self._insert = f"INSERT INTO steps VALUES ({', '.join('?' * len(columns.names))})"
         self._over = threading.Event()
         self._lock = threading.Lock()
         self._meta = {**meta, "run": uuid.uuid4().hex}
-        self._part, self._part_bytes, self._most_bytes = 1, part_bytes, most_bytes
+        self._part, self._part_bytes, self._most_bytes = 1, part_bytes, max_bytes
         self._unsynced, self._synced = False, time.monotonic()
         check_log(path)
         with _refused(path):
@@ -221,8 +183,7 @@ class Log:
         return file
 
     def _lay_tables(self, file: sqlite3.Connection, meta: Mapping[str, Any]) -> None:
-        whole = {"k": "INTEGER PRIMARY KEY", "mode": "INTEGER", "surface": "INTEGER"}
-        steps = ", ".join(f'"{name}" {whole.get(name, "REAL")}' for name in self.columns.names)
+        steps = ", ".join(f'"{name}" {sql_type(name)}' for name in self.columns.names)
         answers = ", ".join(f"{name} {kind}" for name, kind in ANSWERS.items())
         file.execute("PRAGMA synchronous=FULL")
         file.execute("BEGIN")
@@ -242,12 +203,12 @@ class Log:
 
     def commit_row(self) -> None:
         """Keep a copy of :attr:`row`; never waits."""
-        if self._head - self._tail >= RING:
+        if self._head - self._tail >= RING_ROWS:
             self.dropped += 1
             return
-        self._ring[self._head % RING] = self.row
+        self._ring[self._head % RING_ROWS] = self.row
         self._head += 1
-        if self._thread is None and self._head - self._tail >= BATCH:
+        if self._thread is None and self._head - self._tail >= BATCH_ROWS:
             self.flush()
 
     def event(self, k: int, t: float, kind: str, text: str) -> None:
@@ -261,7 +222,7 @@ class Log:
     # -- called by the thread --------------------------------------------------------------
 
     def _write(self) -> None:
-        while not self._over.wait(FLUSH):
+        while not self._over.wait(FLUSH_INTERVAL):
             self.flush()
 
     def flush(self) -> None:
@@ -287,7 +248,7 @@ class Log:
     def _keep_safe(self) -> None:
         """Every half second: have the disk take what was written; go on in another file."""
         now = time.monotonic()
-        if not self._unsynced or now < self._synced + SYNC:
+        if not self._unsynced or now < self._synced + SYNC_INTERVAL:
             return
         self._unsynced, self._synced = False, now
         path = part_path(self.path, self._part)
@@ -311,7 +272,7 @@ class Log:
         return made
 
     def _transact(self, head: int, waiting: Sequence[tuple[str, Line]]) -> None:
-        places = np.arange(self._tail, head) % RING
+        places = np.arange(self._tail, head) % RING_ROWS
         self._file.execute("BEGIN")
         self._file.executemany(self._insert, self._ring[places].tolist())
         for table, values in waiting:
@@ -323,9 +284,9 @@ class Log:
         """Write the rest, and leave one file behind."""
         self._over.set()
         if self._thread is not None:
-            self._thread.join(timeout=PATIENCE)
+            self._thread.join(timeout=CLOSE_TIMEOUT)
             if self._thread.is_alive():  # to wait for its lock would be to hang with it
-                self.failure = f"the disk has not answered for {PATIENCE:g} s"
+                self.failure = f"the disk has not answered for {CLOSE_TIMEOUT:g} s"
                 self.dropped += self._head - self._tail
                 return
         self.flush()
@@ -337,14 +298,13 @@ class Log:
         """Return the log."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the log."""
+    def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def log_error(path: Path, value: str, limit: str | None, remedy: str) -> ArtefactError:
+    """Return what is wrong with a log as an error."""
+    return ArtefactError(f"log '{path}'", value=value, limit=limit, remedy=remedy)
 
 
 def _writable(text: str) -> str:
@@ -358,12 +318,8 @@ def _refused(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.Error, MemoryError) as error:
-        raise ArtefactError(
-            f"log '{path}'",
-            value=str(error) or type(error).__name__,
-            limit="a file that can be written",
-            remedy="Name another one with --log",
-        ) from error
+        value, remedy = str(error) or type(error).__name__, "Name another one with --log"
+        raise log_error(path, value, "a file that can be written", remedy) from error
 
 
 def check_log(path: Path) -> None:
@@ -377,11 +333,12 @@ def check_log(path: Path) -> None:
     with _refused(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         if not os.access(path.parent, os.W_OK):
-            message = "its folder cannot be written"
-            raise PermissionError(message)
+            raise PermissionError("its folder cannot be written")
         disk = shutil.disk_usage(path.parent)
-        if disk.total and disk.free < LEAST:
-            raise OSError(errno.ENOSPC, f"less than {LEAST >> 20} MiB are free on its disk")
+        if disk.total and disk.free < MIN_FREE_SPACE:
+            raise OSError(
+                errno.ENOSPC, f"less than {MIN_FREE_SPACE >> 20} MiB are free on its disk"
+            )
         for earlier in _parts(path):
             _claim(earlier)
 
@@ -512,12 +469,9 @@ def read_log(path: Path) -> Recording:
     """
     found = _read_part(path)
     if found.meta.get("part", 1) != 1:
-        raise ArtefactError(
-            f"log '{path}'",
-            value=f"part {found.meta['part']} of a log",
-            limit="its first part",
-            remedy="Name that: the others are read with it",
-        )
+        value = f"part {found.meta['part']} of a log"
+        remedy = "Name that: the others are read with it"
+        raise log_error(path, value, "its first part", remedy)
     steps, events, answers, part = [found.steps], [*found.events], [*found.answers], 2
     while (further := part_path(path, part)).exists() and further.stat().st_size:
         more = _read_part(further)
@@ -549,12 +503,10 @@ def _read_part(path: Path) -> Recording:
     except ArtefactError:
         raise
     except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError) as error:
-        raise ArtefactError(
-            f"log '{path}'",
-            value=str(error) or type(error).__name__,
-            limit="a log of a run, whole and of this version",
-            remedy="A run that was killed before its first step leaves an empty file",
-        ) from error
+        value = str(error) or type(error).__name__
+        limit = "a log of a run, whole and of this version"
+        remedy = "A run that was killed before its first step leaves an empty file"
+        raise log_error(path, value, limit, remedy) from error
     said = tuple((one["k"], one["t"], one["kind"], one["text"]) for one in events)
     return Recording(path, meta, columns, steps, said, answers)
 
@@ -605,7 +557,7 @@ def _connected(place: str) -> sqlite3.Connection:
     try:
         for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON", "mmap_size=0"):
             file.execute(f"PRAGMA {pragma}")
-        file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
+        file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
         (version,) = file.execute("PRAGMA user_version").fetchone()
         if version > VERSION:
             raise ArtefactError(

@@ -15,24 +15,28 @@ import numpy as np
 
 from undertow.base import InvalidInputError
 from undertow.models import FloatArray
-from undertow.plants.interface import Measurement, OutputOnError, Rig
-from undertow.runtime.clock import YIELD, Clock, WallClock, locked_memory, prompt
+from undertow.plants import Measurement, OutputOnError, Rig
+from undertow.runtime.clock import (
+    SECOND,
+    YIELD,
+    Clock,
+    FailureRatio,
+    RigClock,
+    WallClock,
+    locked_memory,
+    real_time_priority,
+)
 from undertow.runtime.controller import UNSOUND, Controller, Inputs
-from undertow.runtime.encoding import answer_row
-from undertow.runtime.health import SECOND, RigClock, Share
+from undertow.runtime.encoding import Stamps, answer_row
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
-from undertow.runtime.processes import Background, refused_by_the_system
-from undertow.runtime.slow import Answer, Worker, is_answer
-from undertow.runtime.stage import stage_module
-from undertow.runtime.steps import confine
+from undertow.runtime.processes import Background, resource_errors
+from undertow.runtime.slow_loop import Answer, Worker, is_answer
+from undertow.runtime.steps import limit_output, stage_module
 from undertow.runtime.verdict import Report
 
-__all__ = ["Runtime"]
-
-
-#: Time before a step is due at which the shadow rehearses, s.
-REHEARSAL = 1.5e-4
+#: How long before a step is due the lockstep check makes the last one again, s.
+LOCKSTEP_TIME = 1.5e-4
 
 #: Steps between two collections of what is young.
 COLLECT = 10_000
@@ -59,7 +63,7 @@ class Runtime:
         The wall clock by default.
     log
         Where everything goes; closed by the caller.
-    shadow
+    lockstep
         A second controller, built as the first.  It makes every step again, one step behind,
         in the last moments before the next one is due: that brings code and data back into
         the processor's caches, and shows at once when the same inputs give other outputs.
@@ -78,7 +82,7 @@ class Runtime:
         *,
         clock: Clock | None = None,
         log: Log | None = None,
-        shadow: Controller | None = None,
+        lockstep: Controller | None = None,
     ) -> None:
         if not math.isclose(rig.period, controller.period, rel_tol=1e-9):
             raise InvalidInputError(
@@ -87,36 +91,36 @@ class Runtime:
                 limit=f"that of the controller, {controller.period:g} s",
                 remedy="Give both the same one: Recipe(period=...)",
             )
-        self.shadow = shadow
+        self.lockstep = lockstep
         self._behind: deque[tuple[Inputs, FloatArray]] = deque(maxlen=1000)
         self.controller, self.rig, self.worker = controller, rig, worker
         self.clock = WallClock() if clock is None else clock
         self.log = log
         settings, period = controller.settings, controller.period
         self.report = Report(
-            variation=np.zeros_like(controller.u),
-            home=settings.home,
-            homing=settings.homing,
+            total_variation=np.zeros_like(controller.u),
+            target_radius=settings.target_radius,
+            convergence_time=settings.convergence_time,
             unit=controller.cascade.objective.unit,
             log=log,
         )
-        self._stopping, self._silent = False, ""
-        self._unread = self._unwritten = 0.0
-        self._reads, self._writes = (Share(settings.window, period) for _ in range(2))
-        self._overruns, self._rig_clock = Share(SECOND, period), RigClock(settings, period)
-        self._written, self._let_go_of, self._lost = np.zeros_like(controller.u), False, 0
+        self._stopping, self._watchdog_alarm = False, ""
+        self._time_without_reading = self._time_without_write = 0.0
+        self._reads, self._writes = (FailureRatio(settings.fault_window, period) for _ in range(2))
+        self._overruns, self._rig_clock = FailureRatio(SECOND, period), RigClock(settings, period)
+        self._written, self._released, self._lost = np.zeros_like(controller.u), False, 0
         mechanism = controller.cascade.mechanism
         self._stage = stage_module(mechanism, controller.cascade.objective).stage
         self._parameters = np.array(mechanism.parameter_values, dtype=float)
         self._rate, self._since, self._balanced = np.zeros(1), 0.0, 0.0
         self._reserve = b""
-        self._beat = self._origin = self.clock.now()
-        self._left = math.inf
+        self._heartbeat = self._origin = self.clock.now()
+        self._waiting_since = math.inf
 
     @property
     def hangs(self) -> bool:
         """Whether the rig holds the run up: in its close, or since the watchdog let go of it."""
-        return self.clock.now() - self._left > self.controller.settings.insist
+        return self.clock.now() - self._waiting_since > self.controller.settings.zero_output_timeout
 
     def stop(self) -> None:
         """Ask for a safe stop, as an operator does: from anywhere, also before the run."""
@@ -126,9 +130,9 @@ class Runtime:
         """Run from start to a safe stop; the operator's stop comes after ``seconds``.
 
         The run ends once a safe stop has brought the output to zero: the device is asked to take
-        zero until it does, for ``Settings.insist`` at most, and is closed.  Whether it did is in
-        the report and in its verdict.  An interrupt that a driver lets through counts as the
-        operator's stop; other ways out of the interpreter are taken after the safe stop.
+        zero until it does, for ``Settings.zero_output_timeout`` at most, and is closed.  Whether it
+        did is in the report and in its verdict.  An interrupt that a driver lets through counts as
+        the operator's stop; other ways out of the interpreter are taken after the safe stop.
 
         Raises
         ------
@@ -137,7 +141,7 @@ class Runtime:
         ResourceError
             When the system has no thread or memory left for the run.
         """
-        if self.report.steps or self._let_go_of:
+        if self.report.steps or self._released:
             raise InvalidInputError(
                 "second run of a runtime",
                 value=f"stopped by {self.report.stopped_by}",
@@ -146,7 +150,7 @@ class Runtime:
             )
         try:
             with (
-                refused_by_the_system("a run"),
+                resource_errors("a run"),
                 _quiet_interpreter(self.clock) as self.report.system,
                 self._watchdog(),
             ):
@@ -155,20 +159,20 @@ class Runtime:
                     self._say_system()
                     self._loop(seconds)
                 except BaseException as error:
-                    self._broke(error)
+                    self._loop_failed(error)
                     if not isinstance(error, Exception | KeyboardInterrupt):
                         raise
                 finally:
-                    self._let_go()
+                    self._release_rig()
         finally:
-            self._let_go()
+            self._release_rig()
         return self.report
 
     def _say_system(self) -> None:
         for text in self.report.system:
-            self._tell("system", text)
+            self._log_event("system", text)
 
-    def _broke(self, error: BaseException) -> None:
+    def _loop_failed(self, error: BaseException) -> None:
         """Take down what ended the loop itself: its output comes to zero without it."""
         self._reserve = b""
         report, controller = self.report, self.controller
@@ -176,167 +180,175 @@ class Runtime:
         if isinstance(error, KeyboardInterrupt):
             reason = "operator: interrupt"
         if controller.mode is not Mode.SAFE_STOP:
-            report.last = controller.mode
+            report.mode_before_stop = controller.mode
             controller.mode, controller.stopped_by = Mode.SAFE_STOP, reason
-            self._tell("state", f"{report.last.name} → SAFE_STOP: {reason}")
+            self._log_event("state", f"{report.mode_before_stop.name} → SAFE_STOP: {reason}")
 
-    def _let_go(self) -> None:
+    def _release_rig(self) -> None:
         """Bring the output to zero, insist on it for a while, close the rig, and take down how.
 
         Also after the loop has failed, without its memory: nothing here needs much.
         """
-        if self._let_go_of:
+        if self._released:
             return
-        self._let_go_of, self._reserve = True, b""
+        self._released, self._reserve = True, b""
         report, controller = self.report, self.controller
         failure = ""
         try:
-            failure = self._bring_to_zero() if not report.off else ""
+            failure = self._bring_to_zero() if not report.output_zero else ""
         except BaseException as error:  # an interrupt: the rig is closed all the same
             failure = f"{type(error).__name__}: {error}"
-        self._beat = float("inf")
-        output = [] if report.off else [f"the device did not take an output of zero: {failure}"]
-        if self._silent and report.off:
-            output.append(self._silent)
-        self._left = self.clock.now()
+        self._heartbeat = float("inf")
+        output = (
+            [] if report.output_zero else [f"the device did not take an output of zero: {failure}"]
+        )
+        if self._watchdog_alarm and report.output_zero:
+            output.append(self._watchdog_alarm)
+        self._waiting_since = self.clock.now()
         try:
             self.rig.close()
         except BaseException as error:  # a rig that failed may fail again
             output.append(f"close: {type(error).__name__}: {error}")
-            report.off = report.off and not isinstance(error, OutputOnError)
-        self._left = math.inf
-        report.output = "; ".join(output)
+            report.output_zero = report.output_zero and not isinstance(error, OutputOnError)
+        self._waiting_since = math.inf
+        report.output_problem = "; ".join(output)
         report.mode, report.stopped_by = controller.mode, controller.stopped_by
-        report.error = float(np.linalg.norm(controller.home))
-        if report.output:
-            self._tell("output", report.output)
+        report.final_error = float(np.linalg.norm(controller.wrapped))
+        if report.output_problem:
+            self._log_event("output", report.output_problem)
 
     def _bring_to_zero(self) -> str:
         """Write outputs down to zero within the slew rate until the device has taken zero.
 
-        Returns what failed at last, once it was asked for ``Settings.insist`` in vain.
+        Returns what failed at last, once it was asked for ``Settings.zero_output_timeout`` in vain.
         """
         controller, clock, u = self.controller, self.clock, self._written
         zero, failure = np.zeros_like(u), ""
         due = began = clock.now()
         while True:
-            if self._silent:
-                return self._silent
-            confine(zero, u, controller.limits, controller.slew)
-            self._beat = clock.now()
+            if self._watchdog_alarm:
+                return self._watchdog_alarm
+            limit_output(zero, u, controller.limits, controller.slew)
+            self._heartbeat = clock.now()
             try:
                 self.rig.write(u.copy())
             except BaseException as error:  # it must come to zero whatever a driver does
                 failure = f"{type(error).__name__}: {error}"
             else:
                 if not u.any():
-                    self.report.off = True
+                    self.report.output_zero = True
                     return ""
-            if not u.any() and clock.now() - began > controller.settings.insist:
+            if not u.any() and clock.now() - began > controller.settings.zero_output_timeout:
                 break
             due += controller.period
             clock.sleep_until(due)
-        return f"asked for {controller.settings.insist:g} s, {failure}"
+        return f"asked for {controller.settings.zero_output_timeout:g} s, {failure}"
 
     def _loop(self, seconds: float) -> None:
         clock, period, report = self.clock, self.controller.period, self.report
-        think, whole, late, rest = report.think, report.whole, report.late, report.rest
-        stall = self.controller.settings.stall
+        stall = self.controller.settings.max_step_interval
         origin = self._origin = clock.now()
         k, slot, alarm, before = 0, 0, "", self.controller.u.copy()
         limits = self.controller.settings
         while True:
             due = origin + slot * period
             self._wait(due)
-            last, began = self._beat, clock.now()
-            self._beat = began
+            last, began = self._heartbeat, clock.now()
+            self._heartbeat = began
             t = began - origin
             if k > 0 and began - last > stall:
                 alarm = f"no step for {1e3 * (began - last):.0f} ms"
             command = Command.START if k == 0 else Command.NONE
             if (self._stopping or t >= seconds) and self.controller.mode != Mode.SAFE_STOP:
                 command = Command.STOP
-                report.early = t < seconds
+                report.stopped_early = t < seconds
             measurement, alarm = self._read(alarm)
             read = clock.now()
             inputs = Inputs(t, measurement, self._take(t), command, alarm)
             u = self.controller.decide(inputs)
-            thought = clock.now()
+            computed = clock.now()
             alarm = self._write(u)
             written = clock.now()
             self.controller.follow_up()
             try:
-                self._after(k, inputs)
+                self._follow_up(k, inputs)
                 if self.log is not None:
-                    self._record(self.log, k, began, due, (read, thought, written), inputs)
+                    stamps = Stamps(due, began, read, computed, written)
+                    self.log.columns.fill(self.log.row, k, stamps, inputs, self.controller)
+                    self.log.commit_row()
             except Exception as error:  # the output must come to zero before the loop may end
                 alarm = alarm or f"{type(error).__name__}: {error}"
-            if self.shadow is not None:
+            if self.lockstep is not None:
                 self._behind.append((inputs, u.copy()))
             np.abs(u - before, out=before)
-            report.variation += before
+            report.total_variation += before
             before[:] = u
-            late.add(began - due)
-            think.add(thought - read)
-            whole.add(written - due)
+            report.wakeup_delays.add(began - due)
+            report.computation_times.add(computed - read)
+            report.response_times.add(written - due)
             ended = clock.now()
-            rest.add(ended - written)
+            report.followup_times.add(ended - written)
             k += 1
             report.steps = k
             if k % COLLECT == 0 and not clock.simulated:
                 gc.collect(0)  # what an exception leaves behind; some microseconds
-            if self.controller.mode == Mode.SAFE_STOP and (self._silent or not u.any()):
+            if self.controller.mode == Mode.SAFE_STOP and (self._watchdog_alarm or not u.any()):
                 break  # and insist on zero, if the device has not taken it
             slot += 1
             over = (ended - origin) / period - slot
             skipped = int(over) if over > 0 else 0
             if over > 0:
-                report.missed += 1
-                report.asleep += ended - began < period
-                report.skipped += skipped
+                report.missed_deadlines += 1
+                report.late_wakeups += ended - began < period
+                report.skipped_periods += skipped
                 slot += skipped
             self._overruns.add((over > 0) + skipped, 1 + skipped)
-            if self._overruns.value > limits.overrun:
+            if self._overruns.value > limits.max_deadline_miss_ratio:
                 alarm = alarm or (
                     f"deadlines missed in {self._overruns.value:.0%} of the last second, "
                     f"the last step took {1e3 * (ended - began):.2g} ms of {1e3 * period:g} ms"
                 )
 
     def _wait(self, due: float) -> None:
-        """Wait for the next step; shortly before, let the shadow make the last one again."""
-        shadow, clock, behind = self.shadow, self.clock, self._behind
-        if shadow is None:
+        """Wait for the next step; shortly before, make the last one again in lockstep."""
+        lockstep, clock, behind = self.lockstep, self.clock, self._behind
+        if lockstep is None:
             clock.sleep_until(due)
             return
-        clock.sleep_until(due - REHEARSAL)
-        while behind and clock.now() < due - 0.4 * REHEARSAL:
+        clock.sleep_until(due - LOCKSTEP_TIME)
+        while behind and clock.now() < due - 0.4 * LOCKSTEP_TIME:
             inputs, u = behind.popleft()
-            self.report.shadowed += 1
-            self.report.disagreed += not np.array_equal(shadow.step(inputs), u)
+            self.report.lockstep_steps += 1
+            self.report.lockstep_mismatches += not np.array_equal(lockstep.step(inputs), u)
         clock.spin_until(due)
 
     def _read(self, alarm: str) -> tuple[Measurement | None, str]:
         """Read the rig; one that fails gives nothing, and one that fails much is an alarm."""
-        if self._silent:  # the watchdog has let go of it
-            return None, self._silent
+        if self._watchdog_alarm:  # the watchdog has let go of it
+            return None, self._watchdog_alarm
         settings, measurement, what = self.controller.settings, None, ""
         try:
-            measurement = _own(self.rig.read(), self.controller.x.shape[0] // 2)
+            measurement = _copied(self.rig.read(), self.controller.x.shape[0] // 2)
         except Exception as error:
             what = f"read: {type(error).__name__}: {error}"
-            self._tell("rig", what)
+            self._log_event("rig", what)
         if measurement is not None:
-            self._unread = 0.0
-            alarm = alarm or self._rig_clock.check(measurement.t, self._beat, self.report.steps)
+            self._time_without_reading = 0.0
+            alarm = alarm or self._rig_clock.check(
+                measurement.t, self._heartbeat, self.report.steps
+            )
         else:
-            self._unread += self.controller.period
-            self.report.unread += 1
+            self._time_without_reading += self.controller.period
+            self.report.failed_reads += 1
         self._reads.add(measurement is None)
-        if self._unread > settings.patience:
-            alarm = alarm or f"the rig gave nothing for {1e3 * self._unread:.0f} ms, {what}"
-        elif self._reads.value > settings.failing and measurement is None:
+        if self._time_without_reading > settings.sensor_timeout:
+            alarm = (
+                alarm
+                or f"the rig gave nothing for {1e3 * self._time_without_reading:.0f} ms, {what}"
+            )
+        elif self._reads.value > settings.max_failure_ratio and measurement is None:
             alarm = alarm or f"{self._reads.value:.0%} of the reads failed, {what}"
-        return measurement, self._silent or alarm
+        return measurement, self._watchdog_alarm or alarm
 
     def _take(self, t: float) -> Answer | None:
         """Take an answer of the slow loop; what is none is not looked at."""
@@ -347,41 +359,43 @@ class Runtime:
             return None
         if answer is None or is_answer(answer):
             return answer
-        self.report.unsound += 1
-        self._tell("optimiser", f"no whole answer, a {type(answer).__name__}")
+        self.report.invalid_answers += 1
+        self._log_event("optimiser", f"no whole answer, a {type(answer).__name__}")
         return None
 
     def _write(self, u: FloatArray) -> str:
         """Write to the rig; one that fails much is an alarm for the next step."""
-        if self._silent:
-            return self._silent
+        if self._watchdog_alarm:
+            return self._watchdog_alarm
         report, settings, zero = self.report, self.controller.settings, not u.any()
         self._written[:] = u
-        report.off = report.off and zero  # one that fails may have taken it all the same
+        report.output_zero = (
+            report.output_zero and zero
+        )  # one that fails may have taken it all the same
         try:
             self.rig.write(u.copy())  # the rig may keep it, or change it
         except Exception as error:
             what = f"write: {type(error).__name__}: {error}"
         else:
-            self._unwritten, report.off = 0.0, zero
+            self._time_without_write, report.output_zero = 0.0, zero
             self._writes.add(0)
             return ""
-        self._unwritten += self.controller.period
+        self._time_without_write += self.controller.period
         self._writes.add(1)
-        report.unwritten += 1
-        self._tell("rig", what)
-        if self._unwritten > settings.patience:
+        report.failed_writes += 1
+        self._log_event("rig", what)
+        if self._time_without_write > settings.sensor_timeout:
             return what
-        if self._writes.value > settings.failing:
+        if self._writes.value > settings.max_failure_ratio:
             return f"{self._writes.value:.0%} of the writes failed, {what}"
         return ""
 
     def _unreached(self, text: str) -> None:
-        self.report.unreached += 1
-        self._tell("optimiser", text)
+        self.report.optimiser_failures += 1
+        self._log_event("optimiser", text)
 
-    def _tell(self, what: str, text: str) -> None:
-        t, events = self._beat - self._origin, self.report.events
+    def _log_event(self, what: str, text: str) -> None:
+        t, events = self._heartbeat - self._origin, self.report.events
         if len(events) < EVENTS:
             events.append((t, what, text))
         if self.log is not None:
@@ -390,11 +404,11 @@ class Runtime:
             except Exception:  # what is said of a fault must not be another one
                 self.log.dropped += 1
 
-    def _after(self, k: int, inputs: Inputs) -> None:
+    def _follow_up(self, k: int, inputs: Inputs) -> None:
         """Hand requests to the slow loop, and keep what happened."""
         controller, report, log = self.controller, self.report, self.log
         try:
-            if controller.gives_up and not self.worker.replace():
+            if controller.optimiser_timed_out and not self.worker.replace():
                 self._unreached("nobody is left to take over: the last plan stays")
             if controller.request is not None:
                 self.worker.ask(controller.request)
@@ -408,58 +422,33 @@ class Runtime:
             if inputs.answer is not None:
                 log.answer(partial(answer_row, k, inputs.answer))
         for note in controller.notes:
-            self._tell(note.kind, note.text)
+            self._log_event(note.kind, note.text)
             if note.kind == "state":
                 report.entered[controller.mode.name] += 1
-                self._account(note.text, inputs.t)
+                self._note_transition(note.text, inputs.t)
             else:
-                report.unsound += UNSOUND in note.text
+                report.invalid_answers += UNSOUND in note.text
                 report.answers[note.text.split(": ", 1)[1].split(",")[0].split(" by ")[0]] += 1
 
-        report.missing += controller.sensors.missing > 0
+        report.steps_with_missing_readings += controller.sensors.missing > 0
         report.cost += float(self._rate[0]) * (inputs.t - self._since)
         self._since = inputs.t
-        self._stage(controller.home, controller.u, self._parameters, self._rate)
+        self._stage(controller.wrapped, controller.u, self._parameters, self._rate)
         if log is not None and log.dropped > self._lost:
             if not self._lost:
-                self._tell("log", f"rows are lost: {log.failure or 'too slow a disk'}")
+                self._log_event("log", f"rows are lost: {log.failure or 'too slow a disk'}")
             self._lost = log.dropped
 
-    def _account(self, change: str, t: float) -> None:
+    def _note_transition(self, change: str, t: float) -> None:
         """Keep from a change of state what the verdict needs."""
         report, mode = self.report, self.controller.mode
         if mode is Mode.BALANCE:
             self._balanced = t
         elif mode is Mode.SAFE_STOP:
-            report.last = Mode[change.partition(" → ")[0]]
-            report.settled_for = t - self._balanced if report.last is Mode.BALANCE else 0.0
-
-    def _record(
-        self,
-        log: Log,
-        k: int,
-        began: float,
-        due: float,
-        stamps: tuple[float, float, float],
-        inputs: Inputs,
-    ) -> None:
-        row, at, controller = log.row, log.columns, self.controller
-        measurement = inputs.measurement
-        row[0], row[1], row[2] = k, inputs.t, began
-        row[3], row[4] = controller.mode, controller.memory.sequence
-        if measurement is None:
-            row[5] = row[at.q] = row[at.v] = np.nan
-        else:
-            row[5] = measurement.t
-            row[at.q] = measurement.q
-            row[at.v] = np.nan if measurement.v is None else measurement.v
-        row[at.x], row[at.s] = controller.x, controller.s
-        row[at.demand], row[at.u] = controller.demand, controller.u
-        read, thought, written = stamps
-        row[-5], row[-4] = controller.margin[0], 1e6 * (began - due)
-        row[-3], row[-2] = 1e6 * (read - began), 1e6 * (thought - read)
-        row[-1] = 1e6 * (written - thought)
-        log.commit_row()
+            report.mode_before_stop = Mode[change.partition(" → ")[0]]
+            report.settled_time = (
+                t - self._balanced if report.mode_before_stop is Mode.BALANCE else 0.0
+            )
 
     @contextlib.contextmanager
     def _watchdog(self) -> Iterator[None]:
@@ -467,19 +456,21 @@ class Runtime:
         if self.clock.simulated:
             yield
             return
-        over, stall = threading.Event(), self.controller.settings.stall
+        over, stall = threading.Event(), self.controller.settings.max_step_interval
 
         def watch() -> None:
             while not over.wait(0.25 * stall):
-                silence = self.clock.now() - self._beat
+                silence = self.clock.now() - self._heartbeat
                 if silence > 2.0 * stall:
-                    self._silent = f"watchdog: the fast loop was silent for {1e3 * silence:.0f} ms"
-                    self._left = self.clock.now()
+                    self._watchdog_alarm = (
+                        f"watchdog: the fast loop was silent for {1e3 * silence:.0f} ms"
+                    )
+                    self._waiting_since = self.clock.now()
                     with contextlib.suppress(Exception):
                         self.rig.close()
                     return
 
-        self._beat = self.clock.now()
+        self._heartbeat = self.clock.now()
         Background(watch, "undertow watchdog")
         try:
             yield
@@ -487,14 +478,13 @@ class Runtime:
             over.set()
 
 
-def _own(measurement: Measurement, n: int) -> Measurement:
+def _copied(measurement: Measurement, n: int) -> Measurement:
     """Return a copy that the rig cannot change any more, of numbers in the right shape."""
     q = np.array(measurement.q, dtype=float)
     v = None if measurement.v is None else np.array(measurement.v, dtype=float)
     for values in (q,) if v is None else (q, v):
         if values.shape != (n,):
-            message = f"a measurement of shape {values.shape}, not ({n},)"
-            raise ValueError(message)
+            raise ValueError(f"a measurement of shape {values.shape}, not ({n},)")
     return Measurement(float(measurement.t), q, v)
 
 
@@ -515,7 +505,7 @@ def _quiet_interpreter(clock: Clock) -> Iterator[tuple[str, ...]]:
     gc.freeze()
     gc.disable()
     try:
-        with prompt() as priority, locked_memory() as memory:
+        with real_time_priority() as priority, locked_memory() as memory:
             yield priority, memory
     finally:
         gc.unfreeze()

@@ -6,8 +6,6 @@ from enum import IntEnum
 
 from undertow.symbolic import numba
 
-__all__ = ["Command", "Mode", "Reason", "successor", "transition"]
-
 
 class Mode(IntEnum):
     """What the fast loop is doing.
@@ -80,7 +78,34 @@ def transition(
     settled: bool,
     swings: bool,
 ) -> tuple[int, int]:
-    """Return the next state and the reason for a change, as numbers: :func:`successor`."""
+    """Return the next state and the reason for a change, as numbers; the same state if none.
+
+    Faults come before everything, and nothing but the operator leads out of a safe stop.
+
+    Parameters
+    ----------
+    mode, command
+        The present state, a :class:`Mode`, and the operator's wish, a :class:`Command`.
+    fault
+        The run cannot go on.
+    ready
+        The sensors have been sound for long enough.
+    inside
+        The state is where the law may take over.
+    lost
+        The state is where the law cannot hold it.
+    settled
+        The state is close to the target.
+    swings
+        There is a swing-up.
+
+    Examples
+    --------
+    >>> transition(Mode.IDLE.value, Command.START.value, *[False] * 6)
+    (1, 1)
+    >>> transition(Mode.SAFE_STOP.value, Command.NONE.value, *[True] * 6)
+    (5, 0)
+    """
     if mode == _SAFE_STOP:
         if command == _RESET and not fault:
             return _IDLE, _BY_RESET
@@ -107,48 +132,3 @@ def transition(
     if mode == _BALANCE and not settled:
         return _CATCH, _DISTURBED
     return mode, _STAY
-
-
-def successor(
-    mode: Mode,
-    command: Command = Command.NONE,
-    *,
-    fault: bool = False,
-    ready: bool = False,
-    inside: bool = False,
-    lost: bool = False,
-    settled: bool = False,
-    swings: bool = False,
-) -> tuple[Mode, Reason]:
-    """Return the next state and the reason for a change; the same state if there is none.
-
-    Faults come before everything, and nothing but the operator leads out of a safe stop.
-
-    Parameters
-    ----------
-    mode
-        The present state.
-    command
-        The operator's wish.
-    fault
-        The run cannot go on.
-    ready
-        The sensors have been sound for long enough.
-    inside
-        The state is where the law may take over.
-    lost
-        The state is where the law cannot hold it.
-    settled
-        The state is close to the target.
-    swings
-        There is a swing-up.
-
-    Examples
-    --------
-    >>> successor(Mode.IDLE, Command.START)
-    (<Mode.BRING_UP: 1>, <Reason.START: 1>)
-    >>> successor(Mode.SAFE_STOP, ready=True, inside=True)
-    (<Mode.SAFE_STOP: 5>, <Reason.NONE: 0>)
-    """
-    number, why = transition(int(mode), int(command), fault, ready, inside, lost, settled, swings)
-    return Mode(number), Reason(why)

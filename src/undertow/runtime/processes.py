@@ -15,7 +15,7 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,16 +30,6 @@ try:
 except ImportError:  # not on Windows
     resource = None  # type: ignore[assignment]
 
-__all__ = [
-    "STOPPING",
-    "Background",
-    "check_resources",
-    "fork",
-    "held_back",
-    "pipe",
-    "refused_by_the_system",
-    "undisturbed",
-]
 
 #: Signals that ask for a safe stop, where the system has them.
 STOPPING = tuple(
@@ -49,7 +39,7 @@ STOPPING = tuple(
 )
 
 #: The longest that a thread may take to begin, s.
-PATIENCE = 5.0
+START_TIMEOUT = 5.0
 
 #: Memory that a run needs besides what its process has when it begins, bytes: for itself, and
 #: for each process that it forks, which shares what neither of them changes.
@@ -106,7 +96,7 @@ def fork(
         Whether it is ended with this process, by SIGTERM; otherwise this one waits for it.
     ignores
         Which of :data:`STOPPING` it ignores from the beginning, in a session of its own: Ctrl-C,
-        Ctrl-Z and a lost connection reach every process of a terminal, and a keeper that is
+        Ctrl-Z and a lost connection reach every process of a terminal, and a supervisor that is
         stopped or ended with its controller keeps nothing.  The others end it.  A stop that is
         asked for meanwhile reaches this process once the other has begun.
 
@@ -127,7 +117,7 @@ def fork(
     process = multiprocessing.get_context("fork").Process(
         target=_begin, args=(target, args, ignores), name=name, daemon=daemon
     )
-    with held_back(), _blocked(), warnings.catch_warnings():
+    with signals_deferred(), _blocked(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
             process.start()
@@ -181,36 +171,35 @@ def pipe() -> tuple[Connection, Connection]:
 
 
 @contextlib.contextmanager
-def held_back() -> Iterator[None]:
+def signals_deferred() -> Iterator[None]:
     """Let signals that ask for a stop wait until what is being opened can also be closed."""
     heard: list[int] = []
+    try:
+        with signals_handled(lambda number, _: heard.append(number)):
+            yield
+    finally:
+        for number in dict.fromkeys(heard):
+            os.kill(os.getpid(), number)
+
+
+@contextlib.contextmanager
+def signals_ignored() -> Iterator[None]:
+    """Let no signal that asks for a stop interrupt what is being closed."""
+    with signals_handled(signal.SIG_IGN):
+        yield
+
+
+@contextlib.contextmanager
+def signals_handled(handler: Callable[[int, Any], None] | signal.Handlers) -> Iterator[None]:
+    """Handle the signals that ask for a stop in another way, but for those that are ignored."""
     with contextlib.ExitStack() as stack:  # restores the rest, too, when a handler raises
-        stack.callback(_again, heard)
         if threading.current_thread() is threading.main_thread():
             for number in STOPPING:
                 before = signal.getsignal(number)
                 if before not in (signal.SIG_IGN, None):  # None: not Python's own
                     stack.callback(signal.signal, number, before)
-                    signal.signal(number, lambda n, _: heard.append(n))
+                    signal.signal(number, handler)
         yield
-
-
-def _again(heard: Sequence[int]) -> None:
-    for number in dict.fromkeys(heard):
-        os.kill(os.getpid(), number)
-
-
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Let no signal that asks for a stop interrupt what is being closed."""
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        before = {number: signal.signal(number, signal.SIG_IGN) for number in STOPPING}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class Background(threading.Thread):
@@ -235,13 +224,13 @@ class Background(threading.Thread):
     def __init__(self, target: Callable[[], None], name: str) -> None:
         super().__init__(name=name, daemon=True)
         self._work, self._begun = target, threading.Event()
-        self._started = _Patient()  # what `start` waits for
+        self._started = _BoundedEvent()  # what `start` waits for
         try:
             self.start()
         except (RuntimeError, MemoryError) as error:
             raise self._refused(_said(error)) from error
-        if not self._begun.wait(PATIENCE):
-            raise self._refused(f"it has not begun after {PATIENCE:g} s")
+        if not self._begun.wait(START_TIMEOUT):
+            raise self._refused(f"it has not begun after {START_TIMEOUT:g} s")
 
     def run(self) -> None:
         """Work, once it is known to have begun."""
@@ -258,11 +247,11 @@ class Background(threading.Thread):
         )
 
 
-class _Patient(threading.Event):
+class _BoundedEvent(threading.Event):
     """An event that nobody waits for without end."""
 
     def wait(self, timeout: float | None = None) -> bool:
-        return super().wait(PATIENCE if timeout is None else timeout)
+        return super().wait(START_TIMEOUT if timeout is None else timeout)
 
 
 def check_resources(*, processes: int, log: bool = False) -> None:
@@ -352,7 +341,7 @@ def _check_file_size() -> None:
 
 
 @contextlib.contextmanager
-def refused_by_the_system(what: str) -> Iterator[None]:
+def resource_errors(what: str) -> Iterator[None]:
     """Say of what the system refuses for lack of something what it was for.
 
     Raises

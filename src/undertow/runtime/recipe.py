@@ -9,17 +9,18 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
 
-from undertow.base import InvalidInputError, UndertowError, near
-from undertow.cascade import Cascade, CascadeState, derate_actuator
+from undertow.base import InvalidInputError, UndertowError, one_of
+from undertow.cascade import Cascade, CascadeState, cost_gate, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import KalmanFilter
-from undertow.law import Plan
+from undertow.law import Plan, ReachingLaw
+from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, number_of
-from undertow.objective import Goal, objective_for
+from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, IdealRig, RealisticRig
-from undertow.plants.presets import bench_for
+from undertow.plants.bench import bench_for
 from undertow.runtime.controller import Controller
 from undertow.runtime.controller_defaults import (
     RESERVE,
@@ -29,9 +30,7 @@ from undertow.runtime.controller_defaults import (
     reaching_for,
 )
 from undertow.runtime.settings import Settings
-from undertow.runtime.slow import Answer, Request, respond
-
-__all__ = ["Recipe"]
+from undertow.runtime.slow_loop import Answer, Request, respond
 
 #: Shortest period, and longest prediction, of a run, s.
 SHORTEST, FARTHEST = 1e-5, 3600.0
@@ -39,6 +38,19 @@ SHORTEST, FARTHEST = 1e-5, 3600.0
 #: Which words a recipe's objective is written in.  Logs before had no such number: their
 #: "energy" and "time" are "bench-energy" and "bench-time" now.
 WORDS = 2
+
+#: Names of settings in logs before version 0.2.0, and what they are now.
+OLD_SETTINGS = {
+    "lead": "lead_time", "longest_lead": "max_lead_time", "silence": "optimiser_timeout",
+    "surprise": "max_prediction_error", "patience": "sensor_timeout", "jump": "max_innovation",
+    "frozen": "frozen_threshold", "settle": "sensor_settling_time", "near": "settled_radius",
+    "margin": "min_margin", "travel": "max_travel", "lost": "fall_angle",
+    "escape": "max_state_norm", "stall": "max_step_interval", "window": "fault_window",
+    "failing": "max_failure_ratio", "sparse": "max_dropout_ratio",
+    "overrun": "max_deadline_miss_ratio", "drift": "max_clock_drift",
+    "bring_up": "bring_up_timeout", "insist": "zero_output_timeout", "home": "target_radius",
+    "homing": "convergence_time",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,15 +60,15 @@ class Recipe:
     Parameters
     ----------
     mechanism
-        Name in the library, or ``FILE.py:NAME`` for one's own.
+        A mechanism, or a name: in the library, or ``FILE.py:NAME`` for one's own.
     parameters
         Values that differ from the library's, SI units.
     start
         Initial state, (2n,); the mechanism's usual one by default, where it has one.
     objective
-        A word of :func:`undertow.objective_for`; ``"bench-energy"`` suits a rig.
+        An objective, or a word of :func:`undertow.objective_for`; ``"bench-energy"`` suits a rig.
     horizon
-        Longest prediction, s.
+        Longest prediction, s; an objective brings its own.
     rig
         ``"ideal"``, or ``"realistic"``: friction, encoders, delay, jitter, spread.
     seed
@@ -68,7 +80,10 @@ class Recipe:
     swing_up
         Begin hanging at rest, where no other start is given, and swing up.
     settings
-        Limits and patience.
+        Limits and timeouts.
+    design
+        A cascade with further settings, for the same mechanism and objective.  Its gate and
+        reaching law are kept if they are not the defaults, which are for exact states.
 
     Raises
     ------
@@ -76,10 +91,10 @@ class Recipe:
         For a name that the library does not have, or a value that cannot be used.
     """
 
-    mechanism: str = "rotary_pendulum"
+    mechanism: str | Mechanism = "rotary_pendulum"
     parameters: Mapping[str, float] = field(default_factory=dict)
     start: tuple[float, ...] = ()
-    objective: Goal = "bench-energy"
+    objective: Goal | Objective = "bench-energy"
     horizon: float = 20.0
     rig: Literal["ideal", "realistic"] = "ideal"
     seed: int = 0
@@ -88,44 +103,72 @@ class Recipe:
     period: float = 0.001
     swing_up: bool = False
     settings: Settings = field(default_factory=Settings)
+    design: Cascade | None = None
+
+    def __repr__(self) -> str:
+        """Show what is run, for what, and where."""
+        goal = self.objective if isinstance(self.objective, str) else self.objective.name
+        name = self.mechanism if isinstance(self.mechanism, str) else self.mechanism.name
+        return (
+            f"Recipe({name}, {goal}, {self.rig} rig, period={self.period:g} s, seed={self.seed}"
+            f"{', swing_up=True' if self.swing_up else ''})"
+        )
 
     def __post_init__(self) -> None:
         """Refuse an unknown objective, a period that no loop keeps, and a horizon too far."""
-        if self.objective not in get_args(Goal):
-            raise InvalidInputError(
-                "objective of a run",
-                value=repr(self.objective),
-                limit=f"one of {', '.join(get_args(Goal))}",
-                remedy=near(str(self.objective), get_args(Goal)),
-            )
+        if not isinstance(self.objective, Objective):
+            one_of("objective of a run", self.objective, get_args(Goal))
         for what in ("period", "horizon"):
             number_of(f"{what} of a run", getattr(self, what))
-        stall = self.settings.stall
+        stall = self.settings.max_step_interval
         if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
                 "period of a run",
                 value=f"{self.period:g} s",
                 limit=f"≥ {SHORTEST:g} s and less than the longest gap between two steps, "
                 f"{stall:g} s",
-                remedy="1 ms is usual; a longer one needs Settings(stall=...)",
+                remedy="1 ms is usual; a longer one needs Settings(max_step_interval=...)",
             )
         if not 0 < self.horizon <= FARTHEST:
             raise InvalidInputError(
                 "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
             )
-        if self.rig not in ("ideal", "realistic"):
-            raise InvalidInputError("rig of a run", value=self.rig, limit="ideal or realistic")
+        one_of("rig of a run", self.rig, ("ideal", "realistic"))
 
     @cached_property
     def belief(self) -> Mechanism:
         """The controller's model."""
-        return named(self.mechanism).with_parameters(**self.parameters)
+        known = named(self.mechanism) if isinstance(self.mechanism, str) else self.mechanism
+        return known.with_parameters(**self.parameters)
 
-    def of(self, mechanism: Mechanism) -> Self:
-        """Return the same recipe for a mechanism that is at hand, whatever its name says."""
-        other = replace(self)
-        vars(other)["belief"] = mechanism.with_parameters(**self.parameters)
-        return other
+    def in_names(self) -> Self | None:
+        """Return the same recipe with names in place of objects; None where they have none."""
+        belief, made = self.belief, self
+        if isinstance(self.mechanism, Mechanism):
+            known = LIBRARY[belief.name]() if belief.name in LIBRARY else None
+            if known is None or known.structure != belief.structure:
+                return None
+            values = {p.name: p.value for p in belief.parameters}
+            made = replace(made, mechanism=belief.name, parameters=values)
+            if made.belief.fingerprint != belief.fingerprint:
+                return None
+        goal = self.objective
+        if isinstance(goal, Objective):
+            known_goals = (
+                word
+                for word in get_args(Goal)
+                if objective_for(made.belief, word, horizon=goal.horizon) == goal.on(belief)
+            )
+            named_goal = next(known_goals, None)
+            if named_goal is None or goal.horizon > FARTHEST:
+                return None
+            made = replace(made, objective=named_goal, horizon=goal.horizon)
+        if self.design is not None:
+            usual = Cascade(self.design.mechanism, self.design.objective, seed=self.seed)
+            settings = [f.name for f in fields(usual) if f.name not in ("mechanism", "objective")]
+            if any(getattr(self.design, name) != getattr(usual, name) for name in settings):
+                return None
+        return replace(made, design=None)
 
     @cached_property
     def x0(self) -> FloatArray:
@@ -139,14 +182,16 @@ class Recipe:
     @cached_property
     def cascade(self) -> Cascade:
         """Law, optimiser and gate."""
-        estimator = self.make_estimator()
-        return Cascade(
-            self.belief,
-            objective_for(self.belief, self.objective, horizon=self.horizon),
-            reaching_for(estimator),
-            warm=Budget(self.evaluations, self.seconds),
-            gate=default_gate(estimator),
-            seed=self.seed,
+        estimator, goal = self.make_estimator(), self.objective
+        if not isinstance(goal, Objective):
+            goal = objective_for(self.belief, goal, horizon=self.horizon)
+        design = self.design or Cascade(self.belief, goal, seed=self.seed)
+        given = design.reaching != ReachingLaw()
+        return replace(
+            design,
+            reaching=design.reaching if given else reaching_for(estimator),
+            warm=design.warm or Budget(self.evaluations, self.seconds),
+            gate=default_gate(estimator) if design.gate is cost_gate else design.gate,
         )
 
     @cached_property
@@ -173,7 +218,7 @@ class Recipe:
         """Answer a request of the fast loop: what the slow loop computes."""
         return respond(self.cascade, request, self.swing)
 
-    def rehearse(self, memory: CascadeState) -> None:
+    def precompile(self, memory: CascadeState) -> None:
         """Make everything compile that an answer may need, whatever the gate refuses before.
 
         A run that begins balanced has most of it from its first optimum; one that swings up
@@ -186,6 +231,12 @@ class Recipe:
             self.respond(Request(0.0, x, step, memory, 0))
         self.respond(Request(0.0, x, step, memory))
         derate_actuator(cascade.loop, RESERVE).batch(x, memory.plan, duration=step)
+
+    @property
+    def output_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Largest |u|, and largest change of u in one period, (m,) each."""
+        settings = self.settings
+        return settings.limits(self.belief), settings.slew(self.belief) * self.period
 
     @cached_property
     def bench(self) -> Bench:
@@ -217,8 +268,10 @@ class Recipe:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values from which :meth:`from_dict` makes the recipe again."""
-        return asdict(self) | {"words": WORDS}
+        """JSON values from which :meth:`from_dict` makes the recipe again, if it is all data."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        del values["design"]
+        return values | {"settings": asdict(self.settings), "words": WORDS}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -233,7 +286,8 @@ class Recipe:
         for name, kind in (("start", taken["start"]), ("parameters", taken["parameters"].values())):
             if not all(isinstance(v, int | float) for v in kind):
                 raise InvalidInputError(f"{name} of a recipe", value=kind, limit="numbers")
-        settings = Settings(**_of_types(Settings, taken["settings"]))
+        renamed = {OLD_SETTINGS.get(name, name): v for name, v in taken["settings"].items()}
+        settings = Settings(**_of_types(Settings, renamed))
         return cls(**{**taken, "start": tuple(taken["start"]), "settings": settings})
 
 
@@ -246,6 +300,7 @@ def _of_types(made: type, values: Mapping[str, Any]) -> dict[str, Any]:
         With the first that is refused.
     """
     usual = {item.name: getattr(made(), item.name) for item in fields(made)}
+    usual.pop("design", None)  # an object, which no file holds
     for name, value in values.items():
         if name not in usual:
             raise InvalidInputError(

@@ -17,20 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import ArtefactError, UndertowError, file_hash, versions
+from undertow.base import ArtefactError, UndertowError, checked, file_hash, versions
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
-from undertow.plants.interface import Measurement
 from undertow.runtime.controller import Controller, Inputs
-from undertow.runtime.encoding import answer_from, memory_from, memory_to
-from undertow.runtime.log import Columns, Recording, read_log
+from undertow.runtime.encoding import Columns, answer_from, memory_from, memory_to
+from undertow.runtime.log import Recording, read_log
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
-from undertow.runtime.slow import Answer, judge
+from undertow.runtime.slow_loop import Answer, judge
 from undertow.symbolic import processor, sources_digest
-
-__all__ = ["Replay", "about", "replay", "replay_controller"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +83,17 @@ def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> 
     controller
         Idle, as the run will start with it.
     recipe
-        From which it was built; without one, a replay needs the controller from its caller.
+        From which it was built; without one, or with one whose mechanism or objective has no
+        name, a replay needs the controller from its caller.
     **more
         Further JSON values.
     """
     mechanism = controller.cascade.mechanism
-    own = recipe is not None and in_a_file(recipe.mechanism)
+    recipe = None if recipe is None else recipe.in_names()
+    name = "" if recipe is None else str(recipe.mechanism)
     return {
         "mechanism": mechanism.name,
-        "source": _source_hash(recipe.mechanism) if recipe is not None and own else None,
+        "source": _source_hash(name) if in_a_file(name) else None,
         "fingerprint": mechanism.fingerprint,
         "units": {i.name: i.unit for i in mechanism.inputs},
         "memory": memory_to(controller.memory),
@@ -111,6 +110,7 @@ def build() -> dict[str, str | None]:
     return {**versions(), **processor(), "sources": sources_digest()[:12]}
 
 
+@checked
 def replay(
     path: Path, *, mechanism: str | Mechanism | None = None, decisions: bool = True
 ) -> Replay:
@@ -151,7 +151,7 @@ def replay(
             values = {**values, "mechanism": mechanism}
         recipe = Recipe.from_dict(values)
         if isinstance(mechanism, Mechanism):
-            recipe = recipe.of(mechanism)
+            recipe = replace(recipe, mechanism=mechanism)
         _check_mechanism(recording, recipe.belief)  # before anything is designed for it
         memory = memory_from(recording.meta["memory"])
         controller = recipe.make_controller(memory)
@@ -248,14 +248,14 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
     differing, first, gap = 0, None, None
     judged = misjudged = 0
     for k, row in enumerate(recording.steps):
-        if int(row[0]) != k:
+        if int(row[columns.k]) != k:
             gap = k
             break
         arrived = answers.get(k, [])
         command = Command[said.get((k, "command"), "NONE")]
         inputs = Inputs(
-            float(row[1]),
-            _measurement(row, columns),
+            float(row[columns.t]),
+            columns.measurement(row),
             arrived[0] if arrived else None,
             command,
             said.get((k, "alarm"), ""),
@@ -266,7 +266,7 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
             for answer in arrived:
                 judged += 1
                 misjudged += not _same_decision(controller, answer)
-        if not _same_step(controller, row, columns):
+        if not columns.agrees(row, controller):
             differing += 1
             first = k if first is None else first
     changed = _changes(recording.meta.get("versions", {}), build())
@@ -286,24 +286,6 @@ def _changes(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple
     return changed
 
 
-def _measurement(row: FloatArray, columns: Columns) -> Measurement | None:
-    if math.isnan(row[5]) and np.isnan(row[columns.q]).all():
-        return None
-    v = row[columns.v]
-    return Measurement(float(row[5]), row[columns.q], None if np.isnan(v).all() else v)
-
-
-def _same_step(controller: Controller, row: FloatArray, columns: Columns) -> bool:
-    pairs = (
-        (controller.u, columns.u),
-        (controller.x, columns.x),
-        (controller.s, columns.s),
-        (controller.demand, columns.demand),
-    )
-    same = all(np.array_equal(values, row[at], equal_nan=True) for values, at in pairs)
-    return same and controller.mode == row[3] and controller.memory.sequence == row[4]
-
-
 def _same_decision(controller: Controller, answer: Answer) -> bool:
     """Let the gate judge a recorded answer again, or look for the surface that catches."""
     cascade = controller.cascade
@@ -311,12 +293,12 @@ def _same_decision(controller: Controller, answer: Answer) -> bool:
         return controller.swing_up.region.surface(answer.x) == answer.proposal.surface
     if answer.proposal.plan is None and answer.proposal.status not in ("failed", "infeasible"):
         return True  # what the optimiser said could not be written down
-    _, admission, lanes = judge(cascade, answer.before, answer.proposal, answer.x, answer.use)
+    _, admission, law_vectors = judge(cascade, answer.before, answer.proposal, answer.x, answer.use)
     cost = admission.cost == answer.admission.cost or (
         math.isnan(admission.cost) and math.isnan(answer.admission.cost)
     )
     return (
         admission.accepted == answer.admission.accepted
         and cost
-        and np.array_equal(lanes, answer.lanes)
+        and np.array_equal(law_vectors, answer.law_vectors)
     )

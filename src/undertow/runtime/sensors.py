@@ -1,4 +1,4 @@
-"""Which readings can be believed: gaps, spikes, frozen channels, clocks that run back.
+"""Which readings can be accepted: gaps, spikes, frozen channels, clocks that run back.
 
 Each reading is compared with what the belief expects one period after the last estimate.
 A reading that stands still is compared with the model running freely from when it last
@@ -18,21 +18,10 @@ from typing import Any
 
 from undertow.base import InvalidInputError
 from undertow.models import FloatArray, Mechanism
-from undertow.plants.interface import Measurement
-from undertow.plants.stepping import dynamics_source
+from undertow.plants import Measurement
+from undertow.plants.stepping import compiled_module
 from undertow.runtime.settings import Settings
-from undertow.symbolic import (
-    BRIEF,
-    COMPILED,
-    PREAMBLE,
-    Workspace,
-    content_key,
-    docstring,
-    generated,
-    unpacked,
-)
-
-__all__ = ["LAST_HARMLESS", "SensorWatch"]
+from undertow.symbolic import BRIEF, COMPILED, Workspace, unpacked
 
 #: A model that has run freely for this long starts again, s.
 REST = 0.3
@@ -40,7 +29,7 @@ REST = 0.3
 #: When nothing has moved for this long a probe begins; it lasts so long, each side of it, s.
 PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
 
-#: What :meth:`SensorWatch.check` found: nothing wrong; no sound reading yet; none for too long; a
+#: What :meth:`SensorMonitor.check` found: nothing wrong; no sound reading yet; none for too long; a
 #: sensor lost for too long; one that stands still; one that is missing too often.  What comes
 #: after the second is a fault.
 SOUND, NOT_YET, NEVER, LOST, FROZEN, SPARSE = range(6)
@@ -58,7 +47,7 @@ _LAYOUT = {
 
 _BODY = f"""
 {COMPILED}
-def roll(h, x, u, viscous, parameters, work):
+def heun_step(h, x, u, viscous, parameters, work):
     # Heun's step of the belief, in place: readings are compared to far less than its error.
     n = x.shape[0] // 2
     first, second, ahead = work[0], work[1], work[2]
@@ -73,7 +62,7 @@ def roll(h, x, u, viscous, parameters, work):
 
 
 {COMPILED}
-def slow(h, x, band, gain, parameters, W):
+def coulomb_impulse(h, x, band, gain, parameters, W):
     # Impulses of dry friction in the driven joints, of the size of the dead band, in place.
     n = x.shape[0] // 2
     mobility(x, parameters, W)
@@ -86,13 +75,12 @@ def slow(h, x, band, gain, parameters, W):
 
 {COMPILED}
 def gate_measurement(x, u, block):
-    # What is not believable becomes NaN; returns how many are missing, where the longest gap
+    # What cannot be accepted becomes NaN; returns how many are missing, where the longest gap
     # is, and which reading is frozen (-1: none).
 {unpacked(_LAYOUT)}
     h, jump, frozen = settings[0], settings[1], settings[2]
-    for i in range(2 * n):
-        expected[i] = x[i]
-    roll(h, expected, u, viscous, parameters, work)
+    expected[:] = x
+    heun_step(h, expected, u, viscous, parameters, work)
     gains(parameters, gain)
     missing, worst, still, moved = 0, 0, -1, False
     probing = quiet[0] >= {PROBE}
@@ -108,8 +96,8 @@ def gate_measurement(x, u, block):
         if gaps[i] > gaps[worst]:
             worst = i
         if q[i] == last[i]:
-            roll(h, free[i], u, viscous, parameters, work)
-            slow(h, free[i], band, gain, parameters, W)
+            heun_step(h, free[i], u, viscous, parameters, work)
+            coulomb_impulse(h, free[i], band, gain, parameters, W)
             ages[i] += h
             if abs(free[i, i] - q[i]) > frozen:
                 still = i
@@ -117,15 +105,13 @@ def gate_measurement(x, u, block):
                 still = i
             if ages[i] > {REST} or (quiet[0] < {PROBE} <= quiet[0] + h):
                 ages[i] = 0.0
-                for j in range(2 * n):
-                    free[i, j] = x[j]
+                free[i] = x
                 free[i, i], free[i, n + i] = q[i], 0.0
         elif q[i] == q[i]:
             moved = True
             counts[i] = min(counts[i], abs(q[i] - last[i]))
             ages[i] = 0.0
-            for j in range(2 * n):
-                free[i, j] = x[j]
+            free[i] = x
             free[i, i] = last[i] = q[i]
     quiet[0] = 0.0 if moved or quiet[0] > {PROBE + PROBES} else quiet[0] + h
     return missing, worst, still
@@ -152,10 +138,9 @@ def check(stamp, x, u, block):
         size += abs(q[i])
     if clock[3] == 0.0 and size < math.inf:
         clock[3] = 1.0
+        last[:] = q
         for i in range(n):
-            last[i] = q[i]
-            for j in range(n):
-                free[i, j], free[i, n + j] = q[j], 0.0
+            free[i, :n], free[i, n:] = q, 0.0
         return {SOUND}, 0, 0, True, clock[1], 0.0
     if clock[3] == 0.0:
         clock[2] += settings[0]
@@ -176,17 +161,10 @@ def check(stamp, x, u, block):
 
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
-    key = content_key(mechanism.structure, mechanism.name)
-
-    def write() -> str:
-        header = docstring(f"Sensor watch of {mechanism.name}; generated, do not edit.")
-        sizes = f"n, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
-        return f"{header}{PREAMBLE}{sizes}\n\n{dynamics_source(mechanism)}\n{_BODY}"
-
-    return generated("watch", mechanism.name, key, write)
+    return compiled_module(mechanism, "watch", "Sensor watch", _BODY)
 
 
-class SensorWatch:
+class SensorMonitor:
     """Compares readings with what the model expects; short gaps are left to the estimator.
 
     Parameters
@@ -194,14 +172,14 @@ class SensorWatch:
     mechanism
         The controller's belief.
     settings
-        How far and how long to believe.
+        Limits of innovations and of gaps.
     period
         Of the fast loop, s.
 
     Attributes
     ----------
     missing
-        Readings of the last step that are missing or not believed.
+        Readings of the last step that are missing or not accepted.
     first
         Whether the last step was the first with a sound reading.
     probe
@@ -216,14 +194,15 @@ class SensorWatch:
         self._block, self._clock, self._gaps = memory.block, memory["clock"], memory["gaps"]
         self._ages, self._quiet, self._shares = memory["ages"], memory["quiet"], memory["shares"]
         memory["settings"][:] = (
-            period, settings.jump, settings.frozen, settings.patience, settings.stall,
-            min(1.0, period / settings.window), settings.sparse,
+            period, settings.max_innovation, settings.frozen_threshold, settings.sensor_timeout,
+            settings.max_step_interval, min(1.0, period / settings.fault_window),
+            settings.max_dropout_ratio,
         )  # fmt: skip
         memory["parameters"][:] = mechanism.parameter_values
         memory["counts"][:] = 0.01
         memory["band"][:] = settings.bands(mechanism)
-        self._q, self._v, self._window = memory["q"], memory["v"], settings.window
-        self._believed = Measurement(0.0, self._q)
+        self._q, self._v, self._window = memory["q"], memory["v"], settings.fault_window
+        self._accepted = Measurement(0.0, self._q)
         self.forget()
 
     def forget(self) -> None:
@@ -235,7 +214,7 @@ class SensorWatch:
     def check(
         self, measurement: Measurement | None, x: FloatArray, u: FloatArray
     ) -> tuple[Measurement | None, int, int]:
-        """Return what can be believed of a measurement, and what is wrong for too long.
+        """Return what can be accepted of a measurement, and what is wrong for too long.
 
         Parameters
         ----------
@@ -260,17 +239,17 @@ class SensorWatch:
         InvalidInputError
             When the rig does not give one number per coordinate.
         """
-        stamp, believed = math.nan, self._believed
+        stamp, accepted = math.nan, self._accepted
         if measurement is not None:
             stamp = float(measurement.t)
             self._take(measurement.q, self._q)
             if measurement.v is not None:
                 self._take(measurement.v, self._v)
-            believed.v = None if measurement.v is None else self._v
-        found, where, self.missing, self.first, believed.t, self.probe = self._check(
+            accepted.v = None if measurement.v is None else self._v
+        found, where, self.missing, self.first, accepted.t, self.probe = self._check(
             stamp, x, u, self._block
         )
-        return (None if found in (NOT_YET, NEVER) else believed), found, where
+        return (None if found in (NOT_YET, NEVER) else accepted), found, where
 
     @staticmethod
     def _take(said: FloatArray, place: FloatArray) -> None:

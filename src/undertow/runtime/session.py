@@ -3,34 +3,102 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
+import math
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any, Self
 
-from undertow.cascade import CascadeState
-from undertow.plants.interface import Rig
+from numpy.typing import ArrayLike
+
+from undertow.base import InvalidInputError, checked, positive
+from undertow.cascade import Cascade, CascadeState
+from undertow.models.importers.python_file import in_a_file
+from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
 from undertow.runtime.clock import SimulatedClock, WallClock
-from undertow.runtime.log import Columns, Log, check_log
+from undertow.runtime.encoding import Columns
+from undertow.runtime.log import Log, check_log
 from undertow.runtime.loop import Runtime
 from undertow.runtime.processes import (
-    STOPPING,
     check_resources,
-    held_back,
-    refused_by_the_system,
+    resource_errors,
+    signals_deferred,
+    signals_handled,
+    signals_ignored,
 )
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
-from undertow.runtime.slow import (
-    Compute,
-    InlineWorker,
-    Worker,
-    background_worker,
-)
+from undertow.runtime.settings import Settings
+from undertow.runtime.slow_loop import InlineWorker, Worker, background_worker
+from undertow.runtime.supervisor import SupervisedRig
+from undertow.runtime.verdict import Report
 
-__all__ = ["session", "warm_up"]
+
+def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
+    """Return the rig that is asked for, or nothing for one that the recipe itself makes.
+
+    Parameters
+    ----------
+    word
+        ``ideal``, ``realistic``, ``mujoco``, ``FILE.xml`` or ``FILE.py:NAME``.
+    recipe
+        Of the run.
+    supervised
+        Whether a process of its own holds the rig.
+
+    Raises
+    ------
+    InvalidInputError
+        For another word, and for a driver of another period than the fast loop's.
+    """
+
+    def held(make: Callable[[], Rig]) -> Rig:
+        return SupervisedRig(make, recipe.period, *recipe.output_bounds)
+
+    if word in ("ideal", "realistic"):
+        return held(recipe.make_rig) if supervised else None
+    if in_a_file(word):
+        plant = rig_from_file(word, recipe.belief)
+        if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
+            plant.close()
+            raise InvalidInputError(
+                f"period of '{word}'",
+                value=f"{plant.period:g} s",
+                limit=f"that of the fast loop, {recipe.period:g} s",
+                remedy=f"Write --period {plant.period:g}",
+            )
+        if not supervised:
+            return plant
+        plant.close()  # it can be made; now the process that will hold it makes it
+        return held(lambda: rig_from_file(word, recipe.belief))
+    if word == "mujoco" or word.endswith(".xml"):
+        scene = None if word == "mujoco" else Path(word)
+
+        def engine() -> Rig:
+            return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, period=recipe.period)
+
+        return held(engine) if supervised else engine()
+    raise InvalidInputError(
+        "rig",
+        value=repr(word),
+        limit="ideal, realistic, mujoco, FILE.xml or FILE.py:NAME",
+        remedy="A driver of your own: see examples/serial_rig.py",
+    )
+
+
+@contextmanager
+def closed_on_failure(plant: Rig | None) -> Iterator[list[Rig]]:
+    """Close a rig that no run has taken over: what fails before may have left it energised.
+
+    Who takes the rig over clears the list that is yielded.
+    """
+    kept = [] if plant is None else [plant]
+    try:
+        yield kept
+    finally:
+        for rig in kept:
+            with signals_ignored(), suppress(Exception):  # a driver may do anything
+                rig.close()
 
 
 @contextlib.contextmanager
@@ -41,7 +109,7 @@ def session(
     simulated: bool = False,
     processes: int = 3,
     rig: Rig | None = None,
-    shadow: bool = True,
+    lockstep: bool = True,
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Runtime]:
     """Make a runtime ready from a recipe: first optimum, everything compiled and connected.
@@ -58,7 +126,7 @@ def session(
         For the optimiser, see :func:`undertow.runtime.background_worker`; 0: a thread.
     rig
         The plant; the recipe's simulated one by default.
-    shadow
+    lockstep
         Against the wall clock: make every step again, see :class:`undertow.runtime.Runtime`.
     progress
         Called with (what, fraction) before each part.
@@ -79,67 +147,135 @@ def session(
     KeyboardInterrupt
         When a stop is asked for, by whatever signal, before it is ready.
     """
+    tell = progress or (lambda _what, _fraction: None)
     with contextlib.ExitStack() as stack:
-        operator = stack.enter_context(_Operator())  # until the log and all else is closed
-        with operator.preparing(), refused_by_the_system("a session"):
-            runtime = _prepared(recipe, stack, log, simulated, processes, rig, shadow, progress)
-            operator.runtime = runtime
+        signals = _StopSignals()
+        stack.enter_context(signals_handled(signals.stop))  # until the log and all else is closed
+        with signals.preparing(), resource_errors("a session"):
+            check_resources(processes=0 if simulated else processes, log=log is not None)
+            if log is not None:
+                check_log(log)  # before the first optimum, which takes a while
+            tell("first optimum", 0.1)
+            plant = recipe.make_rig() if rig is None else rig
+            memory = recipe.first()
+            tell("warming up", 0.6)
+            warm_up(recipe, memory)
+            controller = recipe.make_controller(memory)
+            meta, book = about(controller, recipe, simulated=simulated), None
+            with signals_deferred():  # what is opened is closed
+                # First the processes are forked, then threads begin.
+                worker: Worker = InlineWorker(recipe.respond)
+                if not simulated:
+                    worker = background_worker(recipe.respond, processes=processes)
+                stack.callback(worker.close)
+                if log is not None:
+                    columns = Columns.of(recipe.belief)
+                    book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
+            clock = SimulatedClock() if simulated else WallClock()
+            double = recipe.make_controller(memory) if lockstep and not simulated else None
+            runtime = Runtime(controller, plant, worker, clock=clock, log=book, lockstep=double)
+            tell("ready", 1.0)
+            signals.runtime = runtime
         yield runtime
 
 
-def _prepared(
-    recipe: Recipe,
-    stack: contextlib.ExitStack,
-    log: Path | None,
-    simulated: bool,
-    processes: int,
-    rig: Rig | None,
-    shadow: bool,
-    progress: Callable[[str, float], None] | None,
-) -> Runtime:
-    """Make a runtime ready; what is to be closed goes on the stack."""
+@checked
+def run(
+    cascade: Cascade,
+    rig: Rig | None = None,
+    *,
+    seconds: float = 20.0,
+    x0: ArrayLike | None = None,
+    log: str | Path | None = None,
+    simulated: bool = False,
+    processes: int = 3,
+    settings: Settings | None = None,
+    progress: Callable[[str, float], None] | None = None,
+    **state: float,
+) -> Report:
+    """Run a cascade on a rig, against the clock, and return how it went.
 
-    def tell(what: str, fraction: float) -> None:
-        if progress is not None:
-            progress(what, fraction)
+    What the cascade leaves at its default for exact states is replaced by what suits a rig: its
+    gate by :func:`undertow.runtime.controller_defaults.default_gate`, its reaching law by one with
+    a boundary layer as thick as the sensors need.
 
-    check_resources(processes=0 if simulated else processes, log=log is not None)
-    if log is not None:
-        check_log(log)  # before the first optimum, which takes a while
-    compute = recipe.respond
-    tell("first optimum", 0.1)
-    plant = recipe.make_rig() if rig is None else rig
-    memory = recipe.first()
-    tell("warming up", 0.6)
-    warm_up(recipe, memory, compute)
-    controller = recipe.make_controller(memory)
-    meta, book = about(controller, recipe, simulated=simulated), None
-    with held_back():  # what is opened is closed
-        # First the processes are forked, then threads begin.
-        worker: Worker = InlineWorker(compute)
-        if not simulated:
-            worker = background_worker(compute, processes=processes)
-        stack.callback(worker.close)
-        if log is not None:
-            columns = Columns.of(recipe.belief)
-            book = stack.enter_context(Log(log, columns, meta, threaded=not simulated))
-    clock = SimulatedClock() if simulated else WallClock()
-    double = recipe.make_controller(memory) if shadow and not simulated else None
-    runtime = Runtime(controller, plant, worker, clock=clock, log=book, shadow=double)
-    tell("ready", 1.0)
-    return runtime
+    Parameters
+    ----------
+    cascade
+        The controller.
+    rig
+        The plant: anything with a ``period``, s, ``read()``, ``write(u)`` and ``close()``, see
+        :class:`undertow.plants.Rig`.  By default a simulated one with friction, encoders and
+        delay.  It is closed at the end.
+    seconds
+        Length of the run, s; then the output is brought to zero.
+    x0
+        Where the mechanism is held at the start, (2n,), or its non-zero entries by name
+        (``phi=0.7``).  With neither, the mechanism's usual ``start``.
+    log
+        File for the log, an SQLite database.
+    simulated
+        In simulated time, as fast as it goes: for simulated rigs.
+    processes
+        For the optimiser; 0: a thread.
+    settings
+        Limits and timeouts of the run.
+    progress
+        Called with (what, fraction) while the run is prepared.
+
+    Returns
+    -------
+    Report
+        ``report.verdict`` says in one word how it ended.
+
+    Raises
+    ------
+    InfeasibleError
+        When the first optimisation finds no admissible surface.
+    InvalidInputError
+        For a rig that is none, or has another period than its controller.
+    ArtefactError
+        When the rig cannot be read, or the log cannot be written.
+    """
+    mechanism, settings = cascade.mechanism, settings or Settings()
+    with closed_on_failure(rig) as kept:
+        positive("length of a run, s", seconds)
+        if rig is not None:
+            check_rig(rig, mechanism)
+        recipe = Recipe(
+            mechanism,
+            start=tuple(mechanism.initial_state(x0, state).tolist()),
+            objective=cascade.objective,
+            rig="ideal" if isinstance(rig, IdealRig) else "realistic",
+            seed=cascade.seed,
+            period=0.001 if rig is None else rig.period,
+            seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
+            settings=settings,
+            design=cascade,
+        )
+        prepared = session(
+            recipe,
+            log=None if log is None else Path(log),
+            simulated=simulated,
+            processes=processes,
+            rig=rig,
+            progress=progress,
+        )
+        with prepared as runtime:
+            kept.clear()  # a run closes its rig
+            return runtime.run(seconds)
 
 
-def warm_up(recipe: Recipe, memory: CascadeState, compute: Compute) -> None:
+def warm_up(recipe: Recipe, memory: CascadeState) -> None:
     """Make a short run in simulated time and throw it away, so that everything is compiled."""
-    recipe.rehearse(memory)
-    controller, lead = recipe.make_controller(memory), recipe.settings.lead
-    worker = InlineWorker(compute, 0.5 * lead)
+    recipe.precompile(memory)
+    controller, lead = recipe.make_controller(memory), recipe.settings.lead_time
+    worker = InlineWorker(recipe.respond, 0.5 * lead)
     runtime = Runtime(controller, recipe.make_rig(), worker, clock=SimulatedClock())
-    runtime.run(min(recipe.settings.settle + 1.2 * lead, 1.0))
+    runtime.run(min(recipe.settings.sensor_settling_time + 1.2 * lead, 1.0))
 
 
-class _Operator:
+class _StopSignals:
     """Lets Ctrl-C, a polite kill and a lost terminal ask for a safe stop; and Ctrl-Z.
 
     A process that is suspended leaves its output on.  While a session is prepared it is given
@@ -150,18 +286,6 @@ class _Operator:
     def __init__(self) -> None:
         self.runtime: Runtime | None = None
         self._asked, self._preparing = False, False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            for number in STOPPING:
-                if signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` wants it so
-                    self._before[number] = signal.signal(number, self._stop)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
 
     @contextlib.contextmanager
     def preparing(self) -> Iterator[None]:
@@ -174,7 +298,8 @@ class _Operator:
         if self._asked:  # something that cannot be interrupted had kept it to itself
             raise KeyboardInterrupt
 
-    def _stop(self, _signal: int, _frame: FrameType | None) -> None:
+    def stop(self, _signal: int, _frame: FrameType | None) -> None:
+        """Handle a signal that asks for a stop."""
         self._asked = True
         if self.runtime is not None:
             self.runtime.stop()

@@ -1,4 +1,4 @@
-"""What a run keeps to: limits of the output, patience with sensors, optimiser and clock."""
+"""What a run keeps to: limits of the output, and timeouts of sensors, optimiser and clock."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from undertow.base import InvalidInputError
+from undertow.base import positive
 from undertow.models import FloatArray, Mechanism
-
-__all__ = ["Settings"]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Limits and patience of the fast loop.
+    """Limits and timeouts of the fast loop.
 
     Parameters
     ----------
@@ -24,96 +22,92 @@ class Settings:
     slew_time
         Shortest time in which an input may cross its whole range, s: the slew rate is
         2 u_max / slew_time.  Inputs without a limit have none on their rate either.
-    lead, longest_lead
+    lead_time, max_lead_time
         How far ahead proposals are computed, s: from a request to the use of its answer.
-        It starts at ``lead``, grows by half when an answer comes late, and shrinks by a tenth
+        It starts at ``lead_time``, grows by half when an answer comes late, and shrinks by a tenth
         when one comes in less than half of it.
-    silence
+    optimiser_timeout
         An optimiser that has not answered for this long after its time is replaced, s.
-    surprise
+    max_prediction_error
         A proposal is refused when, at its time of use, an entry of the state is off the
         predicted one by more than this, in units of 1 + |entry|.
-    patience
+    sensor_timeout
         Longest gap in a sensor that the model bridges, s.
-    jump
-        Largest believable difference between a position and its prediction, rad or m, besides
-        two periods of motion at the present speed.
-    frozen
+    max_innovation
+        Largest difference between a position and its prediction that is accepted, rad or m,
+        besides two periods of motion at the present speed.
+    frozen_threshold
         A reading that does not move while the model has moved by this, rad or m, is frozen.
     dead_band
         Part of the input's limit that friction may swallow without anything moving.
-    settle
+    sensor_settling_time
         The sensors must have been sound for this long before the law takes over, s.
-    near
+    settled_radius
         ‖(q_u, q̇_u)‖₂ of the unactuated coordinates within which the mechanism counts as
         settled; beyond twice that it does not.
-    margin
+    min_margin
         det Γ(q)/det Γ(0) below which the law is taken to be lost, (37).
-    travel
+    max_travel
         Largest |q_i|, rad or m, besides the ranges of the coordinates.
-    lost
-        A free angle further than this from the target has been thrown out, rad.
-    escape
-        ‖x‖₂ beyond which the mechanism has been thrown out, whatever the predictions' own limit.
-    stall
+    fall_angle
+        A free angle further than this from the target has fallen, rad.
+    max_state_norm
+        ‖x‖₂ beyond which the motion has escaped, whatever the predictions' own limit.
+    max_step_interval
         Longest gap between two steps, s; after a longer one the loop stops safely.
-    window, failing, sparse
-        When more than the share ``failing`` of the reads or of the writes fail, or more than
-        ``sparse`` of the readings of one sensor are missing, over a sliding window of this
-        length, s, the loop stops safely.
-    overrun
+    fault_window, max_failure_ratio, max_dropout_ratio
+        When more than the share ``max_failure_ratio`` of the reads or of the writes fail, or more
+        than ``max_dropout_ratio`` of the readings of one sensor are missing, over a sliding window
+        of this length, s, the loop stops safely.
+    max_deadline_miss_ratio
         When more than this share of the periods of the last second had no step that ended in
         time, the loop stops safely.
-    drift
+    max_clock_drift
         The rig's clock may go wrong against the host's, or against the steps made, by this much
         in a second, s; beyond that the loop stops safely.
-    bring_up
+    bring_up_timeout
         Longest bring-up, s; when the law cannot take over by then the loop stops safely.
-    insist
+    zero_output_timeout
         How long a rig that does not take an output of zero is asked again after a safe stop, s.
-    home, homing
-        ‖x‖₂ within which a run that ends settled has come home; and how long after it has
-        settled, s, it is on its way and may be four times as far away.
+    target_radius, convergence_time
+        ‖x‖₂ within which a run that ends settled has reached the target; and how long after
+        it has settled, s, it is converging and may be four times as far away.
     """
 
     output_limit: float = math.inf
     slew_time: float = 0.004
-    lead: float = 0.1
-    longest_lead: float = 0.5
-    silence: float = 0.5
-    surprise: float = 0.5
-    patience: float = 0.02
-    jump: float = 0.05
-    frozen: float = 0.25
+    lead_time: float = 0.1
+    max_lead_time: float = 0.5
+    optimiser_timeout: float = 0.5
+    max_prediction_error: float = 0.5
+    sensor_timeout: float = 0.02
+    max_innovation: float = 0.05
+    frozen_threshold: float = 0.25
     dead_band: float = 0.05
-    settle: float = 0.02
-    near: float = 0.2
-    margin: float = 0.02
-    travel: float = math.inf
-    lost: float = math.pi / 2
-    escape: float = 500.0
-    stall: float = 0.1
-    window: float = 0.25
-    failing: float = 0.2
-    sparse: float = 0.6
-    overrun: float = 0.3
-    drift: float = 0.1
-    bring_up: float = 2.0
-    insist: float = 1.0
-    home: float = 0.35
-    homing: float = 5.0
+    sensor_settling_time: float = 0.02
+    settled_radius: float = 0.2
+    min_margin: float = 0.02
+    max_travel: float = math.inf
+    fall_angle: float = math.pi / 2
+    max_state_norm: float = 500.0
+    max_step_interval: float = 0.1
+    fault_window: float = 0.25
+    max_failure_ratio: float = 0.2
+    max_dropout_ratio: float = 0.6
+    max_deadline_miss_ratio: float = 0.3
+    max_clock_drift: float = 0.1
+    bring_up_timeout: float = 2.0
+    zero_output_timeout: float = 1.0
+    target_radius: float = 0.35
+    convergence_time: float = 5.0
 
     def __post_init__(self) -> None:
         """Refuse what is not positive."""
         for item in fields(self):
             value = getattr(self, item.name)
-            if not value > 0:
-                raise InvalidInputError(
-                    f"{item.name} of a run",
-                    value=value,
-                    limit="> 0",
-                    remedy="Leave it out for the usual value",
-                )
+            positive(
+                f"{item.name} of a run", value, "Leave it out for the usual value", infinite=True
+            )
 
     def limits(self, mechanism: Mechanism) -> FloatArray:
         """Largest |u_i|, (m,)."""
@@ -130,6 +124,6 @@ class Settings:
 
     def travels(self, mechanism: Mechanism) -> FloatArray:
         """Lowest and highest positions, (n, 2), rad or m."""
-        low = [max(c.low, -self.travel) for c in mechanism.coordinates]
-        high = [min(c.high, self.travel) for c in mechanism.coordinates]
+        low = [max(c.low, -self.max_travel) for c in mechanism.coordinates]
+        high = [min(c.high, self.max_travel) for c in mechanism.coordinates]
         return np.column_stack([low, high])

@@ -7,33 +7,35 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
 from undertow.law import LAYOUT, Switching, law_module
 from undertow.models import FloatArray, Mechanism
+from undertow.objective import Objective
 from undertow.runtime.modes import Mode
 from undertow.runtime.settings import Settings
 from undertow.symbolic import (
     BRIEF,
     PREAMBLE,
+    Tape,
     Workspace,
     content_key,
     docstring,
+    function_source,
     generated,
     numba,
     unpacked,
 )
 
-__all__ = ["PAST", "UNSOUND", "confine", "off_by", "settle", "sound", "step_memory", "step_module"]
-
 #: What a step may find wrong by itself: an estimate that is no number, a coordinate past its
 #: travel.
-UNSOUND, PAST = 1, 2
+NOT_FINITE, BEYOND_TRAVEL = 1, 2
 
-#: What a step remembers, after what the law does; settings: margin, escape, near, lost, settle,
-#: period, what a missing reading takes off the time that the sensors were sound; off: by how
-#: much the state is off the expected one, and the margin of a new law there.
+#: What a step remembers, after what the law does; settings: margin, escape, near, fall angle,
+#: settling time of the sensors, period, what a missing reading takes off the time that they were
+#: sound; off: by how much the state is off the expected one, and the margin of a new law there.
 _LAYOUT = LAYOUT | {
-    "x": "2 * n", "home": "2 * n", "turn": "2 * n", "wanted": "m", "output": "m", "slew": "m",
+    "x": "2 * n", "wrapped": "2 * n", "turn": "2 * n", "wanted": "m", "output": "m", "slew": "m",
     "settings": "7", "low": "n", "high": "n", "angles": "n", "band": "m", "since": "1",
     "expected": "2 * n", "off": "2",
 }  # fmt: skip
@@ -41,40 +43,41 @@ _LAYOUT = LAYOUT | {
 _BODY = f"""
 {BRIEF}
 def act(
-    estimate, disturbance, lane, new, most, block, mode, command, wrong, missing, swings, probe
+    estimate, disturbance, law_vector, new, max_error, block, mode, command, wrong, missing, swings,
+    probe,
 ):
     # From an estimate to the next state and the output.  A new surface is put to use if the state
-    # is off the one expected by at most ``most``, and if its law is sound there: it is then the
-    # law of this step.  Returns whether it is, the state, the reason for a change, what is wrong
-    # with the estimate and with which coordinate.  While it swings up, the output is left to the
-    # caller.
+    # is off the one expected by at most ``max_error``, and if its law is sound there: it is then
+    # the law of this step.  Returns whether it is, the state, the reason for a change, what is
+    # wrong with the estimate and with which coordinate.  While it swings up, the output is left to
+    # the caller.
 {unpacked(_LAYOUT)}
     what, where = 0, 0
-    if not settle(estimate, turn, x, home):
-        what = {UNSOUND}
+    if not accept_estimate(estimate, turn, x, wrapped):
+        what = {NOT_FINITE}
     else:
         for i in range(n):
             if what == 0 and not (low[i] <= x[i] <= high[i]):
-                what, where = {PAST}, i
+                what, where = {BEYOND_TRAVEL}, i
     fault = wrong or what != 0
     used = False
     off[0] = off[1] = math.nan
-    if most >= 0.0:
-        off[0] = off_by(home, expected)
-        if off[0] <= most:
-            law(home, new, block)
+    if max_error >= 0.0:
+        off[0] = relative_error(wrapped, expected)
+        if off[0] <= max_error:
+            law(wrapped, new, block)
             off[1] = margin[0]
             used = margin[0] > settings[0]
     if not used:
-        law(home, lane, block)
+        law(wrapped, law_vector, block)
     part = whole = away = 0.0
     for i in range(2 * n):
-        square = home[i] * home[i]
+        square = wrapped[i] * wrapped[i]
         whole += square
         if i % n >= m:
             part += square
         if i < n and angles[i] > 0.0:
-            away = max(away, abs(home[i]))
+            away = max(away, abs(wrapped[i]))
     if missing:
         since[0] = max(0.0, since[0] - settings[6])
     else:
@@ -93,15 +96,16 @@ def act(
         for i in range(m):
             wanted[i] += 2.0 * probe * band[i]
     else:
-        for i in range(m):
-            wanted[i] = 0.0
+        wanted[:] = 0.0
     if after != {Mode.SWING_UP:d}:
-        confine(wanted, output, limits, slew)
+        limit_output(wanted, output, limits, slew)
     return used, after, reason, what, where
 """
 
 
-def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: float) -> Workspace:
+def step_memory(
+    mechanism: Mechanism, settings: Settings, period: float, fall_angle: float
+) -> Workspace:
     """Return what a step of the fast loop works on, its settings filled in.
 
     Parameters
@@ -112,7 +116,7 @@ def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: f
         Limits and patience.
     period
         Of the fast loop, s.
-    lost
+    fall_angle
         A free angle further than this from the target has been thrown out, rad.
     """
     n, m = mechanism.n, mechanism.m
@@ -123,8 +127,9 @@ def step_memory(mechanism: Mechanism, settings: Settings, period: float, lost: f
     slew = settings.slew(mechanism) * period
     memory["slew"][:] = np.where(np.isfinite(slew), slew, np.inf)
     memory["settings"][:] = (
-        settings.margin, settings.escape, settings.near, lost, settings.settle, period,
-        period * max(0.0, 1.0 / settings.sparse - 1.0),
+        settings.min_margin, settings.max_state_norm, settings.settled_radius, fall_angle,
+        settings.sensor_settling_time, period,
+        period * max(0.0, 1.0 / settings.max_dropout_ratio - 1.0),
     )  # fmt: skip
     memory["low"][:], memory["high"][:] = settings.travels(mechanism).T
     memory["angles"][m:] = [c.unit == "rad" for c in mechanism.coordinates[m:]]
@@ -143,9 +148,9 @@ def step_module(mechanism: Mechanism, switching: Switching) -> Any:
         header = docstring(f"Fast step of {mechanism.name}; generated, do not edit. {key[:16]}")
         parts = (
             f"from {law.__name__} import step as law\n"
-            "from undertow.estimators.compensation import subtract_disturbance\n"
+            "from undertow.estimators.drive import subtract_disturbance\n"
             "from undertow.runtime.modes import transition\n"
-            "from undertow.runtime.steps import confine, off_by, settle\n"
+            "from undertow.runtime.steps import limit_output, relative_error, accept_estimate\n"
             f"\np, n, m = {len(mechanism.parameters)}, {mechanism.n}, {mechanism.m}\n"
         )
         return f"{header}{PREAMBLE}{parts}\n\n{_BODY}"
@@ -154,7 +159,7 @@ def step_module(mechanism: Mechanism, switching: Switching) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def confine(wanted: FloatArray, u: FloatArray, limits: FloatArray, slew: FloatArray) -> None:
+def limit_output(wanted: FloatArray, u: FloatArray, limits: FloatArray, slew: FloatArray) -> None:
     """Bring u, (m,), towards ``wanted`` within limits and within ``slew`` of where it was.
 
     Whatever is no number counts as zero.
@@ -166,7 +171,7 @@ def confine(wanted: FloatArray, u: FloatArray, limits: FloatArray, slew: FloatAr
 
 
 @numba.njit(cache=True, error_model="numpy")
-def off_by(x: FloatArray, expected: FloatArray) -> float:
+def relative_error(x: FloatArray, expected: FloatArray) -> float:
     """Return the largest |x_i − e_i| / (1 + |e_i|); infinite where that is no number."""
     worst = 0.0
     for i in range(x.shape[0]):
@@ -177,7 +182,7 @@ def off_by(x: FloatArray, expected: FloatArray) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sound(numbers: FloatArray) -> bool:
+def all_finite(numbers: FloatArray) -> bool:
     """Whether all numbers, (S, …), are finite, and so is their sum."""
     size = 0.0
     for value in numbers.flat:
@@ -186,8 +191,10 @@ def sound(numbers: FloatArray) -> bool:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def settle(estimate: FloatArray, turn: FloatArray, x: FloatArray, home: FloatArray) -> bool:
-    """Copy a finite estimate into x, and less ``turn`` into ``home``; whether it was finite."""
+def accept_estimate(
+    estimate: FloatArray, turn: FloatArray, x: FloatArray, wrapped: FloatArray
+) -> bool:
+    """Copy a finite estimate into x, and less ``turn`` into ``wrapped``; whether it was finite."""
     size = 0.0
     for i in range(x.shape[0]):
         size += abs(estimate[i])
@@ -195,5 +202,33 @@ def settle(estimate: FloatArray, turn: FloatArray, x: FloatArray, home: FloatArr
         return False
     for i in range(x.shape[0]):
         x[i] = estimate[i]
-        home[i] = estimate[i] - turn[i]
+        wrapped[i] = estimate[i] - turn[i]
     return True
+
+
+@lru_cache(maxsize=64)
+def stage_module(mechanism: Mechanism, objective: Objective) -> Any:
+    """Return the compiled module of Φ(x, u), (21): ``stage(x, u, parameters, cost)``.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's belief.
+    objective
+        Whose stage cost it is; ``cost``, (1,), is filled with it.
+    """
+    stage = objective.stage_cost(mechanism)
+    key = content_key(mechanism.structure, mechanism.name, sp.srepr(stage))
+
+    def write() -> str:
+        tape = Tape()
+        body = function_source(
+            "stage",
+            tape,
+            {"x": mechanism.x, "u": mechanism.u, "parameters": mechanism.parameter_symbols},
+            {"cost": tape.let_all([stage])},
+        )
+        header = f'"""Stage cost of {mechanism.name}; generated, do not edit."""\n\n'
+        return f"{header}{PREAMBLE}\n\n{body}"
+
+    return generated("stage", mechanism.name, key, write)

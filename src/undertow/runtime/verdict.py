@@ -15,8 +15,6 @@ from undertow.runtime.clock import Histogram
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Mode, Reason
 
-__all__ = ["EXIT_CODES", "Ending", "Report", "RunVerdict"]
-
 #: How a run may end.
 Ending = Literal["balanced", "caught", "lost", "stopped", "degraded"]
 
@@ -30,9 +28,9 @@ EXIT_CODES: dict[str, int] = {
 #: missing, of a whole run above which it counts as degraded.
 MISSED, FAILED, MISSING = 0.05, 0.02, 0.2
 
-#: Shortest time for which a run must have been settled at its end, s; and how many times as far
-#: from home one may be that is on its way there.
-SETTLED, ON_ITS_WAY = 0.1, 4.0
+#: Shortest time for which a run must have been settled at its end, s; and how many times the
+#: target's radius away one may be that is converging.
+SETTLED, CONVERGING = 0.1, 4.0
 
 
 @dataclass(eq=False)
@@ -41,18 +39,18 @@ class Report:
 
     Attributes
     ----------
-    steps, missed
+    steps, missed_deadlines
         Steps made, and steps that ended after their period: output, what follows it, log.
-    asleep
+    late_wakeups
         Missed steps that took less than a period, but were woken too late.
-    skipped
+    skipped_periods
         Periods in which no step was made, because an earlier one took too long.
-    think, whole, late, rest
+    computation_times, response_times, wakeup_delays, followup_times
         Time of the fast step's own computation between reading and writing; from when the
         step was due to when its output was written; to when it began; and what follows the
         output: answers judged, requests made, rows of the log copied.
-    shadowed, disagreed
-        Steps that the shadow made again, and those in which its output was another.
+    lockstep_steps, lockstep_mismatches
+        Steps that the lockstep check made again, and those in which its output was another.
     mode, stopped_by
         State at the end, and why the run stopped, if it did.
     entered
@@ -61,26 +59,26 @@ class Report:
         Verdicts on the answers of the slow loop, in a few words each, with their numbers.
     events
         Everything that happened: (t, what, text).
-    variation
+    total_variation
         Total variation of the inputs, Σ|u_k − u_{k−1}|, (m,).
-    last, settled_for
+    mode_before_stop, settled_time
         State before the stop, and for how long it had been *balance* then, s.
-    early
+    stopped_early
         Whether the operator stopped the run before its time.
-    unread, unwritten, missing
+    failed_reads, failed_writes, steps_with_missing_readings
         Reads and writes of the rig that failed; steps in which a reading was missing, or not
-        believed.
-    unsound
+        accepted.
+    invalid_answers
         Answers of the slow loop that were none, or refused as unsound: their numbers are not
         those of their plan, or the plan is not stable.
-    unreached
+    optimiser_failures
         How often the slow loop could not be asked, or nobody was left to take over.
-    off, output
+    output_zero, output_problem
         Whether the device took an output of zero at the end; what went wrong with that, or with
         closing it.
-    error, cost, unit
+    final_error, cost, unit
         ‖x‖₂ of the last estimate, and ∫ Φ dt over the run, in the objective's unit.
-    home, homing
+    target_radius, convergence_time
         Of the settings: what a run that ends settled is measured by.
     system
         What the loop asked of the system, and what it got, in words.
@@ -89,38 +87,44 @@ class Report:
     """
 
     steps: int = 0
-    missed: int = 0
-    asleep: int = 0
-    skipped: int = 0
-    think: Histogram = field(default_factory=Histogram)
-    whole: Histogram = field(default_factory=Histogram)
-    late: Histogram = field(default_factory=Histogram)
-    rest: Histogram = field(default_factory=Histogram)
-    shadowed: int = 0
-    disagreed: int = 0
+    missed_deadlines: int = 0
+    late_wakeups: int = 0
+    skipped_periods: int = 0
+    computation_times: Histogram = field(default_factory=Histogram)
+    response_times: Histogram = field(default_factory=Histogram)
+    wakeup_delays: Histogram = field(default_factory=Histogram)
+    followup_times: Histogram = field(default_factory=Histogram)
+    lockstep_steps: int = 0
+    lockstep_mismatches: int = 0
     mode: Mode = Mode.IDLE
     stopped_by: str = ""
     entered: Counter[str] = field(default_factory=Counter)
     answers: Counter[str] = field(default_factory=Counter)
     events: list[tuple[float, str, str]] = field(default_factory=list)
-    variation: FloatArray = field(default_factory=lambda: np.zeros(0))
-    last: Mode = Mode.IDLE
-    settled_for: float = 0.0
-    early: bool = False
-    unread: int = 0
-    unwritten: int = 0
-    missing: int = 0
-    unsound: int = 0
-    unreached: int = 0
-    off: bool = True
-    output: str = ""
-    error: float = math.nan
+    total_variation: FloatArray = field(default_factory=lambda: np.zeros(0))
+    mode_before_stop: Mode = Mode.IDLE
+    settled_time: float = 0.0
+    stopped_early: bool = False
+    failed_reads: int = 0
+    failed_writes: int = 0
+    steps_with_missing_readings: int = 0
+    invalid_answers: int = 0
+    optimiser_failures: int = 0
+    output_zero: bool = True
+    output_problem: str = ""
+    final_error: float = math.nan
     cost: float = 0.0
     unit: str = ""
-    home: float = math.inf
-    homing: float = 0.0
+    target_radius: float = math.inf
+    convergence_time: float = 0.0
     system: tuple[str, ...] = ()
     log: Log | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        """Show how it ended and what it cost."""
+        steps = f"{self.steps} steps, {self.missed_deadlines} missed"
+        cost = f"cost {self.cost:.4g} {self.unit}".rstrip()
+        return f"Report({self.verdict.ending}, {steps}, {cost})"
 
     @property
     def lost_rows(self) -> int:
@@ -145,20 +149,20 @@ class RunVerdict:
     Attributes
     ----------
     ending
-        ``balanced``: the law held the mechanism to the end, settled and at home.  ``caught``:
-        the law held it to the end, but it was not settled, or not at home.  ``degraded``: one of
-        both, but something was wrong on the way.  ``lost``: thrown out, past its travel, or never
-        caught.  ``stopped``: by the operator before its time, or by a fault.
+        ``balanced``: the law held the mechanism to the end, settled at the target.  ``caught``:
+        the law held it to the end, but it was not settled, or not at the target.  ``degraded``:
+        one of both, but something was wrong on the way.  ``lost``: thrown out, past its travel, or
+        never caught.  ``stopped``: by the operator before its time, or by a fault.
     reasons
         Why, in words.
-    error
+    final_error
         ‖x‖₂ of the last estimate, whole turns of free joints taken off.
     cost
         ∫ Φ dt of the estimates and outputs over the run, in the objective's unit.
-    output
+    output_problem
         What is not known to be off: empty when the device took an output of zero at the end,
         and could be closed.
-    off
+    output_zero
         Whether the device took an output of zero at the end.
     unit
         Of the cost.
@@ -166,22 +170,22 @@ class RunVerdict:
 
     ending: Ending
     reasons: tuple[str, ...]
-    error: float
+    final_error: float
     cost: float
-    output: str = ""
-    off: bool = True
+    output_problem: str = ""
+    output_zero: bool = True
     unit: str = ""
 
     @property
     def exit_code(self) -> int:
         """The exit code of ``undertow run``: 0 for ``balanced`` alone."""
-        return EXIT_CODES[self.ending if self.off else "output on"]
+        return EXIT_CODES[self.ending if self.output_zero else "output on"]
 
     def __str__(self) -> str:
         """Return the verdict in one line."""
-        reasons = "; ".join(filter(None, (*self.reasons, self.output)))
+        reasons = "; ".join(filter(None, (*self.reasons, self.output_problem)))
         cost = f"{self.cost:.4g} {self.unit}".rstrip()
-        numbers = f"‖x‖ = {self.error:.3g} at the end, cost {cost}"
+        numbers = f"‖x‖ = {self.final_error:.3g} at the end, cost {cost}"
         return f"{self.ending}{reasons and f', {reasons}'}; {numbers}"
 
     @classmethod
@@ -190,15 +194,17 @@ class RunVerdict:
         ending, reasons = _ending(report)
         if ending in ("balanced", "caught") and (wrong := _wrong(report)):
             ending, reasons = "degraded", [f"{ending}, but {wrong[0]}", *wrong[1:]]
-        if not report.off and ending not in ("lost", "stopped"):
+        if not report.output_zero and ending not in ("lost", "stopped"):
             ending = "stopped"
-        numbers = report.error, report.cost
-        return cls(ending, tuple(reasons), *numbers, report.output, report.off, report.unit)
+        numbers = report.final_error, report.cost
+        return cls(
+            ending, tuple(reasons), *numbers, report.output_problem, report.output_zero, report.unit
+        )
 
 
 def _ending(report: Report) -> tuple[Ending, list[str]]:
     """Return how the motion ended, before what went wrong on the way is looked at."""
-    why, last = report.stopped_by, report.last
+    why, last = report.stopped_by, report.mode_before_stop
     if why == Reason.THROWN_OUT.text or why.endswith("past its travel"):
         return "lost", [why]
     if why != Reason.STOP.text:
@@ -207,35 +213,47 @@ def _ending(report: Report) -> tuple[Ending, list[str]]:
         return "lost", ["not caught by the end"]
     if last not in (Mode.CATCH, Mode.BALANCE):
         return "stopped", [f"{why} before the law took over"]
-    if report.early:
+    if report.stopped_early:
         return "stopped", [f"{why} before the end, {last.name.lower()}"]
-    if last == Mode.CATCH or report.settled_for < SETTLED:
+    if last == Mode.CATCH or report.settled_time < SETTLED:
         return "caught", ["not settled at the end"]
-    if report.error <= report.home:
+    if report.final_error <= report.target_radius:
         return "balanced", []
-    if report.settled_for <= report.homing and report.error <= ON_ITS_WAY * report.home:
-        return "balanced", [f"settled for {report.settled_for:.1f} s, on its way home"]
-    return "caught", [f"settled for {report.settled_for:.1f} s, but not at home"]
+    if (
+        report.settled_time <= report.convergence_time
+        and report.final_error <= CONVERGING * report.target_radius
+    ):
+        return "balanced", [f"settled for {report.settled_time:.1f} s, converging to the target"]
+    return "caught", [f"settled for {report.settled_time:.1f} s, but not at the target"]
 
 
 def _wrong(report: Report) -> Sequence[str]:
     """Return what was wrong with a run that was held to its end."""
     steps = max(1, report.steps)
-    missed = (report.missed + report.skipped) / (steps + report.skipped)
-    lost = report.lost_rows
+    missed = (report.missed_deadlines + report.skipped_periods) / (steps + report.skipped_periods)
+    lost, incomplete = report.lost_rows, report.steps_with_missing_readings
     facts = (
         (missed > MISSED, f"{missed:.0%} of the deadlines were missed"),
         (lost > 0, f"{lost:,} rows of the log were lost"),
         (report.log_failure != "", f"the log: {report.log_failure}"),
-        (report.disagreed > 0, f"the shadow disagreed in {report.disagreed:,} steps"),
-        (report.unsound > 0, f"{report.unsound:,} answers of the optimiser were unsound"),
-        (report.unreached > 0, f"{report.unreached:,} times the optimiser could not be reached"),
-        (report.unread > FAILED * steps, f"{report.unread:,} reads failed"),
-        (report.unwritten > FAILED * steps, f"{report.unwritten:,} writes failed"),
         (
-            report.missing > MISSING * steps,
-            f"readings were missing in {report.missing / steps:.0%} of the steps",
+            report.lockstep_mismatches > 0,
+            f"the lockstep check disagreed in {report.lockstep_mismatches:,} steps",
         ),
-        (report.output != "", "the rig was not closed"),
+        (
+            report.invalid_answers > 0,
+            f"{report.invalid_answers:,} answers of the optimiser were unsound",
+        ),
+        (
+            report.optimiser_failures > 0,
+            f"{report.optimiser_failures:,} times the optimiser could not be reached",
+        ),
+        (report.failed_reads > FAILED * steps, f"{report.failed_reads:,} reads failed"),
+        (report.failed_writes > FAILED * steps, f"{report.failed_writes:,} writes failed"),
+        (
+            incomplete > MISSING * steps,
+            f"readings were missing in {incomplete / steps:.0%} of the steps",
+        ),
+        (report.output_problem != "", "the rig was not closed"),
     )
     return [text for true, text in facts if true]

@@ -16,34 +16,30 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
+from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import InfeasibleError
-from undertow.base import artefacts as results
+from undertow.base import (
+    InfeasibleError,
+    Progress,
+    finite,
+    manifest,
+    markdown_table,
+    no_progress,
+    number,
+    table,
+    to_csv,
+)
 from undertow.bounds import bound
 from undertow.cascade import Cascade, Run, gate_words
-from undertow.display.plot import display
-from undertow.law import Plan, Surface, linearise
+from undertow.display.plot import state_words
+from undertow.law import Plan, Surface
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, linearise
 from undertow.objective import TRAVEL, Objective, objective_for
 from undertow.optimiser import Budget, DecisionVariables
-
-__all__ = [
-    "TRIALS",
-    "Entry",
-    "Trial",
-    "files",
-    "markdown",
-    "median_gap",
-    "start_words",
-    "summary",
-    "survey",
-    "survey_one",
-    "table",
-]
 
 #: A gap beyond this asks for its cause.
 LARGE = 0.10
@@ -137,7 +133,7 @@ def survey(
     horizon: float = 60.0,
     seed: int = 0,
     bounds: bool = True,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress = no_progress,
     done: Callable[[Entry], None] | None = None,
 ) -> tuple[Entry, ...]:
     """Bring every mechanism from its listed start to its target.
@@ -173,8 +169,7 @@ def survey(
         objective.check_start(mechanism, mechanism.usual_start)
     entries = []
     for index, (mechanism, objective) in enumerate(zip(chosen, objectives, strict=True)):
-        if progress is not None:
-            progress(mechanism.name, index / len(chosen))
+        progress(mechanism.name, index / len(chosen))
         entries.append(survey_one(mechanism, objective, seed=seed, bounds=bounds))
         if done is not None:
             done(entries[-1])
@@ -190,7 +185,7 @@ def survey_one(
     cascade = Cascade(mechanism, objective, seed=seed)
     loop = cascade.loop
     proposal = cascade.start(x0)[1]
-    plan, first = proposal.plan, cascade.optimiser.first
+    plan, first = proposal.plan, cascade.optimiser.anchor
     assert plan is not None  # start() raises otherwise
     assert first is not None  # designed when the optimiser was made
     candidates: list[Surface | Plan] = [first, plan]
@@ -210,7 +205,7 @@ def survey_one(
         name=mechanism.name,
         n=mechanism.n,
         m=mechanism.m,
-        start=start_words(mechanism),
+        start=state_words(mechanism, x0),
         unit=objective.unit,
         designed=reached[0],
         one_time=reached[1],
@@ -258,16 +253,6 @@ def _trials(
     return costs
 
 
-def start_words(mechanism: Mechanism) -> str:
-    """Return the listed start in words, angles in degrees."""
-    units = {c.name: c.unit for c in mechanism.coordinates}
-    words = []
-    for name, value in mechanism.start.items():
-        factor, unit = display(units[name.removesuffix("_dot")], name.endswith("_dot"))
-        words.append(f"{name} = {factor * value:.4g}{'' if unit.startswith('°') else ' '}{unit}")
-    return ", ".join(words)
-
-
 def median_gap(entries: Sequence[Entry]) -> float:
     """Return the median of the gaps that are known; NaN where none is."""
     gaps = [entry.gap for entry in entries if math.isfinite(entry.bound)]
@@ -280,21 +265,18 @@ _HEAD = ("mechanism", "n, m", "start", "designed", "one-time", "cascade", "bound
 
 
 def _cells(entry: Entry) -> tuple[str, ...]:
-    def cost(value: float) -> str:
-        return f"{value:.4g}" if math.isfinite(value) else "—"
-
-    gap = f"{100 * entry.gap:.1f} %" if math.isfinite(entry.gap) else "—"
-    when = f"{entry.time:.2f} s" if math.isfinite(entry.time) else "not reached"
-    costs = (entry.designed, entry.one_time)
+    costs = (entry.designed, entry.one_time, entry.cascade, entry.bound)
+    designed, one_time, cascade, bound = (number(value, ".4g") for value in costs)
     return (
         entry.name,
         f"{entry.n}, {entry.m}",
         entry.start,
-        *(cost(value) for value in costs),
-        f"{cost(entry.cascade)} {entry.unit}",
-        cost(entry.bound),
-        gap,
-        when,
+        designed,
+        one_time,
+        f"{cascade} {entry.unit}",
+        bound,
+        f"{100 * entry.gap:.1f} %" if math.isfinite(entry.gap) else "—",
+        f"{entry.time:.2f} s" if math.isfinite(entry.time) else "not reached",
     )
 
 
@@ -303,24 +285,24 @@ def _trial_words(entry: Entry) -> str:
     return f"{entry.name}, {100 * entry.gap:.1f} %: " + "; ".join(words)
 
 
-def table(entries: Sequence[Entry]) -> Table:
+def survey_table(entries: Sequence[Entry]) -> Table:
     """Return the survey for a terminal of 80 columns: start and unit stand on second lines."""
-    grid = Table(box=None, header_style="dim", padding=(0, 1, 0, 0), pad_edge=False)
     heads = ("mechanism, start", *_HEAD[3:7], "gap, %", "time, s")
-    for index, head in enumerate(heads):
-        grid.add_column(
-            head, justify="right" if index else "left", no_wrap=index > 0, ratio=not index or None
-        )
+    rows: list[tuple[RenderableType, ...]] = []
     for entry in entries:
         name, _, start, designed, one_time, cascade, bound, gap, when = _cells(entry)
         cost, _, unit = cascade.partition(" ")
-        grid.add_row(
-            Text(name).append(f"\n{start}", "dim"),
-            *map(Text, (designed, one_time, cost)),
-            Text(bound).append(f"\n{unit}", "dim"),
-            *(Text(cell.removesuffix(" %").removesuffix(" s")) for cell in (gap, when)),
+        rows.append(
+            (
+                Text(name).append(f"\n{start}", "dim"),
+                *(designed, one_time, cost),
+                Text(bound).append(f"\n{unit}", "dim"),
+                *(cell.removesuffix(" %").removesuffix(" s") for cell in (gap, when)),
+            )
         )
-    return grid
+    made = table(heads, rows, whole=heads, padding=(0, 1, 0, 0))
+    made.columns[0].no_wrap, made.columns[0].ratio = False, 1
+    return made
 
 
 def summary(entries: Sequence[Entry]) -> list[str]:
@@ -347,18 +329,12 @@ def _problems(entries: Sequence[Entry]) -> list[str]:
 
 def markdown(entries: Sequence[Entry]) -> str:
     """Return the survey as a Markdown table, as it stands in the documentation."""
-    rows = [_HEAD, tuple("---" if i < 3 else "---:" for i in range(len(_HEAD)))]
-    rows += [_cells(entry) for entry in entries]
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    lines = markdown_table(_HEAD, map(_cells, entries), right=_HEAD[3:])
     return "\n".join(lines) + "\n\n" + "\n\n".join(summary(entries)) + "\n"
 
 
 def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, bytes]:
     """Return ``survey.csv``, ``survey.md`` and ``manifest.json``."""
-
-    def cell(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
     header = (
         "mechanism", "n", "m", "start", "unit", "designed", "one_time", "cascade", "bound",
         "gap", "time_s", "radius", "seconds", *(trial.name for trial in TRIALS),
@@ -366,21 +342,16 @@ def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, 
     rows = [
         (
             e.name, e.n, e.m, e.start, e.unit,
-            *map(cell, (e.designed, e.one_time, e.cascade, e.bound, e.gap)),
-            *map(cell, (e.time, e.radius)),
+            *map(finite, (e.designed, e.one_time, e.cascade, e.bound, e.gap)),
+            *map(finite, (e.time, e.radius)),
             round(e.seconds, 2),
-            *(cell(e.trials.get(trial.name, math.nan)) for trial in TRIALS),
+            *(finite(e.trials.get(trial.name, math.nan)) for trial in TRIALS),
         )
         for e in entries
     ]  # fmt: skip
-    manifest = {
-        "what": "undertow survey",
-        "versions": results.versions(),
-        "request": dict(request),
-        "median_gap": cell(median_gap(entries)),
-    }
+    made = manifest("undertow survey", request, median_gap=finite(median_gap(entries)))
     return {
-        "survey.csv": results.to_csv(header, rows),
+        "survey.csv": to_csv(header, rows),
         "survey.md": markdown(entries).encode(),
-        "manifest.json": results.to_json(manifest),
+        "manifest.json": made,
     }

@@ -19,10 +19,8 @@ from sympy.printing.codeprinter import CodePrinter, PrintMethodNotImplementedErr
 
 from undertow.base import ModelError
 from undertow.symbolic.names import SymbolNames
-from undertow.symbolic.scalar import Emitter
+from undertow.symbolic.scalar import Emitter, ScalarCode
 from undertow.symbolic.tape import Tape
-
-__all__ = ["C99Emitter", "Real", "literal"]
 
 Real = Literal["double", "float"]
 
@@ -44,7 +42,7 @@ def literal(value: float, kind: Real) -> str:
     return f"{float(str(np.float32(value)))!r}f"
 
 
-class _Printer(C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
+class _Printer(ScalarCode, C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
     """C99 expressions on one line, every literal of the chosen precision."""
 
     def __init__(self, names: SymbolNames, kind: Real) -> None:
@@ -54,39 +52,14 @@ class _Printer(C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
         super().__init__(settings)
         self.names = names
         self.kind: Real = kind
+        suffix = "f" * (kind == "float")
+        self.functions = f"sqrt{suffix}", f"pow{suffix}", "ut_max", "ut_min"
 
-    def _print_Pow(self, expr: sp.Pow, **_: object) -> str:
-        base, exponent = expr.args
-        suffix = "f" * (self.kind == "float")
-        one = literal(1.0, self.kind)
-        if exponent == sp.Rational(1, 2):
-            return f"sqrt{suffix}({self._print(base)})"
-        if exponent == sp.Rational(-1, 2):
-            return f"({one} / sqrt{suffix}({self._print(base)}))"
-        if exponent.is_Integer and 0 < abs(int(exponent)) <= 16:
-            power = " * ".join([self.parenthesize(base, 100)] * abs(int(exponent)))
-            return f"({power})" if int(exponent) > 0 else f"({one} / ({power}))"
-        return f"pow{suffix}({self._print(base)}, {self._print(exponent)})"
+    def literal(self, value: sp.Expr | float) -> str:
+        """Return a number in the chosen precision."""
+        return literal(float(value), self.kind)
 
-    def _print_Symbol(self, expr: sp.Symbol) -> str:
-        return self.names[expr]
-
-    def _print_Integer(self, expr: sp.Integer) -> str:
-        return literal(int(expr), self.kind)
-
-    def _print_Rational(self, expr: sp.Rational) -> str:
-        return literal(float(expr), self.kind)
-
-    def _print_Float(self, expr: sp.Float) -> str:
-        return literal(float(expr), self.kind)
-
-    def _print_NumberSymbol(self, expr: sp.NumberSymbol) -> str:
-        return literal(float(expr), self.kind)
-
-    def _print_Pi(self, expr: sp.NumberSymbol) -> str:
-        return literal(float(expr), self.kind)
-
-    _print_Exp1 = _print_Pi  # noqa: N815  # SymPy's names
+    _print_NumberSymbol = _print_Pi = _print_Exp1 = ScalarCode._print_number  # noqa: N815
 
     def _print_sign(self, expr: sp.sign) -> str:
         return f"ut_sign({self._print(expr.args[0])})"
@@ -95,18 +68,6 @@ class _Printer(C99CodePrinter):  # type: ignore[misc]  # SymPy is untyped
         # C's remainder has the sign of a, SymPy's and Python's that of b.
         a, b = map(self._print, expr.args)
         return f"ut_mod(fmod{'f' * (self.kind == 'float')}({a}, {b}), {b})"
-
-    def _print_Max(self, expr: sp.Max) -> str:
-        return self._nest("ut_max", expr.args)
-
-    def _print_Min(self, expr: sp.Min) -> str:
-        return self._nest("ut_min", expr.args)
-
-    def _nest(self, name: str, args: tuple[sp.Expr, ...]) -> str:
-        text = str(self._print(args[0]))
-        for arg in args[1:]:
-            text = f"{name}({text}, {self._print(arg)})"
-        return text
 
     def _print_Piecewise(self, expr: sp.Piecewise) -> str:
         text = ""

@@ -8,8 +8,6 @@ from typing import Any
 import sympy as sp
 from sympy.core.function import FunctionClass
 
-__all__ = ["parse_expression"]
-
 #: What takes texts: names, and decimal digits.  Everything else would hand a text to SymPy's
 #: parser, which evaluates it.
 _OF_TEXT = ("Symbol", "Dummy", "Float")

@@ -1,6 +1,6 @@
 """Tape to one scalar numba function: arrays in, arrays filled, nothing allocated.
 
-For code that runs once a sample, where :mod:`undertow.symbolic.block` is for batches.
+For code that runs once a sample, where :mod:`undertow.closed_loop.kernel_source` is for batches.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ import sympy as sp
 from undertow.symbolic.names import distinct
 from undertow.symbolic.scalar import Emitter
 from undertow.symbolic.tape import Tape
-
-__all__ = ["COMPILED", "PREAMBLE", "function_source"]
 
 #: Head of a generated module.
 PREAMBLE = "import math\n\nimport numba\nimport numpy as np\n"

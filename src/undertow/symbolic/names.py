@@ -14,8 +14,6 @@ import sympy as sp
 from undertow.base import ModelError
 from undertow.symbolic.tape import Tape
 
-__all__ = ["SymbolNames", "distinct", "docstring"]
-
 
 class SymbolNames:
     """Symbols to their names in one piece of generated code.

@@ -18,9 +18,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
-from undertow.base import ArtefactError
-
-__all__ = ["cache_folder", "is_private", "private_folder"]
+from undertow.base.errors import or_refused
 
 
 def cache_folder() -> Path:
@@ -89,15 +87,9 @@ def _user() -> int | None:
 @lru_cache(maxsize=1)
 def _own_temporary() -> Path:
     """Make a folder for this process; its copies, which ``fork`` makes, share it."""
-    try:
+    refusal = "one that you alone can write", "Name one: UNDERTOW_CACHE=FOLDER"
+    with or_refused("folder for compiled code", *refusal):
         folder = Path(tempfile.mkdtemp(prefix="undertow-")).resolve()
-    except OSError as error:
-        raise ArtefactError(
-            "folder for compiled code",
-            value=error.strerror or str(error),
-            limit="one that you alone can write",
-            remedy="Name one: UNDERTOW_CACHE=FOLDER",
-        ) from error
     process = os.getpid()
 
     def remove() -> None:

@@ -9,6 +9,8 @@ to 1e5 rad.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
+from typing import Any
 
 import sympy as sp
 from sympy.printing.codeprinter import CodePrinter
@@ -16,8 +18,6 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from undertow.symbolic.names import SymbolNames
 from undertow.symbolic.tape import Tape
-
-__all__ = ["SINCOS", "Emitter"]
 
 #: Template of one sine-cosine evaluation: ``_sin_{i}`` and ``_cos_{i}`` of ``{arg}``.
 SINCOS = """
@@ -34,36 +34,69 @@ _cos_{i} = g_{i} * (1.0 - 2.0 * o_{i}) * (pc_{i} if o_{i} == 0.0 else ps_{i})
 """.strip()  # noqa: E501
 
 
-class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
-    """Python code that numba turns into vector arithmetic."""
+class ScalarCode:
+    """Scalar arithmetic as a printer of SymPy's writes it: powers multiplied out, names by place.
 
-    def __init__(self, names: SymbolNames) -> None:
-        super().__init__({"fully_qualified_modules": True})
-        self.names = names
+    Attributes
+    ----------
+    names
+        Of symbols.
+    functions
+        The language's square root, power, maximum and minimum of two.
+    """
+
+    names: SymbolNames
+    functions: tuple[str, str, str, str]
+    _print: Any
+    parenthesize: Any
+
+    def literal(self, value: sp.Expr | float) -> str:
+        """Return a number as the language writes it."""
+        return f"{int(value)}.0" if isinstance(value, sp.Integer) else repr(float(value))
 
     def _print_Pow(self, expr: sp.Pow, **_: object) -> str:
         base, exponent = expr.args
-        text = self.parenthesize(base, 100)
+        root, power, *_more = self.functions
+        one = self.literal(1.0)
         if exponent == sp.Rational(1, 2):
-            return f"math.sqrt({self._print(base)})"
+            return f"{root}({self._print(base)})"
         if exponent == sp.Rational(-1, 2):
-            return f"(1.0 / math.sqrt({self._print(base)}))"
+            return f"({one} / {root}({self._print(base)}))"
         if exponent.is_Integer and 0 < abs(int(exponent)) <= 16:
-            power = " * ".join([text] * abs(int(exponent)))
-            return f"({power})" if int(exponent) > 0 else f"(1.0 / ({power}))"
-        return f"math.pow({self._print(base)}, {self._print(exponent)})"
+            product = " * ".join([self.parenthesize(base, 100)] * abs(int(exponent)))
+            return f"({product})" if int(exponent) > 0 else f"({one} / ({product}))"
+        return f"{power}({self._print(base)}, {self._print(exponent)})"
 
     def _print_Symbol(self, expr: sp.Symbol) -> str:
         return self.names[expr]
 
-    def _print_Integer(self, expr: sp.Integer) -> str:
-        return f"{int(expr)}.0"
+    def _print_number(self, expr: sp.Expr) -> str:
+        return self.literal(expr)
 
-    def _print_Rational(self, expr: sp.Rational) -> str:
-        return repr(float(expr))
+    _print_Integer = _print_Rational = _print_Float = _print_number  # noqa: N815 - SymPy's names
 
-    def _print_Float(self, expr: sp.Float) -> str:
-        return repr(float(expr))
+    def _print_Max(self, expr: sp.Max) -> str:
+        return self._nest(self.functions[2], expr.args)
+
+    def _print_Min(self, expr: sp.Min) -> str:
+        return self._nest(self.functions[3], expr.args)
+
+    def _nest(self, name: str, args: Sequence[sp.Expr]) -> str:
+        return reduce(
+            lambda text, arg: f"{name}({text}, {self._print(arg)})",
+            args[1:],
+            str(self._print(args[0])),
+        )
+
+
+class _Printer(ScalarCode, PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
+    """Python code that numba turns into vector arithmetic."""
+
+    functions = "math.sqrt", "math.pow", "max", "min"
+
+    def __init__(self, names: SymbolNames) -> None:
+        super().__init__({"fully_qualified_modules": True})
+        self.names = names
 
     def _print_Abs(self, expr: sp.Abs) -> str:
         return f"abs({self._print(expr.args[0])})"
@@ -75,18 +108,6 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy is untyped
     def _print_frac(self, expr: sp.frac) -> str:
         # SymPy leaves out the brackets: x*frac(y) becomes (x*y) % 1.
         return f"(({self._print(expr.args[0])}) % 1.0)"
-
-    def _print_Max(self, expr: sp.Max) -> str:
-        return self._nest("max", expr.args)
-
-    def _print_Min(self, expr: sp.Min) -> str:
-        return self._nest("min", expr.args)
-
-    def _nest(self, name: str, args: Sequence[sp.Expr]) -> str:
-        text = str(self._print(args[0]))
-        for arg in args[1:]:
-            text = f"{name}({text}, {self._print(arg)})"
-        return text
 
 
 class Emitter:

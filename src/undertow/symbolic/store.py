@@ -24,17 +24,7 @@ import numpy as np
 import sympy as sp
 
 from undertow.symbolic.machine import numba
-from undertow.symbolic.private import cache_folder, private_folder
-
-__all__ = [
-    "cache_folder",
-    "content_key",
-    "generated",
-    "load_module",
-    "recall",
-    "remember",
-    "sources_digest",
-]
+from undertow.symbolic.private import private_folder
 
 PACKAGE = Path(__file__).resolve().parent.parent
 

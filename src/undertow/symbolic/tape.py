@@ -8,11 +8,10 @@ scalars, so the length of the code grows with n³ and not with the expressions i
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import sympy as sp
-
-__all__ = ["Assignment", "Cholesky", "Tape"]
 
 
 class Assignment(NamedTuple):
@@ -65,9 +64,7 @@ class Tape:
 
     def live(self, outputs: Iterable[sp.Expr]) -> list[Assignment]:
         """Return the assignments that ``outputs`` depend on, in order."""
-        needed: set[sp.Basic] = set()
-        for output in outputs:
-            needed |= sp.sympify(output).free_symbols
+        needed: set[sp.Basic] = set().union(*(sp.sympify(o).free_symbols for o in outputs))
         kept = []
         for assignment in reversed(self.assignments):
             if assignment.symbol in needed:
@@ -117,20 +114,14 @@ class Tape:
         return self.matrix(auxiliary * (-1) ** (m - 1)), determinant
 
 
+@dataclass(frozen=True, eq=False)
 class Cholesky:
     """An unrolled L D Lᵀ factorisation on a tape."""
 
-    def __init__(
-        self,
-        tape: Tape,
-        lower: sp.Matrix,
-        pivots: Sequence[sp.Expr],
-        inverse_pivots: Sequence[sp.Expr],
-    ) -> None:
-        self.tape = tape
-        self.lower = lower
-        self.pivots = pivots
-        self.inverse_pivots = inverse_pivots
+    tape: Tape
+    lower: sp.Matrix
+    pivots: Sequence[sp.Expr]
+    inverse_pivots: Sequence[sp.Expr]
 
     def solve(self, b: sp.Matrix) -> sp.Matrix:
         """Return A⁻¹ b for a matrix b of atoms, (n, k)."""

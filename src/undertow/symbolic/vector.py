@@ -14,8 +14,6 @@ from undertow.base import ModelError
 from undertow.symbolic.names import SymbolNames, distinct
 from undertow.symbolic.tape import Tape
 
-__all__ = ["compile_expressions", "compile_numpy"]
-
 #: A compiled tape: called with one array per input, returns one array per output.
 VectorFunction = Callable[..., list[Any]]
 

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BRIEF", "Workspace", "unpacked"]
-
 #: Decorator of generated functions that take about a microsecond.  They keep the interpreter's
 #: lock: to let go of it for so short a time is to hand it to another thread, and to wait.
 BRIEF = (

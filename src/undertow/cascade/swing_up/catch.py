@@ -18,12 +18,10 @@ import scipy.linalg
 from undertow.base import InvalidInputError, UndertowError
 from undertow.cascade.swing_up.law import SwingUp, periods
 from undertow.closed_loop import ClosedLoop
-from undertow.law import InnerLoop, ProvedSet, ReachingLaw, Surface, first_surface, linearise
-from undertow.models import FloatArray, Mechanism
+from undertow.law import InnerLoop, ProvedSet, ReachingLaw, Surface, first_surface
+from undertow.models import FloatArray, Mechanism, linearise
 from undertow.objective import MinimumTime, state_box
 from undertow.plants.simulated import IdealRig
-
-__all__ = ["CatchRegion", "Prove", "SwingUpAndCatch", "unclipped"]
 
 #: Proves regions of attraction for some of a mechanism's surfaces under a reaching law.
 Prove = Callable[[Mechanism, Sequence[Surface], ReachingLaw], Iterable[ProvedSet]]
@@ -69,7 +67,7 @@ class CatchRegion:
         Disturbed copies per surface.
     prove
         Called with mechanism, surfaces and reaching law: returns regions of attraction that are
-        proved for some of the surfaces, as :func:`undertow.certify.terminal_sets` does.  The
+        proved for some of the surfaces, as :func:`undertow.proofs.terminal_sets` does.  The
         first that holds a state counts.
 
     Raises

@@ -34,8 +34,6 @@ from undertow.symbolic import (
     generated,
 )
 
-__all__ = ["Gains", "SwingUp", "hanging", "periods", "swing_source"]
-
 #: While the kinetic energy is below this part of what is missing, the law pushes: at rest
 #: its formula gives nothing.
 STILL = 0.002

@@ -26,8 +26,8 @@ from undertow.cascade.swing_up.catch import unclipped
 from undertow.cascade.swing_up.law import Gains, SwingUp, hanging, periods, swing_source
 from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import CMAES
-from undertow.plants.presets import plausible_rig
-from undertow.plants.stepping import SMOOTH, dynamics_source
+from undertow.plants.bench import plausible_rig
+from undertow.plants.stepping import dynamics_source
 from undertow.symbolic import (
     COMPILED,
     PREAMBLE,
@@ -37,8 +37,6 @@ from undertow.symbolic import (
     recall,
     remember,
 )
-
-__all__ = ["KEPT", "Found", "as_kept", "designed", "found_for", "search"]
 
 #: Gains of mechanisms of the library, as the search found them: see :func:`as_kept`.
 KEPT = Path(__file__).with_name("gains.json")
@@ -65,14 +63,12 @@ DECADES = np.array([[-2.5, 1.5], [-2.5, 1.5], [-2.5, 1.5], [-3.0, -0.3]])
 WORSE = 2.5
 
 _BODY = f"""
-{SMOOTH}
-
 {COMPILED}
 def advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
     # A smooth step with dry friction of the driven joint; whether it met no stop.
     n = x.shape[0] // 2
     u[0] = force - drag * limit * math.tanh(x[n] / 0.02) * (1.0 if gain > 0.0 else -1.0)
-    smooth(0.0, h, x, u, viscous, plant, stages)
+    rk4_step(0.0, h, 1.0, n, x, u, viscous, plant, stages[0], stages[1], stages[2])
     for i in range(n):
         if not stops[i, 0] < x[i] < stops[i, 1]:
             return False

@@ -1,7 +1,7 @@
-"""Ways to bring a mechanism: equations, energies, SymPy's mechanics, URDF and MJCF files.
+"""Importers: mechanisms from equations, energies, SymPy's mechanics, URDF and MJCF files.
 
-Whatever comes in, a :class:`~undertow.models.Mechanism` comes out: actuated coordinates
-first, the target at x = 0, physical parameters as data.
+Each returns a :class:`~undertow.models.Mechanism`: actuated coordinates first, the target at
+x = 0, physical parameters as data.
 """
 
 from undertow.models.importers.coordinates import ActuatedForm, actuate

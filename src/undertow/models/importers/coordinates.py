@@ -1,4 +1,4 @@
-"""Coordinates of which the first m are acted upon, and error coordinates at a target.
+"""Changes of coordinates: the actuated ones first, and errors from a target.
 
 The equations of a mechanism are often written in coordinates q in which the inputs act
 through a constant (n, m) matrix, ``M q̈ = f + B u``: a motor that turns one link against
@@ -19,8 +19,6 @@ import sympy as sp
 from undertow.base import InvalidInputError, ModelError, checked
 from undertow.models.mechanism import Coordinate, FloatArray, matrix_of
 from undertow.models.validity import expression_of
-
-__all__ = ["ActuatedForm", "actuate", "exact_angle", "number", "tidy"]
 
 #: Expressions of more operations than this are left as they are.
 _EXPANDABLE = 400
@@ -77,7 +75,7 @@ def actuate(
     actuated: Sequence[Coordinate | None] | None = None,
     gains: Sequence[sp.Expr | None] | None = None,
 ) -> ActuatedForm:
-    """Change to coordinates of which the first m are acted upon, one by one.
+    """Change to coordinates of which the first m are actuated, each by one input.
 
     Parameters
     ----------

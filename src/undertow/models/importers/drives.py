@@ -17,12 +17,10 @@ from dataclasses import dataclass, fields, replace
 
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, check_fields, checked, near
+from undertow.base import InvalidInputError, ModelError, check_fields, checked, one_of, positive
 from undertow.models.mechanism import Input, Mechanism, Parameter
 from undertow.models.quantities import number_of
 from undertow.models.validity import by_names
-
-__all__ = ["DCMotor", "voltage_driven"]
 
 
 @dataclass(frozen=True)
@@ -73,29 +71,16 @@ class DCMotor:
         for part in fields(self):
             if part.name != "source" and getattr(self, part.name) is not None:
                 number_of(f"{part.name} of a DC motor", getattr(self, part.name))
-        for name, low in (
-            ("torque_constant", 0.0),
-            ("resistance", 0.0),
-            ("gear_ratio", 0.0),
-            ("voltage_limit", 0.0),
-        ):
-            value = getattr(self, name)
-            if not value > low:
-                raise InvalidInputError(f"{name} of a DC motor", value=value, limit="> 0")
+        for name in ("torque_constant", "resistance", "gear_ratio", "voltage_limit"):
+            positive(f"{name} of a DC motor", getattr(self, name), infinite=True)
         for name in ("motor_efficiency", "gear_efficiency"):
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidInputError(
                     f"{name} of a DC motor", value=getattr(self, name), limit="in (0, 1]"
                 )
-        for name in ("viscous_friction", "rotor_inertia"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InvalidInputError(
-                    f"{name} of a DC motor", value=getattr(self, name), limit="finite and ≥ 0"
-                )
-        if self.back_emf_constant is not None and not 0 <= self.back_emf_constant < math.inf:
-            raise InvalidInputError(
-                "back_emf_constant of a DC motor", value=self.back_emf_constant, limit="≥ 0"
-            )
+        for name in ("viscous_friction", "rotor_inertia", "k_m"):
+            shown = name.replace("k_m", "back_emf_constant")
+            positive(f"{shown} of a DC motor", getattr(self, name), zero=True)
 
     @property
     def k_m(self) -> float:
@@ -158,13 +143,8 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
                 limit="an undertow.models.importers.DCMotor",
                 remedy="Write DCMotor(torque_constant, resistance), from the data sheet",
             )
-        if name not in names:
-            raise InvalidInputError(
-                f"motor of '{mechanism.name}'",
-                value=f"on {name!r}",
-                limit=f"one of the inputs {', '.join(names)}",
-                remedy=near(name, names) or "Name inputs of the mechanism",
-            )
+        on = f"input of '{mechanism.name}' for a motor"
+        one_of(on, name, names, "Name inputs of the mechanism")
     m = mechanism.m
     a, b, J = sp.eye(m), sp.zeros(m), sp.zeros(m)
     inputs, parameters = list(mechanism.inputs), list(mechanism.parameters)

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, checked, near
+from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.coordinates import actuate, exact_angle, tidy
+from undertow.models.lagrange import quadratic_form
 from undertow.models.mechanism import (
     TIME,
     Coordinate,
@@ -35,8 +37,6 @@ BALANCE = 1e-9
 
 #: How far an equilibrium may be from a target and still be the one that was meant, rad or m.
 NEAR = 0.5
-
-__all__ = ["from_energies", "from_matrices", "lagrange_force", "unit_inputs"]
 
 
 @checked
@@ -114,15 +114,14 @@ def from_matrices(
     f = sp.Matrix(force)
     if f.shape != (n := len(coordinates), 1):
         raise ModelError(f"force of '{name}'", value=f"shape {f.shape}", limit=f"({n}, 1)")
-    V = None if potential is None else sp.sympify(potential)
     if equilibrium:
-        coordinates, (M, f, V) = shifted(name, coordinates, equilibrium, M, f, V)
+        coordinates, (M, f, potential) = shifted(name, coordinates, equilibrium, M, f, potential)
     form = actuate(
         coordinates,
         M,
         f,
         input_matrix,
-        potential=V,
+        potential=potential,
         values=values,
         actuated=actuated,
         gains=gains,
@@ -132,9 +131,9 @@ def from_matrices(
         name,
         form.coordinates,
         tuple(inputs),
-        sp.ImmutableDenseMatrix(form.mass_matrix),
-        sp.ImmutableDenseMatrix(form.force),
-        sp.ImmutableDenseMatrix(form.input_matrix),
+        form.mass_matrix,
+        form.force,
+        form.input_matrix,
         parameters=tuple(parameters),
         disturbance_bounds=tuple(bounds),
         potential=form.potential,
@@ -148,7 +147,7 @@ def from_matrices(
 
 
 def check_balanced(mechanism: Mechanism) -> None:
-    """Refuse a target on which a force acts that no input balances, f_u(0, 0) ≠ 0.
+    """Refuse a target that is no equilibrium: f_u(0, 0) ≠ 0, which no input can balance.
 
     Raises
     ------
@@ -191,7 +190,7 @@ def nearest_equilibrium(mechanism: Mechanism) -> str:
 def _newton(mechanism: Mechanism) -> tuple[FloatArray, float]:
     """Solve f_u(q, 0) = 0 for the free coordinates, from the target on, by Newton's method.
 
-    Without a solver of a library: what verifies proofs refuses targets, too, and reaches none.
+    Without SciPy's solvers: the verifier of proofs checks targets too, and imports no solver.
 
     Returns
     -------
@@ -205,7 +204,7 @@ def _newton(mechanism: Mechanism) -> tuple[FloatArray, float]:
             slope = (mechanism.f(x + steps) - mechanism.f(x - steps))[:, m:].T / 2e-6
             x[m:n] -= np.linalg.solve(slope, mechanism.f(x)[m:])
         return x[:n], float(np.abs(mechanism.f(x)[m:] / scale).max())
-    except (InvalidInputError, np.linalg.LinAlgError):  # the way left what can be computed
+    except (InvalidInputError, np.linalg.LinAlgError):  # the iteration left the domain of f
         return x[:n], math.inf
 
 
@@ -255,17 +254,7 @@ def from_energies(
         name, coordinates, inputs, rest.get("parameters", ()), kinetic, potential, dissipation
     )
     velocities = [c.velocity for c in coordinates]
-    kinetic = sp.expand(kinetic)
-    mass = sp.hessian(kinetic, velocities).applyfunc(tidy)
-    qd = sp.Matrix(velocities)
-    rest_of_kinetic = tidy(kinetic - (qd.T * mass * qd)[0, 0] / 2)
-    if mass.free_symbols & set(velocities) or sp.simplify(rest_of_kinetic) != 0:
-        raise ModelError(
-            f"kinetic energy of '{name}'",
-            value=str(kinetic)[:80],
-            limit="a quadratic form in the velocities",
-            remedy="Move velocity-free terms to the potential; gyroscopic terms to force",
-        )
+    mass = quadratic_form(name, sp.expand(kinetic), velocities, tidy)
     force = lagrange_force(coordinates, mass, potential, dissipation)
     return from_matrices(
         name, coordinates, inputs, mass, force, input_matrix, potential=potential, **rest
@@ -305,13 +294,7 @@ def unit_inputs(coordinates: Sequence[Coordinate], actuated: Sequence[str]) -> s
     """
     names = [c.name for c in coordinates]
     for joint in actuated:
-        if joint not in names:
-            raise InvalidInputError(
-                "actuated coordinate",
-                value=repr(joint),
-                limit=f"one of {', '.join(names)}",
-                remedy=near(joint, names) or "Check the spelling, and that the joint moves",
-            )
+        one_of("actuated coordinate", joint, names, "Check the spelling, and that the joint moves")
         if list(actuated).count(joint) > 1:
             raise InvalidInputError(
                 "actuated coordinate",
@@ -335,13 +318,7 @@ def shifted(
     known = {c.name: c for c in coordinates}
     equilibrium = by_names(f"equilibrium of '{name}'", equilibrium)
     for joint, value in equilibrium.items():
-        if joint not in known:
-            raise InvalidInputError(
-                f"equilibrium of '{name}'",
-                value=repr(joint),
-                limit=f"one of {', '.join(known)}",
-                remedy=near(joint, known) or "Name the coordinates as the equations do",
-            )
+        one_of(f"equilibrium of '{name}'", joint, known, "Name the coordinates as the equations do")
         if not np.isfinite(number_of(f"equilibrium of '{name}', {joint}", value)):
             raise InvalidInputError(
                 f"equilibrium of '{name}', {joint}", value=value, limit="a finite number"
@@ -351,25 +328,18 @@ def shifted(
         for c in coordinates
         if (v := float(equilibrium.get(c.name, 0.0)))
     }
+    offsets = [equilibrium.get(c.name, 0.0) for c in coordinates]
     moved = tuple(
-        Coordinate(
-            c.name,
-            c.unit,
-            c.description,
-            c.low - equilibrium.get(c.name, 0.0),
-            c.high - equilibrium.get(c.name, 0.0),
-        )
-        for c in coordinates
+        replace(c, low=c.low - offset, high=c.high - offset)
+        for c, offset in zip(coordinates, offsets, strict=True)
     )
-    results: list[Any] = []
-    for expression in expressions:
-        if expression is None:
-            results.append(None)
-        elif isinstance(expression, sp.MatrixBase):
-            results.append(expression.xreplace(shift).applyfunc(tidy))
-        else:
-            results.append(tidy(expression.xreplace(shift)))
-    return moved, results
+
+    def there(expression: Any) -> Any:
+        if isinstance(expression, sp.MatrixBase):
+            return expression.xreplace(shift).applyfunc(tidy)
+        return None if expression is None else tidy(expression.xreplace(shift))
+
+    return moved, [there(expression) for expression in expressions]
 
 
 def _symmetric(

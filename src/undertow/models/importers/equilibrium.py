@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, checked, floats, near
+from undertow.base import InvalidInputError, ModelError, checked, floats, one_of
 from undertow.models.importers.equations import BALANCE, check_balanced, force_scale, shifted
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.models.quantities import number_of
 from undertow.models.validity import by_names
-
-__all__ = ["find_equilibrium", "holding_input", "move_target"]
 
 
 @checked
@@ -133,18 +132,13 @@ def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
         sp.Matrix(mechanism.force),
         mechanism.potential,
     )
-    moved = Mechanism(
-        mechanism.name,
-        coordinates,
-        mechanism.inputs,
-        sp.ImmutableDenseMatrix(mass),
-        sp.ImmutableDenseMatrix(force),
-        mechanism.input_matrix,
-        parameters=mechanism.parameters,
-        disturbance_bounds=mechanism.disturbance_bounds,
+    moved = replace(
+        mechanism,
+        coordinates=coordinates,
+        mass_matrix=mass,
+        force=force,
         potential=potential,
-        description=mechanism.description,
-        source=mechanism.source,
+        start={},
     )
     check_balanced(moved)
     return moved
@@ -154,13 +148,8 @@ def _positions(mechanism: Mechanism, values: Mapping[str, float]) -> FloatArray:
     names = [c.name for c in mechanism.coordinates]
     values = by_names(f"coordinates of '{mechanism.name}'", values)
     for name in values:
-        if name not in names:
-            raise InvalidInputError(
-                f"coordinate of '{mechanism.name}'",
-                value=repr(name),
-                limit=f"one of {', '.join(names)}",
-                remedy=near(name, names) or "Name the coordinates of the mechanism",
-            )
+        whose = f"coordinate of '{mechanism.name}'"
+        one_of(whose, name, names, "Name the coordinates of the mechanism")
     q = np.array([number_of(f"coordinate '{name}'", values.get(name, 0.0)) for name in names])
     if not np.isfinite(q).all():
         raise InvalidInputError(

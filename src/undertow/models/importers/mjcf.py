@@ -10,14 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.base import InvalidInputError, ModelError, checked, near
+from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.mjcf_bodies import Frame, link_of
 from undertow.models.importers.rigid_body import mechanism_from_tree
-from undertow.models.importers.tree import WORLD, Actuator, Coupling, Joint, Link, Tree, Vector
+from undertow.models.importers.tree import (
+    FREE_BASE,
+    WORLD,
+    Actuator,
+    Coupling,
+    Joint,
+    Link,
+    Tree,
+    Vector,
+)
 from undertow.models.importers.xml_files import computable, numbers_of, parse_xml
-from undertow.models.mechanism import Mechanism
-
-__all__ = ["from_mjcf", "read_mjcf"]
+from undertow.models.mechanism import FloatArray, Mechanism
 
 #: Sections that do not touch the equations of motion of a tree of bodies.
 _HARMLESS = {
@@ -68,7 +75,7 @@ def from_mjcf(
     Raises
     ------
     InvalidInputError
-        For broken XML or numbers that are none, unknown or repeated actuated joints.
+        For malformed XML, invalid numbers, unknown or repeated actuated joints.
     ModelError
         For ball and free joints, equality constraints, massless moving bodies, inertias that no
         body has, elements that change the motion in ways that are not read here, and more joints
@@ -178,13 +185,8 @@ class _Reader:
     ) -> ET.Element:
         """A copy of the element with the attributes of its class filled in."""
         name = element.get("class") or childclass or "main"
-        if name not in self.classes:
-            raise ModelError(
-                f"class of <{element.tag}>",
-                value=repr(name),
-                limit="declared in <default>",
-                remedy=near(name, self.classes) or "Declare it, or leave class= out",
-            )
+        what = f"class of <{element.tag}>, one declared in <default>"
+        one_of(what, name, self.classes, "Declare it, or leave class= out", ModelError)
         filled = copy.copy(element)
         defaults = self.classes[name].get(tag or element.tag, {})
         filled.attrib = {**defaults, **element.attrib}
@@ -215,29 +217,18 @@ class _Reader:
                 raise _unread(f"gravcomp or mocap on body '{name}'", "Leave it out")
             inner = body.get("childclass") or childclass
             geoms = [self._filled(g, inner) for g in body.iterfind("geom")]
-            position = numbers_of(body, "pos", "0 0 0", 3)
-            rotation = self.frame.rotation(body)
-            carrier = link
-            joints = list(self._joints_of(body, name, inner))
-            for k, joint in enumerate(joints):
-                last = k == len(joints) - 1
-                child = name if last else f"{name}_frame_{k + 1}"
-                if not last:
+            x, y, z = numbers_of(body, "pos", "0 0 0", 3)
+            pose: tuple[FloatArray, Vector] = self.frame.rotation(body), (x, y, z)
+            carrier, joints = link, list(self._joints_of(body, name, inner))
+            for k, joint in enumerate(joints, 1):
+                child = name
+                if k < len(joints):
+                    child = f"{name}_frame_{k}"
                     self.links.append(Link(child))
-                first = k == 0
-                self.joints.append(
-                    self._joint(
-                        joint,
-                        carrier,
-                        child,
-                        rotation if first else np.eye(3),
-                        (position[0], position[1], position[2]) if first else (0.0, 0.0, 0.0),
-                    )
-                )
-                carrier = child
+                self.joints.append(self._joint(joint, carrier, child, *pose))
+                carrier, pose = child, (np.eye(3), (0.0, 0.0, 0.0))
             if not joints:
-                place = (position[0], position[1], position[2])
-                self.joints.append(Joint(f"{name}_fixed", "fixed", carrier, name, rotation, place))
+                self.joints.append(Joint(f"{name}_fixed", "fixed", carrier, name, *pose))
             self.links.append(link_of(body, name, self.frame, geoms, self.infer))
             self.bodies(body, name, inner)
 
@@ -254,7 +245,7 @@ class _Reader:
                 yield joint
 
     def _joint(
-        self, joint: ET.Element, parent: str, child: str, rotation: object, position: Vector
+        self, joint: ET.Element, parent: str, child: str, rotation: FloatArray, position: Vector
     ) -> Joint:
         kind = joint.get("type", "hinge")
         name = joint.get("name") or f"{child}_{kind}"
@@ -282,7 +273,7 @@ class _Reader:
             "hinge" if turning else "slide",
             parent,
             child,
-            np.asarray(rotation, dtype=float),
+            rotation,
             position,
             axis=(x, y, z),
             anchor=(ax, ay, az),
@@ -315,13 +306,8 @@ class _Reader:
             coefficients: dict[str, float] = {}
             for part in element.iterfind("joint"):
                 joint = part.get("joint", "")
-                if joint not in kinds:
-                    raise ModelError(
-                        f"tendon '{element.get('name', '')}'",
-                        value=f"joint {joint!r}",
-                        limit=f"one of {', '.join(kinds)}",
-                        remedy=near(joint, kinds) or "Declare the joint, or correct its name",
-                    )
+                whose = f"joint of tendon '{element.get('name', '')}'"
+                one_of(whose, joint, kinds, "Declare the joint, or correct its name", ModelError)
                 coefficients[joint] = numbers_of(part, "coef", None, 1)[0]
             yield Coupling(
                 element.get("name", ""),
@@ -391,6 +377,5 @@ def _free(body: str, kind: str) -> ModelError:
         f"body '{body}'",
         value=f"a joint of type {kind!r}",
         limit="hinge and slide joints",
-        remedy="A free base leaves infinitely many equilibria (Remark 3): fix it, or model the "
-        "joint by hinges and slides",
+        remedy=FREE_BASE,
     )

@@ -14,8 +14,6 @@ from undertow.models.importers.tree import LARGEST, Link
 from undertow.models.importers.xml_files import numbers_of, rotation_from_quaternion
 from undertow.models.mechanism import FloatArray
 
-__all__ = ["Frame", "link_of"]
-
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 
 

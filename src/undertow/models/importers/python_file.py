@@ -1,4 +1,4 @@
-"""A mechanism, or a rig, of one's own from a Python file, for the command line."""
+"""User-defined mechanisms and rigs from Python files, for the command line."""
 
 from __future__ import annotations
 
@@ -12,17 +12,15 @@ from typing import Any
 from undertow.base import ArtefactError, InvalidInputError, UndertowError, checked, near, raised_at
 from undertow.models.mechanism import Mechanism
 
-__all__ = ["in_a_file", "mechanism_from_file", "object_from_file"]
-
 
 def in_a_file(text: str) -> bool:
-    """Whether a word of the command line is ``FILE.py:NAME``, or lacks but the name."""
+    """Whether a command-line argument is ``FILE.py:NAME``, or ``FILE.py`` without a name."""
     return ".py:" in text or text.endswith(".py")
 
 
 @checked
 def mechanism_from_file(text: str) -> Mechanism:
-    """Load a mechanism of one's own: ``FILE.py:NAME``, a Mechanism or a function that makes one.
+    """Load a user-defined mechanism: ``FILE.py:NAME``, a Mechanism or a function that makes one.
 
     Raises
     ------

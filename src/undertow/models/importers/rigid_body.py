@@ -22,14 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, checked, near
+from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.coordinates import number, tidy
 from undertow.models.importers.equations import from_matrices, lagrange_force, unit_inputs
 from undertow.models.importers.tree import WORLD, Joint, Link, Tree
 from undertow.models.mechanism import Coordinate, Input, Mechanism, Parameter
 from undertow.models.quantities import code_points, normal_name
-
-__all__ = ["identifier", "mechanism_from_tree"]
 
 #: Longest mass matrix, in operations of its upper half: deriving f from it takes some 10 s.
 MOST_OPERATIONS = 8_000
@@ -188,25 +186,15 @@ def _inputs(
     if actuated is not None:
         wanted = [identifier(joint) for joint in actuated]
         B = unit_inputs(coordinates, wanted)
-        unknown = sorted(set(effort) - set(actuated))
-        if unknown:
-            raise InvalidInputError(
-                f"effort of '{tree.name}'",
-                value=", ".join(unknown),
-                limit=f"actuated joints {', '.join(actuated)}",
-                remedy=near(unknown[0], actuated) or "Limit joints that are actuated",
-            )
+        for joint in effort:
+            one_of(f"effort of '{tree.name}'", joint, actuated, "Limit joints that are actuated")
         chosen = {identifier(j.name): j for j in joints}
-        units = {"hinge": "N m", "slide": "N"}
-        kinds = {"hinge": "torque", "slide": "force"}
-        return [
-            Input(
-                f"{name}_{kinds[chosen[name].kind]}",
-                units[chosen[name].kind],
-                effort.get(given, chosen[name].effort),
-            )
-            for given, name in zip(actuated, wanted, strict=True)
-        ], B
+        pushes = {"hinge": ("torque", "N m"), "slide": ("force", "N")}
+        made = []
+        for given, name in zip(actuated, wanted, strict=True):
+            push, unit = pushes[chosen[name].kind]
+            made.append(Input(f"{name}_{push}", unit, effort.get(given, chosen[name].effort)))
+        return made, B
     if not tree.actuators:
         raise ModelError(
             f"'{tree.name}' names no actuator",
@@ -218,13 +206,8 @@ def _inputs(
     B = sp.zeros(len(joints), len(tree.actuators))
     for k, actuator in enumerate(tree.actuators):
         for joint, coefficient in actuator.coefficients.items():
-            if joint not in index:
-                raise InvalidInputError(
-                    f"actuator '{actuator.name}' of '{tree.name}'",
-                    value=f"joint {joint!r}",
-                    limit=f"one of {', '.join(index)}",
-                    remedy=near(joint, index) or "Check the spelling, and that the joint moves",
-                )
+            whose = f"joint of actuator '{actuator.name}' of '{tree.name}'"
+            one_of(whose, joint, index, "Check the spelling, and that the joint moves")
             B[index[joint], k] += number(actuator.gain) * number(coefficient)
     taken = {c.name for c in coordinates} | {c.velocity.name for c in coordinates}
     taken |= {identifier(a.stroke) for a in tree.actuators if a.stroke}
@@ -323,22 +306,28 @@ class _Frame:
         velocity = (self.J_v - _cross(r) * self.J_w).applyfunc(tidy)
         return velocity, tidy(self.height - (self.gravity.T * r)[0, 0])
 
+    def carried(
+        self, r: sp.Matrix, turn: sp.Matrix, extra_v: sp.Matrix, extra_w: sp.Matrix
+    ) -> _Frame:
+        """Return the frame at r, turned, that moves by so much besides."""
+        velocity, height = self.step(r)
+        return _Frame(
+            (turn.T * velocity).applyfunc(tidy) + extra_v,
+            (turn.T * self.J_w).applyfunc(tidy) + extra_w,
+            (turn.T * self.gravity).applyfunc(tidy),
+            height,
+        )
+
 
 def _outwards(
     parent: _Frame, joint: Joint, coordinates: Sequence[Coordinate], index: Mapping[str, int]
 ) -> _Frame:
     """Carry the recursion over one joint."""
-    R0, p0 = _matrix(joint.rotation), _matrix(joint.position)
+    turn, r = _matrix(joint.rotation), _matrix(joint.position)
+    extra_v = extra_w = sp.zeros(3, len(coordinates))
     i = index.get(joint.name)
     if i is None:
-        velocity, height = parent.step(p0)
-        turn = R0
-        return _Frame(
-            (turn.T * velocity).applyfunc(tidy),
-            (turn.T * parent.J_w).applyfunc(tidy),
-            (turn.T * parent.gravity).applyfunc(tidy),
-            height,
-        )
+        return parent.carried(r, turn, extra_v, extra_w)
     length = float(np.linalg.norm(joint.axis))
     if not length > 0:
         raise ModelError(
@@ -353,20 +342,11 @@ def _outwards(
     pick = sp.zeros(1, len(coordinates))
     pick[i] = 1
     if joint.kind == "slide":
-        velocity, height = parent.step((p0 + R0 * axis * q).applyfunc(tidy))
-        turn = R0
-        extra_v, extra_w = axis * pick, sp.zeros(3, len(coordinates))
-    else:
-        velocity, height = parent.step(p0 + R0 * anchor)
-        turn = R0 * _rotation(axis, q)
-        extra_v, extra_w = sp.zeros(3, len(coordinates)), axis * pick
-    at_anchor = _Frame(
-        (turn.T * velocity).applyfunc(tidy) + extra_v,
-        (turn.T * parent.J_w).applyfunc(tidy) + extra_w,
-        (turn.T * parent.gravity).applyfunc(tidy),
-        height,
-    )
-    if joint.kind == "slide" or not any(joint.anchor):
+        there = (r + turn * axis * q).applyfunc(tidy)
+        return parent.carried(there, turn, axis * pick, extra_w)
+    turned = turn * _rotation(axis, q)
+    at_anchor = parent.carried(r + turn * anchor, turned, extra_v, axis * pick)
+    if not any(joint.anchor):
         return at_anchor
     velocity, height = at_anchor.step(-anchor)
     return _Frame(velocity, at_anchor.J_w, at_anchor.gravity, height)

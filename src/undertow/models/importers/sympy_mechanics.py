@@ -8,17 +8,22 @@ are linear in.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, at_least, checked
+from undertow.base import InvalidInputError, ModelError, at_least, checked, one_of
 from undertow.models.importers.coordinates import tidy
 from undertow.models.importers.equations import from_matrices
 from undertow.models.mechanism import Coordinate, Input, Mechanism, Parameter
-from undertow.models.validity import by_names, check_parts, expression_of, require_smooth, twins
-
-__all__ = ["from_kane", "from_lagrange"]
+from undertow.models.validity import (
+    by_names,
+    check_parts,
+    expression_of,
+    repeated_names,
+    require_smooth,
+)
 
 
 @checked
@@ -179,7 +184,7 @@ def _check_plain(
     own |= {given.symbol for given in inputs.values()}
     free = set().union(*(expression.free_symbols for expression in expressions))
     mixed = ", ".join(sorted(str(s) for s in free & own - set(inputs)))
-    alike = twins(sorted({s.name for s in free}))
+    alike = repeated_names(sorted({s.name for s in free}))
     if mixed or alike:
         raise ModelError(
             f"symbols of '{name}'",
@@ -208,18 +213,12 @@ def _build(
     units = by_names(f"units of '{name}'", units or {})
     coordinates = [Coordinate(_plain(c)) for c in q]
     names = [c.name for c in coordinates]
-    unknown = sorted(set(units) - set(names))
-    if unknown:
-        raise InvalidInputError(
-            f"units of '{name}'", value=", ".join(unknown), limit=f"one of {', '.join(names)}"
-        )
-    coordinates = [
-        Coordinate(_plain(c), units.get(n, "rad")) for c, n in zip(q, names, strict=True)
-    ]
+    for coordinate in units:
+        one_of(f"units of '{name}'", coordinate, names)
+    coordinates = [replace(c, unit=units.get(c.name, "rad")) for c in coordinates]
     translate: dict[Any, Any] = {}
-    for symbol, coordinate in zip(q, coordinates, strict=True):
-        translate[symbol.diff(t)] = coordinate.velocity
-        translate[symbol] = coordinate.symbol
+    for symbol, c in zip(q, coordinates, strict=True):
+        translate |= {symbol.diff(t): c.velocity, symbol: c.symbol}
     translate |= {symbol: given.symbol for symbol, given in inputs.items()}
     by_name = {n: p.symbol for p in parameters for n in (p.name, p.spelling)}
 

@@ -9,14 +9,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from undertow.base import ModelError, check_fields, near
+from undertow.base import ModelError, check_fields, one_of
 from undertow.models.mechanism import FloatArray
-from undertow.models.validity import twins
-
-__all__ = ["WORLD", "Actuator", "Coupling", "Joint", "Link", "Tree", "Vector"]
+from undertow.models.validity import repeated_names
 
 #: Name of the fixed frame that carries the root links.
 WORLD = "world"
+
+#: What to do about a joint that leaves a body free.
+FREE_BASE = (
+    "A free base leaves infinitely many equilibria (Remark 3): fix it, or model the joint by "
+    "hinges and slides"
+)
 
 Vector = tuple[float, float, float]
 
@@ -142,6 +146,18 @@ class Actuator:
     stroke: str = ""
 
 
+#: The numbers of a tree's parts that cannot be infinite.
+_NUMBERS = {
+    "links": ("mass", "com", "inertia"),
+    "joints": (
+        "rotation", "position", "axis", "anchor", "damping", "stiffness", "rest", "armature",
+        "friction", "reference",
+    ),
+    "couplings": ("coefficients", "damping", "stiffness", "rest", "armature"),
+    "actuators": ("coefficients", "gain"),
+}  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Tree:
     """A tree of links and joints under gravity, m/s², with its actuators."""
@@ -177,7 +193,7 @@ class Tree:
             ("joint", [joint.name for joint in self.joints]),
             ("actuator", [actuator.name for actuator in self.actuators]),
         ):
-            repeated = twins(names)
+            repeated = repeated_names(names)
             if repeated:
                 raise ModelError(
                     f"a {what} of '{self.name}' is named twice",
@@ -190,13 +206,10 @@ class Tree:
         parents: dict[str, str] = {}
         for joint in self.joints:
             for end in (joint.parent, joint.child):
-                if end not in known:
-                    raise ModelError(
-                        f"joint '{joint.name}' of '{self.name}'",
-                        value=f"link {end!r}",
-                        limit=f"one of {', '.join(sorted(known))}",
-                        remedy=near(end, known) or "Declare the link, or correct its name",
-                    )
+                whose = f"link of joint '{joint.name}' of '{self.name}'"
+                one_of(
+                    whose, end, sorted(known), "Declare the link, or correct its name", ModelError
+                )
             if joint.child == WORLD:
                 raise ModelError(
                     f"joint '{joint.name}' of '{self.name}'",
@@ -247,7 +260,7 @@ class Tree:
         return [joint for joint in self.ordered() if joint.kind != "fixed"]
 
     def _check_sizes(self) -> None:
-        """Refuse numbers that are none, or beyond any machine: their products would overflow."""
+        """Refuse values that are not numbers, or so large that their products would overflow."""
         named: list[tuple[str, str, Any]] = [("gravity", self.name, self.gravity)]
         if np.shape(self.gravity) != (3,):
             raise ModelError(
@@ -256,21 +269,11 @@ class Tree:
                 limit="three numbers, m/s²",
                 remedy="Write gravity=(0, 0, -9.81)",
             )
-        for link in self.links:
-            named += [(what, link.name, getattr(link, what)) for what in ("mass", "com", "inertia")]
-        for joint in self.joints:
-            for what in (
-                "rotation", "position", "axis", "anchor", "damping", "stiffness", "rest",
-                "armature", "friction", "reference",
-            ):  # fmt: skip
-                named.append((what, joint.name, getattr(joint, what)))
-        for coupling in self.couplings:
-            values = [*coupling.coefficients.values(), coupling.damping, coupling.stiffness]
-            named.append(("coupling", coupling.name, [*values, coupling.rest, coupling.armature]))
-        for actuator in self.actuators:
-            gains = [*actuator.coefficients.values(), actuator.gain]
-            named.append(("actuator", actuator.name, gains))
-        for what, name, value in named:
+        for parts, numbers in _NUMBERS.items():
+            for part in getattr(self, parts):
+                named += [(what, part.name, getattr(part, what)) for what in numbers]
+        for what, name, given in named:
+            value = list(given.values()) if isinstance(given, Mapping) else given
             try:
                 size = np.abs(np.asarray(value, dtype=float)).max(initial=0.0)
             except (TypeError, ValueError):  # no numbers at all

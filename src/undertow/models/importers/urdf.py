@@ -11,13 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from undertow.base import ModelError, checked
+from undertow.base import ModelError, checked, one_of
 from undertow.models.importers.rigid_body import mechanism_from_tree
-from undertow.models.importers.tree import WORLD, Joint, Link, Tree, Vector
+from undertow.models.importers.tree import FREE_BASE, WORLD, Joint, Link, Tree, Vector
 from undertow.models.importers.xml_files import computable, numbers_of, parse_xml, rotation_from_rpy
 from undertow.models.mechanism import FloatArray, Mechanism
-
-__all__ = ["from_urdf", "read_urdf"]
 
 _KINDS: dict[str, Literal["hinge", "slide", "fixed"]] = {
     "revolute": "hinge",
@@ -69,7 +67,7 @@ def from_urdf(
     Raises
     ------
     InvalidInputError
-        For broken XML, numbers that are none, unknown or repeated actuated joints.
+        For malformed XML, invalid numbers, unknown or repeated actuated joints.
     ModelError
         For loops, massless moving links, inertias that no body has, floating or planar joints,
         mimic joints, repeated names, and more joints than equations can be derived for.
@@ -182,16 +180,8 @@ def _link(element: ET.Element) -> Link:
 def _joint(element: ET.Element) -> Joint:
     name = _name(element)
     kind = element.get("type", "")
-    if kind not in _KINDS:
-        raise ModelError(
-            f"joint '{name}'",
-            value=f"type {kind!r}",
-            limit=f"one of {', '.join(_KINDS)}",
-            remedy="A free base leaves infinitely many equilibria (Remark 3): fix it, or model the "
-            "joint by hinges and slides"
-            if kind in ("floating", "planar")
-            else "Model it by hinges and slides",
-        )
+    free = FREE_BASE if kind in ("floating", "planar") else "Model it by hinges and slides"
+    one_of(f"type of joint '{name}'", kind, _KINDS, free, ModelError)
     if element.find("mimic") is not None:
         raise ModelError(
             f"joint '{name}'",

@@ -14,8 +14,6 @@ import numpy as np
 from undertow.base import ArtefactError, InvalidInputError, ModelError, read_file
 from undertow.models.mechanism import FloatArray
 
-__all__ = ["computable", "numbers_of", "parse_xml", "rotation_from_quaternion", "rotation_from_rpy"]
-
 #: Largest file, bytes; deepest nesting, and most elements, of one that is read.
 LARGEST, DEEPEST, MOST = 1 << 24, 64, 20_000
 

@@ -15,11 +15,14 @@ from undertow.studies.certification.subjects import (
     certify_run,
     certify_surface,
 )
+from undertow.studies.certification.verbs import Verification, certify, verify
 
 __all__ = [
     "Certified",
+    "Verification",
     "appendix_report",
     "certificate_files",
+    "certify",
     "certify_appendix",
     "certify_run",
     "certify_surface",
@@ -28,4 +31,5 @@ __all__ = [
     "run_report",
     "subject_report",
     "verification_report",
+    "verify",
 ]

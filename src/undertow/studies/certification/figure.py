@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.certify.region.motion import SurfaceMotion
-from undertow.certify.region.search import ProvedRegion
 from undertow.display.plot import COLOURS, display, style
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
+from undertow.proofs import ProvedRegion, SurfaceMotion
+from undertow.proofs.region.lyapunov import extent
+from undertow.proofs.region.motion import AutonomousSystem
 
 __all__ = ["held", "region_figure", "simulated"]
 
@@ -28,7 +29,6 @@ def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> Fl
     """
     motion = region.motion
     home = np.zeros(len(y), dtype=bool)
-    at_target = motion.determinant(np.zeros(motion.size))
     alive = np.arange(len(y))
     state = y.copy()
     fastest = float(np.abs(np.linalg.eigvals(motion.jacobian)).max())
@@ -37,7 +37,7 @@ def simulated(region: ProvedRegion, y: FloatArray, *, limit: float = 30.0) -> Fl
         for _ in range(int(limit / step)):
             inside = region.level(state) < 1.0
             home[alive[inside]] = True
-            ratio = motion.determinant(state) / at_target
+            ratio = motion.margin(state)
             sound = (ratio > 0) & np.isfinite(state).all(axis=1) & (np.abs(state[:, 0]) < 1e3)
             keep = ~inside & sound
             alive, state, ratio = alive[keep], state[keep], ratio[keep]
@@ -75,8 +75,7 @@ def _hurry(y: FloatArray, ratio: FloatArray) -> FloatArray:
     return np.asarray(np.clip(ratio, 0.01, 1.0) / (1.0 + 0.3 * np.abs(y).max(axis=1)))[:, None]
 
 
-def _step(motion: object, y: FloatArray, h: float | FloatArray) -> FloatArray:
-    assert isinstance(motion, SurfaceMotion)
+def _step(motion: AutonomousSystem, y: FloatArray, h: float | FloatArray) -> FloatArray:
     a = motion(y)
     b = motion(y + 0.5 * h * a)
     c = motion(y + 0.5 * h * b)
@@ -152,10 +151,10 @@ def _slice(axes: Axes, region: ProvedRegion, other: int) -> bool:
     axes.contourf(fa * a, fb * b, inside, [-1.0, 1.0], colors=[to_rgba(COLOURS["blue"], 0.55)])
     axes.contour(fa * a, fb * b, inside, [1.0], colors=COLOURS["blue"], linewidths=1.2)
     edge = _edge(region, other)
-    path, at_target = [edge], motion.determinant(np.zeros(motion.size))
+    path = [edge]
     for _ in range(6000):
-        ratio = motion.determinant(path[-1]) / at_target
-        path.append(_step(motion, path[-1], 0.01 * _hurry(path[-1], ratio)))
+        hurry = _hurry(path[-1], motion.margin(path[-1]))
+        path.append(_step(motion, path[-1], 0.01 * hurry))
     lines = np.array(path)
     for k in range(lines.shape[1]):
         axes.plot(fa * lines[:, k, 0], fb * lines[:, k, other], color=COLOURS["vermilion"], lw=0.8)
@@ -211,8 +210,6 @@ def _edge(region: ProvedRegion, other: int, count: int = 14) -> FloatArray:
 
 def _first(region: ProvedRegion, axis: int) -> float:
     """Where the proved set ends along an axis."""
-    from undertow.certify.region.lyapunov import extent
-
     way = np.zeros(region.motion.size)
     way[axis] = 1.0
     found = extent(region.function, way)

@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.certify.closed_loop.claim import LoopClaim
-from undertow.certify.closed_loop.loop import LoopMotion
-from undertow.certify.closed_loop.search import follow
 from undertow.display.plot import COLOURS, display, style
 from undertow.law import ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism
+from undertow.proofs import LoopClaim
+from undertow.proofs.closed_loop.loop import LoopMotion
+from undertow.proofs.search.closed_loop import follow
 
 __all__ = ["loop_figure"]
 

@@ -13,9 +13,8 @@ from rich.text import Text
 from undertow.base import Verdict, inward
 from undertow.base import artefacts as results
 from undertow.cascade import Run
-from undertow.certify.claims.certificate import Certificate, Subject
-from undertow.certify.claims.verify import Checked
 from undertow.models import Mechanism
+from undertow.proofs import Certificate, Checked, Subject
 from undertow.studies.certification.subjects import Certified
 
 __all__ = [
@@ -36,6 +35,13 @@ def _table(*heads: str) -> Table:
     return table
 
 
+def _claims_table() -> Table:
+    table = _table("verdict", "claim", "margin")
+    table.columns[0].no_wrap = True
+    table.columns[2].max_width = 24
+    return table
+
+
 def _kind(verdict: Verdict) -> Text:
     return Text(verdict.kind, style=_STYLES[verdict.kind])
 
@@ -52,9 +58,7 @@ def _witness(verdict: Verdict) -> str:
 
 def _claims(certified: Certified) -> Table:
     """Verdict and margin beside each claim; its worst point and its method below it."""
-    table = _table("verdict", "claim", "margin")
-    table.columns[0].no_wrap = True
-    table.columns[2].max_width = 24
+    table = _claims_table()
     subject = certified.subject
     for verdict in (*(c.verdict for c in subject.claims), *subject.remarks):
         words = Text(verdict.claim)
@@ -74,9 +78,11 @@ def subject_report(mechanism: Mechanism, certified: Certified) -> RenderableType
 
 def appendix_report(cases: Sequence[Certified]) -> RenderableType:
     """Return the appendix's five cases, one line each."""
+    loops = any(c.kind == "closed loop" for case in cases for c in case.subject.claims)
     table = _table(
-        "case", "stable at", "R ≻ 0 on Ĩ with our P", "terminal ball", "region on the surface"
-    )
+        "case", "stable at", "R ≻ 0 on Ĩ with our P", "terminal ball", "region on the surface",
+        *(["full loop from rest"] if loops else []),
+    )  # fmt: skip
     for case in cases:
         known = {c.kind: c.verdict for c in case.subject.claims}
 
@@ -90,7 +96,8 @@ def appendix_report(cases: Sequence[Certified]) -> RenderableType:
         if ellipsoid is not None:
             ball = f"‖x‖ ≤ {inward(ellipsoid.details['ball'] * (1 - 1e-12), 2)}"
         region = cell("surface region") if case.region is not None else Text("not asked for")
-        table.add_row(case.title, cell("stability"), cell("appendix interval"), ball, region)
+        more = [region, cell("closed loop")] if loops else [region]
+        table.add_row(case.title, cell("stability"), cell("appendix interval"), ball, *more)
     return table
 
 
@@ -145,9 +152,7 @@ def _law(subject: Subject) -> str:
 
 def verification_report(certificate: Certificate, checked: Sequence[Checked]) -> RenderableType:
     """Return every claim of a certificate as it was decided again, and the sum."""
-    table = _table("verdict", "claim", "margin")
-    table.columns[0].no_wrap = True
-    table.columns[2].max_width = 24
+    table = _claims_table()
     law = ""
     for item in checked:
         if _law(item.subject) != law:

@@ -4,26 +4,45 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from undertow.base import UndertowError, Verdict, inward
 from undertow.cascade import Run
-from undertow.certify.claims.certificate import Claim, Subject, ellipsoid_data, function_data
-from undertow.certify.claims.gate import Policy, assess
-from undertow.certify.claims.verify import reaches, region_words
-from undertow.certify.region.motion import SurfaceMotion
-from undertow.certify.region.search import ProvedRegion, prove_region
-from undertow.certify.surface.appendix import CASES, Constants, two_vertex
-from undertow.certify.surface.ellipsoid import verify_ellipsoid
-from undertow.certify.surface.ellipsoid_search import search_for
-from undertow.certify.surface.reaching import reaching
-from undertow.certify.surface.surface import hurwitz, nonsingular, singular_distance
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism
+from undertow.objective import MinimumEnergy
+from undertow.proofs import (
+    AppendixClaim,
+    Claim,
+    LyapunovFunction,
+    NonsingularClaim,
+    Policy,
+    ProvedRegion,
+    ReachingClaim,
+    RegionClaim,
+    StabilityClaim,
+    StatedClaim,
+    Subject,
+    SurfaceMotion,
+    assess,
+    box_starts,
+    prove_loop,
+    prove_region,
+    reaching,
+    sampled_extent,
+    sampled_region,
+    search_for,
+    singular_distance,
+    verify_region,
+)
+from undertow.proofs.claims.appendix import CASES, Constants
+from undertow.proofs.claims.claim import Box
+from undertow.proofs.claims.region import reaches
+from undertow.proofs.region.lyapunov import extent
 from undertow.studies.paper.appendix_search import search_rate
 
 __all__ = [
@@ -38,6 +57,12 @@ Progress = Callable[[str, float], None]
 
 #: Most coordinates of a motion on the surface for which a region is searched.
 LARGEST_REGION = 4
+
+#: Boxes of the proof of one function of a region for every plant of a box.
+MOST_BOXES = 3_000_000
+
+#: How far random starts of the appendix's cases are looked for, rad.
+FAR = math.radians(46)
 
 #: Part of what one disturbance alone may be that is claimed: rounding away from the edge.
 CLAIMED = 0.999
@@ -93,12 +118,14 @@ def certify_surface(
     title
         For tables; the surface itself by default.
     seconds
-        Effort for the region on the surface; 0 leaves it out.
+        Effort for the search of the region on the surface; 0 leaves it out.
     loop
         Also prove how far off the target the full closed loop may start at rest: minutes.
-    hold, uncertain
-        For that proof: the input is held for so many steps of 1 ms (0: at every instant), and
-        plant parameters lie in [low, high] instead of being the law's own.
+    hold
+        For that proof: the input is held for so many steps of 1 ms (0: at every instant).
+    uncertain
+        Plant parameters that lie in [low, high] instead of being the law's own: for the closed
+        loop, and for a second region on the surface.
     predict
         Also predict the motion from the start, and from random ones up to it (sampled).
     progress
@@ -110,35 +137,37 @@ def certify_surface(
     """
     began = time.perf_counter()
     tell = progress or (lambda what, part: None)
-    claims: list[Claim] = []
+    claims: list[StatedClaim] = []
     remarks: list[Verdict] = []
 
-    def keep(kind: str, data: Mapping[str, object], verdict: Verdict) -> None:
-        if verdict:
-            claims.append(Claim(kind, data, verdict))
+    def keep(claim: Claim | None, verdict: Verdict) -> None:
+        if claim is not None and verdict:
+            claims.append(StatedClaim.of(claim, verdict))
         else:
             remarks.append(verdict)
 
     tell("stability", 0.0)
-    keep("stability", {}, hurwitz(mechanism, surface))
+    decide = _Decisions(mechanism, surface, reaching_law, start, dict(uncertain or {}))
+    keep(*decide.own(StabilityClaim()))
     region = None
     if claims:
         tell("terminal set", 0.03)
-        keep("terminal ellipsoid", *_ellipsoid(mechanism, surface, reaching_law))
+        keep(*decide.ellipsoid())
         tell("non-singularity", 0.05)
-        box = _box(mechanism, start)
-        if box:
-            keep("nonsingular", {"region": _lists(box)}, _nonsingular(mechanism, surface, box))
+        if decide.box:
+            keep(*decide.nonsingular())
         tell("disturbances", 0.08)
-        for data, verdict in _disturbances(mechanism, surface, reaching_law, box):
-            keep("reaching", data, verdict)
+        for claim, verdict in decide.disturbances():
+            keep(claim, verdict)
         if seconds > 0:
             tell("region on the surface", 0.1)
-            region, data, verdict = _region(mechanism, surface, start, seconds)
-            keep("surface region", data, verdict)
+            region, found, verdict = decide.region(seconds)
+            keep(found, verdict)
+            if region is not None and uncertain:
+                keep(*decide.region_in_box(region))
         if loop:
             tell("the whole closed loop", 0.5)
-            keep("closed loop", *_loop(mechanism, surface, reaching_law, start, hold, uncertain))
+            keep(*decide.loop(hold))
         if predict and start.any():
             tell("prediction", 0.95)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
@@ -150,10 +179,6 @@ def certify_surface(
     return Certified(title or str(surface), subject, region, time.perf_counter() - began)
 
 
-def _lists(box: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
-    return {k: list(v) for k, v in box.items()}
-
-
 def _box(mechanism: Mechanism, start: FloatArray) -> dict[str, tuple[float, float]]:
     return {
         c.name: (-abs(float(v)), abs(float(v)))
@@ -162,114 +187,139 @@ def _box(mechanism: Mechanism, start: FloatArray) -> dict[str, tuple[float, floa
     }
 
 
-def _ellipsoid(
-    mechanism: Mechanism, surface: Surface, law: ReachingLaw
-) -> tuple[Mapping[str, object], Verdict]:
-    claim = "a terminal set of the full closed loop, layer and input limits included"
-    search = search_for(mechanism, surface, law)
-    found = None if search is None else search.largest()
-    if found is None:
-        return {}, Verdict(claim, "undecided", method="no ellipsoid of the modes is proved")
-    return ellipsoid_data(found), verify_ellipsoid(mechanism, surface, law, found)
+#: A claim, or none that could be made, and its verdict.
+_Decided = tuple[Claim | None, Verdict]
 
 
-def _nonsingular(
-    mechanism: Mechanism, surface: Surface, box: Mapping[str, tuple[float, float]]
-) -> Verdict:
-    verdict = nonsingular(mechanism, surface, box)
-    if not verdict:
-        return verdict
-    factor, _ = singular_distance(mechanism, surface, box, tolerance=1e-3)
-    details = {**verdict.details, "may grow by": factor}
-    method = f"{verdict.method}; the box may grow {inward(factor)} times"
-    return replace(verdict, method=method, details=details)
+@dataclass(frozen=True, eq=False)
+class _Decisions:
+    """The claims on one surface, each with its verdict."""
+
+    mechanism: Mechanism
+    surface: Surface
+    law: ReachingLaw
+    start: FloatArray
+    uncertain: Box
+
+    @property
+    def box(self) -> Box:
+        """The positions up to the start, on either side."""
+        return _box(self.mechanism, self.start)
+
+    def own(self, claim: Claim) -> _Decided:
+        return claim, claim.decide(self.mechanism, self.surface, self.law)
+
+    def ellipsoid(self) -> _Decided:
+        words = "a terminal set of the full closed loop, layer and input limits included"
+        search = search_for(self.mechanism, self.surface, self.law)
+        found = None if search is None else search.largest()
+        if found is None:
+            return None, Verdict(words, "undecided", method="no ellipsoid of the modes is proved")
+        return self.own(found)
+
+    def nonsingular(self) -> _Decided:
+        claim, verdict = self.own(NonsingularClaim(self.box))
+        if not verdict:
+            return claim, verdict
+        factor, _ = singular_distance(self.mechanism, self.surface, self.box, tolerance=1e-3)
+        details = {**verdict.details, "may grow by": factor}
+        method = f"{verdict.method}; the box may grow {inward(factor)} times"
+        return claim, replace(verdict, method=method, details=details)
+
+    def disturbances(self) -> Iterator[_Decided]:
+        """One claim for each coordinate: what K overcomes there, acting alone."""
+        n, m = self.mechanism.n, self.mechanism.m
+        found = reaching(self.mechanism, self.surface, self.box, self.law)
+        for j, bound in enumerate(found.largest):
+            size = bound.proved * CLAIMED
+            if not (size > 0 and math.isfinite(size)):
+                continue
+            load = tuple(size if k == j else 0.0 for k in range(n))
+            claim, verdict = self.own(ReachingClaim(self.box, (0.0,) * m, load))
+            if bound.input_unit:
+                most = f"{inward(bound.as_input * CLAIMED)} {bound.input_unit}"
+                verdict = replace(verdict, method=f"{verdict.method}; {most} at the input")
+            yield claim, verdict
+
+    def region(self, seconds: float) -> tuple[ProvedRegion | None, Claim | None, Verdict]:
+        words, mechanism = "a region of attraction on the surface", self.mechanism
+        n, m = mechanism.n, mechanism.m
+        if 2 * n - m > LARGEST_REGION:
+            why = f"{2 * n - m} coordinates; boxes are searched up to {LARGEST_REGION}"
+            return None, None, Verdict(words, "undecided", method=why)
+        way = np.zeros(2 * n - m)
+        way[: n - m] = self.start[m:n]
+        if not way.any():
+            way[0] = 1.0
+        way /= np.linalg.norm(way)
+        try:
+            motion = SurfaceMotion(mechanism, self.surface)
+            proved = prove_region(motion, way, seconds=seconds)
+        except UndertowError as error:
+            return None, None, Verdict(words, "undecided", method=str(error))
+        point = _inside(proved.function, proved.extent * way)
+        if point is None:
+            return proved, None, Verdict(words, "undecided", method="no start is shown inside")
+        claim = RegionClaim(proved.chain, point)
+        verdict = replace(
+            proved.verdict,
+            claim=claim.sentence(motion),
+            margin=float(np.linalg.norm(point)) * (1 - 1e-12),
+            unit=mechanism.coordinates[m].unit,
+            witness=dict(zip(motion.names, point, strict=True)),
+        )
+        return proved, claim, verdict
+
+    def region_in_box(self, region: ProvedRegion) -> _Decided:
+        """The region for every plant of a box: as many functions of the chain as hold there."""
+        words = "a region of attraction for every plant of the box"
+        box = self.uncertain
+        chain: tuple[LyapunovFunction, ...] = ()
+        for V in region.chain:
+            tried, known = (*chain, V), len(chain)
+            verdict = verify_region(
+                region.motion, tried, parameters=box, max_boxes=MOST_BOXES, proved=known
+            )
+            if not verdict:
+                break
+            chain = tried
+        if not chain:
+            return None, replace(verdict, claim=words)
+        point = _inside(chain[-1], extent(chain[-1], region.way) * region.way)
+        if point is None:
+            return None, Verdict(words, "undecided", method="no start is shown inside")
+        return self.own(RegionClaim(chain, point, box))
+
+    def loop(self, hold: int) -> _Decided:
+        """How far off the target the first free coordinate that starts there may start at rest."""
+        mechanism = self.mechanism
+        free = mechanism.coordinates[mechanism.m :]
+        away = np.abs(self.start[mechanism.m : mechanism.n])
+        index = int(np.argmax(away))
+        reach = float(away[index]) or (1.0 if free[index].unit == "rad" else 0.5)
+        try:
+            proved = prove_loop(
+                mechanism,
+                self.surface,
+                self.law,
+                coordinate=free[index].name,
+                reach=reach,
+                hold=hold,
+                uncertain=self.uncertain,
+            )
+        except UndertowError as error:
+            words = "the full closed loop converges from rest"
+            return None, Verdict(words, "undecided", method=str(error))
+        return proved.claim, proved.verdict
 
 
-def _disturbances(
-    mechanism: Mechanism,
-    surface: Surface,
-    law: ReachingLaw,
-    box: Mapping[str, tuple[float, float]],
-) -> list[tuple[Mapping[str, object], Verdict]]:
-    """One claim for each coordinate: what K overcomes there, acting alone."""
-    rows: list[tuple[Mapping[str, object], Verdict]] = []
-    found = reaching(mechanism, surface, box, law)
-    for j, bound in enumerate(found.largest):
-        size = bound.proved * CLAIMED
-        if not (size > 0 and math.isfinite(size)):
-            continue
-        load = [size if k == j else 0.0 for k in range(mechanism.n)]
-        data = {"region": _lists(box), "eta": [0.0] * mechanism.m, "disturbance": load}
-        verdict = reaching(mechanism, surface, box, law, eta=0.0, disturbance=load).verdict
-        if bound.input_unit:
-            most = f"{inward(bound.as_input * CLAIMED)} {bound.input_unit}"
-            verdict = replace(verdict, method=f"{verdict.method}; {most} at the input")
-        rows.append((data, verdict))
-    return rows
-
-
-def _region(
-    mechanism: Mechanism, surface: Surface, start: FloatArray, seconds: float
-) -> tuple[ProvedRegion | None, Mapping[str, object], Verdict]:
-    claim = "a region of attraction on the surface"
-    free = mechanism.n - mechanism.m
-    size = 2 * mechanism.n - mechanism.m
-    if size > LARGEST_REGION:
-        why = f"{size} coordinates; boxes are searched up to {LARGEST_REGION}"
-        return None, {}, Verdict(claim, "undecided", method=why)
-    way = np.zeros(size)
-    way[:free] = start[mechanism.m : mechanism.n]
-    if not way.any():
-        way[0] = 1.0
-    way /= np.linalg.norm(way)
-    try:
-        motion = SurfaceMotion(mechanism, surface)
-        proved = prove_region(motion, way, seconds=seconds)
-    except UndertowError as error:
-        return None, {}, Verdict(claim, "undecided", method=str(error))
-    point = proved.extent * way
+def _inside(V: LyapunovFunction, point: FloatArray) -> tuple[float, ...] | None:
+    """A point a little nearer to 0 that is shown inside {V ≤ 1}, or none."""
     for _ in range(20):
-        if reaches(proved.function, point.tolist()):
-            break
+        if reaches(V, point.tolist()):
+            return tuple(point.tolist())
         point = 0.999 * point
-    else:
-        return proved, {}, Verdict(claim, "undecided", method="no start is shown inside")
-    data = {"functions": [function_data(V) for V in proved.chain], "start": point.tolist()}
-    verdict = Verdict(
-        region_words(motion, point.tolist(), {}),
-        "proved",
-        float(np.linalg.norm(point)) * (1 - 1e-12),
-        mechanism.coordinates[mechanism.m].unit,
-        dict(zip(motion.names, point.tolist(), strict=True)),
-        proved.verdict.method,
-        proved.verdict.details,
-    )
-    return proved, data, verdict
-
-
-def _loop(
-    mechanism: Mechanism,
-    surface: Surface,
-    law: ReachingLaw,
-    start: FloatArray,
-    hold: int,
-    uncertain: Mapping[str, tuple[float, float]] | None,
-) -> tuple[Mapping[str, object], Verdict]:
-    from undertow.certify.closed_loop.search import prove_loop
-
-    free = mechanism.coordinates[mechanism.m :]
-    away = np.abs(start[mechanism.m : mechanism.n])
-    index = int(np.argmax(away))
-    reach = float(away[index]) or (1.0 if free[index].unit == "rad" else 0.5)
-    try:
-        proved = prove_loop(
-            mechanism, surface, law, coordinate=free[index].name, reach=reach, hold=hold,
-            uncertain=uncertain,
-        )  # fmt: skip
-    except UndertowError as error:
-        claim = "the full closed loop converges from rest"
-        return {}, Verdict(claim, "undecided", method=str(error))
-    return proved.claim.to_dict(), proved.verdict
+    return None
 
 
 #: Random starts of the sampled verdict.
@@ -278,8 +328,6 @@ TRIALS = 4000
 
 def _sampled(loop: ClosedLoop, surface: Surface, start: FloatArray) -> list[Verdict]:
     """Whether starts at rest, up to the given one on either side, arrive."""
-    from undertow.certify.surface.sampled import box_starts, sampled_region
-
     box = _box(loop.mechanism, start)
     if not box:
         return []
@@ -324,7 +372,13 @@ def certify_run(
 
 
 def certify_appendix(
-    mechanism: Mechanism, *, seconds: float = 0.0, progress: Progress | None = None
+    mechanism: Mechanism,
+    *,
+    seconds: float = 0.0,
+    loop: bool = False,
+    hold: int = 0,
+    uncertain: Mapping[str, tuple[float, float]] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Certified, ...]:
     """Decide the appendix's five cases, with a P of our own, for a rotary pendulum.
 
@@ -332,6 +386,12 @@ def certify_appendix(
     ----------
     seconds
         Effort for each region on the surface; 0 leaves them out.
+    loop
+        Also prove how far off the target the full closed loop may start at rest, up to where
+        random starts of the law at every instant, on the plant that it knows, still converge;
+        their verdict is a remark.  Minutes for each case.
+    hold, uncertain
+        As for :func:`certify_surface`.
     """
     constants = Constants.of(mechanism)
     certified = []
@@ -341,16 +401,23 @@ def certify_appendix(
             progress(name, index / len(CASES))
         start = mechanism.state(phi=float(case.half_width))
         base = certify_surface(
-            mechanism, case.surface, start, seconds=seconds, title=name, predict=False
-        )
+            mechanism, case.surface, start, seconds=seconds, uncertain=uncertain, title=name,
+            predict=False,
+        )  # fmt: skip
         P, _ = search_rate(case.reduced(constants), case.half_width)
-        data = {"P": [str(v) for v in P], "half_width": str(case.half_width)}
-        verdict = two_vertex(case.reduced(constants), P, case.half_width)
-        claims, remarks = base.subject.claims, base.subject.remarks
-        if verdict:
-            claims = (*claims, Claim("appendix interval", data, verdict))
-        else:
-            remarks = (*remarks, verdict)
+        law = ReachingLaw()
+        decide = _Decisions(mechanism, case.surface, law, start, dict(uncertain or {}))
+        decided = [decide.own(AppendixClaim(P, case.half_width))]
+        more: tuple[Verdict, ...] = ()
+        if loop:
+            closed = ClosedLoop(mechanism, MinimumEnergy(horizon=80.0), law, tail_rtol=1e-3)
+            more = (sampled_extent(closed, case.surface, "phi", FAR),)
+            limit = mechanism.state(phi=float(more[0].details["extent"]))
+            decided.append(replace(decide, start=limit).loop(hold))
+        proved = [StatedClaim.of(c, v) for c, v in decided if c is not None and v]
+        claims = (*base.subject.claims, *proved)
+        rest = (v for c, v in decided if c is None or not v)
+        remarks = (*base.subject.remarks, *rest, *more)
         subject = Subject(case.surface, ReachingLaw(), claims, remarks)
         certified.append(Certified(name, subject, base.region, base.seconds))
     return tuple(certified)

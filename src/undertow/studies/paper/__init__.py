@@ -1,7 +1,13 @@
 """The paper's experiment, end to end: printed data, Tables 1-2, Figures 3-11, findings."""
 
 from undertow.studies.paper.data import CASES, CONDITIONS, OBJECTIVES, PRINTED, ROWS, Condition
-from undertow.studies.paper.experiment import Bound, Effort, Reproduction, printed_motion, reproduce
+from undertow.studies.paper.experiment import (
+    Effort,
+    LowerBound,
+    Reproduction,
+    printed_motion,
+    reproduce,
+)
 from undertow.studies.paper.figures import figures
 from undertow.studies.paper.findings import Finding, findings
 from undertow.studies.paper.limits import catch_limit, singular_angle
@@ -13,10 +19,10 @@ __all__ = [
     "OBJECTIVES",
     "PRINTED",
     "ROWS",
-    "Bound",
     "Condition",
     "Effort",
     "Finding",
+    "LowerBound",
     "Reproduction",
     "catch_limit",
     "figures",

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from undertow.base import inward
-from undertow.base.verdict import Verdict
-from undertow.certify.surface.appendix import (
+from undertow.base import Verdict, inward, markdown_table
+from undertow.display.plot import figure_files, style
+from undertow.mechanisms import rotary_pendulum
+from undertow.proofs.claims.appendix import (
     CASES,
     PRINTED,
     AppendixCase,
@@ -24,12 +26,8 @@ from undertow.certify.surface.appendix import (
     paper_rate,
     two_vertex,
 )
-from undertow.certify.surface.surface import hurwitz
-from undertow.display.plot import figure_bytes, style
-from undertow.mechanisms import rotary_pendulum
+from undertow.proofs.claims.stability import hurwitz
 from undertow.studies.paper.appendix_search import search_interval, search_rate
-
-__all__ = ["CaseReport", "figures", "files", "markdown", "report"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +68,7 @@ class CaseReport:
     our_width: float
 
 
+@cache
 def report(case: AppendixCase, constants: Constants) -> CaseReport:
     """Decide all claims of one case for given constants."""
     reduced = case.reduced(constants)
@@ -104,38 +103,46 @@ def _mark(verdict: Verdict) -> str:
 
 
 def _rows(reports: Sequence[CaseReport]) -> list[str]:
-    lines = [
-        "| case | ε: printed / is | β: printed / is | Ĩ | R ≻ 0 on Ĩ | inf λ_min(R) | "
-        "holds up to | σ, λ_max(P̃) | (A20): V̇ / its bound |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    heads = (
+        "case", "ε: printed / is", "β: printed / is", "Ĩ", "R ≻ 0 on Ĩ", "inf λ_min(R)",
+        "holds up to", "σ, λ_max(P̃)", "(A20): V̇ / its bound",
+    )  # fmt: skip
+    rows = []
     for r in reports:
-        margin = inward(r.printed_test.margin, 2)
-        sigma = inward(r.printed_sigma.margin, 2) if r.printed_sigma else "none"
         gap = r.false_bound.details
         place = tuple(round(v, 3) for v in r.false_bound.witness.values())
-        lines.append(
-            f"| {r.case.number} {r.case.title} | {r.case.epsilon} / {r.epsilon:.4f} "
-            f"| {r.case.beta} / {r.beta:.4g} | ±{float(r.case.half_width):g} "
-            f"| {_mark(r.printed_test)} | {margin} | {inward(r.printed_width)} | {sigma} "
-            f"| {_mark(r.false_bound)}: {gap['V̇']:.3g} / {gap['claimed bound']:.3g} at {place} |"
+        rows.append(
+            (
+                f"{r.case.number} {r.case.title}",
+                f"{r.case.epsilon} / {r.epsilon:.4f}",
+                f"{r.case.beta} / {r.beta:.4g}",
+                f"±{float(r.case.half_width):g}",
+                _mark(r.printed_test),
+                inward(r.printed_test.margin, 2),
+                inward(r.printed_width),
+                inward(r.printed_sigma.margin, 2) if r.printed_sigma else "none",
+                f"{_mark(r.false_bound)}: {gap['V̇']:.3g} / {gap['claimed bound']:.3g} at {place}",
+            )
         )
-    return lines
+    return markdown_table(heads, rows)
 
 
 def _our_rows(reports: Sequence[CaseReport]) -> list[str]:
-    lines = [
-        "| case | our P: p₁₁, p₁₂, p₁₃, p₂₂, p₃₃ | R ≻ 0 on Ĩ | σ proved, 1/s "
-        "| widest Ĩ / arccos ε |",
-        "|---|---|---|---|---|",
-    ]
-    for r in reports:
-        entries = ", ".join(f"{float(v):.4g}" for v in r.ours)
-        lines.append(
-            f"| {r.case.number} | {entries} | {_mark(r.our_rate)} | {inward(r.our_rate.margin, 3)} "
-            f"| {inward(r.our_width)} / {r.limit:.4f} |"
+    heads = (
+        "case", "our P: p₁₁, p₁₂, p₁₃, p₂₂, p₃₃", "R ≻ 0 on Ĩ", "σ proved, 1/s",
+        "widest Ĩ / arccos ε",
+    )  # fmt: skip
+    rows = [
+        (
+            r.case.number,
+            ", ".join(f"{float(v):.4g}" for v in r.ours),
+            _mark(r.our_rate),
+            inward(r.our_rate.margin, 3),
+            f"{inward(r.our_width)} / {r.limit:.4f}",
         )
-    return lines
+        for r in reports
+    ]
+    return markdown_table(heads, rows)
 
 
 def markdown() -> str:
@@ -150,10 +157,11 @@ def markdown() -> str:
         parts += [f"### {title}", "", "The printed P:", "", *_rows(reports), ""]
         parts += ["Ours:", "", *_our_rows(reports), ""]
     parts += ["### Local exponential stability, b = 0.0045016", ""]
-    parts += ["| case | verdict | proved rate, 1/s |", "|---|---|---|"]
-    for case in CASES:
-        verdict = hurwitz(rig, case.surface)
-        parts.append(f"| {case.number} | {verdict.kind} | {inward(verdict.margin)} |")
+    verdicts = {case.number: hurwitz(rig, case.surface) for case in CASES}
+    parts += markdown_table(
+        ("case", "verdict", "proved rate, 1/s"),
+        [(number, verdict.kind, inward(verdict.margin)) for number, verdict in verdicts.items()],
+    )
     return "\n".join(parts) + "\n"
 
 
@@ -165,13 +173,12 @@ def figures() -> dict[str, Figure]:
     dict
         Figures by file name, without its ending.
     """
-    rig, drawn = rotary_pendulum(), {}
+    constants, drawn = Constants.of(rotary_pendulum()), {}
     for case in CASES:
         y1 = np.linspace(-1, 1, 401) * float(case.half_width)
-        before, after = case.reduced(PRINTED), case.reduced(Constants.of(rig))
-        ours, _ = search_rate(after, case.half_width)
+        before, after = case.reduced(PRINTED), case.reduced(constants)
         # P has no scale of its own: ours takes the printed p₁₁.
-        ours = Lyapunov(*(v * case.P.p11 for v in ours))
+        ours = Lyapunov(*(v * case.P.p11 for v in report(case, constants).ours))
         with style():
             figure = Figure(figsize=(5, 3.6), layout="constrained")
             axes = figure.subplots()
@@ -196,9 +203,7 @@ def files() -> dict[str, bytes]:
     MissingExtraError
         Where ``undertow[certify]`` is not installed.
     """
-    made = {
-        f"{name}.{kind}": figure_bytes(figure, kind)
-        for name, figure in figures().items()
-        for kind in ("png", "pdf")
+    return {
+        "appendix.md": markdown().encode(),
+        **figure_files(figures(), ("png", "pdf")),
     }
-    return {"appendix.md": markdown().encode(), **made}

@@ -1,6 +1,6 @@
 """The search for the appendix's P: semidefinite programs at the two vertices (Clarabel).
 
-What is found is rounded to decimals and proved by :mod:`undertow.certify.surface.appendix`, which
+What is found is rounded to decimals and proved by :mod:`undertow.proofs.claims.appendix`, which
 shares nothing with the search.
 """
 
@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.base import InfeasibleError, MissingExtraError
+from undertow.base import InfeasibleError, require_extra
 from undertow.base.verdict import Verdict
-from undertow.certify.intervals.interval import flint
-from undertow.certify.surface.appendix import (
+from undertow.proofs.claims.appendix import (
     BITS,
     Lyapunov,
     Reduced,
@@ -25,28 +23,16 @@ from undertow.certify.surface.appendix import (
     gamma_factor,
     two_vertex,
 )
-
-__all__ = ["search_interval", "search_rate"]
+from undertow.proofs.intervals.interval import flint
 
 FloatArray = NDArray[np.float64]
-
-
-def _clarabel() -> Any:
-    try:
-        import clarabel
-    except ImportError as error:
-        raise MissingExtraError(
-            "the search for P needs Clarabel",
-            remedy="Install the extra: pip install 'undertow[certify]'",
-        ) from error
-    return clarabel
 
 
 def _solve_sdp(
     objective: FloatArray, blocks: Sequence[tuple[FloatArray, FloatArray]]
 ) -> FloatArray:
     """Minimise objective·x subject to C + Σ x_i A_i ⪰ 0 for blocks (C, A), A (k, 3, 3)."""
-    clarabel = _clarabel()
+    clarabel = require_extra("clarabel", "certify", "the search for P needs Clarabel")
     from scipy import sparse
 
     def svec(M: FloatArray) -> FloatArray:

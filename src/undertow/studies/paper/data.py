@@ -24,18 +24,6 @@ from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, MinimumTime, Objective
 
-__all__ = [
-    "CASES",
-    "CONDITIONS",
-    "HORIZON_CLAIM",
-    "OBJECTIVES",
-    "PERIOD",
-    "PRINTED",
-    "ROWS",
-    "Condition",
-    "Printed",
-]
-
 #: Δt between re-optimisations, s (Sec. 4).
 PERIOD = 0.1
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import degrees, pi
 
-from undertow.base import InfeasibleError, MissingExtraError, UndertowError
+from undertow.base import InfeasibleError, MissingExtraError, Progress, UndertowError, no_progress
 from undertow.cascade import Cascade, Run
 from undertow.closed_loop import ClosedLoop, Event, Trajectory
 from undertow.law import Surface, first_surface
@@ -28,21 +28,6 @@ from undertow.studies.paper.limits import (
     own_reach,
 )
 from undertow.studies.paper.repeats import Repeats, noisy_repeats
-
-__all__ = [
-    "Bound",
-    "Effort",
-    "Motion",
-    "OwnOptimum",
-    "Reproduction",
-    "Row",
-    "lower_bound",
-    "own_optimum",
-    "printed_motion",
-    "reproduce",
-]
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +69,7 @@ class OwnOptimum:
 
 
 @dataclass(frozen=True)
-class Bound:
+class LowerBound:
     """The optimal-control lower bound, or why there is none."""
 
     value: float | None
@@ -101,7 +86,22 @@ class Row:
     paper: float
     printed: Motion
     ours: Motion
-    bound: Bound
+    bound: LowerBound
+
+    @property
+    def place(self) -> dict[str, str]:
+        """What tells it from the other lines."""
+        return {"condition": self.condition, "objective": self.objective, "row": self.row}
+
+    @property
+    def cells(self) -> dict[str, tuple[float | None, str]]:
+        """Column to its figure, or to why there is none."""
+        return {
+            "paper": (self.paper, ""),
+            "printed": (self.printed.total, self.printed.reason),
+            "ours": (self.ours.total, self.ours.reason),
+            "bound": (self.bound.value, self.bound.reason),
+        }
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Reproduction:
 
 def _ending(trajectory: Trajectory) -> str:
     """Say in words why a motion did not reach the terminal set; empty if it did."""
-    t = trajectory.duration
+    t = trajectory.time
     angle = degrees(trajectory["phi"][-1])
     return {
         Event.REACHED: "",
@@ -180,7 +180,7 @@ def _motion(
         tuple(surfaces),
         tuple(switch_times),
         trajectory,
-        trajectory.total if reached else None,
+        trajectory.cost if reached else None,
         _ending(trajectory),
     )
 
@@ -248,7 +248,7 @@ def _schedule(run: Run) -> tuple[list[Surface], list[float]]:
     return surfaces, times
 
 
-def lower_bound(condition: Condition, objective: str) -> Bound:
+def lower_bound(condition: Condition, objective: str) -> LowerBound:
     """Return the optimal-control lower bound by collocation, where CasADi is there.
 
     The pendulum stays above the horizontal, as (37) makes every stable surface keep it.
@@ -260,10 +260,10 @@ def lower_bound(condition: Condition, objective: str) -> Bound:
     try:
         found = bound(condition.mechanism, upright, condition.start)
     except MissingExtraError:
-        return Bound(None, "not computed: pip install 'undertow[bounds]'")
+        return LowerBound(None, "not computed: pip install 'undertow[bounds]'")
     except UndertowError as error:
-        return Bound(None, f"no optimal control found ({error.value})")
-    return Bound(float(found.cost))
+        return LowerBound(None, f"no optimal control found ({error.value})")
+    return LowerBound(float(found.cost))
 
 
 class _Clock:
@@ -292,7 +292,7 @@ def reproduce(
     *,
     seed: int = 0,
     effort: Effort | None = None,
-    progress: Progress = lambda _what, _fraction: None,
+    progress: Progress = no_progress,
 ) -> Reproduction:
     """Run the whole experiment.
 
@@ -329,7 +329,7 @@ def reproduce(
             d: own_reach(rotary_pendulum(d_e=d), seed=seed, budget=Budget(512)) for d in dampings
         }
     own: dict[tuple[str, str], OwnOptimum] = {}
-    bounds: dict[tuple[str, str], Bound] = {}
+    bounds: dict[tuple[str, str], LowerBound] = {}
     for key, goal in tasks:
         title = f"{CONDITIONS[key].title}, {goal}"
         with clock.part(f"cascade ({title})", 3) as inner:
@@ -339,7 +339,7 @@ def reproduce(
         if effort.bounds:
             with clock.part(f"bound ({title})", 3):
                 bounds[key, goal] = lower_bound(CONDITIONS[key], goal)
-    skipped = Bound(None, "not computed: --quick")
+    skipped = LowerBound(None, "not computed: --quick")
     rows = tuple(
         Row(
             key,

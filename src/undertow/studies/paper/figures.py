@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from math import degrees
 from typing import Any
 
@@ -12,22 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, input_series, phase, state_series, style, surface_trace
+from undertow.display.plot import COLOURS, phase, style, surface_trace
 from undertow.models import FloatArray
+from undertow.studies.figures import REPEATS, ROW_LINES, beginning, draw_rows, rows_figure
 from undertow.studies.paper.data import CONDITIONS, ROWS
 from undertow.studies.paper.experiment import Reproduction
 from undertow.studies.paper.repeats import Repeats
 
-__all__ = ["comparison", "figures", "phase_plane", "repeats_figure"]
-
 #: What Figure 5 shows of the motion, s: later on the surface hardly moves.
 PHASE_TIME = 1.0
-
-ROW_LINES: Mapping[str, dict[str, Any]] = {
-    "base": {"color": COLOURS["grey"], "linestyle": (0, (4, 1.5))},
-    "one-time": {"color": COLOURS["orange"], "linestyle": "-"},
-    "cascade": {"color": COLOURS["blue"], "linestyle": "-"},
-}
 
 
 def figures(result: Reproduction) -> dict[str, Figure]:
@@ -56,37 +48,18 @@ def _where(key: str) -> str:
 
 def repeats_figure(repeats: Repeats) -> Figure:
     """Return Figure 3: the ideal motion and the simulated repeats, three rows over time."""
-    with style():
-        figure = Figure(figsize=(6.4, 5.2), layout="constrained")
-        top, middle, bottom = figure.subplots(3, 1, sharex=True)
-        lines = (COLOURS["orange"], COLOURS["green"], COLOURS["vermilion"])
-        for number, (repeat, colour) in enumerate(zip(repeats.repeats, lines, strict=False)):
-            look: dict[str, Any] = {
-                "color": colour,
-                "linewidth": 0.7,
-                "label": f"simulated repeat {number + 1}",
-            }
-            _three(top, middle, bottom, repeat, look)
-        ideal: dict[str, Any] = {
-            "color": "black", "linestyle": (0, (4, 2)), "label": "ideal model",
-        }  # fmt: skip
-        _three(top, middle, bottom, repeats.ideal, ideal)
-        bottom.set_xlabel("time (s)")
-        bottom.set_xlim(0, 4)
-        top.set_title(
-            f"Table 2's one-time surface, {_where('matched')}\n"
-            "repeats: 1 kHz sampling, noise, Coulomb friction, spread start (simulated)",
-            loc="left",
-        )
-        top.legend(loc="upper right", ncols=2)
-        figure.align_ylabels()
-    return figure
-
-
-def _three(top: Any, middle: Any, bottom: Any, motion: Trajectory, look: dict[str, Any]) -> None:
-    state_series(top, motion, "phi", **look)
-    state_series(middle, motion, "theta", **look)
-    input_series(bottom, motion, **look)
+    motions: list[tuple[Trajectory, dict[str, Any]]] = [
+        (repeat, {"color": colour, "linewidth": 0.7, "label": f"simulated repeat {number}"})
+        for number, (repeat, colour) in enumerate(zip(repeats.repeats, REPEATS, strict=False), 1)
+    ]
+    look = {"color": "black", "linestyle": (0, (4, 2)), "label": "ideal model"}
+    return rows_figure(
+        [*motions, (repeats.ideal, look)],
+        until=4.0,
+        title=f"Table 2's one-time surface, {_where('matched')}\n"
+        "repeats: 1 kHz sampling, noise, Coulomb friction, spread start (simulated)",
+        columns=2,
+    )
 
 
 def comparison(
@@ -113,7 +86,7 @@ def comparison(
         for column, (name, motions) in enumerate(columns.items()):
             top, middle, bottom = grid[:, column]
             for row, motion in motions.items():
-                _three(top, middle, bottom, motion, {**ROW_LINES[row], "label": row})
+                draw_rows((top, middle, bottom), motion, **ROW_LINES[row], label=row)
             top.set_title(name, loc="left")
             for axes, end in ((top, short), (middle, long), (bottom, short)):
                 axes.set_xlim(0, end)
@@ -141,7 +114,9 @@ def phase_plane(result: Reproduction) -> Figure:
             if motion.trajectory is None:
                 axes.text(0.5, 0.5, motion.reason, transform=axes.transAxes, ha="center")
                 continue
-            trajectory = _first(motion.trajectory, PHASE_TIME)
+            trajectory = beginning(
+                motion.trajectory, int((motion.trajectory.t < PHASE_TIME - 1e-9).sum())
+            )
             surface_trace(
                 axes,
                 trajectory,
@@ -164,13 +139,6 @@ def phase_plane(result: Reproduction) -> Figure:
             fontsize=10,
         )
     return figure
-
-
-def _first(motion: Trajectory, end: float) -> Trajectory:
-    """Return the beginning of a motion, up to a time, s."""
-    rows = motion.t < end - 1e-9
-    columns = ("t", "x", "u", "s", "cost", "margin")
-    return replace(motion, **{name: getattr(motion, name)[rows] for name in columns})
 
 
 def _mark_switches(axes: Axes, motion: Trajectory, times: Sequence[float]) -> None:

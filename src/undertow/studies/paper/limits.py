@@ -16,16 +16,6 @@ from undertow.objective import MinimumTime, Objective
 from undertow.optimiser import Budget, Optimiser
 from undertow.studies.paper.data import CASES, OBJECTIVES, PRINTED, Condition
 
-__all__ = [
-    "Limit",
-    "Sensitivity",
-    "base_sensitivity",
-    "case_limits",
-    "catch_limit",
-    "own_reach",
-    "singular_angle",
-]
-
 
 @dataclass(frozen=True)
 class Limit:
@@ -123,18 +113,12 @@ def base_sensitivity(condition: Condition) -> Sensitivity:
     step = 0.05
 
     def slope(objective: Objective, d_e: float, angle: float) -> float:
-        loops = [
-            (
-                ClosedLoop(rotary_pendulum(d_e=condition.d_e * (1 + sign * d_e)), objective),
-                condition.phi + sign * angle,
-            )
-            for sign in (-1, 1)
-        ]
-        low, high = (
-            loop.simulate(loop.mechanism.state(phi=phi), PRINTED["time", "base"].surfaces).total
-            for loop, phi in loops
-        )
-        return (high - low) / (2 * step)
+        def total(sign: int) -> float:
+            rig = rotary_pendulum(d_e=condition.d_e * (1 + sign * d_e))
+            start = rig.state(phi=condition.phi + sign * angle)
+            return ClosedLoop(rig, objective).simulate(start, PRINTED["time", "base"].surfaces).cost
+
+        return (total(1) - total(-1)) / (2 * step)
 
     energy, duration = OBJECTIVES["energy"], OBJECTIVES["time"]
     percent, degree = 0.01 * step, radians(step)

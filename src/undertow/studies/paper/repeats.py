@@ -17,8 +17,6 @@ from undertow.closed_loop import ClosedLoop, Trajectory
 from undertow.models import Parameter
 from undertow.studies.paper.data import PRINTED, Condition
 
-__all__ = ["Repeats", "noisy_repeats"]
-
 #: Coulomb friction of the arm, N m: assumed, about 0.23 V at the motor.
 COULOMB_FRICTION = 0.03
 #: Speed below which it falls off smoothly, rad/s.
@@ -52,7 +50,7 @@ def noisy_repeats(condition: Condition, *, seed: int, count: int = 3) -> Repeats
     surfaces = PRINTED["time", "one-time"].surfaces
     duration, sample = 5.0, 0.001
     ideal = ClosedLoop(rig).simulate(condition.start, surfaces, duration=duration, terminal=0.0)
-    loop = ClosedLoop(rig, plant=truth, step=sample / 2, hold=2)
+    loop = ClosedLoop(rig, plant=truth, step=sample / 2, zoh_steps=2)
     repeats = []
     for number in range(count):
         rng = np.random.default_rng([seed, number])

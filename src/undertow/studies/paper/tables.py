@@ -11,16 +11,14 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import artefacts as results
-from undertow.display.plot import figure_bytes
+from undertow.base import facts, number, table, to_csv, to_json, versions
+from undertow.display.plot import figure_files
 from undertow.optimiser import Budget
 from undertow.studies.paper.data import CASES, CONDITIONS, OBJECTIVES, PERIOD, ROWS
 from undertow.studies.paper.experiment import Reproduction, Row
 from undertow.studies.paper.figures import figures
 from undertow.studies.paper.findings import findings
 from undertow.studies.paper.repeats import ANGLE_NOISE, COULOMB_FRICTION, RATE_NOISE, START_SPREAD
-
-__all__ = ["COLUMNS", "csv", "files", "manifest", "report"]
 
 COLUMNS = ("condition", "objective", "row", "paper", "printed", "ours", "bound")
 
@@ -40,42 +38,25 @@ CAPTION = (
 )
 
 
-def _values(row: Row) -> tuple[float, float | None, float | None, float | None]:
-    return row.paper, row.printed.total, row.ours.total, row.bound.value
+def _values(row: Row) -> list[float | None]:
+    return [value for value, _ in row.cells.values()]
 
 
 def csv(result: Reproduction) -> bytes:
     """Return ``tables.csv``: one line a row, empty cells where a motion fails."""
-    return results.to_csv(
-        COLUMNS,
-        [
-            [
-                row.condition,
-                row.objective,
-                row.row,
-                *("" if value is None else f"{value:.6g}" for value in _values(row)),
-            ]
-            for row in result.rows
-        ],
+    lines = (
+        [*row.place.values(), *(number(value, ".6g", missing="") for value in _values(row))]
+        for row in result.rows
     )
+    return to_csv(COLUMNS, lines)
 
 
 def reasons(result: Reproduction) -> list[dict[str, str]]:
     """Return why each empty cell of the tables is empty."""
     return [
-        {
-            "condition": row.condition,
-            "objective": row.objective,
-            "row": row.row,
-            "column": column,
-            "reason": reason,
-        }
+        {**row.place, "column": column, "reason": reason}
         for row in result.rows
-        for column, reason in (
-            ("printed", row.printed.reason),
-            ("ours", row.ours.reason),
-            ("bound", row.bound.reason),
-        )
+        for column, (_, reason) in row.cells.items()
         if reason
     ]
 
@@ -85,10 +66,10 @@ def _budget(budget: Budget | None) -> str:
 
 
 def manifest(result: Reproduction) -> dict[str, Any]:
-    """Return what the run was made with, and what the tables have no room for."""
+    """Return what the run was made with, and its results besides the tables."""
     return {
         "what": "undertow reproduce",
-        "versions": results.versions(),
+        "versions": versions(),
         "seed": result.seed,
         "effort": {
             "first optimisation": _budget(result.effort.cold),
@@ -117,9 +98,7 @@ def manifest(result: Reproduction) -> dict[str, Any]:
         },
         "surfaces": [
             {
-                "condition": row.condition,
-                "objective": row.objective,
-                "row": row.row,
+                **row.place,
                 "ours": [
                     {"from_s": round(t, 9), "vector": surface.vector.tolist()}
                     for t, surface in zip(row.ours.switch_times, row.ours.surfaces, strict=True)
@@ -176,28 +155,23 @@ def _tables(result: Reproduction, objective: str) -> RenderableType:
 
 def _table(condition: str, rows: list[Row]) -> Table:
     where = CONDITIONS[condition]
-    table = Table(
+    made = table(
+        ("", "paper", "printed", "ours", "bound"),
+        [
+            (row.row, f"{row.paper:.1f}", *(number(v, ".2f") for v in _values(row)[1:]))
+            for row in rows
+        ],
         title=f"{where.title}, d_e = {where.d_e:g}",
         title_style="",
-        title_justify="left",
-        box=None,
-        header_style="dim",
         padding=(0, 1, 0, 0),
-        pad_edge=False,
+        min_width=None,
     )
-    table.add_column("", min_width=8)
-    for name in ("paper", "printed", "ours", "bound"):
-        table.add_column(name, justify="right", min_width=5)
-    for row in rows:
-        cells = [f"{row.paper:.1f}"] + [
-            Text("—", style="dim") if value is None else f"{value:.2f}"
-            for value in _values(row)[1:]
-        ]
-        table.add_row(row.row, *cells)
-    return table
+    for column in made.columns:
+        column.min_width = 8 if column is made.columns[0] else 5
+    return made
 
 
-def _notes(result: Reproduction) -> RenderableType:
+def _notes(result: Reproduction) -> RenderableType | None:
     """Return why cells are empty, by condition, each reason once."""
     told: dict[tuple[str, str], list[tuple[str, str, str]]] = {}
     for entry in reasons(result):
@@ -218,48 +192,41 @@ def _notes(result: Reproduction) -> RenderableType:
     return _bullets(lines)
 
 
-def _bullets(lines: list[str], mark: str = "–") -> RenderableType:
-    grid = Table.grid(padding=(0, 1))
-    grid.add_column()
-    grid.add_column()
-    for line in lines:
-        grid.add_row(mark, line)
-    return grid
+def _bullets(lines: list[str]) -> RenderableType | None:
+    return facts((("–", line) for line in lines), gap=1) if lines else None
 
 
 def _limits(result: Reproduction) -> Table:
-    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0), pad_edge=False)
-    table.add_column("appendix case", no_wrap=True)
-    for name in ("α_u", "λ_u", "λ_a", "singular\nat"):
-        table.add_column(name, justify="right", no_wrap=True)
     dampings = sorted(result.limits[0].caught, reverse=True)
-    for d in dampings:
-        table.add_column(f"caught at\nd_e {d:g}", justify="right", no_wrap=True)
+    caught = [f"caught at\nd_e {d:g}" for d in dampings]
+    heads = ("appendix case", "α_u", "λ_u", "λ_a", "singular\nat", *caught)
+    rows = []
     for limit in result.limits:
         surface = CASES[limit.case]
-        table.add_row(
-            limit.case,
-            *(f"{v[0, 0]:g}" for v in (surface.alpha_u, surface.lambda_u, surface.lambda_a)),
-            f"{degrees(limit.singular):.1f}°",
-            *(f"< {degrees(limit.caught[d]):.1f}°" for d in dampings),
+        rows.append(
+            (
+                limit.case,
+                *(f"{v[0, 0]:g}" for v in (surface.alpha_u, surface.lambda_u, surface.lambda_a)),
+                f"{degrees(limit.singular):.1f}°",
+                *(f"< {degrees(limit.caught[d]):.1f}°" for d in dampings),
+            )
         )
-    return table
+    return table(heads, rows, whole=heads)
 
 
 def _descent(result: Reproduction) -> Table:
-    table = Table(box=None, header_style="dim", padding=(0, 2, 0, 0), pad_edge=False)
-    table.add_column("our cascade", no_wrap=True)
-    for name in ("smallest slack", "re-optimisations", "admitted"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for (key, goal), own in result.own.items():
-        if own.slack:
-            table.add_row(
-                f"{CONDITIONS[key].title}, {goal}",
-                f"{min(own.slack):.1e} {OBJECTIVES[goal].unit}",
-                f"{len(own.slack)}",
-                f"{own.accepted - 1}",
-            )
-    return table
+    heads = ("our cascade", "smallest slack", "re-optimisations", "admitted")
+    rows = [
+        (
+            f"{CONDITIONS[key].title}, {goal}",
+            f"{min(own.slack):.1e} {OBJECTIVES[goal].unit}",
+            f"{len(own.slack)}",
+            f"{own.accepted - 1}",
+        )
+        for (key, goal), own in result.own.items()
+        if own.slack
+    ]
+    return table(heads, rows, whole=heads)
 
 
 def report(result: Reproduction) -> RenderableType:
@@ -272,30 +239,24 @@ def report(result: Reproduction) -> RenderableType:
             "",
         ]
     parts.append(Text(CAPTION, style="dim"))
-    if reasons(result):
-        parts += ["", Text("Empty cells", style="bold"), _notes(result)]
-    parts += ["", Text("Reach of the printed surfaces, at rest from φ(0)", style="bold")]
-    parts += [
-        _limits(result),
-        "",
-        Text("Lemma 3: J̃ₖ − spent − J̃ₖ₊₁ ≥ 0, or t_f,k − Δt − t_f,k+1 ≥ 0", style="bold"),
-        _descent(result),
-    ]
     told = findings(result)
-    good = [f.text for f in told if f.agrees]
-    bad = [f.text for f in told if not f.agrees]
-    if good:
-        parts += ["", Text("What comes out", style="bold"), _bullets(good)]
-    if bad:
-        parts += ["", Text("What does not come out, and why", style="bold"), _bullets(bad)]
+    sections = {
+        "Empty cells": _notes(result),
+        "Reach of the printed surfaces, at rest from φ(0)": _limits(result),
+        "Lemma 3: J̃ₖ − spent − J̃ₖ₊₁ ≥ 0, or t_f,k − Δt − t_f,k+1 ≥ 0": _descent(result),
+        "What comes out": _bullets([f.text for f in told if f.agrees]),
+        "What does not come out, and why": _bullets([f.text for f in told if not f.agrees]),
+    }
+    for title, content in sections.items():
+        if content is not None:
+            parts += ["", Text(title, style="bold"), content]
     return Group(*parts)
 
 
 def files(result: Reproduction) -> dict[str, bytes]:
     """Return everything that a run leaves behind, by file name."""
-    made = {
-        f"{name}.{kind}": figure_bytes(figure, kind)
-        for name, figure in figures(result).items()
-        for kind in ("png", "pdf")
+    return {
+        "tables.csv": csv(result),
+        "manifest.json": to_json(manifest(result)),
+        **figure_files(figures(result), ("png", "pdf")),
     }
-    return {"tables.csv": csv(result), "manifest.json": results.to_json(manifest(result)), **made}

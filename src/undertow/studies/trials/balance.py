@@ -14,20 +14,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import InfeasibleError
+from undertow.base import InfeasibleError, Progress, no_progress
 from undertow.cascade import Cascade
 from undertow.law import InnerLoop, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, srv02_rig
-from undertow.runtime.controller_defaults import default_gate, estimator_for
+from undertow.runtime import default_gate, estimator_for
 from undertow.studies.trials.steering import CascadeSteering, steady
 from undertow.studies.trials.trial import MakeController, Outcome, trial, undisturbed
-
-__all__ = ["BASE", "GOALS", "BalanceResult", "Limits", "balance", "catch_limit", "controllers"]
-
-Progress = Callable[[str, float], None]
 
 #: The base case of Tables 1 and 2.
 BASE = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
@@ -144,7 +140,7 @@ def balance(
     seeds: int = 20,
     budget: int = 256,
     limits: bool = True,
-    progress: Progress = lambda _what, _fraction: None,
+    progress: Progress = no_progress,
     begun: Callable[[BalanceResult], None] = lambda _result: None,
 ) -> BalanceResult:
     """Run the three controllers for both objectives on every rig.

@@ -13,11 +13,9 @@ from undertow.estimators import Estimator, FilteredDerivative, KalmanFilter, Mea
 from undertow.law import InnerLoop, first_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Measurement, srv02_rig
-from undertow.runtime.controller_defaults import estimator_for
+from undertow.runtime import estimator_for
 from undertow.studies.trials.steering import steady
 from undertow.studies.trials.trial import Outcome, balanced, trial, undisturbed
-
-__all__ = ["EstimatorRow", "compared", "estimators_for"]
 
 
 def estimators_for(belief: Mechanism, bench: Bench) -> dict[str, Callable[[], Estimator]]:
@@ -34,7 +32,7 @@ def estimators_for(belief: Mechanism, bench: Bench) -> dict[str, Callable[[], Es
 
 @dataclass(frozen=True)
 class EstimatorRow:
-    """One estimator: what it is off by, what it costs, what came of it.
+    """One estimator: its errors, its processor time and the runs with it.
 
     Attributes
     ----------

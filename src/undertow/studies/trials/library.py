@@ -8,11 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from undertow.base import Progress, no_progress
 from undertow.mechanisms import LIBRARY
-from undertow.runtime import Recipe
-from undertow.runtime.session import session
-
-__all__ = ["LibraryRow", "through_the_runtime"]
+from undertow.runtime import Recipe, session
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ def through_the_runtime(
     seeds: int = 5,
     seconds: float = 10.0,
     evaluations: int = 256,
-    progress: Callable[[str, float], None] = lambda _what, _part: None,
+    progress: Progress = no_progress,
     done: Callable[[LibraryRow], None] = lambda _row: None,
 ) -> list[LibraryRow]:
     """Run mechanisms from their usual starts, each on its realistic rigs.
@@ -87,7 +85,7 @@ def through_the_runtime(
                 continue
             applied.append(report.answers.get("applied", 0))
             limits = recipe.settings.limits(recipe.belief)
-            chatter.append(float((report.variation / limits).max() / seconds))
+            chatter.append(float((report.total_variation / limits).max() / seconds))
         rows.append(
             LibraryRow(
                 name,

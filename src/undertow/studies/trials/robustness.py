@@ -1,4 +1,4 @@
-"""Random rigs that no controller was told of: who still balances, and what breaks whom.
+"""Random rigs unknown to the controllers: which ones still balance, and what makes each fail.
 
 Every rig is the SRV02 bench with masses within ±20 %, friction between nothing and twice as
 much, up to 5 ms of delay in all, and a knock on the pendulum on the way.  The controllers
@@ -12,35 +12,23 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import scipy.linalg
 
-from undertow.base import MissingExtraError
-from undertow.law import linearise
+from undertow.base import MissingExtraError, Progress, no_progress, versions
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.plants import Bench, Push, srv02_rig
-from undertow.runtime.controller_defaults import estimator_for
+from undertow.runtime import estimator_for
+from undertow.studies.ledger import Ledger
 from undertow.studies.trials.balance import controllers
-from undertow.studies.trials.ledger import Ledger
-from undertow.studies.trials.nmpc import predictive
-from undertow.studies.trials.trial import MakeController, Result, trial
-
-__all__ = [
-    "FACTORS",
-    "Breaking",
-    "RobustnessResult",
-    "breaking_point",
-    "clipped_regulator",
-    "random_bench",
-    "robustness",
-]
-
-Progress = Callable[[str, float], None]
+from undertow.studies.trials.steering import clipped_regulator, predictive
+from undertow.studies.trials.trial import MakeController, Outcome, Result, trial
 
 #: Half-width of the masses; scale of friction; delay in all, s; impulse, N m s.
 MASSES, FRICTION, DELAY, IMPULSE = 0.20, 2.0, 0.005, 0.004
@@ -51,18 +39,6 @@ KNOCK, SINGLE = 5.0, 20.0
 
 #: Names in the tables.
 NAMES = ("cascade", "fixed surface", "clipped LQR", "NMPC, 10 Hz")
-
-
-def clipped_regulator(belief: Mechanism) -> MakeController:
-    """Return a linear-quadratic regulator, its output clipped: Q of the first surface."""
-    lin = linearise(belief)
-    n, m = belief.n, belief.m
-    limit = belief.input_limits
-    Q = np.diag([1.0] * m + [10.0] * (n - m) + [0.1] * n)
-    R = np.diag(1.0 / limit**2)
-    P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
-    k = -np.linalg.solve(R, lin.input.T @ P)
-    return lambda _: lambda t, x: np.clip(k @ x, -limit, limit)
 
 
 def _with_delay(bench: Bench, delay: float) -> Bench:
@@ -160,6 +136,41 @@ def breaking_point(
     return Breaking(low, high, seed)
 
 
+#: Types of the numbers of a result.
+_KINDS: Mapping[str, tuple[type, ...]] = {
+    field.name: {"int": (int,), "bool": (bool,)}.get(str(field.type), (int, float))
+    for field in fields(Result)
+}
+
+#: Controller, what was changed, by how much, and seed.
+RunKey = tuple[str, str, float, int]
+RunLedger = Ledger[RunKey, Result]
+
+
+def run_ledger(path: Path | None, settings: Mapping[str, Any]) -> RunLedger:
+    """Return the ledger of runs with some settings, JSON values."""
+    return Ledger(path, {"settings": settings, "versions": versions()}, _read)
+
+
+def keep_run(ledger: RunLedger, name: str, what: str, value: float, outcome: Outcome) -> Result:
+    """Keep the numbers of a run."""
+    result = Result(**{name: getattr(outcome, name) for name in _KINDS})
+    numbers = {k: v if math.isfinite(v) else None for k, v in asdict(result).items()}
+    return ledger.keep((name, what, value, outcome.seed), result, [name, what, value, numbers])
+
+
+def _read(
+    line: tuple[str, str, float, dict[str, Any]],
+) -> tuple[tuple[str, str, float, int], Result]:
+    name, what, value, numbers = line
+    kept: dict[str, Any] = {k: math.inf if v is None else v for k, v in numbers.items()}
+    result = Result(**kept)
+    whole = all(type(getattr(result, key)) in kinds for key, kinds in _KINDS.items())
+    if not (isinstance(name, str) and isinstance(what, str) and whole):
+        raise ValueError(f"a line that is no result: {str(line)[:80]}")
+    return (name, what, float(value), result.seed), result
+
+
 def _makers(
     belief: Mechanism, bench: Bench, x0: FloatArray, budget: int
 ) -> dict[str, MakeController]:
@@ -182,7 +193,7 @@ def robustness(
     seconds: float = 10.0,
     budget: int = 256,
     ledger: Path | None = None,
-    progress: Progress = lambda _what, _fraction: None,
+    progress: Progress = no_progress,
 ) -> RobustnessResult:
     """Run every controller on the same random rigs, then look for what breaks each.
 
@@ -214,17 +225,22 @@ def robustness(
     objective = objective_for(belief, "bench-energy")
     makers = _makers(belief, bench, x0, budget)
     settings = {"angle": angle, "seconds": [seconds, SINGLE], "budget": budget}
-    book = Ledger(ledger, settings | {"fingerprint": belief.fingerprint})
+    book = run_ledger(ledger, settings | {"fingerprint": belief.fingerprint})
 
     def once(name: str, what: str, value: float, seed: int, truth: Bench) -> Result:
-        known = book.find(name, what, value, seed)
+        known = book.known.get((name, what, value, seed))
         if known is not None:
             return known
         told, length = estimator_for(belief, bench), seconds if what == "random" else SINGLE
         outcome = trial(
             belief, truth, makers[name], x0, length, seed, objective=objective, estimator=told
         )
-        return book.keep(name, what, value, outcome)
+        return keep_run(book, name, what, value, outcome)
+
+    def survived(
+        name: str, factor: str, change: Callable[[Bench, float], Bench], value: float, seed: int
+    ) -> bool:
+        return once(name, factor, value, seed, change(bench, value)).balanced
 
     parts = len(makers) * (1 + (len(FACTORS) if seeds else 0))
     done = 0
@@ -240,15 +256,7 @@ def robustness(
         for name in makers:
             progress(f"{factor}, {name}", done / parts)
 
-            def survives(
-                value: float,
-                seed: int,
-                name: str = name,
-                factor: str = factor,
-                change: Callable[[Bench, float], Bench] = change,
-            ) -> bool:
-                return once(name, factor, value, seed, change(bench, value)).balanced
-
-            breaking[name, factor] = breaking_point(survives, largest, seeds=seeds)
+            run = partial(survived, name, factor, change)
+            breaking[name, factor] = breaking_point(run, largest, seeds=seeds)
             done += 1
     return RobustnessResult(outcomes, breaking, seeds)

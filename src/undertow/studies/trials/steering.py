@@ -1,17 +1,30 @@
-"""Controllers for rigs in simulated time: a law that stays, and the two-rate cascade."""
+"""Controllers for rigs in simulated time: one fixed surface, the cascade, LQR and NMPC.
+
+NMPC at 10 Hz, to compare with, is direct multiple shooting: stage cost of the trial's objective
+over a horizon, the linear-quadratic value at its end, the input held for 20 ms at a time.  The plan
+is played open loop between two solutions; the solution is there at once, which flatters it: the
+cascade's answers come a period late.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import scipy.linalg
+import sympy as sp
 
+from undertow.base import require_extra
+from undertow.bounds.expressions import translate
 from undertow.cascade import Cascade, CascadeState
+from undertow.estimators import StateFeedback
 from undertow.law import InnerLoop
-from undertow.models import FloatArray
+from undertow.models import FloatArray, Mechanism, linearise, require_smooth
+from undertow.objective import Objective
 from undertow.optimiser import Proposal
-
-__all__ = ["CascadeSteering", "steady"]
+from undertow.studies.trials.trial import MakeController
+from undertow.symbolic import Tape
 
 
 def steady(law: InnerLoop) -> Callable[[float, FloatArray], FloatArray]:
@@ -20,7 +33,7 @@ def steady(law: InnerLoop) -> Callable[[float, FloatArray], FloatArray]:
 
 
 class CascadeSteering:
-    """The cascade in simulated time, with the optimiser a period behind as it is in life.
+    """The cascade in simulated time; its optimiser answers one period later, as on a real rig.
 
     At every multiple of the period the answer asked for one period ago is judged from the
     present state, then the next one is asked for: for the state predicted one period ahead.
@@ -72,3 +85,142 @@ class CascadeSteering:
         later = t + cascade.period
         ahead = cascade.loop.batch(x, self.memory.at(t), duration=cascade.period, terminal=0.0)
         self.waiting = cascade.propose(self.memory, ahead.x[0], later)
+
+
+class NMPC:
+    """The optimal-control problem of one mechanism, warm-started from solution to solution.
+
+    Parameters
+    ----------
+    belief
+        The model.
+    objective
+        Gives the stage cost; the terminal cost is that of its quadratic part.
+    period
+        Time between solutions, s.
+    step, horizon
+        Time that an input is held, and length of the prediction, s.
+    iterations
+        Most iterations of the interior-point method per solution.
+    """
+
+    def __init__(
+        self,
+        belief: Mechanism,
+        objective: Objective,
+        *,
+        period: float = 0.1,
+        step: float = 0.02,
+        horizon: float = 1.2,
+        iterations: int = 40,
+    ) -> None:
+        ca = require_extra("casadi", "bounds", "CasADi is not installed")
+        self.period, self.step, self.count = period, step, round(horizon / step)
+        self.size, self.m = 2 * belief.n, belief.m
+        limit = belief.input_limits
+        flow, stage = _functions(ca, belief, objective)
+        x, u = ca.SX.sym("x", self.size), ca.SX.sym("u", self.m)
+        k1 = flow(x, u)
+        k2 = flow(x + step / 2 * k1, u)
+        k3 = flow(x + step / 2 * k2, u)
+        k4 = flow(x + step * k3, u)
+        ahead = ca.Function("ahead", [x, u], [x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+        X, U = ca.MX.sym("X", self.size, self.count + 1), ca.MX.sym("U", self.m, self.count)
+        x0 = ca.MX.sym("x0", self.size)
+        gaps = X[:, 1:] - ahead.map(self.count)(X[:, :-1], U)
+        P = _terminal(belief, objective)
+        cost = step * ca.sum2(stage.map(self.count)(X[:, :-1], U)) + ca.bilin(
+            ca.DM(P), X[:, -1], X[:, -1]
+        )
+        unknowns = ca.veccat(X, U)
+        problem = {"x": unknowns, "p": x0, "f": cost, "g": ca.veccat(X[:, 0] - x0, gaps)}
+        options: Any = {
+            "ipopt": {
+                "print_level": 0, "sb": "yes", "max_iter": iterations, "tol": 1e-4,
+                "warm_start_init_point": "yes", "mu_strategy": "adaptive",
+            },
+            "print_time": False,
+        }  # fmt: skip
+        self._solve: Any = ca.nlpsol("nmpc", "ipopt", problem, options)
+        high = np.concatenate(
+            [np.full(self.size * (self.count + 1), np.inf), np.tile(limit, self.count)]
+        )
+        self._box = {"lbx": -high, "ubx": high, "lbg": 0.0, "ubg": 0.0}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all plans, and count the time from 0 again."""
+        self._guess = np.zeros(self.size * (self.count + 1) + self.m * self.count)
+        self._plan: FloatArray = np.zeros((self.count, self.m))
+        self._due = self._began = 0.0
+
+    def __call__(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at (t, x): of the newest plan."""
+        if t >= self._due - 1e-9 and np.isfinite(x).all():
+            if not self._guess.any():
+                self._guess[: self.size * (self.count + 1)] = np.tile(x, self.count + 1)
+            answer = self._solve(x0=self._guess, p=x, **self._box)
+            self._guess = np.asarray(answer["x"]).ravel()
+            states = self.size * (self.count + 1)
+            self._plan = self._guess[states:].reshape(self.count, self.m)
+            self._began, self._due = t, self._due + self.period
+        k = min(int((t - self._began) / self.step + 1e-6), self.count - 1)
+        return np.asarray(self._plan[k])
+
+
+def _functions(ca: Any, belief: Mechanism, objective: Objective) -> tuple[Any, Any]:
+    """Return ẋ(x, u) and Φ(x, u) as CasADi functions."""
+    tape = Tape()
+    qdd = belief.partition(tape).accelerations(sp.Matrix(belief.u))
+    (stage,) = tape.let_all([objective.stage_cost(belief)])
+    x, u = ca.SX.sym("x", 2 * belief.n), ca.SX.sym("u", belief.m)
+    known: dict[sp.Basic, Any] = dict(belief.substitution)
+    known |= {symbol: x[i] for i, symbol in enumerate(belief.x)}
+    known |= {symbol: u[i] for i, symbol in enumerate(belief.u)}
+    for line in tape.live([*qdd, stage]):
+        known[line.symbol] = translate(ca, line.expression, known)
+    outputs = [translate(ca, e, known) for e in (*belief.x[belief.n :], *qdd)]
+    flow = ca.Function("flow", [x, u], [ca.vertcat(*outputs)])
+    return flow, ca.Function("stage", [x, u], [translate(ca, stage, known)])
+
+
+def _terminal(belief: Mechanism, objective: Objective) -> FloatArray:
+    """Return the value function at the target of the cost's second-order part, (2n, 2n)."""
+    lin = linearise(belief)
+    symbols = [*belief.x, *belief.u]
+    stage = objective.stage_cost(belief)
+    require_smooth(f"stage cost of '{objective.name}'", [stage], symbols)
+    hessian = sp.hessian(stage, symbols).subs(dict.fromkeys(symbols, 0))
+    H = 0.5 * np.array(hessian, dtype=float)
+    size = 2 * belief.n
+    Q, R = H[:size, :size] + 1e-6 * np.eye(size), H[size:, size:]
+    return np.asarray(scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R), np.float64)
+
+
+def predictive(belief: Mechanism, objective: Objective, **settings: Any) -> MakeController:
+    """Return the maker of an NMPC controller: the same one for each run, set back."""
+    controller = NMPC(belief, objective, **settings)
+
+    def make(_start: FloatArray) -> NMPC:
+        controller.reset()
+        return controller
+
+    make.__name__ = "NMPC"
+    return make
+
+
+def clipped_regulator(belief: Mechanism) -> MakeController:
+    """Return a linear-quadratic regulator, its output clipped: Q of the first surface."""
+    lin = linearise(belief)
+    n, m = belief.n, belief.m
+    limit = belief.input_limits
+    Q = np.diag([1.0] * m + [10.0] * (n - m) + [0.1] * n)
+    R = np.diag(1.0 / limit**2)
+    P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
+    k = -np.linalg.solve(R, lin.input.T @ P)
+
+    def make(_start: FloatArray) -> StateFeedback:
+        return lambda t, x: np.clip(k @ x, -limit, limit)
+
+    make.__name__ = "LQR, clipped"
+    return make

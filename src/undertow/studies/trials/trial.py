@@ -10,28 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.closed_loop import Event, Trajectory
-from undertow.estimators import Controller, Estimator, Record, compensated, drive
+from undertow.estimators import Estimator, Record, StateFeedback, compensated, drive
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.plants import Bench, RealisticRig
-from undertow.runtime.controller_defaults import estimator_for
+from undertow.runtime import estimator_for
 from undertow.symbolic import compile_expressions
 
-__all__ = [
-    "MakeController",
-    "Outcome",
-    "Result",
-    "Spread",
-    "balanced",
-    "judge",
-    "motion",
-    "spread",
-    "trial",
-    "undisturbed",
-]
-
 #: Belief and estimated start, (2n,), to a controller for one run.
-MakeController = Callable[[FloatArray], Controller]
+MakeController = Callable[[FloatArray], StateFeedback]
 
 #: Within these of the target a coordinate counts as home: free ones, driven ones (rad or m).
 HOME_FREE, HOME_DRIVEN = math.radians(2.0), math.radians(20.0)
@@ -214,6 +201,6 @@ def motion(mechanism: Mechanism, record: Record, every: int = 5) -> Trajectory:
 
 
 def undisturbed(mechanism: Mechanism, period: float = 0.001) -> Bench:
-    """Return the bench on which belief is truth: nothing but sampling at the same period."""
+    """Return the bench that moves as the belief says, sampled at the same period."""
     bench = Bench(mechanism)
     return replace(bench, timing=replace(bench.timing, period=period))

@@ -8,32 +8,18 @@ from functools import partial
 
 import numpy as np
 
+from undertow.base import Progress, no_progress
 from undertow.cascade import Cascade
 from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
 from undertow.cascade.swing_up.search import Found, found_for
-from undertow.estimators import Controller, compensated, drive
+from undertow.estimators import StateFeedback, compensated, drive
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, MuJoCoRig, plausible_rig, srv02_rig
-from undertow.runtime.controller_defaults import default_gate, estimator_for
+from undertow.runtime import default_gate, estimator_for
 from undertow.studies.trials.steering import CascadeSteering
 from undertow.studies.trials.trial import Outcome, judge, trial
-
-__all__ = [
-    "ENGINES",
-    "SWINGING",
-    "SWING_SECONDS",
-    "EngineResult",
-    "SwingResult",
-    "all_of",
-    "bench_of",
-    "engine_trial",
-    "searched",
-    "swing_trials",
-]
-
-Progress = Callable[[str, float], None]
 
 #: Length of a swing-up run, s.
 SWING_SECONDS = 30.0
@@ -50,7 +36,7 @@ def bench_of(mechanism: Mechanism) -> Bench:
 
 
 def searched(
-    names: Sequence[str], fresh: int | None = None, progress: Progress = lambda _what, _part: None
+    names: Sequence[str], fresh: int | None = None, progress: Progress = no_progress
 ) -> dict[Mechanism, tuple[Found, ...]]:
     """Return the swing-up gains of mechanisms of the library, kept or searched for.
 
@@ -185,7 +171,7 @@ def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 2
     return EngineResult(mechanism, judge(mechanism, record, 0, objective), steering.admitted)
 
 
-def _given(controller: Controller, _start: FloatArray) -> Controller:
+def _given(controller: StateFeedback, _start: FloatArray) -> StateFeedback:
     return controller
 
 

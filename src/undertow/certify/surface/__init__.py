@@ -1,1 +1,0 @@
-"""Claims about a surface: stability, singularity, reaching, ellipsoids."""

@@ -1,0 +1,154 @@
+"""Plants that are all plausible, and what a plan is worth on them together.
+
+A closed loop with an ensemble rolls every plan out on every member, in the lanes of one kernel,
+and hands back one result for each plan, as if there were one plant: inadmissible on one member is
+inadmissible, and the cost is a risk measure over the members.  Searches and gates need not know.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from undertow.base import InvalidInputError, check_fields, one_of
+from undertow.closed_loop.trajectory import Event
+from undertow.models import FloatArray, Mechanism
+from undertow.symbolic import numba
+
+#: How the costs of a plan on the members count: their mean, the mean of the dearest third
+#: (conditional value at risk), or the dearest.
+Risk = Literal["mean", "cvar", "worst"]
+
+#: The part of the members that the conditional value at risk is the mean of.
+TAIL = 1.0 / 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Plants of one structure, by their parameters.
+
+    Parameters
+    ----------
+    plant
+        Their structure; its own parameter values do not count.
+    values
+        Parameter values of the members, (K, P), SI units, in the order of
+        ``plant.parameters``.
+    risk
+        ``"mean"``, ``"cvar"`` (mean of the dearest third) or ``"worst"`` of the costs.
+
+    Raises
+    ------
+    InvalidInputError
+        For values of another shape, or that are not finite.
+    """
+
+    plant: Mechanism
+    values: FloatArray
+    risk: Risk = "mean"
+
+    def __post_init__(self) -> None:
+        """Check shapes and words."""
+        check_fields(self)
+        one_of("risk of an ensemble", self.risk, get_args(Risk))
+        values = np.ascontiguousarray(self.values, dtype=float)
+        names = [p.name for p in self.plant.parameters]
+        if values.ndim != 2 or len(values) == 0 or values.shape[1] != len(names):
+            raise InvalidInputError(
+                f"members of an ensemble of '{self.plant.name}'",
+                value=f"shape {values.shape}",
+                limit=f"(at least 1, {len(names)}), in the order {', '.join(names)}",
+            )
+        if not np.isfinite(values).all():
+            row, column = np.argwhere(~np.isfinite(values))[0]
+            raise InvalidInputError(
+                f"parameter '{names[column]}' of member {row} of an ensemble",
+                value=values[row, column],
+                limit="a finite number",
+            )
+        object.__setattr__(self, "values", values)
+
+    def __len__(self) -> int:
+        """Return the number of members."""
+        return len(self.values)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def summarise(member_out, members, tail, margins, out):  # type: ignore[no-untyped-def]
+    """Write one result for each plan from those of its members, row after row.
+
+    Columns are those of the kernel: cost, time, event, radius, smallest margins, closest approach
+    with its time and state, final state, steps.  All members must arrive; otherwise the result is
+    that of the member that failed first, and only one that is merely late or dear counts as late
+    or dear.  The closest approach is that of the member that stays farthest away, the final state
+    that of the first member.  ``tail`` is the number of dearest members whose mean is the cost.
+    """
+    count, columns = out.shape
+    costs, times = np.empty(members), np.empty(members)
+    for plan in range(count):
+        first = plan * members
+        worst, farthest, arrived = first, first, 0
+        for k in range(members):
+            row = first + k
+            costs[k], times[k] = member_out[row, 0], member_out[row, 1]
+            if int(member_out[row, 2]) == Event.REACHED:
+                arrived += 1
+            if _precedes(member_out[row], member_out[worst]):
+                worst = row
+            if member_out[row, 4 + margins] > member_out[farthest, 4 + margins]:
+                farthest = row
+        for column in range(columns):
+            out[plan, column] = member_out[worst, column]
+        if arrived == members:
+            out[plan, 0] = _dearest(costs, tail)
+            out[plan, 1] = times.max()
+        for column in range(4, 4 + margins):
+            low = member_out[first, column]
+            for k in range(1, members):
+                low = min(low, member_out[first + k, column])
+            out[plan, column] = low
+        half = (columns - 7 - margins) // 2  # of a state: 2n
+        for column in range(4 + margins, 6 + margins + half):
+            out[plan, column] = member_out[farthest, column]
+        for column in range(6 + margins + half, columns - 1):
+            out[plan, column] = member_out[first, column]
+        steps = 0.0
+        for k in range(members):
+            steps += member_out[first + k, columns - 1]
+        out[plan, columns - 1] = steps
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _precedes(a, b):  # type: ignore[no-untyped-def]
+    """Whether a member's result a stands for the plan rather than b.
+
+    One that breaks off before one that is late or too dear, the earlier before the later; a late
+    one before one that arrives, the farther before the nearer.
+    """
+    grade_a, grade_b = _grade(int(a[2])), _grade(int(b[2]))
+    if grade_a != grade_b:
+        return grade_a > grade_b
+    if grade_a == 2:
+        return a[1] < b[1]
+    return a[3] > b[3]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _grade(event):  # type: ignore[no-untyped-def]
+    if event == Event.REACHED:
+        return 0
+    late = event == Event.HORIZON
+    return 1 if late or event == Event.COSTLY else 2
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _dearest(costs, tail):  # type: ignore[no-untyped-def]
+    """Return the mean of the ``tail`` largest costs."""
+    if tail < len(costs):
+        costs.sort()
+    total = 0.0
+    for k in range(len(costs) - tail, len(costs)):
+        total += costs[k]
+    return total / tail

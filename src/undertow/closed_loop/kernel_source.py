@@ -1,0 +1,483 @@
+"""Tape to a numba kernel that integrates many closed loops at once in SIMD blocks.
+
+The generated source is a plain Python module: one ``rollout`` function whose innermost
+loops run over the lanes of a block, without branches, so that LLVM turns each of them
+into vector instructions.  All lane data live in one flat work array ``W`` at constant
+offsets, which is what lets the vectoriser prove that loads and stores do not alias.
+
+Lines of the tape are hoisted by what they depend on: parameters only (once a call),
+surface and gains (once a surface), state (every stage).
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Sequence
+
+import sympy as sp
+
+from undertow.closed_loop import etd
+from undertow.closed_loop.rows import LANES, LoopGraph, Rows, code, entrance, total
+from undertow.closed_loop.trajectory import Event
+from undertow.symbolic import Emitter, distinct, docstring
+
+#: Whether a lane may hand over is looked at in these intervals, s.
+WATCH = 0.032
+
+
+class _Writer:
+    """Writes the bodies of the lane loops of one closed loop."""
+
+    def __init__(self, program: LoopGraph) -> None:
+        self.program = program
+        distinct((*program.state, *program.plant_parameters, program.time))
+        self.emit = Emitter(program.tape)
+        self.time = self.emit.text(program.time)
+        self.limits = [self.emit.text(limit) for limit in program.limits]
+        self.of_call, self.of_lane = _hoist(program)
+        self.rows = Rows(program, self.of_lane)
+        self.constant = {*self.of_call, *self.of_lane}
+        self.rates = [*program.derivative, program.stage]
+        self.monitored = [*program.s, program.singular]
+        if program.input_margin is not None:
+            self.monitored.append(program.input_margin)
+
+    # -- once a call, once a block, once a surface ---------------------------------------
+
+    def constants(self) -> list[str]:
+        """Everything that depends on parameters alone."""
+        program = self.program
+        return [
+            *(f"{self.emit.text(s)} = plant[{j}]" for j, s in enumerate(program.plant_parameters)),
+            *(
+                f"{self.emit.text(s)} = belief[{j}]"
+                for j, s in enumerate(program.belief_parameters)
+            ),
+            *(f"{self.emit.text(s)} = limits[{j}]" for j, s in enumerate(program.limits)),
+            *self.emit.lines(self.of_call, set())[0],
+        ]
+
+    def reset(self) -> list[str]:
+        """Initial states and counters of a block."""
+        r = self.rows
+        return [
+            *(f"{row} = x0[b + i, {j}]" for j, row in enumerate(r.x)),
+            "radius = math.sqrt(" + total(f"{row} * {row}" for row in r.x) + ")",
+            f"{r.cost} = 0.0",
+            f"{r.end} = start",
+            f"{r.radius} = radius",
+            f"{r.code} = {code(Event.REACHED)} if radius <= terminal else "
+            f"({code(Event.HORIZON)} if live[b + i] > 0.0 else {code(Event.UNSTABLE)})",
+            f"{r.active} = 1.0 if {r.code} == {code(Event.HORIZON)} else 0.0",
+            f"{r.near} = radius",
+            f"{r.near_time} = start",
+            *(f"{near} = {x}" for near, x in zip(r.near_x, r.x, strict=True)),
+            *(f"{row} = math.inf" for row in r.smallest),
+            *(f"{row} = 0.0" for row in [*r.u, *r.s, *r.path]),
+            f"{r.singular} = 1.0",
+            f"{r.input} = 1.0",
+        ]
+
+    def load_surface(self) -> list[str]:
+        """The surface that takes over, and what depends on it alone."""
+        r = self.rows
+        lines, needs = self.emit.lines(self.of_lane, set(self.of_call))
+        return [
+            *(f"{row} = lanes[b + i, segment, {j}]" for j, row in enumerate(r.lane.values())),
+            *(f"{self.emit.text(s)} = {row}" for s, row in r.lane.items() if s in needs),
+            *lines,
+            *(f"{row} = {self.emit.text(s)}" for s, row in r.kept.items()),
+        ]
+
+    # -- the law and the plant -----------------------------------------------------------
+
+    def _load(self, needs: set[sp.Symbol], source: Sequence[str]) -> list[str]:
+        """Bring the state from ``source`` and the lane constants into scalars."""
+        state = zip(self.program.state, source, strict=True)
+        constants = (self.rows.lane | self.rows.kept).items()
+        return [
+            *(f"{self.emit.text(s)} = {row}" for s, row in state if s in needs),
+            *(f"{self.emit.text(s)} = {row}" for s, row in constants if s in needs),
+        ]
+
+    def _law(self, source: Sequence[str], more: Sequence[sp.Expr]) -> list[str]:
+        """Evaluate the law at the state in ``source`` and clip its demand: ``u_j``."""
+        demand = self.program.demand
+        code, needs = self.emit.lines([*demand, *more], self.constant)
+        clip = [
+            f"u_{j} = max(-{limit}, min({limit}, {self.emit.text(d)}))"
+            for j, (d, limit) in enumerate(zip(demand, self.limits, strict=True))
+        ]
+        return [*self._load(needs, source), *code, *clip]
+
+    def _flow(
+        self, source: Sequence[str], outputs: Sequence[sp.Expr], known: set[sp.Symbol]
+    ) -> list[str]:
+        """Evaluate rates and margins of the plant at the state in ``source``."""
+        code, needs = self.emit.lines(outputs, self.constant | known)
+        return [*self._load(needs, source), *code]
+
+    def _laid(self, outputs: Sequence[sp.Expr]) -> set[sp.Symbol]:
+        return {line.symbol for line in self.program.tape.live(outputs)}
+
+    def _store_law(self) -> list[str]:
+        r, program, text = self.rows, self.program, self.emit.text
+        margin = "1.0" if program.input_margin is None else text(program.input_margin)
+        return [
+            *(f"{row} = u_{j}" for j, row in enumerate(r.u)),
+            *(f"{row} = {text(e)}" for row, e in zip(r.s, program.s, strict=True)),
+            f"{r.singular} = {text(program.singular)}",
+            f"{r.input} = {margin}",
+        ]
+
+    def sample(self) -> list[str]:
+        """The sampled law on the measured state; its input is held until the next sample."""
+        measured = [f"y_{j}" for j in range(len(self.rows.x))]
+        return [
+            *(
+                f"{y} = {x} + noise[sample, b + i, {j}]"
+                for j, (y, x) in enumerate(zip(measured, self.rows.x, strict=True))
+            ),
+            *self._law(measured, self.monitored),
+            *self._store_law(),
+        ]
+
+    def first_stage(self, *, sampled: bool) -> list[str]:
+        """First Runge-Kutta stage, with everything that is watched."""
+        r, program, text = self.rows, self.program, self.emit.text
+        outputs = [*self.rates, *program.path]
+        if sampled:
+            law, known = self._apply(r.u), set[sp.Symbol]()
+        else:
+            law = [*self._law(r.x, self.monitored), *self._store_law(), *self._apply()]
+            known = self._laid([*program.demand, *self.monitored])
+        return [
+            *law,
+            *self._flow(r.x, outputs, known),
+            *(f"{row} = {text(e)}" for row, e in zip(r.path, program.path, strict=True)),
+            *self._slopes("{slope} = {d}", "half"),
+            f"{r.cost_slope} = {text(program.stage)}",
+        ]
+
+    def later_stage(self, *, sampled: bool) -> list[str]:
+        """Runge-Kutta stages two to four; ``weight`` and ``reach`` tell them apart."""
+        r = self.rows
+        held = [*self._apply(r.u), *self._flow(r.stage_x, self.rates, set())] if sampled else None
+        return [
+            *(held or self._evaluate(r.stage_x)),
+            *self._slopes("{slope} = {slope} + weight * {d}", "reach"),
+            f"{r.cost_slope} = {r.cost_slope} + weight * ({self.emit.text(self.program.stage)})",
+        ]
+
+    def _slopes(self, add: str, way: str) -> list[str]:
+        """Add the rates to the slopes of a step, and go some way along them to the next stage."""
+        r, lines = self.rows, list[str]()
+        for j, rate in enumerate(self.program.derivative):
+            lines += [
+                f"d_{j} = {self.emit.text(rate)}",
+                add.format(slope=r.slope[j], d=f"d_{j}"),
+                f"{r.stage_x[j]} = {r.x[j]} + {way} * d_{j}",
+            ]
+        return lines
+
+    def _evaluate(self, source: Sequence[str], more: Sequence[sp.Expr] = ()) -> list[str]:
+        """Evaluate the continuous law, the rates of the plant under it, and ``more``."""
+        known = self._laid(self.program.demand)
+        return [
+            *self._law(source, []),
+            *self._apply(),
+            *self._flow(source, [*self.rates, *more], known),
+        ]
+
+    def _apply(self, rows: Sequence[str] = ()) -> list[str]:
+        """Apply the inputs that lie in rows, or else those that the law has just given."""
+        held = rows or [f"u_{j}" for j in range(len(self.program.applied))]
+        return [
+            f"{self.emit.text(a)} = {u}" for a, u in zip(self.program.applied, held, strict=True)
+        ]
+
+    # -- events ----------------------------------------------------------------------------
+
+    def watch(self) -> list[str]:
+        """Keep the smallest margins; stop a lane whose margin is negative.
+
+        Rows are read before they are chosen between: a choice between two elements of ``W``
+        would be compiled as a choice between two addresses, and the loop not as vectors.
+        """
+        r = self.rows
+        low = [f"low_{j}" for j in range(len(r.margins))]
+        now = [f"now_{j}" for j in range(len(r.margins))]
+        return [
+            *(f"{name} = {row}" for name, row in zip(now, r.margins, strict=True)),
+            *(f"{name} = {row}" for name, row in zip(low, r.smallest, strict=True)),
+            f"active = {r.active} > 0.0",
+            f"end = {r.end}",
+            f"code = {r.code}",
+            # Written so that a margin that is not a number counts as broken, and is kept.
+            "sound = " + " & ".join(f"({name} >= 0.0)" for name in now),
+            *(
+                f"{row} = {a} if ({b} >= {a}) | (not active) else {b}"
+                for row, a, b in zip(r.smallest, low, now, strict=True)
+            ),
+            "broken = active & (not sound)",
+            f"kind = {code(Event.CONSTRAINT)} if {now[0]} >= 0.0 else {code(Event.SINGULAR)}",
+            f"{r.end} = {self.time} if broken else end",
+            f"{r.code} = kind if broken else code",
+            f"{r.active} = 1.0 if active & sound else 0.0",
+        ]
+
+    def hand_over(self) -> list[str]:
+        """Stop a lane (code ``HANDED_OVER``) that is well inside its boundary layer and its limits.
+
+        The rest is left to :mod:`undertow.closed_loop.etd`.
+        """
+        r, m, boxes = self.rows, len(self.rows.u), self.program.boxes
+        eta = 2 * m * len(r.x) // 2
+        layers = [r.lane[symbol] for symbol in self.program.lane_inputs[eta + m : eta + 2 * m]]
+        return [
+            f"calm = {r.active} > 0.0",
+            *(f"calm = calm & (abs({s}) <= 0.1 * {e})" for s, e in zip(r.s, layers, strict=True)),
+            *(
+                f"calm = calm & (abs({row}) <= 0.5 * {limit})"
+                for row, limit in zip(r.u, self.limits, strict=True)
+            ),
+            *(
+                f"calm = calm & ({row} > max({spare!r}, {low}))"
+                for row, low, (_, spare) in zip(r.path, r.low, boxes, strict=bool(boxes))
+            ),
+            f"code, active = {r.code}, {r.active}",
+            f"{r.code} = {etd.HANDED_OVER} if calm else code",
+            f"{r.active} = 0.0 if calm else active",
+        ]
+
+    def rates_at_stage(self) -> list[str]:
+        """Law and plant at the state of a stage: input, rates and stage cost into their rows.
+
+        Where large steps know bounds of states, the margins to them, too.
+        """
+        r, text = self.rows, self.emit.text
+        path = self.program.path if self.program.boxes else ()
+        return [
+            *self._evaluate(r.stage_x, path),
+            *(f"{row} = {text(e)}" for row, e in zip(r.path, path, strict=bool(path))),
+            *(f"{row} = u_{j}" for j, row in enumerate(r.u)),
+            *(
+                f"{row} = {text(rate)}"
+                for row, rate in zip(r.slope, self.program.derivative, strict=True)
+            ),
+            f"{r.cost_slope} = {text(self.program.stage)}",
+        ]
+
+    def approach(self) -> list[str]:
+        """Keep the point of the motion that is closest to the target, on the chord of a step."""
+        r = self.rows
+        nx = len(r.x)
+        return [
+            *(f"m_{j} = sixth * {slope}" for j, slope in enumerate(r.slope)),
+            "chord = " + total(f"m_{j} * m_{j}" for j in range(nx)),
+            "slant = -(" + total(f"{x} * m_{j}" for j, x in enumerate(r.x)) + ")",
+            "part = max(0.0, min(1.0, slant / chord)) if chord > 0.0 else 0.0",
+            *(f"m_{j} = {x} + part * m_{j}" for j, x in enumerate(r.x)),
+            "near = math.sqrt(" + total(f"m_{j} * m_{j}" for j in range(nx)) + ")",
+            f"nearer = {r.active} > 0.0 and near < {r.near}",
+            f"{r.near} = near if nearer else {r.near}",
+            f"{r.near_time} = {self.time} + part * h if nearer else {r.near_time}",
+            *(f"{row} = m_{j} if nearer else {row}" for j, row in enumerate(r.near_x)),
+        ]
+
+    def advance(self) -> list[str]:
+        """Complete the step; stop lanes that reach the terminal set, are lost or too costly."""
+        r = self.rows
+        nx = len(r.x)
+        return [
+            f"active = {r.active}",
+            *(
+                f"n_{j} = {x} + sixth * {d}"
+                for j, (x, d) in enumerate(zip(r.x, r.slope, strict=True))
+            ),
+            f"c_new = {r.cost} + sixth * {r.cost_slope}",
+            *(f"m_{j} = n_{j} - {x}" for j, x in enumerate(r.x)),
+            "outer = " + total(f"n_{j} * n_{j}" for j in range(nx)),
+            "radius = math.sqrt(outer)",
+            f"before = {r.radius}",
+            *entrance(r.x, "before"),
+            "reached = (radius <= terminal) | passed",
+            "part = max(0.0, min(1.0, part)) if reached else 1.0",
+            "lost = not (radius < escape)",
+            *(f"m_{j} = {x} + part * m_{j} if reached else n_{j}" for j, x in enumerate(r.x)),
+            *(f"{x} = m_{j} if active > 0.0 else {x}" for j, x in enumerate(r.x)),
+            f"{r.cost} = {r.cost} + part * (c_new - {r.cost}) if active > 0.0 else {r.cost}",
+            f"{r.end} = {self.time} + part * h if active > 0.0 else {r.end}",
+            f"costly = {r.cost} > cap",
+            f"code = {code(Event.DIVERGED)} if lost else ({code(Event.REACHED)} if reached else "
+            f"({code(Event.COSTLY)} if costly else {code(Event.HORIZON)}))",
+            f"{r.code} = code if active > 0.0 else {r.code}",
+            "radius = min(radius, terminal) if reached else radius",
+            f"{r.radius} = radius if active > 0.0 else before",
+            f"{r.active} = 0.0 if (lost or reached or costly) else active",
+        ]
+
+    def record(self) -> list[str]:
+        """One line of a recorded trajectory: x, u, s, cost, det Γ(q)/det Γ(0)."""
+        r = self.rows
+        columns = [*r.x, *r.u, *r.s, r.cost, r.singular]
+        return [f"record[b + i, step // every, {j}] = {row}" for j, row in enumerate(columns)]
+
+    def collect(self) -> list[str]:
+        """One line of results: cost, end, code, radius, closest, margins, final x, steps."""
+        r = self.rows
+        steps = f"({r.end} - start) / h"
+        columns = [r.cost, r.end, r.code, r.radius, *r.smallest, r.near, r.near_time]
+        return [
+            f"out[b + i, {j}] = {row}" for j, row in enumerate([*columns, *r.near_x, *r.x, steps])
+        ]
+
+
+def kernel_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
+    """Return the source of a module with one function ``rollout``.
+
+    Parameters
+    ----------
+    program
+        The closed loop.
+    sampled
+        False: the law acts in continuous time, inside every Runge-Kutta stage.  True: it
+        is evaluated every ``zoh_steps`` steps on the measured state and held in between.
+    header
+        Text for the module's docstring.
+    """
+    w = _Writer(program)
+    sampling = ""
+    if sampled:
+        sampling = f"""\
+            if step % zoh_steps == 0:
+                sample = min(step // zoh_steps, noise.shape[0] - 1)
+{_lanes(w.sample(), 4)}
+"""
+    return f"""{docstring(header)}import math
+
+import numba
+import numpy as np
+
+
+@numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
+)
+def rollout(
+    x0, live, lanes, switch, plant, belief, limits, noise,
+    start, h, steps, zoh_steps, terminal, escape, cap, seek, calm_from, every, record, out,
+):
+{textwrap.indent(chr(10).join(w.constants()), "    ")}
+    W = np.empty({w.rows.count * LANES})
+    half, sixth = 0.5 * h, h / 6.0
+    stride = max(1, round({WATCH} / h))
+    for b in range(0, x0.shape[0], {LANES}):
+        segment = 0
+{_lanes(w.reset(), 2)}
+        for step in range(steps):
+            {w.time} = start + step * h
+            if segment < switch.shape[0] and step == switch[segment]:
+{_lanes(w.load_surface(), 4)}
+                segment += 1
+{sampling}\
+{_lanes([*w.first_stage(sampled=sampled), *w.watch()], 3)}
+            if every > 0 and step % every == 0:
+{_lanes(w.record(), 4)}
+            if step >= calm_from and step % stride == 0 and segment == switch.shape[0]:
+{_lanes(w.hand_over(), 4)}
+            for rk in range(3):
+                weight = 1.0 if rk == 2 else 2.0
+                reach = half if rk == 0 else h
+                {w.time} = start + (step + (1.0 if rk == 2 else 0.5)) * h
+{_lanes(w.later_stage(sampled=sampled), 4)}
+            {w.time} = start + step * h
+            if seek > 0.0:
+{_lanes(w.approach(), 4)}
+{_lanes(w.advance(), 3)}
+            if step % 8 == 0:
+                alive = 0.0
+                for i in range({LANES}):
+                    alive += {w.rows.active}
+                if alive == 0.0:
+                    break
+{_lanes(w.collect(), 2)}
+{"" if sampled else _etd_integrate(w)}"""
+
+
+def _etd_integrate(w: _Writer) -> str:
+    """Return the function that ends rollouts in large steps, see :mod:`.etd`."""
+    return f"""
+
+@numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
+)
+def etd_integrate(
+    lanes, plant, belief, limits, until, terminal, escape, tail, counted,
+    linear, value, powers, forced, reach, out,
+):
+{textwrap.indent(chr(10).join(w.constants()), "    ")}
+    W = np.empty({w.rows.count * LANES})
+    {w.time} = 0.0
+    segment = lanes.shape[1] - 1
+    for b in range(0, out.shape[0], {LANES}):
+        block = b // {LANES}
+{_lanes(w.load_surface(), 2)}
+{_lanes(etd.begin(w.rows), 2)}
+        for step in range({etd.MOST}):
+            alive = 0.0
+            for i in range({LANES}):
+                alive += {w.rows.active}
+            if alive == 0.0:
+                break
+{textwrap.indent(etd.choose_step(w.rows), " " * 12)}\
+            for half in range(2):
+{_lanes(w.rates_at_stage(), 4)}
+                if half == 0:
+{_lanes(etd.first_half(w.rows, w.limits), 5)}
+{_lanes(etd.second_half(w.rows), 3)}
+{_lanes(etd.finish(w.rows), 2)}
+"""
+
+
+def _lanes(lines: Iterable[str], depth: int) -> str:
+    """Return a loop over the lanes of a block around ``lines``, indented."""
+    text = f"for i in range({LANES}):\n" + textwrap.indent("\n".join(lines), "    ")
+    return textwrap.indent(text, "    " * depth)
+
+
+def _hoist(program: LoopGraph) -> tuple[list[sp.Symbol], list[sp.Symbol]]:
+    """Return the symbols of the tape to be computed once a call, and once a surface.
+
+    Lines are told apart by what they depend on; those are kept that later lines use.
+    """
+    constants = {*program.plant_parameters, *program.belief_parameters, *program.limits}
+    per_lane = {*program.lane_inputs}
+    level: dict[sp.Symbol, int] = dict.fromkeys(constants, 0) | dict.fromkeys(per_lane, 1)
+    outputs = [
+        *program.demand,
+        *program.s,
+        program.singular,
+        *program.derivative,
+        program.stage,
+        *program.path,
+        *([] if program.input_margin is None else [program.input_margin]),
+    ]
+    live = program.tape.live(outputs)
+    for line in live:
+        level[line.symbol] = max(
+            (level.get(s, 2) for s in line.expression.free_symbols if isinstance(s, sp.Symbol)),
+            default=0,
+        )
+    used_by_state: set[sp.Basic] = set().union(*(sp.sympify(o).free_symbols for o in outputs))
+    used_by_lane: set[sp.Basic] = set()
+    for line in live:
+        if level[line.symbol] == 2:
+            used_by_state |= line.expression.free_symbols
+    lane = [a.symbol for a in live if level[a.symbol] == 1 and a.symbol in used_by_state]
+    for line in live:
+        if level[line.symbol] == 1:
+            used_by_lane |= line.expression.free_symbols
+    call = [
+        a.symbol for a in live if level[a.symbol] == 0 and a.symbol in used_by_state | used_by_lane
+    ]
+    return call, lane

@@ -1,0 +1,200 @@
+"""A mechanism linearised at its target: A, B, and how far they are from uncontrollable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from sympy.core.function import Application
+
+from undertow.base import ModelError, require_extra
+from undertow.models.mechanism import Mechanism
+from undertow.models.partition import compiled
+from undertow.models.quantities import TIME, FloatArray, numbers
+from undertow.models.validity import kinks, require_smooth, shortened
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """``M q̈ = F q + D q̇ + (B u, 0)`` at the target, numbers.
+
+    ``M, F, D`` are (n, n), ``B`` (m, m); ``states`` and ``inputs`` are names, in the order of A.
+    """
+
+    M: FloatArray
+    F: FloatArray
+    D: FloatArray
+    B: FloatArray
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Show its states, its inputs and the eigenvalues of A."""
+        modes = ", ".join(f"{mode:.4g}" for mode in np.linalg.eigvals(self.A))
+        return f"Linearisation({', '.join(self.states)}; {', '.join(self.inputs)}; eig A: {modes})"
+
+    @property
+    def A(self) -> FloatArray:
+        """State matrix of ẋ = A x + B u with x = (q, q̇), (2n, 2n)."""
+        n = len(self.M)
+        lower = np.linalg.solve(self.M, np.hstack([self.F, self.D]))
+        return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+
+    @property
+    def input(self) -> FloatArray:
+        """Input matrix of ẋ = A x + B u, (2n, m)."""
+        n, m = len(self.M), len(self.B)
+        force = np.vstack([self.B, np.zeros((n - m, m))])
+        return np.vstack([np.zeros((n, m)), np.linalg.solve(self.M, force)])
+
+    def ss(self) -> Any:
+        """Return ẋ = A x + B u, y = x as a ``control.StateSpace`` of python-control, with names.
+
+        Raises
+        ------
+        MissingExtraError
+            Without python-control.
+        """
+        control = require_extra("control", "interop", "state-space objects need python-control")
+        size, m = len(self.states), len(self.inputs)
+        return control.ss(
+            self.A,
+            self.input,
+            np.eye(size),
+            np.zeros((size, m)),
+            states=self.states,
+            inputs=self.inputs,
+            outputs=self.states,
+        )
+
+
+@lru_cache(maxsize=128)
+def linearise(mechanism: Mechanism) -> Linearisation:
+    """Linearise a mechanism at its target x = 0, disturbances at t = 0 included.
+
+    Raises
+    ------
+    ModelError
+        When the target is no equilibrium for u = 0, or f has no derivative there.
+    """
+    n = mechanism.n
+    require_smooth(
+        f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
+    )
+    rest, jacobian = _force_at_target(mechanism)
+    if not (np.isfinite(rest).all() and np.isfinite(jacobian).all()):
+        raise ModelError(
+            f"force of '{mechanism.name}' at the target",
+            value=f"f = {rest}, with slopes that are not finite"
+            if np.isfinite(rest).all()
+            else rest,
+            limit="finite, with its slopes",
+            remedy="Something is divided by zero there: rewrite the expression",
+        )
+    if np.abs(rest[mechanism.m :]).max() > 1e-9:
+        from undertow.models.importers.equations import nearest_equilibrium
+
+        raise ModelError(
+            f"target of '{mechanism.name}'",
+            value=f"f_u(0, 0) = {rest[mechanism.m :]}",
+            limit="an equilibrium, f_u = 0",
+            remedy=nearest_equilibrium(mechanism),
+        )
+    return Linearisation(
+        M=mechanism.M(np.zeros(n)),
+        F=jacobian[:, :n],
+        D=jacobian[:, n:],
+        B=numbers(mechanism.input_matrix.subs(mechanism.substitution)),
+        states=mechanism.state_names,
+        inputs=tuple(i.name for i in mechanism.inputs),
+    )
+
+
+@lru_cache(maxsize=128)
+def has_linear_model(mechanism: Mechanism) -> bool:
+    """Whether f has a derivative at the target: :func:`linearise` refuses where it has none."""
+    return next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
+
+
+def linear_numbers(
+    mechanism: Mechanism, values: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return M, (n, n), ∂f/∂x, (n, 2n), and B, (m, m), at the target for other parameters.
+
+    ``values`` are those of all parameters, (P,), SI units; nothing is checked.
+    """
+    n, m = mechanism.n, mechanism.m
+    at_rest = [0.0] * (2 * n + 1)
+    mass = np.array(mechanism.function("mass")(*at_rest, *values), dtype=float)
+    gain = np.array(
+        compiled(mechanism.input_matrix, mechanism.parameter_symbols)(*values), dtype=float
+    )
+    return mass.reshape(n, n), _force_at_target(mechanism, values)[1], gain.reshape(m, m)
+
+
+def _target(mechanism: Mechanism) -> dict[sp.Symbol, float]:
+    """All symbols of f to their values at the target, at t = 0."""
+    return mechanism.substitution | dict.fromkeys((*mechanism.x, TIME), 0.0)
+
+
+#: Functions that NumPy continues analytically to complex arguments.
+_ANALYTIC = (
+    sp.sin, sp.cos, sp.tan, sp.exp, sp.log, sp.sinh, sp.cosh, sp.tanh, sp.atan, sp.asinh,
+)  # fmt: skip
+
+
+def _force_at_target(
+    mechanism: Mechanism, parameters: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return f, (n,), and ∂f/∂x, (n, 2n), at x = 0 and t = 0, for some parameter values.
+
+    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives.
+    """
+    force, size = mechanism.force, 2 * mechanism.n
+    given = mechanism.parameter_values if parameters is None else parameters
+    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(Application)) and all(
+        power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*mechanism.x)
+    )
+    if analytic:
+        step = 1e-200  # its square is nothing: what is flat to first order comes out as zero
+        x = np.vstack([np.zeros(size), 1j * step * np.eye(size)])
+        with np.errstate(all="ignore"):
+            entries = mechanism.function("force")(0.0, *x.T, *given)
+            at_rest = mechanism.function("force")(0.0, *np.zeros(size), *given)
+            real = np.isfinite(np.array(at_rest, dtype=float)).all()
+        values = np.stack([np.broadcast_to(e, size + 1) for e in entries])
+        if np.isfinite(values).all() and real:  # of a negative number, a logarithm is complex
+            return values[:, 0].real, values[:, 1:].imag / step
+    at_target = dict.fromkeys(mechanism.x, 0)
+    numbered = dict(zip(mechanism.parameter_symbols, given.tolist(), strict=True))
+    numeric = sp.Matrix(force).subs(numbered | {TIME: 0})
+    jacobian = numeric.jacobian(list(mechanism.x)).subs(at_target)
+    try:
+        return numbers(numeric.subs(at_target)).ravel(), numbers(jacobian)
+    except TypeError as error:  # zoo, or complex
+        raise ModelError(
+            f"force of '{mechanism.name}' at the target",
+            value=shortened(list(numeric.subs(at_target))),
+            limit="real and finite, with its slopes",
+            remedy="Something is divided by zero there, or a root or logarithm taken of a "
+            "negative number",
+        ) from error
+
+
+def controllability(mechanism: Mechanism) -> float:
+    """Distance of (A, B) at the target from an uncontrollable pair, relative, ≥ 0.
+
+    The smallest singular value of [λI − A, B] over the eigenvalues λ of A (Hautus test),
+    over ‖[A, B]‖₂; zero means that no linear surface can stabilise.
+    """
+    lin = linearise(mechanism)
+    A, B = lin.A, lin.input
+    scale = float(np.linalg.norm(np.hstack([A, B]), 2))
+    tests = [
+        np.linalg.svd(np.hstack([eigenvalue * np.eye(len(A)) - A, B]), compute_uv=False)[-1]
+        for eigenvalue in np.linalg.eigvals(A)
+    ]
+    return float(min(tests)) / scale

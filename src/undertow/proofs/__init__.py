@@ -1,0 +1,80 @@
+"""Certificates: claims about a surface, a region or the closed loop, each with its verdict.
+
+``intervals`` encloses, ``region`` and ``closed_loop`` prove, ``claims`` has a file for each kind of
+claim and reads, writes and verifies certificates; what ``search`` finds is trusted nowhere.  The
+admission gate (:mod:`undertow.proofs.gate`) and random trials (:mod:`undertow.proofs.sampled`)
+prove less.  Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when first
+used.
+"""
+
+from undertow.base.verdict import Verdict
+from undertow.proofs.claims.appendix import AppendixClaim
+from undertow.proofs.claims.certificate import (
+    Certificate,
+    StatedClaim,
+    Subject,
+    read_certificate,
+)
+from undertow.proofs.claims.claim import Claim
+from undertow.proofs.claims.closed_loop import LoopClaim
+from undertow.proofs.claims.nonsingular import NonsingularClaim, nonsingular, singular_distance
+from undertow.proofs.claims.reaching import (
+    DisturbanceBound,
+    ReachingCertificate,
+    ReachingClaim,
+    reaching,
+)
+from undertow.proofs.claims.region import RegionClaim
+from undertow.proofs.claims.stability import StabilityClaim, hurwitz
+from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram, TerminalEllipsoid
+from undertow.proofs.claims.verify import Checked, check_settings, proved_sets, verify
+from undertow.proofs.gate import Policy, assess, certified_gate
+from undertow.proofs.region.lyapunov import LyapunovFunction
+from undertow.proofs.region.motion import SurfaceMotion
+from undertow.proofs.region.region import verify_region
+from undertow.proofs.sampled import box_starts, sampled_extent, sampled_region
+from undertow.proofs.search.closed_loop import ProvedLoop, prove_loop
+from undertow.proofs.search.region import ProvedRegion, prove_region
+from undertow.proofs.search.terminal_ellipsoid import search_for, terminal_sets
+
+__all__ = [
+    "AppendixClaim",
+    "Certificate",
+    "Checked",
+    "Claim",
+    "ClosedLoopProgram",
+    "DisturbanceBound",
+    "LoopClaim",
+    "LyapunovFunction",
+    "NonsingularClaim",
+    "Policy",
+    "ProvedLoop",
+    "ProvedRegion",
+    "ReachingCertificate",
+    "ReachingClaim",
+    "RegionClaim",
+    "StabilityClaim",
+    "StatedClaim",
+    "Subject",
+    "SurfaceMotion",
+    "TerminalEllipsoid",
+    "Verdict",
+    "assess",
+    "box_starts",
+    "certified_gate",
+    "check_settings",
+    "hurwitz",
+    "nonsingular",
+    "prove_loop",
+    "prove_region",
+    "proved_sets",
+    "reaching",
+    "read_certificate",
+    "sampled_extent",
+    "sampled_region",
+    "search_for",
+    "singular_distance",
+    "terminal_sets",
+    "verify",
+    "verify_region",
+]

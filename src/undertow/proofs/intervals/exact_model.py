@@ -1,0 +1,101 @@
+"""The model that a proof is about: smooth, with every float the rational number that it is.
+
+SymPy computes with floats of 53 bits: 2⁵³ + 1 − 2⁵³ is 0, and then an equilibrium seems to be
+where there is none.  It gives a derivative to what has none: that of |x| at 0 is 0.  So a model
+is made exact, and what is not smooth is refused, before anything symbolic is done with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+
+from undertow.models.mechanism import TIME, Mechanism
+from undertow.models.validity import require_smooth
+from undertow.proofs.intervals.interval import exact_fraction
+
+__all__ = [
+    "exact_expression",
+    "exact_matrix",
+    "exact_mechanism",
+    "exact_number",
+    "exact_rates",
+    "is_odd",
+    "vanishes",
+]
+
+
+def exact_number(value: float) -> sp.Rational:
+    """Return the rational number that a float is."""
+    return sp.Rational(*float(value).as_integer_ratio())
+
+
+def exact_matrix(block: ArrayLike) -> sp.Matrix:
+    """Return a matrix of the rational numbers that the floats are."""
+    array = np.asarray(block, dtype=float)
+    return sp.Matrix(*array.shape, [exact_number(v) for v in array.ravel()])
+
+
+def exact_expression(expression: sp.Expr) -> sp.Expr:
+    """Replace floats by the rational numbers that they are."""
+    floats = expression.atoms(sp.Float)
+    exact = {f: sp.Rational(*exact_fraction(f).as_integer_ratio()) for f in floats}
+    return expression.xreplace(exact)
+
+
+@lru_cache(maxsize=64)
+def exact_mechanism(mechanism: Mechanism) -> Mechanism:
+    """Return the mechanism with exact expressions; itself where they hold no floats.
+
+    Raises
+    ------
+    ModelError
+        For expressions that are not smooth, everywhere or at the target.
+    """
+    blocks = ("mass_matrix", "force", "input_matrix")
+    values = {p.symbol: p.value for p in mechanism.parameters}
+    target = dict.fromkeys((*mechanism.x, TIME), 0.0) | values
+    exact = {name: getattr(mechanism, name).applyfunc(exact_expression) for name in blocks}
+    for name, matrix in exact.items():
+        what = f"{name} of '{mechanism.name}'"
+        require_smooth(what, matrix, mechanism.x, orders=2)
+        require_smooth(what, matrix, mechanism.x, at=target, orders=2)
+    changed = {k: v for k, v in exact.items() if v != getattr(mechanism, k)}
+    return replace(mechanism, **changed) if changed else mechanism
+
+
+def exact_rates(
+    rates: Sequence[sp.Expr], states: Sequence[sp.Symbol], values: dict[sp.Symbol, float]
+) -> tuple[sp.Expr, ...]:
+    """Return the expressions of a vector field made exact; ``values`` are its parameters'.
+
+    Raises
+    ------
+    ModelError
+        For expressions that are not smooth, everywhere or at 0.
+    """
+    exact = tuple(exact_expression(sp.sympify(e)) for e in rates)
+    require_smooth("vector field", exact, states, orders=2)
+    target = dict.fromkeys(states, 0.0) | values
+    require_smooth("vector field", exact, states, at=target, orders=2)
+    return exact
+
+
+def is_odd(
+    odd: Iterable[sp.Expr], symbols: Iterable[sp.Symbol], even: Iterable[sp.Expr] = ()
+) -> bool:
+    """Whether expressions change their sign with that of the symbols, and others do not at all."""
+    flip = {x: -x for x in symbols}
+    rest = [e - e.xreplace(flip) for e in even] + [e + e.xreplace(flip) for e in odd]
+    return all(sp.expand(e) == 0 for e in rest)
+
+
+def vanishes(expressions: Iterable[sp.Expr], at: Iterable[sp.Symbol]) -> bool:
+    """Whether exact expressions are shown to be 0 where some symbols are, for all others."""
+    origin = dict.fromkeys(at, sp.Integer(0))
+    return all(sp.simplify(sp.sympify(e).subs(origin)) == 0 for e in expressions)

@@ -1,0 +1,277 @@
+"""Autonomous motions that regions are proved for: on a surface, or any vector field."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+
+from undertow.law import Surface, check_surface_shape
+from undertow.models.mechanism import FloatArray, Mechanism, Parameter
+from undertow.proofs.intervals.exact_model import (
+    exact_matrix,
+    exact_mechanism,
+    exact_rates,
+    is_odd,
+    vanishes,
+)
+from undertow.proofs.intervals.require import require, require_autonomous
+from undertow.symbolic import Tape, compile_numpy
+
+__all__ = ["AutonomousSystem", "SurfaceMotion", "VectorField"]
+
+
+def unused(names: Iterable[str], taken: Collection[str]) -> list[str]:
+    """Return made-up names, each with underscores after it until nothing else has it.
+
+    >>> unused(["w_x"], ["x", "w_x"])
+    ['w_x_']
+    """
+    found: list[str] = []
+    for name in names:
+        while name in taken or name in found:
+            name += "_"  # noqa: PLW2901
+        found.append(name)
+    return found
+
+
+class AutonomousSystem(ABC):
+    """ẏ = f(y, p) with f(0, p) = 0, written once in SymPy."""
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names of y, (N,)."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters p with their values."""
+
+    @abstractmethod
+    def build_graph(self, tape: Tape, y: Sequence[sp.Expr]) -> tuple[list[sp.Expr], sp.Expr]:
+        """Lay ẏ, and the determinant whose zeros are singular, on a tape; y are atoms."""
+
+    @property
+    @abstractmethod
+    def odd(self) -> bool:
+        """Whether ẏ(−y) = −ẏ(y), decided on the expressions."""
+
+    @property
+    @abstractmethod
+    def at_rest(self) -> bool:
+        """Whether ẏ(0) = 0 for all parameter values, decided symbolically."""
+
+    @property
+    def size(self) -> int:
+        """N."""
+        return len(self.names)
+
+    @cached_property
+    def symbols(self) -> tuple[sp.Symbol, ...]:
+        """Symbols of the N coordinates."""
+        return tuple(sp.Symbol(f"_y{i}", real=True) for i in range(self.size))
+
+    @cached_property
+    def _field(self) -> Any:
+        tape = Tape()
+        rates, determinant = self.build_graph(tape, self.symbols)
+        inputs = [*self.symbols, *(p.symbol for p in self.parameters)]
+        return compile_numpy(tape, inputs, [*rates, determinant])
+
+    def _evaluate(self, y: ArrayLike) -> list[FloatArray]:
+        columns = np.moveaxis(np.asarray(y, dtype=float), -1, 0)
+        with np.errstate(all="ignore"):
+            values = self._field(*columns, *(p.value for p in self.parameters))
+        return [np.broadcast_to(v, columns.shape[1:]) for v in values]
+
+    def __call__(self, y: ArrayLike) -> FloatArray:
+        """Return ẏ at the points y: (…, N) to (…, N)."""
+        return np.stack(self._evaluate(y)[:-1], axis=-1)
+
+    def determinant(self, y: ArrayLike) -> FloatArray:
+        """Return the determinant at the points y, (…,)."""
+        return np.asarray(self._evaluate(y)[-1])
+
+    @cached_property
+    def _at_target(self) -> float:
+        return float(self.determinant(np.zeros(self.size)))
+
+    def margin(self, y: ArrayLike) -> FloatArray:
+        """Return what is left of the determinant at points y, as a part of that at the target."""
+        return np.asarray(self.determinant(y) / self._at_target)
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """∂ẏ/∂y at 0, (N, N), by central differences."""
+        h = 1e-6 * np.eye(self.size)
+        return np.asarray((self(h) - self(-h)).T / 2e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMotion(AutonomousSystem):
+    """The sliding dynamics of a mechanism in y = (q_u, q̇_u, w), of order N = 2n − m.
+
+    Parameters
+    ----------
+    mechanism, surface
+        Whose motion, on which surface; w = q_a + λ_a⁻¹ λ_u q_u.
+
+    Raises
+    ------
+    InvalidInputError
+        For a surface of another size, with a singular λ_a, or a force that depends on time.
+    ModelError
+        For a model that is not smooth.
+    """
+
+    mechanism: Mechanism
+    surface: Surface
+
+    def __post_init__(self) -> None:
+        """Check sizes and that w exists; make the model exact."""
+        check_surface_shape(self.mechanism, self.surface)
+        object.__setattr__(self, "mechanism", exact_mechanism(self.mechanism))
+        require_autonomous(self.mechanism, "region")
+        require(
+            not abs(np.linalg.det(self.surface.lambda_a)) < 1e-12,
+            "surface for a region of attraction",
+            "λ_a singular",
+            "λ_a invertible",
+            "With λ_a singular the actuated coordinates do not converge",
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of y."""
+        c = self.mechanism.coordinates
+        free = c[self.mechanism.m :]
+        return (
+            *(k.name for k in free),
+            *(f"{k.name}_dot" for k in free),
+            *unused((f"w_{k.name}" for k in c[: self.mechanism.m]), self.mechanism.state_names),
+        )
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The mechanism's."""
+        return self.mechanism.parameters
+
+    def build_graph(self, tape: Tape, y: Sequence[sp.Expr]) -> tuple[list[sp.Expr], sp.Expr]:
+        """Lay ẏ and det E on a tape, for y given as atoms."""
+        mechanism, surface = self.mechanism, self.surface
+        m, free = mechanism.m, mechanism.n - mechanism.m
+        q_u, v_u, w = (
+            sp.Matrix(y[:free]), sp.Matrix(y[free : 2 * free]), sp.Matrix(y[2 * free :])
+        )  # fmt: skip
+        lambda_a, alpha_u = exact_matrix(surface.lambda_a), exact_matrix(surface.alpha_u)
+        inverse = exact_matrix(surface.alpha_a).inv()
+        ratio = lambda_a.inv() * exact_matrix(surface.lambda_u)
+        q_a = tape.matrix(w - ratio * q_u)
+        v_a = tape.matrix(-inverse * (lambda_a * w + alpha_u * v_u))
+        w_dot = tape.matrix(v_a + ratio * v_u)
+        rename = dict(zip(mechanism.x, [*q_a, *q_u, *v_a, *v_u], strict=True))
+        rows = [*mechanism.mass_matrix[m:, :], *mechanism.force[m:, :]]
+        atoms = tape.let_all([e.xreplace(rename) for e in rows])
+        M = sp.Matrix(free, mechanism.n, atoms[: free * mechanism.n])
+        f_u = sp.Matrix(atoms[free * mechanism.n :])
+        pull = tape.matrix(M[:, :m] * inverse)
+        E = tape.matrix(M[:, m:] - pull * alpha_u)
+        right = tape.matrix(f_u + pull * (lambda_a * w_dot))
+        adjugate, determinant = tape.adjugate(E)
+        reciprocal = tape.let(1 / determinant)
+        acceleration = tape.matrix(tape.product(adjugate, right) * reciprocal)
+        return [*v_u, *acceleration, *w_dot], determinant
+
+    @cached_property
+    def odd(self) -> bool:
+        """Whether ẏ(−y) = −ẏ(y), decided on the mechanism's expressions."""
+        return is_odd(self.mechanism.force, self.mechanism.x, self.mechanism.mass_matrix)
+
+    @cached_property
+    def at_rest(self) -> bool:
+        """Whether f_u(0, 0) = 0 for all parameter values, decided symbolically."""
+        return vanishes(self.mechanism.force[self.mechanism.m :, :], self.mechanism.x)
+
+    @cached_property
+    def slow(self) -> FloatArray:
+        """κ, (m, n−m), in η = q_a + α_a⁻¹α_u q_u = w − κ q_u.
+
+        η̇ = −α_a⁻¹λ_a w holds no q̇_u: where λ_a is small, η is slow while w is not.
+        """
+        s = self.surface
+        return np.asarray(
+            np.linalg.solve(s.lambda_a, s.lambda_u) - np.linalg.solve(s.alpha_a, s.alpha_u)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class VectorField(AutonomousSystem):
+    """Any autonomous motion ẋ = f(x, p), from expressions.
+
+    Parameters
+    ----------
+    states
+        Symbols of x, (N,).
+    rates
+        Expressions of ẋ, (N,), of the states and the parameters alone.
+    parameters
+        The parameters p.
+
+    Raises
+    ------
+    InvalidInputError
+        For another number of rates than states, or a symbol that is neither state nor
+        parameter.
+    ModelError
+        For rates that are not smooth.
+
+    Examples
+    --------
+    >>> x = sp.Symbol("x", real=True)
+    >>> motion = VectorField((x,), (-x + x**3,))
+    >>> motion.at_rest, motion.odd, float(motion([0.5])[0])
+    (True, True, -0.375)
+    """
+
+    states: tuple[sp.Symbol, ...]
+    rates: tuple[sp.Expr, ...]
+    parameters: tuple[Parameter, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that the expressions are closed; make them exact."""
+        rates, wanted = f"{len(self.rates)} rates", f"{len(self.states)}, one per state"
+        require(len(self.states) == len(self.rates), "vector field", rates, wanted)
+        known = {*self.states, *(p.symbol for p in self.parameters)}
+        unknown = {s for e in self.rates for s in sp.sympify(e).free_symbols} - known
+        names = ", ".join(sorted(str(s) for s in unknown))
+        remedy = "Give every other symbol as a Parameter, or its value"
+        require(not unknown, "vector field", names, "states and parameters alone", remedy)
+        values = {p.symbol: p.value for p in self.parameters}
+        object.__setattr__(self, "rates", exact_rates(self.rates, self.states, values))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return tuple(str(s) for s in self.states)
+
+    def build_graph(self, tape: Tape, y: Sequence[sp.Expr]) -> tuple[list[sp.Expr], sp.Expr]:
+        """Lay ẋ on a tape; nothing is singular but where an expression is."""
+        rename = dict(zip(self.states, y, strict=True))
+        return tape.let_all([e.xreplace(rename) for e in self.rates]), sp.Integer(1)
+
+    @cached_property
+    def odd(self) -> bool:
+        """Whether ẋ(−x) = −ẋ(x)."""
+        return is_odd(self.rates, self.states)
+
+    @cached_property
+    def at_rest(self) -> bool:
+        """Whether f(0) = 0 for all parameter values."""
+        return vanishes(self.rates, self.states)

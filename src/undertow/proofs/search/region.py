@@ -1,0 +1,266 @@
+"""The search for a region of attraction: a quadratic set, a chain that grows from it, proofs.
+
+:mod:`undertow.proofs.search.quadratic` finds the first set,
+:mod:`undertow.proofs.search.chain` lets it grow, all by samples; here as few functions of
+that chain as possible are proved by :func:`undertow.proofs.verify_region`, and the level of the
+last one is raised to the largest that is proved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base.errors import InfeasibleError
+from undertow.base.verdict import Verdict
+from undertow.models.mechanism import FloatArray
+from undertow.proofs.region.lyapunov import LyapunovFunction, extent
+from undertow.proofs.region.motion import AutonomousSystem, SurfaceMotion
+from undertow.proofs.region.region import verify_region
+from undertow.proofs.search.chain import Progress, SearchBudget, grow
+from undertow.proofs.search.chart import natural_stretch
+from undertow.proofs.search.quadratic import Start, quadratic
+
+__all__ = ["ProvedRegion", "prove_region", "search_region"]
+
+Chain = tuple[LyapunovFunction, ...]
+
+#: How close to the largest level that the checker proves; the first step on the way there.
+TIGHT, STRIDE = 1.02, 1.05
+
+#: Functions of a found chain that one proof tries to leap over, at first.
+LEAP = 16
+
+
+@dataclass(frozen=True)
+class ProvedRegion:
+    """A proved region of attraction.
+
+    Parameters
+    ----------
+    motion
+        The motion, on a surface in y = (q_u, q̇_u, w).
+    way
+        The asked direction of y, (N,).
+    chain
+        Functions from the innermost set to the outermost; the set is the component of
+        {V ≤ 1}, V the last, that contains 0.
+    verdict
+        The proof.
+    extent
+        How far along the asked direction the set is proved to reach.
+    raised
+        What the checker says of the last level, at most 2 % higher: never ``proved``, and
+        with a witness.
+    """
+
+    motion: AutonomousSystem
+    way: FloatArray
+    chain: Chain
+    verdict: Verdict
+    extent: float
+    raised: Verdict
+
+    @property
+    def function(self) -> LyapunovFunction:
+        """The last V of the chain."""
+        return self.chain[-1]
+
+    def level(self, y: ArrayLike) -> FloatArray:
+        """Return the larger of V and its guard at points y, (…, N): ≤ 1 on what is proved alone.
+
+        {V ≤ 1} may have parts elsewhere, of which nothing is proved.
+        """
+        guard = self.function.guard
+        assert guard is not None
+        return np.maximum(self.function(y), guard(y))
+
+
+def search_region(
+    motion: AutonomousSystem,
+    direction: ArrayLike,
+    *,
+    degrees: Sequence[int] = (4, 6),
+    programs: int = 300,
+    seconds: float = math.inf,
+    seed: int = 0,
+    start: Start = "round",
+    slow: bool = True,
+    goal: float = math.inf,
+    progress: Progress | None = None,
+) -> Chain:
+    """Find a chain whose last set {V ≤ 1} reaches far along a direction of y, by sampling.
+
+    Parameters
+    ----------
+    motion
+        The sliding dynamics, or any vector field.
+    direction
+        In y, (N,); on a surface y = (q_u, q̇_u, w), so (1, 0, 0) is an angle at rest.
+    degrees
+        Even degrees of the functions, one after the other; the first V is quadratic.
+    programs
+        Linear programs at most, shared by the degrees.
+    seconds
+        Process time at most, likewise.
+    start
+        The quadratic V to begin with: ``"far"`` reaches far along the direction and grows
+        little; ``"round"`` starts closer and grows further; ``"balanced"`` is for coordinates
+        of very different sizes.
+    slow
+        On a surface with one unactuated coordinate: whether the third of the coordinates of
+        :mod:`undertow.proofs.search.chart` is η, not w.
+    goal
+        Stop when the set reaches so far along the direction.
+    progress
+        Called with a line of text after each step.
+
+    Raises
+    ------
+    UnstableSurfaceError
+        When the surface is not locally stable.
+    """
+    rng = np.random.default_rng(seed)
+    way = np.asarray(direction, dtype=float)
+    stretch = None
+    if isinstance(motion, SurfaceMotion):
+        stretch = natural_stretch(motion, slow=slow)
+    # A little inside what samples allow.
+    chain = [quadratic(motion, stretch, way, rng, start).times(1.02)]
+    for k, degree in enumerate(degrees):
+        share = (k + 1) / sum(range(1, len(degrees) + 1))
+        budget = SearchBudget(math.floor(share * programs), share * seconds)
+        chain += grow(motion, chain[-1], way, degree, budget, goal, rng, progress)
+    return tuple(chain)
+
+
+def prove_region(
+    motion: AutonomousSystem,
+    direction: ArrayLike,
+    *,
+    degrees: Sequence[int] = (4, 6),
+    programs: int = 300,
+    seconds: float = math.inf,
+    seed: int = 0,
+    slow: bool = True,
+    goal: float = math.inf,
+    parameters: Mapping[str, tuple[float, float]] | None = None,
+    max_boxes: int = 1_000_000,
+    progress: Progress | None = None,
+    keep: Callable[[Chain], None] | None = None,
+) -> ProvedRegion:
+    """Search for a region of attraction, prove it, and raise its level as far as that goes.
+
+    Parameters
+    ----------
+    motion, direction, degrees, programs, seconds, seed, slow, goal, progress
+        As for :func:`search_region`.
+    parameters
+        Intervals of uncertain parameters, as for :func:`undertow.proofs.verify_region`.
+    max_boxes
+        Of each function's proof.  The proofs are not timed: with ``seconds`` left out the
+        work does not depend on the machine.
+    keep
+        Called with the functions that are proved so far, whenever there is one more: a run
+        that is stopped need not lose them.
+
+    Returns
+    -------
+    ProvedRegion
+        The largest set found that could be proved.
+
+    Raises
+    ------
+    InfeasibleError
+        When not even the first set could be proved.
+    UnstableSurfaceError
+        When the surface is not locally stable.
+    """
+    way = np.asarray(direction, dtype=float)
+    search = partial(search_region, motion, direction, seed=seed, slow=slow)
+    found = search(
+        degrees=degrees, programs=programs, seconds=seconds, goal=goal, progress=progress
+    )
+    # Sets that start round grow furthest, but near 0 the far one is proved with far less work.
+    far, balanced = search(degrees=(), start="far")[0], search(degrees=(), start="balanced")[0]
+
+    def decide(chain: Sequence[LyapunovFunction]) -> Verdict:
+        """The last function, those before it being proved."""
+        verdict = verify_region(
+            motion,
+            chain,
+            parameters=parameters,
+            max_boxes=max_boxes,
+            max_seconds=math.inf,
+            proved=len(chain) - 1,
+        )
+        if progress is not None:
+            boxes = verdict.details.get("boxes")
+            progress(
+                f"function {len(chain)}: reach {extent(chain[-1], way):.4f} {verdict.kind}, "
+                f"{boxes} boxes"
+            )
+        if verdict and keep is not None:
+            keep(tuple(chain))
+        return verdict
+
+    chain = _proved_chain((far, found[0], balanced), found, decide)
+    if extent(chain[0], way) > extent(chain[-1], way):
+        chain = chain[:1]
+    level, raised = _tight_level(chain, decide)
+    chain[-1] = level
+    verdict = verify_region(
+        motion, chain, parameters=parameters, max_boxes=10**12, max_seconds=math.inf
+    )
+    return ProvedRegion(motion, way, tuple(chain), verdict, extent(level, way) * (1 - 1e-9), raised)
+
+
+Decide = Callable[[Sequence[LyapunovFunction]], Verdict]
+
+
+def _proved_chain(firsts: Chain, found: Chain, decide: Decide) -> list[LyapunovFunction]:
+    """As few functions as prove one another, from a quadratic to the outermost that is proved."""
+    for first in (V.times(factor) for factor in (1.0, 1.1, 1.3, 2.0) for V in firsts):
+        verdict = decide([first])
+        if verdict:
+            break
+    else:
+        raise InfeasibleError(
+            "region of attraction",
+            value=str(verdict),
+            limit="a proved sublevel set",
+            remedy="Give the search another seed",
+        )
+    proved, at, leap = [first], -1, LEAP
+    while at < len(found) - 1:
+        target = min(at + leap, len(found) - 1)
+        if decide([*proved, found[target]]):
+            proved.append(found[target])
+            at, leap = target, min(2 * leap, LEAP)
+        elif target > at + 1:
+            leap = (target - at) // 2
+        else:
+            break
+    return proved
+
+
+def _tight_level(
+    chain: Sequence[LyapunovFunction], decide: Decide
+) -> tuple[LyapunovFunction, Verdict]:
+    """The last function with a level that is proved and, 2 % higher, is not: and that verdict."""
+    *inner, V = chain
+    stride = STRIDE
+    level, low, high, refusal = stride, 1.0, math.inf, None
+    while refusal is None or high / low > TIGHT:
+        verdict = decide([*inner, V.times(1 / level)])
+        if verdict:
+            low, stride = level, stride**2
+        else:
+            high, refusal = level, verdict
+        level = low * stride if refusal is None else math.sqrt(low * high)
+    return V.times(1 / low), refusal

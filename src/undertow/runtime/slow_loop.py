@@ -1,0 +1,411 @@
+"""The slow loop: one request of the fast loop to one answer, and who computes it where.
+
+A request is a state and the plan in use; the answer is computed for the state *predicted*
+for the time of use.  Everything here is a function of the request, so that a recorded
+answer can be judged again without a clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import math
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Protocol, TypeGuard
+
+import numpy as np
+
+from undertow.base import ResourceError
+from undertow.cascade import Admission, Cascade, CascadeState
+from undertow.cascade.swing_up import SwingUpAndCatch
+from undertow.law import Plan, SlidingModeLaw, pack_law_parameters
+from undertow.models import FloatArray
+from undertow.optimiser import Proposal
+from undertow.runtime.processes import START_TIMEOUT, STOPPING, Background, fork, pipe
+
+#: The first that a process says which is to compute.
+BEGUN = "begun"
+
+#: What asks the fast loop for a stop, which decides when its processes end, by SIGTERM.
+OTHERS = tuple(number for number in STOPPING if number != signal.SIGTERM)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Request:
+    """What the fast loop asks: re-optimise ``memory.plan`` from x at t for use at ``use``, s.
+
+    With ``swing`` ≥ 0 the mechanism is being swung up, with these gains: is there a surface
+    that catches it?
+    """
+
+    t: float
+    x: FloatArray
+    use: float
+    memory: CascadeState
+    swing: int = -1
+
+    @property
+    def sequence(self) -> int:
+        """Number that the answer must carry."""
+        return self.memory.sequence + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What the slow loop says.
+
+    Attributes
+    ----------
+    sequence, use
+        Number and time of use, s, of the request.
+    x
+        State predicted for the time of use, (2n,).
+    proposal, admission
+        The optimiser's answer and the gate's decision.
+    before, memory
+        The cascade's memory as it was asked, and from the time of use on.
+    law_vectors
+        Numbers of the law for each surface of the plan, (S, 2mn + 2m + 1).
+    seconds
+        Time from request to answer, s.
+    swing
+        That of the request.
+    """
+
+    sequence: int
+    use: float
+    x: FloatArray
+    proposal: Proposal
+    admission: Admission
+    before: CascadeState
+    memory: CascadeState
+    law_vectors: FloatArray
+    seconds: float
+    swing: int = -1
+
+
+Compute = Callable[[Request], Answer]
+
+
+def is_answer(said: object) -> TypeGuard[Answer]:
+    """Whether what a worker gave has all that a step reads of an answer, of the right types."""
+    return (
+        isinstance(said, Answer)
+        and isinstance(said.sequence, int)
+        and isinstance(said.use, float)
+        and isinstance(said.admission, Admission)
+        and isinstance(said.memory, CascadeState)
+        and isinstance(said.memory.plan, Plan)
+        and all(
+            isinstance(part, np.ndarray) and part.dtype == float
+            for part in (said.x, said.law_vectors)
+        )
+    )
+
+
+def law_vectors_of(cascade: Cascade, plan: Plan) -> FloatArray:
+    """Return the numbers of the compiled law for each surface of a plan, (S, 2mn + 2m + 1).
+
+    Raises
+    ------
+    UndertowError
+        For a plan that does not fit the mechanism, or is singular at the target.
+    """
+    laws = plan.reaching or (cascade.reaching,) * len(plan.surfaces)
+    pairs = zip(plan.surfaces, laws, strict=True)
+    return np.stack(
+        [pack_law_parameters(SlidingModeLaw(cascade.mechanism, s, law)) for s, law in pairs]
+    )
+
+
+def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None = None) -> Answer:
+    """Predict, re-optimise, judge; never raises.
+
+    In a swing-up: predict, and look for a surface that catches.
+    """
+    began = time.perf_counter()
+    if request.swing >= 0 and swing_up is not None:
+        return _catch(cascade, request, swing_up, began)
+    x = _predicted(cascade, request)
+    memory = request.memory
+    proposal: object = cascade.propose(memory, x, request.use)
+    if not isinstance(proposal, Proposal):
+        what = f"not a proposal but a {type(proposal).__name__}"
+        proposal = Proposal(
+            None, "failed", math.inf, math.inf, (), 0, 0.0, request.sequence, request.use, what
+        )
+    judged = judge(cascade, memory, proposal, x, request.use)
+    return _answer(request, x, proposal, *judged, began)
+
+
+def _answer(
+    request: Request, x: FloatArray, proposal: Proposal, after: CascadeState, admission: Admission,
+    law_vectors: FloatArray, began: float,
+) -> Answer:  # fmt: skip
+    seconds, asked = time.perf_counter() - began, request.memory
+    return Answer(
+        request.sequence, request.use, x, proposal, admission, asked, after, law_vectors, seconds,
+        request.swing,
+    )  # fmt: skip
+
+
+def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began: float) -> Answer:
+    """Return an answer whose plan is the surface that catches, if there is one."""
+    try:
+        x = swing_up.ahead(request.x, request.use - request.t, request.swing)
+        home = x - swing_up.region.turns(x)
+        surface = swing_up.region.surface(home)
+    except Exception:
+        home, surface = np.full_like(request.x, math.nan), None
+    memory = request.memory
+    plan = memory.plan if surface is None else Plan.of(surface)
+    proposal = Proposal(
+        None if surface is None else plan,
+        "infeasible" if surface is None else "converged",
+        math.inf,
+        math.inf,
+        (),
+        0,
+        time.perf_counter() - began,
+        request.sequence,
+        request.use,
+    )
+    words = "not to be caught from here" if surface is None else "comes home from here"
+    after = replace(memory, plan=plan, since=request.use, sequence=request.sequence, x=())
+    admission = Admission(surface is not None, words, math.inf)
+    vectors = law_vectors_of(cascade, plan)
+    return _answer(request, home, proposal, after, admission, vectors, began)
+
+
+def judge(
+    cascade: Cascade, memory: CascadeState, proposal: Proposal, x: FloatArray, use: float
+) -> tuple[CascadeState, Admission, FloatArray]:
+    """Pass a proposal through the cascade's gate; whatever goes wrong refuses it."""
+    try:
+        after, admission = cascade.apply_gate(memory, proposal, x)
+        return after, admission, law_vectors_of(cascade, after.plan)
+    except Exception as error:  # an optimiser's answer may be anything
+        reason = f"gate: {type(error).__name__}: {error}"
+        admission = Admission(False, reason, memory.predicted)
+        number = memory.sequence + 1
+        after = replace(memory, plan=memory.at(use), since=use, sequence=number, x=())
+        return after, admission, law_vectors_of(cascade, after.plan)
+
+
+def _predicted(cascade: Cascade, request: Request) -> FloatArray:
+    plan, span = request.memory.at(request.t), request.use - request.t
+    try:
+        batch = cascade.loop.batch(request.x, plan, duration=span, terminal=0.0)
+        return np.asarray(batch.x[0])
+    except Exception:  # then the optimiser fails on it too, and says so
+        return np.full_like(request.x, math.nan)
+
+
+class Worker(Protocol):
+    """Who computes answers: the fast loop asks, and takes what is there, never waiting."""
+
+    def ask(self, request: Request) -> None:
+        """Hand over a request."""
+        ...
+
+    def take(self, t: float) -> Answer | None:
+        """Return the next answer that has arrived by the time t, s, if there is one."""
+        ...
+
+    def replace(self) -> bool:
+        """Give up on the present computation; whether there is someone to take over."""
+        ...
+
+    def close(self) -> None:
+        """Stop computing."""
+        ...
+
+
+class InlineWorker:
+    """Computes at once, and answers after a latency of simulated time.
+
+    Parameters
+    ----------
+    compute
+        Request to answer.
+    latency
+        Simulated time from request to answer, s.
+    """
+
+    def __init__(self, compute: Compute, latency: float = 0.05) -> None:
+        self.compute, self.latency = compute, latency
+        self.waiting: deque[tuple[float, Answer]] = deque()
+
+    def ask(self, request: Request) -> None:
+        """Compute the answer."""
+        self.waiting.append((request.t + self.latency, self.compute(request)))
+
+    def take(self, t: float) -> Answer | None:
+        """Return the answer once its latency has passed."""
+        if self.waiting and self.waiting[0][0] <= t + 1e-9:
+            return self.waiting.popleft()[1]
+        return None
+
+    def replace(self) -> bool:
+        """Forget what was asked."""
+        self.waiting.clear()
+        return True
+
+    def close(self) -> None:
+        """Nothing to stop."""
+
+
+class BackgroundWorker:
+    """Computes in other threads, which may in turn wait for other processes.
+
+    Every computer has its thread from the beginning: a run that needs the next one asks the
+    system for nothing.
+    """
+
+    def __init__(self, computers: list[_Computer]) -> None:
+        self.computers = computers
+        try:
+            for computer in computers:
+                computer.begin()
+        except ResourceError:
+            self.close()
+            raise
+
+    @property
+    def processes(self) -> list[int]:
+        """Process ids of the computers, the one that computes first."""
+        return [c.process.pid or 0 for c in self.computers if isinstance(c, _Child)]
+
+    def ask(self, request: Request) -> None:
+        """Hand the request over; costs some microseconds."""
+        self.computers[0].requests.put(request)
+
+    def take(self, t: float) -> Answer | None:
+        """Return an answer that has arrived."""
+        answers = self.computers[0].answers
+        return answers.popleft() if answers else None
+
+    def replace(self) -> bool:
+        """End the present computation and let the next computer take over."""
+        if len(self.computers) < 2:
+            return False
+        self.computers.pop(0).close()
+        return True
+
+    def close(self) -> None:
+        """End all computers."""
+        for computer in self.computers:
+            computer.close()
+
+
+class _Computer:
+    """A computation, and a thread that carries requests there and answers back."""
+
+    def __init__(self, compute: Compute) -> None:
+        self.compute = compute
+        self.requests: SimpleQueue[Request | None] = SimpleQueue()
+        self.answers: deque[Answer] = deque()
+
+    def begin(self) -> None:
+        """Start the thread; processes are forked before."""
+        Background(self._carry, "undertow slow loop")
+
+    def _carry(self) -> None:
+        while (request := self.requests.get()) is not None:
+            try:
+                self.answers.append(self.compute(request))
+            except (EOFError, OSError, TypeError):  # gone, or closed while it is asked
+                return
+
+    def close(self) -> None:
+        """Ask for no more; a thread cannot be ended from outside: it is left behind."""
+        self.requests.put(None)
+
+
+class _Child(_Computer):
+    """A forked process: it has everything compiled already, and can be ended at any time."""
+
+    def __init__(self, compute: Compute) -> None:
+        self.pipe, theirs = pipe()
+        try:
+            self.process = fork(
+                _serve, (compute, theirs, self.pipe), "undertow slow loop", ignores=OTHERS
+            )
+        except BaseException:
+            self.pipe.close()  # which ends it
+            raise
+        finally:
+            theirs.close()
+        super().__init__(self._exchange)
+        if not self._begun():
+            self.close()
+            self.process.join(START_TIMEOUT)
+            raise ResourceError(
+                "process 'undertow slow loop'",
+                value=f"it ended with exit code {self.process.exitcode}",
+                limit=f"one that answers within {START_TIMEOUT:g} s",
+                remedy="The system ends processes for lack of memory: end other programs",
+            )
+
+    def _begun(self) -> bool:
+        with contextlib.suppress(EOFError, OSError):
+            return self.pipe.poll(START_TIMEOUT) and self.pipe.recv() == BEGUN
+        return False
+
+    def _exchange(self, request: Request) -> Answer:
+        self.pipe.send(request)
+        answer: Answer = self.pipe.recv()
+        return answer
+
+    def close(self) -> None:
+        """Kill the process, and do not wait for it."""
+        self.process.kill()
+        with contextlib.suppress(OSError):
+            self.pipe.close()
+        super().close()
+
+
+def _serve(compute: Compute, ours: Connection, theirs: Connection) -> None:
+    """Answer requests until the other end is gone."""
+    theirs.close()
+    with contextlib.suppress(OSError, AttributeError):  # Linux: do not outlive the fast loop
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    with contextlib.suppress(EOFError, OSError):
+        ours.send(BEGUN)
+        while True:
+            ours.send(compute(ours.recv()))
+
+
+def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWorker:
+    """Return a worker on another core: one process computes, the others stand by.
+
+    Parameters
+    ----------
+    compute
+        Request to answer; call it once before, so that everything is compiled.
+    processes
+        Processes to fork now, while the fast loop does not run yet: one to compute, the
+        rest to take over from one that hangs or dies.  0: a thread of this process.
+
+    Raises
+    ------
+    ResourceError
+        When the system has no process or thread more.
+    """
+    forked = processes >= 1 and hasattr(os, "fork")
+    computers: list[_Computer] = []
+    try:
+        for _ in range(max(1, processes)):
+            computers.append(_Child(compute) if forked else _Computer(compute))
+    except BaseException:
+        for computer in computers:
+            computer.close()
+        raise
+    return BackgroundWorker(computers)

@@ -1,0 +1,167 @@
+"""Certify and verify in Python: a surface to a certificate, a certificate to what still holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base import checked, positive, versions
+from undertow.law import ReachingLaw, Surface
+from undertow.models import Mechanism
+from undertow.proofs import Certificate, read_certificate
+from undertow.proofs.claims.verify import Checked
+from undertow.proofs.claims.verify import verify as decide
+from undertow.studies.certification.subjects import Progress, certify_surface
+
+__all__ = ["Verification", "certify", "verify"]
+
+
+@checked
+def certify(
+    mechanism: Mechanism,
+    surface: Surface,
+    x0: ArrayLike | None = None,
+    *,
+    reaching: ReachingLaw = ReachingLaw(),
+    seconds: float = 60.0,
+    loop: bool = False,
+    hold: int = 0,
+    uncertain: Mapping[str, tuple[float, float]] | None = None,
+    progress: Progress | None = None,
+    **state: float,
+) -> Certificate:
+    """Prove what can be proved of a surface: stability, terminal set, domain, disturbances, region.
+
+    Parameters
+    ----------
+    mechanism
+        Belief and plant.
+    surface, reaching
+        The law.
+    x0
+        A state, (2n,), or its non-zero entries by name (``phi=0.7``): its positions, with both
+        signs, span the region in which the law must exist, and say which way the region of
+        attraction should reach.  With neither, the mechanism's usual ``start``, if it has one.
+    seconds
+        Effort for the region on the surface, s; 0 leaves it out.
+    loop
+        Also prove how far off the target the full closed loop may start at rest: minutes.
+    hold, uncertain
+        For that proof: the input is held for so many steps of 1 ms (0: at every instant), and
+        plant parameters lie in [low, high] instead of being the law's own.
+    progress
+        Called with (what, part done).
+
+    Returns
+    -------
+    Certificate
+        ``print`` shows its claims; ``.save("certificate.json")`` writes the file that
+        :func:`verify` reads.
+
+    Raises
+    ------
+    MissingExtraError
+        Without ``undertow[certify]``.
+    ModelError
+        For a mechanism that is not smooth.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> certificate = certify(rig, ut.first_surface(rig), seconds=0)
+    >>> certificate.subjects[0].claims[0].kind
+    'stability'
+    """
+    positive("time of the search, s", seconds, zero=True)
+    known = x0 is not None or state or mechanism.start
+    start = mechanism.initial_state(x0, state) if known else np.zeros(2 * mechanism.n)
+    certified = certify_surface(
+        mechanism,
+        surface,
+        start,
+        reaching_law=reaching,
+        seconds=seconds,
+        loop=loop,
+        hold=hold,
+        uncertain=uncertain,
+        progress=progress,
+    )
+    return Certificate.of(mechanism, [certified.subject], versions())
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The claims of a certificate, each decided again; true if all of them hold.
+
+    Attributes
+    ----------
+    name
+        The mechanism's.
+    checked
+        In the order of the file.
+    """
+
+    name: str
+    checked: tuple[Checked, ...]
+
+    def __bool__(self) -> bool:
+        """Whether every claim was proved again."""
+        return all(item.verdict for item in self.checked)
+
+    def __iter__(self) -> Iterator[Checked]:
+        """Iterate over the claims."""
+        return iter(self.checked)
+
+    def __repr__(self) -> str:
+        """Show how many claims hold."""
+        held = sum(bool(item.verdict) for item in self.checked)
+        return f"Verification({self.name}, {held} of {len(self.checked)} claims proved again)"
+
+    def __str__(self) -> str:
+        """Return a line for each claim, as it was decided now."""
+        lines = (f"  {item.verdict.kind}: {item.verdict.claim}" for item in self.checked)
+        return "\n".join([f"{self.name}:", *lines])
+
+
+@checked
+def verify(
+    certificate: Certificate | str | Path,
+    mechanism: Mechanism,
+    *,
+    max_seconds: float = 600.0,
+    progress: Progress | None = None,
+) -> Verification:
+    """Decide every claim of a certificate again, for a mechanism with its own parameters.
+
+    Nothing of the file is believed but the numbers that it brings to try.
+
+    Parameters
+    ----------
+    certificate
+        The file, or what :func:`certify` returned.
+    mechanism
+        Which it must be about: the same equations, parameters and input limits.
+    max_seconds
+        Effort for each claim, s.
+    progress
+        Called with (claim, part done).
+
+    Raises
+    ------
+    ArtefactError, CertificateError
+        When the file cannot be read, is damaged, or is about another mechanism.
+    MissingExtraError
+        Without ``undertow[certify]``.
+    """
+    given = (
+        certificate if isinstance(certificate, Certificate) else read_certificate(Path(certificate))
+    )
+    found = decide(
+        given, mechanism, own_parameters=True, max_seconds=max_seconds, progress=progress
+    )
+    return Verification(given.name, found)

@@ -1,0 +1,261 @@
+"""The drill: each fault of the list is put into a run in simulated time, and judged."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base import Progress, no_progress
+from undertow.cascade import CascadeState
+from undertow.estimators import Estimator
+from undertow.models import FloatArray
+from undertow.plants import Measurement, Push, RealisticRig, Rig
+from undertow.runtime import (
+    Columns,
+    Controller,
+    Log,
+    Mode,
+    Recipe,
+    Runtime,
+    RunVerdict,
+    SimulatedClock,
+    about,
+    read_log,
+    replay_controller,
+    respond,
+)
+from undertow.studies.fault_injection.cases import (
+    CASES,
+    Case,
+    FaultyRig,
+    FaultyWorker,
+    OutputMonitor,
+    corrupt_optimiser,
+)
+
+#: Unactuated coordinates within this at the end count as held, rad or m.
+HELD = 0.2
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What happened in one run of the drill.
+
+    Attributes
+    ----------
+    case
+        The fault.
+    stopped_by
+        Why the run stopped.
+    after
+        Time from the fault to the safe stop, s; NaN when it never came to one before the
+        end of the run.
+    held
+        Whether the mechanism was held to the end of the run.
+    output_faults
+        Outputs that were not finite, past their limits or too fast; empty when all were sound.
+    largest
+        Largest |u|/limit.
+    ended_safely
+        Whether the loop ended in a safe stop with the output at zero.
+    answers
+        Verdicts on the answers of the optimiser, in words.
+    replayed
+        Whether the replay of the log was identical, bit for bit.
+    verdict
+        How the run ended, with its exit code.
+    note
+        What else is worth knowing.
+    """
+
+    case: Case
+    stopped_by: str
+    after: float
+    held: bool
+    output_faults: tuple[str, ...]
+    largest: float
+    ended_safely: bool
+    answers: str
+    replayed: bool
+    verdict: RunVerdict
+    note: str = ""
+
+    @property
+    def happened(self) -> str:
+        """What happened, in words."""
+        if self.held:
+            text = "held to the end"
+        elif math.isnan(self.after):
+            text = "not held, not stopped"
+        else:
+            text = f"safe stop after {1e3 * self.after:.0f} ms: {self.stopped_by}"
+        answers = self.answers if self.case.part in ("optimiser", "answer") else ""
+        return "; ".join(filter(None, (text, answers, *self.output_faults[:1], self.note)))
+
+    @property
+    def passed(self) -> bool:
+        """Sound outputs, a safe end, an identical replay, and held where that is possible.
+
+        And the verdict says how it ended, with an exit code that is 0 for what balanced alone.
+        """
+        sound = not self.output_faults and self.ended_safely and self.replayed
+        stopped = not math.isnan(self.after)
+        sound = sound and self.verdict.output_zero == self.case.off
+        sound = sound and self.verdict.ending in self.case.endings
+        sound = sound and (self.verdict.exit_code == 0) == (self.verdict.ending == "balanced")
+        return sound and (self.held or (stopped and not self.case.holds))
+
+
+class _FaultyEstimator:
+    """An estimator that goes wrong from some time on."""
+
+    def __init__(
+        self, honest: Estimator, corrupt: Callable[[FloatArray], FloatArray], since: float
+    ):
+        self.honest, self.corrupt, self.since = honest, corrupt, since
+        self.disturbance = honest.disturbance
+
+    def reset(self, x0: ArrayLike) -> None:
+        self.honest.reset(x0)
+
+    def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
+        x = self.honest.estimate(measurement, u)
+        return self.corrupt(x) if measurement.t >= self.since else x
+
+
+def drill_recipe(seed: int = 0) -> Recipe:
+    """Return the run that the drill disturbs: the paper's bench from 15°, short searches."""
+    return Recipe(
+        start=(0.0, math.radians(15.0), 0.0, 0.0), rig="realistic", evaluations=96, seed=seed
+    )
+
+
+def run_case(
+    case: Case,
+    recipe: Recipe,
+    memory: CascadeState,
+    log: Path,
+    *,
+    since: float = 0.5,
+    seconds: float = 3.0,
+) -> CaseResult:
+    """Run one fault in simulated time.
+
+    Parameters
+    ----------
+    case
+        The fault.
+    recipe, memory
+        The run, and its first optimum.
+    log
+        File for the log of the run.
+    since
+        When the fault begins, s.
+    seconds
+        Length of the run, s.
+    """
+    clock = SimulatedClock()
+    since = since if case.since is None else case.since
+    cascade = recipe.cascade
+    if case.optimiser is not None:
+        cascade = corrupt_optimiser(cascade, case.optimiser, since)
+
+    worker = FaultyWorker(
+        lambda request: respond(cascade, request, recipe.swing),
+        (lambda answer: [(0.0, answer)]) if case.answers is None else case.answers(),
+        since,
+    )
+    plant = _plant(recipe, case, since)
+    rig: Rig = FaultyRig(
+        plant,
+        since,
+        sense=None if case.sensor is None else case.sensor(),
+        drive=None if case.actuator is None else case.actuator(),
+        hang=case.hang,
+        clock=clock,
+        slow=case.slow,
+    )
+
+    def make_controller() -> Controller:
+        controller = recipe.make_controller(memory)
+        if case.estimator is not None:
+            controller.estimator = _FaultyEstimator(controller.estimator, case.estimator, since)
+        return controller
+
+    controller = make_controller()
+    monitor = OutputMonitor(rig, controller.limits, controller.slew)
+    meta = about(controller, recipe, drill=f"{case.part}: {case.name}")
+    with Log(
+        log,
+        Columns.of(recipe.belief),
+        meta,
+        threaded=False,
+        max_bytes=60_000 if case.disk_full else None,
+    ) as book:
+        runtime = Runtime(controller, monitor, worker, clock=clock, log=book)
+        if case.silent:
+            worker.act = worker.waiting.clear
+        if case.operator:
+            worker.act = runtime.stop
+        report = runtime.run(seconds)
+    stopped = [t for t, what, text in report.events if what == "state" and "SAFE_STOP" in text]
+    free = plant.truth[recipe.belief.m : recipe.belief.n]
+    by_operator = report.stopped_by == "operator: stop" and not case.operator
+    answers = ", ".join(f"{n} {what}" for what, n in report.answers.most_common(2))
+    return CaseResult(
+        case,
+        report.stopped_by,
+        math.nan if by_operator or not stopped else max(0.0, stopped[0] - since),
+        by_operator and bool((np.abs(free) <= HELD).all()),
+        tuple(monitor.faults),
+        monitor.largest,
+        report.mode == Mode.SAFE_STOP and not monitor.last.any(),
+        answers,
+        not replay_controller(read_log(log), make_controller(), decisions=False).differing,
+        report.verdict,
+        f"log: {book.failure}" if book.failure else "",
+    )
+
+
+def _plant(recipe: Recipe, case: Case, since: float) -> RealisticRig:
+    plant = recipe.make_rig()
+    if not case.push:
+        return plant
+    bench = recipe.bench if recipe.rig == "realistic" else plant.bench
+    last = recipe.belief.coordinates[-1].name
+    pushed = replace(bench, pushes=(Push(since, last, case.push),))
+    return RealisticRig(pushed, recipe.x0, recipe.seed)
+
+
+def drill(
+    cases: Sequence[Case] = CASES, *, seed: int = 0, progress: Progress = no_progress
+) -> tuple[CaseResult, ...]:
+    """Run all faults and judge them.
+
+    Parameters
+    ----------
+    cases
+        The list.
+    seed
+        Of the rig and of the optimiser.
+    progress
+        Called with (what, fraction) before each.
+    """
+    recipe = drill_recipe(seed)
+    memory, _ = recipe.cascade.start(recipe.x0)
+    outcomes = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number, case in enumerate(cases):
+            progress(f"{case.part}: {case.name}", number / len(cases))
+            log = Path(folder) / f"{number}.db"
+            outcomes.append(run_case(case, recipe, memory, log))
+            with contextlib.suppress(OSError):
+                log.unlink()
+    return tuple(outcomes)

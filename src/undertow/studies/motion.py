@@ -1,0 +1,258 @@
+"""One motion and one optimum, as text and as files: `undertow simulate`, `undertow optimise`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from undertow.base import facts, finite, manifest, table, to_csv
+from undertow.cascade import Gate, Run, Update, problem_words
+from undertow.closed_loop import Event, Trajectory
+from undertow.display.plot import display, figure_bytes, motion_figure, state_words
+from undertow.law import Surface
+from undertow.models import FloatArray, Mechanism
+from undertow.objective import Objective
+from undertow.optimiser import Proposal
+
+_ENDINGS = {
+    Event.REACHED: "reached the target, ‖x‖ ≤ {radius:g}",
+    Event.HORIZON: "had not reached ‖x‖ ≤ {radius:g} by the horizon: ‖x‖ = {norm:.3g}",
+    Event.CONSTRAINT: "broke {broken}",
+    Event.SINGULAR: "met the singularity (37): the law does not exist further on",
+    Event.DIVERGED: "diverged",
+}
+
+
+def _surface_words(surface: Surface) -> str:
+    return repr(surface).removeprefix("Surface(").removesuffix(")")
+
+
+def _head(
+    mechanism: Mechanism, objective: Objective, start: FloatArray, gate: Gate | None = None
+) -> list[tuple[str, str]]:
+    problem = problem_words(mechanism, objective, gate).removeprefix("objective ")
+    return [
+        ("mechanism", f"{mechanism.name}: {mechanism.description}".removesuffix(": ")),
+        ("objective", problem),
+        ("start", state_words(mechanism, start)),
+    ]
+
+
+def ended(motion: Trajectory, objective: Objective) -> str:
+    """Say in words how a motion ended."""
+    if motion.event == Event.REACHED and motion.time == motion.t[0]:
+        return (
+            f"started at the target, ‖x‖ ≤ {objective.terminal_radius:g}: there was nothing to do"
+        )
+    broken = _broken(motion, objective) if motion.event == Event.CONSTRAINT else ""
+    words = _ENDINGS[motion.event].format(
+        radius=objective.terminal_radius, norm=float(np.linalg.norm(motion.x[-1])), broken=broken
+    )
+    return f"{words}, at {motion.time:.3f} s"
+
+
+def _broken(motion: Trajectory, objective: Objective) -> str:
+    """Return the constraints that the last state of a motion breaks, whatever the input is."""
+    mechanism = motion.mechanism
+    at_end = mechanism.substitution | dict(zip(mechanism.x, motion.x[-1].tolist(), strict=True))
+    objective = objective.on(mechanism)
+    margins = [margin.subs(at_end) for margin in objective.path_margins(mechanism)]
+    names = [
+        constraint.words
+        for constraint, margin in zip(objective.constraints, margins, strict=True)
+        if margin.is_number and margin < 0
+    ]
+    hard = "the hard input limit" if objective.hard_input else "a constraint on the input"
+    return " and ".join(names) or hard
+
+
+def motion_report(
+    mechanism: Mechanism,
+    objective: Objective,
+    start: FloatArray,
+    motion: Trajectory,
+    surface: Surface,
+    run: Run | None = None,
+    gate: Gate | None = None,
+) -> RenderableType:
+    """Return a simulated motion for the terminal.
+
+    Parameters
+    ----------
+    mechanism, objective, start
+        What was asked for.
+    motion
+        What the plant did.
+    surface
+        The (first) surface.
+    run
+        The cascade's record, where a cascade was run.
+    gate
+        Who admitted its surfaces.
+    """
+    rows = _head(mechanism, objective, start, gate)
+    if run is None:
+        rows.append(("surface", _surface_words(surface)))
+    else:
+        admitted = sum(update.admission.accepted for update in run.updates)
+        rows += [
+            ("first optimum", _surface_words(surface)),
+            ("last surface", _surface_words(run.surfaces[-1])),
+            ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
+        ]
+        if any(verdict is not None for verdict in run.verdicts):
+            rows.append(("evidence", _evidence(run)))
+        if len(run.lemma3_slack):
+            rows.append(("Lemma 3", _slack_words(run, objective)))
+    rows += [
+        ("cost", f"{motion.cost:.6g} {objective.unit}"),
+        (
+            "largest input",
+            ", ".join(
+                f"|{channel.name}| = {abs(motion.u[:, i]).max():.3g} of {channel.limit:g} "
+                f"{channel.unit}"
+                for i, channel in enumerate(mechanism.inputs)
+            ),
+        ),
+    ]
+    good = motion.event == Event.REACHED
+    if good and motion.time == motion.t[0]:
+        return Group(facts(rows), Text(ended(motion, objective)))
+    mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
+    return Group(facts(rows), mark + Text(ended(motion, objective)))
+
+
+def _slack_words(run: Run, objective: Objective) -> str:
+    """Say the smallest slack of Lemma 3, and of how many decisions none is known."""
+    slack = run.lemma3_slack
+    known = slack[np.isfinite(slack)]
+    unknown = len(slack) - len(known)
+    without = (
+        f"; {unknown} of {len(slack)} decisions without a finite prediction" if unknown else ""
+    )
+    if not len(known):
+        return f"no slack is known{without}"
+    return f"smallest slack {known.min():.1e} {objective.unit} (≥ 0 wanted, to rounding){without}"
+
+
+def _evidence(run: Run) -> str:
+    """Count what is known of the plan in use at each decision."""
+    kinds = [None if v is None else v.details.get("evidence") for v in run.verdicts]
+    words = {
+        "region": "in a proved set",
+        "dual": "predicted into a proved set",
+        "sampled": "sampled nearby",
+        "local": "stable near the target",
+        None: "without accepted evidence",
+    }
+    counts = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kinds.count(kind)]
+    return ", ".join(counts)
+
+
+def _decision(update: Update) -> dict[str, object]:
+    admission, verdict = update.admission, update.admission.verdict
+    return {
+        "t": update.t,
+        "admitted": admission.accepted,
+        "reason": admission.reason,
+        "surface": update.surface.vector.tolist(),
+        "predicted_cost": finite(admission.cost),
+        "verdict": None
+        if verdict is None
+        else {
+            "kind": verdict.kind,
+            "evidence": verdict.details.get("evidence"),
+            "claim": verdict.claim,
+            "margin": finite(verdict.margin),
+            "unit": verdict.unit,
+            "method": verdict.method,
+        },
+    }
+
+
+def motion_files(
+    request: Mapping[str, object],
+    motion: Trajectory,
+    cost: float,
+    surfaces: Sequence[Surface],
+    run: Run | None = None,
+) -> dict[str, bytes]:
+    """Return a motion's files: ``motion.csv`` (SI units), ``motion.png``, ``manifest.json``.
+
+    Parameters
+    ----------
+    request
+        What was asked for, to be kept in the manifest.
+    motion
+        The motion.
+    cost
+        Its total.
+    surfaces
+        The surfaces in use, in order.
+    run
+        The cascade's record: every decision with its verdict goes into the manifest.
+    """
+    *names, _ = motion.columns
+    columns = (motion.t, *(values for values, _ in motion.columns.values()))
+    content = [[f"{value:.9g}" for value in row] for row in zip(*columns, strict=True)]
+    more: dict[str, object] = {
+        "ended": motion.event.name.lower(),
+        "time_s": motion.time,
+        "cost": cost,
+        "surfaces": [surface.vector.tolist() for surface in surfaces],
+    }
+    if run is not None:
+        more["decisions"] = [_decision(update) for update in run.updates]
+    return {
+        "motion.csv": to_csv(["t", *names, "margin_37"], content),
+        "motion.png": figure_bytes(motion_figure({"motion": motion})),
+        "manifest.json": manifest("undertow simulate", request, **more),
+    }
+
+
+def proposal_report(
+    mechanism: Mechanism, objective: Objective, start: FloatArray, proposal: Proposal
+) -> RenderableType:
+    """Return one optimisation's answer for the terminal, with its margins."""
+    assert proposal.surface is not None  # require() raises otherwise
+    rows = [
+        *_head(mechanism, objective, start),
+        ("surface", _surface_words(proposal.surface)),
+        ("predicted cost", f"{proposal.cost:.6g} {objective.unit}"),
+        ("status", proposal.status),
+        ("work", f"{proposal.evaluations} rollouts in {proposal.seconds:.2f} s"),
+    ]
+    bounds = objective.on(mechanism).constraints
+    units = {constraint.name: constraint.unit for constraint in bounds}
+    margins = []
+    for margin in proposal.margins:
+        unit = margin.unit or units.get(margin.name, "")
+        factor, shown = 1.0, unit
+        if unit in ("rad", "rad/s"):
+            factor, shown = display("rad", unit == "rad/s")
+        margins.append((margin.name, f"{factor * margin.value:.4g}", shown))
+    heads = ("margin (≥ 0 is satisfied)", "value", "")
+    return Group(facts(rows), "", table(heads, margins, left=("",)))
+
+
+def proposal_files(request: Mapping[str, object], proposal: Proposal) -> dict[str, bytes]:
+    """Return one optimisation's answer as ``proposal.json``."""
+    surface = proposal.surface
+    assert surface is not None  # require() raises otherwise
+    blocks = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
+    content = manifest(
+        "undertow optimise",
+        request,
+        surface={name: getattr(surface, name).tolist() for name in blocks},
+        cost=proposal.cost,
+        status=proposal.status,
+        margins=[
+            {"name": m.name, "value": finite(m.value), "unit": m.unit} for m in proposal.margins
+        ],
+        evaluations=proposal.evaluations,
+        seconds=round(proposal.seconds, 4),
+    )
+    return {"proposal.json": content}

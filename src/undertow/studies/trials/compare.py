@@ -1,0 +1,240 @@
+"""Controllers side by side: each on the same plants, from the same start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base import InvalidInputError, at_least, checked, positive, require_extra
+from undertow.cascade import Cascade
+from undertow.law import InnerLoop, Surface
+from undertow.models import Mechanism
+from undertow.objective import Objective
+from undertow.plants import Bench
+from undertow.plants.bench import bench_for
+from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, predictive, steady
+from undertow.studies.trials.trial import MakeController, Outcome, trial, undisturbed
+
+#: What :func:`compare` takes for a controller.
+Contender = Cascade | Surface | MakeController
+
+T = TypeVar("T")
+
+
+@checked
+def lqr(mechanism: Mechanism) -> MakeController:
+    """Return a linear-quadratic regulator at the target, its output clipped, to compare with.
+
+    Q is 1 on q_a, 10 on q_u and 0.1 on the velocities, R is 1/u_max²: what
+    :func:`undertow.first_surface` is designed by.
+    """
+    return clipped_regulator(mechanism)
+
+
+@checked
+def nmpc(mechanism: Mechanism, objective: Objective, **settings: Any) -> MakeController:
+    """Return nonlinear model-predictive control by multiple shooting at 10 Hz, to compare with.
+
+    ``settings`` are those of :class:`undertow.studies.trials.steering.NMPC`.
+
+    Raises
+    ------
+    MissingExtraError
+        Without CasADi.
+    """
+    return predictive(mechanism, objective.on(mechanism), **settings)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Outcomes by (controller, plant).
+
+    Attributes
+    ----------
+    outcomes
+        Names of controller and plant to the run.
+    cost_unit
+        Unit of the outcomes' cost.
+    """
+
+    outcomes: Mapping[tuple[str, str], Outcome]
+    cost_unit: str = ""
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A row for each run: names, whether it balanced, when it settled, what it cost."""
+        return [
+            {
+                "controller": controller,
+                "plant": plant,
+                "balanced": outcome.balanced,
+                "settled_s": outcome.settled,
+                "cost": outcome.cost,
+                "effort": outcome.effort,
+                "chatter": outcome.chatter,
+            }
+            for (controller, plant), outcome in self.outcomes.items()
+        ]
+
+    def to_pandas(self) -> Any:
+        """Return a ``pandas.DataFrame`` with a row for each run.
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas.
+        """
+        pandas = require_extra("pandas", "interop", "data frames need pandas")
+        return pandas.DataFrame(self.rows)
+
+    def _cells(self) -> list[list[str]]:
+        heads = ["controller", "plant", "balanced", "settled, s"]
+        heads.append(f"cost, {self.cost_unit}" if self.cost_unit else "cost")
+        lines = [
+            [
+                row["controller"],
+                row["plant"],
+                "yes" if row["balanced"] else "no",
+                f"{row['settled_s']:.3g}",
+                "—" if math.isnan(row["cost"]) else f"{row['cost']:.4g}",
+            ]
+            for row in self.rows
+        ]
+        return [heads, *lines]
+
+    def __str__(self) -> str:
+        """Return the table as text."""
+        cells = self._cells()
+        widths = [max(len(line[k]) for line in cells) for k in range(len(cells[0]))]
+        return "\n".join(
+            "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
+            for line in cells
+        )
+
+    def __repr__(self) -> str:
+        """Show how many balanced."""
+        good = sum(outcome.balanced for outcome in self.outcomes.values())
+        return f"Comparison({good} of {len(self.outcomes)} runs balanced)"
+
+    def _repr_html_(self) -> str:
+        """Show the table in a notebook."""
+        lines = [[escape(cell) for cell in line] for line in self._cells()]
+        body = "".join(f"<tr><td>{'</td><td>'.join(line)}</td></tr>" for line in lines[1:])
+        return f"<table><tr><th>{'</th><th>'.join(lines[0])}</th></tr>{body}</table>"
+
+
+@checked
+def compare(
+    mechanism: Mechanism,
+    controllers: Sequence[Contender] | Mapping[str, Contender],
+    *,
+    plants: Sequence[Bench | Mechanism] | Mapping[str, Bench | Mechanism] = (),
+    objective: Objective | None = None,
+    x0: ArrayLike | None = None,
+    seconds: float = 10.0,
+    seed: int = 0,
+    **state: float,
+) -> Comparison:
+    """Run each controller on each plant from the same start, in simulated time.
+
+    All have the same estimator, and what it knows of a disturbance at the inputs is taken off the
+    output of each.
+
+    Parameters
+    ----------
+    mechanism
+        What every controller believes.
+    controllers
+        Cascades, surfaces to be kept, :func:`lqr`, :func:`nmpc`, or whatever returns a function of
+        t and x that gives u, (m,), when it is called with the measured start; with names of your
+        own in a mapping.
+    plants
+        Benches, or mechanisms that move as they are; by default the mechanism itself and
+        a bench with friction, encoders and delay.
+    objective
+        What the cost is counted by; the first cascade's by default.
+    x0
+        Initial state, (2n,), or its non-zero entries by name (``phi=0.7``).  With neither, the
+        mechanism's usual ``start``.
+    seconds
+        Length of a run, s.
+    seed
+        Of the benches.
+
+    Raises
+    ------
+    InfeasibleError
+        When a cascade finds no admissible surface.
+    InvalidInputError
+        When there is nothing to compare.
+    """
+    if not controllers:
+        raise InvalidInputError("controllers to compare", value="none", limit="at least one")
+    positive("length of a trial, s", seconds)
+    at_least("seed", seed, 0)
+    start = mechanism.initial_state(x0, state)
+    named = controllers
+    if not isinstance(named, Mapping):
+        named = _numbered([(_name(item), item) for item in named])
+    meets: Mapping[str, Bench | Mechanism]
+    if isinstance(plants, Mapping):
+        meets = plants
+    elif plants:
+        named_plants = [(_plant_name(mechanism, plant), plant) for plant in plants]
+        meets = _numbered(named_plants)
+    else:
+        meets = {"as believed": mechanism, "realistic bench": bench_for(mechanism)}
+    if objective is None:
+        objective = next((c.objective for c in named.values() if isinstance(c, Cascade)), None)
+    outcomes = {}
+    for name, controller in named.items():
+        make = _maker(mechanism, controller, start)
+        for place, plant in meets.items():
+            bench = undisturbed(plant) if isinstance(plant, Mechanism) else plant
+            outcomes[name, place] = trial(
+                mechanism, bench, make, start, seconds, seed, objective=objective
+            )
+    return Comparison(outcomes, "" if objective is None else objective.unit)
+
+
+def _maker(
+    mechanism: Mechanism, controller: Contender, start: np.ndarray[Any, np.dtype[np.float64]]
+) -> MakeController:
+    """Return what makes the controller of one run."""
+    if isinstance(controller, Cascade):
+        first = controller.start(start)
+        return lambda _: CascadeSteering(controller, first)
+    if isinstance(controller, Surface):
+        return lambda _: steady(InnerLoop(mechanism, controller))
+    return controller
+
+
+def _name(controller: Contender) -> str:
+    if isinstance(controller, Cascade):
+        return f"cascade, {controller.objective.name}"
+    if isinstance(controller, Surface):
+        return "fixed surface"
+    return str(getattr(controller, "__name__", type(controller).__name__))
+
+
+def _plant_name(mechanism: Mechanism, plant: Bench | Mechanism) -> str:
+    if plant is mechanism:
+        return "as believed"
+    return plant.name if isinstance(plant, Mechanism) else f"bench of {plant.mechanism.name}"
+
+
+def _numbered(items: Sequence[tuple[str, T]]) -> dict[str, T]:
+    """Return items by names that are told apart: the second of one name is its name and 2."""
+    found: dict[str, T] = {}
+    for name, item in items:
+        unique, number = name, 2
+        while unique in found:
+            unique, number = f"{name} {number}", number + 1
+        found[unique] = item
+    return found

@@ -1,0 +1,87 @@
+"""Results as tables, text and files."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from rich.console import RenderableType
+from rich.text import Text
+
+from undertow.base import (
+    as_text,
+    facts,
+    finite,
+    manifest,
+    markdown_table,
+    number,
+    one_of,
+    table,
+    to_csv,
+    write_files,
+)
+from undertow.base.errors import InvalidInputError
+
+
+def shown(*parts: RenderableType) -> list[str]:
+    return [line.rstrip() for line in as_text(*parts).decode().splitlines()]
+
+
+def test_numbers_end_at_the_right_and_text_is_no_markup() -> None:
+    rows: list[tuple[RenderableType, ...]] = [
+        ("a [b]", "1.5", "[red]x"),
+        (Text("longer"), "-12.25", "y"),
+    ]
+    lines = shown(table(("name", "value", "word"), rows, left=("word",)))
+    assert lines == [
+        "name     value  word",
+        "a [b]      1.5  [red]x",
+        "longer  -12.25  y",
+    ]
+
+
+def test_a_ruled_table_has_its_title_above_and_its_note_below() -> None:
+    lines = shown(
+        table(("", "n"), [("a", "1")], title="Counts of all", note="n: how many", ruled=True)
+    )
+    words = [" ".join(line.split()) for line in lines if line.strip(" ─")]
+    assert words == ["Counts of all", "n", "a 1", "n: how many"]
+    assert any(set(line.strip()) == {"─"} for line in lines)
+
+
+def test_facts_are_two_columns() -> None:
+    assert shown(facts([("cost", "12 V² s"), ("t", "[3] s")])) == ["cost  12 V² s", "t     [3] s"]
+
+
+def test_what_is_not_finite_is_a_dash_for_people_and_an_empty_cell_in_files() -> None:
+    values = (1.25, math.inf, math.nan)
+    assert [number(v, ".1f") for v in values] == ["1.2", "—", "—"]
+    assert to_csv(("v",), [(finite(v),) for v in values]) == b'v\n1.25\n""\n""\n'
+
+
+def test_markdown_columns_of_numbers_end_at_the_right() -> None:
+    lines = markdown_table(("case", "x"), [(1, "2.5")], right=("x",))
+    assert lines == ["| case | x |", "| --- | ---: |", "| 1 | 2.5 |"]
+
+
+def test_a_manifest_says_what_was_run_with_which_versions() -> None:
+    content = json.loads(manifest("undertow x", {"out": Path("a"), "seed": 1}, gap=None))
+    assert content["what"] == "undertow x"
+    assert content["request"] == {"out": "a", "seed": 1}
+    assert content["gap"] is None
+    assert content["versions"]["numpy"]
+
+
+def test_files_of_an_earlier_run_are_moved_not_lost(tmp_path: Path) -> None:
+    assert write_files(tmp_path, {"a.txt": b"1"}) is None
+    assert write_files(tmp_path, {"a.txt": b"2", "b.txt": b"3"}) == tmp_path / "earlier-1"
+    assert (tmp_path / "earlier-1" / "a.txt").read_bytes() == b"1"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "b.txt", "earlier-1"]
+
+
+def test_an_unknown_name_is_refused_with_those_that_are_like_it() -> None:
+    one_of("colour", "red", ["red", "green"])
+    with pytest.raises(InvalidInputError, match=r"got 'gren', must be one of red, green. Did you"):
+        one_of("colour", "gren", ["red", "green"])

@@ -1,0 +1,123 @@
+"""What cannot be right is refused, or counted as broken, and never passes in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import undertow as ut
+from support import interpreted
+from undertow.base import InvalidInputError, UndertowError, UnstableSurfaceError
+from undertow.cascade import Update
+from undertow.models import TIME
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_constraint_that_is_not_a_number_is_broken(rig: ut.Mechanism, compiled: bool) -> None:
+    """w(x, u) = NaN, here 0 · ∞, stops the motion: NaN is no satisfied constraint."""
+    odd = ut.Constraint("odd", lambda v: v.theta * (v.phi + 1e200) ** 2)
+    loop = ut.ClosedLoop(rig, ut.MinimumTime(constraints=(odd,)))
+    if not compiled:
+        loop = interpreted(loop)
+    with np.errstate(over="ignore", invalid="ignore"):
+        run = loop.batch(rig.state(phi=0.2), [ut.first_surface(rig)], duration=0.02)
+    assert run.event[0] == ut.Event.CONSTRAINT
+    assert np.isnan(run.path[0, 0])
+
+
+def test_the_step_must_follow_the_gains_of_the_disturbance_bounds(rig: ut.Mechanism) -> None:
+    """k of (13), not η alone, sets the fastest rate k/ε; half the named step resolves it.
+
+    Inside the layer s then falls to nothing without a change of sign.
+    """
+    bounded = rig.with_disturbance_bounds(0.5, 0.2)
+    surface = ut.first_surface(bounded)
+    x0 = bounded.state(theta=0.08 / surface.lambda_a.item())
+    with pytest.raises(InvalidInputError, match=r"gains \(13\)") as refusal:
+        ut.ClosedLoop(bounded).simulate(x0, surface)
+    limit = float(str(refusal.value.limit).split("=")[1].split()[0])
+    assert limit < 2 * 0.1 / 20  # what η alone would ask for
+    loop = interpreted(ut.ClosedLoop(bounded, step=limit / 2))
+    s = loop.simulate(x0, surface, duration=10 * limit).s[:-1, 0]
+    assert s[0] == pytest.approx(0.08)
+    assert (np.diff(s) < 0).all()
+    assert 0 < s[-1] < 1e-3 * s[0]
+
+
+def test_a_coordinate_may_be_called_x() -> None:
+    """On a cart, v.x is the position of the cart and v.states is the whole state."""
+    cart = ut.mechanisms.cart_pendulum()
+    goal = ut.Objective(
+        "own", lambda v: (v.states.T * v.states)[0], constraints=ut.state_box(x=0.5)
+    )
+    assert goal.stage_cost(cart) == sum(symbol**2 for symbol in cart.x)
+    loop = interpreted(ut.ClosedLoop(cart, goal))
+    run = loop.simulate(cart.state(x=0.49, x_dot=1.0), ut.first_surface(cart), duration=0.1)
+    assert run.event == ut.Event.CONSTRAINT
+    assert run["x"][-2] <= 0.5 < run["x"][-1]
+
+
+@pytest.mark.parametrize("evaluations", [300, 6000])
+def test_a_budget_is_spent_and_not_exceeded(rig: ut.Mechanism, evaluations: int) -> None:
+    """A global search uses the evaluations that it is given, to within one generation."""
+    optimiser = ut.Optimiser(ut.ClosedLoop(rig, ut.MinimumTime()))
+    proposal = optimiser.propose(rig.state(phi=0.3), budget=ut.Budget(evaluations))
+    assert evaluations - optimiser.population < proposal.evaluations <= evaluations
+
+
+def test_descent_is_undefined_where_a_prediction_is() -> None:
+    """A plant that leaves what the belief can bring home gives NaN slack, no −∞."""
+    nothing: Any = None
+    updates = tuple(
+        Update(0.1 * k, nothing, nothing, nothing, nothing, predicted, 1.0)
+        for k, predicted in enumerate((9.0, 7.5, np.inf, np.inf, 5.0, 4.0))
+    )
+    slack = ut.Run(nothing, updates).lemma3_slack
+    np.testing.assert_array_equal(slack, [0.5, np.nan, np.nan, np.nan, 0.0])
+
+
+SURFACE = ut.Surface(-1, -1.49, 1.72, 11.9)
+REFUSED: dict[str, Callable[[ut.Mechanism], object]] = {
+    "time-dependent belief": lambda rig: ut.Cascade(rig.disturbed({"theta": sp.sin(TIME)})),
+    "time-dependent law": lambda rig: ut.SlidingModeLaw(
+        rig.disturbed({"theta": sp.sin(TIME)}), SURFACE
+    ),
+    "NaN surface": lambda rig: ut.ClosedLoop(rig).batch(rig.state(), [[-1, np.nan, 1.7, 12]]),
+    "negative gains": lambda rig: ut.ClosedLoop(rig).batch(
+        rig.state(), SURFACE.vector, reaching=np.array([-20.0, 0.1])
+    ),
+    "state and names": lambda rig: ut.Cascade(rig).simulate(rig.state(phi=0.1), theta=0.1),
+    "duration": lambda rig: ut.Cascade(rig).simulate(phi=0.1, duration=-1.0),
+    "many starts": lambda rig: ut.Cascade(rig).simulate(np.zeros((2, 4))),
+    "step": lambda rig: ut.Cascade(rig, step=0.0),
+    "seed": lambda rig: ut.Cascade(rig, seed=-1),
+    "budget": lambda rig: ut.Budget(10.5),  # type: ignore[arg-type]
+    "zoh_steps": lambda rig: ut.ClosedLoop(rig, zoh_steps=1.5),  # type: ignore[arg-type]
+    "horizon": lambda rig: ut.ClosedLoop(rig, ut.MinimumTime(horizon=1e12)).batch(
+        rig.state(phi=0.1), SURFACE
+    ),
+    "plan with times": lambda rig: ut.ClosedLoop(rig).simulate(
+        rig.state(phi=0.1), ut.Plan((SURFACE,)), switch_times=(0.0, 0.5)
+    ),
+    "unit": lambda rig: ut.Coordinate("a", unit="deg"),
+    "name": lambda rig: ut.Coordinate("a b"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_bad_input_is_refused(rig: ut.Mechanism, what: str) -> None:
+    """Each with a condition of ours that carries a value, a limit and a remedy."""
+    with pytest.raises(UndertowError) as refusal:
+        REFUSED[what](rig)
+    assert refusal.value.value is not None
+    assert refusal.value.limit is not None
+
+
+def test_an_unstable_first_surface_is_refused(rig: ut.Mechanism) -> None:
+    """(35) fails for λ_a > 0 at α_a = −1, and the message says so."""
+    with pytest.raises(UnstableSurfaceError, match=r"\(35\)"):
+        ut.Optimiser(ut.ClosedLoop(rig), first=ut.Surface(-1, 0.5, 5, 10))

@@ -1,0 +1,95 @@
+"""A cascade that learns its plant: plants that the exact model loses, and what stays as it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+import undertow as ut
+
+SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> ut.Mechanism:
+    """The rotary pendulum with the printed damping."""
+    return ut.mechanisms.rotary_pendulum()
+
+
+def learning(pendulum: ut.Mechanism, objective: ut.Objective) -> ut.Cascade:
+    """Return a cascade that looks at the plant every 20 ms."""
+    belief = ut.Belief.relative(pendulum, **SPREAD)
+    warm = ut.Budget(256)
+    return ut.Cascade(pendulum, objective, period=0.02, belief=belief, warm=warm)
+
+
+def changed(pendulum: ut.Mechanism, parts: Mapping[str, float]) -> ut.Mechanism:
+    """Return a plant whose parameters are larger by some parts."""
+    value = {p.name: p.value for p in pendulum.parameters}
+    return pendulum.with_parameters(**{k: value[k] * (1 + part) for k, part in parts.items()})
+
+
+def test_a_cascade_learns_the_plant(pendulum: ut.Mechanism) -> None:
+    """After 0.1 s law and predictions are those of a plant that is heavier, its motor weaker."""
+    plant = changed(pendulum, {"m": 0.15, "I_e": 0.15, "a_e": -0.08})
+    cascade = learning(pendulum, ut.MinimumTime(horizon=6.0))
+    x = pendulum.state(phi=0.5)
+    memory, _ = cascade.start(x)
+    assert memory.estimate is not None
+    loop = cascade.loop_at(memory)
+    assert loop is cascade.loop
+    truth = ut.ClosedLoop(pendulum, cascade.objective, plant=plant)
+    motion = truth.simulate(x, memory.plan, duration=0.1)
+    memory = cascade.learn(memory, motion.t, motion.x, motion.u)
+    believed = cascade.loop_at(memory).mechanism
+    rng = np.random.default_rng(0)
+    states, inputs = rng.uniform(-0.5, 0.5, (50, 4)), rng.uniform(-5, 5, (50, 1))
+    right = plant.accelerations(0.0, states, inputs)
+    before = np.abs(pendulum.accelerations(0.0, states, inputs) - right).mean()
+    after = np.abs(believed.accelerations(0.0, states, inputs) - right).mean()
+    assert after < 0.1 * before
+    control = cascade.control(memory, 0.1, motion.x[-1])
+    surface, law = memory.plan.at(0.1)
+    asked = ut.SlidingModeLaw(believed, surface, law or cascade.reaching)(0.1, motion.x[-1])
+    assert control.u == pytest.approx(asked.u)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [30.0, 37.0])
+def test_least_time_on_plants_that_are_not_the_model(
+    pendulum: ut.Mechanism, degrees: float
+) -> None:
+    """Eight drawn plants: all arrive, faster than on the first optimum kept; exact loses some."""
+    rng = np.random.default_rng(11)
+    plants = [
+        changed(pendulum, {k: rng.uniform(-part, part) for k, part in SPREAD.items()})
+        for _ in range(8)
+    ]
+    objective, start = ut.MinimumTime(horizon=6.0), pendulum.state(phi=math.radians(degrees))
+    learnt, exact = learning(pendulum, objective), ut.Cascade(pendulum, objective)
+    surface = exact.simulate(start).surfaces[0]
+    times, kept, lost = [], [], 0
+    for plant in plants:
+        run = learnt.simulate(start, plant=plant)
+        assert run.reached
+        assert run.trajectory.margin.min() > 0
+        times.append(run.time)
+        lost += not exact.simulate(start, plant=plant).reached
+        alone = ut.ClosedLoop(pendulum, objective, plant=plant)
+        fixed = alone.simulate(start, surface)
+        kept.append(fixed.time if fixed.event.name == "REACHED" else math.inf)
+    assert lost >= 3
+    assert np.median(times) < 0.85 * np.median(kept)
+
+
+def test_without_a_belief_nothing_is_learnt(pendulum: ut.Mechanism) -> None:
+    """The exact cascade's memory stays as it is."""
+    cascade = ut.Cascade(pendulum, ut.MinimumEnergy(horizon=10.0))
+    x = pendulum.state(phi=0.3)
+    memory, _ = cascade.start(x)
+    assert memory.estimate is None
+    assert cascade.loop_at(memory) is cascade.loop
+    assert cascade.learn(memory, np.arange(2.0), np.array([x, x]), np.zeros((2, 1))) is memory

@@ -1,0 +1,390 @@
+"""The command line: help with examples, refusals in one line, results where they are said."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+from typer.main import get_command
+
+import undertow as ut
+from runs import run
+from undertow.base import InvalidInputError
+from undertow.cli import app
+from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
+from undertow.studies.motion import ended
+
+RIG = "rotary_pendulum"
+
+
+# -- help ------------------------------------------------------------------------------------
+
+
+def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """All commands with their words, those of groups too."""
+    for name, child in getattr(command, "commands", {}).items():
+        yield from leaves(child, (*path, name))
+    if path and not hasattr(command, "commands"):
+        yield path, command
+
+
+COMMANDS = dict(leaves(get_command(app)))
+
+
+@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
+def test_help_ends_with_examples_that_parse_as_they_stand(path: tuple[str, ...]) -> None:
+    """Pasted into a shell, folded lines and all, each example is a call of this command."""
+    code, out, _ = run(*path, "--help")
+    assert code == 0
+    shown = out.split("Examples")[1].replace("\\\n", "").strip()
+    found = [shlex.split(line) for line in shown.splitlines() if line.strip()]
+    assert found
+    for words in found:
+        assert words[: len(path) + 1] == ["undertow", *path]
+        COMMANDS[path].make_context(path[-1], words[len(path) + 1 :])
+
+
+def test_long_examples_are_folded_for_a_terminal_of_80_columns() -> None:
+    """No line is longer."""
+    for command in COMMANDS.values():
+        for line in command.epilog.splitlines():
+            assert len(line) <= 78
+
+
+def test_flags_show_no_type() -> None:
+    """A flag takes no value, and its help does not look as if it did."""
+    _, out, _ = run("simulate", "--help")
+    assert "--hard-input" in out
+    assert "<bool>" not in out
+
+
+def test_version_and_bare_call() -> None:
+    """``--version`` names the version; no command at all shows the commands."""
+    code, out, _ = run("--version")
+    assert code == 0
+    assert out.startswith("undertow ")
+    _, out, _ = run()
+    assert all(command in out for command in ("reproduce", "simulate", "optimise"))
+
+
+# -- refusals: exit code, value, limit, remedy ---------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "value", "limit"),
+    [
+        (("simulate", "piano"), "'piano'", "rotary_pendulum"),
+        (("simulate", RIG, "--start", "phi=40"), "'40'", "deg or rad"),
+        (("simulate", RIG, "--start", "phi=40m"), "'40m'", "deg or rad"),
+        (("simulate", RIG, "--start", "phi_dot=4deg"), "'4deg'", "deg/s or rad/s"),
+        (("simulate", RIG, "--start", "psi=4deg"), "'psi'", "theta, phi"),
+        (("simulate", RIG, "--start", "phi=nandeg"), "'nandeg'", "a number with its unit"),
+        (("simulate", RIG, "--start", "phi"), "'phi'", "name=value"),
+        (("simulate", RIG, "--set", "m=-1"), "-1", "inside (0, inf) kg"),
+        (("simulate", RIG, "--set", "mass=1"), "'mass'", "d_e"),
+        (("simulate", RIG, "--set", "m=nan"), "'nan'", "finite"),
+        (("simulate", RIG, "--plant", "q=1"), "'q'", "one of"),
+        (("simulate", RIG, "--limit", "current=3"), "'current'", "one of voltage"),
+        (("optimise", RIG, "--limit", "voltage=-3"), "-3 V", "positive"),
+        (("optimise", RIG, "--limit", "voltage=nan"), "'nan'", "finite"),
+        (("optimise", RIG, "--box", "theta=60"), "'60'", "deg or rad"),
+        (("optimise", RIG, "--box", "theta=60m"), "'60m'", "deg or rad"),
+        (("optimise", RIG, "--box", "theta=-60deg"), "'-60deg'", "> 0"),
+        (("optimise", RIG, "--box", "theta=9deg:20deg"), "'9deg:20deg'", "LOW < 0 < HIGH"),
+        (("optimise", RIG, "--box", "theta=-1rad:0rad:1rad"), "'-1rad:0rad:1rad'", "LOW:HIGH"),
+        (("optimise", RIG, "--box", "psi=-1rad:1rad"), "'psi'", "theta, phi"),
+        (("optimise", RIG, "--box", "phi=1rad", "--box", "phi=2rad"), "'phi' twice", "once"),
+        (("optimise", RIG, "--set", "m=0.1", "--set", "m=0.2"), "'m' twice", "once"),
+        (("optimise", RIG, "--start", "phi=1deg", "--start", "phi=2deg"), "'phi' twice", "once"),
+        (("animate", RIG, "--start", "phi=20deg", "--box", "phi=10deg"), "-0.1745 rad", "≥ 0"),
+        (("simulate", RIG, "--horizon", "-1"), "-1", "finite and > 0"),
+        (("simulate", RIG, "--period", "0.0333"), "0.0333", "multiple"),
+        (("simulate", RIG, "--surface", "alpha_u=5"), "'alpha_u=5'", "missing"),
+        (("simulate", RIG, "--surface", "beta=5"), "'beta'", "one of"),
+        (("simulate", RIG, "--surface", "lambda_a=0.5 alpha_u=5 lambda_u=10"), "-0.5", "> 0"),
+        (("simulate", RIG, "--surface", "lambda_a=-5 alpha_u=5 lambda_u=10"), "-3", "> 0"),
+        (
+            ("simulate", RIG, "--start", "phi=60deg", "--control", "designed"),
+            "-0.2",
+            "> 0",
+        ),
+        (("optimise", RIG, "--evaluations", "0"), "0 evaluations", "at least 1"),
+    ],
+)
+def test_bad_input_is_refused_with_value_and_limit(
+    words: tuple[str, ...], value: str, limit: str
+) -> None:
+    """Exit code 2, one line on standard error, no traceback, the value and its limit."""
+    code, out, err = run(*words)
+    assert code == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert f"got {value}" in err or value in err
+    assert limit in err
+
+
+def test_start_without_unit_is_told_what_to_write() -> None:
+    """The remedy is a word that can be pasted."""
+    _, _, err = run("simulate", RIG, "--start", "phi=40")
+    assert "--start phi=10deg" in err
+
+
+def test_unknown_option_and_choice_exit_2() -> None:
+    """Typer's own refusals have the same exit code."""
+    assert run("simulate", RIG, "--objective", "joy")[0] == 2
+    assert run("simulate", RIG, "--nope")[0] == 2
+    assert run("simulate")[0] == 2
+
+
+def test_infeasible_task_exits_1_with_the_evidence() -> None:
+    """No admissible surface from 70°: says what the best candidate met, and what helps."""
+    code, _, err = run(
+        "optimise", RIG, "--start", "phi=70deg", "--objective", "time", "--evaluations", "300"
+    )
+    assert code == 1
+    assert "no admissible surface" in err
+    assert "the best candidate" in err
+
+
+def test_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    """A file in the way of the folder: exit 1, named, with the remedy."""
+    (tmp_path / "taken").write_text("here first")
+    code, _, err = run("simulate", RIG, "--out", str(tmp_path / "taken" / "deeper"))
+    assert code == 1
+    assert "taken" in err
+    assert "--out" in err
+    code, out, _ = run("reproduce", "--out", str(tmp_path / "taken"))
+    assert (code, out) == (1, "")
+
+
+# -- work --------------------------------------------------------------------------------------
+
+SURFACE = "lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1"
+
+
+def test_simulate_writes_the_motion_that_the_library_gives(tmp_path: Path) -> None:
+    """motion.csv holds the library's own trajectory; the manifest the request and versions."""
+    code, out, _ = run(
+        "simulate", RIG, "--start", "phi=20deg", "--objective", "time", "--set", "d_e=0.025",
+        "--surface", SURFACE, "--out", str(tmp_path),
+    )  # fmt: skip
+    assert code == 0
+    assert "reached the target" in out
+    assert f"{tmp_path}" in out.replace("\n", "")
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    expected = ut.ClosedLoop(rig, ut.MinimumTime()).simulate(
+        rig.state(phi=ut.deg(20)), parse_surface(rig, SURFACE)
+    )
+    with (tmp_path / "motion.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(expected.t)
+    found = [float(row["phi"]) for row in rows]
+    np.testing.assert_allclose(found, expected["phi"], rtol=1e-8, atol=1e-12)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert manifest["cost"] == pytest.approx(expected.cost)
+    assert manifest["request"]["setting"] == ["d_e=0.025"]
+    assert manifest["versions"]["numpy"]
+    assert (tmp_path / "motion.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_earlier_results_are_kept_and_said_where(tmp_path: Path) -> None:
+    """A second run into the same folder moves the first one's files aside."""
+    words = ("simulate", RIG, "--start", "phi=10deg", "--surface", SURFACE, "--out", str(tmp_path))
+    run(*words)
+    first = (tmp_path / "motion.csv").read_bytes()
+    (tmp_path / "notes.txt").write_text("mine")
+    _, out, _ = run(*words[:3], "phi=15deg", *words[4:])
+    assert "earlier-1" in out
+    assert (tmp_path / "earlier-1" / "motion.csv").read_bytes() == first
+    assert (tmp_path / "motion.csv").read_bytes() != first
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    run(*words)
+    assert (tmp_path / "earlier-2" / "motion.csv").exists()
+
+
+def test_simulate_with_no_further_choice_runs_the_cascade() -> None:
+    """A name and a start are enough: it designs, optimises and arrives."""
+    code, out, _ = run(
+        "simulate", RIG, "--start", "phi=20deg", "--objective", "time", "--set", "d_e=0.025"
+    )
+    assert code == 0
+    assert "reached the target" in out
+    assert "admitted" in out
+
+
+def test_simulate_on_a_plant_that_the_controller_does_not_know() -> None:
+    """``--plant`` changes the truth alone: another motion under the same surface."""
+    words = ("simulate", RIG, "--start", "phi=20deg", "--surface", SURFACE)
+    same, other = run(*words), run(*words, "--plant", "m=0.14")
+    assert same[0] == other[0] == 0
+    assert same[1] != other[1]
+
+
+def test_simulate_that_fails_says_so_and_exits_1() -> None:
+    """From beyond the catch limit: the ending in words, and a status for scripts."""
+    code, out, _ = run(
+        "simulate", RIG, "--start", "phi=39deg",
+        "--surface", "lambda_a=-0.5 alpha_u=5 lambda_u=10",
+    )  # fmt: skip
+    assert code == 1
+    assert "singularity (37)" in out
+
+
+@pytest.mark.slow  # kernels of its own
+def test_a_hard_limit_binds_the_law_before_it_is_clipped() -> None:
+    """With ``--hard-input`` the answer asks for less than ``--limit``; without, for more."""
+    words = (
+        "optimise", RIG, "--start", "phi=20deg", "--objective", "time", "--set", "d_e=0.025",
+        "--evaluations", "400", "--limit", "voltage=9",
+    )  # fmt: skip
+    code, out, _ = run(*words, "--hard-input")
+    assert code == 0
+    assert "|voltage| ≤ 9 V before clipping" in out
+    found = re.search(r"hard input limit.*?([-\d.]+) +V", out)
+    assert found is not None
+    assert float(found[1]) >= 0
+    code, free, _ = run(*words)
+    assert code == 0
+    assert "clipping" not in free
+    assert cost(free) < cost(out)
+
+
+def cost(out: str) -> float:
+    found = re.search(r"cost +([\d.]+)", out)
+    assert found is not None
+    return float(found[1])
+
+
+@pytest.mark.slow  # kernels of their own
+def test_a_box_binds_the_motion_and_one_that_breaks_is_named() -> None:
+    """The optimum of a box that binds costs more, and its margin is in degrees."""
+    words = ("--start", "phi=20deg", "--set", "d_e=0.025")
+    _, free, _ = run("optimise", RIG, *words)
+    code, out, _ = run("optimise", RIG, *words, "--box", "theta=60deg")
+    assert code == 0
+    found = re.search(r"\|theta\| ≤ 60° +([-\d.]+) +°", out)
+    assert found is not None
+    assert 0 <= float(found[1]) < 10
+    assert cost(out) > cost(free)
+    code, out, _ = run("simulate", RIG, *words, "--surface", SURFACE, "--box", "theta=5deg")
+    assert code == 1
+    assert "broke |theta| ≤ 5°, at" in out
+
+
+def test_the_end_of_a_motion_names_what_it_broke(rig: ut.Mechanism) -> None:
+    """The states outside their boxes, else the hard limit: for people."""
+    goal = objective_named("time", rig, 5.0, ["theta=5deg", "phi=-90deg:90deg"], hard_input=True)
+    row = np.zeros((1, 1))
+
+    def motion(**state: float) -> ut.Trajectory:
+        x = rig.state(**state)[None]
+        end = ut.Event.CONSTRAINT
+        return ut.Trajectory(rig, np.array([0.25]), x, row, row, row[0], row[0], end)
+
+    assert ended(motion(theta=0.1), goal) == "broke |theta| ≤ 5°, at 0.250 s"
+    both = ended(motion(theta=0.1, phi=-1.6), goal)
+    assert both == "broke |theta| ≤ 5° and -90° ≤ phi ≤ 90°, at 0.250 s"
+    assert ended(motion(theta=0.01), goal) == "broke the hard input limit, at 0.250 s"
+
+
+def test_optimise_prints_the_surface_with_its_margins(tmp_path: Path) -> None:
+    """The answer on the screen and in proposal.json is the optimiser's."""
+    code, out, _ = run(
+        "optimise", RIG, "--start", "phi=20deg", "--objective", "time", "--set", "d_e=0.025",
+        "--evaluations", "400", "--seed", "3", "--out", str(tmp_path),
+    )  # fmt: skip
+    assert code == 0
+    assert "(37)" in out
+    answer = json.loads((tmp_path / "proposal.json").read_text())
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    expected = ut.Optimiser(
+        ut.ClosedLoop(rig, ut.MinimumTime()), cold=ut.Budget(400), seed=3
+    ).require(rig.state(phi=ut.deg(20)))
+    assert expected.surface is not None
+    assert answer["surface"]["alpha_u"] == expected.surface.alpha_u.tolist()
+    assert answer["cost"] == expected.cost
+    assert answer["evaluations"] <= 400
+
+
+# -- words to values -----------------------------------------------------------------------------
+
+
+def test_start_words_become_si() -> None:
+    """Degrees and radians, angles and rates; what is not named is zero."""
+    rig = ut.mechanisms.rotary_pendulum()
+    x = parse_start(rig, ["phi=90deg", "theta=-0.5rad", "phi_dot=180deg/s", "theta_dot=1e-1rad/s"])
+    np.testing.assert_allclose(x, [-0.5, np.pi / 2, 0.1, np.pi])
+    np.testing.assert_array_equal(parse_start(rig, []), rig.state(**rig.start))
+
+
+def test_box_words_become_constraints_in_si() -> None:
+    """One bound is a modulus, two are an interval; the margin is in the unit that it names."""
+    rig = ut.mechanisms.rotary_pendulum()
+    words = ["theta=60deg", "phi_dot=-4rad/s:180deg/s", "phi=-0.5rad:90deg"]
+    objective = objective_named("time", rig, 5.0, words, hard_input=True)
+    assert objective.hard_input
+    assert [(c.name, c.unit) for c in objective.constraints] == [
+        ("|theta| ≤ 60°", "rad"),
+        ("-4 rad/s ≤ phi_dot ≤ 180°/s", "rad/s"),
+        ("-0.5 rad ≤ phi ≤ 90°", "rad"),
+    ]
+    at = dict(zip(rig.x, rig.state(theta=-1.0, phi=-0.4, phi_dot=3.0), strict=True))
+    margins = [float(margin.subs(at)) for margin in objective.path_margins(rig)]
+    np.testing.assert_allclose(margins, [np.pi / 3 - 1.0, np.pi - 3.0, 0.1])
+
+
+def test_a_mechanism_of_a_file_is_one_like_any_other(tmp_path: Path) -> None:
+    """``FILE.py:NAME`` serves where a name of the library does, with parameters and limits."""
+    file = tmp_path / "model.py"
+    file.write_text("import undertow as ut\nmine = ut.mechanisms.cart_pendulum()\n")
+    found = mechanism_named(f"{file}:mine", ["l=0.4"], ["force=7"])
+    assert found.substitution[sp.Symbol("l", real=True)] == 0.4
+    assert found.input_limits == [7.0]
+    code, out, _ = run("derive", f"{file}:mine")
+    assert code == 0
+    assert "M₁₂ = l m_p cos(φ)" in out
+    code, out, err = run("derive", f"{file}:yours")
+    assert (code, out) == (2, "")
+    assert "yours" in err
+    code, _, err = run("simulate", f"{tmp_path}/none.py:mine")
+    assert code == 1
+    assert "none.py" in err
+
+
+def test_limit_words_replace_the_named_inputs_alone() -> None:
+    """Of two motors the one that is named gets another limit."""
+    pair = mechanism_named("two_motor_three_link")
+    first, second = pair.inputs
+    changed = mechanism_named("two_motor_three_link", limits=[f"{second.name}=0.25"])
+    np.testing.assert_array_equal(changed.input_limits, [first.limit, 0.25])
+
+
+def test_surface_words_of_several_inputs() -> None:
+    """Commas join a row, semicolons rows; α_a is −I unless given."""
+    pair = ut.mechanisms.two_motor_three_link()
+    text = "lambda_a=-2,0.5;0,-3 alpha_u=1;2 lambda_u=4;5"
+    surface = parse_surface(pair, text)
+    np.testing.assert_array_equal(surface.lambda_a, [[-2, 0.5], [0, -3]])
+    np.testing.assert_array_equal(surface.alpha_a, -np.eye(2))
+    with pytest.raises(InvalidInputError, match="equal length"):
+        parse_surface(pair, "lambda_a=-2,0.5;0 alpha_u=1;2 lambda_u=4;5")
+
+
+@pytest.mark.slow
+def test_quick_reproduction_end_to_end(tmp_path: Path) -> None:
+    """``reproduce --quick`` prints both tables and writes tables, figures and manifest."""
+    code, out, _ = run("reproduce", "--quick", "--out", str(tmp_path))
+    assert code == 0
+    assert "Table 1" in out
+    assert "Table 2" in out
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"tables.csv", "manifest.json", "figure-3-repeats.png", "figure-5-phase.png"} <= names

@@ -1,0 +1,150 @@
+"""One result for each plan on an ensemble: what its members alone say, put together by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.base import InvalidInputError
+from undertow.closed_loop import INADMISSIBLE, Ensemble, Event
+from undertow.law import SlidingModeLaw
+from undertow.models import FloatArray
+
+HORIZON = 20.0
+
+
+@pytest.fixture(scope="module")
+def plants(rig: ut.Mechanism) -> list[ut.Mechanism]:
+    """The nominal plant and five that differ from it."""
+    rng, value = np.random.default_rng(7), {p.name: p.value for p in rig.parameters}
+    spread = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
+    drawn = [
+        {name: value[name] * (1 + rng.uniform(-part, part)) for name, part in spread.items()}
+        for _ in range(5)
+    ]
+    return [rig, *(rig.with_parameters(**values) for values in drawn)]
+
+
+@pytest.fixture(scope="module")
+def loop(rig: ut.Mechanism, plants: list[ut.Mechanism]) -> ut.ClosedLoop:
+    """The law of the nominal plant on all of them."""
+    values = np.array([plant.parameter_values for plant in plants])
+    return ut.ClosedLoop(rig, ut.MinimumEnergy(horizon=HORIZON), ensemble=Ensemble(rig, values))
+
+
+@pytest.fixture(scope="module")
+def surfaces(base: ut.Surface, quick: ut.Surface) -> list[ut.Surface]:
+    """One that all members survive, one that is slower, one that none survives."""
+    return [quick, ut.Surface(-1, -1.2, 1.8, 10.1), ut.Surface(-1, -0.5, 1.0, 0.5)]
+
+
+def test_each_member_is_the_plant_alone(
+    loop: ut.ClosedLoop, plants: list[ut.Mechanism], surfaces: list[ut.Surface]
+) -> None:
+    """Costs, events and margins come from single plants, to rounding."""
+    x = loop.mechanism.state(phi=0.4)
+    together = loop.batch(x, surfaces)
+    alone = [replace(loop, ensemble=None, plant=plant).batch(x, surfaces) for plant in plants]
+    for k in range(2):
+        assert all(one.event[k] == Event.REACHED for one in alone)
+        assert together.event[k] == Event.REACHED
+        costs = [float(one.cost[k]) for one in alone]
+        assert together.cost[k] == pytest.approx(math.fsum(costs) / len(costs), rel=1e-12)
+        assert together.time[k] == pytest.approx(max(one.time[k] for one in alone), rel=1e-12)
+        margins = [one.singular[k] for one in alone]
+        assert together.singular[k] == pytest.approx(min(margins), rel=1e-12)
+    assert together.event[2] not in (Event.REACHED, Event.HORIZON)
+    assert together.time[2] == pytest.approx(min(one.time[2] for one in alone), rel=1e-12)
+    assert together.score(HORIZON)[2] >= INADMISSIBLE
+
+
+def test_inadmissible_on_one_is_inadmissible(
+    loop: ut.ClosedLoop, plants: list[ut.Mechanism], quick: ut.Surface
+) -> None:
+    """From a start that some members survive and others do not, no plan is admissible."""
+    angles = np.radians(np.arange(30.0, 52.0, 1.0))
+    starts = np.array([loop.mechanism.state(phi=angle) for angle in angles])
+    alone = np.array(
+        [replace(loop, ensemble=None, plant=one).batch(starts, quick).reached for one in plants]
+    )
+    together = loop.batch(starts, quick).reached
+    assert (alone.any(axis=0) & ~alone.all(axis=0)).any()
+    assert (together == alone.all(axis=0)).all()
+
+
+def test_risk_measures_are_ordered(loop: ut.ClosedLoop, surfaces: list[ut.Surface]) -> None:
+    """Mean ≤ mean of the dearest third ≤ dearest, and the last two by hand."""
+    x, ensemble = loop.mechanism.state(phi=0.4), loop.ensemble
+    assert ensemble is not None
+    cost = {
+        risk: replace(loop, ensemble=replace(ensemble, risk=risk))
+        .batch(x, surfaces[:2])
+        .cost.copy()
+        for risk in ("mean", "cvar", "worst")
+    }
+    assert (cost["mean"] < cost["cvar"]).all()
+    assert (cost["cvar"] < cost["worst"]).all()
+    alone = np.sort(
+        [
+            replace(loop, ensemble=replace(ensemble, values=one[None])).batch(x, surfaces[:2]).cost
+            for one in ensemble.values
+        ],
+        axis=0,
+    )
+    assert cost["worst"] == pytest.approx(alone[-1], rel=1e-14)
+    assert cost["cvar"] == pytest.approx(alone[-2:].mean(axis=0), rel=1e-14)
+
+
+def test_large_steps_know_each_plant(loop: ut.ClosedLoop, surfaces: list[ut.Surface]) -> None:
+    """They agree with small steps to the end, and are far fewer."""
+    x = loop.mechanism.state(phi=0.4)
+    small = loop.batch(x, surfaces[:2])
+    cost, steps = small.cost.copy(), small.steps.copy()
+    large = replace(loop, tail_rtol=1e-3).batch(x, surfaces[:2])
+    assert large.cost == pytest.approx(cost, rel=1e-3)
+    assert (large.steps < 0.7 * steps).all()
+
+
+def test_linear_model_of_another_plant(
+    loop: ut.ClosedLoop, plants: list[ut.Mechanism], quick: ut.Surface
+) -> None:
+    """It is the Jacobian of plant and law, by central differences of both."""
+    end, rig = loop.linear_end, loop.mechanism
+    assert end is not None
+    buffers = loop.batch(rig.state(phi=0.1), quick)  # what a batch writes is not needed here
+    assert buffers.reached[0]
+    from undertow.closed_loop.buffers import RolloutBuffers
+
+    filled = RolloutBuffers(loop, 1, 1).fill(rig.state(phi=0.1), quick.vector).spread()
+    room = end.buffers(filled.padded)
+    end.prepare(filled.lanes, None, room, filled.member)
+    law = SlidingModeLaw(rig, quick, loop.reaching)
+
+    def rate(plant: ut.Mechanism, x: FloatArray) -> FloatArray:
+        return plant.accelerations(0.0, x, law(0.0, x).demand)
+
+    for k, plant in enumerate(plants):
+        step = 1e-6
+        columns = [(rate(plant, step * e) - rate(plant, -step * e)) / (2 * step) for e in np.eye(4)]
+        assert room.A[k] == pytest.approx(np.array(columns).T, rel=1e-6, abs=1e-5)
+
+
+def test_what_makes_no_ensemble(loop: ut.ClosedLoop, rig: ut.Mechanism) -> None:
+    """Wrong shapes, NaN and words; a plant beside it; a motion of it."""
+    good = rig.parameter_values
+    for values in (good, good[None, 1:], np.empty((0, len(good)))):
+        with pytest.raises(InvalidInputError, match="members of an ensemble"):
+            Ensemble(rig, values)
+    broken = np.where(np.array([p.name for p in rig.parameters]) == "m", np.nan, good)[None]
+    with pytest.raises(InvalidInputError, match="parameter 'm' of member 0"):
+        Ensemble(rig, broken)
+    with pytest.raises(InvalidInputError, match="risk"):
+        Ensemble(rig, good[None], "median")  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="beside an ensemble"):
+        replace(loop, plant=rig)
+    with pytest.raises(InvalidInputError, match="an ensemble of 6 plants"):
+        loop.simulate(rig.state(phi=0.1), ut.Surface(-1, -1.59, 1.96, 12.1))

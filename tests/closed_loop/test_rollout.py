@@ -1,0 +1,625 @@
+"""Rollouts: right numbers at the right order, batches, schedules, sampling, events and costs."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.integrate import simpson, solve_ivp
+
+import undertow as ut
+from support import (
+    derivative,
+    interpreted,
+    observed_order,
+    random_mechanism,
+    random_states,
+    random_surface,
+    runge_kutta,
+)
+from undertow.base import InvalidInputError
+from undertow.closed_loop.trajectory import Batch
+from undertow.models import TIME, FloatArray
+
+PUSH = ut.Parameter("push", 0.05, "N m", "size of the disturbance")
+
+
+@pytest.fixture(scope="module")
+def loop(rig: ut.Mechanism) -> ut.ClosedLoop:
+    return ut.ClosedLoop(rig)
+
+
+@pytest.fixture(scope="module")
+def starts(rig: ut.Mechanism) -> FloatArray:
+    x = random_states(rig, 37, position=0.9, speed=1.5)
+    x[:, 0] *= 0.1
+    return x
+
+
+@pytest.fixture(scope="module")
+def surfaces(quick: ut.Surface) -> list[ut.Surface]:
+    rng = np.random.default_rng(4)
+    scale = rng.uniform(0.8, 1.2, (37, 4))
+    return [ut.Surface.from_vector(quick.vector * row, 2, 1).normalised() for row in scale]
+
+
+def assert_same(one: Batch, two: Batch) -> None:
+    """Bit for bit the same results."""
+    for name in ("cost", "time", "event", "radius", "singular", "input", "path", "x"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
+
+
+# -- against other integrators ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phi", [0.25, 0.8])
+def test_kernel_agrees_with_scipy(rig: ut.Mechanism, quick: ut.Surface, phi: float) -> None:
+    """Saturation law, from 0.8 rad with the 15 V limit met: 1e-7 against DOP853 at 1e-11."""
+    loop = ut.ClosedLoop(rig, step=2e-5)
+    x0 = rig.state(phi=phi, theta_dot=-0.4)
+    run = loop.simulate(x0, quick, duration=1.0, terminal=0.0, every=2500)
+    assert (np.abs(run.u).max() == 15.0) == (phi == 0.8)
+    law = ut.SlidingModeLaw(rig, quick)
+    exact = solve_ivp(
+        lambda t, x: derivative(rig, t, x, law(t, x).u),
+        (0, 1.0),
+        x0,
+        method="DOP853",
+        rtol=1e-11,
+        atol=1e-12,
+        max_step=0.01,
+        t_eval=run.t,
+    )
+    np.testing.assert_allclose(run.x, exact.y.T, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow  # compiling it takes longer than all else in this file
+def test_kernel_with_four_coordinates_and_two_inputs_agrees_with_scipy() -> None:
+    mechanism, surface = random_mechanism(4, 2), random_surface(4, 2)
+    reaching = ut.ReachingLaw(eta=(6.0, 9.0), layer=(0.5, 0.8))
+    loop = ut.ClosedLoop(mechanism, reaching=reaching, step=1e-4)
+    x0 = random_states(mechanism, 1, position=0.3, speed=0.5)[0]
+    run = loop.simulate(x0, surface, duration=0.4, terminal=0.0, every=500)
+    law = ut.SlidingModeLaw(mechanism, surface, reaching)
+    exact = solve_ivp(
+        lambda t, x: derivative(mechanism, t, x, law(t, x).u),
+        (0, 0.4),
+        x0,
+        method="DOP853",
+        rtol=1e-9,
+        atol=1e-10,
+        t_eval=run.t,
+    )
+    np.testing.assert_allclose(run.x, exact.y.T, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(run.s[:-1], surface.s(run.x[:-1]), atol=1e-10)
+
+
+def test_runge_kutta_converges_with_order_four(rig: ut.Mechanism, quick: ut.Surface) -> None:
+    """On a smooth piece (tanh, wide layer, no limit met) the error falls as step⁴."""
+    free = rig.with_input_limit(1e6)
+    reaching = ut.ReachingLaw(layer=1.0, switching="tanh")
+
+    def end(step: float) -> FloatArray:
+        loop = ut.ClosedLoop(free, reaching=reaching, step=step)
+        x0 = free.state(phi=0.4, phi_dot=-0.5)
+        return np.asarray(loop.simulate(x0, quick, duration=0.512, terminal=0.0).x[-1])
+
+    exact = end(1.25e-4)
+    steps = np.array([0.008, 0.004, 0.002, 0.001])
+    errors = np.array([np.abs(end(h) - exact).max() for h in steps])
+    assert observed_order(steps, errors) == pytest.approx(4.0, abs=0.15)
+    assert errors[-1] < 1e-7
+
+
+def test_uncontrolled_rollouts_conserve_energy_to_order_four(rig: ut.Mechanism) -> None:
+    """No damping, an actuator without strength: |E − E(0)| falls as step⁴ or faster."""
+    free = rig.with_parameters(d_e=0.0).with_input_limit(1e-300)
+    alone = ut.Surface(-1, -1, 0, 1)  # α_u = 0: Γ = α_a, so the motion is never stopped
+    x0 = free.state(phi=0.6, theta_dot=2.0, phi_dot=1.0)
+    steps, drifts = np.array([0.008, 0.004, 0.002]), []
+    for h in steps:
+        run = ut.ClosedLoop(free, step=h).simulate(x0, alone, duration=2.0, terminal=0.0)
+        assert run.event == ut.Event.HORIZON
+        assert np.abs(run["phi"]).max() > 3.0  # it swings right through
+        energy = free.energy(run.x)
+        drifts.append(np.abs(energy - energy[0]).max())
+    assert observed_order(steps, np.array(drifts)) > 3.8
+    assert drifts[-1] < 1e-6 * np.abs(energy[0])
+
+
+# -- batches and schedules -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hold", [0, 4])
+def test_a_batch_equals_a_loop_bit_for_bit(
+    rig: ut.Mechanism, starts: FloatArray, surfaces: list[ut.Surface], hold: int
+) -> None:
+    """Neither the place in the batch nor its size matters: 37 lanes, reversed, alone."""
+    loop = ut.ClosedLoop(rig, zoh_steps=hold)
+    together = loop.batch(starts, surfaces, duration=3.0)
+    backwards = loop.batch(starts[::-1], surfaces[::-1], duration=3.0)
+    assert len(set(together.event.tolist())) >= 2  # lanes end differently, at different times
+    assert len(set(together.time.tolist())) > 10
+    for i in range(37):
+        alone = loop.batch(starts[i], [surfaces[i]], duration=3.0)
+        for name in ("cost", "time", "event", "radius", "singular", "input", "path", "x"):
+            value = getattr(together, name)[i]
+            np.testing.assert_array_equal(getattr(alone, name)[0], value, err_msg=name)
+            np.testing.assert_array_equal(getattr(backwards, name)[36 - i], value, err_msg=name)
+
+
+def test_a_batch_broadcasts_states_against_surfaces(
+    loop: ut.ClosedLoop, starts: FloatArray, surfaces: list[ut.Surface]
+) -> None:
+    one_state = loop.batch(starts[0], surfaces, duration=1.0)
+    assert_same(one_state, loop.batch(np.tile(starts[0], (37, 1)), surfaces, duration=1.0))
+    one_surface = loop.batch(starts, [surfaces[0]], duration=1.0)
+    assert_same(one_surface, loop.batch(starts, surfaces[0].vector, duration=1.0))
+    assert_same(one_surface, loop.batch(starts, [surfaces[0]] * 37, duration=1.0))
+
+
+def test_simulate_and_batch_are_one_rollout(
+    loop: ut.ClosedLoop, starts: FloatArray, surfaces: list[ut.Surface]
+) -> None:
+    for i in range(4):
+        run = loop.simulate(starts[i], surfaces[i], duration=6.0)
+        batch = loop.batch(starts[i], [surfaces[i]], duration=6.0)
+        assert run.cost == batch.cost[0]
+        assert run.time == batch.time[0]
+        assert run.event == batch.event[0]
+        np.testing.assert_array_equal(run.x[-1], batch.x[0])
+        np.testing.assert_array_equal(run.x[0], starts[i])
+        assert run.margin[:-1].min() == batch.singular[0]
+
+
+def test_each_rollout_may_have_its_own_reaching_law(
+    rig: ut.Mechanism, loop: ut.ClosedLoop, starts: FloatArray, quick: ut.Surface
+) -> None:
+    reaching = np.array([[[20.0, 0.1]], [[12.0, 0.4]], [[35.0, 0.2]]])
+    vectors = np.tile(quick.vector, (3, 1))
+    together = loop.batch(starts[:3], vectors, reaching=reaching, duration=3.0)
+    for i, (eta, layer) in enumerate(reaching[:, 0]):
+        own = ut.ClosedLoop(rig, reaching=ut.ReachingLaw(eta, layer))
+        alone = own.batch(starts[i], [quick], duration=3.0)
+        assert together.cost[i] == alone.cost[0]
+        np.testing.assert_array_equal(together.x[i], alone.x[0])
+
+
+def test_a_schedule_equals_its_pieces(
+    loop: ut.ClosedLoop, starts: FloatArray, surfaces: list[ut.Surface]
+) -> None:
+    """Switching inside one rollout and starting anew at each switch give the same bits of x."""
+    times = (0.0, 0.1, 0.25, 0.3)
+    whole = loop.simulate(starts[0], surfaces[:4], switch_times=times, duration=0.5, terminal=0.0)
+    x, pieces = starts[0], []
+    for surface, begin, end in zip(surfaces[:4], times, (*times[1:], 0.5), strict=True):
+        piece = loop.simulate(x, surface, duration=end - begin, start=begin, terminal=0.0)
+        x = piece.x[-1]
+        pieces.append(piece)
+    joined = ut.Trajectory.join(pieces)
+    np.testing.assert_array_equal(whole.x, joined.x)
+    np.testing.assert_array_equal(whole.s[:-1], joined.s[:-1])
+    np.testing.assert_allclose(whole.t, joined.t, atol=1e-12)
+    np.testing.assert_allclose(whole.cost, joined.cost, rtol=1e-12)
+    assert np.abs(np.diff(whole.s[:, 0])).max() > 0.05  # s jumps: a new reaching phase
+    batch = loop.batch(
+        starts[0],
+        np.stack([s.vector for s in surfaces[:4]])[None],
+        switch_times=times,
+        duration=0.5,
+    )
+    np.testing.assert_array_equal(batch.x[0], whole.x[-1])
+
+
+# -- belief and truth, sampling, noise, time -------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wrong_belief(rig: ut.Mechanism) -> ut.Mechanism:
+    """A plant that is heavier than believed and pushed about in time."""
+    return rig.with_parameters(m=0.15, d_e=0.04).disturbed(
+        {"theta": PUSH.symbol * sp.sin(9 * TIME), "phi": 0.1 * PUSH.symbol * sp.cos(5 * TIME)},
+        [PUSH],
+    )
+
+
+@pytest.mark.parametrize("truthful", [True, False])
+def test_sampled_loops_equal_a_plain_reference(
+    rig: ut.Mechanism, wrong_belief: ut.Mechanism, quick: ut.Surface, truthful: bool
+) -> None:
+    """Law on the believed model and the measured state, held; plant on its own equations."""
+    loop = ut.ClosedLoop(rig, plant=None if truthful else wrong_belief, zoh_steps=4)
+    loop = loop if truthful else interpreted(loop)
+    x0, samples = rig.state(phi=0.4, theta=0.1), 10
+    noise = np.random.default_rng(6).normal(0, 2e-3, (samples, 4))
+    run = loop.simulate(x0, quick, duration=0.08, terminal=0.0, noise=noise, start=0.7)
+    law = ut.SlidingModeLaw(rig, quick)
+
+    def sampled(t: float, x: FloatArray) -> FloatArray:
+        return law(t, x + noise[round((t - 0.7) / 0.008)]).u
+
+    expected = runge_kutta(loop.truth, sampled, x0, 0.002, 40, hold=4, start=0.7)
+    np.testing.assert_allclose(run.x, expected, rtol=1e-9, atol=1e-9)
+    held = run.u[:-1, 0].reshape(samples, 4)
+    np.testing.assert_array_equal(held, np.repeat(held[:, :1], 4, axis=1))
+    quiet, silent = (
+        loop.simulate(x0, quick, duration=0.08, terminal=0.0, start=0.7, noise=none)
+        for none in (None, np.zeros((samples, 4)))
+    )
+    np.testing.assert_array_equal(quiet.x, silent.x)
+    assert np.abs(quiet.x - run.x).max() > 1e-4
+
+
+def test_noise_that_runs_out_keeps_its_last_sample(rig: ut.Mechanism, quick: ut.Surface) -> None:
+    loop, x0 = ut.ClosedLoop(rig, zoh_steps=4), rig.state(phi=0.3)
+    short = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.01, 0.0, 0.1]])
+    long = np.vstack([short, np.tile(short[1], (8, 1))])
+    one, two = (
+        loop.simulate(x0, quick, duration=0.08, terminal=0.0, noise=noise)
+        for noise in (short, long)
+    )
+    np.testing.assert_array_equal(one.x, two.x)
+
+
+def test_sampled_batches_without_noise_read_none(rig: ut.Mechanism, quick: ut.Surface) -> None:
+    """A batch far larger than a block: every lane starts alike and so must end alike."""
+    loop = ut.ClosedLoop(rig, zoh_steps=4)
+    batch = loop.batch(np.tile(rig.state(phi=0.3), (20_000, 1)), [quick], duration=0.02)
+    np.testing.assert_array_equal(batch.x, np.broadcast_to(batch.x[0], batch.x.shape))
+    assert set(batch.event) == {ut.Event.HORIZON}
+
+
+def test_sampling_ever_faster_approaches_the_continuous_law(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """Zero-order hold errs in the first order of its period."""
+    x0 = rig.state(phi=0.2)
+
+    def end(step: float, hold: int) -> FloatArray:
+        loop = ut.ClosedLoop(rig, step=step, zoh_steps=hold)
+        return np.asarray(loop.simulate(x0, quick, duration=0.4, terminal=0.0).x[-1])
+
+    exact = end(2.5e-4, 0)
+    periods = np.array([0.004, 0.002, 0.001])
+    errors = np.array([np.abs(end(2.5e-4, round(p / 2.5e-4)) - exact).max() for p in periods])
+    assert observed_order(periods, errors) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_plant_like_the_belief_changes_nothing_but_rounding(
+    rig: ut.Mechanism, wrong_belief: ut.Mechanism, quick: ut.Surface
+) -> None:
+    right = wrong_belief.with_parameters(m=0.125, d_e=0.025, push=0.0)
+    x0 = rig.state(phi=0.4)
+    one = ut.ClosedLoop(rig, zoh_steps=4).simulate(x0, quick, duration=0.08)
+    twin = interpreted(ut.ClosedLoop(rig, plant=right, zoh_steps=4))
+    two = twin.simulate(x0, quick, duration=0.08)
+    np.testing.assert_allclose(one.x, two.x, atol=1e-12)
+
+
+# -- reaching and the boundary layer ---------------------------------------------------------
+
+
+@pytest.mark.slow  # a kernel of its own; in test_sliding.py NumPy proves the same for any n, m
+def test_sign_switching_reaches_the_surface_within_16_under_disturbance(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """‖s‖ falls to the chatter of the step by ‖s(0)‖₂ / min η, pushed by the declared bounds."""
+    believed = rig.with_disturbance_bounds(0.05, 0.005).with_input_limit(1e4)
+    plant = rig.with_input_limit(1e4).disturbed(
+        {"theta": PUSH.symbol * sp.sin(9 * TIME), "phi": 0.1 * PUSH.symbol * sp.cos(5 * TIME)},
+        [PUSH],
+    )
+    eta, step = 20.0, 5e-5
+    reaching = ut.ReachingLaw(eta=eta, switching="sign")
+    loop = ut.ClosedLoop(believed, reaching=reaching, plant=plant, step=step)
+    for x0 in (
+        rig.state(phi=0.3, phi_dot=1.0),
+        rig.state(phi=-0.2, theta_dot=3.0),
+        rig.state(theta=1.0, phi=0.1),
+    ):
+        bound = float(np.linalg.norm(quick.s(x0))) / eta
+        run = loop.simulate(x0, quick, duration=bound + 0.05, terminal=0.0)
+        assert np.abs(run.u).max() < 1e4
+        gains = ut.SlidingModeLaw(believed, quick, reaching)(0.0, run.x).gains
+        chatter = 2 * step * gains.max()
+        s = np.abs(run.s[:-1, 0])
+        assert s[0] > 50 * chatter
+        assert s[run.t[:-1] >= bound].max() <= chatter
+        # Before that it never falls more slowly than η, (16).
+        reached = int(np.argmax(s <= chatter))
+        assert (np.diff(s[:reached]) <= -eta * step * (1 - 1e-3)).all()
+
+
+def test_inside_the_layer_a_matched_disturbance_leaves_s_below_its_bound(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """|s| ≤ ε (K − η) / K: the layer's answer to the most that the gains are sized for."""
+    believed = rig.with_disturbance_bounds(PUSH.value, 0.0)
+    plant = rig.disturbed({"theta": PUSH.symbol}, [PUSH])
+    law = ut.SlidingModeLaw(believed, quick)
+    step, x0 = 1e-3, rig.state(phi=0.1)
+    x = runge_kutta(plant, lambda t, x: law(t, x).demand, x0, step, 600)
+    gains = law(0.0, x).gains[:, 0]
+    limit = 0.1 * ((gains - 20.0) / gains).max()
+    s = np.abs(quick.s(x)[:, 0])
+    inside = int(np.argmax(s < 0.1))
+    settled = s[inside + round(0.1 / step) :]
+    assert s[0] > 0.1
+    assert settled.max() <= limit
+    assert settled.max() > 0.2 * limit  # constant at its bound, it uses up a good part
+    assert limit < 0.1
+
+
+# -- events ----------------------------------------------------------------------------------
+
+
+def test_a_motion_ends_where_the_terminal_set_is_reached(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """(31): ‖x‖₂ ≤ ν for the first time."""
+    run = loop.simulate(rig.state(phi=0.5), quick)
+    radius = np.linalg.norm(run.x, axis=1)
+    assert run.event == ut.Event.REACHED
+    assert radius[-1] <= 0.01 < radius[:-1].min()
+    assert run.t[-2] < run.time <= run.t[-2] + loop.step
+
+
+def test_a_motion_that_starts_in_the_terminal_set_costs_nothing(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    run = loop.simulate(rig.state(phi=0.009), quick)
+    assert run.event == ut.Event.REACHED
+    assert run.time == 0.0
+    assert run.cost == 0.0
+    np.testing.assert_array_equal(run.x[-1], rig.state(phi=0.009))
+
+
+def test_a_motion_without_end_stops_at_the_horizon(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    run = loop.simulate(rig.state(phi=0.5), quick, duration=0.5)
+    assert run.event == ut.Event.HORIZON
+    assert run.time == pytest.approx(0.5, abs=1e-12)
+    assert len(run.t) == 251
+
+
+def test_crossing_the_singular_angle_is_an_event_and_never_a_nan(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, base: ut.Surface
+) -> None:
+    """(37): outward through 78° the law ceases to exist, and the rollout says so."""
+    run = loop.simulate(rig.state(phi=math.radians(70), phi_dot=6.0), base, duration=2.0)
+    assert run.event == ut.Event.SINGULAR
+    assert 0 < run.time < 0.5
+    assert np.isfinite(run.x).all()
+    assert (run.margin[:-1] > 0).all()
+    M = rig.M([0, 0])
+    edge = math.acos(-M[1, 1] / (M[0, 1] * 5.0))
+    assert run["phi"][-2] < edge <= run["phi"][-1] + 1e-12
+    beyond = loop.batch(rig.state(phi=math.radians(80)), [base])
+    assert beyond.event[0] == ut.Event.SINGULAR
+    assert beyond.time[0] == 0.0
+    assert beyond.singular[0] < 0
+
+
+def test_a_fall_is_an_event(rig: ut.Mechanism) -> None:
+    """Beyond the escape radius a motion counts as diverged."""
+    loop = ut.ClosedLoop(rig, escape=5.0)
+    run = loop.simulate(rig.state(phi=0.5), ut.Surface(-1, -1, 0, 1), duration=20.0)
+    radius = np.linalg.norm(run.x, axis=1)
+    assert run.event == ut.Event.DIVERGED
+    assert radius[:-1].max() < 5.0 <= radius[-1]
+
+
+def test_overflow_counts_as_diverged(rig: ut.Mechanism, quick: ut.Surface) -> None:
+    loop = ut.ClosedLoop(rig)
+    batch = loop.batch(rig.state(theta_dot=1e200, phi=0.1), [quick], duration=1.0)
+    assert batch.event[0] == ut.Event.DIVERGED
+    assert batch.time[0] <= loop.step * (1 + 1e-12)
+
+
+@pytest.fixture(scope="module")
+def watched(rig: ut.Mechanism) -> ut.Objective:
+    """Hard input limit, a state box, a mixed constraint, and a cost of several terms."""
+    return ut.Objective(
+        "watched",
+        lambda v: v.voltage**2 + 3 * sp.Abs(v.phi) + v.theta_dot**2 * v.d_e,
+        horizon=8.0,
+        constraints=(
+            *ut.state_box(theta=math.radians(60)),
+            ut.Constraint("power", lambda v: v.voltage * v.theta_dot - 40),
+        ),
+        hard_input=True,
+    )
+
+
+def test_a_motion_ends_with_what_the_law_does_there(rig: ut.Mechanism) -> None:
+    """The last row is of the last state: input, surface value and margin, also after a switch."""
+    first, second = ut.Surface(-1, -1.59, 1.96, 12.1), ut.Surface(-1, -0.7, 1.5, 9.0)
+    loop = ut.ClosedLoop(rig, ut.MinimumEnergy())
+    run = loop.simulate(
+        rig.state(phi=0.5), (first, second), switch_times=(0.0, 0.1), duration=0.1503
+    )
+    end = ut.SlidingModeLaw(rig, second, loop.reaching)(run.t[-1], run.x[-1])
+    assert run.t[-1] == pytest.approx(0.15, abs=2e-3)
+    np.testing.assert_allclose(run.u[-1], end.u, rtol=1e-9)
+    np.testing.assert_allclose(run.s[-1], end.s, rtol=1e-9, atol=1e-12)
+    assert run.margin[-1] == pytest.approx(float(end.margin), rel=1e-9)
+
+
+def test_constraints_end_a_motion_and_margins_are_the_smallest_met(
+    rig: ut.Mechanism, watched: ut.Objective, quick: ut.Surface
+) -> None:
+    """(25) and (38): signed margins along the way, and the first break ends the rollout."""
+    loop = ut.ClosedLoop(rig, watched)
+    law = ut.SlidingModeLaw(rig, quick)
+
+    def margins(run: ut.Trajectory) -> FloatArray:
+        x, u = run.x[:-1], run.u[:-1, 0]
+        return np.array(
+            [
+                (15.0 - np.abs(law(0.0, x).demand[:, 0])).min(),
+                (math.radians(60) - np.abs(x[:, 0])).min(),
+                (40 - u * x[:, 2]).min(),
+            ]
+        )
+
+    calm = rig.state(phi=0.15)
+    run, batch = loop.simulate(calm, quick), loop.batch(calm, [quick])
+    assert run.event == ut.Event.REACHED
+    found = np.array([batch.input[0], *batch.path[0]])
+    np.testing.assert_allclose(found, margins(run), rtol=1e-9)
+    assert (found > 0).all()
+
+    # Too far out, the law asks for more than 15 V; from an arm turned away, for too much arm.
+    for x0, which in ((rig.state(phi=0.8), 0), (rig.state(theta=1.0, theta_dot=2.0), 1)):
+        batch = loop.batch(x0, [quick])
+        assert batch.event[0] == ut.Event.CONSTRAINT
+        found = np.array([batch.input[0], *batch.path[0]])
+        assert found[which] < 0
+        assert batch.time[0] < 0.5
+    assert loop.simulate(rig.state(phi=0.8), quick).event == ut.Event.CONSTRAINT
+
+
+def test_a_hard_input_limit_is_tight(
+    rig: ut.Mechanism, watched: ut.Objective, quick: ut.Surface
+) -> None:
+    """Admissible with the limit just above the largest demand, not with it just below."""
+    x0 = rig.state(phi=0.15)
+    peak = 15.0 - float(ut.ClosedLoop(rig, watched).batch(x0, [quick]).input[0])
+    for limit, event in ((1.0001, ut.Event.REACHED), (0.9999, ut.Event.CONSTRAINT)):
+        loop = ut.ClosedLoop(rig.with_input_limit(limit * peak), watched)
+        assert loop.batch(x0, [quick]).event[0] == event
+
+
+# -- costs -----------------------------------------------------------------------------------
+
+
+def test_running_costs_are_quadratures_of_the_recorded_motion(
+    rig: ut.Mechanism, loop: ut.ClosedLoop, watched: ut.Objective, quick: ut.Surface
+) -> None:
+    """∫Φ dt by the kernel and by Simpson's rule on its record."""
+    x0 = rig.state(phi=0.15)
+    for objective in (loop.objective, watched):
+        run = ut.ClosedLoop(rig, objective, step=2e-4).simulate(x0, quick, duration=1.5)
+        stage = sp.lambdify(
+            [*rig.x, *rig.u], objective.stage_cost(rig).subs(rig.substitution), "numpy"
+        )
+        x, u = run.x[:-1], run.u[:-1]
+        expected = simpson(stage(*x.T, *u.T), x=run.t[:-1])
+        assert run.accumulated_cost[-2] == pytest.approx(expected, rel=1e-5)
+        assert (np.diff(run.accumulated_cost) >= 0).all()
+
+
+def test_time_and_cost_at_the_end_do_not_jump_with_the_step(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """The end is interpolated inside the last step: t_f errs as step², not as step."""
+
+    def end(step: float) -> tuple[float, float]:
+        batch = ut.ClosedLoop(rig, step=step).batch(rig.state(phi=0.3), [quick])
+        assert batch.event[0] == ut.Event.REACHED
+        return float(batch.time[0]), float(batch.cost[0])
+
+    time, cost = end(2e-5)
+    steps = np.array([0.004, 0.003, 0.002, 0.0015, 0.001, 0.0005])
+    ends = np.array([end(h) for h in steps])
+    late = np.abs(ends[:, 0] - time)
+    assert (late <= 0.01 * steps).all()
+    assert (late <= 3 * steps**2).all()
+    np.testing.assert_allclose(ends[:, 1], cost, rtol=2e-5)
+
+
+def test_scores_rank_admissible_then_slow_then_broken(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface, base: ut.Surface
+) -> None:
+    """Penalties fall with survival and with the final distance; any admissible cost is lower."""
+    x0 = np.array([rig.state(phi=0.3), rig.state(phi=1.2, phi_dot=1.0), rig.state(phi=1.36)])
+    x0 = np.vstack([x0, rig.state(phi=1.5)])
+    batch = loop.batch(x0, [quick, base, base, base], duration=10.0)
+    scores = batch.score(10.0)
+    assert batch.event.tolist()[:1] == [ut.Event.REACHED]
+    assert scores[0] == batch.cost[0] < 1e9
+    broken = batch.event == ut.Event.SINGULAR
+    assert broken.sum() >= 2
+    assert (scores[broken] > 2e9 - 1).all()
+    order = np.argsort(batch.time[broken])
+    assert (np.diff(scores[broken][order]) <= 0).all()
+    slow = loop.batch(np.array([rig.state(phi=0.1), rig.state(phi=0.6)]), [quick], duration=0.4)
+    assert slow.event.tolist() == [ut.Event.HORIZON] * 2
+    assert 1e9 < slow.score(0.4).min() < slow.score(0.4).max() <= 2e9
+    assert slow.score(0.4).argmax() == slow.radius.argmax()
+
+
+# -- trajectories and refusals ---------------------------------------------------------------
+
+
+def test_recording_less_often_keeps_the_ends(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    x0 = rig.state(phi=0.4)
+    fine, coarse = (loop.simulate(x0, quick, every=every) for every in (1, 7))
+    np.testing.assert_array_equal(coarse.x[:-1], fine.x[:-1][::7])
+    np.testing.assert_array_equal(coarse.t[:-1], fine.t[:-1][::7])
+    np.testing.assert_array_equal(coarse.x[-1], fine.x[-1])
+    assert (coarse.cost, coarse.time, coarse.event) == (fine.cost, fine.time, fine.event)
+    np.testing.assert_array_equal(fine["phi"], fine.x[:, 1])
+
+
+def refusals(rig: ut.Mechanism, s: ut.Surface) -> dict[str, tuple[Callable[[], object], str]]:
+    loop = ut.ClosedLoop(rig)
+    sampled = ut.ClosedLoop(rig, zoh_steps=4)
+    x0 = rig.state(phi=0.1)
+    return {
+        "step": (lambda: ut.ClosedLoop(rig, step=0.01), r"0\.01 s.*2 ε/η = 0\.01"),
+        "period": (lambda: ut.ClosedLoop(rig, step=0.002, zoh_steps=5), r"sample period.*0\.01 s"),
+        "NaN step": (lambda: ut.ClosedLoop(rig, step=math.nan), "nan.*finite"),
+        "negative hold": (lambda: ut.ClosedLoop(rig, zoh_steps=-1), "zoh_steps.*-1"),
+        "plant": (
+            lambda: ut.ClosedLoop(rig, plant=random_mechanism(3, 1)),
+            "n = 3, m = 1.*n = 2, m = 1",
+        ),
+        "NaN state": (lambda: loop.simulate([0.0, math.nan, 0.0, 0.0], s), "phi.*nan"),
+        "surface": (lambda: loop.simulate(x0, random_surface(3, 1)), "n = 3, m = 1"),
+        "vector": (lambda: loop.batch(x0, np.ones(5)), r"\(1, 1, 5\)"),
+        "no surface": (lambda: loop.batch(x0, np.ones((0, 4))), "at least one"),
+        "late start": (lambda: loop.simulate(x0, s, switch_times=(0.1,)), r"times.*\[0\.1\]"),
+        "falling times": (
+            lambda: loop.simulate(x0, [s, s, s], switch_times=(0.0, 0.2, 0.1)),
+            r"\[0\.0, 0\.2, 0\.1\]",
+        ),
+        "times in one step": (
+            lambda: loop.batch(x0, np.ones((1, 2, 4)), switch_times=(0.0, 0.0005)),
+            r"0\.0005.*0\.002",
+        ),
+        "too few surfaces": (
+            lambda: loop.simulate(x0, [s], switch_times=(0.0, 0.2)),
+            r"\[0\.0, 0\.2\]",
+        ),
+        "noise on a continuous loop": (
+            lambda: loop.simulate(x0, s, noise=np.zeros((3, 4))),
+            "continuous.*sampled",
+        ),
+        "noise of another width": (
+            lambda: sampled.simulate(x0, s, noise=np.zeros((3, 3))),
+            r"\(3, 3\).*\(samples, 4\)",
+        ),
+        "no noise at all": (lambda: sampled.simulate(x0, s, noise=np.zeros((0, 4))), r"\(0, 4\)"),
+        "NaN noise": (lambda: sampled.simulate(x0, s, noise=np.full((3, 4), math.nan)), "nan"),
+        "name of a series": (
+            lambda: interpreted(loop).simulate(x0, s, duration=0.004)["psi"],
+            "'psi'.*theta, phi",
+        ),
+    }
+
+
+def test_bad_input_is_refused_with_value_and_limit(rig: ut.Mechanism, quick: ut.Surface) -> None:
+    for what, (attempt, message) in refusals(rig, quick).items():
+        with pytest.raises(InvalidInputError) as caught:
+            attempt()
+        assert re.search(message, str(caught.value)), (what, str(caught.value))
+        assert caught.value.value is not None, what
+        assert caught.value.limit is not None, what

@@ -1,0 +1,172 @@
+"""Parameters learnt from motions that SciPy integrates, which knows nothing of the filter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import undertow as ut
+from undertow.base import InvalidInputError
+from undertow.estimators import Belief
+from undertow.models import FloatArray
+
+SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
+
+
+@pytest.fixture(scope="module")
+def belief() -> Belief:
+    """The rotary pendulum, five parameters uncertain."""
+    return Belief.relative(ut.mechanisms.rotary_pendulum(), **SPREAD)
+
+
+def drawn(belief: Belief, rng: np.random.Generator) -> ut.Mechanism:
+    """Return a plant from within the tolerances."""
+    value = {p.name: p.value for p in belief.mechanism.parameters}
+    changed = {k: value[k] + t * rng.uniform(-1, 1) for k, t in belief.tolerances.items()}
+    return belief.mechanism.with_parameters(**changed)
+
+
+def motion(
+    plant: ut.Mechanism, rng: np.random.Generator, seconds: float = 0.2, period: float = 0.002
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return t, x, u of a motion under an input that wanders, by SciPy's DOP853."""
+    size, shift = rng.uniform(1.0, 4.0, 3), rng.uniform(0.0, 6.0, 3)
+
+    def u(t: FloatArray) -> FloatArray:
+        waves = size * np.sin(np.multiply.outer(t, (9.0, 23.0, 51.0)) + shift)
+        return np.asarray(waves.sum(axis=-1))
+
+    def rate(t: float, x: FloatArray) -> FloatArray:
+        return np.concatenate([x[2:], plant.accelerations(t, x, [u(np.asarray(t))])])
+
+    t = np.arange(0.0, seconds + 1e-9, period)
+    x0 = [0.0, rng.uniform(-0.6, 0.6), rng.uniform(-2, 2), rng.uniform(-2, 2)]
+    run = solve_ivp(rate, (0, t[-1]), x0, "DOP853", t, rtol=1e-10, atol=1e-10)
+    return t, run.y.T, u(t)[:, None]
+
+
+def error(
+    belief: Belief, offset: FloatArray, plant: ut.Mechanism, x: FloatArray, u: FloatArray
+) -> float:
+    """Root mean square of the accelerations that a believed plant gets wrong, rad/s²."""
+    believed = belief.mechanism.with_values(belief.values(offset))
+    return float(np.std(believed.accelerations(0.0, x, u) - plant.accelerations(0.0, x, u)))
+
+
+def test_accelerations_are_learnt_within_a_fifth_of_a_second(belief: Belief) -> None:
+    """On motions that were not learnt from, a tenth of the error is left in the median."""
+    left = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        plant = drawn(belief, rng)
+        estimate = belief.learn(belief.prior, *motion(plant, rng))
+        _, x, u = motion(plant, rng)
+        before = error(belief, belief.prior.offset, plant, x, u)
+        left.append(error(belief, estimate.offset, plant, x, u) / before)
+    assert np.median(left) < 0.1
+    assert max(left) < 0.5
+
+
+def test_pieces_are_as_good_as_the_whole(belief: Belief) -> None:
+    """What ten pieces teach in turn is what the whole motion teaches."""
+    rng = np.random.default_rng(3)
+    plant = drawn(belief, rng)
+    t, x, u = motion(plant, rng)
+    whole = pieces = belief.prior
+    whole = belief.learn(whole, t, x, u)
+    for k in range(0, 100, 10):
+        part = slice(k, k + 11)
+        pieces = belief.learn(pieces, t[part], x[part], u[part])
+    assert pieces.samples == whole.samples == 100
+    assert np.abs(pieces.offset - whole.offset) == pytest.approx(0, abs=0.3)
+    assert pieces.deviation == pytest.approx(whole.deviation, rel=0.2)
+    _, y, v = motion(plant, rng)
+    assert (
+        error(belief, pieces.offset, plant, y, v)
+        < 2 * error(belief, whole.offset, plant, y, v) + 0.3
+    )
+
+
+@pytest.mark.slow
+def test_the_truth_is_as_far_off_as_the_deviations_say(belief: Belief) -> None:
+    """Noise of the stated size on each velocity: errors are no larger than the deviations say."""
+    ratios = []
+    for seed in range(200):
+        rng = np.random.default_rng(1000 + seed)
+        plant = drawn(belief, rng)
+        t, x, u = motion(plant, rng)
+        noisy = x.copy()
+        noisy[:, 2:] += rng.normal(0.0, 0.004 / np.sqrt(2), noisy[:, 2:].shape)
+        estimate = belief.learn(belief.prior, t, noisy, u)
+        truth = (plant.parameter_values - belief.mechanism.parameter_values)[belief._places]
+        off = truth / belief._scale - estimate.offset
+        ratios.append(off @ estimate.information @ off / len(off))
+    assert 0.1 < np.mean(ratios) < 1.3
+    assert np.mean(np.array(ratios) < 4.0) > 0.99
+
+
+def test_a_plant_that_changes_is_followed(belief: Belief) -> None:
+    """A pendulum that becomes a fifth heavier after half a second is believed to be so."""
+    rng = np.random.default_rng(5)
+    value = {p.name: p.value for p in belief.mechanism.parameters}
+    light = belief.mechanism.with_parameters(m=0.85 * value["m"], I_e=0.85 * value["I_e"])
+    heavy = belief.mechanism.with_parameters(m=1.15 * value["m"], I_e=1.15 * value["I_e"])
+    estimate = belief.prior
+    for plant in (light, light, light, heavy, heavy):
+        estimate = belief.learn(estimate, *motion(plant, rng))
+    _, x, u = motion(heavy, rng)
+    assert error(belief, estimate.offset, heavy, x, u) < 0.3 * error(
+        belief, belief.prior.offset, heavy, x, u
+    )
+
+
+def test_nothing_leaves_the_tolerances(belief: Belief) -> None:
+    """Estimate and members stay within them, however far the plant is outside."""
+    rng = np.random.default_rng(6)
+    value = {p.name: p.value for p in belief.mechanism.parameters}
+    plant = belief.mechanism.with_parameters(m=1.6 * value["m"], d_e=3 * value["d_e"])
+    estimate = belief.learn(belief.prior, *motion(plant, rng))
+    assert np.abs(estimate.offset).max() <= 1.0
+    members = belief.ensemble(estimate)
+    low, high = belief.values(-np.ones(5)), belief.values(np.ones(5))
+    assert (members.values >= low - 1e-12).all()
+    assert (members.values <= high + 1e-12).all()
+
+
+def test_the_design_of_the_ensemble(belief: Belief) -> None:
+    """The estimate first; at the prior each parameter, and each pair, is as often high as low."""
+    members = belief.ensemble(belief.prior).values
+    nominal = belief.mechanism.parameter_values
+    assert (members[0] == nominal).all()
+    off = (members[1:] - nominal)[:, belief._places] / belief._scale
+    assert np.abs(off) == pytest.approx(np.sqrt(1 / 3 + 0.2**2))
+    assert off.T @ off == pytest.approx(len(off) * np.eye(5) * (1 / 3 + 0.2**2), abs=1e-12)
+
+
+def test_broken_samples_teach_nothing(belief: Belief) -> None:
+    """NaN, or a single row: the estimate stays."""
+    t, x, u = motion(belief.mechanism, np.random.default_rng(0))
+    assert belief.learn(belief.prior, t[:1], x[:1], u[:1]) is belief.prior
+    x[3, 2] = np.nan
+    assert belief.learn(belief.prior, t, x, u) is belief.prior
+
+
+def test_what_makes_no_belief() -> None:
+    """Unknown names; tolerances that are not positive or leave what makes sense; noise; words."""
+    rig = ut.mechanisms.rotary_pendulum()
+    with pytest.raises(InvalidInputError, match="uncertain parameter"):
+        Belief(rig, {"mass": 0.1})
+    with pytest.raises(InvalidInputError, match="uncertain parameter"):
+        Belief.relative(rig, mass=0.1)
+    for tolerance in (0.0, -0.1, np.nan, 10.0):
+        with pytest.raises(InvalidInputError, match="tolerance of"):
+            Belief(rig, {"m": tolerance})
+    with pytest.raises(InvalidInputError, match="noise"):
+        Belief(rig, {"m": 0.01}, noise=0.0)
+    with pytest.raises(InvalidInputError, match="confidence"):
+        Belief(rig, {"m": 0.01}, confidence=-1.0)
+    with pytest.raises(InvalidInputError, match="risk"):
+        Belief(rig, {"m": 0.01}, risk="median")  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="another object"):
+        ut.Cascade(rig, belief=Belief(ut.mechanisms.rotary_pendulum(), {"m": 0.01}))

@@ -1,0 +1,309 @@
+"""Stability on the surface: the exact condition, (35)-(37), first surfaces, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg
+import sympy as sp
+from numpy.typing import NDArray
+
+import undertow as ut
+from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
+from undertow.law import sliding_matrix, stability_margin
+from undertow.models import Linearisation, controllability, linearise
+from undertow.studies.paper import CASES
+
+Spectrum = NDArray[Any]
+SHAPES = [(2, 1), (3, 1), (3, 2), (4, 2), (5, 2), (5, 3)]
+
+
+def constants(rig: ut.Mechanism) -> tuple[float, float, float]:
+    """The paper's b, c and d from the mechanism's own numbers."""
+    value = {p.name: p.value for p in rig.parameters}
+    b = value["m"] * value["l"] * value["r_o"]
+    return b, 4 / 3 * value["m"] * value["l"] ** 2, value["m"] * value["g"] * value["l"]
+
+
+def random_mechanism(n: int, m: int, rng: np.random.Generator) -> ut.Mechanism:
+    """A linear mechanism with random M > 0, stiffness, damping and input matrix."""
+    root = rng.standard_normal((n, n))
+    M = root @ root.T + n * np.eye(n)
+    F, D = rng.standard_normal((n, n)), 0.3 * rng.standard_normal((n, n))
+    coordinates = [ut.Coordinate(f"q{i}") for i in range(n)]
+    q = sp.Matrix([c.symbol for c in coordinates])
+    v = sp.Matrix([c.velocity for c in coordinates])
+    B = rng.standard_normal((m, m)) + 2 * np.eye(m)
+    return ut.Mechanism(
+        f"linear_{n}_{m}",
+        tuple(coordinates),
+        tuple(ut.Input(f"u{i}", "N m") for i in range(m)),
+        sp.ImmutableDenseMatrix((M + M.T) / 2),
+        sp.ImmutableDenseMatrix(sp.Matrix(F) * q + sp.Matrix(D) * v),
+        sp.ImmutableDenseMatrix(B),
+    )
+
+
+def random_surface(n: int, m: int, rng: np.random.Generator) -> ut.Surface:
+    shapes = [(m, m), (m, m), (m, n - m), (m, n - m)]
+    alpha_a, lambda_a, alpha_u, lambda_u = (rng.standard_normal(shape) for shape in shapes)
+    return ut.Surface(alpha_a - 2 * np.eye(m), lambda_a, alpha_u, lambda_u)
+
+
+def match_spectra(left: Spectrum, right: Spectrum, tolerance: float) -> None:
+    """Assert that two spectra agree, whatever their order."""
+    assert left.shape == right.shape
+    scale = 1 + np.abs(left).max()
+    rest = list(right)
+    for value in left:
+        nearest = int(np.argmin([abs(value - other) for other in rest]))
+        assert abs(value - rest.pop(nearest)) < tolerance * scale
+
+
+# -- the exact condition -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ("1 base case", [-0.92 + 3.11j, -0.92 - 3.11j, -0.548]),
+        ("2 one-time, energy", [-5.91 + 3.55j, -5.91 - 3.55j, -0.264]),
+        ("3 last of cascade, energy", [-5.28 + 1.78j, -5.28 - 1.78j, -0.104]),
+        ("4 one-time, time", [-3.81 + 2.58j, -3.81 - 2.58j, -3.72]),
+        ("5 last of cascade, time", [-5.17 + 4.13j, -5.17 - 4.13j, -5.54]),
+    ],
+)
+def test_eigenvalues_of_the_five_cases(
+    rig: ut.Mechanism, case: str, expected: list[complex]
+) -> None:
+    """The paper's surfaces slide with the eigenvalues derived by hand for b = 0.0045."""
+    found = np.linalg.eigvals(sliding_matrix(rig, CASES[case]))
+    match_spectra(found, np.array(expected), 0.002)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_characteristic_polynomial_of_the_rotary_pendulum(rig: ut.Mechanism, case: str) -> None:
+    """(α_u b + α_a c)s³ + (bλ_u + cλ_a)s² − α_a d s − λ_a d has the same roots."""
+    b, c, d = constants(rig)
+    alpha_a, lambda_a, alpha_u, lambda_u = CASES[case].vector
+    roots = np.roots(
+        [alpha_u * b + alpha_a * c, b * lambda_u + c * lambda_a, -alpha_a * d, -lambda_a * d]
+    )
+    found = np.linalg.eigvals(sliding_matrix(rig, CASES[case]))
+    match_spectra(found, roots, 1e-9)
+
+
+def test_conditions_35_to_37_at_zero_hold_if_and_only_if_hurwitz(rig: ut.Mechanism) -> None:
+    """20,000 random surfaces with α_a = −1: (35)-(37) at φ = 0 ⇔ exponentially stable."""
+    b, c, _ = constants(rig)
+    rng = np.random.default_rng(35)
+    free = rng.standard_normal((20_000, 3)) * [2, 4, 12]
+    free[::2] = np.abs(free[::2]) * [-1, 1, 1]  # half of them with the signs of (35)
+    lambda_a, alpha_u, lambda_u = free.T
+    condition = (
+        (lambda_a < 0)
+        & (alpha_u > 0)
+        & (lambda_u > 0)  # (35)
+        & (-lambda_a < lambda_u / alpha_u)  # (36)
+        & (-c + b * alpha_u > 0)  # (37) at φ = 0
+    )
+    vectors = np.column_stack([-np.ones(len(free)), free])
+    hurwitz = stability_margin(rig, vectors) > 0
+    assert 0.1 < hurwitz.mean() < 0.9
+    np.testing.assert_array_equal(condition, hurwitz)
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_equals_finite_eigenvalues_of_the_pencil(n: int, m: int) -> None:
+    """The sliding eigenvalues are the finite ones of [[A − sI, B], [C, 0]], any n and m."""
+    rng = np.random.default_rng([n, m])
+    mechanism = random_mechanism(n, m, rng)
+    lin = linearise(mechanism)
+    for _ in range(5):
+        surface = random_surface(n, m, rng)
+        ours = np.linalg.eigvals(sliding_matrix(mechanism, surface))
+        left = np.block([[lin.A, lin.input], [surface.matrix, np.zeros((m, m))]])
+        right = scipy.linalg.block_diag(np.eye(2 * n), np.zeros((m, m)))
+        pencil = scipy.linalg.eigvals(left, right)
+        finite = pencil[np.argsort(np.abs(pencil))[: 2 * n - m]]
+        match_spectra(ours, finite, 1e-6)
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_equals_projected_state_matrix(n: int, m: int) -> None:
+    """They are also those of (I − B(CB)⁻¹C)A on ker C, equivalent control, any n and m."""
+    rng = np.random.default_rng([m, n])
+    mechanism = random_mechanism(n, m, rng)
+    lin = linearise(mechanism)
+    for _ in range(5):
+        surface = random_surface(n, m, rng)
+        C = surface.matrix
+        projected = lin.A - lin.input @ np.linalg.solve(C @ lin.input, C @ lin.A)
+        kernel = scipy.linalg.null_space(C)
+        on_kernel = np.linalg.eigvals(kernel.T @ projected @ kernel)
+        match_spectra(np.linalg.eigvals(sliding_matrix(mechanism, surface)), on_kernel, 1e-7)
+
+
+def test_motor_does_not_enter_the_sliding_dynamics() -> None:
+    """Damping and gain of the motor and the arm's inertia are matched: they cancel."""
+    surface = CASES["4 one-time, time"]
+    plain = sliding_matrix(ut.mechanisms.rotary_pendulum(), surface)
+    other = ut.mechanisms.rotary_pendulum(d_e=0.5, a_e=1.0, I_e=0.02)
+    np.testing.assert_allclose(sliding_matrix(other, surface), plain, rtol=1e-12)
+
+
+def test_batch_of_surfaces_equals_loop(rig: ut.Mechanism) -> None:
+    """One call for many surfaces gives what many calls give; a singular one gives −∞."""
+    b, c, _ = constants(rig)
+    singular = ut.Surface(-1, -0.5, c / b, 10)
+    surfaces = [*CASES.values(), singular]
+    together = stability_margin(rig, np.stack([s.vector for s in surfaces]))
+    alone = [float(stability_margin(rig, s)) for s in surfaces]
+    np.testing.assert_array_equal(together, alone)
+    assert together[-1] == -np.inf
+
+
+def test_linearisation_equals_finite_differences(rig: ut.Mechanism) -> None:
+    """A and B at the target equal central differences of the accelerations."""
+    lin: Linearisation = linearise(rig)
+    h = 1e-6
+    steps = np.vstack([np.eye(4), -np.eye(4)]) * h
+    rates = rig.accelerations(0.0, steps, np.zeros((8, 1)))
+    np.testing.assert_allclose(lin.A[2:], ((rates[:4] - rates[4:]) / (2 * h)).T, atol=1e-5)
+    push = rig.accelerations(0.0, np.zeros((2, 4)), np.array([[h], [-h]]))
+    np.testing.assert_allclose(lin.input[2:, 0], (push[0] - push[1]) / (2 * h), rtol=1e-8)
+
+
+# -- first surfaces ------------------------------------------------------------------------
+
+
+def test_quadratic_design_of_utkin_and_young(rig: ut.Mechanism) -> None:
+    """Q = diag(1, 10, 0.1, 0.1) gives λ_a −1.49, α_u 1.72, λ_u 11.9."""
+    surface = ut.first_surface(rig, [1, 10, 0.1, 0.1])
+    np.testing.assert_allclose(surface.vector, [-1, -1.49, 1.72, 11.9], rtol=5e-3)
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0, 5.0])
+def test_quadratic_design_keeps_the_rate_asked_for(rig: ut.Mechanism, rate: float) -> None:
+    """All eigenvalues lie left of −rate."""
+    assert float(stability_margin(rig, ut.first_surface(rig, rate=rate))) >= rate - 1e-9
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_quadratic_design_stabilises_any_controllable_mechanism(n: int, m: int) -> None:
+    """Random (n, m): the designed surface passes the exact condition."""
+    mechanism = random_mechanism(n, m, np.random.default_rng([n, m, 1]))
+    assert controllability(mechanism) > 1e-6
+    assert float(stability_margin(mechanism, ut.first_surface(mechanism))) > 0
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_pole_placement_places_all_poles(n: int, m: int) -> None:
+    """All 2n − m eigenvalues are where they were asked for."""
+    mechanism = random_mechanism(n, m, np.random.default_rng([n, m, 2]))
+    poles = [-1.0 - 0.7 * k for k in range(2 * n - m)]
+    surface = ut.placed_surface(mechanism, poles)
+    found = np.sort(np.linalg.eigvals(sliding_matrix(mechanism, surface)).real)
+    np.testing.assert_allclose(found, np.sort(poles), rtol=1e-5)
+
+
+def test_complex_poles_can_be_placed(rig: ut.Mechanism) -> None:
+    """Conjugate pairs too."""
+    poles = [-4 + 3j, -4 - 3j, -2]
+    found = np.linalg.eigvals(sliding_matrix(rig, ut.placed_surface(rig, poles)))
+    match_spectra(found, np.array(poles), 1e-9)
+
+
+# -- refusals -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("surface", "what"),
+    [
+        (ut.Surface(-1, 0.5, 5, 10), r"\(35\) λ_a < 0"),
+        (ut.Surface(-1, -0.5, -5, 10), r"\(35\) α_u > 0"),
+        (ut.Surface(-1, -0.5, 5, -10), r"\(35\) λ_u > 0"),
+        (ut.Surface(-1, -5, 5, 10), r"\(36\)"),
+    ],
+)
+def test_surface_that_violates_35_or_36_is_refused(
+    rig: ut.Mechanism, surface: ut.Surface, what: str
+) -> None:
+    """The message names the condition, the margin and the remedy."""
+    with pytest.raises(UnstableSurfaceError, match=what) as caught:
+        ut.check_surface(rig, surface)
+    assert float(str(caught.value.value).split()[0]) < 0
+    assert caught.value.limit == "> 0"
+    assert caught.value.remedy
+
+
+def test_surface_singular_at_the_target_is_refused(rig: ut.Mechanism) -> None:
+    """α_u b = c makes α_a − α_u M_uu⁻¹ M_auᵀ vanish."""
+    b, c, _ = constants(rig)
+    with pytest.raises(SingularSurfaceError, match="at the target"):
+        ut.check_surface(rig, ut.Surface(-1, -0.5, c / b, 10))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_condition_37_at_the_initial_state_is_tight(rig: ut.Mechanism, case: str) -> None:
+    """Just inside arccos ε a surface passes, just outside it is refused."""
+    b, c, _ = constants(rig)
+    surface = CASES[case]
+    edge = float(np.arccos(-surface.alpha_a[0, 0] * c / (surface.alpha_u[0, 0] * b)))
+    ut.check_surface(rig, surface, rig.state(phi=edge - 1e-6))
+    with pytest.raises(SingularSurfaceError, match="initial state") as caught:
+        ut.check_surface(rig, surface, rig.state(phi=edge + 1e-6))
+    assert "Start closer" in caught.value.remedy
+
+
+def test_uncontrollable_linearisation_is_refused() -> None:
+    """A free coordinate that no input reaches: the Hautus distance is zero, and said so."""
+    a, b = ut.Coordinate("a"), ut.Coordinate("b")
+    mechanism = ut.Mechanism(
+        "two_rooms",
+        (a, b),
+        (ut.Input("u", "N m"),),
+        sp.ImmutableDenseMatrix(sp.eye(2)),
+        sp.ImmutableDenseMatrix([0, 3 * b.symbol]),
+    )
+    assert controllability(mechanism) < 1e-12
+    with pytest.raises(ModelError, match="uncontrollable pair"):
+        ut.first_surface(mechanism)
+
+
+def test_target_that_is_no_equilibrium_is_refused() -> None:
+    """f_u(0, 0) ≠ 0 is named with its value."""
+    a, b = ut.Coordinate("a"), ut.Coordinate("b")
+    mechanism = ut.Mechanism(
+        "tilted",
+        (a, b),
+        (ut.Input("u", "N m"),),
+        sp.ImmutableDenseMatrix([[2, 1], [1, 2]]),
+        sp.ImmutableDenseMatrix([0, sp.cos(b.symbol)]),
+    )
+    with pytest.raises(ModelError, match="equilibrium"):
+        linearise(mechanism)
+
+
+@pytest.mark.parametrize("rate", [-1.0, np.nan, np.inf])
+def test_an_unusable_rate_is_refused(rig: ut.Mechanism, rate: float) -> None:
+    with pytest.raises(InvalidInputError, match="convergence rate"):
+        ut.first_surface(rig, rate=rate)
+
+
+@pytest.mark.parametrize(
+    "weights", [[1, 10, 0.1], [1, 10, 0.1, 0], [1, 10, 0.1, np.nan], [1, 10, 0.1, -1]]
+)
+def test_unusable_weights_are_refused(rig: ut.Mechanism, weights: list[float]) -> None:
+    """Wrong length, zero, NaN and negative weights."""
+    with pytest.raises(InvalidInputError, match="weights"):
+        ut.first_surface(rig, weights)
+
+
+@pytest.mark.parametrize("poles", [[-1, -2], [-1, -2, 0.5], [-1, -2, -3, -4]])
+def test_unusable_poles_are_refused(rig: ut.Mechanism, poles: list[complex]) -> None:
+    """Wrong number, or not left of the imaginary axis."""
+    with pytest.raises(InvalidInputError, match="poles"):
+        ut.placed_surface(rig, poles)

@@ -1,0 +1,208 @@
+"""Mutants of the core: one change of one expression, and whether a test notices.
+
+``python tests/mutants.py --count 300`` changes 300 places, spread evenly over the files of law,
+closed loop and certificates, runs the tests of the package that was changed (then those of the
+packages that stand on it), and lists the mutants that survive.  ``--list`` shows them without
+running anything; a mutant comes out again with ``--seed N --only NUMBER``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "undertow"
+
+#: The packages that are mutated: to the tests that should notice, the nearest first.
+CORE = {
+    "law": (("law",), ("closed_loop", "optimiser", "cascade")),
+    "closed_loop": (("closed_loop",), ("optimiser", "cascade")),
+    "proofs": (("proofs",), ("studies",)),
+}
+
+#: Longest time of the tests of one mutant, s: one that does not end is noticed, too.
+LIMIT = 600.0
+
+SWAPS: dict[type[ast.AST], tuple[str, str]] = {
+    ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),
+    ast.Eq: ("==", "!="), ast.NotEq: ("!=", "=="), ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"), ast.In: ("in", "not in"), ast.NotIn: ("not in", "in"),
+    ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"),
+    ast.Pow: ("**", "*"), ast.FloorDiv: ("//", "*"), ast.Mod: ("%", "*"), ast.MatMult: ("@", "*"),
+    ast.And: ("and", "or"), ast.Or: ("or", "and"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: ``old`` at a place of a file becomes ``new``."""
+
+    file: Path
+    line: int
+    start: int
+    end: int
+    old: str
+    new: str
+
+    def __str__(self) -> str:
+        place = f"{self.file.relative_to(ROOT)}:{self.line}"
+        return f"{place}: {' '.join(self.old.split())} -> {' '.join(self.new.split())}"
+
+    def text(self) -> bytes:
+        """Return the file with the change."""
+        content = self.file.read_bytes()
+        return content[: self.start] + self.new.encode() + content[self.end :]
+
+
+def mutants(path: Path) -> Iterator[Mutant]:
+    """Yield all changes of a file that are tried."""
+    content = path.read_bytes()
+    starts = [0]
+    for line in content.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+
+    def begin(node: ast.expr | ast.stmt) -> int:
+        return starts[node.lineno - 1] + node.col_offset
+
+    def end(node: ast.expr | ast.stmt) -> int:
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        return starts[node.end_lineno - 1] + node.end_col_offset
+
+    def change(line: int, start: int, stop: int, new: str) -> Mutant:
+        return Mutant(path, line, start, stop, content[start:stop].decode(), new)
+
+    def between(left: ast.expr, right: ast.expr, kind: type[ast.AST]) -> Iterator[Mutant]:
+        old, new = SWAPS[kind]
+        if (at := content.find(old.encode(), end(left), begin(right))) >= 0:
+            yield change(left.lineno, at, at + len(old), new)
+
+    for node in _computing(ast.parse(content)):
+        if isinstance(node, ast.Compare) and len(node.ops) == 1:
+            yield from between(node.left, node.comparators[0], type(node.ops[0]))
+        elif isinstance(node, ast.BinOp) and type(node.op) in SWAPS:
+            yield from between(node.left, node.right, type(node.op))
+        elif isinstance(node, ast.BoolOp):
+            yield from between(node.values[0], node.values[1], type(node.op))
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+            sign = 1 if isinstance(node.op, ast.USub) else len("not")
+            yield change(node.lineno, begin(node), begin(node) + sign, "")
+        elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
+            yield change(node.lineno, begin(node), end(node), str(not node.value))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, int):
+            yield change(node.lineno, begin(node), end(node), str(node.value + 1))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, float):
+            yield change(node.lineno, begin(node), end(node), repr(2 * node.value + 1e-3))
+        elif isinstance(node, ast.If) and not _of_types(node.test):
+            test = content[begin(node.test) : end(node.test)].decode()
+            yield change(node.lineno, begin(node.test), end(node.test), f"not ({test})")
+        elif isinstance(node, ast.AugAssign) or (
+            isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
+        ):
+            yield change(node.lineno, begin(node), end(node), "pass")
+
+
+def _of_types(test: ast.expr) -> bool:
+    return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
+
+
+def _computing(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield what computes: no words, no annotations, no settings of caches, no errors' texts."""
+    if isinstance(node, ast.JoinedStr | ast.Raise) or (
+        isinstance(node, ast.FunctionDef) and node.name in ("__repr__", "__str__")
+    ):
+        return
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list", "type_comment"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                yield from _computing(child)
+
+
+def chosen(count: int, seed: int, packages: list[str]) -> list[Mutant]:
+    """Return ``count`` mutants, as many of each file as of any other where it has them."""
+    rng = random.Random(seed)
+    files = [path for name in packages for path in sorted((PACKAGE / name).rglob("*.py"))]
+    rest = {path: list(mutants(path)) for path in files}
+    for some in rest.values():
+        rng.shuffle(some)
+    found: list[Mutant] = []
+    while len(found) < count and any(rest.values()):
+        turn = [path for path in files if rest[path]]
+        rng.shuffle(turn)
+        found += [rest[path].pop() for path in turn[: count - len(found)]]
+    return found
+
+
+def survives(mutant: Mutant) -> bool:
+    """Whether no test notices a mutant."""
+    package = mutant.file.relative_to(PACKAGE).parts[0]
+    with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
+        tree = Path(folder) / "undertow"
+        shutil.copytree(PACKAGE, tree)
+        (tree / mutant.file.relative_to(PACKAGE)).write_bytes(mutant.text())
+        environment = os.environ | {
+            "PYTHONPATH": folder, "UNDERTOW_CACHE": str(Path(tempfile.gettempdir()) / "mutants"),
+        }  # fmt: skip
+        for names in CORE[package]:
+            words = ["-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
+            words += [f"tests/{name}" for name in names]
+            try:
+                done = subprocess.run(
+                    [sys.executable, "-m", "pytest", *words],
+                    cwd=ROOT, env=environment, capture_output=True, timeout=LIMIT, check=False,
+                )  # fmt: skip
+            except subprocess.TimeoutExpired:
+                return False
+            if done.returncode:
+                return False
+    return True
+
+
+def main() -> int:
+    """Try mutants from the command line; exit status 1 when fewer than asked are killed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=300, help="mutants")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--package", choices=sorted(CORE), action="append", help="all by default")
+    parser.add_argument("--only", type=int, action="append", help="number of a mutant")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--least", type=float, default=85.0, help="share to be killed, %%")
+    parser.add_argument("--list", action="store_true", help="show them alone")
+    asked = parser.parse_args()
+    every = chosen(asked.count, asked.seed, asked.package or list(CORE))
+    numbered = [(k, one) for k, one in enumerate(every) if not asked.only or k in asked.only]
+    if asked.list:
+        for number, mutant in numbered:
+            print(f"{number}: {mutant}")
+        return 0
+    began, alive = time.monotonic(), 0
+    with ThreadPoolExecutor(asked.jobs) as pool:
+        outcomes = pool.map(survives, [mutant for _, mutant in numbered])
+        for done, ((number, mutant), lives) in enumerate(zip(numbered, outcomes, strict=True), 1):
+            alive += lives
+            print(f"{done} of {len(numbered)}, {'SURVIVED' if lives else 'killed'}: "
+                  f"#{number} {mutant}", flush=True)  # fmt: skip
+    killed = len(numbered) - alive
+    share = 100 * killed / max(1, len(numbered))
+    print(f"{killed} of {len(numbered)} mutants killed, {share:.0f} %, seed {asked.seed}, "
+          f"{time.monotonic() - began:.0f} s")  # fmt: skip
+    return 0 if share >= asked.least else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

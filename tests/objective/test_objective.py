@@ -1,0 +1,198 @@
+"""Objectives: stage costs, terminal sets and constraints in the mechanism's own names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import undertow as ut
+from support import interpreted, random_mechanism
+from undertow.base import InvalidInputError
+from undertow.objective.objective import Names
+
+
+def test_minimum_energy_is_the_sum_of_squared_inputs(rig: ut.Mechanism) -> None:
+    """Φ = uᵀu, (40), for any number of inputs."""
+    (voltage,) = rig.u
+    assert ut.MinimumEnergy().stage_cost(rig) == voltage**2
+    two = random_mechanism(4, 2)
+    assert sp.expand(ut.MinimumEnergy().stage_cost(two) - sum(u**2 for u in two.u)) == 0
+
+
+def test_state_weight_makes_the_energy_cost_obey_27_and_28(rig: ut.Mechanism) -> None:
+    """Φ = uᵀu + w xᵀx is positive definite; without w it vanishes wherever u = 0 does."""
+    weighted = ut.MinimumEnergy(state_weight=0.3).stage_cost(rig)
+    expected = rig.u[0] ** 2 + 0.3 * sum(s**2 for s in rig.x)
+    assert sp.expand(weighted - expected) == 0
+    symbols = [*rig.x, *rig.u]
+    smallest = {
+        w: np.linalg.eigvalsh(
+            np.array(
+                sp.hessian(ut.MinimumEnergy(state_weight=w).stage_cost(rig), symbols), dtype=float
+            )
+        )[0]
+        for w in (0.0, 0.3)
+    }
+    assert smallest[0.0] == 0.0
+    assert smallest[0.3] == pytest.approx(0.6)
+
+
+def test_minimum_time_costs_what_the_motion_lasts(rig: ut.Mechanism, quick: ut.Surface) -> None:
+    """∫ 1 dt = t_f, (29): to rounding, although t_f lies inside a step."""
+    assert ut.MinimumTime().stage_cost(rig) == 1
+    way = ut.ClosedLoop(rig).simulate(rig.state(phi=0.3), quick, duration=1.0)
+    late = way.x[-1]  # sliding home by now, ever closer
+    radius = 0.9 * float(np.linalg.norm(late))
+    loop = interpreted(ut.ClosedLoop(rig, ut.MinimumTime(terminal_radius=radius)))
+    run = loop.simulate(late, quick, duration=0.1)
+    assert run.event == ut.Event.REACHED
+    assert 0 < run.time < 0.1
+    assert run.cost == pytest.approx(run.time, rel=1e-12)
+
+
+def test_the_users_own_stage_cost_and_constraint_are_compiled_in(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """Any Φ(x, u) and w(x, u) ≤ 0 in names of states, inputs and parameters, (21) and (25)."""
+    objective = ut.Objective(
+        "own",
+        lambda v: 2 * v.voltage**2 + v.m * v.phi_dot**2 + (v.states.T * v.states)[0],
+        constraints=(ut.Constraint("sum", lambda v: v.voltage + 10 * v.phi - 60),),
+    )
+    theta, phi, w, p = rig.x
+    expected = 2 * rig.u[0] ** 2 + sp.Symbol("m", real=True) * p**2 + theta**2 + phi**2 + w**2
+    assert sp.expand(objective.stage_cost(rig) - expected - p**2) == 0
+    (margin,) = objective.path_margins(rig)
+    assert sp.expand(margin - (60 - rig.u[0] - 10 * phi)) == 0
+    loop = interpreted(ut.ClosedLoop(rig, objective))
+    x0 = rig.state(phi=0.3)
+    batch = loop.batch(x0, [quick], duration=0.004)
+    run = loop.simulate(x0, quick, duration=0.004)
+    margins = 60 - run.u[:-1, 0] - 10 * run["phi"][:-1]
+    assert batch.path[0, 0] == pytest.approx(margins.min(), rel=1e-12)
+    x, u = run.x[:-1], run.u[:-1, 0]
+    stage = 2 * u**2 + 0.125 * x[:, 3] ** 2 + (x**2).sum(1)
+    assert batch.cost[0] == pytest.approx(stage.mean() * 0.004, rel=0.05)
+
+
+def test_state_boxes_are_bounds_on_moduli(rig: ut.Mechanism) -> None:
+    box = ut.state_box(theta=math.radians(60), phi_dot=8.0)
+    assert [c.name for c in box] == ["|theta| ≤ 1.0472", "|phi_dot| ≤ 8"]
+    objective = ut.Objective("boxed", lambda v: v.voltage**2, constraints=box)
+    arm, rate = objective.path_margins(rig)
+    at = {rig.x[0]: -1.2, rig.x[3]: 5.0}
+    assert float(arm.subs(at)) == pytest.approx(math.radians(60) - 1.2)
+    assert float(rate.subs(at)) == 3.0
+
+
+def test_boxes_need_not_be_symmetric(rig: ut.Mechanism) -> None:
+    """low ≤ state ≤ high: the margin is the distance to the nearer end, negative outside."""
+    (bound,) = ut.state_box(phi=(-0.2, 0.6))
+    assert bound.name == "-0.2 ≤ phi ≤ 0.6"
+    (margin,) = ut.MinimumTime(constraints=(bound,)).path_margins(rig)
+    found = [float(margin.subs(rig.x[1], phi)) for phi in (-0.3, -0.2, 0.0, 0.5, 0.7)]
+    np.testing.assert_allclose(found, [-0.1, 0.0, 0.2, 0.1, -0.1], atol=1e-15)
+
+
+def test_a_start_outside_is_refused_and_one_that_inputs_decide_is_not(rig: ut.Mechanism) -> None:
+    """A margin that depends on the input is no reason to refuse a state."""
+    box = ut.state_box(phi=0.2)
+    with pytest.raises(InvalidInputError, match=r"\|phi\| ≤ 0.2.*-0\.1"):
+        ut.MinimumTime(constraints=box).check_start(rig, rig.state(phi=0.3))
+    ut.MinimumTime(constraints=box).check_start(rig, rig.state(phi=0.1))
+    power = ut.Constraint("power", lambda v: v.voltage * v.theta_dot + 1)
+    ut.MinimumTime(constraints=(power,)).check_start(rig, rig.state(theta_dot=2.0))
+
+
+def test_between_tests_a_bound_is_passed_by_no_more_than_the_chord_allows(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """(h²/8) max |q̈|: what `Constraint` says of motions between the starts of steps, h apart."""
+    fine = ut.ClosedLoop(rig, step=1e-4).simulate(rig.state(phi=0.3), quick, duration=0.6)
+    swing = np.abs(fine["theta"])
+    peak = int(np.argmax(swing))
+    assert 0 < peak < len(swing) - 1
+    rate = rig.accelerations(0.0, fine.x[:-1], fine.u[:-1])[:, 0]
+    for stride in (20, 100, 400):  # tests every 2, 10 and 40 ms
+        passed = [swing.max() - swing[first::stride].max() for first in range(stride)]
+        allowed = (stride * 1e-4) ** 2 / 8 * np.abs(rate).max()
+        assert 0 < max(passed) <= allowed
+
+
+def test_names_are_states_inputs_and_parameters_and_nothing_else(rig: ut.Mechanism) -> None:
+    v = Names(rig)
+    assert (v.theta, v.phi_dot, v.voltage) == (rig.x[0], rig.x[3], rig.u[0])
+    assert v.r_o == sp.Symbol("r_o", real=True)
+    assert list(v.states) == list(rig.x)
+    assert list(v.inputs) == list(rig.u)
+    with pytest.raises(AttributeError, match=r"psi.*theta.*voltage"):
+        _ = v.psi
+
+
+REFUSALS: dict[str, tuple[Callable[[ut.Mechanism], object], str]] = {
+    "unknown name in a stage cost": (
+        lambda rig: ut.Objective("odd", lambda v: v.psi**2).stage_cost(rig),
+        r"stage cost of 'odd' for 'rotary_pendulum'.*'psi'.*theta",
+    ),
+    "unknown name in a constraint": (
+        lambda rig: ut.Objective(
+            "odd", lambda v: 1, constraints=(ut.Constraint("far", lambda v: v.psi - 1),)
+        ).path_margins(rig),
+        r"constraint 'far' for 'rotary_pendulum'.*'psi'",
+    ),
+    "unknown state of a box": (
+        lambda rig: ut.ClosedLoop(
+            rig, ut.Objective("odd", lambda v: 1, constraints=ut.state_box(psi=1.0))
+        ).batch(rig.state(phi=0.1), np.ones((1, 4))),
+        r"\|psi\| ≤ 1.*'psi'.*theta",
+    ),
+    "foreign symbol": (
+        lambda rig: ut.Objective("odd", lambda v: sp.Symbol("k") * v.phi).stage_cost(rig),
+        r"stage cost of 'odd'.*k\*phi.*states and inputs",
+    ),
+    "more than one expression": (
+        lambda rig: ut.Objective("odd", lambda v: v.states).stage_cost(rig),
+        r"stage cost of 'odd'.*one expression",
+    ),
+    "cost that can be negative": (
+        lambda rig: ut.Objective("odd", lambda v: v.voltage * v.theta_dot).stage_cost(rig),
+        r"stage cost of 'odd'.*-.*≥ 0",
+    ),
+    "cost that is no number everywhere": (
+        lambda rig: ut.Objective("odd", lambda v: sp.sqrt(v.phi)).stage_cost(rig),
+        r"stage cost of 'odd'.*nan",
+    ),
+    "negative bound": (lambda rig: ut.state_box(theta=-1.0), r"'theta'.*-1\.0.*> 0"),
+    "interval without the target": (
+        lambda rig: ut.state_box(theta=(0.1, 0.5)),
+        r"'theta'.*\(0\.1, 0\.5\).*low < 0 < high",
+    ),
+    "NaN bound": (lambda rig: ut.state_box(theta=math.nan), r"'theta'.*nan.*finite"),
+    "zero horizon": (lambda rig: ut.MinimumTime(horizon=0.0), r"horizon.*0\.0.*> 0"),
+    "infinite horizon": (lambda rig: ut.MinimumTime(horizon=math.inf), r"horizon.*inf.*finite"),
+    "negative terminal radius": (
+        lambda rig: ut.MinimumEnergy(terminal_radius=-0.01),
+        r"terminal_radius.*-0\.01.*> 0",
+    ),
+    "NaN terminal radius": (lambda rig: ut.MinimumEnergy(terminal_radius=math.nan), "nan.*finite"),
+    "negative state weight": (
+        lambda rig: ut.MinimumEnergy(state_weight=-0.1),
+        r"state_weight.*-0\.1.*≥ 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSALS)
+def test_bad_objectives_are_refused_with_value_limit_and_remedy(
+    what: str, rig: ut.Mechanism
+) -> None:
+    attempt, message = REFUSALS[what]
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        attempt(rig)
+    assert caught.value.value is not None
+    assert caught.value.limit is not None
+    assert caught.value.remedy

@@ -1,0 +1,222 @@
+"""The optimiser: never worse than what is there, the same from any seed, honest when it fails."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import undertow as ut
+from undertow.base import InfeasibleError, InvalidInputError
+from undertow.optimiser.proposal import motion_margins
+from undertow.studies.paper import CASES
+
+OBJECTIVES = {"energy": ut.MinimumEnergy(), "time": ut.MinimumTime()}
+
+
+@pytest.fixture(scope="module")
+def optimisers(rig: ut.Mechanism) -> dict[str, ut.Optimiser]:
+    return {
+        name: ut.Optimiser(ut.ClosedLoop(rig, objective, tail_rtol=5e-3), warm=ut.Budget(96))
+        for name, objective in OBJECTIVES.items()
+    }
+
+
+def optimum(loop: ut.ClosedLoop, x: NDArray[np.float64], seed: int = 0) -> ut.Surface:
+    surface = ut.Optimiser(loop, seed=seed).require(x).surface
+    assert surface is not None
+    return surface
+
+
+@settings(max_examples=15)
+@given(
+    phi=st.floats(-35, 35),
+    rate=st.floats(-60, 60),
+    case=st.sampled_from(sorted(CASES)),
+    name=st.sampled_from(sorted(OBJECTIVES)),
+)
+def test_never_worse_than_the_incumbent(
+    optimisers: dict[str, ut.Optimiser], phi: float, rate: float, case: str, name: str
+) -> None:
+    """From any state the answer costs at most what keeping the surface in use would cost."""
+    optimiser = optimisers[name]
+    x = optimiser.loop.mechanism.state(phi=ut.deg(phi), phi_dot=ut.deg(rate))
+    proposal = optimiser.propose(x, incumbent=CASES[case], sequence=1)
+    assert proposal.cost <= proposal.incumbent_cost
+    if proposal.surface is not None:
+        fresh = optimiser.loop.batch(x, [proposal.surface])
+        # A search for an earlier arrival takes small steps throughout.
+        assert float(fresh.cost[0]) == pytest.approx(
+            proposal.cost, rel=0.2 * optimiser.loop.tail_rtol
+        )
+
+
+@pytest.mark.parametrize(("name", "at_most"), [("energy", 12.0), ("time", 1.60)])
+def test_three_seeds_agree_at_41_degrees(rig: ut.Mechanism, name: str, at_most: float) -> None:
+    """One-time optimum at 41°, d_e = 0.025: ≤ 12.0 V² s and ≤ 1.60 s, within 1 %."""
+    loop = ut.ClosedLoop(rig, OBJECTIVES[name], tail_rtol=5e-3)
+    x = rig.state(phi=ut.deg(41))
+    surfaces = [optimum(loop, x, seed) for seed in range(3)]
+    costs = ut.ClosedLoop(rig, OBJECTIVES[name]).batch(x, surfaces).cost  # integrated to the end
+    assert costs.max() <= at_most
+    assert np.ptp(costs) <= 0.01 * costs.min()
+
+
+def test_proposal_depends_on_seed_and_number_alone(optimisers: dict[str, ut.Optimiser]) -> None:
+    """Whatever was asked before, the same question gets the same bits."""
+    optimiser = optimisers["time"]
+    x = optimiser.loop.mechanism.state(phi=0.4)
+    incumbent = CASES["4 one-time, time"]
+
+    def ask(sequence: int, seed: int = 0) -> ut.Proposal:
+        return replace(optimiser, seed=seed).propose(x, incumbent=incumbent, sequence=sequence)
+
+    first = ask(3)
+    optimiser.propose(0.5 * x, incumbent=incumbent, sequence=9)
+    assert ask(3).surface == first.surface
+    assert ask(4).surface != first.surface
+    assert ask(3, seed=1).surface != first.surface
+
+
+def test_budget_in_evaluations_is_kept(optimisers: dict[str, ut.Optimiser]) -> None:
+    """Never more rollouts than allowed; one is enough for an answer."""
+    optimiser = optimisers["time"]
+    x = optimiser.loop.mechanism.state(phi=0.4)
+    for evaluations in (1, 33, 200):
+        proposal = optimiser.propose(
+            x, incumbent=CASES["4 one-time, time"], budget=ut.Budget(evaluations)
+        )
+        assert proposal.evaluations <= evaluations
+        assert proposal.surface is not None
+
+
+def test_from_the_edge_of_the_terminal_set_there_is_nothing_to_search(
+    optimisers: dict[str, ut.Optimiser],
+) -> None:
+    """A time of arrival below one step is an answer, and no rollout of no length is asked for."""
+    optimiser = optimisers["time"]
+    start = optimiser.loop.mechanism.state(phi=0.4)
+    motion = optimiser.loop.simulate(start, CASES["4 one-time, time"])
+    x = motion.x[-1] * (1 + 1e-9)
+    proposal = optimiser.propose(x, incumbent=CASES["4 one-time, time"])
+    assert proposal.status == "converged"
+    assert proposal.cost <= optimiser.loop.step
+
+
+def test_budget_in_seconds_still_answers(optimisers: dict[str, ut.Optimiser]) -> None:
+    """With no time at all the incumbent, at least, comes back."""
+    optimiser = optimisers["energy"]
+    x = optimiser.loop.mechanism.state(phi=0.4)
+    proposal = optimiser.propose(
+        x, incumbent=CASES["1 base case"], budget=ut.Budget(10**9, seconds=1e-9)
+    )
+    assert proposal.surface is not None
+    assert proposal.status == "budget spent"
+    assert proposal.cost <= proposal.incumbent_cost
+
+
+def test_search_coordinates_are_invertible(optimisers: dict[str, ut.Optimiser]) -> None:
+    """decode ∘ encode is the identity on normalised surfaces, of any sign."""
+    decision = optimisers["energy"].space
+    for surface in (*CASES.values(), ut.Surface(-1, 3.0, -0.2, 40.0)):
+        vectors, gains = decision.decode(decision.encode(ut.Plan.of(surface))[None])
+        np.testing.assert_allclose(vectors[0, 0], surface.vector, rtol=1e-12)
+        assert gains is None
+
+
+def test_margins_of_the_answer_are_satisfied(optimisers: dict[str, ut.Optimiser]) -> None:
+    """An admissible answer has every margin ≥ 0: (35)-(37), stability, the motion."""
+    proposal = optimisers["energy"].require(optimisers["energy"].loop.mechanism.state(phi=0.5))
+    assert {m.name[:4] for m in proposal.margins} >= {"(35)", "(36)", "(37)", "stab"}
+    assert min(m.value for m in proposal.margins) > 0
+
+
+@pytest.mark.slow
+def test_state_constraint_binds_and_is_kept(rig: ut.Mechanism) -> None:
+    """(24): the arm stays within ±25° where the free optimum swings further, at a price."""
+    x = rig.state(phi=ut.deg(12))
+    box = ut.state_box(theta=ut.deg(25))
+    free = optimum(ut.ClosedLoop(rig, ut.MinimumEnergy()), x)
+    loop = ut.ClosedLoop(rig, ut.MinimumEnergy(constraints=box))
+    proposal = ut.Optimiser(loop).require(x)
+    assert proposal.surface is not None
+    unconstrained = ut.ClosedLoop(rig, ut.MinimumEnergy())
+    motions = [unconstrained.simulate(x, surface) for surface in (free, proposal.surface)]
+    swings = [float(np.abs(motion["theta"]).max()) for motion in motions]
+    assert swings[0] > ut.deg(25)
+    assert swings[1] <= ut.deg(25)
+    assert motions[1].cost > motions[0].cost
+    assert proposal.margins[-1].name.startswith("|theta|")
+    assert 0 <= proposal.margins[-1].value < 0.1
+
+
+def test_what_a_best_candidate_breaks_is_said_with_its_unit(rig: ut.Mechanism) -> None:
+    """The constraint that is broken, not the smallest number of whatever unit."""
+    box = (ut.Constraint("arm below 5°", lambda v: v.theta - ut.deg(5), "rad"),)
+    loop = ut.ClosedLoop(rig, ut.MinimumEnergy(constraints=box))
+    x = -rig.state(phi=ut.deg(20))
+    margins, message, _ = motion_margins(loop, ut.Plan((ut.first_surface(rig),)), x, 5.0)
+    broken = next(m for m in margins if m.value < 0)
+    assert (broken.name, broken.unit) == (box[0].name, "rad")
+    assert f"breaks '{box[0].name}' by {-broken.value:.3g} rad at" in message
+
+
+def test_a_start_outside_the_constraints_is_refused_before_a_search(rig: ut.Mechanism) -> None:
+    """No rollout is spent on what nothing can mend."""
+    loop = ut.ClosedLoop(rig, ut.MinimumEnergy(constraints=ut.state_box(phi=ut.deg(10))))
+    with pytest.raises(InvalidInputError, match="initial state of") as caught:
+        ut.Optimiser(loop).require(rig.state(phi=ut.deg(20)))
+    assert "Start inside" in str(caught.value)
+    assert "_kernels" not in vars(loop)  # not even compiled
+
+
+def test_hard_input_limit_is_a_constraint_on_the_unclipped_law(rig: ut.Mechanism) -> None:
+    """(38) as a constraint: the demand itself stays within the limit."""
+    weak = rig.with_input_limit(4.0)
+    x = weak.state(phi=ut.deg(8))
+    loop = ut.ClosedLoop(weak, ut.MinimumTime(hard_input=True))
+    surface = optimum(loop, x)
+    motion = ut.ClosedLoop(weak, ut.MinimumTime()).simulate(x, surface)
+    demand = ut.SlidingModeLaw(weak, surface)(0.0, motion.x).demand
+    assert np.abs(demand).max() <= 4.0
+
+
+def test_hard_input_limit_that_no_surface_meets_is_refused(rig: ut.Mechanism) -> None:
+    """The refusal carries what the best candidate broke, the limit and the remedy."""
+    weak = rig.with_input_limit(0.3)
+    loop = ut.ClosedLoop(weak, ut.MinimumEnergy(hard_input=True))
+    with pytest.raises(InfeasibleError, match="no admissible surface") as caught:
+        ut.Optimiser(loop, cold=ut.Budget(600)).require(weak.state(phi=ut.deg(30)))
+    assert "hard input limit" in str(caught.value.value)
+    assert "margin ≥ 0" in str(caught.value.limit)
+    assert "Raise the actuator limit" in caught.value.remedy
+
+
+def test_infeasible_is_a_status_and_not_an_exception(optimisers: dict[str, ut.Optimiser]) -> None:
+    """From 80° nothing helps: the proposal says so, with the event in words."""
+    optimiser = optimisers["energy"]
+    proposal = optimiser.propose(
+        optimiser.loop.mechanism.state(phi=ut.deg(80)), budget=ut.Budget(300)
+    )
+    assert proposal.surface is None
+    assert proposal.status == "infeasible"
+    assert proposal.cost == math.inf
+    assert "the best candidate" in proposal.message
+
+
+@pytest.mark.parametrize(("evaluations", "seconds"), [(0, 1.0), (10, 0.0), (10, -1.0)])
+def test_budget_that_allows_nothing_is_refused(evaluations: int, seconds: float) -> None:
+    """At least one evaluation and more than no time."""
+    with pytest.raises(InvalidInputError, match="budget"):
+        ut.Budget(evaluations, seconds)
+
+
+def test_state_that_is_not_a_number_is_refused(optimisers: dict[str, ut.Optimiser]) -> None:
+    """NaN from a sensor is named, not optimised."""
+    with pytest.raises(InvalidInputError, match="'phi'"):
+        optimisers["time"].propose([0.0, np.nan, 0.0, 0.0])

@@ -1,0 +1,132 @@
+"""The benchmarks run, refuse clearly, and compare with controllers that are what they say."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import undertow as ut
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))
+HELPERS = {"__main__", "harness", "rivals"}
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python on the benchmarks' folder or one of its files."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, check=False, env=environment
+    )
+
+
+@pytest.fixture
+def harness(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The module that every benchmark imports first."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    import harness
+
+    return harness
+
+
+@pytest.fixture
+def rivals(harness: ModuleType) -> ModuleType:
+    """The controllers to compare with."""
+    pytest.importorskip("casadi")
+    import rivals
+
+    return rivals
+
+
+def test_the_one_command_knows_every_benchmark() -> None:
+    shown = run(str(FOLDER), "--help")
+    assert shown.returncode == 0
+    assert "examples:" in shown.stdout
+    words = shown.stdout.replace(",", " ").split()
+    assert set(SCRIPTS) - HELPERS <= set(words)
+
+
+def test_an_unknown_benchmark_is_refused_with_the_known_ones() -> None:
+    refused = run(str(FOLDER), "kernal")
+    assert refused.returncode == 2
+    assert "no benchmark named kernal; there are kernel" in refused.stderr
+
+
+def test_a_missing_extra_says_what_to_install(harness: ModuleType) -> None:
+    with pytest.raises(SystemExit, match=r"not installed.\nInstall it: .*\[compare\]"):
+        harness.need("no_such_package", "compare")
+
+
+def test_entrants_of_a_race_take_turns(harness: ModuleType) -> None:
+    order: list[str] = []
+    ticks = iter(range(100))
+    times = harness.race(
+        {"a": lambda: order.append("a"), "b": lambda: order.append("b")},
+        3,
+        lambda: float(next(ticks)),
+        "",
+    )
+    assert order == ["a", "b"] * 3
+    assert times == {"a": [1.0] * 3, "b": [1.0] * 3}
+
+
+def test_rivals_move_by_the_mechanisms_own_equations(rivals: ModuleType, rig: ut.Mechanism) -> None:
+    import casadi as ca
+
+    rng = np.random.default_rng(0)
+    rates = rivals.dynamics(ca, rig)
+    for _ in range(20):
+        x, u = rng.uniform(-2, 2, 4), rng.uniform(-15, 15, 1)
+        expected = np.concatenate([x[2:], rig.accelerations(0.0, x, u)])
+        np.testing.assert_allclose(np.array(rates(x, u)).ravel(), expected, rtol=1e-10)
+
+
+def test_the_regulator_solves_its_riccati_equation(rivals: ModuleType, rig: ut.Mechanism) -> None:
+    from undertow.models import linearise
+
+    lin, (P, K) = linearise(rig), rivals.riccati(rig, 0.1)
+    residual = lin.A.T @ P + P @ lin.A - P @ lin.input @ lin.input.T @ P + 0.1 * np.eye(4)
+    assert np.abs(residual).max() < 1e-8 * np.abs(P).max()
+    assert np.linalg.eigvals(lin.A - lin.input @ K).real.max() < 0
+
+
+def test_a_plan_of_least_time_arrives_when_it_says(rivals: ModuleType, rig: ut.Mechanism) -> None:
+    x = rig.state(phi=ut.deg(10))
+    mpc = rivals.ShootingMPC(rig, "time")
+    assert mpc.plan(0.0, x)
+    promised = mpc.cost
+    mpc.forget()
+    outcome = rivals.Plant(rig, 0.01, 3.0).held(x, mpc)
+    assert outcome.reached
+    assert abs(outcome.time - promised) < 0.02
+
+
+@pytest.mark.slow
+def test_predictive_control_of_least_time_is_near_the_bound(
+    rivals: ModuleType, rig: ut.Mechanism
+) -> None:
+    from undertow.bounds import bound
+
+    x = rig.state(phi=ut.deg(15))
+    box = ut.state_box(phi=np.pi / 2)
+    least = bound(rig, ut.MinimumTime(constraints=box), x).cost
+    outcome = rivals.Plant(rig, 0.01, 3.0).held(x, rivals.ShootingMPC(rig, "time"))
+    assert outcome.reached
+    assert 0.98 * least < outcome.time < 1.15 * least
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(SCRIPTS) - HELPERS))
+def test_quick_run(name: str) -> None:
+    if name in ("kernel", "reoptimise", "closed_loop", "gap", "searchers"):
+        pytest.importorskip("casadi")
+    finished = run(str(FOLDER / f"{name}.py"), "--quick")
+    assert finished.returncode == 0, finished.stderr
+    assert "Traceback" not in finished.stderr
+    assert len(finished.stdout.split()) > 5

@@ -1,0 +1,209 @@
+"""The example drivers: a pendulum balanced over a pseudo-terminal, and over UDP with losses."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import math
+import os
+import re
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow.cli import app
+from undertow.plants import check_rig
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX")
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return importlib.import_module
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """The device's end of a serial line, and the name of the driver's port."""
+    ours, theirs = os.openpty()
+    yield ours, os.ttyname(theirs)
+    for end in (ours, theirs):
+        with contextlib.suppress(OSError):
+            os.close(end)
+
+
+@pytest.mark.parametrize("name", ["serial_rig", "udp_rig"])
+def test_a_driver_of_twenty_lines_balances(name: str, example: Callable[[str], ModuleType]) -> None:
+    if name == "serial_rig" and sys.platform == "win32":
+        pytest.skip("pseudo-terminals are POSIX")
+    largest = example(name).main(seconds=3.0)
+    assert largest < ut.deg(1)
+
+
+def test_what_cannot_be_read_is_a_lost_reading(example: Callable[[str], ModuleType]) -> None:
+    wire = example("wire")
+    for garbage in (b"", b"q", b"\xff\xfe", b"q 1 0.1 x 3", b"q 1 0.1 5", b"u 1 0.1 5 6", b"\0\0"):
+        number, lost = wire.parse(garbage)
+        assert number == -1
+        assert np.isnan(lost.q).all()
+    number, sound = wire.parse(b"q 7 0.25 1024 -2048\n")
+    assert (number, sound.t) == (7, 0.25)
+    assert sound.q.tolist() == pytest.approx([math.pi / 2, -math.pi])
+
+
+@POSIX
+def test_a_serial_line_with_garbage_late_and_lost_answers(
+    line: tuple[int, str], example: Callable[[str], ModuleType]
+) -> None:
+    """The newest answer to a command of this driver counts, whatever else is on the line."""
+    device, port = line
+    rig = example("serial_rig").SerialRig(port, timeout=0.01)
+    assert re.fullmatch(rb"u 1 0\.000000\n", os.read(device, 100))
+    os.write(device, b"\xff\x00q 9 noise\nq 1 0.001 1024 0\n")
+    assert rig.read().q[0] == pytest.approx(math.pi / 2)
+    rig.write([1.0])
+    assert math.isnan(rig.read().t)  # no answer: lost, after 10 ms
+    rig.write([1.0])
+    os.write(device, b"q 2 0.002 0 0\nq 3 0.0")  # the late one, and half of the next
+    assert rig.read().t == 0.002
+    os.write(device, b"03 0 1\n")
+    assert rig.read().t == 0.003
+    rig.write([1.0])
+    os.write(device, b"q 99 9.9 0 0\n" + b"x" * 3000)  # of another driver, and a flood
+    assert math.isnan(rig.read().t)
+    os.write(device, b"\nq 4 0.004 0 0\n")
+    assert rig.read().t == 0.004
+    rig.close()
+
+
+@POSIX
+def test_a_serial_line_that_is_unplugged_is_an_error_and_no_wait(
+    line: tuple[int, str], example: Callable[[str], ModuleType]
+) -> None:
+    """Reads fail at once, so do writes, and closing does not."""
+    device, port = line
+    rig = example("serial_rig").SerialRig(port)
+    os.close(device)
+    with pytest.raises(OSError, match=r"closed|error"):
+        rig.read()
+    with pytest.raises(OSError, match="error"):
+        rig.write([1.0])
+    rig.close()
+
+
+def test_datagrams_that_are_lost_late_or_of_others(example: Callable[[str], ModuleType]) -> None:
+    device = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    device.bind(("127.0.0.1", 0))
+    device.settimeout(5.0)
+    rig = example("udp_rig").UdpRig(*device.getsockname(), timeout=0.01)
+    _, driver = device.recvfrom(100)
+    assert math.isnan(rig.read().t)
+    rig.write([1.0])
+    for answer in (b"garbage", b"q 2 0.002 5 6\n", b"q 1 0.001 3 4\n"):  # out of order
+        device.sendto(answer, driver)
+    assert rig.read().t == 0.002
+    rig.write([1.0])
+    assert math.isnan(rig.read().t)  # what came too late for its turn is not taken now
+    device.close()
+    rig.write([1.0])
+    with pytest.raises(ConnectionError):
+        rig.read()
+    rig.close()
+
+
+@POSIX
+def test_a_serial_port_is_one_drivers_alone(
+    line: tuple[int, str], example: Callable[[str], ModuleType]
+) -> None:
+    """A second one is refused by name while the first is open, and takes over when it is closed."""
+    _, port = line
+    serial_rig = example("serial_rig")
+    first = serial_rig.SerialRig(port)
+    with pytest.raises(OSError, match="in use by another program"):
+        serial_rig.SerialRig(port)
+    first.close()
+    serial_rig.SerialRig(port).close()
+
+
+def test_a_lost_datagram_costs_less_than_a_period(example: Callable[[str], ModuleType]) -> None:
+    """The median of reads without an answer, on a machine that may be busy."""
+    silent = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    silent.bind(("127.0.0.1", 0))
+    rig = example("udp_rig").UdpRig(*silent.getsockname())
+    times = []
+    for _ in range(21):
+        rig.write([1.0])
+        began = time.perf_counter()
+        assert math.isnan(rig.read().t)
+        times.append(time.perf_counter() - began)
+    assert np.median(times) < rig.period
+    assert rig.timeout < 0.5 * rig.period
+    rig.close()
+    assert example("serial_rig").SerialRig.__init__.__defaults__[-1] is None
+    silent.close()
+
+
+def test_an_emulated_device_obeys_one_sender(example: Callable[[str], ModuleType]) -> None:
+    """What another socket sends is neither applied nor answered; nor does the driver hear it."""
+    udp_rig = example("udp_rig")
+    bench = udp_rig.srv02_rig()
+    device = udp_rig.RealisticRig(bench, seed=1)
+    host, port = udp_rig.emulate(device)
+    rig = udp_rig.UdpRig(host, port, timeout=1.0)
+    assert rig.read().t > 0
+    other = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    other.settimeout(0.1)
+    before = device.t
+    other.sendto(b"u 1 15.000000\n", (host, port))
+    with pytest.raises(TimeoutError):
+        other.recvfrom(256)
+    assert device.t == before
+    rig.write([0.0])
+    other.sendto(b"q 2 9.0 0 0\n", rig.socket.getsockname())
+    assert rig.read().t != 9.0
+    rig.close()
+    other.close()
+
+
+def test_the_driver_of_the_page_is_a_rig(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``docs/rigs.md``, with a card of 4096 counts a turn that stands for the hardware."""
+    page = (EXAMPLES.parent / "docs" / "rigs.md").read_text(encoding="utf-8")
+    code = page.split("## A driver of your own")[1].split("```python\n")[1].split("```")[0]
+    counts, volts = [100, 200], list[float]()
+    card = SimpleNamespace(counts=lambda: list(counts), set_volt=volts.append)
+    monkeypatch.setitem(sys.modules, "daq", SimpleNamespace(open=lambda: card))
+    names: dict[str, Any] = {}
+    exec(code, names)
+    rig = names["MyRig"]()
+    check_rig(rig, ut.mechanisms.rotary_pendulum())
+    counts[:] = [100 + 1024, 200 - 2048]
+    assert rig.read().q.tolist() == pytest.approx([math.pi / 2, 0.0])
+    rig.write(np.array([3.0]))
+    rig.close()
+    assert volts == [3.0, 0.0]
+
+
+@POSIX
+@pytest.mark.slow
+def test_the_runtime_drives_the_example_from_the_command_line(tmp_path: Path) -> None:
+    """``undertow run --rig FILE.py:NAME``: a mechanism is balanced by one's own driver, logged."""
+    words = ("run", "rotary_pendulum", "--rig", f"{EXAMPLES / 'serial_rig.py'}:emulated")
+    log = tmp_path / "run.db"
+    result = CliRunner().invoke(
+        app, [*words, "--start", "phi=20deg", "--seconds", "2", "--log", str(log)]
+    )
+    assert result.exit_code == 0, result.stderr
+    assert "BALANCE" in result.stdout
+    assert "operator: stop" in result.stdout
+    assert CliRunner().invoke(app, ["replay", str(log)]).exit_code == 0

@@ -1,0 +1,823 @@
+"""Certificate files: proved again from the file alone; what is damaged or untrue is refused."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+from rich.console import Console
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow.base import ArtefactError, InvalidInputError, ModelError, Verdict, inward
+from undertow.base.errors import CertificateError
+from undertow.base.verdict import within
+from undertow.cli import app
+from undertow.law import Plan
+from undertow.models.importers import mechanism_from_file
+from undertow.proofs.claims.appendix import CASES, Constants, two_vertex
+from undertow.proofs.claims.certificate import (
+    LARGEST,
+    Certificate,
+    StatedClaim,
+    Subject,
+    _checksum,
+    read_certificate,
+)
+from undertow.proofs.claims.closed_loop import LoopClaim, ProvedStarts
+from undertow.proofs.claims.nonsingular import nonsingular
+from undertow.proofs.claims.reaching import reaching
+from undertow.proofs.claims.region import reaches
+from undertow.proofs.claims.stability import StabilityClaim, hurwitz
+from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
+from undertow.proofs.claims.verify import proved_sets, verify
+from undertow.proofs.closed_loop.loop import LoopMotion
+from undertow.proofs.closed_loop.terminal import TerminalSet
+from undertow.proofs.gate import Policy, assess
+from undertow.proofs.region.lyapunov import LyapunovFunction
+from undertow.proofs.region.motion import SurfaceMotion, VectorField
+from undertow.proofs.region.region import verify_region
+from undertow.proofs.search.terminal_ellipsoid import search_for
+from undertow.studies.certification import certificate_files, certify_surface, verification_report
+from undertow.studies.paper.appendix_search import search_rate
+
+pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+
+RIG = ut.mechanisms.rotary_pendulum()
+SURFACE = ut.Surface(-1, -1.59, 1.96, 12.1)
+#: V of the sliding dynamics, rounded, and a level at which it is proved in a second.
+P = np.array([[30.0, 3.0, -3.0], [3.0, 0.8, 0.4], [-3.0, 0.4, 3.0]])
+SQUARES = np.array([[2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0], [0, 1, 1], [0, 0, 2]])
+
+
+def quadratic(matrix: np.ndarray, level: float) -> LyapunovFunction:
+    values = [matrix[0, 0], 2 * matrix[0, 1], 2 * matrix[0, 2]]
+    values += [matrix[1, 1], 2 * matrix[1, 2], matrix[2, 2]]
+    return LyapunovFunction(np.eye(3), SQUARES, np.array(values) / level)
+
+
+def lyapunov_matrix() -> np.ndarray:
+    """P of the linear sliding dynamics in y = (φ, φ̇, w)."""
+    import scipy.linalg
+
+    from undertow.proofs.region.motion import SurfaceMotion
+
+    A = SurfaceMotion(RIG, SURFACE).jacobian
+    return np.asarray(scipy.linalg.solve_continuous_lyapunov(A.T, -np.diag([30.0, 0.3, 3.0])))
+
+
+def region_claim(level: float, start: float) -> StatedClaim:
+    data = {"function": quadratic(lyapunov_matrix(), level).to_dict(), "start": [start, 0, 0]}
+    return StatedClaim(
+        "surface region", data, Verdict("a region", "proved", start * (1 - 1e-12), "rad")
+    )
+
+
+@pytest.fixture(scope="module")
+def written() -> bytes:
+    """A certificate with one claim of each kind that is quick."""
+    x0 = RIG.state(phi=0.5)
+    one = certify_surface(RIG, SURFACE, x0, seconds=0.0, predict=False)
+    claims = (*one.subject.claims, region_claim(0.02, 0.01))
+    remark = Verdict("the motion from 30° arrives", "sampled", 0.4)
+    subject = Subject(SURFACE, ut.ReachingLaw(), claims, (remark,))
+    return Certificate.of(RIG, [subject], {"undertow": "test", "sympy": sp.__version__}).to_bytes()
+
+
+Edit = Callable[[dict[str, Any]], Any]
+
+
+def edited(content: bytes, edit: Edit, *, signed: bool = True) -> bytes:
+    """The file after a change, with a checksum that fits again if ``signed``."""
+    document = json.loads(content)
+    edit(document)
+    if signed:
+        document["checksum"] = _checksum(document)
+    return json.dumps(document).encode()
+
+
+def claims_of(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
+    return [c for c in document["subjects"][0]["claims"] if c["kind"] == kind]
+
+
+def test_all_claims_are_proved_again(written: bytes) -> None:
+    certificate = Certificate.from_bytes(written)
+    assert certificate.to_bytes() == written
+    checked = verify(certificate, RIG)
+    kinds = {item.claim.kind for item in checked}
+    assert kinds >= {
+        "stability", "terminal ellipsoid", "nonsingular", "reaching", "surface region"
+    }  # fmt: skip
+    assert [item.verdict.kind for item in checked] == ["proved"] * len(checked)
+    assert len(certificate.subjects[0].remarks) == 1
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "cut off": lambda c: c[: len(c) // 2],
+    "a digit": lambda c: c.replace(b"12.1", b"12.2", 1),
+    "a word": lambda c: c.replace(b'"proved"', b'"PROVED"', 1),
+    "a parameter": lambda c: c.replace(b'"m": 0.125', b'"m": 0.126', 1),
+    "NaN": lambda c: c.replace(b"12.1", b"NaN", 1),
+    "infinity": lambda c: c.replace(b"12.1", b"1e999", 1),
+    "a repeated key": lambda c: c.replace(b'"version": 1', b'"version": 1, "version": 1', 1),
+    "no text": lambda c: b"\xff\xfe" + c,
+    "no object": lambda c: b"[1, 2]",
+    "nothing": lambda c: b"",
+    "endless nesting": lambda c: b"[" * 200_000,
+    "an endless number": lambda c: c.replace(b"12.1", b"9" * 5000, 1),
+    "too large": lambda c: b" " * (LARGEST + 1),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_or_edited_file_is_refused(written: bytes, name: str) -> None:
+    content = DAMAGES[name](written)
+    assert content != written
+    with pytest.raises(CertificateError, match="certificate"):
+        Certificate.from_bytes(content)
+
+
+FORGERIES: dict[str, tuple[Edit, str]] = {
+    "another format": (lambda d: d.update(format="proof"), "format"),
+    "a later version": (lambda d: d.update(version=2), "version 2"),
+    "an unknown claim": (lambda d: claims_of(d, "stability")[0].update(kind="magic"), "magic"),
+    "no claim": (lambda d: d["subjects"][0].update(claims=[]), "no claim"),
+    "a missing part": (lambda d: d["subjects"][0].pop("reaching"), "complete"),
+    "another shape": (
+        lambda d: d["subjects"][0]["surface"].update(alpha_u=[[1.0, 2.0]]), "shape"
+    ),
+    "a kind of verdict": (
+        lambda d: claims_of(d, "stability")[0]["verdict"].update(kind="certain"), "certain"
+    ),
+    "a negative layer": (lambda d: d["subjects"][0]["reaching"].update(layer=[-1.0]), "layer"),
+    "a huge exponent": (
+        lambda d: claims_of(d, "surface region")[0]["data"]["function"].update(
+            exponents=[[200, 0, 0]] * 6
+        ),
+        "24",
+    ),
+    "an ellipsoid of another size": (
+        lambda d: claims_of(d, "terminal ellipsoid")[0]["data"].update(W=[[1.0]]), "shape"
+    ),
+    "numbers beyond all floats": (
+        lambda d: claims_of(d, "surface region")[0]["data"]["function"].update(
+            stretch=[np.eye(3).tolist()], pole=1e308
+        ),
+        "OverflowError",
+    ),
+    "a fraction over 0": (
+        lambda d: d["subjects"][0].update(
+            surface={k: [[float(getattr(CASES[3], k))]] for k in SURFACE.__dataclass_fields__},
+            claims=[{
+                "kind": "appendix interval",
+                "data": {"P": ["1/0", "1", "1", "1", "1"], "half_width": "1/2"},
+                "verdict": d["subjects"][0]["claims"][0]["verdict"],
+            }],
+        ),
+        "ZeroDivisionError",
+    ),
+    "an unknown coordinate": (
+        lambda d: claims_of(d, "nonsingular")[0]["data"].update(region={"psi": [-1, 1]}), "psi"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_file_that_was_signed_again_but_means_nothing_is_refused(
+    written: bytes, name: str
+) -> None:
+    edit, words = FORGERIES[name]
+    with pytest.raises(CertificateError, match=words):
+        verify(Certificate.from_bytes(edited(written, edit)), RIG)
+
+
+def only(kind: str) -> Edit:
+    def keep(document: dict[str, Any]) -> None:
+        document["subjects"][0]["claims"] = claims_of(document, kind)
+
+    return keep
+
+
+def verdict_after(content: bytes, kind: str, edit: Edit) -> Verdict:
+    """The verdict on the first claim of a kind, after a change and with a fresh checksum."""
+
+    def both(document: dict[str, Any]) -> None:
+        only(kind)(document)
+        edit(document)
+
+    return verify(Certificate.from_bytes(edited(content, both)), RIG)[0].verdict
+
+
+def test_untrue_claims_meet_the_proof(written: bytes) -> None:
+    """A forger may sign what he likes; each trap fails as it should."""
+
+    def data(document: dict[str, Any]) -> dict[str, Any]:
+        found: dict[str, Any] = document["subjects"][0]["claims"][0]["data"]
+        return found
+
+    # A K that is too small for the stated disturbance.
+    weak = verdict_after(written, "reaching", lambda d: data(d).update(disturbance=[0.12, 0.0]))
+    assert weak.kind == "refuted"
+    # A box that holds a singular position.
+    wide = verdict_after(
+        written, "nonsingular", lambda d: data(d).update(region={"phi": [-1.1, 1.1]})
+    )
+    assert wide.kind == "refuted"
+    assert abs(wide.witness["phi"]) > 1.0
+
+    # A repeated zero eigenvalue, and an unstable surface.
+    def other(value: float) -> Edit:
+        return lambda d: d["subjects"][0]["surface"].update(lambda_a=[[value]])
+
+    for value in (0.0, 1.59):
+        assert verdict_after(written, "stability", other(value)).kind == "refuted"
+    # A terminal ellipsoid half as large again; a margin that is overstated.
+    larger = verdict_after(
+        written, "terminal ellipsoid", lambda d: data(d).update(radius=1.5 * data(d)["radius"])
+    )
+    assert larger.kind == "undecided"
+
+    def boast(document: dict[str, Any]) -> None:
+        document["subjects"][0]["claims"][0]["verdict"]["margin"] = 50.0
+
+    assert "states a margin of 50" in verdict_after(written, "stability", boast).method
+
+
+def test_untrue_regions_meet_the_proof(written: bytes) -> None:
+    """A level too high, across the singularity, or without bound; a start that is outside."""
+
+    def function(matrix: np.ndarray, level: float, start: float = 0.01) -> Verdict:
+        data = quadratic(matrix, level).to_dict()
+
+        def edit(document: dict[str, Any]) -> None:
+            document["subjects"][0]["claims"][0]["data"] = {
+                "function": data, "start": [start, 0, 0]
+            }  # fmt: skip
+
+        return verdict_after(written, "surface region", edit)
+
+    good = lyapunov_matrix()
+    assert function(good, 0.02).kind == "proved"
+    high = function(good, 20.0)
+    assert high.kind == "refuted"
+    assert high.witness
+    assert function(np.diag([1.0, 1.0, 1.0]), 1.5).kind != "proved"  # beyond arccos ε
+    assert function(np.diag([1.0, 1.0, 0.0]), 0.01).kind == "undecided"
+    assert "start" in function(good, 0.02, start=0.5).method
+
+
+def test_a_region_for_other_plants_alone_is_refused(written: bytes) -> None:
+    """A box of parameters must hold the mechanism's own values, and the claim says it."""
+
+    def claim(low: float, high: float) -> Verdict:
+        def edit(document: dict[str, Any]) -> None:
+            document["subjects"][0]["claims"][0]["data"] = {
+                "function": quadratic(lyapunov_matrix(), 0.01).to_dict(),
+                "start": [0.01, 0, 0],
+                "parameters": {"r_o": [low, high]},
+            }
+
+        return verdict_after(written, "surface region", edit)
+
+    near = claim(0.2149, 0.2151)
+    assert near.kind == "proved"
+    assert "for every r_o in [0.2149, 0.2151]" in near.claim
+    with pytest.raises(CertificateError, match=r"without its 0\.215"):
+        claim(0.3, 0.31)
+
+
+def test_reaching_a_point_is_proved_in_intervals() -> None:
+    V = quadratic(np.diag([4.0, 1.0, 1.0]), 1.0)
+    assert reaches(V, [0.4999, 0.0, 0.0])
+    assert not reaches(V, [0.5001, 0.0, 0.0])
+    assert not reaches(V, [0.1, 0.1])
+    # {V ≤ 1} again beyond a ridge is another component.
+    ridge = LyapunovFunction(np.eye(1), np.array([[2], [4], [6]]), np.array([4.0, -4.4, 1.21]))
+    assert float(ridge([1.35])) < 1 < float(ridge([0.7]))
+    assert not reaches(ridge, [1.35])
+
+
+def test_another_model_is_refused(written: bytes) -> None:
+    """Another mechanism, other equations under the same name, a parameter, an input limit."""
+    certificate = Certificate.from_bytes(written)
+    cart = ut.mechanisms.cart_pendulum()
+    with pytest.raises(CertificateError, match="another mechanism"):
+        verify(certificate, cart)
+    pushed = RIG.disturbed({"phi": sp.Rational(1, 1000) * RIG.x[1]})
+    with pytest.raises(CertificateError, match="equations"):
+        verify(certificate, pushed)
+    heavier = RIG.with_parameters(m=0.13)
+    with pytest.raises(CertificateError, match=r"parameter 'm'.*0\.13.*0\.125"):
+        verify(certificate, heavier, own_parameters=True)
+    with pytest.raises(CertificateError, match="input limits"):
+        verify(certificate, RIG.with_input_limit(10.0))
+    # By name alone the file's parameters count, and the proof is about them.
+    checked = verify(Certificate.from_bytes(edited(written, only("stability"))), heavier)
+    assert checked[0].verdict
+
+
+def test_a_parameter_changed_and_signed_again_meets_the_proof(written: bytes) -> None:
+    """With another length the old numbers are another claim: decided, not believed."""
+
+    def longer(document: dict[str, Any]) -> None:
+        only("stability")(document)
+        document["mechanism"]["parameters"]["l"] = 0.4
+
+    verdict = verify(Certificate.from_bytes(edited(written, longer)), RIG)[0].verdict
+    longer_rig = RIG.with_parameters(l=0.4)
+    slowest = [np.linalg.eigvals(SurfaceMotion(one, SURFACE).jacobian).real.max()
+               for one in (RIG, longer_rig)]  # fmt: skip
+    assert slowest[0] < 0 < slowest[1]
+    assert verdict.kind == "refuted"
+    broken = edited(written, lambda d: d["mechanism"]["parameters"].update(m=-1.0))
+    with pytest.raises(CertificateError, match="parameters of a certificate"):
+        verify(Certificate.from_bytes(broken), RIG)
+
+
+def test_a_verified_certificate_serves_the_gate(written: bytes) -> None:
+    """Its ellipsoid is evidence for its own surface, and only what was proved again counts."""
+    checked = verify(Certificate.from_bytes(edited(written, only("terminal ellipsoid"))), RIG)
+    sets = proved_sets(RIG, checked)
+    assert len(sets) == 1
+    x = 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
+    assert sets[0].contains(x)
+    assert not sets[0].contains(RIG.state(phi=0.3))
+    verdict = assess(ut.ClosedLoop(RIG), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    assert "proved before" in verdict.method
+    doubtful = [replace(item, verdict=Verdict("x", "undecided")) for item in checked]
+    assert proved_sets(RIG, doubtful) == ()
+
+
+def test_proved_sets_are_of_one_mechanism(written: bytes) -> None:
+    """What was proved for other parameters is no evidence, in one step or the other."""
+    heavy = RIG.with_input_limit(14.0)
+    checked = verify(Certificate.from_bytes(edited(written, only("terminal ellipsoid"))), RIG)
+    with pytest.raises(CertificateError, match="other equations, parameters or limits"):
+        proved_sets(heavy, checked)
+    sets, x = proved_sets(RIG, checked), 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
+    verdict = assess(ut.ClosedLoop(heavy), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    assert "proved before" not in verdict.method
+
+
+def test_a_claim_of_a_held_input_is_no_set_of_the_continuous_loop(written: bytes) -> None:
+    terminal = {"scale": (0.01 * np.eye(3)).tolist(), "widths": [0.01]}
+    data = {"coordinate": "phi", "edges": [0.0, 0.1], "terminal": terminal, "step": 1e-3}
+    item = verify(Certificate.from_bytes(edited(written, only("stability"))), RIG)[0]
+    for hold, count in ((0, 1), (1, 0)):
+        claim = StatedClaim("closed loop", data | {"horizon": 1.0, "hold": hold}, item.verdict)
+        assert len(proved_sets(RIG, [replace(item, claim=claim)])) == count
+
+
+def test_starts_at_rest_are_a_set() -> None:
+    starts = ProvedStarts(SURFACE, ut.ReachingLaw(), 1, 0.3)
+    assert starts.contains(RIG.state(phi=-0.3))
+    assert not starts.contains(RIG.state(phi=0.31))
+    assert not starts.contains(RIG.state(phi=0.1, phi_dot=1e-9))
+
+
+def test_only_proofs_become_claims() -> None:
+    claim = StatedClaim("stability", {}, Verdict("x", "sampled", 1.0))
+    with pytest.raises(CertificateError, match="proved"):
+        Certificate.of(RIG, [Subject(SURFACE, ut.ReachingLaw(), (claim,))])
+
+
+def test_unreadable_and_huge_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="certificate"):
+        read_certificate(tmp_path / "nothing.json")
+    huge = tmp_path / "huge.json"
+    with huge.open("wb") as file:
+        file.truncate(LARGEST + 1)
+    with pytest.raises(CertificateError, match="at most"):
+        read_certificate(huge)
+
+
+# -- what is printed -----------------------------------------------------------------------------
+
+LIE = "every start at rest with |phi| ≤ 3.14159 rad converges"
+
+
+def printed(content: bytes, mechanism: ut.Mechanism = RIG) -> str:
+    """What the command line prints of a certificate, on one line."""
+    certificate = Certificate.from_bytes(content)
+    console = Console(width=4000, record=True, file=io.StringIO())
+    console.print(verification_report(certificate, verify(certificate, mechanism)))
+    return " ".join(console.export_text().split())
+
+
+@pytest.mark.parametrize("kind", ["stability", "nonsingular", "reaching", "terminal ellipsoid",
+                                  "surface region"])  # fmt: skip
+def test_a_verdict_says_what_was_decided_whatever_the_file_says(written: bytes, kind: str) -> None:
+    """A stability claim that is worded as one of global convergence is printed as what it is."""
+
+    def reword(document: dict[str, Any]) -> None:
+        only(kind)(document)
+        for claim in document["subjects"][0]["claims"]:
+            claim["verdict"].update(claim=LIE, method=LIE, unit=LIE, witness={LIE: 1.0})
+
+    true = printed(edited(written, only(kind)))
+    lied = printed(edited(written, reword))
+    assert "3.14159" not in lied
+    assert "otherwise" in lied
+    words = {
+        "stability": "motions on the surface near the target",
+        "nonsingular": "the law exists for |phi| ≤ 0.5 rad, the other coordinates at the target",
+        "reaching": "the law overcomes every disturbance on theta: ",
+        "terminal ellipsoid": "its input renewed at every instant",
+        "surface region": "contains phi = 0.01",
+    }
+    assert words[kind] in lied
+    for line in (true, lied):
+        assert "alpha_a = [[-1.0]], lambda_a = [[-1.59]], alpha_u = [[1.96]]" in line
+        assert "eta = 20.0, layer = 0.1, saturation" in line
+        assert "m = 0.125" in line
+
+
+def test_what_is_decided_is_in_the_sentence(written: bytes) -> None:
+    """Another box, load, start or law is another sentence; a proof of one says so."""
+
+    def data(document: dict[str, Any]) -> dict[str, Any]:
+        found: dict[str, Any] = document["subjects"][0]["claims"][0]["data"]
+        return found
+
+    box = verdict_after(
+        written, "nonsingular", lambda d: data(d).update(region={"phi": [-0.1, 0.25]})
+    )
+    assert "phi in [-0.1, 0.25] rad" in box.claim
+    load = verdict_after(written, "reaching", lambda d: data(d).update(disturbance=[0.001, 0.0]))
+    assert "on theta: 0.001 N m at most" in load.claim
+    assert "for |phi| ≤ 0.5 rad, the other coordinates at the target" in load.claim
+    near = verdict_after(written, "surface region", lambda d: data(d).update(start=[1e-3, 0, 0]))
+    assert "contains phi = 0.001" in near.claim
+    assert load.claim.endswith("the inputs not limited")
+    assert near.claim.endswith("the inputs not limited")
+    weak = RIG.with_input_limit(12.345678901)
+    search = search_for(weak, SURFACE, ut.ReachingLaw())
+    assert search is not None
+    found = search.largest()
+    assert found is not None
+    claim = found.decide(weak, SURFACE, ut.ReachingLaw()).claim
+    assert "|voltage| ≤ 12.345678901 V" in claim
+
+
+NAMES: dict[str, Edit] = {
+    "control characters in a name": lambda d: d["mechanism"].update(name="\x1b[2Jrotary_pendulum"),
+    "a line break in a kind": lambda d: claims_of(d, "stability")[0].update(kind="x\n✓ proved"),
+    "a turn of the writing in a parameter": lambda d: d["mechanism"]["parameters"].update(
+        {"m\u202e": 1.0}
+    ),
+    "a carriage return in a remark": lambda d: d["subjects"][0]["remarks"][0].update(claim="a\rb"),
+    "a sentence for a name": lambda d: d["mechanism"].update(name=f"pendulum: {LIE}" * 2),
+    "a sentence for a kind": lambda d: claims_of(d, "stability")[0].update(kind=LIE * 2),
+    "a sentence for a parameter": lambda d: d["mechanism"]["parameters"].update({LIE * 2: 1.0}),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_in_a_file_cannot_smuggle_a_sentence(written: bytes, name: str) -> None:
+    """Refused, and not even the refusal shows it."""
+    with pytest.raises(CertificateError) as refusal:
+        verify(Certificate.from_bytes(edited(written, NAMES[name])), RIG)
+    assert "converges" not in str(refusal.value)
+    assert str(refusal.value).isprintable()
+
+
+def test_markup_in_a_file_is_not_obeyed(written: bytes, tmp_path: Path) -> None:
+    """Names that are short and printable are quoted in the refusal, as they are."""
+    edit = edited(written, lambda d: d["mechanism"].update(name="[green]✓[/green] proved"))
+    with pytest.raises(CertificateError, match=r"'\[green\]"):
+        verify(Certificate.from_bytes(edit), RIG)
+
+
+def test_margins_are_rounded_towards_zero(written: bytes) -> None:
+    """No more is printed than was proved, whatever the last digit."""
+    known = {3.71689: "3.716", 0.99999: "0.9999", 0.5: "0.5", -1.23459: "-1.234"}
+    for value, text in known.items():
+        assert inward(value) == text
+    assert within(0.95 * 0.125, 1.05 * 0.125) == "[0.11875, 0.13125]"
+    assert within(-0.87266462, 0.87266462) == "[-0.872664, 0.872664]"
+    assert within(0.12345678, 0.12345679) == "[0.12345678, 0.12345679]"
+    rng = np.random.default_rng(0)
+    for value in 10.0 ** rng.uniform(-12, 12, 300) * rng.choice([-1.0, 1.0], 300):
+        for digits in (1, 4, 6):
+            shown = float(inward(value, digits))
+            assert abs(shown) <= abs(value)
+            assert abs(value - shown) <= 10.0 ** (1 - digits) * abs(value)
+    proof = verify(Certificate.from_bytes(edited(written, only("stability"))), RIG)[0].verdict
+    shown = float(str(proof).split("margin ")[1].split()[0])
+    assert proof.margin * (1 - 1e-3) <= shown <= proof.margin
+
+
+# -- models that are not what they seem ------------------------------------------------------------
+
+
+def kinked(extra: sp.Expr) -> ut.Mechanism:
+    """The rotary pendulum with a torque on the pendulum that has a kink at the target."""
+    force = RIG.force + sp.Matrix([0, extra])
+    return replace(RIG, name="kinked", force=sp.ImmutableDenseMatrix(force))
+
+
+TILT = RIG.q[1]
+KINKS = {
+    "Abs": -3 * sp.Abs(TILT),
+    "Abs times sign": 3 * sp.Abs(TILT) * sp.sign(TILT),
+    "Max": 3 * sp.Max(TILT, 0),
+    "Max and Min": 3 * sp.Max(0, TILT) + 3 * sp.Min(0, TILT),
+    "Piecewise": 5 * sp.Piecewise((TILT, TILT > 0), (0, True)),
+    "Piecewise the other way": 5 * sp.Piecewise((0, sp.Not(TILT > 0)), (TILT, True)),
+    "Piecewise of three": sp.Piecewise((-TILT, TILT < 0), (0, sp.Eq(TILT, 0)), (TILT, True)),
+    "Heaviside": TILT * sp.Heaviside(TILT),
+    "a root": 5 * sp.sqrt(TILT**2),
+    "a root of a square in disguise": sp.sqrt(TILT**2 + 2 * TILT * RIG.q[0] + RIG.q[0] ** 2),
+    "a root of sines": sp.sqrt(sp.sin(TILT) ** 2 + 0.0 * TILT),
+    "a fourth root": (TILT**4) ** sp.Rational(1, 4),
+    "arccos of cos": sp.acos(sp.cos(TILT)),
+    "a kink in the mass's slope": sp.sin(sp.Abs(RIG.x[3])) * RIG.x[3],
+    "drag, a kink that a factor softens": -0.01 * sp.Abs(RIG.x[3]) * RIG.x[3],
+    "arccot, which jumps at 0": -3 * TILT * sp.acot(TILT),
+    "arctan of cot": TILT * sp.atan(sp.cot(TILT)),
+    "a pole in disguise": TILT * sp.tanh(sp.tan(TILT + sp.pi / 2)),
+    "Abs of sin": sp.Abs(sp.sin(TILT)) + TILT**2,
+}
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_a_model_with_a_kink_is_refused_by_every_claim(name: str) -> None:
+    """SymPy's derivative of |x| at 0 is 0; a proof with it "held" for a pendulum that falls."""
+    model = kinked(KINKS[name])
+    law = ut.ReachingLaw()
+    ellipsoid = TerminalEllipsoid(np.eye(4), np.eye(4), 0.01)
+    loop = LoopClaim("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
+    box = {"phi": (-0.1, 0.1)}
+    for decide in (
+        lambda: hurwitz(model, SURFACE),
+        lambda: nonsingular(model, SURFACE, box),
+        lambda: reaching(model, SURFACE, box),
+        lambda: verify_region(SurfaceMotion(model, SURFACE), quadratic(np.eye(3), 0.01)),
+        lambda: ellipsoid.decide(model, SURFACE, law),
+        lambda: loop.decide(model, SURFACE, law),
+        lambda: certify_surface(model, SURFACE, np.zeros(4), seconds=0.0, predict=False),
+    ):
+        with pytest.raises(ModelError, match="not smooth"):
+            decide()
+
+
+def test_a_certificate_of_a_model_with_a_kink_is_refused(written: bytes) -> None:
+    model = kinked(KINKS["Abs"])
+
+    def forged(document: dict[str, Any]) -> None:
+        document["mechanism"].update(name=model.name, structure=model.structure)
+
+    with pytest.raises(ModelError, match="not smooth"):
+        verify(Certificate.from_bytes(edited(written, forged)), model)
+
+
+def test_a_kink_of_parameters_alone_is_none() -> None:
+    """|m| is a number, and x**2.0 is x²."""
+    mass = RIG.parameters[2].symbol
+    smooth = kinked(0.001 * sp.Abs(mass - 1) * TILT + 0.001 * TILT**3.0)
+    assert hurwitz(smooth, SURFACE)
+
+
+X = sp.Symbol("x", real=True)
+
+
+@pytest.mark.parametrize("shift", [2.0**-13, 2.0**-9])
+def test_an_equilibrium_that_is_off_is_not_rounded_home(shift: float) -> None:
+    """Floats of 53 bits lose the shift beside 2⁵³; in rationals it is there, and nothing proved."""
+    big = float(2.0 ** np.ceil(np.log2(shift * 2.0**53.9)))
+    rest = big * (1 + X) ** 2 - big * X**2 - 2 * big * X - big + shift * sp.cos(X)
+    field = VectorField((X,), (-X + rest,))
+    assert not field.at_rest
+    assert not field.odd
+    V = LyapunovFunction(np.eye(1), np.array([[2]]), np.array([1.0]))
+    assert not verify_region(field, V, max_seconds=5)
+    # Likewise of a mechanism: no claim about the target, which is no equilibrium.
+    off = kinked(rest.xreplace({X: TILT}))
+    assert not hurwitz(off, SURFACE)
+    assert not SurfaceMotion(off, SURFACE).at_rest
+    assert not LoopMotion(off, SURFACE).at_rest
+    assert not LoopMotion(off, SURFACE).odd
+    found = TerminalEllipsoid(np.eye(4), np.eye(4), 1e-3)
+    assert "f_u(0, 0) = 0" in found.decide(off, SURFACE, ut.ReachingLaw()).method
+    # And the same model without it is at rest, exactly.
+    still = VectorField((X,), (-X + rest - shift * sp.cos(X),))
+    assert still.at_rest
+
+
+def test_floats_in_a_model_are_the_numbers_that_they_are() -> None:
+    """The derivative of 0.1 x³ has 3 · 0.1 exactly, not the float beside it."""
+    field = VectorField((X,), (-0.1 * X**3,))
+    assert field.rates[0].atoms(sp.Float) == set()
+    assert sp.diff(field.rates[0], X).subs(X, 1) == -3 * sp.Rational(*(0.1).as_integer_ratio())
+
+
+def test_a_hold_that_is_no_whole_number_is_refused() -> None:
+    """0.9 steps were taken for none."""
+    claim = LoopClaim("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
+    for hold in (0.9, 1.0, "1", True, None):
+        with pytest.raises(InvalidInputError, match="hold"):
+            LoopClaim.from_dict(claim.to_dict() | {"hold": hold})
+    assert LoopClaim.from_dict(claim.to_dict() | {"hold": 2}).hold == 2
+
+
+def test_reaching_names_its_region_and_ends_at_the_singularity() -> None:
+    """Beyond arccos ε = 58° there is no law that could overcome anything."""
+    inside = reaching(RIG, SURFACE, {"phi": (-0.9, 0.9)}, eta=1.0, disturbance=[0.001, 0.0])
+    assert inside.verdict
+    assert "|phi| ≤ 0.9 rad" in inside.verdict.claim
+    across = reaching(RIG, SURFACE, {"phi": (-1.1, 1.1)}, eta=1.0, disturbance=[0.001, 0.0])
+    assert across.verdict.kind == "refuted"
+    assert "exist" in across.verdict.method
+    assert abs(across.verdict.witness["phi"]) > 1.0
+    assert across.scale == 0.0
+    assert [bound.proved for bound in across.largest] == [0.0, 0.0]
+
+
+def test_an_interval_beyond_the_singular_angle_is_refuted_wherever_its_end_is() -> None:
+    """cos 31.2 > ε, but R does not exist on the way there."""
+    case = CASES[3]
+    P, _ = search_rate(case.reduced(Constants.of(RIG)), case.half_width)
+    reduced = case.reduced(Constants.of(RIG))
+    assert two_vertex(reduced, P, case.half_width)
+    for width in (31.2, 6.3, 1.2, 3.2):
+        assert two_vertex(reduced, P, width).kind == "refuted"
+    with pytest.raises(InvalidInputError, match="half-width"):
+        two_vertex(reduced, P, -0.5)
+
+
+# -- independence ------------------------------------------------------------------------------
+
+
+def imports_of(module: str) -> set[str]:
+    """Modules that a module's own text imports, wherever in it."""
+    spec = importlib.util.find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    found = set()
+    for node in ast.walk(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {node.module} | {n for n in names if _is_module(n)}
+    return found
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return name.startswith("undertow") and importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def test_the_verifier_shares_nothing_with_the_searches() -> None:
+    """All that it reaches: no search, no linear program, no semidefinite or other optimiser."""
+    todo, seen = ["undertow.proofs.claims.verify"], set[str]()
+    while todo:
+        module = todo.pop()
+        if module in seen:
+            continue
+        seen.add(module)
+        # Package files that only collect names are not what is used of a package.
+        if module.split(".")[0] == "undertow" and module not in (
+            "undertow", "undertow.proofs", "undertow.models.importers", "undertow.mechanisms"
+        ):  # fmt: skip
+            todo += imports_of(module)
+    ours = {name for name in seen if name.startswith("undertow")}
+    assert "undertow.proofs.region.region" in ours
+    assert not [n for n in ours if "search" in n or "optimis" in n or "linear_program" in n]
+    foreign = seen - ours
+    assert not [n for n in foreign if n.split(".")[0] in ("clarabel", "cvxpy", "cmaes", "casadi")]
+    assert not [n for n in foreign if n.startswith(("scipy.optimize", "scipy.stats"))]
+
+
+# -- the command line --------------------------------------------------------------------------
+
+
+OWN = """
+import undertow as ut
+
+def make():
+    return ut.mechanisms.rotary_pendulum().with_parameters(m={m})
+
+number = 3
+"""
+
+
+def test_certify_and_verify_from_the_command_line(tmp_path: Path) -> None:
+    """0 for proved, 1 for a file that is not, 2 for a wrong request; own mechanisms too."""
+    run = CliRunner(env={"COLUMNS": "140"}).invoke
+    out = tmp_path / "proof"
+    words = ["certify", "rotary_pendulum", "--start", "phi=20deg", "--seconds", "0"]
+    surface = ["--surface", "lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1"]
+    answer = run(app, [*words, *surface, "--out", str(out)])
+    assert answer.exit_code == 0, answer.output
+    assert "disturbance on theta" in answer.output
+    file = out / "certificate.json"
+    answer = run(app, ["verify", str(file)])
+    assert answer.exit_code == 0, answer.output
+    assert "claims proved again" in answer.output
+    assert run(app, ["verify", str(file), "--set", "m=0.125"]).exit_code == 0
+    changed = run(app, ["verify", str(file), "--set", "m=0.126"])
+    assert changed.exit_code == 1
+    assert "0.126" in changed.output
+    assert run(app, ["verify", str(file), "--mechanism", "cart_pendulum"]).exit_code == 1
+    for m, code in ((0.125, 0), (0.126, 1)):
+        (tmp_path / "model.py").write_text(OWN.format(m=m))
+        answer = run(app, ["verify", str(file), "--mechanism", f"{tmp_path}/model.py:make"])
+        assert answer.exit_code == code, answer.output
+    (out / "edited.json").write_bytes(file.read_bytes().replace(b"12.1", b"12.2", 1))
+    damaged = run(app, ["verify", str(out / "edited.json")])
+    assert damaged.exit_code == 1
+    assert "checksum" in damaged.output
+    unstable = ["--surface", "lambda_a=1.59 alpha_u=1.96 lambda_u=12.1"]
+    assert run(app, [*words, *unstable]).exit_code == 1
+    assert run(app, ["certify"]).exit_code == 2
+    assert run(app, ["certify", "rotary_pendulum", "--appendix"]).exit_code == 2
+
+
+BAR = """
+import sympy as sp
+import undertow as ut
+
+x, tilt = ut.Coordinate("x", "m"), ut.Coordinate("tilt")
+v, w, a = x.velocity, tilt.velocity, tilt.symbol
+bar = ut.Mechanism.from_energies(
+    "sprung_bar", [x, tilt], [ut.Input("force", "N", 10.0)],
+    kinetic=1.1 * v**2 / 2 + 0.075 * sp.cos(a) * v * w + 0.0125 * w**2,
+    potential=0.73575 * sp.cos(a) + 0.1 * a**2, start={"tilt": 0.2},
+)
+"""
+
+
+@pytest.mark.slow
+def test_a_mechanism_of_ones_own_is_certified_and_verified(tmp_path: Path) -> None:
+    """Nothing of the library is needed: the file brings the model both times."""
+    run = CliRunner().invoke
+    model, out = tmp_path / "model.py", tmp_path / "proof"
+    model.write_text(BAR)
+    words = ["certify", f"{model}:bar", "--seconds", "0", "--out", str(out)]
+    answer = run(app, words)
+    assert answer.exit_code == 0, answer.output
+    file = str(out / "certificate.json")
+    assert run(app, ["verify", file, "--mechanism", f"{model}:bar"]).exit_code == 0
+    answer = run(app, ["verify", file])
+    assert answer.exit_code == 2
+    assert "--mechanism FILE.py:NAME" in " ".join(answer.output.split())
+    model.write_text(BAR.replace("0.1 * a**2", "0.2 * a**2"))
+    answer = run(app, ["verify", file, "--mechanism", f"{model}:bar"])
+    assert answer.exit_code == 1
+    assert "equations" in answer.output
+
+
+def test_a_claim_that_stands_twice_is_decided_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, surface = ut.mechanisms.rotary_pendulum(), ut.Surface(-1, -1.59, 1.96, 12.1)
+    one = certify_surface(rig, surface, rig.state(phi=0.5), seconds=0.0, predict=False).subject
+    other = replace(one, surface=ut.Surface(-1, -1.6, 1.96, 12.1))
+    decided: list[str] = []
+    decide = StabilityClaim.decide
+
+    def note(*asked: Any, seconds: float) -> Verdict:
+        decided.append(str(asked[2]))
+        return decide(*asked, seconds=seconds)
+
+    monkeypatch.setattr(StabilityClaim, "decide", note)
+    claim = next(c for c in one.claims if c.kind == "stability")
+    subjects = [replace(s, claims=(claim,)) for s in (one, one, other, one)]
+    checked = verify(Certificate.of(rig, subjects, {}), rig)
+    assert len(decided) == 2
+    assert checked[0].verdict == checked[1].verdict == checked[3].verdict != checked[2].verdict
+
+
+def test_own_mechanisms_are_loaded_or_named(tmp_path: Path) -> None:
+    model = tmp_path / "model.py"
+    model.write_text(OWN.format(m=0.2))
+    assert mechanism_from_file(f"{model}:make").parameter_values[2] == 0.2
+    for text in ("model.py", f"{model}:number", f"{model}:absent"):
+        with pytest.raises(InvalidInputError):
+            mechanism_from_file(text)
+    model.write_text("1 / 0")
+    with pytest.raises(ArtefactError, match="ZeroDivisionError"):
+        mechanism_from_file(f"{model}:make")
+
+
+@pytest.mark.parametrize("name", ["cart_pendulum", "overhead_crane", "gantry_crane", "tora"])
+def test_other_mechanisms_get_certificates(name: str) -> None:
+    """Written, read, proved again: stability and a terminal set of the full loop, at least."""
+    rig = ut.mechanisms.LIBRARY[name]()
+    one = certify_surface(
+        rig, ut.first_surface(rig), rig.state(**rig.start), seconds=0.0, predict=False
+    )
+    content = certificate_files(rig, [one])["certificate.json"]
+    checked = verify(Certificate.from_bytes(content), ut.mechanisms.LIBRARY[name]())
+    assert {"stability", "terminal ellipsoid"} <= {item.claim.kind for item in checked}
+    assert all(item.verdict for item in checked)

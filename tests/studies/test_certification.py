@@ -1,0 +1,211 @@
+"""What people see of proofs: tables, pictures, the log of a run's decisions."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow.base import Verdict
+from undertow.cli import app
+from undertow.proofs import LoopClaim, RegionClaim, read_certificate
+from undertow.proofs.claims.appendix import CASES
+from undertow.proofs.gate import Policy, certified_gate
+from undertow.proofs.region.lyapunov import LyapunovFunction
+from undertow.proofs.region.motion import SurfaceMotion
+from undertow.proofs.search.region import ProvedRegion
+from undertow.studies import motion
+from undertow.studies.certification import (
+    appendix_report,
+    certify_appendix,
+    certify_run,
+    figure,
+    region_figure,
+    run_report,
+    subject_report,
+    subjects,
+)
+
+pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+
+RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
+GOOD = ut.Surface(-1, -1.59, 1.96, 12.1)
+GOAL = ut.MinimumTime(horizon=20.0)
+
+
+def text(shown: Any, width: int = 150) -> str:
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(shown)
+    return console.export_text()
+
+
+@pytest.fixture(scope="module")
+def run() -> ut.Run:
+    """A short cascade whose gate asks for evidence."""
+    gate = certified_gate(Policy(("region", "dual")))
+    cascade = ut.Cascade(RIG, GOAL, gate=gate, first=GOOD, cold=ut.Budget(64), warm=ut.Budget(32))
+    return cascade.simulate(phi=0.2)
+
+
+def test_the_log_of_a_run_has_a_verdict_for_each_decision(run: ut.Run) -> None:
+    files = motion.motion_files({}, run.trajectory, run.cost, run.surfaces, run)
+    decisions = json.loads(files["manifest.json"])["decisions"]
+    assert len(decisions) == len(run.updates)
+    for decision, update in zip(decisions, run.updates, strict=True):
+        assert decision["reason"] == update.admission.reason
+        assert decision["verdict"]["kind"] in ("proved", "sampled", "undecided")
+        assert decision["surface"] == update.surface.vector.tolist()
+    assert decisions[-1]["verdict"]["evidence"] in ("region", "dual")
+    start = RIG.state(phi=0.2)
+    shown = text(motion.motion_report(RIG, GOAL, start, run.trajectory, run.surfaces[0], run))
+    assert "evidence" in shown
+    assert "predicted into a proved set" in shown
+
+
+def test_a_run_is_shown_decision_by_decision(run: ut.Run) -> None:
+    shown = text(run_report(run))
+    assert f"{len(run.updates)} decisions" in shown
+    assert "dual, sampled" in shown
+    assert "Lemma 3" in shown
+    bare = replace(run, updates=tuple(
+        replace(u, admission=replace(u.admission, verdict=None)) for u in run.updates
+    ))  # fmt: skip
+    assert "without accepted evidence" in text(run_report(bare))
+
+
+def test_reports_are_readable_on_a_terminal_of_80_columns(run: ut.Run) -> None:
+    """A few lines for each decision and claim: no column is squeezed to a letter a line."""
+    decisions = text(run_report(run), 80).splitlines()
+    assert len(decisions) <= 7 * min(len(run.updates), 13) + 5
+    certified = certify_run(RIG, run)[-1]
+    claims = text(subject_report(RIG, certified), 80).splitlines()
+    count = len(certified.subject.claims) + len(certified.subject.remarks)
+    assert count >= 4
+    assert len(claims) <= 9 * count + 5
+
+
+def test_each_surface_of_a_run_is_certified(run: ut.Run) -> None:
+    certified = certify_run(RIG, run)
+    assert [c.subject.surface for c in certified] == list(dict.fromkeys(run.surfaces))
+    for item in certified:
+        assert {"stability"} <= {claim.kind for claim in item.subject.claims}
+
+
+def test_the_papers_cases_at_once() -> None:
+    cases = certify_appendix(ut.mechanisms.rotary_pendulum())
+    shown = text(appendix_report(cases))
+    assert shown.count("proved,") == 10
+    assert "0.5481 1/s" in shown  # the rate of docs/appendix.md
+
+
+def region() -> ProvedRegion:
+    """A round set, small enough to be one of attraction."""
+    import scipy.linalg
+
+    motion = SurfaceMotion(RIG, GOOD)
+    P = scipy.linalg.solve_continuous_lyapunov(motion.jacobian.T, -np.diag([30.0, 0.3, 3.0]))
+    squares = np.array([[2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0], [0, 1, 1], [0, 0, 2]])
+    values = [P[0, 0], 2 * P[0, 1], 2 * P[0, 2], P[1, 1], 2 * P[1, 2], P[2, 2]]
+    V = LyapunovFunction(np.eye(3), squares, np.array(values) / 0.02)
+    sound = Verdict("a region", "proved")
+    return ProvedRegion(motion, np.eye(3)[0], (V,), sound, 0.02, Verdict("a larger one", "refuted"))
+
+
+def test_a_region_for_every_plant_of_a_box() -> None:
+    """As many functions as hold for all of them; where none does, nothing is claimed."""
+    radius = next(p.value for p in RIG.parameters if p.name == "r_o")
+    box = {"r_o": (0.99 * radius, 1.01 * radius)}
+    asked = subjects._Decisions(RIG, GOOD, ut.ReachingLaw(), np.zeros(4), box)
+    claim, verdict = asked.region_in_box(region())
+    assert isinstance(claim, RegionClaim)
+    assert verdict
+    assert dict(claim.parameters) == box
+    assert "for every r_o in" in verdict.claim
+    wide = {"r_o": (0.01 * radius, 10 * radius)}
+    claim, verdict = replace(asked, uncertain=wide).region_in_box(region())
+    assert claim is None
+    assert not verdict
+
+
+def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The claim of the full loop joins the others; what is sampled is a remark."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.073)
+    kept = read_certificate(Path(__file__).parents[1] / "data" / "loops.json").subjects[3]
+    claim = LoopClaim.from_dict(kept.claims[0].data)
+    reaches: list[float] = []
+
+    def prove(asked: subjects._Decisions, hold: int) -> tuple[LoopClaim, Verdict]:
+        reaches.append(np.degrees(asked.start[1]))
+        return claim, kept.claims[0].verdict
+
+    monkeypatch.setattr(subjects._Decisions, "loop", prove)
+    monkeypatch.setattr(subjects, "CASES", CASES[3:4])
+    (case,) = certify_appendix(rig, loop=True)
+    assert reaches == [pytest.approx(44.62, abs=0.02)]  # docs/certificates.md
+    assert case.subject.claims[-1].kind == "closed loop"
+    assert case.subject.remarks[-1].kind == "sampled"
+    assert "full loop" in text(appendix_report([case]))
+
+
+def test_the_simulated_region_is_the_non_singular_strip() -> None:
+    """Between the singular angles, ±58.0°, all slow motions come home; beyond, none."""
+    angles = np.array([-1.1, -1.0, -0.5, 0.0, 0.5, 1.0, 1.1])
+    y = np.zeros((7, 3))
+    y[:, 0] = angles
+    home = figure.simulated(region(), y)
+    assert home.tolist() == [False, True, True, True, True, True, False]
+
+
+def test_the_picture_names_its_axes_in_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figure, "GRID", 9)
+    drawn = region_figure(region(), "a title")
+    left, right = drawn.axes
+    assert left.get_xlabel() == "φ (°)"
+    assert "°/s" in left.get_ylabel()
+    assert right.get_ylabel().startswith("w = θ")
+    assert len(drawn.legends) == 1
+
+
+def test_unknown_evidence_is_refused() -> None:
+    words = ["simulate", "rotary_pendulum", "--start", "phi=5deg", "--accept", "faith"]
+    answer = CliRunner().invoke(app, words)
+    assert answer.exit_code == 2
+    assert "faith" in answer.output
+
+
+@pytest.mark.slow  # proves and draws
+def test_the_picture_of_a_region_says_where_it_ignores_the_input_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At φ = 50° on the surface the law asks for more than 15 V; near the target for less.
+
+    A small region says nothing with 15 V, and says it with a motor of 0.1 V.
+    """
+    monkeypatch.setattr(figure, "GRID", 9)
+    one = region()
+    motion = one.motion
+    assert isinstance(motion, SurfaceMotion)
+    surface = motion.surface
+    x = motion.mechanism.state(phi=ut.deg(50), theta=0.0)
+    w = (surface.lambda_u / surface.lambda_a).item() * x[1]
+    y = np.array([[x[1], 0.0, w], [0.0, 0.0, 0.0]])
+    x[2] = float((surface.lambda_u * x[1] / -surface.alpha_a).item())
+    law = ut.SlidingModeLaw(motion.mechanism, surface)(0.0, x)
+    assert float(law.s[0]) == pytest.approx(0.0, abs=1e-12)
+    spare = figure.held(motion, y)
+    assert spare[0] == pytest.approx(1 - abs(law.demand[0]) / 15)
+    assert spare[0] < 0
+    assert spare[1] == 1.0
+    assert figure.region_figure(one, "a title").get_suptitle() == "a title"
+    weak = SurfaceMotion(motion.mechanism.with_input_limit(0.1), surface)
+    said = figure.region_figure(replace(one, motion=weak), "a title")
+    assert "input limit ignored" in said.get_suptitle()
+    assert any("0.1 V" in text.get_text() for text in said.legends[0].get_texts())

@@ -1,0 +1,167 @@
+"""Every mechanism reaches its target with no further choice; the documented table is a run's."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from undertow.base import InvalidInputError
+from undertow.cli import app
+from undertow.mechanisms import LIBRARY
+from undertow.studies import survey
+
+DOCS = Path(__file__).parents[2] / "docs"
+NAMES = sorted(LIBRARY)
+#: Reaches the target long before the horizon, so that its cascade is short.
+PROMPT = "pendubot"
+
+
+@cache
+def entry(name: str, bounds: bool = False) -> survey.Entry:
+    return survey.survey([name], bounds=bounds)[0]
+
+
+def documented() -> dict[str, list[str]]:
+    """Rows of the table in the documentation by mechanism."""
+    text = (DOCS / "mechanisms.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\w+) \| \d, \d \|.*$", text, re.MULTILINE)
+    lines = [line for line in text.splitlines() if re.match(r"\| \w+ \| \d, \d \|", line)]
+    return {
+        name: [cell.strip() for cell in line.strip("|").split("|")]
+        for name, line in zip(rows, lines, strict=True)
+    }
+
+
+def check_simulate(name: str) -> None:
+    result = CliRunner().invoke(app, ["simulate", name])
+    assert result.exit_code == 0, result.output
+    assert "reached the target" in result.stdout
+    found = re.search(r"cost +([\d.e-]+)", result.stdout)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(float(documented()[name][5].split()[0]), rel=0.03)
+
+
+@pytest.mark.slow  # kernels of its own
+def test_simulate_with_no_further_choice() -> None:
+    """Claim: ``undertow simulate NAME`` arrives, exits 0, and costs what the page says."""
+    check_simulate(PROMPT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in NAMES if name != PROMPT])
+def test_simulate_every_other_with_no_further_choice(name: str) -> None:
+    """Claim: the same for all others; most of them creep to their target until the horizon."""
+    check_simulate(name)
+
+
+@pytest.mark.parametrize("name", [PROMPT, pytest.param("acrobot", marks=pytest.mark.slow)])
+def test_costs_fall_from_first_surface_to_cascade(name: str) -> None:
+    """Claim: optimising once never costs more than the first surface, the cascade not more yet."""
+    line = entry(name)
+    assert line.cascade <= line.one_time * (1 + 1e-3)
+    assert line.one_time <= line.designed
+    assert math.isfinite(line.time)
+    assert line.radius <= 0.01 + 1e-9
+    assert math.isnan(line.bound)
+
+
+def test_documented_table_is_of_all_mechanisms() -> None:
+    """Claim: docs/mechanisms.md has one row for each mechanism, and each arrives."""
+    rows = documented()
+    assert sorted(rows) == NAMES
+    assert all(float(row[8].split()[0]) <= 60.0 for row in rows.values())
+
+
+def test_documented_median_is_that_of_the_rows() -> None:
+    """Claim: the median gap that the page names follows from its rows, and is under 10 %."""
+    text = (DOCS / "mechanisms.md").read_text(encoding="utf-8")
+    gaps = [float(row[7].split()[0]) for row in documented().values() if "%" in row[7]]
+    assert len(gaps) == len(NAMES)
+    match = re.search(r"Median gap of the cascade to the bound: ([\d.]+) %", text)
+    assert match is not None
+    assert float(match[1]) == pytest.approx(float(np.median(gaps)), abs=0.06)
+    assert float(match[1]) < 10
+    for name, row in documented().items():
+        if "%" in row[7] and float(row[7].split()[0]) > 10:
+            assert f"\n{name}, " in text or f"**{name}**" in text, "each larger gap is explained"
+
+
+def test_bound_is_below_the_cascade() -> None:
+    """Claim: the pendubot's bound is below its cascade, by what the page says; no trial needed."""
+    pytest.importorskip("casadi")
+    line = entry("pendubot", bounds=True)
+    assert 0 < line.bound < line.cascade
+    assert 100 * line.gap == pytest.approx(float(documented()["pendubot"][7].split()[0]), abs=1)
+    assert line.trials == {}
+
+
+@pytest.mark.slow
+def test_large_gaps_are_looked_into() -> None:
+    """Claim: the acrobot's gap is large, and all but vanishes once its reaching law is free."""
+    pytest.importorskip("casadi")
+    line = entry("acrobot", bounds=True)
+    assert line.gap > survey.LARGE
+    assert set(line.trials) == {trial.name for trial in survey.TRIALS}
+    free = next(cost for name, cost in line.trials.items() if name.startswith("reaching law free"))
+    assert abs(line.gap_of(free)) < 0.03
+
+
+def made(name: str = "a", gap: float = 0.05, **more: object) -> survey.Entry:
+    values: dict[str, object] = {
+        "name": name, "n": 2, "m": 1, "start": "x = 1 m", "unit": "N² s", "designed": 3.0,
+        "one_time": 2.0, "cascade": 1.0 + gap, "time": 4.0, "radius": 0.01, "bound": 1.0,
+        "seconds": 0.5, "trials": {},
+    }  # fmt: skip
+    return survey.Entry(**{**values, **more})  # type: ignore[arg-type]
+
+
+def test_table_and_files_say_what_was_found() -> None:
+    """Claim: gap, median and failures appear as such, nowhere NaN."""
+    entries = [
+        made("a", 0.05),
+        made("b", 0.50, trials={survey.TRIALS[0].name: 1.02}),
+        made("c", designed=math.inf, time=math.inf, cascade=math.inf, bound=math.nan),
+        made("d", 0.2),
+    ]
+    assert survey.median_gap(entries) == pytest.approx(0.2)
+    assert math.isnan(survey.median_gap(entries[2:3]))
+    text = survey.markdown(entries)
+    assert "2 of 4" not in text
+    assert "3 of 4 reach the target" in text
+    assert "Median gap of the cascade to the bound: 20.0 %" in text
+    assert "b, 50.0 %: more evaluations (30 000): 2.0 %" in text
+    assert "| not reached |" in text
+    files = survey.files({"seed": 0}, entries)
+    rows = list(csv.DictReader(io.StringIO(files["survey.csv"].decode())))
+    assert [row["mechanism"] for row in rows] == ["a", "b", "c", "d"]
+    assert rows[2]["bound"] == rows[2]["time_s"] == ""
+    assert float(rows[1]["gap"]) == pytest.approx(0.5)
+    assert not re.search(r"nan|inf\b", "".join(f.decode() for f in files.values()))
+
+
+def test_survey_on_the_command_line(tmp_path: Path) -> None:
+    """Claim: one command prints the table and leaves it as files."""
+    words = ["survey", "--only", "pendubot", "--no-bounds", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, words, env={"COLUMNS": "60"})
+    assert result.exit_code == 0, result.output
+    assert re.search(r"^pendubot +\d.*\nq_1 = 5°, q_2 = -5°", result.stdout, re.MULTILINE)
+    shown = result.stdout.partition("1 of 1")[0].splitlines()
+    assert max(map(len, shown)) <= 80
+    assert (tmp_path / "survey.csv").exists()
+    listed = CliRunner().invoke(app, ["mechanisms"], env={"COLUMNS": "60"})
+    assert listed.exit_code == 0
+    assert all(name in listed.stdout for name in NAMES)
+
+
+def test_unknown_names_are_refused_before_any_work() -> None:
+    """Claim: a wrong name ends the survey at once."""
+    with pytest.raises(InvalidInputError, match="'piano'"):
+        survey.survey(["rotary_pendulum", "piano"])

@@ -1,0 +1,207 @@
+"""Trials: the cascade balances realistic rigs, in simulated time, a period behind as in life."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import undertow as ut
+from undertow.base import ArtefactError
+from undertow.estimators import Record
+from undertow.estimators.drive import subtract_disturbance
+from undertow.law import InnerLoop
+from undertow.objective import objective_for
+from undertow.plants import Friction, srv02_rig
+from undertow.runtime.controller_defaults import estimator_for
+from undertow.studies.trials.balance import controllers
+from undertow.studies.trials.report import balance_files, balance_report
+from undertow.studies.trials.robustness import (
+    breaking_point,
+    keep_run,
+    random_bench,
+    run_ledger,
+)
+from undertow.studies.trials.steering import (
+    CascadeSteering,
+    clipped_regulator,
+    predictive,
+    steady,
+)
+from undertow.studies.trials.trial import Outcome, judge, spread, trial, undisturbed
+
+
+@pytest.fixture(scope="module")
+def arm() -> ut.Mechanism:
+    return ut.mechanisms.rotary_pendulum()
+
+
+def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
+    """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
+    x0, goal = arm.state(phi=ut.deg(35)), objective_for(arm, "bench-energy")
+    made = controllers(arm, undisturbed(arm), goal, x0, budget=128)
+    costs = {
+        row: trial(arm, undisturbed(arm), made[row], x0, 8.0, 0, objective=goal).cost
+        for row in ("one-time", "cascade")
+    }
+    assert costs["cascade"] < costs["one-time"] * 1.002
+
+
+def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism) -> None:
+    x0, goal = arm.state(phi=ut.deg(35)), objective_for(arm, "bench-energy")
+    made = controllers(arm, srv02_rig(), goal, x0, budget=128)
+    runs = {
+        row: [trial(arm, srv02_rig(), made[row], x0, 8.0, s, objective=goal) for s in range(3)]
+        for row in ("one-time", "cascade")
+    }
+    assert all(run.balanced for row in runs.values() for run in row)
+    assert spread(runs["cascade"], "cost").mean < spread(runs["one-time"], "cost").mean
+
+
+def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None:
+    x0 = arm.state(phi=0.4)
+    cascade = ut.Cascade(
+        arm, objective_for(arm, "bench-energy"), warm=ut.Budget(64), cold=ut.Budget(256)
+    )
+    start = cascade.start(x0)
+    records = [
+        trial(arm, srv02_rig(), lambda _: CascadeSteering(cascade, start), x0, 1.0, 7).record
+        for _ in range(2)
+    ]
+    assert np.array_equal(records[0].u, records[1].u)
+    assert np.array_equal(records[0].truth, records[1].truth)
+
+
+def test_a_run_is_balanced_only_if_it_stays_so(arm: ut.Mechanism) -> None:
+    t = np.arange(0.0, 4.0, 0.001)
+
+    def outcome(phi: np.ndarray) -> tuple[bool, float]:
+        truth = np.zeros((len(t), 4))
+        truth[:, 1] = phi
+        run = judge(arm, Record(t, truth[:, :2], truth, np.zeros((len(t), 1)), truth))
+        return run.balanced, run.settled
+
+    held, since = outcome(np.where(t < 1.0, 0.5, 0.0))
+    assert held
+    assert since == pytest.approx(1.0)
+    assert not outcome(np.where(t < 3.5, 0.5, 0.0))[0]
+    assert outcome(np.where(t > 3.9, 0.5, 0.0)) == (False, math.inf)
+    assert outcome(np.full(len(t), math.nan)) == (False, math.inf)
+
+
+def test_a_fixed_law_is_that_of_the_formulas(arm: ut.Mechanism, base: ut.Surface) -> None:
+    """At any time, and clipped where it asks for more than there is."""
+    formulas, controller = ut.SlidingModeLaw(arm, base), steady(InnerLoop(arm, base))
+    for t, angle, speed in ((0.0, 0.1, 0.0), (3.0, -0.02, 1.0), (7.0, 0.7, 50.0)):
+        x = arm.state(phi=angle, theta_dot=speed)
+        np.testing.assert_allclose(controller(t, x), formulas(t, x).u, rtol=1e-9)
+    assert abs(formulas(0.0, x).demand[0]) > 15.0 == abs(controller(0.0, x)[0])
+
+
+@pytest.mark.slow
+def test_the_report_prints_what_was_run() -> None:
+    from rich.console import Console
+
+    from undertow.studies.trials.balance import balance
+
+    result = balance(seeds=2, seconds=4.0, budget=64, limits=False)
+    console = Console(record=True, width=100)
+    console.print(balance_report(result))
+    text = console.export_text()
+    assert "of 2" in text
+    assert "φ(0) = 35°" in text
+    files = balance_files(result)
+    assert files["balance.csv"].decode().count("\n") == 1 + 2 * 3 * 2
+
+
+def test_a_breaking_point_is_bracketed_with_the_seed_that_breaks_it() -> None:
+    limits = [0.8, 0.5, 0.9]
+    found = breaking_point(lambda value, seed: value <= limits[seed], 2.0, seeds=3, bisections=12)
+    assert found.survived <= 0.5 < found.broken
+    assert found.broken - found.survived < 1e-3
+    assert found.seed == 1
+    unbroken = breaking_point(lambda value, seed: True, 2.0, seeds=3)
+    assert (unbroken.survived, unbroken.seed) == (2.0, None)
+
+
+def test_random_benches_stay_within_what_is_declared() -> None:
+    bench = srv02_rig()
+    benches = [random_bench(bench, seed) for seed in range(60)]
+    delays = [b.timing.input_delay + b.timing.measurement_delay for b in benches]
+    frictions = [b.friction["theta"].coulomb for b in benches]
+    assert 0.004 < max(delays) <= 0.005
+    assert 0.05 < max(frictions) <= 0.06
+    assert all(b.friction["theta"].F_s >= b.friction["theta"].coulomb for b in benches)
+    assert random_bench(bench, 3) == benches[3]
+    assert all(b.tolerance["m"] == 0.2 for b in benches)
+
+
+def test_a_clipped_regulator_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
+    x0 = arm.state(phi=ut.deg(10))
+    assert trial(arm, undisturbed(arm), clipped_regulator(arm), x0, 6.0, 0).balanced
+
+
+def test_predictive_control_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
+    pytest.importorskip("casadi")
+    make = predictive(arm, objective_for(arm, "bench-energy"))
+    run = trial(arm, undisturbed(arm), make, arm.state(phi=ut.deg(30)), 4.0, 0)
+    assert run.caught
+    assert np.abs(run.record.u).max() <= 15.0
+
+
+def test_a_ledger_goes_on_where_it_ended(tmp_path: Path) -> None:
+    """Kept runs come back, a line cut off by a kill is left out, other settings are refused."""
+    path = tmp_path / "ledger.jsonl"
+    record = Record(*(np.zeros((1, k)) for k in (1, 2, 4, 1, 4)))
+    lost = Outcome(4, False, True, math.inf, math.nan, 1.5, 2.5, record)
+    keep_run(run_ledger(path, {"angle": 0.5}), "cascade", "delay", 0.25, lost)
+    with path.open("a") as file:
+        file.write('["cascade", "delay", 0.5, {"se')
+    again = run_ledger(path, {"angle": 0.5})
+    found = again.known.get(("cascade", "delay", 0.25, 4))
+    assert found is not None
+    assert (found.seed, found.balanced, found.caught, found.effort) == (4, False, True, 1.5)
+    assert found.settled == math.inf
+    assert again.known.get(("cascade", "delay", 0.5, 4)) is None
+    keep_run(again, "cascade", "delay", 0.5, lost)
+    assert run_ledger(path, {"angle": 0.5}).known.get(("cascade", "delay", 0.5, 4)) is not None
+    with pytest.raises(ArtefactError, match="other versions or settings"):
+        run_ledger(path, {"angle": 0.6})
+
+
+def test_the_observed_disturbance_frees_an_arm_that_stiction_holds(arm: ut.Mechanism) -> None:
+    """A soft surface and twice the friction: stuck far from home without, at home with it."""
+    soft = ut.Surface(alpha_a=-1, lambda_a=-0.32, alpha_u=2.5, lambda_u=15)
+    bench = srv02_rig()
+    rough = replace(bench, friction={"theta": Friction(0.06, 0.08), "phi": bench.friction["phi"]})
+    x0 = arm.state(theta=0.5)
+    ends = []
+    for drift in (0.0, None):
+        run = trial(
+            arm, rough, lambda _: steady(InnerLoop(arm, soft)), x0, 10.0, 0,
+            estimator=estimator_for(arm, bench, drift),
+        )  # fmt: skip
+        assert run.caught
+        ends.append(float(np.abs(run.record.truth[-1000:, 0]).max()))
+    assert ends[0] > 0.3
+    assert ends[1] < 0.15
+
+
+@given(
+    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
+    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
+)
+def test_what_is_taken_off_keeps_to_its_share_and_to_the_limits(
+    u: list[float], disturbance: list[float]
+) -> None:
+    limits, out = np.array([2.0, math.inf]), np.zeros(2)
+    subtract_disturbance(np.array(u), np.array(disturbance), limits, out)
+    assert abs(out[0]) <= 2.0
+    free = min(max(u[0] - min(max(disturbance[0], -1.0), 1.0), -2.0), 2.0)
+    assert out[0] == free
+    assert out[1] == u[1] - disturbance[1]
