@@ -318,11 +318,9 @@ class _Computer:
         Background(self._carry, "undertow slow loop")
 
     def _carry(self) -> None:
-        while (request := self.requests.get()) is not None:
-            try:
+        with contextlib.suppress(EOFError, OSError):  # gone, or ended while it is asked
+            while (request := self.requests.get()) is not None:
                 self.answers.append(self.compute(request))
-            except (EOFError, OSError, TypeError):  # gone, or closed while it is asked
-                return
 
     def close(self) -> None:
         """Ask for no more; a thread cannot be ended from outside: it is left behind."""
@@ -345,7 +343,8 @@ class _Child(_Computer):
             theirs.close()
         super().__init__(self._exchange)
         if not self._begun():
-            self.close()
+            self.process.kill()
+            self.pipe.close()
             self.process.join(START_TIMEOUT)
             raise ResourceError(
                 "process 'undertow slow loop'",
@@ -359,6 +358,10 @@ class _Child(_Computer):
             return self.pipe.poll(START_TIMEOUT) and self.pipe.recv() == BEGUN
         return False
 
+    def _carry(self) -> None:
+        with self.pipe:  # closed by the thread that reads it: a descriptor read by one and closed
+            super()._carry()  # by another may by then belong to another file
+
     def _exchange(self, request: Request) -> Answer:
         self.pipe.send(request)
         answer: Answer = self.pipe.recv()
@@ -366,9 +369,7 @@ class _Child(_Computer):
 
     def close(self) -> None:
         """Kill the process, and do not wait for it."""
-        self.process.kill()
-        with contextlib.suppress(OSError):
-            self.pipe.close()
+        self.process.kill()  # which ends what the thread reads
         super().close()
 
 

@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.context import ForkProcess
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from undertow.runtime import (
     Recording,
     Report,
     Runtime,
+    Settings,
     SupervisedRig,
     read_log,
     replay,
@@ -73,6 +74,11 @@ class _Blocking(RigWrapper):
         self.rig.close()
 
 
+def _patient_recipe() -> Recipe:
+    """Return the drill's run for faults that are not about time: a busy host does not end it."""
+    return replace(drill_recipe(), settings=Settings(max_step_interval=1.0))
+
+
 def _children(runtime: Runtime) -> list[int]:
     worker = runtime.worker
     assert isinstance(worker, BackgroundWorker)
@@ -81,7 +87,7 @@ def _children(runtime: Runtime) -> list[int]:
 
 def _hurt_optimiser(number: signal.Signals) -> tuple[Report, OutputMonitor]:
     """Send a signal to the process that optimises, half a second into a run."""
-    recipe = drill_recipe()
+    recipe = _patient_recipe()
     rig = recipe.make_rig()
     monitor = OutputMonitor(rig, *recipe.output_bounds)
     with session(recipe, rig=monitor, processes=2) as runtime:
@@ -345,7 +351,7 @@ def _no_memory() -> Happened:
         return ("left out: needs /proc", True)
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "facts.json"
-        child = fork(_starved, (drill_recipe(), record), "undertow starved", daemon=False)
+        child = fork(_starved, (_patient_recipe(), record), "undertow starved", daemon=False)
         child.join(120.0)
         code = child.exitcode
         child.kill()
