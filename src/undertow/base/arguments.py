@@ -7,6 +7,7 @@ All public functions use them: :func:`checked` reads the annotations of a functi
 from __future__ import annotations
 
 import contextlib
+import math
 import inspect
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -153,6 +154,8 @@ def positive(
     InvalidInputError
         With the value and the limit.
     """
+    if isinstance(value, float) and 0.0 < value < math.inf:
+        return  # the usual case, in loops
     numbers = np.asarray(value, dtype=np.float64)
     good = (numbers >= 0 if zero else numbers > 0) & (infinite | np.isfinite(numbers))
     if not good.all():

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import scipy.linalg
 
 from undertow.base import InvalidInputError
 from undertow.cascade.cascade import Admission, cost_gate, gate_words
@@ -42,12 +41,14 @@ def feedback(law: InnerLoop) -> FloatArray:
 @lru_cache(maxsize=32)
 def _sampled(mechanism: Mechanism, period: float) -> tuple[FloatArray, FloatArray]:
     """Return the linear model at the target with its input held for a period."""
+    from scipy.linalg import expm  # slow to import
+
     lin = linearise(mechanism)
     A, B = lin.A, lin.input
     size = A.shape[0] + B.shape[1]
     whole = np.zeros((size, size))
     whole[: len(A)] = np.hstack([A, B])
-    held = scipy.linalg.expm(whole * period)
+    held = expm(whole * period)
     return held[: len(A), : len(A)], held[: len(A), len(A) :]
 
 

@@ -80,10 +80,12 @@ class RolloutBuffers:
         self, states: FloatArray, surfaces: FloatArray, laws: FloatArray | None = None
     ) -> RolloutBuffers:
         """Take states (…, 2n), surfaces (…, S, 2mn) and laws (…, S, 2m), by default the loop's."""
-        lanes, count, layout = self.lanes, self.count, self.layout
-        lanes[:count, :, layout.surface] = surfaces
-        lanes[:count, :, layout.reaching] = self.loop.numbers.law if laws is None else laws
-        lanes[:count, :, layout.size - 1] = gamma_determinant(self.loop.numbers.coupling, surfaces)
+        lanes, count, numbers = self.lanes, self.count, self.loop.numbers
+        *_, eta, _ = self.layout.starts
+        last = self.layout.size - 1
+        lanes[:count, :, :eta] = surfaces
+        lanes[:count, :, eta:last] = numbers.law if laws is None else laws
+        lanes[:count, :, last] = gamma_determinant(numbers.coupling, surfaces)
         self.states[:count] = states
         if self.padded > count:
             lanes[count:] = lanes[count - 1]

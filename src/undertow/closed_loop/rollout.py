@@ -285,7 +285,8 @@ class ClosedLoop:
         radius = self.objective.terminal_radius if terminal is None else terminal
         # Large steps see no closest approach, and leave nothing to record.
         large = self.takes_large_steps and not every and not seek
-        part, calm_from, where = buffers, 0 if large else steps, np.arange(buffers.count)
+        part, calm_from = buffers, 0 if large else steps
+        where: NDArray[np.intp] | slice = slice(buffers.count)
         while True:
             live, out = part.live, part.out
             live.fill(1.0)
@@ -313,13 +314,15 @@ class ClosedLoop:
                 taken = buffers.out[where, -1]
                 buffers.out[where] = out[: part.count]
                 buffers.out[where, -1] += taken
+            if not goes_on:
+                return buffers.batch(start)
             again = np.flatnonzero(out[: part.count, 2] == GIVEN_BACK)
-            if not (goes_on and len(again)):
+            if not len(again):
                 return buffers.batch(start)
             # Too fast for large steps, or at a limit again: small steps until later.
             failed = round((float(out[again, 1].max()) - start) / self.step)
             calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
-            part, where = part.part(again), where[again]
+            part, where = part.part(again), np.arange(buffers.count)[where][again]
 
     def _linearised(self, buffers: RolloutBuffers) -> Prepared | None:
         """Linearise the last surface of every lane."""
@@ -531,6 +534,8 @@ class ClosedLoop:
 
     def _steps(self, duration: float) -> int:
         """Return the number of steps of a rollout, refusing what memory or patience forbid."""
+        if 1.0 <= duration / self.step <= MOST_STEPS:
+            return round(duration / self.step)
         self._check_duration(duration)
         steps = round(duration / self.step)
         if steps > MOST_STEPS or (steps < 1 and duration > 0):

@@ -19,7 +19,6 @@ from functools import cached_property
 from typing import get_args
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, check_fields, checked, floats, one_of, positive
@@ -197,9 +196,11 @@ class Belief:
         the estimate's covariance, kept within the tolerances: every axis is as often high as low,
         and so is every pair of axes.
         """
+        from scipy.linalg import hadamard  # slow to import
+
         size = len(estimate.offset)
         variances, axes = np.linalg.eigh(np.linalg.inv(estimate.information))
-        design = scipy.linalg.hadamard(1 << size.bit_length())[:, 1 : size + 1]
+        design = hadamard(1 << size.bit_length())[:, 1 : size + 1]
         corners = self.confidence * (design * np.sqrt(variances + LEAST**2)) @ axes.T
         offsets = np.vstack([estimate.offset, np.clip(estimate.offset + corners, -1.0, 1.0)])
         return Ensemble(self.mechanism, self.values(offsets), self.risk)

@@ -341,8 +341,10 @@ def coupling(mechanism: Mechanism, q: ArrayLike) -> FloatArray:
 def gamma_determinant(X: FloatArray, surfaces: FloatArray) -> FloatArray:
     """Return det(α_a − α_u X) for surface vectors, (…, 2mn); leading shapes broadcast."""
     free, m = X.shape[-2:]
-    blocks = LawLayout(m + free, m).blocks(surfaces)
-    gamma = blocks.alpha_a - blocks.alpha_u @ X
+    _, lambda_a, alpha_u, lambda_u, *_ = LawLayout(m + free, m).starts
+    lead = surfaces.shape[:-1]  # searches ask this often: no more views than needed
+    gamma = surfaces[..., :lambda_a].reshape(*lead, m, m)
+    gamma = gamma - surfaces[..., alpha_u:lambda_u].reshape(*lead, m, free) @ X
     return np.asarray(gamma[..., 0, 0] if m == 1 else np.linalg.det(gamma))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal, NamedTuple, Protocol, Self, get_args
 
 import numpy as np
@@ -58,8 +59,7 @@ class LawLayout(NamedTuple):
     @property
     def starts(self) -> tuple[int, int, int, int, int, int]:
         """Where α_a, λ_a, α_u, λ_u, η and ε begin: what compiled code is given."""
-        m, mn = self.m, self.m * self.n
-        return 0, m * m, 2 * m * m, m * m + mn, 2 * mn, 2 * mn + m
+        return _starts(self.n, self.m)
 
     @property
     def surface(self) -> slice:
@@ -100,6 +100,11 @@ class LawLayout(NamedTuple):
     def matrices(self, entries: Sequence[sp.Expr]) -> SurfaceBlocks:
         """Return the blocks of the 2mn entries of a surface as SymPy's matrices."""
         return SurfaceBlocks(*(sp.Matrix(b) for b in self.blocks(np.array(entries, dtype=object))))
+
+
+@cache
+def _starts(n: int, m: int) -> tuple[int, int, int, int, int, int]:
+    return 0, m * m, 2 * m * m, m * m + m * n, 2 * m * n, 2 * m * n + m
 
 
 @dataclass(frozen=True, eq=False)

@@ -373,7 +373,7 @@ class Mechanism:
         """Input symbols."""
         return tuple(i.symbol for i in self.inputs)
 
-    @property
+    @cached_property
     def state_names(self) -> tuple[str, ...]:
         """Names of the states, in the order of x."""
         return tuple(str(s) for s in self.x)

@@ -147,23 +147,25 @@ class Optimisation:
         cap = math.inf
         if known:
             cap = (NEARLY if seek else hopeless) * self.best_cost + self.resolution
+        stable = None
         # The rollouts of a loop with a linear model tell by themselves what is unstable.
-        stable: slice | NDArray[np.bool_] = slice(None)
         if loop.linear_end is None:
-            stable = stability_margin(loop.mechanism, vectors[:, -1]) > 0
-        scores, guide = np.full(len(z), UNSTABLE), np.full(len(z), UNSTABLE)
-        if len(scores[stable]):
+            stable = np.flatnonzero(stability_margin(loop.mechanism, vectors[:, -1]) > 0)
+            vectors, gains = vectors[stable], None if gains is None else gains[stable]
+        scores = guide = np.empty(0)
+        if len(vectors):
             batch = loop.roll_out(
-                self._filled(vectors[stable], None if gains is None else gains[stable]),
-                optimiser.freedom.times, self.horizon, cap=cap, stable_only=True, seek=seek,
+                self._filled(vectors, gains), optimiser.freedom.times, self.horizon,
+                cap=cap, stable_only=True, seek=seek,
             )  # fmt: skip
-            guided = batch.score(self.horizon)
-            scores[stable] = guided
+            scores = batch.score(self.horizon)
+            guide = scores.copy()
             _guide(
                 batch.event, batch.cost, batch.radius, batch.closest, batch.closest_time,
-                loop.objective.terminal_radius, self.best_cost, seek, guided,
+                loop.objective.terminal_radius, self.best_cost, seek, guide,
             )  # fmt: skip
-            guide[stable] = guided
+        if stable is not None:
+            scores, guide = _among(len(z), stable, scores), _among(len(z), stable, guide)
         if incumbent is not None:
             self._adopt(incumbent, z[0].copy(), float(scores[0]))
         best = int(np.argmin(scores))
@@ -447,6 +449,13 @@ class Optimisation:
             "" if found else message,
             "" if found else remedy,
         )
+
+
+def _among(count: int, stable: NDArray[np.intp], scores: FloatArray) -> FloatArray:
+    """Return the scores of the stable ones among all."""
+    every = np.full(count, UNSTABLE)
+    every[stable] = scores
+    return every
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

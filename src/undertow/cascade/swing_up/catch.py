@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.linalg
 
 from undertow.base import InvalidInputError, UndertowError
 from undertow.cascade.swing_up.law import SwingUp, periods
@@ -32,13 +31,13 @@ def unclipped(mechanism: Mechanism) -> tuple[FloatArray, float, FloatArray]:
 
     With R = 1/u_max² and u = k x, |k x| ≤ u_max on xᵀPx ≤ 1/(u_max² BᵀPB).
     """
+    from scipy.linalg import solve_continuous_are  # slow to import
+
     lin = linearise(mechanism)
     n, m = mechanism.n, mechanism.m
     limit = mechanism.inputs[0].limit
     Q = np.diag([0.1] * m + [1.0] * (n - m) + [0.01] * n)
-    P = np.asarray(
-        scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, np.eye(m) / limit**2), np.float64
-    )
+    P = np.asarray(solve_continuous_are(lin.A, lin.input, Q, np.eye(m) / limit**2), np.float64)
     k = -(limit**2) * (lin.input.T @ P)[0]
     return P, float(1.0 / (limit**2 * (lin.input.T @ P @ lin.input)[0, 0])), k
 
