@@ -6,8 +6,8 @@ FOLDER is another checkout (``git worktree add FOLDER COMMIT``).  Each build wor
 its own, on one thread, with a cache of its own; they are asked in turn, in changing order, round
 after round.  A ratio is this build's seconds over the other's in one round; printed are its
 geometric mean and the 95 % interval of it.  Both must give the same costs, bit for bit, or the row
-says so.  Every fourth part of the rounds has a pair of new processes: where the system puts a process's
-memory moves its times by several per cent.
+says so.  Every fourth part of the rounds has a pair of new processes: where the system puts a
+process's memory moves its times by several per cent.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from operator import methodcaller
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +131,10 @@ class Build:
             return time.perf_counter() - began, ""
 
 
+#: What is timed: seconds and result of one run.
+Run = Callable[[Build], tuple[float, str]]
+
+
 def interval(ours: list[float], theirs: list[float]) -> tuple[float, float, float]:
     """Return geometric mean and 95 % interval of the paired ratios."""
     logs = np.log(np.asarray(ours) / np.asarray(theirs))
@@ -139,7 +145,11 @@ def interval(ours: list[float], theirs: list[float]) -> tuple[float, float, floa
 
 def main() -> int:
     """Compare two builds; exit status 1 when their results differ."""
-    parser = command_line(__doc__, "../before", clocks=False)
+    parser = command_line(__doc__, clocks=False)
+    parser.epilog = (
+        "example:\n  git worktree add ../before HEAD~5\n"
+        "  python benchmarks/builds.py ../before --rounds 60"
+    )
     parser.add_argument("other", type=Path, metavar="FOLDER", help="the other checkout")
     parser.add_argument("--rounds", type=int, default=60, help="of the quick jobs; starts: a tenth")
     asked = parser.parse_args()
@@ -150,11 +160,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         new = Build(HERE, Path(folder) / "new")
         old = Build(asked.other.resolve(), Path(folder) / "old")
-        plans = [(name, rounds, lambda b, job=job: b.ask(job)) for name, job in JOBS.items()]
-        plans += [
-            ("import", rounds // 2, lambda b: b.start(IMPORT, empty=False)),
-            ("start, second", rounds // 2, lambda b: b.start(START, empty=False)),
-            ("start, empty cache", max(3, rounds // 6), lambda b: b.start(START, empty=True)),
+        plans: list[tuple[str, int, Run]] = [
+            *((name, rounds, methodcaller("ask", job)) for name, job in JOBS.items()),
+            ("import", rounds // 2, methodcaller("start", IMPORT, empty=False)),
+            ("start, second", rounds // 2, methodcaller("start", START, empty=False)),
+            ("start, empty cache", max(3, rounds // 6), methodcaller("start", START, empty=True)),
         ]
         seconds: dict[str, dict[Build, list[float]]] = {}
         results: dict[str, dict[Build, str]] = {}

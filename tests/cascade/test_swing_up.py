@@ -19,7 +19,7 @@ from undertow.cascade.swing_up import (
     designed,
     hanging,
 )
-from undertow.cascade.swing_up.search import KEPT, _judged, _Swings, as_kept, found_for, search
+from undertow.cascade.swing_up.search import KEPT, _judged, _Swings, designs_for, kept_text, search
 from undertow.plants import Bench, Push, RealisticRig, srv02_rig
 from undertow.proofs import terminal_sets
 from undertow.proofs.claims.terminal_ellipsoid import ProvedEllipsoid
@@ -160,8 +160,8 @@ def test_gains_that_are_kept_are_those_of_the_library(name: str) -> None:
     kept = json.loads(KEPT.read_text(encoding="utf-8"))
     entry = kept[mechanism.fingerprint]
     assert entry["mechanism"] == name
-    found = found_for(mechanism)
-    assert json.loads(as_kept({mechanism: found})) == {mechanism.fingerprint: entry}
+    found = designs_for(mechanism)
+    assert json.loads(kept_text({mechanism: found})) == {mechanism.fingerprint: entry}
     assert designed(mechanism).gains == tuple(one.gains for one in found)
     assert mechanism.with_parameters(g=9.7).fingerprint not in kept
 
@@ -172,13 +172,13 @@ def test_what_is_kept_swings_up_whatever_is_a_little_different(name: str) -> Non
     """Swings of another seed, which the search had not seen, say of its gains what it did."""
     mechanism = getattr(ut.mechanisms, name)()
     swings = _Swings(mechanism, 17)
-    for one in found_for(mechanism):
+    for one in designs_for(mechanism):
         again = _judged(np.array(astuple(one.gains)), swings(np.array(astuple(one.gains)), 0, 256))
         spread = math.sqrt(one.arrives * (1 - one.arrives) * (1 / 128 + 1 / 256))
         assert abs(again.arrives - one.arrives) < 4 * spread + 0.02
     # Rounding: starts that differ in the last bits alone are other swings, and no worse on
     # the average.
-    best = np.array(astuple(found_for(mechanism)[0].gains))
+    best = np.array(astuple(designs_for(mechanism)[0].gains))
     before = swings(best, 0, 256)
     swings._starts = [x + 1e-15 for x in swings._starts]
     after = swings(best, 0, 256)

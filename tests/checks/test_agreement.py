@@ -39,7 +39,7 @@ from undertow.checks.agreement import (
     worst,
 )
 from undertow.checks.exact import ExactModel, Number, evaluate
-from undertow.closed_loop import etd, kernel
+from undertow.closed_loop import exponential_integrator, kernel
 from undertow.law import inner_loop
 from undertow.mechanisms import LIBRARY
 from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram
@@ -368,14 +368,14 @@ def test_what_is_wrong_in_the_large_steps_is_found(
 ) -> None:
     """Claim: cost and arrival beside SciPy's show each of these; the kernel's step does not."""
     part, right, wrong = MUTANTS[mutant]
-    write = getattr(etd, part)
+    write = getattr(exponential_integrator, part)
 
     def mutated(*args: Any) -> list[str]:
         lines = "\n".join(write(*args))
         assert right in lines
         return lines.replace(right, wrong, 1).splitlines()
 
-    monkeypatch.setattr(etd, part, mutated)
+    monkeypatch.setattr(exponential_integrator, part, mutated)
     kernel.compile_loop.cache_clear()
     try:
         subject = Subject(ut.mechanisms.rotary_pendulum(), count=1)

@@ -13,8 +13,8 @@ import undertow as ut
 from undertow.cascade.cascade import TAIL_RTOL
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT
-from undertow.closed_loop.rows import LANES
-from undertow.closed_loop.terminal_model import Prepared
+from undertow.closed_loop.linear_model import Prepared
+from undertow.closed_loop.work_array import LANES
 from undertow.models import FloatArray
 
 #: A cart that may overshoot by little.

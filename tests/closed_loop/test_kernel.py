@@ -28,7 +28,7 @@ from support import (
 )
 from undertow.closed_loop.kernel import build_loop_graph
 from undertow.closed_loop.kernel_source import kernel_source
-from undertow.closed_loop.rows import LANES
+from undertow.closed_loop.work_array import LANES
 from undertow.law import Switching
 from undertow.models import TIME, FloatArray
 from undertow.symbolic import store

@@ -13,8 +13,8 @@ import scipy.linalg
 import undertow as ut
 from undertow.cascade.cascade import TAIL_RTOL
 from undertow.closed_loop import ClosedLoop
-from undertow.closed_loop.rows import LANES
-from undertow.closed_loop.terminal_model import Prepared, TerminalLinearModel
+from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
+from undertow.closed_loop.work_array import LANES
 from undertow.law import sliding_matrix
 from undertow.models import FloatArray
 

@@ -16,7 +16,7 @@ from undertow.estimators import (
     KalmanFilter,
     Measured,
     SuperTwisting,
-    drive,
+    run_recorded,
 )
 from undertow.law import InnerLoop
 from undertow.plants import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
@@ -69,7 +69,7 @@ def test_the_kalman_filter_finds_the_state_of_its_own_model(arm: ut.Mechanism) -
     rig = IdealRig(arm, [0.1, 3.0, 0.5, -0.5])
     kalman = KalmanFilter(arm, position_noise=1e-6, acceleration_noise=1e-3)
     kalman.reset([0.1, 3.0, 0.0, 0.0])
-    record = drive(rig, kalman, lambda t, x: np.array([3.0 * math.sin(5 * t)]), 1.0)
+    record = run_recorded(rig, kalman, lambda t, x: np.array([3.0 * math.sin(5 * t)]), 1.0)
     assert np.abs(record.x - record.truth)[200:].max() < 1e-7
 
 
@@ -102,7 +102,7 @@ def test_a_matched_disturbance_is_found(arm: ut.Mechanism) -> None:
     rig = RealisticRig(Bench(truth), [0.0, math.pi, 0.0, 0.0])
     kalman = KalmanFilter(arm, disturbance_drift=5.0)
     kalman.reset([0.0, math.pi, 0.0, 0.0])
-    drive(rig, kalman, lambda t, x: np.zeros(1), 2.0)
+    run_recorded(rig, kalman, lambda t, x: np.zeros(1), 2.0)
     assert kalman.disturbance[0] == pytest.approx(0.7, abs=0.05)
 
 
@@ -121,7 +121,7 @@ def test_the_observer_lowers_the_gain_that_is_needed(arm: ut.Mechanism, base: ut
         def control(t: float, x: np.ndarray) -> np.ndarray:
             return np.clip(law(x) - observe * kalman.disturbance, -15.0, 15.0)
 
-        record = drive(RealisticRig(bench, x0), kalman, control, 3.0)
+        record = run_recorded(RealisticRig(bench, x0), kalman, control, 3.0)
         return float(np.abs(base.s(record.truth[-500:])).max())
 
     assert offset(5.0, True) < 0.5 * offset(20.0, False)
@@ -136,7 +136,7 @@ def test_a_known_delay_is_predicted_over(arm: ut.Mechanism) -> None:
         rig = RealisticRig(Bench(arm, timing=late), [0.0, 3.0, 0.0, 1.0])
         kalman = KalmanFilter(arm, position_noise=1e-5, delay=delay)
         kalman.reset([0.0, 3.0, 0.0, 1.0])
-        record = drive(rig, kalman, lambda t, x: np.array([4.0 * math.sin(9 * t)]), 1.0)
+        record = run_recorded(rig, kalman, lambda t, x: np.array([4.0 * math.sin(9 * t)]), 1.0)
         errors[delay] = np.abs(record.x[500:-3] - record.truth[503:]).max()
     assert errors[0.005] < 0.05 * errors[0.0]
 
@@ -165,7 +165,8 @@ def test_on_the_realistic_rig_the_model_is_worth_having(arm: ut.Mechanism) -> No
     ):
         estimator.reset(x0)
         law = InnerLoop(arm, ut.first_surface(arm))
-        record = drive(RealisticRig(srv02_rig(), x0, 1), estimator, lambda t, x: law(x), 4.0)  # noqa: B023
+        rig = RealisticRig(srv02_rig(), x0, 1)
+        record = run_recorded(rig, estimator, lambda t, x: law(x), 4.0)  # noqa: B023
         assert abs(record.truth[-1, 1]) < 0.02
         errors[name] = np.sqrt(np.mean((record.x - record.truth)[500:, 2:] ** 2))
     assert errors["kalman"] < 0.7 * min(errors["derivative"], errors["twisting"])
@@ -173,7 +174,7 @@ def test_on_the_realistic_rig_the_model_is_worth_having(arm: ut.Mechanism) -> No
 
 def test_measured_velocities_need_no_estimator(arm: ut.Mechanism) -> None:
     rig = IdealRig(arm)
-    record = drive(rig, Measured(arm), lambda t, x: np.zeros(1), 0.1)
+    record = run_recorded(rig, Measured(arm), lambda t, x: np.zeros(1), 0.1)
     np.testing.assert_array_equal(record.x, record.truth)
     with pytest.raises(InvalidInputError, match="positions only"):
         Measured(arm).estimate(Measurement(0.0, np.zeros(2)), np.zeros(1))

@@ -27,11 +27,11 @@ from undertow.studies.certification import (
     appendix_report,
     certify_appendix,
     certify_run,
+    decide,
     figure,
     region_figure,
     run_report,
     subject_report,
-    subjects,
 )
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
@@ -123,7 +123,7 @@ def test_a_region_for_every_plant_of_a_box() -> None:
     """As many functions as hold for all of them; where none does, nothing is claimed."""
     radius = next(p.value for p in RIG.parameters if p.name == "r_o")
     box = {"r_o": (0.99 * radius, 1.01 * radius)}
-    asked = subjects._Decisions(RIG, GOOD, ut.ReachingLaw(), np.zeros(4), box)
+    asked = decide._Decisions(RIG, GOOD, ut.ReachingLaw(), np.zeros(4), box)
     claim, verdict = asked.region_in_box(region())
     assert isinstance(claim, RegionClaim)
     assert verdict
@@ -142,12 +142,12 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
     claim = LoopClaim.from_dict(kept.claims[0].data)
     reaches: list[float] = []
 
-    def prove(asked: subjects._Decisions, hold: int) -> tuple[LoopClaim, Verdict]:
+    def prove(asked: decide._Decisions, hold: int) -> tuple[LoopClaim, Verdict]:
         reaches.append(np.degrees(asked.start[1]))
         return claim, kept.claims[0].verdict
 
-    monkeypatch.setattr(subjects._Decisions, "loop", prove)
-    monkeypatch.setattr(subjects, "CASES", CASES[3:4])
+    monkeypatch.setattr(decide._Decisions, "loop", prove)
+    monkeypatch.setattr(decide, "CASES", CASES[3:4])
     (case,) = certify_appendix(rig, loop=True)
     assert reaches == [pytest.approx(44.62, abs=0.02)]  # docs/certificates.md
     assert case.subject.claims[-1].kind == "closed loop"

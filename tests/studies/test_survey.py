@@ -109,7 +109,7 @@ def test_large_gaps_are_looked_into() -> None:
     pytest.importorskip("casadi")
     line = entry("acrobot", bounds=True)
     assert line.gap > survey.LARGE
-    assert set(line.trials) == {trial.name for trial in survey.TRIALS}
+    assert set(line.trials) == {trial.name for trial in survey.ABLATIONS}
     free = next(cost for name, cost in line.trials.items() if name.startswith("reaching law free"))
     assert abs(line.gap_of(free)) < 0.03
 
@@ -127,7 +127,7 @@ def test_table_and_files_say_what_was_found() -> None:
     """Claim: gap, median and failures appear as such, nowhere NaN."""
     entries = [
         made("a", 0.05),
-        made("b", 0.50, trials={survey.TRIALS[0].name: 1.02}),
+        made("b", 0.50, trials={survey.ABLATIONS[0].name: 1.02}),
         made("c", designed=math.inf, time=math.inf, cascade=math.inf, bound=math.nan),
         made("d", 0.2),
     ]

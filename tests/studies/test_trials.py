@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import undertow as ut
 from undertow.base import ArtefactError
 from undertow.estimators import Record
-from undertow.estimators.drive import subtract_disturbance
+from undertow.estimators.recorded_run import subtract_disturbance
 from undertow.law import InnerLoop
 from undertow.objective import objective_for
 from undertow.plants import Friction, srv02_rig

@@ -7,8 +7,8 @@ All public functions use them: :func:`checked` reads the annotations of a functi
 from __future__ import annotations
 
 import contextlib
-import math
 import inspect
+import math
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cache, wraps

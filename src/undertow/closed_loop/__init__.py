@@ -1,15 +1,15 @@
 """Mechanism and law integrated: the kernel, many runs at once, and what one run was.
 
 :mod:`.kernel` compiles what :mod:`.kernel_source` writes: small Runge-Kutta steps, and the large
-ones of :mod:`.etd`, with the linear model of :mod:`.terminal_model`.
+ones of :mod:`.exponential_integrator`, with the linear model of :mod:`.linear_model`.
 """
 
 from undertow.closed_loop.buffers import RolloutBuffers
 from undertow.closed_loop.ensemble import Ensemble, Risk
 from undertow.closed_loop.kernel import compile_loop
 from undertow.closed_loop.rollout import ClosedLoop
-from undertow.closed_loop.rows import LANES
 from undertow.closed_loop.trajectory import INADMISSIBLE, UNSTABLE, Event, Trajectory
+from undertow.closed_loop.work_array import LANES
 
 __all__ = [
     "INADMISSIBLE",

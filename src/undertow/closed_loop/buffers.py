@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.closed_loop.rows import LANES
-from undertow.closed_loop.terminal_model import NOBODY, Prepared
+from undertow.closed_loop.linear_model import NOBODY, Prepared
 from undertow.closed_loop.trajectory import Batch
+from undertow.closed_loop.work_array import LANES
 from undertow.law import LawLayout, gamma_determinant
 from undertow.models import FloatArray
 

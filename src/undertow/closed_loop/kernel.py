@@ -8,7 +8,7 @@ from typing import Any
 import sympy as sp
 
 from undertow.closed_loop.kernel_source import kernel_source
-from undertow.closed_loop.rows import LANES, LoopGraph
+from undertow.closed_loop.work_array import LANES, LoopGraph
 from undertow.law import LawSymbols, Switching, build_law_graph
 from undertow.models import TIME, Mechanism
 from undertow.objective import Objective

@@ -16,9 +16,9 @@ from collections.abc import Iterable, Sequence
 
 import sympy as sp
 
-from undertow.closed_loop import etd
-from undertow.closed_loop.rows import LANES, LoopGraph, Rows, code, entrance, total
+from undertow.closed_loop import exponential_integrator
 from undertow.closed_loop.trajectory import Event
+from undertow.closed_loop.work_array import LANES, LoopGraph, WorkArray, code, entrance, total
 from undertow.symbolic import Emitter, distinct, docstring
 
 #: Whether a lane may hand over is looked at in these intervals, s.
@@ -35,7 +35,7 @@ class _Writer:
         self.time = self.emit.text(program.time)
         self.limits = [self.emit.text(limit) for limit in program.limits]
         self.of_call, self.of_lane = _hoist(program)
-        self.rows = Rows(program, self.of_lane)
+        self.rows = WorkArray(program, self.of_lane)
         self.constant = {*self.of_call, *self.of_lane}
         self.rates = [*program.derivative, program.stage]
         self.monitored = [*program.s, program.singular]
@@ -201,7 +201,7 @@ class _Writer:
     def watch(self) -> list[str]:
         """Keep the smallest margins; stop a lane whose margin is negative.
 
-        Rows are read before they are chosen between: a choice between two elements of ``W``
+        WorkArray are read before they are chosen between: a choice between two elements of ``W``
         would be compiled as a choice between two addresses, and the loop not as vectors.
         """
         r = self.rows
@@ -229,7 +229,7 @@ class _Writer:
     def hand_over(self) -> list[str]:
         """Stop a lane (code ``HANDED_OVER``) that is well inside its boundary layer and its limits.
 
-        The rest is left to :mod:`undertow.closed_loop.etd`.
+        The rest is left to :mod:`undertow.closed_loop.exponential_integrator`.
         """
         r, m, boxes = self.rows, len(self.rows.u), self.program.boxes
         eta = 2 * m * len(r.x) // 2
@@ -246,7 +246,7 @@ class _Writer:
                 for row, low, (_, spare) in zip(r.path, r.low, boxes, strict=bool(boxes))
             ),
             f"code, active = {r.code}, {r.active}",
-            f"{r.code} = {etd.HANDED_OVER} if calm else code",
+            f"{r.code} = {exponential_integrator.HANDED_OVER} if calm else code",
             f"{r.active} = 0.0 if calm else active",
         ]
 
@@ -405,7 +405,7 @@ def rollout(
 
 
 def _etd_integrate(w: _Writer) -> str:
-    """Return the function that ends rollouts in large steps, see :mod:`.etd`."""
+    """Return the function that ends rollouts in large steps, see :mod:`.exponential_integrator`."""
     return f"""
 
 @numba.njit(
@@ -422,20 +422,20 @@ def etd_integrate(
     for b in range(0, out.shape[0], {LANES}):
         block = b // {LANES}
 {_lanes(w.load_surface(), 2)}
-{_lanes(etd.begin(w.rows), 2)}
-        for step in range({etd.MOST}):
+{_lanes(exponential_integrator.begin(w.rows), 2)}
+        for step in range({exponential_integrator.MOST}):
             alive = 0.0
             for i in range({LANES}):
                 alive += {w.rows.active}
             if alive == 0.0:
                 break
-{textwrap.indent(etd.choose_step(w.rows), " " * 12)}\
+{textwrap.indent(exponential_integrator.choose_step(w.rows), " " * 12)}\
             for half in range(2):
 {_lanes(w.rates_at_stage(), 4)}
                 if half == 0:
-{_lanes(etd.first_half(w.rows, w.limits), 5)}
-{_lanes(etd.second_half(w.rows), 3)}
-{_lanes(etd.finish(w.rows), 2)}
+{_lanes(exponential_integrator.first_half(w.rows, w.limits), 5)}
+{_lanes(exponential_integrator.second_half(w.rows), 3)}
+{_lanes(exponential_integrator.finish(w.rows), 2)}
 """
 
 

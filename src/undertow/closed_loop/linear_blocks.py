@@ -9,7 +9,7 @@ matrices is written out for the given N, so that its innermost loop runs over th
 
 from __future__ import annotations
 
-from undertow.closed_loop.rows import LANES
+from undertow.closed_loop.work_array import LANES
 
 #: Time of the first stored power e^{At}, s; level k stands for 2ᵏ units.
 UNIT = 0.005

@@ -5,7 +5,7 @@ that moves) are separate arguments everywhere; by default they are the same.
 
 Rollouts are read from buffers and written there (:mod:`undertow.closed_loop.buffers`).  They go in
 small Runge-Kutta steps until the law is in its boundary layer and then, where the loop has a
-linear model, in large ones (:mod:`undertow.closed_loop.etd`).
+linear model, in large ones (:mod:`undertow.closed_loop.exponential_integrator`).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from numpy.typing import ArrayLike, NDArray
 from undertow.base import InvalidInputError, at_least, check_fields, checked, floats, positive
 from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
 from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
-from undertow.closed_loop.etd import GIVEN_BACK
+from undertow.closed_loop.exponential_integrator import GIVEN_BACK
 from undertow.closed_loop.kernel import compile_loop
-from undertow.closed_loop.rows import LANES
-from undertow.closed_loop.terminal_model import Prepared, TerminalLinearModel
+from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory
+from undertow.closed_loop.work_array import LANES
 from undertow.law import (
     LawLayout,
     Plan,
@@ -85,9 +85,9 @@ class ClosedLoop:
     escape
         ‖x‖₂ beyond which a motion counts as diverged.
     tail_rtol
-        Relative tolerance of the large steps that a batch takes once the law is in its
-        boundary layer, see :mod:`undertow.closed_loop.etd`; 0: small steps to the end.  Used by
-        :meth:`batch` where belief and truth agree, the loop is continuous, all path
+        Relative tolerance of the large steps that a batch takes once the law is in its boundary
+        layer, see :mod:`undertow.closed_loop.exponential_integrator`; 0: small steps to the end.
+        Used by :meth:`batch` where belief and truth agree, the loop is continuous, all path
         constraints are bounds of states and the stage cost has a second-order model.
     ensemble
         Plausible plants instead of one: every plan is rolled out on all of them, and a batch has

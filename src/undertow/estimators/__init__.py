@@ -1,9 +1,9 @@
 """Estimators: states from measured positions, parameters from motions."""
 
 from undertow.estimators.belief import Belief, ParameterEstimate
-from undertow.estimators.drive import Record, StateFeedback, compensated, drive
 from undertow.estimators.interface import Estimator, FilteredDerivative, Measured, SuperTwisting
 from undertow.estimators.kalman import KalmanFilter
+from undertow.estimators.recorded_run import Record, StateFeedback, compensated, run_recorded
 
 __all__ = [
     "Belief",
@@ -16,5 +16,5 @@ __all__ = [
     "StateFeedback",
     "SuperTwisting",
     "compensated",
-    "drive",
+    "run_recorded",
 ]

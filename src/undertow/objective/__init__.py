@@ -1,5 +1,6 @@
 """What is best: cost, horizon, terminal set and constraints; and the word for each problem."""
 
+from undertow.objective.named import Goal, finite_limits, objective_for
 from undertow.objective.objective import (
     TRAVEL,
     Constraint,
@@ -9,7 +10,6 @@ from undertow.objective.objective import (
     check_travel,
     state_box,
 )
-from undertow.objective.words import Goal, finite_limits, objective_for
 
 __all__ = [
     "TRAVEL",

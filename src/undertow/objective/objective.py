@@ -42,7 +42,8 @@ from undertow.symbolic import compile_expressions
 #: knows of, before the end stop.
 TRAVEL = 0.95
 
-#: Part of a bound on a state that large steps keep clear of, see :mod:`undertow.closed_loop.etd`.
+#: Part of a bound on a state that large steps keep clear of, see
+#: :mod:`undertow.closed_loop.exponential_integrator`.
 SPARE = 0.05
 
 

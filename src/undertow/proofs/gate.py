@@ -365,7 +365,7 @@ def certified_gate(
         The gate that comes first: stable, feasible, cost not raised (Lemma 3).
     tail
         Relative tolerance of the large steps in which the base gate's predictions end (see
-        :mod:`undertow.closed_loop.etd`); 0: small steps to the terminal set.
+        :mod:`undertow.closed_loop.exponential_integrator`); 0: small steps to the terminal set.
 
     Returns
     -------

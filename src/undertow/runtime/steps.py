@@ -148,7 +148,7 @@ def step_module(mechanism: Mechanism, switching: Switching) -> Any:
         header = docstring(f"Fast step of {mechanism.name}; generated, do not edit. {key[:16]}")
         parts = (
             f"from {law.__name__} import step as law\n"
-            "from undertow.estimators.drive import subtract_disturbance\n"
+            "from undertow.estimators.recorded_run import subtract_disturbance\n"
             "from undertow.runtime.modes import transition\n"
             "from undertow.runtime.steps import limit_output, relative_error, accept_estimate\n"
             f"\np, n, m = {len(mechanism.parameters)}, {mechanism.n}, {mechanism.m}\n"

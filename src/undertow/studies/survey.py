@@ -3,7 +3,7 @@
 Nothing is chosen by hand: designed surface, optimisation and cascade are those of
 ``undertow simulate NAME``, from the mechanism's listed start.  The bound is a local optimum of
 the same task over *all* inputs, see :mod:`undertow.bounds`; the gap is what the cascade spends
-beyond it.  Where the gap is large, :data:`TRIALS` look for its cause: each removes one
+beyond it.  Where the gap is large, :data:`ABLATIONS` look for its cause: each removes one
 restriction, and the table shows what is left of the gap without it.
 """
 
@@ -49,7 +49,7 @@ PER_CYCLE = 12
 
 
 @dataclass(frozen=True)
-class Trial:
+class Ablation:
     """One restriction taken away from the one-time optimum.
 
     Parameters
@@ -68,10 +68,10 @@ class Trial:
 
 
 #: Tried in this order where the gap is large.
-TRIALS = (
-    Trial("more evaluations (30 000)", DecisionVariables(), Budget(30_000)),
-    Trial("reaching law free (10 000)", DecisionVariables(reaching=True), Budget(10_000)),
-    Trial("both (40 000)", DecisionVariables(reaching=True), Budget(40_000)),
+ABLATIONS = (
+    Ablation("more evaluations (30 000)", DecisionVariables(), Budget(30_000)),
+    Ablation("reaching law free (10 000)", DecisionVariables(reaching=True), Budget(10_000)),
+    Ablation("both (40 000)", DecisionVariables(reaching=True), Budget(40_000)),
 )
 
 
@@ -243,7 +243,7 @@ def _trials(
     mechanism: Mechanism, objective: Objective, x0: FloatArray, seed: int
 ) -> dict[str, float]:
     costs = {}
-    for trial in TRIALS:
+    for trial in ABLATIONS:
         cascade = Cascade(mechanism, objective, freedom=trial.freedom, cold=trial.budget, seed=seed)
         proposal = cascade.optimiser.propose(x0)
         costs[trial.name] = math.inf
@@ -337,7 +337,7 @@ def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, 
     """Return ``survey.csv``, ``survey.md`` and ``manifest.json``."""
     header = (
         "mechanism", "n", "m", "start", "unit", "designed", "one_time", "cascade", "bound",
-        "gap", "time_s", "radius", "seconds", *(trial.name for trial in TRIALS),
+        "gap", "time_s", "radius", "seconds", *(trial.name for trial in ABLATIONS),
     )  # fmt: skip
     rows = [
         (
@@ -345,7 +345,7 @@ def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, 
             *map(finite, (e.designed, e.one_time, e.cascade, e.bound, e.gap)),
             *map(finite, (e.time, e.radius)),
             round(e.seconds, 2),
-            *(finite(e.trials.get(trial.name, math.nan)) for trial in TRIALS),
+            *(finite(e.trials.get(trial.name, math.nan)) for trial in ABLATIONS),
         )
         for e in entries
     ]  # fmt: skip

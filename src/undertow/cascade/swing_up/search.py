@@ -38,7 +38,7 @@ from undertow.symbolic import (
     remember,
 )
 
-#: Gains of mechanisms of the library, as the search found them: see :func:`as_kept`.
+#: Gains of mechanisms of the library, as the search found them: see :func:`kept_text`.
 KEPT = Path(__file__).with_name("gains.json")
 
 #: A swing may take so long, s, before other gains are tried; its law is held for so long, s.
@@ -149,7 +149,7 @@ def _module(mechanism: Mechanism) -> Any:
 
 
 @dataclass(frozen=True)
-class Found:
+class RatedGains:
     """Gains and what swings that the search had not seen said of them.
 
     Attributes
@@ -224,7 +224,7 @@ def _merit(ends: FloatArray) -> float:
     return float(np.where(np.isfinite(times), times / SECONDS - 1.0, missed).mean())
 
 
-def _judged(row: FloatArray, ends: FloatArray) -> Found:
+def _judged(row: FloatArray, ends: FloatArray) -> RatedGains:
     """Return gains with the time that swings which are tried again and again take.
 
     A swing is given up after ``SECONDS``: E[min(t, SECONDS)]/P(t ≤ SECONDS).
@@ -233,14 +233,14 @@ def _judged(row: FloatArray, ends: FloatArray) -> Found:
     part = float(np.isfinite(times).mean())
     spent = float(np.minimum(times, SECONDS).mean())
     expected = spent / part if part else math.inf
-    return Found(Gains(*(float(v) for v in row)), part, expected)
+    return RatedGains(Gains(*(float(v) for v in row)), part, expected)
 
 
 def search(
     mechanism: Mechanism,
     seed: int = 0,
     progress: Callable[[float], None] = lambda _: None,
-) -> tuple[Found, ...]:
+) -> tuple[RatedGains, ...]:
     """Search for gains that swing a mechanism up, whatever is a little different.
 
     Random gains are tried on a few swings, the best of them on more, and the best of those
@@ -257,7 +257,7 @@ def search(
 
     Returns
     -------
-    tuple of Found
+    tuple of RatedGains
         The best first; empty where nothing arrives.
 
     Raises
@@ -289,13 +289,13 @@ def search(
     return tuple(one for one in found if one.arrives and one.expected <= WORSE * found[0].expected)
 
 
-def found_for(
+def designs_for(
     mechanism: Mechanism,
     *,
     seed: int = 0,
     fresh: bool = False,
     progress: Callable[[float], None] = lambda _: None,
-) -> tuple[Found, ...]:
+) -> tuple[RatedGains, ...]:
     """Return what :func:`search` finds, from what is kept where it was found before.
 
     Parameters
@@ -341,12 +341,12 @@ def designed(
     fresh: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> SwingUp:
-    """Return the swing-up with the gains that :func:`found_for` returns: see there."""
-    found = found_for(mechanism, seed=seed, fresh=fresh, progress=progress)
+    """Return the swing-up with the gains that :func:`designs_for` returns: see there."""
+    found = designs_for(mechanism, seed=seed, fresh=fresh, progress=progress)
     return SwingUp(mechanism, tuple(one.gains for one in found))
 
 
-def as_kept(found: Mapping[Mechanism, Sequence[Found]]) -> str:
+def kept_text(found: Mapping[Mechanism, Sequence[RatedGains]]) -> str:
     """Return the text of the file ``KEPT`` for what the search found, seed 0."""
     rows = {
         mechanism.fingerprint: {
@@ -358,12 +358,12 @@ def as_kept(found: Mapping[Mechanism, Sequence[Found]]) -> str:
     return json.dumps(rows, indent=1) + "\n"
 
 
-def _read(rows: Sequence[dict[str, Any]]) -> tuple[Found, ...]:
-    return tuple(Found(**{**row, "gains": Gains(**row["gains"])}) for row in rows)
+def _read(rows: Sequence[dict[str, Any]]) -> tuple[RatedGains, ...]:
+    return tuple(RatedGains(**{**row, "gains": Gains(**row["gains"])}) for row in rows)
 
 
 @lru_cache(maxsize=1)
-def _kept() -> dict[str, tuple[Found, ...]]:
+def _kept() -> dict[str, tuple[RatedGains, ...]]:
     """What the library keeps, by the fingerprint of the mechanism."""
     kept = json.loads(KEPT.read_text(encoding="utf-8"))
     return {fingerprint: _read(entry["found"]) for fingerprint, entry in kept.items()}

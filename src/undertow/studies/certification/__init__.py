@@ -1,6 +1,13 @@
 """What `undertow certify` and `undertow verify` do: claims composed, shown, drawn, written."""
 
+from undertow.studies.certification.decide import (
+    Certified,
+    certify_appendix,
+    certify_run,
+    certify_surface,
+)
 from undertow.studies.certification.figure import region_figure
+from undertow.studies.certification.interface import Verification, certify, verify
 from undertow.studies.certification.loop_figure import loop_figure
 from undertow.studies.certification.report import (
     appendix_report,
@@ -9,13 +16,6 @@ from undertow.studies.certification.report import (
     subject_report,
     verification_report,
 )
-from undertow.studies.certification.subjects import (
-    Certified,
-    certify_appendix,
-    certify_run,
-    certify_surface,
-)
-from undertow.studies.certification.verbs import Verification, certify, verify
 
 __all__ = [
     "Certified",

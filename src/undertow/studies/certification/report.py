@@ -15,7 +15,7 @@ from undertow.base import artefacts as results
 from undertow.cascade import Run
 from undertow.models import Mechanism
 from undertow.proofs import Certificate, Checked, Subject
-from undertow.studies.certification.subjects import Certified
+from undertow.studies.certification.decide import Certified
 
 __all__ = [
     "appendix_report",

@@ -11,7 +11,7 @@ from rich.console import RenderableType
 
 from undertow.base import Progress, as_text
 from undertow.cascade.swing_up import SwingUp
-from undertow.cascade.swing_up.search import KEPT, as_kept
+from undertow.cascade.swing_up.search import KEPT, kept_text
 from undertow.studies.rigs.bring_up import coverage, coverage_table
 from undertow.studies.trials import balance, estimation, library, report, robustness, upright
 
@@ -83,7 +83,7 @@ class Campaign:
     def swing_up(self, progress: Progress) -> None:
         """Swing up from hanging at rest, and balance."""
         searched = upright.searched(upright.SWINGING, self.fresh, progress)
-        self._files[KEPT.name] = as_kept(searched).encode()
+        self._files[KEPT.name] = kept_text(searched).encode()
         for i, (mechanism, found) in enumerate(searched.items()):
             progress(mechanism.name, i / len(searched))
             swing = SwingUp(mechanism, tuple(one.gains for one in found))

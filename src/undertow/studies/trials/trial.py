@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.closed_loop import Event, Trajectory
-from undertow.estimators import Estimator, Record, StateFeedback, compensated, drive
+from undertow.estimators import Estimator, Record, StateFeedback, compensated, run_recorded
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.plants import Bench, RealisticRig
@@ -106,7 +106,7 @@ def trial(
     estimator = estimator_for(belief, bench) if estimator is None else estimator
     estimator.reset(seen)
     controller = compensated(make(seen), estimator, belief.input_limits, compensates)
-    record = drive(rig, estimator, controller, seconds)
+    record = run_recorded(rig, estimator, controller, seconds)
     return judge(belief, record, seed, objective)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from undertow.base import Progress, no_progress
 from undertow.cascade import Cascade
 from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
-from undertow.cascade.swing_up.search import Found, found_for
-from undertow.estimators import StateFeedback, compensated, drive
+from undertow.cascade.swing_up.search import RatedGains, designs_for
+from undertow.estimators import StateFeedback, compensated, run_recorded
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.optimiser import Budget
@@ -37,7 +37,7 @@ def bench_of(mechanism: Mechanism) -> Bench:
 
 def searched(
     names: Sequence[str], fresh: int | None = None, progress: Progress = no_progress
-) -> dict[Mechanism, tuple[Found, ...]]:
+) -> dict[Mechanism, tuple[RatedGains, ...]]:
     """Return the swing-up gains of mechanisms of the library, kept or searched for.
 
     Parameters
@@ -52,7 +52,7 @@ def searched(
     found = {}
     for mechanism in all_of(names):
         what = f"gains of {mechanism.name}"
-        found[mechanism] = found_for(
+        found[mechanism] = designs_for(
             mechanism, seed=fresh or 0, fresh=fresh is not None, progress=partial(progress, what)
         )
     return found
@@ -167,7 +167,7 @@ def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 2
     steering = CascadeSteering(cascade, cascade.start(x0))
     kalman.reset(x0)
     controller = compensated(steering, kalman, mechanism.input_limits)
-    record = drive(rig, kalman, controller, seconds)
+    record = run_recorded(rig, kalman, controller, seconds)
     return EngineResult(mechanism, judge(mechanism, record, 0, objective), steering.admitted)
 
 

@@ -64,7 +64,9 @@ class Record:
         return Record(*(column[-1:] for column in (self.t, self.q, self.x, self.u, self.truth)))
 
 
-def drive(rig: Rig, estimator: Estimator, controller: StateFeedback, seconds: float) -> Record:
+def run_recorded(
+    rig: Rig, estimator: Estimator, controller: StateFeedback, seconds: float
+) -> Record:
     """Run a controller on a rig for some time, as fast as it goes.
 
     Parameters

@@ -6,7 +6,8 @@ the stage cost is Φ₀ + xᵀQx to second order.  With AᵀP + PA = −Q,
     ∫ xᵀQx dt from x to x_f  =  xᵀPx − x_fᵀPx_f.
 
 A rollout that has come into its boundary layer goes on from there in large steps that take A
-and P exactly, and what they leave over by quadrature: :mod:`undertow.closed_loop.etd`.
+and P exactly, and what they leave over by quadrature:
+:mod:`undertow.closed_loop.exponential_integrator`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from undertow.closed_loop.ensemble import Ensemble
 from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT, linear_source
-from undertow.closed_loop.rows import LANES
+from undertow.closed_loop.work_array import LANES
 from undertow.law import LawLayout
 from undertow.models import FloatArray, Mechanism, is_smooth, linear_numbers, linearise, numbers
 from undertow.objective import Objective
@@ -100,7 +101,7 @@ class Prepared(NamedTuple):
     ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
     ``P`` (C, 2n, 2n); ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and ``forced`` responses,
     see :mod:`.linear_blocks`; ``reach`` of bounded states (C/16, STEP_SIZES, w·2n·16), see
-    :mod:`.etd`.
+    :mod:`.exponential_integrator`.
     """
 
     A: FloatArray

@@ -45,7 +45,7 @@ class LoopGraph:
     boxes: tuple[tuple[int, float], ...] = ()
 
 
-class Rows:
+class WorkArray:
     """The rows of the flat work array, by name; a row holds one value per lane.
 
     Every attribute is the text of an element, ``W[offset + i]``, or a list of them.

@@ -29,8 +29,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT
-from undertow.closed_loop.rows import LANES, Rows, code, entrance, total
 from undertow.closed_loop.trajectory import Event
+from undertow.closed_loop.work_array import LANES, WorkArray, code, entrance, total
 
 #: Codes of a lane that waits for its large steps, and of one that cannot be done in this way.
 HANDED_OVER, GIVEN_BACK = -1.0, -2.0
@@ -42,7 +42,7 @@ MOST = 4000
 CORRECTION = 0.2
 
 
-def _level(r: Rows, x: Sequence[str]) -> list[str]:
+def _level(r: WorkArray, x: Sequence[str]) -> list[str]:
     """V = xᵀPx and p = P x."""
     size = len(x)
     return [
@@ -54,7 +54,7 @@ def _level(r: Rows, x: Sequence[str]) -> list[str]:
     ]
 
 
-def begin(r: Rows) -> list[str]:
+def begin(r: WorkArray) -> list[str]:
     """Lanes that handed over begin with the smallest step; their costs include V."""
     size = len(r.x)
     columns = {r.cost: "0", r.end: "1", r.code: "2", r.radius: "3", r.steps: "-1"}
@@ -87,7 +87,7 @@ def begin(r: Rows) -> list[str]:
     ]
 
 
-def choose_step(r: Rows) -> str:
+def choose_step(r: WorkArray) -> str:
     """Fetch what a step of another length needs, for the lanes that change theirs.
 
     Not a loop of vectors: which lanes change, and to which power, is different for each.
@@ -120,13 +120,13 @@ for lane in range({LANES}):
 """
 
 
-def _bend(r: Rows) -> str:
+def _bend(r: WorkArray) -> str:
     """Φ + V̇, or Φ alone where the cost has no quadratic part, from p = P x and the rates."""
     slope = total(f"p_{j} * {row}" for j, row in enumerate(r.slope))
     return f"{r.cost_slope} + 2.0 * counted * ({slope})"
 
 
-def _rest(r: Rows, j: int, x: str) -> str:
+def _rest(r: WorkArray, j: int, x: str) -> str:
     """The part of the j-th acceleration at a state x_0, x_1, … that A leaves over."""
     n = len(r.linear)
     return (
@@ -134,7 +134,7 @@ def _rest(r: Rows, j: int, x: str) -> str:
     )
 
 
-def _clear(r: Rows) -> list[str]:
+def _clear(r: WorkArray) -> list[str]:
     """Whether all bounds are out of this step's reach: ``clear``; of one four times: ``wide``."""
     half = range(len(r.linear))
     lines = [f"rate_{j} = abs(x_{j + len(half)})" for j in half]
@@ -152,7 +152,7 @@ def _clear(r: Rows) -> list[str]:
     ]
 
 
-def first_half(r: Rows, limits: Sequence[str]) -> list[str]:
+def first_half(r: WorkArray, limits: Sequence[str]) -> list[str]:
     """From the rates at x to the state a; ``limits`` are the names of the inputs' limits."""
     size, half = len(r.x), range(len(r.linear))
     return [
@@ -180,7 +180,7 @@ def first_half(r: Rows, limits: Sequence[str]) -> list[str]:
     ]
 
 
-def second_half(r: Rows) -> list[str]:
+def second_half(r: WorkArray) -> list[str]:
     """From the rates at a to the end of the step, where it is taken; and the next step."""
     size, half = len(r.x), range(len(r.linear))
     bounds, clear, wide = (_clear(r), " & clear", " & wide") if r.boxes else ([], "", "")
@@ -241,7 +241,7 @@ def second_half(r: Rows) -> list[str]:
     ]
 
 
-def finish(r: Rows) -> list[str]:
+def finish(r: WorkArray) -> list[str]:
     """Take V out of the costs again; lanes that are not done cannot be done in this way."""
     size = len(r.x)
     columns = {r.end: "1", r.radius: "3", r.steps: "-1"}

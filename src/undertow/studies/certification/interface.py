@@ -15,7 +15,7 @@ from undertow.models import Mechanism
 from undertow.proofs import Certificate, read_certificate
 from undertow.proofs.claims.verify import Checked
 from undertow.proofs.claims.verify import verify as decide
-from undertow.studies.certification.subjects import Progress, certify_surface
+from undertow.studies.certification.decide import Progress, certify_surface
 
 __all__ = ["Verification", "certify", "verify"]
 
