@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
-#: Those that take ``--clock``, the quick ones first; any other file here is a benchmark too, but for
-#: builds.py, which needs another checkout to compare with.
+#: Those that take ``--clock``, the quick ones first.  Any other file here is a benchmark too, but
+#: for builds.py, which needs another checkout to compare with.
 CLOCKED = (
     "kernel", "budget", "tail", "growth", "searchers", "reoptimise", "closed_loop", "gap",
     "admission",
