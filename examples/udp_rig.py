@@ -21,7 +21,7 @@ import time
 from wire import LOST, Device, command, parse
 
 import undertow as ut
-from undertow.estimators import KalmanFilter, drive
+from undertow.estimators import KalmanFilter, run_recorded
 from undertow.law import InnerLoop
 from undertow.models import FloatArray
 from undertow.plants import Measurement, RealisticRig, srv02_rig
@@ -119,7 +119,7 @@ def main(host: str | None = None, port: str = "0", seconds: float = 5.0) -> floa
     estimator.reset(arm.state(phi=ut.deg(20)))
     law = InnerLoop(arm, ut.first_surface(arm))
     with contextlib.closing(rig):
-        record = drive(rig, estimator, lambda t, x: law(x), seconds)
+        record = run_recorded(rig, estimator, lambda t, x: law(x), seconds)
     return float(abs(record.x[-1000:, 1]).max())
 
 

@@ -145,6 +145,7 @@ def test_unknown_option_and_choice_exit_2() -> None:
     assert run("simulate")[0] == 2
 
 
+@pytest.mark.slow
 def test_infeasible_task_exits_1_with_the_evidence() -> None:
     """No admissible surface from 70°: says what the best candidate met, and what helps."""
     code, _, err = run(

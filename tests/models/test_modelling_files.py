@@ -231,6 +231,7 @@ def test_a_branched_urdf_moves_as_mujoco_says() -> None:
     assert all("target" in check.name for check in report.failures)
 
 
+@pytest.mark.slow
 def test_a_branched_mjcf_moves_as_mujoco_says() -> None:
     """Claim: geom inertias, defaults, classes, offsets, references, springs, several joints a
     body, unnamed bodies, tendons and gears are read as MuJoCo reads them."""

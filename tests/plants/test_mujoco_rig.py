@@ -17,7 +17,10 @@ from undertow.plants.scenes import Scene, mujoco_scene
 pytest.importorskip("mujoco")
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", "double_pendulum_on_a_cart"])
+@pytest.mark.parametrize(
+    "name",
+    ["rotary_pendulum", pytest.param("double_pendulum_on_a_cart", marks=pytest.mark.slow)],
+)
 def test_both_engines_move_alike(name: str) -> None:
     mechanism = ut.mechanisms.LIBRARY[name]()
     x0 = mechanism.state(**mechanism.start)

@@ -109,6 +109,7 @@ def claims_of(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
     return [c for c in document["subjects"][0]["claims"] if c["kind"] == kind]
 
 
+@pytest.mark.slow
 def test_all_claims_are_proved_again(written: bytes) -> None:
     certificate = Certificate.from_bytes(written)
     assert certificate.to_bytes() == written

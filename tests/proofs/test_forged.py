@@ -461,6 +461,7 @@ def count_false(document: Document, count: int, seed: int) -> int:
     return false
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", QUICK)
 def test_what_is_false_by_simulation_is_not_proved(true: dict[str, Document], kind: str) -> None:
     document = true[kind]

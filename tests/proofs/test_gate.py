@@ -154,6 +154,7 @@ def test_a_policy_says_what_will_do(accept: tuple[Evidence, ...], x: FloatArray,
         assert verdict.margin > 0
 
 
+@pytest.mark.slow
 def test_margins_of_the_policy_count() -> None:
     """A singularity close to the path, a constraint, a hard input limit."""
     near = singular_at(0.32)

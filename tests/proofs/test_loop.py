@@ -95,6 +95,7 @@ def test_slopes_hold_every_difference_quotient() -> None:
     assert (change <= high_sum + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_tubes_hold_the_motions_from_their_starts() -> None:
     """RK4 at a tenth of the step stays inside, through clip, layer and sliding."""
     edges = np.radians([20.0, 20.1, 38.0, 38.02])
@@ -300,6 +301,7 @@ def test_a_hold_that_is_too_long_is_not_proved(claim: LoopClaim) -> None:
         LoopMotion(RIG, SURFACE, LAW, period=-0.001)
 
 
+@pytest.mark.slow
 def test_a_held_claim_is_verified_from_its_numbers_alone(claim: LoopClaim) -> None:
     """0.45° at 1 kHz; the same in a plant whose mass is off by up to 5 %, held or not."""
     near = replace(claim, edges=claim.edges[:7], terminal=THICK, hold=1)

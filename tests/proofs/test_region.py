@@ -281,6 +281,7 @@ def test_a_set_with_a_ring_inside_that_motions_cannot_cross_is_not_proved(
     assert verify_region(motion, [V.times(1 / 0.61), V], proved=1).kind == "proved"
 
 
+@pytest.mark.slow
 def test_the_reversed_van_der_pol_region_stays_inside_its_limit_cycle() -> None:
     """ẋ = −y, ẏ = x − (1 − x²) y: a proved chain, converging, no larger than the true region.
 

@@ -103,6 +103,7 @@ def test_a_run_makes_every_call(campaign: Systematic) -> None:
         assert counts["write"] > 300
 
 
+@pytest.mark.slow
 def test_after_any_call_that_fails_at_every_step_the_output_is_off_or_not_said_to_be(
     campaign: Systematic,
 ) -> None:
