@@ -180,7 +180,9 @@ def main() -> int:
             kept = {one.plant: one.cost for one in here if one.controller == "kept" and one.reached}
             unit = "s" if aim == "time" else "V² s"
             rows = [row([one for one in here if one.controller == name], kept) for name in names]
-            table(f"{aim}, {unit}, from {angle:g}°, {plants} plants, seed {asked.seed}", header, rows)
+            table(
+                f"{aim}, {unit}, from {angle:g}°, {plants} plants, seed {asked.seed}", header, rows
+            )
     return 0
 
 

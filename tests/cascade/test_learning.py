@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,6 +56,34 @@ def test_a_cascade_learns_the_plant(pendulum: ut.Mechanism) -> None:
     surface, law = memory.plan.at(0.1)
     asked = ut.SlidingModeLaw(believed, surface, law or cascade.reaching)(0.1, motion.x[-1])
     assert control.u == pytest.approx(asked.u)
+
+
+def test_the_first_plan_is_the_best_for_the_estimate(pendulum: ut.Mechanism) -> None:
+    """Nothing is known better yet, and the next decision knows more: no premium for all plants."""
+    objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.5)
+    cost = [
+        replace(cascade, belief=None).loop.batch(x, cascade.start(x)[0].plan).cost[0]
+        for cascade in (learning(pendulum, objective), ut.Cascade(pendulum, objective))
+    ]
+    assert cost[0] == pytest.approx(cost[1], rel=0.01)
+
+
+@pytest.mark.slow
+def test_least_energy_on_plants_that_are_not_the_model(pendulum: ut.Mechanism) -> None:
+    """Four drawn plants from 37°: close to what each would need if it were known."""
+    pytest.importorskip("casadi")
+    rng = np.random.default_rng(3)
+    objective, start = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=math.radians(37.0))
+    upright = replace(objective, constraints=ut.state_box(phi=math.pi / 2))
+    cascade = learning(pendulum, objective)
+    over = []
+    for _ in range(4):
+        plant = changed(pendulum, {k: rng.uniform(-part, part) for k, part in SPREAD.items()})
+        run = cascade.simulate(start, plant=plant)
+        assert run.reached
+        over.append(run.cost / ut.bound(plant, upright, start).cost)
+    assert max(over) < 1.10
+    assert np.median(over) < 1.06
 
 
 @pytest.mark.slow

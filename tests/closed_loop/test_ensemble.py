@@ -11,6 +11,7 @@ import pytest
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.closed_loop import INADMISSIBLE, Ensemble, Event
+from undertow.closed_loop.ensemble import Risk
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
 
@@ -99,6 +100,34 @@ def test_risk_measures_are_ordered(loop: ut.ClosedLoop, surfaces: list[ut.Surfac
     assert cost["cvar"] == pytest.approx(alone[-2:].mean(axis=0), rel=1e-14)
 
 
+def test_weights_count_in_the_cost_alone(
+    loop: ut.ClosedLoop, surfaces: list[ut.Surface], quick: ut.Surface
+) -> None:
+    """Mean and tail by hand; a member without weight still has to arrive."""
+    x, ensemble = loop.mechanism.state(phi=0.4), loop.ensemble
+    assert ensemble is not None
+    weights = np.array([4.0, 0.0, 1.0, 1.0, 3.0, 1.0])
+    alone = np.array(
+        [
+            replace(loop, ensemble=replace(ensemble, values=one[None])).batch(x, quick).cost[0]
+            for one in ensemble.values
+        ]
+    )
+
+    def cost(risk: Risk) -> float:
+        weighed = replace(ensemble, risk=risk, weights=weights)
+        return float(replace(loop, ensemble=weighed).batch(x, quick).cost[0])
+
+    assert cost("mean") == pytest.approx(weights @ alone / 10.0, rel=1e-12)
+    assert cost("worst") == pytest.approx(alone.max(), rel=1e-14)
+    drawn = np.repeat(alone, (300 * weights).astype(int))  # 3000 members, the same distribution
+    assert cost("cvar") == pytest.approx(np.sort(drawn)[-1000:].mean(), rel=1e-12)
+    none = np.eye(6)[0]
+    far = [loop.mechanism.state(phi=math.radians(a)) for a in np.arange(30.0, 52.0, 1.0)]
+    first_alone = replace(loop, ensemble=replace(ensemble, weights=none)).batch(far, quick).reached
+    assert (first_alone == loop.batch(far, quick).reached).all()
+
+
 def test_large_steps_know_each_plant(loop: ut.ClosedLoop, surfaces: list[ut.Surface]) -> None:
     """They agree with small steps to the end, and are far fewer."""
     x = loop.mechanism.state(phi=0.4)
@@ -144,6 +173,9 @@ def test_what_makes_no_ensemble(loop: ut.ClosedLoop, rig: ut.Mechanism) -> None:
         Ensemble(rig, broken)
     with pytest.raises(InvalidInputError, match="risk"):
         Ensemble(rig, good[None], "median")  # type: ignore[arg-type]
+    for weights in ([1.0, 1.0], [-1.0], [0.0], [np.nan]):
+        with pytest.raises(InvalidInputError, match="weights"):
+            Ensemble(rig, good[None], weights=np.array(weights))
     with pytest.raises(InvalidInputError, match="beside an ensemble"):
         replace(loop, plant=rig)
     with pytest.raises(InvalidInputError, match="an ensemble of 6 plants"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -9,6 +11,7 @@ from scipy.integrate import solve_ivp
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.estimators import Belief
+from undertow.estimators.belief import EVEN, LEAST
 from undertow.models import FloatArray
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
@@ -142,6 +145,17 @@ def test_the_design_of_the_ensemble(belief: Belief) -> None:
     off = (members[1:] - nominal)[:, belief._places] / belief._scale
     assert np.abs(off) == pytest.approx(np.sqrt(1 / 3 + 0.2**2))
     assert off.T @ off == pytest.approx(len(off) * np.eye(5) * (1 / 3 + 0.2**2), abs=1e-12)
+
+
+def test_what_is_known_weighs_more(belief: Belief) -> None:
+    """Corners count as the estimate's own uncertainty does; the margin around it costs nothing."""
+    before = belief.ensemble(belief.prior).shares
+    assert before[0] == pytest.approx(1 - EVEN**2 / (EVEN**2 + LEAST**2))
+    assert np.ptp(before[1:]) == 0
+    known = replace(belief.prior, information=1e8 * np.eye(len(belief.tolerances)))
+    after = belief.ensemble(known).shares
+    assert after[0] > 0.999
+    assert after.sum() == pytest.approx(1.0)
 
 
 def test_broken_samples_teach_nothing(belief: Belief) -> None:

@@ -28,7 +28,7 @@ from undertow.base import (
     positive,
     write_file,
 )
-from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event, Trajectory
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Ensemble, Event, Trajectory
 from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import (
     Control,
@@ -496,12 +496,11 @@ class Cascade:
             loop = replace(loop, step=2 * self.step)
         return Optimiser(loop, self.first, self.cold, self.warm, self.freedom, seed=self.seed)
 
-    def _planner(self, state: CascadeState | None = None) -> Planner:
-        """Who is asked for plans: ``planner``, or else the optimiser with what is known by now."""
+    def _planner(self, exact: ClosedLoop) -> Planner:
+        """Who is asked for plans: ``planner``, or else the optimiser of a predicted closed loop."""
         if self.planner is not None:
             return self.planner
         optimiser = self.optimiser
-        exact = self.loop if state is None else self.loop_at(state)
         if exact is self.loop:
             return optimiser
         loop = optimiser.loop.believing(exact.mechanism, exact.ensemble)
@@ -535,20 +534,43 @@ class Cascade:
 
     def _start(self, x: FloatArray) -> tuple[CascadeState, Proposal]:
         self.objective.check_start(self.mechanism, x)
-        planner = self._planner()
-        while True:
+        known = None if self.belief is None else self.belief.prior
+        for planner, loop in (tries := self._first_tries()):
             proposal = planner.propose(
                 x, incumbent=None, horizon=None, sequence=0, computed_for=0.0, resolution=0.0
-            ).required(self.loop)
-            plan, horizon = proposal.plan, self.objective.horizon
+            )
+            if proposal.plan is None and loop is not self.loop:
+                continue
+            plan, horizon = proposal.required(self.loop).plan, self.objective.horizon
             assert plan is not None  # required
-            cost = float(self.loop.batch(x, plan, duration=horizon).score(horizon)[0])
+            cost = float(loop.batch(x, plan, duration=horizon).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
-            if math.isfinite(cost) or planner is not self.optimiser:
-                known = None if self.belief is None else self.belief.prior
+            good = math.isfinite(cost)
+            if loop is not self.loop:  # every plausible plant lives to see the next decision
+                event = self.loop.batch(x, plan, duration=2 * self.period).event[0]
+                good &= event in (Event.HORIZON, Event.REACHED)
+            if good or planner is tries[-1][0]:
                 return CascadeState(plan, 0, cost, cost, x=_kept(x), estimate=known), proposal
-            # Large steps were too hopeful: small ones throughout.
-            planner = replace(self.optimiser, loop=self.loop)
+        raise AssertionError("the last try returns or raises")
+
+    def _first_tries(self) -> list[tuple[Planner, ClosedLoop]]:
+        """Who is asked for the first plan, one after the other, and on what it is judged.
+
+        Before anything has moved, what suits every plausible plant suits none of them well: the
+        estimate alone comes first, for a plan that the next decision replaces.  Where large steps
+        were too hopeful, small ones throughout follow.
+        """
+        if self.planner is not None:
+            return [(self.planner, self.loop)]
+        loops = [self.loop]
+        if self.belief is not None:
+            one = Ensemble(self.mechanism, self.belief.values(self.belief.prior.offset[None]))
+            loops.insert(0, self.loop.believing(self.mechanism, one))
+        return [
+            (planner, loop)
+            for loop in loops
+            for planner in (self._planner(loop), replace(self.optimiser, loop=loop))
+        ]
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
@@ -603,7 +625,7 @@ class Cascade:
     ) -> Proposal:
         sequence = state.sequence + 1
         try:
-            return self._planner(state).propose(
+            return self._planner(self.loop_at(state)).propose(
                 self.mechanism.check_state(x),
                 incumbent=state.at(t),
                 horizon=horizon,

@@ -7,12 +7,13 @@ inadmissible, and the cost is a risk measure over the members.  Searches and gat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 
-from undertow.base import InvalidInputError, check_fields, one_of
+from undertow.base import InvalidInputError, check_fields, floats, one_of
 from undertow.closed_loop.trajectory import Event
 from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import numba
@@ -21,8 +22,8 @@ from undertow.symbolic import numba
 #: (conditional value at risk), or the dearest.
 Risk = Literal["mean", "cvar", "worst"]
 
-#: The part of the members that the conditional value at risk is the mean of.
-TAIL = 1.0 / 3.0
+#: The weight of the dearest members that a risk is the mean of; 0: the dearest alone.
+TAIL: dict[Risk, float] = {"mean": 1.0, "cvar": 1.0 / 3.0, "worst": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,16 +39,20 @@ class Ensemble:
         ``plant.parameters``.
     risk
         ``"mean"``, ``"cvar"`` (mean of the dearest third) or ``"worst"`` of the costs.
+    weights
+        How much each member counts in the mean and in the dearest third, (K,), none negative; all
+        alike by default.  A member without weight still has to arrive.
 
     Raises
     ------
     InvalidInputError
-        For values of another shape, or that are not finite.
+        For values or weights of another shape, or that are not finite.
     """
 
     plant: Mechanism
     values: FloatArray
     risk: Risk = "mean"
+    weights: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         """Check shapes and words."""
@@ -69,6 +74,20 @@ class Ensemble:
                 limit="a finite number",
             )
         object.__setattr__(self, "values", values)
+        weights = floats("weights of an ensemble", self.weights)
+        good = weights.shape == (len(values),) and np.isfinite(weights).all()
+        if len(weights) and not (good and (weights >= 0).all() and weights.sum() > 0):
+            raise InvalidInputError(
+                "weights of an ensemble",
+                value=weights,
+                limit=f"{len(values)} numbers ≥ 0, not all of them 0",
+            )
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """The weights, their sum 1, (K,)."""
+        weights = self.weights if len(self.weights) else np.ones(len(self))
+        return np.asarray(weights / weights.sum(), dtype=np.float64)
 
     def __len__(self) -> int:
         """Return the number of members."""
@@ -76,16 +95,18 @@ class Ensemble:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def summarise(member_out, members, tail, margins, out):  # type: ignore[no-untyped-def]
+def summarise(member_out, weights, tail, margins, out):  # type: ignore[no-untyped-def]
     """Write one result for each plan from those of its members, row after row.
 
     Columns are those of the kernel: cost, time, event, radius, smallest margins, closest approach
     with its time and state, final state, steps.  All members must arrive; otherwise the result is
     that of the member that failed first, and only one that is merely late or dear counts as late
     or dear.  The closest approach is that of the member that stays farthest away, the final state
-    that of the first member.  ``tail`` is the number of dearest members whose mean is the cost.
+    that of the first member.  The cost is the mean of the dearest members, those that weigh
+    ``tail`` together.
     """
     count, columns = out.shape
+    members = len(weights)
     costs, times = np.empty(members), np.empty(members)
     for plan in range(count):
         first = plan * members
@@ -102,7 +123,7 @@ def summarise(member_out, members, tail, margins, out):  # type: ignore[no-untyp
         for column in range(columns):
             out[plan, column] = member_out[worst, column]
         if arrived == members:
-            out[plan, 0] = _dearest(costs, tail)
+            out[plan, 0] = _dearest(costs, weights, tail)
             out[plan, 1] = times.max()
         for column in range(4, 4 + margins):
             low = member_out[first, column]
@@ -144,11 +165,14 @@ def _grade(event):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _dearest(costs, tail):  # type: ignore[no-untyped-def]
-    """Return the mean of the ``tail`` largest costs."""
-    if tail < len(costs):
-        costs.sort()
-    total = 0.0
-    for k in range(len(costs) - tail, len(costs)):
-        total += costs[k]
-    return total / tail
+def _dearest(costs, weights, tail):  # type: ignore[no-untyped-def]
+    """Return the mean of the dearest members, those that weigh ``tail`` together."""
+    if tail <= 0.0:
+        return costs.max()
+    order = np.argsort(-costs)
+    left, total = tail, 0.0
+    for k in order:
+        part = min(weights[k], left)
+        total += part * costs[k]
+        left -= part
+    return total / (tail - left)

@@ -277,9 +277,9 @@ class ClosedLoop:
                 stable_only=stable_only, seek=seek,
             )  # fmt: skip
             count, size = buffers.count, len(self.ensemble)
-            tail = {"mean": size, "cvar": math.ceil(TAIL * size), "worst": 1}[self.ensemble.risk]
+            weights, tail = self.ensemble.shares, TAIL[self.ensemble.risk]
             margins = 2 + len(self.objective.constraints)
-            summarise(members.out[: count * size], size, tail, margins, buffers.out[:count])
+            summarise(members.out[: count * size], weights, tail, margins, buffers.out[:count])
             return buffers.batch(start)
         numbers, end = self.numbers, self.linear_end
         radius = self.objective.terminal_radius if terminal is None else terminal

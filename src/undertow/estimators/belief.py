@@ -203,7 +203,12 @@ class Belief:
         design = hadamard(1 << size.bit_length())[:, 1 : size + 1]
         corners = self.confidence * (design * np.sqrt(variances + LEAST**2)) @ axes.T
         offsets = np.vstack([estimate.offset, np.clip(estimate.offset + corners, -1.0, 1.0)])
-        return Ensemble(self.mechanism, self.values(offsets), self.risk)
+        # Of what the corners span, only the estimate's own uncertainty is expected; the rest is a
+        # margin: it has to be survived, and costs nothing.
+        expected = float(np.mean(variances / (variances + LEAST**2)))
+        weights = np.full(len(offsets), expected / (len(offsets) - 1))
+        weights[0] = 1.0 - expected
+        return Ensemble(self.mechanism, self.values(offsets), self.risk, weights)
 
     @checked
     def learn(
