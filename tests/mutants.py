@@ -12,6 +12,7 @@ import argparse
 import ast
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -148,6 +149,13 @@ def chosen(count: int, seed: int, packages: list[str]) -> list[Mutant]:
     return found
 
 
+def nearest(mutant: Mutant, names: tuple[str, ...]) -> list[str]:
+    """Return the files of tests that name the module that was changed: they notice first."""
+    word = re.compile(rf"\b{mutant.file.stem}\b")
+    files = [path for name in names for path in sorted((ROOT / "tests" / name).glob("test_*.py"))]
+    return [str(path.relative_to(ROOT)) for path in files if word.search(path.read_text())]
+
+
 def survives(mutant: Mutant) -> bool:
     """Whether no test notices a mutant."""
     package = mutant.file.relative_to(PACKAGE).parts[0]
@@ -160,7 +168,7 @@ def survives(mutant: Mutant) -> bool:
         }  # fmt: skip
         for names in CORE[package]:
             words = ["-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
-            words += [f"tests/{name}" for name in names]
+            words += [*nearest(mutant, names), *(f"tests/{name}" for name in names)]
             try:
                 done = subprocess.run(
                     [sys.executable, "-m", "pytest", *words],
