@@ -151,7 +151,12 @@ def main() -> int:
         "  python benchmarks/builds.py ../before --rounds 60"
     )
     parser.add_argument("other", type=Path, metavar="FOLDER", help="the other checkout")
-    parser.add_argument("--rounds", type=int, default=60, help="of the quick jobs; starts: a tenth")
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        default=60,
+        help="of the quick jobs; half for import, a sixth for a cold start",
+    )
     asked = parser.parse_args()
     if not (asked.other / "src" / "undertow").is_dir():
         parser.error(f"{asked.other} is no checkout: it has no folder src/undertow")

@@ -87,7 +87,6 @@ def first_optimum(objective: str, degrees: float) -> ut.Surface:
     return cascade(objective, "exact").start(RIG.state(phi=ut.deg(degrees)))[0].plan.surfaces[0]
 
 
-@cache
 def least(objective: str, degrees: float, seed: int, number: int) -> float:
     """Return the bound of a plant."""
     plant = drawn(seed, number)

@@ -535,7 +535,9 @@ class Cascade:
     def _start(self, x: FloatArray) -> tuple[CascadeState, Proposal]:
         self.objective.check_start(self.mechanism, x)
         known = None if self.belief is None else self.belief.prior
-        for planner, loop in (tries := self._first_tries()):
+        tries = self._first_tries()
+        for number, (loop, small) in enumerate(tries, 1):
+            planner = replace(self.optimiser, loop=loop) if small else self._planner(loop)
             proposal = planner.propose(
                 x, incumbent=None, horizon=None, sequence=0, computed_for=0.0, resolution=0.0
             )
@@ -549,28 +551,24 @@ class Cascade:
             if loop is not self.loop:  # every plausible plant lives to see the next decision
                 event = self.loop.batch(x, plan, duration=2 * self.period).event[0]
                 good &= event in (Event.HORIZON, Event.REACHED)
-            if good or planner is tries[-1][0]:
+            if good or number == len(tries):
                 return CascadeState(plan, 0, cost, cost, x=_kept(x), estimate=known), proposal
         raise AssertionError("the last try returns or raises")
 
-    def _first_tries(self) -> list[tuple[Planner, ClosedLoop]]:
-        """Who is asked for the first plan, one after the other, and on what it is judged.
+    def _first_tries(self) -> list[tuple[ClosedLoop, bool]]:
+        """What the first plan is to be best on, one after the other; and whether in small steps.
 
         Before anything has moved, what suits every plausible plant suits none of them well: the
         estimate alone comes first, for a plan that the next decision replaces.  Where large steps
         were too hopeful, small ones throughout follow.
         """
         if self.planner is not None:
-            return [(self.planner, self.loop)]
+            return [(self.loop, False)]
         loops = [self.loop]
         if self.belief is not None:
             one = Ensemble(self.mechanism, self.belief.values(self.belief.prior.offset[None]))
             loops.insert(0, self.loop.believing(self.mechanism, one))
-        return [
-            (planner, loop)
-            for loop in loops
-            for planner in (self._planner(loop), replace(self.optimiser, loop=loop))
-        ]
+        return list(itertools.product(loops, (False, True)))
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:

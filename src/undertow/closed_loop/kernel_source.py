@@ -201,7 +201,7 @@ class _Writer:
     def watch(self) -> list[str]:
         """Keep the smallest margins; stop a lane whose margin is negative.
 
-        WorkArray are read before they are chosen between: a choice between two elements of ``W``
+        Rows are read before they are chosen between: a choice between two elements of ``W``
         would be compiled as a choice between two addresses, and the loop not as vectors.
         """
         r = self.rows

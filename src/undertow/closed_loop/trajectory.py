@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 #: surface.
 INADMISSIBLE, UNSTABLE = 1e8, 1e10
 
-#: WorkArray at either end of a trajectory that a notebook shows.
+#: Rows at either end of a trajectory that a notebook shows.
 SHOWN = 3
 
 
