@@ -486,25 +486,28 @@ class Cascade:
         what it finds again.  A time of arrival is a matter of milliseconds, and is not searched
         for with longer steps than it is judged with.
         """
-        loop = replace(self.loop, tail_rtol=TAIL_RTOL)
+        return Optimiser(
+            self._for_search(self.loop),
+            self.first, self.cold, self.warm, self.freedom, seed=self.seed,
+        )  # fmt: skip
+
+    def _for_search(self, loop: ClosedLoop) -> ClosedLoop:
+        """Return a predicted closed loop as the optimiser integrates it."""
         end = loop.linear_end
         smooth = end is not None and end.counts_cost and not self.freedom.reaching
         eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
         slow = 2 * self.step * float((eta / layer).max()) <= RESOLVED
         even = all(round(t / self.step) % 2 == 0 for t in self.freedom.times)
-        if smooth and slow and even and not any(self.mechanism.disturbance_bounds):
-            loop = replace(loop, step=2 * self.step)
-        return Optimiser(loop, self.first, self.cold, self.warm, self.freedom, seed=self.seed)
+        larger = smooth and slow and even and not any(self.mechanism.disturbance_bounds)
+        return loop.with_steps(self.step * (2 if larger else 1), TAIL_RTOL)
 
     def _planner(self, exact: ClosedLoop) -> Planner:
         """Who is asked for plans: ``planner``, or else the optimiser of a predicted closed loop."""
         if self.planner is not None:
             return self.planner
-        optimiser = self.optimiser
         if exact is self.loop:
-            return optimiser
-        loop = optimiser.loop.believing(exact.mechanism, exact.ensemble)
-        return replace(optimiser, loop=loop, first=optimiser.anchor)
+            return self.optimiser
+        return self.optimiser.on(self._for_search(exact))
 
     def __repr__(self) -> str:
         """Show what is controlled, for what, and how often it is planned anew."""
@@ -537,7 +540,7 @@ class Cascade:
         known = None if self.belief is None else self.belief.prior
         tries = self._first_tries()
         for number, (loop, small) in enumerate(tries, 1):
-            planner = replace(self.optimiser, loop=loop) if small else self._planner(loop)
+            planner = self.optimiser.on(loop) if small else self._planner(loop)
             proposal = planner.propose(
                 x, incumbent=None, horizon=None, sequence=0, computed_for=0.0, resolution=0.0
             )

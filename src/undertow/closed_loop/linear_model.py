@@ -13,6 +13,7 @@ and P exactly, and what they leave over by quadrature:
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -46,13 +47,12 @@ class QuadraticStage:
     uu: FloatArray
 
 
-def quadratic_stage(mechanism: Mechanism, objective: Objective) -> QuadraticStage | None:
-    """Return the second-order model of Φ at the target; ``None`` where there is none.
+def quadratic_stage(mechanism: Mechanism, stage: sp.Expr) -> QuadraticStage | None:
+    """Return the second-order model of a Φ at the target; ``None`` where there is none.
 
     There is none when Φ is not twice differentiable at 0 (|u|, say) or has a slope there.
     """
-    stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
-    return _second_order(stage, mechanism.x, mechanism.u)
+    return _second_order(stage.subs(mechanism.substitution), mechanism.x, mechanism.u)
 
 
 @lru_cache(maxsize=64)
@@ -88,11 +88,9 @@ _ITSELF = np.empty((0, 0, 0)), np.empty((0, 0, 0))
 def _linear_plants(ensemble: Ensemble) -> tuple[FloatArray, FloatArray]:
     """Return q̈ = drift x + push u of every member at the target, (K, n, 2n) and (K, n, m)."""
     plant = ensemble.plant
-    n, m = plant.n, plant.m
-    members = [linear_numbers(plant, values) for values in ensemble.values]
-    drift = [np.linalg.solve(mass, forces) for mass, forces, _ in members]
-    push = [np.linalg.solve(mass, np.vstack([B, np.zeros((n - m, m))])) for mass, _, B in members]
-    return np.stack(drift), np.stack(push)
+    mass, forces, gain = linear_numbers(plant, ensemble.values)
+    inputs = np.pad(gain, [(0, 0), (0, plant.n - plant.m), (0, 0)])
+    return np.linalg.solve(mass, forces).astype(float), np.linalg.solve(mass, inputs).astype(float)
 
 
 class Prepared(NamedTuple):
@@ -133,15 +131,24 @@ class TerminalLinearModel:
     def __init__(
         self, mechanism: Mechanism, objective: Objective, ensemble: Ensemble | None = None
     ) -> None:
-        lin = linearise(mechanism)
-        m = mechanism.m
         self.objective = objective
-        self.stage = quadratic_stage(mechanism, objective)
-        n = mechanism.n
+        stage = objective.stage_cost(mechanism)
+        self._one_stage = stage.free_symbols.isdisjoint(mechanism.parameter_symbols)
+        self.stage = quadratic_stage(mechanism, stage)
+        n, m = mechanism.n, mechanism.m
         self._layout = LawLayout(n, m)
         self._weights = self.stage or QuadraticStage(
             0.0, np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m)), np.zeros((m, m))
         )
+        # Where Φ has no quadratic part (minimum time) the state itself must be exact.
+        self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
+        self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
+        self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
+        self._take(mechanism, ensemble)
+
+    def _take(self, mechanism: Mechanism, ensemble: Ensemble | None) -> None:
+        """Keep the numbers of a mechanism and of the plants that its law acts on."""
+        lin, m = linearise(mechanism), mechanism.m
         M_uu, M_au = lin.M[m:, m:], lin.M[:m, m:]
         forces = np.hstack([lin.F, lin.D])
         self.X = np.ascontiguousarray(np.linalg.solve(M_uu, M_au.T))
@@ -149,11 +156,15 @@ class TerminalLinearModel:
         self.H = np.ascontiguousarray(forces[:m] - M_au @ self.Y)
         self.S = lin.M[:m, :m] - M_au @ self.X
         self.B_inverse = np.linalg.inv(lin.B)
-        # Where Φ has no quadratic part (minimum time) the state itself must be exact.
-        self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
         self._plants = _ITSELF if ensemble is None else _linear_plants(ensemble)
-        self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
-        self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
+
+    def believing(self, mechanism: Mechanism, ensemble: Ensemble | None) -> TerminalLinearModel:
+        """Return this model with other parameters, and with another ensemble."""
+        if not self._one_stage:
+            return TerminalLinearModel(mechanism, self.objective, ensemble)
+        other = copy(self)
+        other._take(mechanism, ensemble)
+        return other
 
     def buffers(self, count: int) -> Prepared:
         """Return room for the ends of ``count`` closed loops, a multiple of the lanes."""

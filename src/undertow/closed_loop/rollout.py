@@ -219,8 +219,26 @@ class ClosedLoop:
 
         The equations stay, and so do the kernels: nothing is compiled or looked up again.
         """
-        other = replace(self, mechanism=mechanism, ensemble=ensemble)
-        other.__dict__["_kernels"] = self._kernels
+        end = None
+        if self.plant is None and (self.ensemble is None) == (ensemble is None):
+            end = self.linear_end and self.linear_end.believing(mechanism, ensemble)
+        other = self._changed({"numbers", "linear_end"}, mechanism=mechanism, ensemble=ensemble)
+        if end is not None:
+            other.__dict__["linear_end"] = end
+        return other
+
+    @checked
+    def with_steps(self, step: float, tail_rtol: float) -> ClosedLoop:
+        """Return this loop integrated with other steps; what does not depend on them is shared."""
+        if step != self.step:  # may be too long for the boundary layer
+            replace(self, step=step)
+        return self._changed({"takes_large_steps"}, step=step, tail_rtol=tail_rtol)
+
+    def _changed(self, without: set[str], **fields: Any) -> ClosedLoop:
+        """Return a copy with other fields, unchecked, and without some of what was computed."""
+        assert self._kernels is not None  # found once, for all copies
+        other = object.__new__(type(self))
+        other.__dict__.update({k: v for k, v in vars(self).items() if k not in without}, **fields)
         return other
 
     def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -81,10 +82,11 @@ def linearise(mechanism: Mechanism) -> Linearisation:
         When the target is no equilibrium for u = 0, or f has no derivative there.
     """
     n = mechanism.n
-    require_smooth(
-        f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
-    )
-    rest, jacobian = _force_at_target(mechanism)
+    if not _is_analytic(mechanism.force, mechanism.x):
+        require_smooth(
+            f"force of '{mechanism.name}'", mechanism.force, mechanism.x, at=_target(mechanism)
+        )
+    rest, jacobian = _force_at_target(mechanism, mechanism.parameter_values)
     if not (np.isfinite(rest).all() and np.isfinite(jacobian).all()):
         raise ModelError(
             f"force of '{mechanism.name}' at the target",
@@ -107,7 +109,7 @@ def linearise(mechanism: Mechanism) -> Linearisation:
         M=mechanism.M(np.zeros(n)),
         F=jacobian[:, :n],
         D=jacobian[:, n:],
-        B=numbers(mechanism.input_matrix.subs(mechanism.substitution)),
+        B=_gain(mechanism, mechanism.parameter_values[None])[0],
         states=mechanism.state_names,
         inputs=tuple(i.name for i in mechanism.inputs),
     )
@@ -116,23 +118,40 @@ def linearise(mechanism: Mechanism) -> Linearisation:
 @lru_cache(maxsize=128)
 def has_linear_model(mechanism: Mechanism) -> bool:
     """Whether f has a derivative at the target: :func:`linearise` refuses where it has none."""
-    return next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
+    return _is_analytic(mechanism.force, mechanism.x) or (
+        next(kinks(mechanism.force, mechanism.x, at=_target(mechanism)), None) is None
+    )
 
 
 def linear_numbers(
     mechanism: Mechanism, values: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return M, (n, n), ∂f/∂x, (n, 2n), and B, (m, m), at the target for other parameters.
+    """Return M, (K, n, n), ∂f/∂x, (K, n, 2n), and B, (K, m, m), at the target for K plants.
 
-    ``values`` are those of all parameters, (P,), SI units; nothing is checked.
+    ``values`` are those of all parameters, (K, P), SI units; nothing is checked.
     """
-    n, m = mechanism.n, mechanism.m
+    n, count = mechanism.n, len(values)
     at_rest = [0.0] * (2 * n + 1)
-    mass = np.array(mechanism.function("mass")(*at_rest, *values), dtype=float)
-    gain = np.array(
-        compiled(mechanism.input_matrix, mechanism.parameter_symbols)(*values), dtype=float
+    mass = _stacked(mechanism.function("mass")(*at_rest, *values.T), count)
+    found = _complex_step(mechanism, values)
+    slopes = (
+        np.stack([_force_at_target(mechanism, each)[1] for each in values])
+        if found is None
+        else found[1]
     )
-    return mass.reshape(n, n), _force_at_target(mechanism, values)[1], gain.reshape(m, m)
+    return mass.reshape(count, n, n), slopes, _gain(mechanism, values)
+
+
+def _gain(mechanism: Mechanism, values: FloatArray) -> FloatArray:
+    """Return B of K plants, (K, m, m), from all their parameters, (K, P)."""
+    function = compiled(mechanism.input_matrix, mechanism.parameter_symbols)
+    return _stacked(function(*values.T), len(values)).reshape(-1, mechanism.m, mechanism.m)
+
+
+def _stacked(entries: Sequence[Any], count: int) -> FloatArray:
+    """Return entries, numbers or (K,), as (K, entries)."""
+    columns = [np.broadcast_to(np.asarray(e, dtype=float), count) for e in entries]
+    return np.stack(columns, axis=-1)
 
 
 def _target(mechanism: Mechanism) -> dict[sp.Symbol, float]:
@@ -146,31 +165,47 @@ _ANALYTIC = (
 )  # fmt: skip
 
 
-def _force_at_target(
-    mechanism: Mechanism, parameters: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
+@lru_cache(maxsize=256)
+def _is_analytic(force: sp.ImmutableDenseMatrix, x: tuple[sp.Symbol, ...]) -> bool:
+    """Whether NumPy continues f analytically to complex states."""
+    return all(isinstance(f, _ANALYTIC) for f in force.atoms(Application)) and all(
+        power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*x)
+    )
+
+
+def _complex_step(mechanism: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return f, (K, n), and ∂f/∂x, (K, n, 2n), at the target by a complex step, exact to rounding.
+
+    ``None`` where f is not analytic, or not finite.
+    """
+    if not _is_analytic(mechanism.force, mechanism.x):
+        return None
+    size = 2 * mechanism.n
+    step = 1e-200  # its square is nothing: what is flat to first order comes out as zero
+    x = np.vstack([np.zeros(size), 1j * step * np.eye(size)])
+    function = mechanism.function("force")
+    columns = values[0] if len(values) == 1 else values.T[:, :, None]
+    with np.errstate(all="ignore"):
+        entries = function(0.0, *x.T, *columns)
+        at_rest = function(0.0, *np.zeros(size), *columns)
+    real = all(np.isfinite(np.asarray(e, dtype=float)).all() for e in at_rest)
+    f = np.stack([np.broadcast_to(e, (len(values), size + 1)) for e in entries], axis=1)
+    if not (real and np.isfinite(f).all()):  # of a negative number, a logarithm is complex
+        return None
+    return f[:, :, 0].real, f[:, :, 1:].imag / step
+
+
+def _force_at_target(mechanism: Mechanism, given: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return f, (n,), and ∂f/∂x, (n, 2n), at x = 0 and t = 0, for some parameter values.
 
-    By a complex step, exact to rounding, where f is analytic; else by symbolic derivatives.
+    By a complex step where f is analytic; else by symbolic derivatives.
     """
-    force, size = mechanism.force, 2 * mechanism.n
-    given = mechanism.parameter_values if parameters is None else parameters
-    analytic = all(isinstance(f, _ANALYTIC) for f in force.atoms(Application)) and all(
-        power.exp.is_Integer for power in force.atoms(sp.Pow) if power.base.has(*mechanism.x)
-    )
-    if analytic:
-        step = 1e-200  # its square is nothing: what is flat to first order comes out as zero
-        x = np.vstack([np.zeros(size), 1j * step * np.eye(size)])
-        with np.errstate(all="ignore"):
-            entries = mechanism.function("force")(0.0, *x.T, *given)
-            at_rest = mechanism.function("force")(0.0, *np.zeros(size), *given)
-            real = np.isfinite(np.array(at_rest, dtype=float)).all()
-        values = np.stack([np.broadcast_to(e, size + 1) for e in entries])
-        if np.isfinite(values).all() and real:  # of a negative number, a logarithm is complex
-            return values[:, 0].real, values[:, 1:].imag / step
+    found = _complex_step(mechanism, given[None])
+    if found is not None:
+        return found[0][0], found[1][0]
     at_target = dict.fromkeys(mechanism.x, 0)
     numbered = dict(zip(mechanism.parameter_symbols, given.tolist(), strict=True))
-    numeric = sp.Matrix(force).subs(numbered | {TIME: 0})
+    numeric = sp.Matrix(mechanism.force).subs(numbered | {TIME: 0})
     jacobian = numeric.jacobian(list(mechanism.x)).subs(at_target)
     try:
         return numbers(numeric.subs(at_target)).ravel(), numbers(jacobian)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Self, cast
 
@@ -292,13 +292,9 @@ class Mechanism:
         """
         numbers = self._columns("parameter values", values, [p.name for p in self.parameters])
         copy = object.__new__(type(self))
-        copy.__dict__.update(
-            {each.name: getattr(self, each.name) for each in fields(self)},
-            parameters=tuple(
-                replace(p, value=float(v)) for p, v in zip(self.parameters, numbers, strict=True)
-            ),
-            structure=self.structure,
-        )
+        kept = {k: v for k, v in vars(self).items() if k != "fingerprint"}  # of the structure
+        parameters = tuple(p.at(float(v)) for p, v in zip(self.parameters, numbers, strict=True))
+        copy.__dict__.update(kept, parameters=parameters, structure=self.structure)
         check_definite(f"mass_matrix of '{self.name}'", self.coordinates, copy.M)
         return copy
 
@@ -358,17 +354,17 @@ class Mechanism:
         """Number of inputs."""
         return len(self.inputs)
 
-    @property
+    @cached_property
     def q(self) -> tuple[sp.Symbol, ...]:
         """Coordinate symbols, actuated first."""
         return tuple(c.symbol for c in self.coordinates)
 
-    @property
+    @cached_property
     def x(self) -> tuple[sp.Symbol, ...]:
         """State symbols (q, q̇)."""
         return (*self.q, *(c.velocity for c in self.coordinates))
 
-    @property
+    @cached_property
     def u(self) -> tuple[sp.Symbol, ...]:
         """Input symbols."""
         return tuple(i.symbol for i in self.inputs)
@@ -378,7 +374,7 @@ class Mechanism:
         """Names of the states, in the order of x."""
         return tuple(str(s) for s in self.x)
 
-    @property
+    @cached_property
     def parameter_symbols(self) -> tuple[sp.Symbol, ...]:
         """Parameter symbols, in order."""
         return tuple(p.symbol for p in self.parameters)

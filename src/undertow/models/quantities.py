@@ -6,7 +6,7 @@ import math
 import re
 import unicodedata
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any
 
@@ -168,6 +168,20 @@ class Parameter(_Named):
                 limit=interval,
                 remedy="Give a value inside the interval",
             )
+
+    def at(self, value: float) -> Parameter:
+        """Return the parameter with another value, SI units; nothing else is checked again.
+
+        Raises
+        ------
+        InvalidInputError
+            For a value that is not inside the interval.
+        """
+        if not self.low < value < self.high:
+            return replace(self, value=value)  # says what is wrong
+        other = object.__new__(type(self))
+        other.__dict__.update(vars(self), value=value)
+        return other
 
 
 @dataclass(frozen=True)

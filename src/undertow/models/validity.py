@@ -310,12 +310,12 @@ def check_definite(
     """Refuse an M(q) that is not positive definite at one of 16 positions, the target first."""
     rng = np.random.default_rng(0)
     spread = np.array([math.pi if c.unit == "rad" else 1.0 for c in coordinates])
-    for trial in range(16):
-        q = trial * rng.uniform(-spread, spread) / 15
-        try:
-            smallest = float(np.linalg.eigvalsh(mass(q))[0])
-        except np.linalg.LinAlgError:  # of a matrix that holds no numbers
-            smallest = math.nan
+    places = np.arange(16)[:, None] / 15 * rng.uniform(-spread, spread, (16, len(spread)))
+    try:
+        least = np.linalg.eigvalsh(mass(places))[:, 0]
+    except np.linalg.LinAlgError:  # of a matrix that holds no numbers
+        least = np.array([_least_eigenvalue(mass(q)) for q in places])
+    for q, smallest in zip(places, least, strict=True):
         if not smallest > 0:
             where = ", ".join(
                 f"{c.name} = {v:.3g} {c.unit}" for c, v in zip(coordinates, q, strict=True)
@@ -326,6 +326,13 @@ def check_definite(
                 limit="positive",
                 remedy="Check masses, lengths and inertias: a massless link has no M > 0",
             )
+
+
+def _least_eigenvalue(mass: FloatArray) -> float:
+    try:
+        return float(np.linalg.eigvalsh(mass)[0])
+    except np.linalg.LinAlgError:
+        return math.nan
 
 
 def require_smooth(

@@ -77,6 +77,13 @@ class Optimiser:
         )
         at_least("seed", self.seed, 0)
 
+    def on(self, loop: ClosedLoop) -> Optimiser:
+        """Return this optimiser for a loop of the same structure, with the same first surface."""
+        other = object.__new__(type(self))
+        kept = {k: v for k, v in vars(self).items() if k != "space"}
+        other.__dict__.update(kept, loop=loop, anchor=self.anchor)
+        return other
+
     @cached_property
     def anchor(self) -> Surface:
         """The surface to start from, given or designed."""
