@@ -41,7 +41,9 @@ def questions(objective: ut.Objective, budget: ut.Budget) -> list[Any]:
         asked.append(question)
         return gate(*question)
 
-    cascade = ut.Cascade(RIG, objective, gate=listening, cold=ut.Budget(1024), warm=budget)
+    cascade = ut.Cascade(
+        RIG, objective, gate=listening, cold=ut.Budget(1024), warm=budget, belief="exact"
+    )
     cascade.simulate(phi=ut.deg(40), duration=8.0)
     return [q for q in asked if q[1] != q[2]]
 

@@ -28,7 +28,9 @@ PERIOD = 0.1
 def situations(objective: ut.Objective, count: int) -> list[tuple[FloatArray, ut.Surface]]:
     """Return states near those of a cascade run with the surface in use, all of them feasible."""
     exact = ut.ClosedLoop(RIG, objective)
-    run = ut.Cascade(RIG, objective, period=PERIOD).simulate(phi=START, duration=1.0)
+    run = ut.Cascade(RIG, objective, period=PERIOD, belief="exact").simulate(
+        phi=START, duration=1.0
+    )
     rng = np.random.default_rng(0)
     found: list[tuple[FloatArray, ut.Surface]] = []
     while len(found) < count:

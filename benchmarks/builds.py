@@ -44,7 +44,8 @@ loop = ut.ClosedLoop(rig, ut.MinimumEnergy(), step=0.002)
 x0 = rig.state(phi=ut.deg(30))
 spread = 1 + 0.05 * np.random.default_rng(0).standard_normal((256, 4)) * np.array([0, 1, 1, 1])
 vectors = np.array([-1.0, -1.59, 1.96, 12.1]) * spread
-cascades = {o.name: ut.Cascade(rig, o) for o in (ut.MinimumEnergy(), ut.MinimumTime())}
+exact = {"belief": "exact"} if hasattr(ut, "Belief") else {}
+cascades = {o.name: ut.Cascade(rig, o, **exact) for o in (ut.MinimumEnergy(), ut.MinimumTime())}
 tasks = {}
 for name, cascade in cascades.items():
     surface = cascade.optimiser.propose(x0).surface

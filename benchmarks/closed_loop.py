@@ -151,7 +151,7 @@ def cascade(
     now: Clock,
 ) -> Result:
     """Run undertow's cascade; also return the seconds of each optimisation."""
-    controller = ut.Cascade(scene.rig, objective, freedom=freedom)
+    controller = ut.Cascade(scene.rig, objective, freedom=freedom, belief="exact")
     seconds: list[float] = []
     for incumbent in (None, ut.first_surface(scene.rig)):  # compile
         controller.optimiser.propose(scene.x0, incumbent=incumbent, budget=ut.Budget(64))

@@ -17,14 +17,16 @@ import sys
 RIG = "import undertow as ut; rig = ut.mechanisms.rotary_pendulum(d_e=0.025); "
 JOBS = {
     "import": "import undertow",
-    "one optimum, energy": RIG + "ut.Optimiser(ut.Cascade(rig).optimiser.loop)"
+    "one optimum, energy": RIG + "ut.Optimiser(ut.Cascade(rig, belief='exact').optimiser.loop)"
     ".require(rig.state(phi=ut.deg(41)))",
-    "cascade, energy": RIG + "ut.Cascade(rig).simulate(phi=ut.deg(41))",
-    "cascade, time": RIG + "ut.Cascade(rig, ut.MinimumTime()).simulate(phi=ut.deg(41))",
+    "cascade, energy": RIG + "ut.Cascade(rig, belief='exact').simulate(phi=ut.deg(41))",
+    "cascade, time": RIG + "ut.Cascade(rig, ut.MinimumTime(), belief='exact')"
+    ".simulate(phi=ut.deg(41))",
     "cascade, time, reaching free": RIG + "ut.Cascade(rig, ut.MinimumTime(), "
-    "freedom=ut.DecisionVariables(reaching=True), warm=ut.Budget(4000)).simulate(phi=ut.deg(41))",
+    "freedom=ut.DecisionVariables(reaching=True), warm=ut.Budget(4000), belief='exact')"
+    ".simulate(phi=ut.deg(41))",
     "cascade, energy, n = 4": "import undertow as ut; "
-    "ut.Cascade(ut.mechanisms.triple_pendulum_on_a_cart()).simulate(duration=1.0)",
+    "ut.Cascade(ut.mechanisms.triple_pendulum_on_a_cart(), belief='exact').simulate(duration=1.0)",
     "20,000 rollouts at once": RIG + "import numpy as np; p = np.tile([-1, -1.59, 1.96, 12.1], "
     "(20000, 1)); ut.ClosedLoop(rig).batch(rig.state(phi=0.5), p)",
 }

@@ -61,7 +61,13 @@ def runs(
         for seed in progress(range(seeds), f"{name}, {degrees:g}°: seeds"):
             budget = None if warm is None else ut.Budget(warm)
             cascade = ut.Cascade(
-                RIG, objective, period=period, freedom=freedom, warm=budget, seed=seed
+                RIG,
+                objective,
+                period=period,
+                freedom=freedom,
+                warm=budget,
+                seed=seed,
+                belief="exact",
             )
             began = now()
             run = cascade.simulate(x)

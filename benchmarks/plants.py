@@ -75,10 +75,8 @@ def cascade(objective: str, controller: str) -> ut.Cascade:
     """Return a cascade; one for each process."""
     if controller == "belief":
         belief = ut.Belief.relative(RIG, **SPREAD)
-        return ut.Cascade(
-            RIG, OBJECTIVES[objective], period=0.02, belief=belief, warm=ut.Budget(256)
-        )
-    return ut.Cascade(RIG, OBJECTIVES[objective])
+        return ut.Cascade(RIG, OBJECTIVES[objective], belief=belief)
+    return ut.Cascade(RIG, OBJECTIVES[objective], belief="exact")
 
 
 @cache

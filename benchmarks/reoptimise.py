@@ -75,7 +75,7 @@ Runs = list[tuple[FloatArray, float, list[Task]]]
 
 def collect(objective: ut.Objective, starts: tuple[float, ...], steps: int) -> Runs:
     """Return for each start its state, the cost of its first optimum, and its tasks."""
-    cascade = ut.Cascade(RIG, objective)
+    cascade = ut.Cascade(RIG, objective, belief="exact")
     exact, optimiser = cascade.loop, cascade.optimiser
     runs: Runs = []
     for start in progress(starts, f"{objective.name}: tasks"):
@@ -155,7 +155,7 @@ def theirs(mpc: DoMPC | ShootingMPC, runs: Runs, now: Clock) -> tuple[Score, Sco
 
 def compare(objective: ut.Objective, goal: Goal, runs: Runs, rounds: int, now: Clock) -> list[str]:
     """Print both tables of one objective; return what to say of the wanted figures."""
-    cascade = ut.Cascade(RIG, objective)
+    cascade = ut.Cascade(RIG, objective, belief="exact")
     do_mpc, shooting = DoMPC(RIG, goal), ShootingMPC(RIG, goal)
     names = ["undertow", "do-mpc, IPOPT, N = 25", f"CasADi, IPOPT, N = {len(shooting.grid)}"]
     entrants: list[Callable[[int], tuple[Score, Score]]] = [

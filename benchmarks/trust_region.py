@@ -28,9 +28,9 @@ def cascade_with(mechanism: ut.Mechanism, model: bool, seed: int) -> tuple[float
     """Return the cost of one cascade and its re-optimisations."""
     size = task.MODEL_SIZE if model else -1
     with mock.patch.object(task, "MODEL_SIZE", size):
-        run = ut.Cascade(mechanism, ut.objective_for(mechanism, "energy"), seed=seed).simulate(
-            mechanism.usual_start
-        )
+        run = ut.Cascade(
+            mechanism, ut.objective_for(mechanism, "energy"), seed=seed, belief="exact"
+        ).simulate(mechanism.usual_start)
     return (run.cost if run.reached else np.inf), list(run.updates[1:])
 
 
@@ -45,7 +45,9 @@ def main() -> int:
     rows = []
     for name in progress(list(names), "mechanisms"):
         mechanism = LIBRARY[name]()
-        size = ut.Cascade(mechanism, ut.objective_for(mechanism, "energy")).optimiser.space.size
+        size = ut.Cascade(
+            mechanism, ut.objective_for(mechanism, "energy"), belief="exact"
+        ).optimiser.space.size
         if size > task.MODEL_SIZE:
             continue
         cost: dict[bool, list[float]] = {True: [], False: []}

@@ -61,7 +61,7 @@ def parts() -> dict[str, Any]:
     problem = ut.MinimumTime(horizon=0.05)
     loop = ut.ClosedLoop(rig, problem)
     surface, budget = ut.first_surface(rig), ut.Budget(64)
-    cascade = ut.Cascade(rig, problem, cold=budget, warm=budget)
+    cascade = ut.Cascade(rig, problem, cold=budget, warm=budget, belief="exact")
     x = rig.state(phi=0.001)
     state, proposal = cascade.start(x)
     belief = ut.Belief.relative(rig, m=0.2)
@@ -148,6 +148,8 @@ def kane() -> tuple[Any, dict[Any, ut.Input]]:
 
 #: Arguments that mean something else where they are.
 ELSEWHERE: dict[str, Callable[[], Any]] = {
+    "ClosedLoop.with_steps.step": lambda: 0.002,
+    "ClosedLoop.with_steps.tail_rtol": lambda: 1e-3,
     "Belief.relative.tolerances": lambda: {"m": 0.1},
     "Belief.learn.t": lambda: [0.0, 0.1],
     "Belief.learn.x": lambda: np.zeros((2, 4)),

@@ -34,7 +34,9 @@ BASE = CASES["1 base case"]
 @pytest.fixture(scope="module")
 def cascade(rig: ut.Mechanism) -> ut.Cascade:
     """Minimum time with short searches: a run takes a fraction of a second."""
-    return ut.Cascade(rig, ut.MinimumTime(), cold=ut.Budget(600), warm=ut.Budget(96))
+    return ut.Cascade(
+        rig, ut.MinimumTime(), cold=ut.Budget(600), warm=ut.Budget(96), belief="exact"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,12 @@ def test_time_to_go_falls_by_the_period_at_each_decision(run: ut.Run) -> None:
 def test_cost_to_go_falls_by_what_was_spent(rig: ut.Mechanism) -> None:
     """Lemma 3: J̃ₖ₊₁ ≤ J̃ₖ − spent at every decision of a minimum-energy run."""
     cascade = ut.Cascade(
-        rig, ut.MinimumEnergy(), period=0.5, cold=ut.Budget(600), warm=ut.Budget(96)
+        rig,
+        ut.MinimumEnergy(),
+        period=0.5,
+        cold=ut.Budget(600),
+        warm=ut.Budget(96),
+        belief="exact",
     )
     run = cascade.simulate(phi=ut.deg(30))
     assert run.reached
@@ -98,7 +105,10 @@ def test_no_worse_than_the_one_time_optimum(run: ut.Run, cascade: ut.Cascade) ->
 )
 def test_cascades_at_41_degrees(rig: ut.Mechanism, objective: ut.Objective, at_most: float) -> None:
     """Energy ≤ 11.9 V² s and time ≤ 1.42 s at 41°, d_e = 0.025; three seeds within 1 %."""
-    runs = [ut.Cascade(rig, objective, seed=seed).simulate(phi=ut.deg(41)) for seed in range(3)]
+    runs = [
+        ut.Cascade(rig, objective, seed=seed, belief="exact").simulate(phi=ut.deg(41))
+        for seed in range(3)
+    ]
     costs = np.array([run.cost for run in runs])
     firsts = np.array([run.updates[0].predicted for run in runs])
     assert all(run.reached for run in runs)
@@ -299,7 +309,10 @@ def test_fast_step_is_bounded_and_never_nan(cascade: ut.Cascade) -> None:
 def test_hard_input_limit_that_no_surface_meets_is_refused(rig: ut.Mechanism) -> None:
     """The first optimisation raises, with value, limit and remedy, before anything moves."""
     cascade = ut.Cascade(
-        rig.with_input_limit(0.3), ut.MinimumTime(hard_input=True), cold=ut.Budget(300)
+        rig.with_input_limit(0.3),
+        ut.MinimumTime(hard_input=True),
+        cold=ut.Budget(300),
+        belief="exact",
     )
     with pytest.raises(InfeasibleError) as caught:
         cascade.simulate(phi=ut.deg(30))
@@ -311,13 +324,13 @@ def test_hard_input_limit_that_no_surface_meets_is_refused(rig: ut.Mechanism) ->
 def test_unusable_settings_are_refused(rig: ut.Mechanism) -> None:
     """A period off the step grid, an unstable and a singular first surface, a wrong state."""
     with pytest.raises(InvalidInputError, match="period"):
-        ut.Cascade(rig, period=0.0333)
+        ut.Cascade(rig, period=0.0333, belief="exact")
     with pytest.raises(UnstableSurfaceError):
-        ut.Cascade(rig, first=ut.Surface(-1, 0.5, 5, 10))
+        ut.Cascade(rig, first=ut.Surface(-1, 0.5, 5, 10), belief="exact")
     with pytest.raises((SingularSurfaceError, UnstableSurfaceError)):
-        ut.Cascade(rig, first=ut.Surface(-1, -0.5, 0.5, 10))
+        ut.Cascade(rig, first=ut.Surface(-1, -0.5, 0.5, 10), belief="exact")
     with pytest.raises(InvalidInputError, match="'psi'"):
-        ut.Cascade(rig).simulate(psi=0.1)
+        ut.Cascade(rig, belief="exact").simulate(psi=0.1)
 
 
 # -- how far down the kernel is ----------------------------------------------------------------
@@ -343,7 +356,7 @@ def test_ten_frames_lie_between_simulate_and_the_kernel(
 
     monkeypatch.setattr(rollout, "compile_loop", watched)
     few = ut.Budget(200)
-    cascade = ut.Cascade(rig, objective, cold=few, warm=few)
+    cascade = ut.Cascade(rig, objective, cold=few, warm=few, belief="exact")
     outside = sum(1 for _ in traceback.walk_stack(sys._getframe()))
     cascade.simulate(phi=ut.deg(20))
     assert 5 < max(depths) <= 10

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from undertow.base import InvalidInputError
+from undertow.cascade import CascadeState, cost_gate
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
 
@@ -62,10 +64,96 @@ def test_the_first_plan_is_the_best_for_the_estimate(pendulum: ut.Mechanism) -> 
     """Nothing is known better yet, and the next decision knows more: no premium for all plants."""
     objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.5)
     cost = [
-        replace(cascade, belief=None).loop.batch(x, cascade.start(x)[0].plan).cost[0]
-        for cascade in (learning(pendulum, objective), ut.Cascade(pendulum, objective))
+        replace(cascade, belief="exact").loop.batch(x, cascade.start(x)[0].plan).cost[0]
+        for cascade in (
+            learning(pendulum, objective),
+            ut.Cascade(pendulum, objective, belief="exact"),
+        )
     ]
     assert cost[0] == pytest.approx(cost[1], rel=0.01)
+
+
+def test_a_cascade_holds_plants_that_differ_from_its_model(pendulum: ut.Mechanism) -> None:
+    """With no argument of its own: the exact model meets the singularity on these plants."""
+    objective = ut.MinimumTime(horizon=6.0)
+    cascade = ut.Cascade(pendulum, objective)
+    exact = replace(cascade, belief="exact")
+    lost, times = 0, []
+    for k in range(4):
+        rng = np.random.default_rng([5, k])
+        plant = changed(pendulum, {k: rng.uniform(-part, part) for k, part in SPREAD.items()})
+        run = cascade.simulate(phi=ut.deg(30), plant=plant)
+        assert run.reached
+        times.append(run.time)
+        lost += not exact.simulate(phi=ut.deg(30), plant=plant).reached
+    assert lost >= 1
+    assert np.median(times) < 1.0
+
+
+def test_decisions_come_early_when_what_is_learnt_breaks_the_plan(pendulum: ut.Mechanism) -> None:
+    """Of twelve plants some need a decision between two; spent cost is counted to each."""
+    cascade = ut.Cascade(pendulum, ut.MinimumTime(horizon=6.0))
+    early = 0
+    for k in range(6):
+        rng = np.random.default_rng([77, k])
+        plant = changed(pendulum, {k: rng.uniform(-part, part) for k, part in SPREAD.items()})
+        run = cascade.simulate(phi=ut.deg(37), plant=plant)
+        at = np.array([update.t for update in run.updates])
+        off = np.abs(at / cascade.period - np.round(at / cascade.period)) > 1e-6
+        early += int(off.sum())
+        spent = sum(update.spent for update in run.updates)
+        assert spent == pytest.approx(at[-1], abs=1e-9)  # least time spends time
+        assert np.isin(np.arange(0, at[-1], cascade.period).round(6), at.round(6)).all()
+    assert early > 0
+
+
+def test_where_no_plan_suits_all_the_one_that_lives_longest_is_kept(
+    pendulum: ut.Mechanism,
+) -> None:
+    """Fast towards the singularity: the gate takes what all plants survive longer, no other."""
+    cascade = ut.Cascade(pendulum, ut.MinimumTime(horizon=6.0))
+    x = pendulum.state(phi=0.75, phi_dot=3.0)
+    surfaces = [ut.Surface(-1, -2, 1.6, 8), ut.Surface(-1, -2, 1.9, 8)]
+    pair = cascade.loop.batch(x, surfaces, duration=6.0)
+    assert not pair.reached.any()
+    assert pair.time[0] != pair.time[1]
+    short, long = (ut.Plan.of(surfaces[k]) for k in np.argsort(pair.time))
+    assert cost_gate(cascade.loop, short, long, x, 6.0).accepted
+    assert not cost_gate(cascade.loop, long, short, x, 6.0).accepted
+    alone = replace(cascade, belief="exact").loop
+    assert not cost_gate(alone, short, long, x, 6.0).accepted
+    state = CascadeState(
+        short, x=tuple(x), estimate=cascade.start(pendulum.state(phi=0.1))[0].estimate
+    )
+    proposal = cascade.propose(state, x)
+    assert proposal.status == "infeasible"
+    assert proposal.plan is not None
+    kept, admission = cascade.apply_gate(state, proposal, x)
+    assert admission.accepted
+    assert cascade.loop.batch(x, kept.plan).time[0] > pair.time.min()
+
+
+def test_usual_tolerances_and_those_that_parameters_carry(pendulum: ut.Mechanism) -> None:
+    """By unit where nobody says; a parameter's own tolerance counts, and 0 is exact."""
+    usual = ut.Belief.usual(pendulum)
+    value = {p.name: p.value for p in pendulum.parameters}
+    assert "g" not in usual.tolerances
+    assert usual.tolerances["m"] == pytest.approx(0.2 * value["m"])
+    assert usual.tolerances["d_e"] == pytest.approx(0.5 * value["d_e"])
+    own = {"m": 0.001, "l": 0.0}
+    told = replace(
+        pendulum,
+        parameters=tuple(replace(p, tolerance=own.get(p.name)) for p in pendulum.parameters),
+    )
+    belief = ut.Belief.usual(told)
+    assert belief.tolerances["m"] == 0.001
+    assert "l" not in belief.tolerances
+    nothing = replace(
+        pendulum, parameters=tuple(replace(p, tolerance=0.0) for p in pendulum.parameters)
+    )
+    assert ut.Cascade(nothing).known is None
+    with pytest.raises(InvalidInputError, match="tolerance of parameter 'm'"):
+        replace(pendulum.parameters[0], name="m", tolerance=-1.0)
 
 
 @pytest.mark.slow
@@ -98,7 +186,7 @@ def test_least_time_on_plants_that_are_not_the_model(
         for _ in range(8)
     ]
     objective, start = ut.MinimumTime(horizon=6.0), pendulum.state(phi=math.radians(degrees))
-    learnt, exact = learning(pendulum, objective), ut.Cascade(pendulum, objective)
+    learnt, exact = learning(pendulum, objective), ut.Cascade(pendulum, objective, belief="exact")
     surface = exact.simulate(start).surfaces[0]
     times, kept, lost = [], [], 0
     for plant in plants:
@@ -116,7 +204,7 @@ def test_least_time_on_plants_that_are_not_the_model(
 
 def test_without_a_belief_nothing_is_learnt(pendulum: ut.Mechanism) -> None:
     """The exact cascade's memory stays as it is."""
-    cascade = ut.Cascade(pendulum, ut.MinimumEnergy(horizon=10.0))
+    cascade = ut.Cascade(pendulum, ut.MinimumEnergy(horizon=10.0), belief="exact")
     x = pendulum.state(phi=0.3)
     memory, _ = cascade.start(x)
     assert memory.estimate is None

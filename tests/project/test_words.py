@@ -130,8 +130,8 @@ def test_declared_travel_bounds_every_problem(cart: ut.Mechanism) -> None:
     for problem in (
         ut.ClosedLoop(cart, ut.MinimumEnergy()).objective,
         ut.ClosedLoop(cart, mine).objective,
-        ut.Cascade(cart, ut.MinimumTime()).objective,
-        ut.Cascade(cart).optimiser.loop.objective,
+        ut.Cascade(cart, ut.MinimumTime(), belief="exact").objective,
+        ut.Cascade(cart, belief="exact").optimiser.loop.objective,
         ut.objective_for(cart, "energy"),
         Recipe(mechanism="cart_pendulum").cascade.objective,
     ):
@@ -206,7 +206,7 @@ def test_a_box_beyond_the_travel_is_refused_in_python_too(cart: ut.Mechanism) ->
     wide = ut.state_box(x=(-1.0, 3.0))
     for attempt in (
         lambda: ut.ClosedLoop(cart, ut.MinimumTime(constraints=wide)),
-        lambda: ut.Cascade(cart, ut.MinimumEnergy(constraints=wide)),
+        lambda: ut.Cascade(cart, ut.MinimumEnergy(constraints=wide), belief="exact"),
         lambda: objective_for(cart, "energy", constraints=wide),
     ):
         with pytest.raises(
@@ -225,7 +225,7 @@ def test_a_box_beyond_the_travel_is_refused_in_python_too(cart: ut.Mechanism) ->
 @pytest.mark.slow  # a cascade that has to turn round before the end of the rail
 def test_simulate_keeps_the_cart_on_its_rail(cart: ut.Mechanism) -> None:
     """The optimum without the rail needs 6.5 m of it; what is planned stays within 1.425 m."""
-    motion = ut.Cascade(cart, objective_for(cart, "energy")).simulate().trajectory
+    motion = ut.Cascade(cart, objective_for(cart, "energy"), belief="exact").simulate().trajectory
     assert motion.event == ut.Event.REACHED
     assert 1.0 < np.abs(motion["x"]).max() <= 1.425
 
@@ -236,7 +236,7 @@ def test_simulate_keeps_the_cart_on_its_rail(cart: ut.Mechanism) -> None:
 def test_one_gate_is_the_default_everywhere() -> None:
     """Exact states: the cost gate; with an estimator the same and the stated margins."""
     assert default_gate() is cost_gate
-    assert ut.Cascade(RIG).gate is cost_gate
+    assert ut.Cascade(RIG, belief="exact").gate is cost_gate
     bench = srv02_rig()
     filter_ = estimator_for(bench.mechanism, bench)
     recipe = Recipe(rig="realistic")
@@ -351,7 +351,7 @@ def test_a_run_without_a_start_is_refused_before_any_work(tmp_path: Path) -> Non
     )
     own = f"{tmp_path / 'own.py'}:rig"
     with pytest.raises(InvalidInputError, match=r"start of 'rotary_pendulum'.*--start phi=0\.1rad"):
-        ut.Cascade(NOWHERE).simulate()
+        ut.Cascade(NOWHERE, belief="exact").simulate()
     with pytest.raises(InvalidInputError, match="start of"):
         _ = Recipe(mechanism=own).x0
     with pytest.raises(InvalidInputError, match="start of"):
@@ -379,7 +379,7 @@ def test_a_start_at_the_target_is_no_success_of_control() -> None:
 def steered() -> ut.Cascade:
     """A cascade of small budgets, shared by what follows."""
     goal = ut.MinimumTime(horizon=20.0)
-    return ut.Cascade(RIG, goal, cold=ut.Budget(300), warm=ut.Budget(64))
+    return ut.Cascade(RIG, goal, cold=ut.Budget(300), warm=ut.Budget(64), belief="exact")
 
 
 def test_an_admission_says_that_the_target_jumped(steered: ut.Cascade) -> None:
@@ -459,7 +459,7 @@ SENT: dict[str, Callable[[], ut.Objective]] = {
 @pytest.mark.parametrize("kind", SENT)
 def test_copies_of_a_cascade_are_made_of_the_same(kind: str) -> None:
     """Pickled or copied: the same problem, mechanism and gate, so the same kernel."""
-    cascade = ut.Cascade(RIG, SENT[kind]())
+    cascade = ut.Cascade(RIG, SENT[kind](), belief="exact")
     for again in (
         pickle.loads(pickle.dumps(cascade)),
         pickle.loads(pickle.dumps(cascade.loop)),

@@ -64,7 +64,9 @@ def cascade(answers: Sequence[ut.Surface | None], **settings: Any) -> ut.Cascade
     """A cascade whose optimiser lies: it claims cost 0 for everything."""
     goal = ut.MinimumTime(horizon=20.0)
     gate = certified_gate(Policy())
-    return ut.Cascade(RIG, goal, gate=gate, first=GOOD, planner=Fake(answers), **settings)
+    return ut.Cascade(
+        RIG, goal, gate=gate, first=GOOD, planner=Fake(answers), **settings, belief="exact"
+    )
 
 
 def test_bad_proposals_are_refused_and_the_run_converges() -> None:

@@ -74,7 +74,7 @@ def test_a_plan_is_packed_as_the_slow_loop_packs_it(name: str) -> None:
     """Bit for bit; det Γ(0), which both compute by themselves, to rounding."""
     mechanism = getattr(ut.mechanisms, name)()
     law = ReachingLaw(30.0, 0.2)
-    cascade = ut.Cascade(mechanism, ut.MinimumTime(), law)
+    cascade = ut.Cascade(mechanism, ut.MinimumTime(), law, belief="exact")
     surface = first_surface(mechanism)
     other = ut.Surface.from_vector(1.01 * surface.vector, mechanism.n, mechanism.m)
     test = PlanCheck(mechanism, law)

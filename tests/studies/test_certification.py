@@ -51,7 +51,9 @@ def text(shown: Any, width: int = 150) -> str:
 def run() -> ut.Run:
     """A short cascade whose gate asks for evidence."""
     gate = certified_gate(Policy(("region", "dual")))
-    cascade = ut.Cascade(RIG, GOAL, gate=gate, first=GOOD, cold=ut.Budget(64), warm=ut.Budget(32))
+    cascade = ut.Cascade(
+        RIG, GOAL, gate=gate, first=GOOD, cold=ut.Budget(64), warm=ut.Budget(32), belief="exact"
+    )
     return cascade.simulate(phi=0.2)
 
 

@@ -66,7 +66,11 @@ def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism)
 def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None:
     x0 = arm.state(phi=0.4)
     cascade = ut.Cascade(
-        arm, objective_for(arm, "bench-energy"), warm=ut.Budget(64), cold=ut.Budget(256)
+        arm,
+        objective_for(arm, "bench-energy"),
+        warm=ut.Budget(64),
+        cold=ut.Budget(256),
+        belief="exact",
     )
     start = cascade.start(x0)
     records = [

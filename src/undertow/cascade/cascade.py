@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,7 @@ from undertow.base import (
     at_least,
     check_fields,
     checked,
+    one_of,
     positive,
     write_file,
 )
@@ -73,6 +74,9 @@ RESOLVED = 1.0
 #: that jumps shows in positions at once; what a model does not know shows in velocities first.
 JUMP, PART = 0.1, 0.5
 
+#: How often what a motion shows is learnt, about, s.
+LEARNING = 0.02
+
 Gate = Callable[[ClosedLoop, Plan, Plan, FloatArray, float], Admission]
 
 
@@ -80,7 +84,8 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
     """Admit a plan that is stable, feasible from x, and does not raise the cost.
 
     Both plans are rolled out afresh from the present state: nothing that the optimiser
-    says of them is believed.  This is the step of Lemma 3, J̃_{k+1} ≤ Ĵ_{k+1}.
+    says of them is believed.  This is the step of Lemma 3, J̃_{k+1} ≤ Ĵ_{k+1}.  On an ensemble,
+    where neither suits every plausible plant, the one that all survive longer stays in use.
 
     Parameters
     ----------
@@ -94,16 +99,19 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
         Longest prediction, s.
     """
     pair = loop.batch(x, [old, new], duration=horizon)
-    old_cost, new_cost = pair.score(horizon)
-    old_cost = float(old_cost) if old_cost < INADMISSIBLE else math.inf
+    old_score, new_cost = pair.score(horizon)
+    old_cost = float(old_score) if old_score < INADMISSIBLE else math.inf
     stability = float(stability_margin(loop.mechanism, new.surfaces[-1]))
     if not stability > 0:
         return Admission(False, f"unstable: margin {stability:.3g} 1/s", old_cost)
     if new_cost >= INADMISSIBLE:
         event = Event(int(pair.event[1])).name.lower()
-        return Admission(
-            False, f"not feasible from here: {event} at {pair.time[1]:.3g} s", old_cost
-        )
+        broken = f"{event} at {pair.time[1]:.3g} s"
+        if loop.ensemble is not None and new_cost < old_score:  # of two that fail, the later
+            return Admission(
+                True, f"suits not every plausible plant, but longer: {broken}", old_cost
+            )
+        return Admission(False, f"not feasible from here: {broken}", old_cost)
     if new_cost > old_cost:
         return Admission(
             False, f"raises the predicted cost: {new_cost:.6g} > {old_cost:.6g}", old_cost
@@ -351,9 +359,11 @@ class Cascade:
         Proposes plans in the place of :attr:`optimiser`: one of your own.  The gate judges what
         it proposes as it judges the library's.
     belief
-        What is not known of the mechanism.  Plans are then judged on an ensemble of plausible
-        plants, and what the motion shows narrows it: law, search and gate go on with the
-        estimated parameters.  Without it the mechanism is taken to be exact.
+        What is not known of the mechanism: by default the tolerances that its parameters carry,
+        :meth:`undertow.Belief.usual`.  Plans are judged on an ensemble of plausible plants, and
+        what the motion shows narrows it: law, search and gate go on with the estimated parameters,
+        and a plan that some plausible plant would not survive is replaced before its period ends.
+        ``"exact"``: the mechanism is taken for the plant, as in the paper.
 
     Raises
     ------
@@ -385,7 +395,7 @@ class Cascade:
     gate: Gate = cost_gate
     seed: int = 0
     planner: Planner | None = None
-    belief: Belief | None = None
+    belief: Belief | Literal["usual", "exact"] = "usual"
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
@@ -424,18 +434,28 @@ class Cascade:
             )
         if self.first is not None:
             check_surface(self.mechanism, self.first)
-        if self.belief is not None and self.belief.mechanism is not self.mechanism:
+        known = self.known
+        if known is not None and known.mechanism is not self.mechanism:
             raise InvalidInputError(
                 "belief of the cascade",
-                value=f"about '{self.belief.mechanism.name}', another object",
+                value=f"about '{known.mechanism.name}', another object",
                 limit=f"about the cascade's own mechanism, '{self.mechanism.name}'",
                 remedy="Write Cascade(rig, belief=Belief.relative(rig, m=0.2))",
             )
 
     @cached_property
+    def known(self) -> Belief | None:
+        """What is known of the mechanism; ``None`` where it is exact."""
+        if isinstance(self.belief, Belief):
+            return self.belief
+        one_of("belief of the cascade", self.belief, ("usual", "exact"))
+        usual = None if self.belief == "exact" else Belief.usual(self.mechanism)
+        return usual if usual is not None and usual.tolerances else None
+
+    @cached_property
     def loop(self) -> ClosedLoop:
         """The predicted closed loop, belief as plant, integrated to its end: the gate's."""
-        belief = self.belief
+        belief = self.known
         return ClosedLoop(
             self.mechanism,
             self.objective,
@@ -453,7 +473,7 @@ class Cascade:
     @cached_property
     def _loops(self) -> Callable[[ParameterEstimate | None], ClosedLoop]:
         """The predicted closed loop for an estimate; the latest are kept."""
-        belief, prior = self.belief, self.loop
+        belief, prior = self.known, self.loop
 
         @lru_cache(maxsize=2)
         def loop(estimate: ParameterEstimate | None) -> ClosedLoop:
@@ -474,9 +494,9 @@ class Cascade:
         t, x, u
             Times, (N,), s; states, (N, 2n); inputs after the actuator, (N, m).
         """
-        if self.belief is None or state.estimate is None:
+        if self.known is None or state.estimate is None:
             return state
-        return replace(state, estimate=self.belief.learn(state.estimate, t, x, u))
+        return replace(state, estimate=self.known.learn(state.estimate, t, x, u))
 
     @cached_property
     def optimiser(self) -> Optimiser:
@@ -537,7 +557,7 @@ class Cascade:
 
     def _start(self, x: FloatArray) -> tuple[CascadeState, Proposal]:
         self.objective.check_start(self.mechanism, x)
-        known = None if self.belief is None else self.belief.prior
+        known = None if self.known is None else self.known.prior
         tries = self._first_tries()
         for number, (loop, small) in enumerate(tries, 1):
             planner = self.optimiser.on(loop) if small else self._planner(loop)
@@ -552,8 +572,7 @@ class Cascade:
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
             if loop is not self.loop:  # every plausible plant lives to see the next decision
-                event = self.loop.batch(x, plan, duration=2 * self.period).event[0]
-                good &= event in (Event.HORIZON, Event.REACHED)
+                good &= self.survives(CascadeState(plan, estimate=known), x, 0.0)
             if good or number == len(tries):
                 return CascadeState(plan, 0, cost, cost, x=_kept(x), estimate=known), proposal
         raise AssertionError("the last try returns or raises")
@@ -568,8 +587,8 @@ class Cascade:
         if self.planner is not None:
             return [(self.loop, False)]
         loops = [self.loop]
-        if self.belief is not None:
-            one = Ensemble(self.mechanism, self.belief.values(self.belief.prior.offset[None]))
+        if self.known is not None:
+            one = Ensemble(self.mechanism, self.known.values(self.known.prior.offset[None]))
             loops.insert(0, self.loop.believing(self.mechanism, one))
         return list(itertools.product(loops, (False, True)))
 
@@ -689,7 +708,41 @@ class Cascade:
             return ""
         return f"; the state is {off:.3g} off the plan's prediction: after a jump, call start again"
 
+    @checked
+    def survives(self, state: CascadeState, x: ArrayLike, t: float) -> bool:
+        """Whether every plausible plant lives to see the next decisions with the plan in use.
+
+        What is learnt between two decisions may show that it does not: then it is time for the
+        next one.  Without an ensemble there is nothing to learn, and the answer is yes.
+
+        Parameters
+        ----------
+        state
+            Memory of the cascade.
+        x
+            Present state, (2n,).
+        t
+            When that is, s.
+        """
+        loop = self.loop_at(state)
+        if loop.ensemble is None:
+            return True
+        event = loop.batch(x, state.at(t), duration=2 * self.period).event[0]
+        return event in (Event.HORIZON, Event.REACHED)
+
     # -- simulation -----------------------------------------------------------------------
+
+    def _moments(self, total: float) -> Iterator[tuple[float, float, bool]]:
+        """Times of a run, s, until the next one, and whether a decision is due."""
+        stride = self.step * max(1, self.zoh_steps)
+        strides = round(self.period / stride)
+        parts = 1 if self.known is None else min(strides, max(1, round(self.period / LEARNING)))
+        within = [round(strides * part / parts) * stride for part in range(parts)]
+        for k in range(math.ceil(total / self.period - 1e-9)):
+            for part, (begin, end) in enumerate(itertools.pairwise([*within, self.period])):
+                t = k * self.period + begin
+                if t < total - 1e-9:
+                    yield t, min(end - begin, total - t), part == 0
 
     @checked
     def simulate(
@@ -725,33 +778,29 @@ class Cascade:
         x = self.mechanism.initial_state(x0, state)
         total = self.objective.horizon if duration is None else duration
         positive("duration of a run, s", total, "Leave it out for the objective's horizon")
-        moving = plant or (None if self.belief is None else self.mechanism)
+        moving = plant or (None if self.known is None else self.mechanism)
         truth = replace(self.loop, plant=moving, ensemble=None)
         memory, proposal = self._start(x)
         admission = self.first_admission(memory, x, total)
         updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
         pieces: list[Trajectory] = []
-        for k in range(math.ceil(total / self.period - 1e-9)):
-            t = k * self.period
-            if k > 0:
+        since = 0  # the last decision, in pieces
+        for t, span, due in self._moments(total):
+            if t > 0 and (due or not self.survives(memory, x, t)):
                 proposal = self._propose(memory, x, t, total - t)
                 memory, admission = self.apply_gate(memory, proposal, x, total - t)
-                updates.append(
-                    Update(
-                        t, x, proposal, admission, memory.plan, memory.predicted,
-                        pieces[-1].cost,
-                    )
-                )  # fmt: skip
-            pieces.append(
-                truth.simulate(x, memory.plan, duration=min(self.period, total - t), start=t)
-            )
+                spent = sum(piece.cost for piece in pieces[since:])
+                since = len(pieces)
+                update = Update(t, x, proposal, admission, memory.plan, memory.predicted, spent)
+                updates.append(update)
+            pieces.append(truth.simulate(x, memory.at(t), duration=span, start=t))
             x = pieces[-1].x[-1]
-            if self.belief is not None:
+            if self.known is not None:
                 motion = pieces[-1]
                 memory = self.learn(memory, motion.t, motion.x, motion.u)
                 truth = truth.believing(self.loop_at(memory).mechanism)
             if progress is not None:
-                progress(t + self.period, total)
+                progress(t + span, total)
             if pieces[-1].event != Event.HORIZON:
                 break
         return Run(Trajectory.join(pieces), tuple(updates))

@@ -141,7 +141,7 @@ def certify(
             certified, report = cases, certification.appendix_report(cases)
         elif run:
             mechanism, x0, goal = parse_task(str(name), start, objective, horizon, settings=setting)
-            cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed)
+            cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed, belief="exact")
             motion = cascade.simulate(x0, progress=lambda t, end: progress("cascade", t / end))
             certified = certification.certify_run(mechanism, motion, progress=progress)
             report = certification.run_report(motion)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from undertow.cascade import Cascade, Gate
 from undertow.cli import options
@@ -64,6 +64,15 @@ def simulate(
             metavar="EVIDENCE",
         ),
     ] = None,
+    known: Annotated[
+        Literal["usual", "exact"] | None,
+        option(
+            "--belief",
+            "What the cascade takes for known. usual: parameters within their tolerances, learnt "
+            "as it goes. exact: the model, as in the paper. Default: usual; with --accept, whose "
+            "evidence is of one model, exact.",
+        ),
+    ] = None,
     seed: options.Seed = 0,
     out: Annotated[Path | None, folder("motion.csv, motion.png and manifest.json")] = None,
 ) -> None:
@@ -80,7 +89,8 @@ def simulate(
     run = gate = None
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
-        cascade = Cascade(belief, goal, period=period, gate=gate, seed=seed)
+        known = known or ("usual" if accept is None else "exact")
+        cascade = Cascade(belief, goal, period=period, gate=gate, seed=seed, belief=known)
         with progress_bar() as progress:
             run = cascade.simulate(
                 x0, plant=truth, progress=lambda t, end: progress("cascade", t / end)

@@ -196,6 +196,11 @@ class ClosedLoop:
         )
 
     @cached_property
+    def _alone(self) -> ClosedLoop:
+        """This loop with its mechanism as the only plant."""
+        return replace(self, ensemble=None)
+
+    @cached_property
     def linear_end(self) -> TerminalLinearModel | None:
         """The linear model of this loop at the target, where it has one."""
         if self.zoh_steps or self.reaching.switching == "sign" or self.plant is not None:
@@ -238,7 +243,9 @@ class ClosedLoop:
         """Return a copy with other fields, unchecked, and without some of what was computed."""
         assert self._kernels is not None  # found once, for all copies
         other = object.__new__(type(self))
-        other.__dict__.update({k: v for k, v in vars(self).items() if k not in without}, **fields)
+        other.__dict__.update(
+            {k: v for k, v in vars(self).items() if k not in without | {"_alone"}}, **fields
+        )
         return other
 
     def _switch_steps(self, switch_times: Sequence[float]) -> NDArray[np.int64]:
@@ -505,12 +512,10 @@ class ClosedLoop:
         self._check_duration(duration)
         at_least("every", every, 1, "Record each step: 1")
         if self.ensemble is not None:
-            raise InvalidInputError(
-                "simulation of a closed loop",
-                value=f"an ensemble of {len(self.ensemble)} plants",
-                limit="one plant",
-                remedy="Give plant= the one that moves, or take batch for what a plan is worth",
-            )
+            return self._alone.simulate(
+                x0, surfaces, switch_times=switch_times, duration=duration, start=start,
+                terminal=terminal, every=every, noise=noise,
+            )  # fmt: skip
         plan = Plan.of(surfaces, switch_times)
         for surface in plan.surfaces:
             check_surface_shape(self.mechanism, surface)

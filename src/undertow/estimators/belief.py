@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, check_fields, checked, floats, one_of, positive
 from undertow.closed_loop import Ensemble, Risk
-from undertow.models import FloatArray, Mechanism, number_of
+from undertow.models import FloatArray, Mechanism, linear_numbers, number_of
 
 #: Standard deviation of what is evenly spread over ± a tolerance, as a part of it.
 EVEN = 1.0 / math.sqrt(3.0)
@@ -31,6 +31,17 @@ EVEN = 1.0 / math.sqrt(3.0)
 #: What is never known better, as a part of the tolerance: what the model leaves out looks like an
 #: error of its parameters, and least time goes right past singular plants.
 LEAST = 0.2
+
+#: How far a parameter is usually off where nobody says, as a part of its value, by its unit.
+#: What has no unit, gravity and zeros count as exact.
+USUAL = {"kg": 0.2, "kg m²": 0.2, "m": 0.05, "N m s/rad": 0.5, "N s/m": 0.5}
+OTHERS, EXACT = 0.1, ("", "m/s²")
+
+#: Usual deviations of a change of velocity over a sample, by the unit of the coordinate.
+NOISE = {"rad": 0.004, "m": 0.001}
+
+#: How many axes of what is uncertain span an ensemble, at most: those that matter most.
+AXES = 7
 
 #: Relative step of the differences by which accelerations are linearised in the parameters.
 STEP = 1e-5
@@ -80,8 +91,8 @@ class Belief:
         Names of uncertain parameters and how far they may be off, SI units.
     noise
         Standard deviation of how a velocity changes over one sample beyond what the model says, in
-        the units of the velocities: one number, or one for each coordinate.  0.004 rad/s over a
-        sample of 2 ms is 2 rad/s².
+        the units of the velocities: one number, or one for each coordinate.  The usual 0.004 rad/s
+        (0.001 m/s) over a sample of 2 ms is 2 rad/s² (0.5 m/s²).
     confidence
         How many standard deviations from the estimate the members of the ensemble stand; a
         deviation counts as a fifth of the tolerance at least.
@@ -107,7 +118,7 @@ class Belief:
 
     mechanism: Mechanism
     tolerances: Mapping[str, float]
-    noise: float | tuple[float, ...] = 0.004
+    noise: float | tuple[float, ...] | None = None
     confidence: float = 1.0
     risk: Risk = "mean"
 
@@ -129,7 +140,7 @@ class Belief:
                     f"{parameter.value:g} leaves",
                     remedy="Leave certain parameters out",
                 )
-        noise = np.asarray(self.noise, dtype=float)
+        noise = self.deviations if self.noise is None else np.asarray(self.noise, dtype=float)
         if (
             noise.shape not in ((), (self.mechanism.n,))
             or not (np.isfinite(noise) & (noise > 0)).all()
@@ -149,9 +160,30 @@ class Belief:
             one_of(f"uncertain parameter of '{mechanism.name}'", name, values)
         return cls(mechanism, {name: part * values[name] for name, part in tolerances.items()})
 
+    @classmethod
+    @checked
+    def usual(cls, mechanism: Mechanism) -> Belief:
+        """Return the belief of a mechanism whose parameters carry tolerances, or the usual ones.
+
+        Usual is ±20 % of masses and inertias, ±5 % of lengths, ±50 % of damping and ±10 % of all
+        else, gravity and numbers without a unit apart.
+        """
+        found: dict[str, float] = {}
+        for p in mechanism.parameters:
+            part = 0.0 if p.unit in EXACT else USUAL.get(p.unit, OTHERS)
+            tolerance = abs(p.value) * part if p.tolerance is None else p.tolerance
+            room = min(p.value - p.low, p.high - p.value)
+            if p.tolerance is None and not tolerance < room:
+                tolerance = 0.5 * room
+            if tolerance > 0:
+                found[p.name] = tolerance
+        return cls(mechanism, found)
+
     @property
     def deviations(self) -> FloatArray:
         """Standard deviations of the changes of velocity, (n,)."""
+        if self.noise is None:
+            return np.array([NOISE[c.unit] for c in self.mechanism.coordinates])
         return np.broadcast_to(np.asarray(self.noise, dtype=float), self.mechanism.n)
 
     @cached_property
@@ -192,23 +224,40 @@ class Belief:
     def ensemble(self, estimate: ParameterEstimate) -> Ensemble:
         """Return the estimate and the corners of what is plausible around it.
 
-        The corners are those of a two-level orthogonal design (Hadamard's) in the principal axes of
-        the estimate's covariance, kept within the tolerances: every axis is as often high as low,
-        and so is every pair of axes.
+        The corners are those of a two-level orthogonal design (Hadamard's) in the axes of the
+        estimate's covariance, kept within the tolerances: every axis is as often high as low, and
+        so is every pair of axes.  Of more than ``AXES`` parameters the axes that change the
+        accelerations near the target most span the ensemble.
         """
         from scipy.linalg import hadamard  # slow to import
 
         size = len(estimate.offset)
         variances, axes = np.linalg.eigh(np.linalg.inv(estimate.information))
-        design = hadamard(1 << size.bit_length())[:, 1 : size + 1]
-        corners = self.confidence * (design * np.sqrt(variances + LEAST**2)) @ axes.T
-        offsets = np.vstack([estimate.offset, np.clip(estimate.offset + corners, -1.0, 1.0)])
+        axes = axes * np.sqrt(variances + LEAST**2)
+        if size > AXES:
+            axes = axes @ np.linalg.svd(self._effects(estimate.offset) @ axes)[2][:AXES].T
+        count = axes.shape[1]
+        corners = hadamard(1 << count.bit_length())[:, 1 : count + 1] @ axes.T
+        around = np.clip(estimate.offset + self.confidence * corners, -1.0, 1.0)
+        offsets = np.vstack([estimate.offset, around])
         # Of what the corners span, only the estimate's own uncertainty is expected; the rest is a
         # margin: it has to be survived, and costs nothing.
         expected = float(np.mean(variances / (variances + LEAST**2)))
         weights = np.full(len(offsets), expected / (len(offsets) - 1))
         weights[0] = 1.0 - expected
         return Ensemble(self.mechanism, self.values(offsets), self.risk, weights)
+
+    def _effects(self, offset: FloatArray) -> FloatArray:
+        """Return how accelerations near the target depend on the offsets, (E, p), relative."""
+        size = len(offset)
+        values = self.values(np.vstack([offset, offset + STEP * np.eye(size)]))
+        mass, forces, gain = linear_numbers(self.mechanism, values)
+        inputs = np.pad(gain, [(0, 0), (0, self.mechanism.n - self.mechanism.m), (0, 0)])
+        effects = []
+        for side in (forces, inputs):
+            rates = np.linalg.solve(mass, side).reshape(size + 1, -1)
+            effects.append((rates[1:] - rates[0]).T / (STEP * max(np.abs(rates[0]).max(), 1e-12)))
+        return np.vstack(effects)
 
     @checked
     def learn(

@@ -29,6 +29,7 @@ from undertow.models.quantities import (
     Parameter,
     number_of,
     numbers,
+    with_value,
 )
 from undertow.models.validity import (
     by_names,
@@ -293,7 +294,9 @@ class Mechanism:
         numbers = self._columns("parameter values", values, [p.name for p in self.parameters])
         copy = object.__new__(type(self))
         kept = {k: v for k, v in vars(self).items() if k != "fingerprint"}  # of the structure
-        parameters = tuple(p.at(float(v)) for p, v in zip(self.parameters, numbers, strict=True))
+        parameters = tuple(
+            with_value(p, float(v)) for p, v in zip(self.parameters, numbers, strict=True)
+        )
         copy.__dict__.update(kept, parameters=parameters, structure=self.structure)
         check_definite(f"mass_matrix of '{self.name}'", self.coordinates, copy.M)
         return copy

@@ -136,6 +136,9 @@ class Parameter(_Named):
         The open interval of values that make physical sense.
     source
         Where the number was found.
+    tolerance
+        How far off the value may be, in ``unit``; ``None`` where nobody said, and 0 for what is
+        exact.  See :meth:`undertow.Belief.usual`.
     """
 
     name: str
@@ -145,6 +148,7 @@ class Parameter(_Named):
     low: float = -math.inf
     high: float = math.inf
     source: str = ""
+    tolerance: float | None = None
     spelling: str = field(default="", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -168,20 +172,27 @@ class Parameter(_Named):
                 limit=interval,
                 remedy="Give a value inside the interval",
             )
+        if self.tolerance is not None:
+            what = f"tolerance of parameter '{self.name}'"
+            tolerance = number_of(what, self.tolerance)
+            if not 0 <= tolerance < math.inf:
+                raise InvalidInputError(what, value=tolerance, limit="finite and ≥ 0")
+            object.__setattr__(self, "tolerance", tolerance)
 
-    def at(self, value: float) -> Parameter:
-        """Return the parameter with another value, SI units; nothing else is checked again.
 
-        Raises
-        ------
-        InvalidInputError
-            For a value that is not inside the interval.
-        """
-        if not self.low < value < self.high:
-            return replace(self, value=value)  # says what is wrong
-        other = object.__new__(type(self))
-        other.__dict__.update(vars(self), value=value)
-        return other
+def with_value(parameter: Parameter, value: float) -> Parameter:
+    """Return a parameter with another value, SI units; nothing else is checked again.
+
+    Raises
+    ------
+    InvalidInputError
+        For a value that is not inside the interval.
+    """
+    if not parameter.low < value < parameter.high:
+        return replace(parameter, value=value)  # says what is wrong
+    other = object.__new__(Parameter)
+    other.__dict__.update(vars(parameter), value=value)
+    return other
 
 
 @dataclass(frozen=True)

@@ -175,6 +175,8 @@ class Optimiser:
             converged = task.local_search(Plan.of(incumbent))
         if self.shoots:
             converged = task.shoot()
+        if warm and self.loop.ensemble is not None:
+            task.fall_back()
         return task.answer(converged, computed_for)
 
     @checked

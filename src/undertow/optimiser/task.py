@@ -426,6 +426,15 @@ class Optimisation:
             designs.append(self.space.encode(Plan.of(surface)))
         return designs
 
+    def fall_back(self) -> None:
+        """Where nothing suits every plausible plant, also try designs, whatever is left to spend.
+
+        The best plan is then the one that all plants survive longest, and it is answered.
+        """
+        if not self.best_cost < INADMISSIBLE:
+            anchor = self.space.encode(Plan.of(self.optimiser.anchor))
+            self.cost(np.vstack([anchor, *self._designs(16)]))
+
     def answer(self, converged: bool, computed_for: float) -> Proposal:
         """Pack the best admissible plan with its margins."""
         found = self.best_cost < INADMISSIBLE
@@ -436,8 +445,9 @@ class Optimisation:
         status: Status = "infeasible"
         if found:
             status = "converged" if converged else "budget spent"
+        best_effort = self.warm and self.loop.ensemble is not None
         return Proposal(
-            self.best if found else None,
+            self.best if found or best_effort else None,
             status,
             self.best_cost if found else math.inf,
             self.incumbent_cost if self.incumbent_cost < INADMISSIBLE else math.inf,

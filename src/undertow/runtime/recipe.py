@@ -12,7 +12,7 @@ from typing import Any, Literal, Self, get_args
 from undertow.base import InvalidInputError, UndertowError, one_of
 from undertow.cascade import Cascade, CascadeState, cost_gate, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
-from undertow.estimators import KalmanFilter
+from undertow.estimators import Belief, KalmanFilter
 from undertow.law import Plan, ReachingLaw
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
@@ -181,14 +181,28 @@ class Recipe:
 
     @cached_property
     def cascade(self) -> Cascade:
-        """Law, optimiser and gate."""
+        """Law, optimiser and gate; the mechanism is taken to be exact: a run does not learn yet.
+
+        Raises
+        ------
+        InvalidInputError
+            For a design with a belief of its own.
+        """
         estimator, goal = self.make_estimator(), self.objective
         if not isinstance(goal, Objective):
             goal = objective_for(self.belief, goal, horizon=self.horizon)
         design = self.design or Cascade(self.belief, goal, seed=self.seed)
+        if isinstance(design.belief, Belief):
+            raise InvalidInputError(
+                "belief of a run",
+                value=f"tolerances of {', '.join(design.belief.tolerances)}",
+                limit='"exact": a run does not learn yet',
+                remedy="Leave it out, or simulate the cascade",
+            )
         given = design.reaching != ReachingLaw()
         return replace(
             design,
+            belief="exact",
             reaching=design.reaching if given else reaching_for(estimator),
             warm=design.warm or Budget(self.evaluations, self.seconds),
             gate=default_gate(estimator) if design.gate is cost_gate else design.gate,

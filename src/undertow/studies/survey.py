@@ -182,7 +182,7 @@ def survey_one(
     """Bring one mechanism from its listed start to its target; the line of the survey."""
     began = time.perf_counter()
     x0 = mechanism.usual_start
-    cascade = Cascade(mechanism, objective, seed=seed)
+    cascade = Cascade(mechanism, objective, seed=seed, belief="exact")
     loop = cascade.loop
     proposal = cascade.start(x0)[1]
     plan, first = proposal.plan, cascade.optimiser.anchor
@@ -244,7 +244,14 @@ def _trials(
 ) -> dict[str, float]:
     costs = {}
     for trial in ABLATIONS:
-        cascade = Cascade(mechanism, objective, freedom=trial.freedom, cold=trial.budget, seed=seed)
+        cascade = Cascade(
+            mechanism,
+            objective,
+            freedom=trial.freedom,
+            cold=trial.budget,
+            seed=seed,
+            belief="exact",
+        )
         proposal = cascade.optimiser.propose(x0)
         costs[trial.name] = math.inf
         if proposal.plan is not None:

@@ -221,7 +221,9 @@ def own_optimum(
     loop = ClosedLoop(rig, goal)
     first = first_surface(rig)
     motions = {"base": _motion(loop.simulate(condition.start, first), [first], [0.0])}
-    cascade = Cascade(rig, goal, period=PERIOD, cold=effort.cold, warm=effort.warm, seed=seed)
+    cascade = Cascade(
+        rig, goal, period=PERIOD, cold=effort.cold, warm=effort.warm, seed=seed, belief="exact"
+    )
     try:
         run = cascade.simulate(condition.start, progress=lambda t, end: progress(t / end))
     except InfeasibleError as error:

@@ -83,7 +83,7 @@ def controllers(
     estimator does.
     """
     gate = default_gate(estimator_for(belief, bench))
-    cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate, seed=seed)
+    cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate, seed=seed, belief="exact")
     start = cascade.start(x0)
     once = start[1].surface
     assert once is not None  # start() raises otherwise

@@ -163,7 +163,9 @@ def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 2
     rig = MuJoCoRig(mechanism, x0)
     objective = objective_for(mechanism, "effort")
     kalman = estimator_for(mechanism, Bench(mechanism))
-    cascade = Cascade(mechanism, objective, gate=default_gate(kalman), warm=Budget(budget))
+    cascade = Cascade(
+        mechanism, objective, gate=default_gate(kalman), warm=Budget(budget), belief="exact"
+    )
     steering = CascadeSteering(cascade, cascade.start(x0))
     kalman.reset(x0)
     controller = compensated(steering, kalman, mechanism.input_limits)
