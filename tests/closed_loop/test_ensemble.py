@@ -178,5 +178,12 @@ def test_what_makes_no_ensemble(loop: ut.ClosedLoop, rig: ut.Mechanism) -> None:
             Ensemble(rig, good[None], weights=np.array(weights))
     with pytest.raises(InvalidInputError, match="beside an ensemble"):
         replace(loop, plant=rig)
-    with pytest.raises(InvalidInputError, match="an ensemble of 6 plants"):
-        loop.simulate(rig.state(phi=0.1), ut.Surface(-1, -1.59, 1.96, 12.1))
+
+
+def test_a_motion_of_a_loop_with_an_ensemble_is_that_of_its_mechanism(
+    loop: ut.ClosedLoop, rig: ut.Mechanism
+) -> None:
+    """One plant moves at a time: what is believed, until another is given."""
+    x, surface = rig.state(phi=0.1), ut.Surface(-1, -1.59, 1.96, 12.1)
+    alone = replace(loop, ensemble=None).simulate(x, surface)
+    assert np.array_equal(loop.simulate(x, surface).x, alone.x)

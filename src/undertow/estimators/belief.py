@@ -46,12 +46,15 @@ AXES = 7
 #: Relative step of the differences by which accelerations are linearised in the parameters.
 STEP = 1e-5
 
+#: Part of how much an acceleration changes over a sample that its mean may be off.
+CORNER = 0.2
+
 #: Gauss-Newton steps for one batch of samples, and the change of all parameters, as a part of
 #: their tolerances, that ends them.
 ROUNDS, ENOUGH = 4, 1e-4
 
-#: Mean squared residual, in standard deviations, beyond which the plant has changed: what was
-#: learnt before is forgotten then.
+#: Median of squared residuals, in standard deviations, beyond which the plant has changed: what
+#: was learnt before is forgotten then.  A few bad samples are no change.
 CHANGED = 9.0
 
 
@@ -299,14 +302,15 @@ class Belief:
     def _fitted(
         self, before: ParameterEstimate, t: FloatArray, x: FloatArray, u: FloatArray
     ) -> tuple[ParameterEstimate, float] | None:
-        """Return the estimate after these samples, and its mean squared residual."""
+        """Return the estimate after these samples, and the median of their squared residuals."""
         size, offset = len(before.offset), before.offset
         information = before.information
         for _ in range(ROUNDS):
             around = np.vstack([offset, offset + STEP * np.eye(size)])
-            predicted = self._changes(around, t, x, u)
-            rest = (np.diff(x[:, self.mechanism.n :], axis=0) - predicted[0]) / self.deviations
-            slope = (predicted[1:] - predicted[0]) / (STEP * self.deviations)
+            predicted, corners = self._changes(around, t, x, u)
+            deviations = np.hypot(self.deviations, corners)
+            rest = (np.diff(x[:, self.mechanism.n :], axis=0) - predicted[0]) / deviations
+            slope = (predicted[1:] - predicted[0]) / (STEP * deviations)
             if not (np.isfinite(rest).all() and np.isfinite(slope).all()):
                 return None
             slope = slope.reshape(size, -1)
@@ -316,18 +320,23 @@ class Belief:
             if np.abs(offset - last).max() < ENOUGH:
                 break
         samples = before.samples + len(t) - 1
-        return ParameterEstimate(offset, information, samples), float(np.mean(rest**2))
+        return ParameterEstimate(offset, information, samples), float(np.median(rest**2))
 
     def _changes(
         self, offsets: FloatArray, t: FloatArray, x: FloatArray, u: FloatArray
-    ) -> FloatArray:
-        """Return the predicted changes of velocity over each sample, (K, N − 1, n)."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the predicted changes of velocity over each sample, (K, N − 1, n).
+
+        And how far the trapezoidal rule may be off in the first of them, (N − 1, n): an
+        acceleration that runs up within a sample need not run straight.
+        """
         values = self.values(offsets).T[:, :, None]
         rates = self.mechanism.function("dynamics")(t, *x.T, *u.T, *values)
         shape = (len(offsets), len(t))
         qdd = np.stack([np.broadcast_to(rate, shape) for rate in rates], axis=-1)
-        change: FloatArray = 0.5 * (qdd[:, 1:] + qdd[:, :-1]) * np.diff(t)[:, None]
-        return change
+        span = np.diff(t)[:, None]
+        change: FloatArray = 0.5 * (qdd[:, 1:] + qdd[:, :-1]) * span
+        return change, CORNER * np.abs(np.diff(qdd[0], axis=0)) * span
 
 
 def _within(offset: FloatArray, information: FloatArray, pull: FloatArray) -> FloatArray:

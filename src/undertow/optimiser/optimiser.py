@@ -80,7 +80,7 @@ class Optimiser:
     def on(self, loop: ClosedLoop) -> Optimiser:
         """Return this optimiser for a loop of the same structure, with the same first surface."""
         other = object.__new__(type(self))
-        kept = {k: v for k, v in vars(self).items() if k != "space"}
+        kept = {k: v for k, v in vars(self).items() if k not in ("space", "shoots")}
         other.__dict__.update(kept, loop=loop, anchor=self.anchor)
         return other
 
@@ -104,8 +104,9 @@ class Optimiser:
 
     @cached_property
     def shoots(self) -> bool:
-        """Whether this is a minimum-time task with enough parameters to aim with."""
-        return self.counts_time and self.space.size >= 2 * self.loop.mechanism.n
+        """Whether this is a minimum-time task with enough parameters to aim with, at one plant."""
+        enough = self.space.size >= 2 * self.loop.mechanism.n
+        return self.counts_time and enough and self.loop.ensemble is None
 
     def _budget(self, warm: bool) -> Budget:
         given = self.warm if warm else self.cold
