@@ -197,7 +197,7 @@ class ClosedLoop:
 
     @cached_property
     def _alone(self) -> ClosedLoop:
-        """This loop with its mechanism as the only plant."""
+        """Return this loop with its mechanism as the only plant."""
         return replace(self, ensemble=None)
 
     @cached_property
