@@ -18,7 +18,15 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, ModelError, check_fields, checked, floats, one_of
+from undertow.base import (
+    InvalidInputError,
+    ModelError,
+    check_fields,
+    checked,
+    floats,
+    one_of,
+    positive,
+)
 from undertow.models.lagrange import derived
 from undertow.models.partition import Partition, compiled
 from undertow.models.quantities import (
@@ -344,6 +352,47 @@ class Mechanism:
             force=sp.ImmutableDenseMatrix(self.force + g),
             parameters=(*self.parameters, *parameters),
         )
+
+    @checked
+    def with_friction(self, *, width: float = 0.05, **bounds: float) -> Self:
+        """Return the mechanism with Coulomb friction of at most these levels in its joints.
+
+        The force −F tanh(q̇/width), with F a parameter ``friction_<coordinate>`` of half the bound,
+        ± half the bound: a belief learns it.
+
+        Parameters
+        ----------
+        width
+            Velocity within which friction falls to zero, rad/s or m/s.
+        **bounds
+            Coordinate name to the largest friction that is plausible, N m or N.
+
+        Raises
+        ------
+        InvalidInputError
+            For unknown coordinates, and for bounds or a width that are not positive.
+
+        Examples
+        --------
+        >>> import undertow as ut
+        >>> rig = ut.mechanisms.rotary_pendulum().with_friction(theta=0.02)
+        >>> ut.Belief.usual(rig).tolerances["friction_theta"]
+        0.01
+        """
+        positive("width of Coulomb friction, rad/s or m/s", width, "0.05 is usual")
+        velocities = {c.name: c.velocity for c in self.coordinates}
+        units = {c.name: "N m" if c.unit == "rad" else "N" for c in self.coordinates}
+        force, parameters = {}, []
+        for name, bound in bounds.items():
+            one_of(f"unknown coordinate of '{self.name}'", name, velocities)
+            positive(f"friction of '{name}', {units[name]}", bound)
+            level = Parameter(
+                f"friction_{name}", bound / 2, units[name], f"Coulomb friction of {name}",
+                -bound, math.inf, tolerance=bound / 2,
+            )  # fmt: skip
+            parameters.append(level)
+            force[name] = -level.symbol * sp.tanh(velocities[name] / width)
+        return self.disturbed(force, parameters)
 
     # -- names and symbols --------------------------------------------------------------
 
