@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import undertow as ut
 from undertow.base import InvalidInputError
@@ -131,6 +132,42 @@ def test_where_no_plan_suits_all_the_one_that_lives_longest_is_kept(
     kept, admission = cascade.apply_gate(state, proposal, x)
     assert admission.accepted
     assert cascade.loop.batch(x, kept.plan).time[0] > pair.time.min()
+
+
+def test_a_plant_that_changes_while_it_runs(pendulum: ut.Mechanism) -> None:
+    """Mass doubled, motor 40 % weaker, both beyond the tolerances: held, and the change learnt."""
+    cascade = ut.Cascade(pendulum, ut.MinimumTime(horizon=6.0))
+    for part in ({"m": 1.0}, {"a_e": -0.4}):
+        plant = changed(pendulum, part)
+        seen: list[float] = []
+        run = cascade.simulate(
+            phi=0.5, plant={0.31: plant}, progress=lambda t, _, seen=seen: seen.append(t)
+        )
+        assert run.reached
+        assert 0.31 in np.round(seen, 9)
+        before = ut.ClosedLoop(pendulum, cascade.objective).simulate(
+            pendulum.state(phi=0.5), run.updates[0].plan, duration=0.02
+        )
+        assert np.array_equal(run.trajectory.x[: len(before.x)], before.x)
+    again = cascade.simulate(phi=0.5, plant={0.0: pendulum}).trajectory.x
+    assert np.array_equal(again, cascade.simulate(phi=0.5).trajectory.x)
+    with pytest.raises(InvalidInputError, match="time of a plant"):
+        cascade.simulate(phi=0.5, plant={-1.0: pendulum})
+
+
+def test_friction_is_learnt(pendulum: ut.Mechanism) -> None:
+    """A level in the joint is found, which without a parameter of its own leaves the arm short."""
+    with_friction = pendulum.with_friction(theta=0.02)
+    objective = ut.MinimumEnergy(horizon=10.0)
+    plant = changed(pendulum, {"m": -0.1}).disturbed(
+        {"theta": -0.02 * sp.tanh(pendulum.coordinates[0].velocity / 0.05)}
+    )
+    assert ut.Cascade(with_friction, objective).simulate(phi=ut.deg(30), plant=plant).reached
+    assert not ut.Cascade(pendulum, objective).simulate(phi=ut.deg(30), plant=plant).reached
+    with pytest.raises(InvalidInputError, match="unknown coordinate"):
+        pendulum.with_friction(psi=0.1)
+    with pytest.raises(InvalidInputError, match="friction of 'theta'"):
+        pendulum.with_friction(theta=-0.1)
 
 
 def test_usual_tolerances_and_those_that_parameters_carry(pendulum: ut.Mechanism) -> None:

@@ -124,17 +124,33 @@ def test_a_plant_that_changes_is_followed(belief: Belief) -> None:
     )
 
 
-def test_nothing_leaves_the_tolerances(belief: Belief) -> None:
-    """Estimate and members stay within them, however far the plant is outside."""
+def test_nothing_leaves_the_tolerances_that_they_explain(belief: Belief) -> None:
+    """Of plants at their edge, estimate and members stay within, whatever noise says."""
     rng = np.random.default_rng(6)
     value = {p.name: p.value for p in belief.mechanism.parameters}
-    plant = belief.mechanism.with_parameters(m=1.6 * value["m"], d_e=3 * value["d_e"])
-    estimate = belief.learn(belief.prior, *motion(plant, rng))
+    edge = {k: value[k] + t * rng.choice([-0.99, 0.99]) for k, t in belief.tolerances.items()}
+    t, x, u = motion(belief.mechanism.with_parameters(**edge), rng)
+    x[:, 2:] += 0.004 * rng.standard_normal((len(t), 2))
+    estimate = belief.learn(belief.prior, t, x, u)
     assert np.abs(estimate.offset).max() <= 1.0
     members = belief.ensemble(estimate)
     low, high = belief.values(-np.ones(5)), belief.values(np.ones(5))
     assert (members.values >= low - 1e-12).all()
     assert (members.values <= high + 1e-12).all()
+
+
+def test_a_plant_beyond_its_tolerances_is_found_all_the_same(belief: Belief) -> None:
+    """Twice the mass, within the intervals that parameters have: accelerations come out right."""
+    rng = np.random.default_rng(6)
+    value = {p.name: p.value for p in belief.mechanism.parameters}
+    plant = belief.mechanism.with_parameters(m=2.0 * value["m"], I_e=2.0 * value["I_e"])
+    t, x, u = motion(plant, rng)
+    estimate = belief.learn(belief.prior, t, x, u)
+    assert np.abs(estimate.offset).max() > 1.0
+    kept = np.clip(estimate.offset, -1.0, 1.0)
+    assert error(belief, estimate.offset, plant, x, u) < 0.1 * error(belief, kept, plant, x, u)
+    for p, row in zip(belief.mechanism.parameters, belief.ensemble(estimate).values.T, strict=True):
+        assert ((p.low < row) & (row < p.high)).all()
 
 
 def test_the_design_of_the_ensemble(belief: Belief) -> None:

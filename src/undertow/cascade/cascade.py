@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from html import escape
@@ -416,7 +416,7 @@ class Cascade:
         )
         at_least("seed", self.seed, 0)
         assert self.loop is not None  # built here, so that its checks run first
-        stride = self.step * max(1, self.zoh_steps)
+        stride = self._stride
         count = number_of("period of the cascade", self.period) / stride
         if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
             raise InvalidInputError(
@@ -732,24 +732,35 @@ class Cascade:
 
     # -- simulation -----------------------------------------------------------------------
 
-    def _moments(self, total: float) -> Iterator[tuple[float, float, bool]]:
-        """Times of a run, s, until the next one, and whether a decision is due."""
-        stride = self.step * max(1, self.zoh_steps)
+    def _moments(self, total: float, marks: Iterable[int]) -> Iterator[tuple[float, float, bool]]:
+        """Times of a run, s, until the next one, and whether a decision is due.
+
+        Decisions come each period, learning some times within it; ``marks`` are strides besides.
+        """
+        stride = self._stride
         strides = round(self.period / stride)
         parts = 1 if self.known is None else min(strides, max(1, round(self.period / LEARNING)))
-        within = [round(strides * part / parts) * stride for part in range(parts)]
+        within = {round(strides * part / parts) for part in range(parts)}
         for k in range(math.ceil(total / self.period - 1e-9)):
-            for part, (begin, end) in enumerate(itertools.pairwise([*within, self.period])):
-                t = k * self.period + begin
+            begin = k * self.period
+            extra = {mark - k * strides for mark in marks if 0 < mark - k * strides < strides}
+            for part, end in itertools.pairwise([*sorted(within | extra), strides]):
+                t = begin + part * stride
                 if t < total - 1e-9:
-                    yield t, min(end - begin, total - t), part == 0
+                    span = self.period if end - part == strides else (end - part) * stride
+                    yield t, min(span, total - t), part == 0
+
+    @property
+    def _stride(self) -> float:
+        """Time between two inputs of the inner loop, or a step of a continuous one, s."""
+        return self.step * max(1, self.zoh_steps)
 
     @checked
     def simulate(
         self,
         x0: ArrayLike | None = None,
         *,
-        plant: Mechanism | None = None,
+        plant: Mechanism | Mapping[float, Mechanism] | None = None,
         duration: float | None = None,
         progress: Callable[[float, float], None] | None = None,
         **state: float,
@@ -762,7 +773,8 @@ class Cascade:
             Initial state, (2n,); or give its non-zero entries by name (``phi=0.7``).
             With neither, the mechanism's usual ``start``, where it has one.
         plant
-            The truth; the belief by default.
+            The truth; the belief by default.  One that changes while it runs is a mapping from the
+            time, s, to what the plant is from then on.
         duration
             Longest run, s; the objective's horizon by default.  Predictions end there too.
         progress
@@ -778,14 +790,28 @@ class Cascade:
         x = self.mechanism.initial_state(x0, state)
         total = self.objective.horizon if duration is None else duration
         positive("duration of a run, s", total, "Leave it out for the objective's horizon")
-        moving = plant or (None if self.known is None else self.mechanism)
-        truth = replace(self.loop, plant=moving, ensemble=None)
+        usual = None if self.known is None else self.mechanism
+        changes = (
+            dict(sorted(plant.items())) if isinstance(plant, Mapping) else {0.0: plant or usual}
+        )
+        for t in changes:
+            positive("time of a plant, s", t, "Plants change after the start, at 0", zero=True)
+        truths = {
+            round(number_of("time of a plant, s", t) / self._stride): replace(
+                self.loop, plant=moving or usual, ensemble=None
+            )
+            for t, moving in {0.0: usual, **changes}.items()
+        }
+        truth = truths[0]
         memory, proposal = self._start(x)
         admission = self.first_admission(memory, x, total)
         updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
         pieces: list[Trajectory] = []
         since = 0  # the last decision, in pieces
-        for t, span, due in self._moments(total):
+        for t, span, due in self._moments(total, truths):
+            changed = truths.get(round(t / self._stride))
+            if changed is not None and t > 0:
+                truth = changed.believing(self.loop_at(memory).mechanism)
             if t > 0 and (due or not self.survives(memory, x, t)):
                 proposal = self._propose(memory, x, t, total - t)
                 memory, admission = self.apply_gate(memory, proposal, x, total - t)

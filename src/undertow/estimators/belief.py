@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import get_args
 
@@ -54,8 +54,10 @@ CORNER = 0.2
 ROUNDS, ENOUGH = 4, 1e-4
 
 #: Median of squared residuals, in standard deviations, beyond which the plant has changed: what
-#: was learnt before is forgotten then.  A few bad samples are no change.
+#: was learnt before is forgotten then.  A few bad samples are no change.  Where nothing within the
+#: tolerances explains what is seen, plants farther off do, up to so many tolerances.
 CHANGED = 9.0
+BEYOND = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ class ParameterEstimate:
     Attributes
     ----------
     offset
-        θ − θ₀ in units of the tolerances, (p,); within ±1.
+        θ − θ₀ in units of the tolerances, (p,); within ±1, unless the motion says otherwise.
     information
         Inverse covariance of ``offset``, (p, p), the prior's included.
     samples
@@ -241,7 +243,8 @@ class Belief:
             axes = axes @ np.linalg.svd(self._effects(estimate.offset) @ axes)[2][:AXES].T
         count = axes.shape[1]
         corners = hadamard(1 << count.bit_length())[:, 1 : count + 1] @ axes.T
-        around = np.clip(estimate.offset + self.confidence * corners, -1.0, 1.0)
+        limits = np.maximum(1.0, np.abs(estimate.offset))
+        around = np.clip(estimate.offset + self.confidence * corners, -limits, limits)
         offsets = np.vstack([estimate.offset, around])
         # Of what the corners span, only the estimate's own uncertainty is expected; the rest is a
         # margin: it has to be survived, and costs nothing.
@@ -276,10 +279,9 @@ class Belief:
             Times, (N,), s; states, (N, 2n); inputs after the actuator, (N, m).  Between two rows
             the input runs straight from one to the other.
         """
-        motion = [
-            floats(f"{name} of a motion", value)
-            for name, value in zip("txu", (t, x, u), strict=True)
-        ]
+        motion = (
+            floats("t of a motion", t), floats("x of a motion", x), floats("u of a motion", u)
+        )  # fmt: skip
         rows, mechanism = motion[0].size, self.mechanism
         shapes = [(rows,), (rows, 2 * mechanism.n), (rows, mechanism.m)]
         if [part.shape for part in motion] != shapes:
@@ -293,17 +295,39 @@ class Belief:
         found = self._fitted(estimate, *motion)
         if found is None:
             return estimate
-        if found[1] > CHANGED:
-            again = self._fitted(self.prior, *motion)
-            if again is not None and again[1] < found[1]:
-                found = again
+        for prior, reach in ((self.prior, 1.0), (self._beyond, BEYOND)):
+            if found[1] > CHANGED:
+                again = self._fitted(prior, *motion, reach=reach)
+                if again is not None and again[1] < found[1]:
+                    found = again
         return found[0]
 
+    @cached_property
+    def _beyond(self) -> ParameterEstimate:
+        """Even spread over much more than the tolerances."""
+        return replace(self.prior, information=self.prior.information / BEYOND**2)
+
+    @cached_property
+    def _room(self) -> FloatArray:
+        """How far parameters may be off at all, in tolerances, (p,): within their intervals."""
+        p = [self.mechanism.parameters[place] for place in self._places]
+        room = [min(each.value - each.low, each.high - each.value) for each in p]
+        return np.maximum(1.0, 0.95 * np.array(room) / self._scale)
+
     def _fitted(
-        self, before: ParameterEstimate, t: FloatArray, x: FloatArray, u: FloatArray
+        self,
+        before: ParameterEstimate,
+        t: FloatArray,
+        x: FloatArray,
+        u: FloatArray,
+        reach: float = 1.0,
     ) -> tuple[ParameterEstimate, float] | None:
-        """Return the estimate after these samples, and the median of their squared residuals."""
+        """Return the estimate after these samples, and the median of their squared residuals.
+
+        It stays within ``reach`` tolerances, or as far out as it was before.
+        """
         size, offset = len(before.offset), before.offset
+        limits = np.minimum(self._room, np.maximum(reach, np.abs(offset)))
         information = before.information
         for _ in range(ROUNDS):
             around = np.vstack([offset, offset + STEP * np.eye(size)])
@@ -316,7 +340,7 @@ class Belief:
             slope = slope.reshape(size, -1)
             information = before.information + slope @ slope.T
             pull = before.information @ (before.offset - offset) + slope @ rest.ravel()
-            offset, last = _within(offset, information, pull), offset
+            offset, last = _within(offset, information, pull, limits), offset
             if np.abs(offset - last).max() < ENOUGH:
                 break
         samples = before.samples + len(t) - 1
@@ -339,8 +363,10 @@ class Belief:
         return change, CORNER * np.abs(np.diff(qdd[0], axis=0)) * span
 
 
-def _within(offset: FloatArray, information: FloatArray, pull: FloatArray) -> FloatArray:
-    """Return where a quadratic in the offsets is least within ±1; what is beyond stays at ±1.
+def _within(
+    offset: FloatArray, information: FloatArray, pull: FloatArray, limits: FloatArray
+) -> FloatArray:
+    """Return where a quadratic in the offsets is least within ±limits; what is beyond stays there.
 
     ``information`` is its Hessian, ``pull`` its descent direction at ``offset``.
     """
@@ -350,9 +376,9 @@ def _within(offset: FloatArray, information: FloatArray, pull: FloatArray) -> Fl
         held = ~free
         rest = pull[free] - information[np.ix_(free, held)] @ (new - offset)[held]
         new[free] = offset[free] + np.linalg.solve(information[np.ix_(free, free)], rest)
-        beyond = free & (np.abs(new) > 1.0)
+        beyond = free & (np.abs(new) > limits)
         if not beyond.any():
             break
-        new[beyond] = np.sign(new[beyond])
+        new[beyond] = np.sign(new[beyond]) * limits[beyond]
         free &= ~beyond
     return new
