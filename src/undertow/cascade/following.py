@@ -17,7 +17,7 @@ import numpy as np
 from undertow.base import positive
 from undertow.cascade.cascade import Cascade, CascadeState, Run, Update
 from undertow.cascade.targets import legs_of
-from undertow.closed_loop import ClosedLoop, Event, Trajectory
+from undertow.closed_loop import ClosedLoop, Event, Trajectory, simulate_along
 from undertow.law import Reference, Target, target_of
 from undertow.models import FloatArray, Mechanism
 
@@ -91,6 +91,8 @@ def _piece(
     """Simulate one period; the motion is absolute, and costs nothing once it has arrived."""
     target, plan = memory.target, memory.at(t)
     assert target is not None  # a run along one has one
+    if target.moves:
+        return simulate_along(truth, x, plan, target, duration=span, start=t)
     loop, error = cascade.about(truth, target, t), memory.error(t, x)
     motion = loop.simulate(error, plan, duration=span, start=t)
     if motion.event == Event.REACHED:
