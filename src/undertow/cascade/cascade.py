@@ -29,7 +29,14 @@ from undertow.base import (
     write_file,
 )
 from undertow.cascade.targets import LoopsAbout, legs_of
-from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Ensemble, Event, Trajectory
+from undertow.closed_loop import (
+    INADMISSIBLE,
+    ClosedLoop,
+    Ensemble,
+    Event,
+    Trajectory,
+    cost_along,
+)
 from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import (
     Control,
@@ -315,7 +322,7 @@ class Run:
         minimum time it is t_{f,k} − Δt − t_{f,k+1}.  NaN where one of the predictions is
         infinite: a disturbed plant may leave what the belief can bring home; and where the target
         jumped in between: then another task begins.  While a reference moves, predictions
-        leave its motion out, and slack may be negative.
+        count to a horizon that moves along, and slack may be negative.
         """
         predicted = np.array([update.predicted for update in self.updates])
         spent = np.array([update.spent for update in self.updates])
@@ -654,9 +661,21 @@ class Cascade:
                 event = here.batch(x, plan, duration=2 * self.period).event[0]
                 good &= event in (Event.HORIZON, Event.REACHED)
             if good or number == len(tries):
+                if target is not None and target.moves:
+                    plan, cost = self._first_along(plan, x, target, t)
                 begun = CascadeState(plan, 0, cost, cost, t, _kept(x), known, target)
                 return begun, proposal
         raise AssertionError("the last try returns or raises")
+
+    def _first_along(
+        self, plan: Plan, x: FloatArray, target: ReferenceMotion, t: float
+    ) -> tuple[Plan, float]:
+        """The first plan, or the designed surface where that is better along a reference."""
+        plans = [plan, Plan.of(self.optimiser.anchor)]
+        absolute, span = x + target.state(t), self.objective.horizon
+        costs = [cost_along(self.loop, absolute, p, target, duration=span, start=t) for p in plans]
+        best = int(np.argmin(costs))
+        return plans[best], costs[best]
 
     def _first_tries(self) -> list[tuple[ClosedLoop, bool]]:
         """What the first plan is to be best on, one after the other; and whether in small steps.
@@ -722,8 +741,8 @@ class Cascade:
         -----
         The search is warm: it looks near the plan in use.  Where the state has jumped, or the
         target, the optimum may be far from it: :meth:`apply_gate` says so, :meth:`retarget` finds
-        it.  Of a target that moves, predictions leave the motion out: they see the error, and the
-        target at rest where it is at the time t.
+        it.  Of a target that moves, the search leaves the motion out: it sees the error, and the
+        target at rest where it is at the time t.  :meth:`apply_gate` sees the motion.
         """
         return self._propose(state, x, t, horizon)
 
@@ -762,6 +781,9 @@ class Cascade:
         moment than ``JUMP`` = 0.1 rad or m and ``PART`` = half of the way that it was to move them
         since, the admission's reason says so: after a jump the cost is compared with that of a plan
         for another task, and "cost not raised" is little.
+
+        Where the target moves, what the gate admits is also rolled out along the reference, as is
+        the plan in use: constraints have to hold there, and the cost must not rise.
         """
         span = self.objective.horizon if horizon is None else horizon
         current = self.mechanism.check_state(x)
@@ -779,9 +801,27 @@ class Cascade:
             admission = replace(kept, accepted=False, reason=reason)
             return replace(state, predicted=kept.cost), admission
         admission = self.gate(loop, old, proposal.plan, current, span)
+        if state.target is not None and state.target.moves:
+            admission = self._along(state, old, proposal.plan, admission, span)
         admission = replace(admission, reason=f"{admission.reason}{jump}")
         plan = proposal.plan if admission.accepted else old
         return replace(state, plan=plan, predicted=admission.cost), admission
+
+    def _along(
+        self, state: CascadeState, old: Plan, new: Plan, admission: Admission, span: float
+    ) -> Admission:
+        """Judge again what the gate admitted: both plans along the reference, as it will move."""
+        assert state.target is not None  # there is no reference without one
+        loop, target, t = self._loops(state.estimate), state.target, state.since
+        x = np.array(state.x) + target.state(t)
+        cost = cost_along(loop, x, old, target, duration=span, start=t)
+        if not admission.accepted:
+            return replace(admission, cost=cost)
+        found = cost_along(loop, x, new, target, duration=span, start=t)
+        if found <= cost and found < math.inf:
+            return replace(admission, cost=found)
+        words = f"raises the cost along the reference: {found:.6g} > {cost:.6g}"
+        return Admission(False, words, cost, admission.verdict)
 
     def _jump(self, state: CascadeState, t: float, x: FloatArray) -> str:
         """Say how far a state is off what the plan in use predicted for it, where it is far."""

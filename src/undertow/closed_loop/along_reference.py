@@ -7,7 +7,8 @@ constraints.  Runge-Kutta steps of the loop's length, the reference at their end
 
 from __future__ import annotations
 
-from functools import lru_cache
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -96,9 +97,22 @@ def along(
 """
 
 
-@lru_cache(maxsize=32)
+#: Modules by what they are made of.
+_MODULES: dict[object, Any] = {}
+
+
 def _module(loop: ClosedLoop) -> Any:
     """Return the compiled module of a loop along references: ``along``."""
+    key = (
+        loop.mechanism.structure, loop.mechanism.name, loop.truth.structure, loop.objective,
+        loop.reaching.switching,
+    )  # fmt: skip
+    if key not in _MODULES:
+        _MODULES[key] = _made(loop)
+    return _MODULES[key]
+
+
+def _made(loop: ClosedLoop) -> Any:
     plant, objective = loop.truth, loop.objective
     law = law_module(error_dynamics(loop.mechanism), loop.reaching.switching)
     stage, path = objective.stage_cost(plant), objective.path_margins(plant)
@@ -129,6 +143,24 @@ def _module(loop: ClosedLoop) -> Any:
         return f"{header}{PREAMBLE}{own}\n\n{flow}\n\n{measures}\n{_BODY}"
 
     return generated("along", plant.name, key, write)
+
+
+def cost_along(
+    loop: ClosedLoop,
+    x: FloatArray,
+    plan: Plan,
+    motion: ReferenceMotion,
+    *,
+    duration: float,
+    start: float = 0.0,
+) -> float:
+    """Return what a plan costs along a reference; infinite where the motion breaks off.
+
+    See :func:`simulate_along`; of an ensemble the belief alone moves.
+    """
+    alone = loop if loop.ensemble is None else replace(loop, ensemble=None)
+    run = simulate_along(alone, x, plan, motion, duration=duration, start=start)
+    return run.cost if run.event in (Event.HORIZON, Event.REACHED) else math.inf
 
 
 def simulate_along(

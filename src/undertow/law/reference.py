@@ -126,8 +126,7 @@ class ReferenceMotion:
         """Return the mechanism as the error x − x_r(t) sees it at the time t."""
         if not self.moves:
             return mechanism
-        values = np.concatenate([mechanism.parameter_values, self.rows(t)[0]])
-        return error_dynamics(mechanism).with_values(values)
+        return error_dynamics(mechanism, self.rows(t)[0])
 
 
 def _hermite(

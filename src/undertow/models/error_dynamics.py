@@ -15,10 +15,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
+import numpy as np
 import sympy as sp
 
 from undertow.models.mechanism import Mechanism
-from undertow.models.quantities import Parameter
+from undertow.models.quantities import FloatArray, Parameter
 
 
 @lru_cache(maxsize=64)
@@ -78,13 +79,29 @@ def reference_names(mechanism: Mechanism) -> tuple[str, ...]:
     return tuple(f"{name}_reference{dots}" for dots in ("", "_dot", "_ddot") for name in names)
 
 
-@lru_cache(maxsize=64)
-def error_dynamics(mechanism: Mechanism) -> Mechanism:
+#: What was derived, for every structure with its input limits.
+_DERIVED: dict[object, Mechanism] = {}
+
+
+def error_dynamics(mechanism: Mechanism, reference: FloatArray | None = None) -> Mechanism:
     """Return the mechanism of the error q̃ = q − q_r.
 
-    Its last 3n parameters are q_r, q̇_r and q̈_r, named by :func:`reference_names`; they are zero
-    until they are set (:meth:`undertow.Mechanism.with_values`).
+    Parameters
+    ----------
+    mechanism
+        What moves.
+    reference
+        q_r, q̇_r and q̈_r, (3n,): the last parameters of what is returned, named by
+        :func:`reference_names`; zero by default.
     """
+    key = mechanism.structure, mechanism.name, mechanism.input_limits.tobytes()
+    if key not in _DERIVED:
+        _DERIVED[key] = _derive(mechanism)
+    still = np.zeros(3 * mechanism.n) if reference is None else reference
+    return _DERIVED[key].with_values(np.append(mechanism.parameter_values, still))
+
+
+def _derive(mechanism: Mechanism) -> Mechanism:
     n = mechanism.n
     units = [c.unit + rate for rate in ("", "/s", "/s²") for c in mechanism.coordinates]
     added = tuple(
