@@ -1,7 +1,7 @@
-"""Targets that move: what jumps cost beside a fresh start, and how closely references are followed.
+"""Targets that move: what jumps cost beside a fresh start, how closely references are followed.
 
-- Set-points every 2 s on the overhead and the gantry crane.  At each jump a fresh start is made from
-  the same state to the same set-point, and costs are compared over the time until the next jump.
+- Set-points every 2 s on the overhead and the gantry crane.  At each jump a fresh start is made
+  from the same state to the same set-point; costs are compared until the next jump.
   Wanted: ≤ 1.1 times the fresh start's; residual swing ≤ 0.5° within 10 s of the last jump.
 - A jump met by the warm search alone, which looks near the old plan, beside the cold one.
 - Sines and a path from a CSV file on both cranes; ±45° of the arm at 0.5 Hz with the rotary
@@ -101,8 +101,17 @@ def searches(quick: bool) -> None:
         moved = replace(state, target=cold.target, x=())
         warm, _ = cascade.apply_gate(moved, cascade.propose(moved, x, t), x)
         costs = [s.predicted for s in (fresh, cold, warm)]
-        rows.append([name, *(f"{c:.4g}" for c in costs), *(f"{c / costs[0]:.2f}" for c in costs[1:])])
-    header = ["mechanism", "fresh start", "jump, cold", "jump, warm", "cold / fresh", "warm / fresh"]
+        rows.append(
+            [name, *(f"{c:.4g}" for c in costs), *(f"{c / costs[0]:.2f}" for c in costs[1:])]
+        )
+    header = [
+        "mechanism",
+        "fresh start",
+        "jump, cold",
+        "jump, warm",
+        "cold / fresh",
+        "warm / fresh",
+    ]
     table("Predicted cost after a jump at 1 s", header, rows)
 
 
@@ -144,7 +153,8 @@ def references(quick: bool) -> None:
                 ]
             )
     header = [
-        "mechanism", "reference", "error", "from 5 s", "swing asked", "swing", "10 s after", "ended",
+        "mechanism", "reference", "error", "from 5 s", "swing asked", "swing", "10 s after",
+        "ended",
     ]  # fmt: skip
     table("References; bench-time", header, rows)
 

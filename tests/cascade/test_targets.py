@@ -109,3 +109,37 @@ def test_constraints_are_about_absolute_positions() -> None:
     run = short.simulate(CRANE.state(x=-1.0), target={"x": 1.0})
     assert run.reached
     assert np.abs(run.trajectory["x"]).max() <= 1.05 + 1e-4
+
+
+def test_the_upright_pendulum_follows_a_sine_of_the_arm() -> None:
+    """±45° at 0.5 Hz: from rest onto the reference, and then on it."""
+    rig = ut.mechanisms.rotary_pendulum()
+    reference = ut.Reference.sine(0.5, theta=ut.deg(45))
+    cascade = ut.Cascade(rig, ut.objective_for(rig, "bench-time", horizon=6.0))
+    run = cascade.simulate(rig.state(), target=reference, duration=6.0)
+    assert run.reached
+    late = run.trajectory.t > 4.0
+    t, theta = run.trajectory.t[late], run.trajectory["theta"][late]
+    assert np.degrees(np.abs(theta - ut.deg(45) * np.sin(np.pi * t)).max()) < 0.5
+    assert np.degrees(np.abs(run.trajectory["phi"][late]).max()) < 9.0
+
+
+def test_the_gate_sees_the_reference_move(cascade: ut.Cascade) -> None:
+    """A plan that the gate admits about the target at rest is refused where the way breaks it."""
+    reference = ut.Reference.sine(0.2, x=1.2)
+    state, proposal = cascade.start(CRANE.state(), reference)
+    slow = ut.placed_surface(CRANE, [-0.2, -0.21, -0.22])
+    other = replace(proposal, plan=ut.Plan.of(slow), sequence=1, computed_for=0.1)
+    from undertow.cascade import Admission
+
+    yes = replace(cascade, gate=lambda *_: Admission(True, "yes", 1.0))
+    _, admission = yes.apply_gate(state, other, CRANE.state())
+    assert not admission.accepted
+    assert "along the reference" in admission.reason
+    assert np.isfinite(admission.cost)
+
+
+def test_references_past_the_travel_are_refused(cascade: ut.Cascade) -> None:
+    """With where and when they first do so most."""
+    with pytest.raises(InvalidInputError, match=r"at 1.2\d? s: got x = 1.6 m, must be .x."):
+        cascade.simulate(CRANE.state(), target=ut.Reference.sine(0.2, x=1.6), duration=5.0)

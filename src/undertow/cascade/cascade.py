@@ -182,8 +182,8 @@ class Update:
     """One decision of the outer loop, as recorded.
 
     ``t`` and ``x`` are when and where; ``plan`` the one in use afterwards; ``predicted``
-    its J̃_k; ``spent`` the cost spent since the decision before; ``task`` counts the jumps of the
-    target before.
+    its J̃_k; ``spent`` the cost spent since the decision before; ``task`` counts the
+    tasks before: a target that jumps begins one, and so does leaving a set-point once reached.
     """
 
     t: float
@@ -320,8 +320,8 @@ class Run:
 
         Never negative, to integration tolerance, where belief and truth agree; for
         minimum time it is t_{f,k} − Δt − t_{f,k+1}.  NaN where one of the predictions is
-        infinite: a disturbed plant may leave what the belief can bring home; and where the target
-        jumped in between: then another task begins.  While a reference moves, predictions
+        infinite: a disturbed plant may leave what the belief can bring home; and where another task
+        begins, for instance because the target jumped.  While a reference moves, predictions
         count to a horizon that moves along, and slack may be negative.
         """
         predicted = np.array([update.predicted for update in self.updates])
@@ -562,7 +562,9 @@ class Cascade:
         target: Target | Mapping[str, float] | None = None,
         t: float = 0.0,
     ) -> tuple[CascadeState, Proposal]:
-        """Run the first, global optimisation from x.
+        """Run the first, global optimisation from x: at the start, and again after a jump of x.
+
+        A target that jumps asks for :meth:`retarget`.
 
         Parameters
         ----------

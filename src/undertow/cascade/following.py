@@ -45,7 +45,8 @@ def follow(
     updates: list[Update] = []
     pieces: list[Trajectory] = []
     memory: CascadeState | None = None
-    for task, (begin, end, (_, motion)) in enumerate(zip(begins, ends, legs, strict=False)):
+    task, arrived = -1, False
+    for begin, end, (_, motion) in zip(begins, ends, legs, strict=False):
         t = since = begin
         while end - t > 0.5 * stride:
             error = x - motion.state(t)
@@ -54,6 +55,7 @@ def follow(
             left = min(longest, total - begin) - (t - since)
             spent = pieces[-1].cost if pieces else 0.0
             decided = memory is None or t == begin or not inside
+            task += t == begin or (decided and arrived)  # left what was reached: another task
             if memory is None:
                 memory, proposal = cascade.start_to(x, motion, t)
                 admission = cascade.first_admission(memory, x, left)
@@ -79,8 +81,9 @@ def follow(
             x = piece.x[-1]
             if progress is not None:
                 progress(t, total)
-            arrived = piece.event == Event.REACHED and duration is None and not motion.moves
-            if piece.event not in (Event.HORIZON, Event.REACHED) or (arrived and end == ends[-1]):
+            arrived = piece.event == Event.REACHED
+            over = arrived and duration is None and not motion.moves and end == ends[-1]
+            if over or piece.event not in (Event.HORIZON, Event.REACHED):
                 return Run(Trajectory.join(pieces), tuple(updates))
     return Run(Trajectory.join(pieces), tuple(updates))
 

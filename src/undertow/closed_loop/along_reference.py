@@ -132,11 +132,7 @@ def _made(loop: ClosedLoop) -> Any:
             "measures",
             tape,
             {"e": errors, "x": plant.x, "u": plant.u, "parameters": plant.parameter_symbols},
-            {
-                "out": tape.let_all(
-                    [stage.xreplace(dict(zip(plant.x, errors, strict=True))), *path]
-                )
-            },
+            {"out": tape.let_all([stage.xreplace(dict(zip(plant.x, errors, strict=True))), *path])},
         )
         header = docstring(f"{plant.name} along a reference; generated, do not edit. {key[:16]}")
         own = f"from {law.__name__} import law\n\nPATH = {len(path)}\n"
