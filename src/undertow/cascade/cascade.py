@@ -176,6 +176,10 @@ class CascadeState:
         """Return how far a state x, (…, 2n), is off the target at time t, s."""
         return x if self.target is None else x - self.target.state(t)
 
+    def absolute(self, t: float, error: FloatArray) -> FloatArray:
+        """Return the state that is so far off the target at time t, s: the inverse."""
+        return error if self.target is None else error + self.target.state(t)
+
 
 @dataclass(frozen=True, eq=False)
 class Update:
@@ -815,7 +819,7 @@ class Cascade:
         """Judge again what the gate admitted: both plans along the reference, as it will move."""
         assert state.target is not None  # there is no reference without one
         loop, target, t = self._loops(state.estimate), state.target, state.since
-        x = np.array(state.x) + target.state(t)
+        x = state.absolute(t, np.array(state.x))
         cost = cost_along(loop, x, old, target, duration=span, start=t)
         if not admission.accepted:
             return replace(admission, cost=cost)

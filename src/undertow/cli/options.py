@@ -95,6 +95,15 @@ Target = Annotated[
         metavar="STATE=VALUE[@TIME]|FILE.csv",
     ),
 ]
+SetPoints = Annotated[
+    list[str] | None,
+    option(
+        "--target",
+        "Set-point, with units: x=1m, or x=-1m@8s from 8 s after the start on, as soon as there "
+        "is a plan for it. Repeatable. Default: x = 0.",
+        metavar="STATE=VALUE[@TIME]",
+    ),
+]
 SurfaceText = Annotated[
     str | None,
     option(
