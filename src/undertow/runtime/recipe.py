@@ -146,6 +146,7 @@ class Recipe:
                 limit="one of them",
                 remedy="Swing up first, and run to the target from there",
             )
+        assert self.legs is not None  # found here, so that its checks run before anything moves
 
     @cached_property
     def belief(self) -> Mechanism:
