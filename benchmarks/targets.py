@@ -87,11 +87,15 @@ def jumps(quick: bool) -> None:
 def searches(quick: bool) -> None:
     """Print what the searches find for a jump while running: warm, cold, and a fresh start."""
     rows = []
-    for name, rig, start, goal in (
-        ("overhead crane", ut.mechanisms.overhead_crane(), {"x": -0.5}, {"x": 1.2}),
-        ("rotary pendulum", ut.mechanisms.rotary_pendulum(), {"phi": 0.5}, {"theta": 2.0}),
-    )[: 1 if quick else 2]:
-        cascade = cascade_for(rig, "bench-energy", 8.0)
+    crane, pendulum = ut.mechanisms.overhead_crane(), ut.mechanisms.rotary_pendulum()
+    for name, rig, objective, start, goal in (
+        ("overhead crane", crane, "bench-energy", {"x": -0.5}, {"x": 1.2}),
+        ("overhead crane", crane, "bench-time", {"x": -0.5}, {"x": 1.2}),
+        ("rotary pendulum", pendulum, "bench-energy", {"phi": 0.5}, {"theta": 2.0}),
+        ("rotary pendulum", pendulum, "bench-energy", {"phi": 0.1}, {"theta": 6.0}),
+        ("rotary pendulum", pendulum, "bench-time", {"phi": 0.5}, {"theta": 6.0}),
+    )[: 1 if quick else None]:
+        cascade = cascade_for(rig, objective, 8.0)
         x, t = rig.state(**start), 1.0
         state, _ = cascade.start(x, dict.fromkeys(goal, 0.0))
         x = cascade.loop_at(state).batch(x, state.plan, duration=t, terminal=0.0).x[0]
@@ -102,7 +106,11 @@ def searches(quick: bool) -> None:
         warm, _ = cascade.apply_gate(moved, cascade.propose(moved, x, t), x)
         costs = [s.predicted for s in (fresh, cold, warm)]
         rows.append(
-            [name, *(f"{c:.4g}" for c in costs), *(f"{c / costs[0]:.2f}" for c in costs[1:])]
+            [
+                f"{name}, {objective}",
+                *(f"{c:.4g}" for c in costs),
+                *(f"{c / costs[0]:.2f}" for c in costs[1:]),
+            ]
         )
     header = [
         "mechanism",
