@@ -57,7 +57,8 @@ def jumps(quick: bool) -> None:
         schedule = ut.SetPoints([(2.0 * k, goal) for k, goal in enumerate(goals)])
         last = schedule.times[-1]
         run = cascade.simulate(rig.state(), target=schedule, duration=last + 14.0)
-        motion, where = run.trajectory, {}
+        motion = run.trajectory
+        where: dict[str, float] = {}
         for begin, goal in zip(schedule.times, goals, strict=True):
             where |= goal
             x = motion.x[np.searchsorted(motion.t, begin - 1e-9)]
