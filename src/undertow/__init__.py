@@ -26,6 +26,8 @@ from undertow.estimators import Belief
 from undertow.law import (
     Plan,
     ReachingLaw,
+    Reference,
+    SetPoints,
     SlidingModeLaw,
     Surface,
     check_surface,
@@ -87,7 +89,9 @@ __all__ = [
     "Plan",
     "Proposal",
     "ReachingLaw",
+    "Reference",
     "Run",
+    "SetPoints",
     "SlidingModeLaw",
     "Surface",
     "Trajectory",

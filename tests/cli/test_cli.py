@@ -23,6 +23,7 @@ from undertow.cli.parsing import mechanism_named, objective_named, parse_start, 
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
+CRANE = "overhead_crane"
 
 
 # -- help ------------------------------------------------------------------------------------
@@ -117,6 +118,15 @@ def test_version_and_bare_call() -> None:
             "> 0",
         ),
         (("optimise", RIG, "--evaluations", "0"), "0 evaluations", "at least 1"),
+        (("simulate", CRANE, "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
+        (("simulate", CRANE, "--target", "x=2"), "'2'", "a number with its unit, m"),
+        (("simulate", CRANE, "--target", "x=1m@2min"), "'2min'", "s or Hz"),
+        (("simulate", CRANE, "--target", "x_dot=1m/s"), "x_dot = 1", "velocity 0"),
+        (("simulate", CRANE, "--target", "theta=5deg"), "theta = 0.0872665", "along x"),
+        (("simulate", CRANE, "--target", "x=1m", "--target", "x=.1m"), "'x' twice", "once"),
+        (("simulate", CRANE, "--target", "x=1m", "--target", "x=.1m@2Hz"), "x=1m", "one frequency"),
+        (("simulate", CRANE, "--target", "x=1m", "--control", "designed"), "designed", "cascade"),
+        (("run", CRANE, "--simulated", "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
     ],
 )
 def test_bad_input_is_refused_with_value_and_limit(
@@ -130,6 +140,15 @@ def test_bad_input_is_refused_with_value_and_limit(
     assert err.count("\n") == 1
     assert f"got {value}" in err or value in err
     assert limit in err
+
+
+def test_a_target_on_the_command_line(tmp_path: Path) -> None:
+    """Set-points one after another; the report says which, and what was reached."""
+    short = ("--objective", "bench-time", "--horizon", "6", "--start", "x=0m")
+    code, out, _ = run("simulate", CRANE, *short, "--target", "x=0.3m", "--target", "x=0m@1s")
+    assert code == 0
+    assert "x=0.3m, x=0m@1s" in out
+    assert "begin another task" in " ".join(out.split())
 
 
 def test_start_without_unit_is_told_what_to_write() -> None:

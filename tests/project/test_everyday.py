@@ -142,6 +142,17 @@ def test_run_and_compare(names: dict[str, Any]) -> None:
     assert "balanced" in str(table)
 
 
+def test_a_target_that_moves(names: dict[str, Any]) -> None:
+    """The crane rests at the last set-point, the arm is where the sine is."""
+    made = does("A target that moves", names)
+    moved, swings = made["moved"], made["swings"]
+    assert moved.reached
+    assert abs(moved.trajectory["x"][-1] + 0.5) < 0.05
+    assert swings.reached
+    wanted = ut.deg(45) * np.sin(np.pi * swings.time)
+    assert abs(swings.trajectory["theta"][-1] - wanted) < 0.05
+
+
 def test_prove(names: dict[str, Any]) -> None:
     pytest.importorskip("flint")
     made = does("6.", names)

@@ -12,17 +12,20 @@ from undertow.cascade.cascade import (
     problem_words,
 )
 from undertow.cascade.robustness import derate_actuator, noise_share, robustness_gate
+from undertow.cascade.targets import Legs, legs_of
 
 __all__ = [
     "Admission",
     "Cascade",
     "CascadeState",
     "Gate",
+    "Legs",
     "Run",
     "Update",
     "cost_gate",
     "derate_actuator",
     "gate_words",
+    "legs_of",
     "noise_share",
     "problem_words",
     "robustness_gate",

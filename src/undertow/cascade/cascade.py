@@ -29,14 +29,24 @@ from undertow.base import (
     positive,
     write_file,
 )
-from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Ensemble, Event, Trajectory
+from undertow.cascade.targets import LoopsAbout, legs_of
+from undertow.closed_loop import (
+    INADMISSIBLE,
+    ClosedLoop,
+    Ensemble,
+    Event,
+    Trajectory,
+    cost_along,
+)
 from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import (
     Control,
     Plan,
     ReachingLaw,
+    ReferenceMotion,
     SlidingModeLaw,
     Surface,
+    Target,
     check_surface,
     stability_margin,
 )
@@ -148,7 +158,8 @@ class CascadeState:
     ``plan`` is in use since the time ``since``; ``sequence`` is the number of the last
     proposal considered; ``predicted`` is the predicted cost J̃_k at the last decision;
     ``scale`` that of the first; ``x`` the state at ``since``, empty where it is not known;
-    ``estimate`` what is known of the plant's parameters, where the cascade learns them.
+    ``estimate`` what is known of the plant's parameters, where the cascade learns them;
+    ``target`` where the target is, where it is not at x = 0: ``x`` is counted from it.
     """
 
     plan: Plan
@@ -158,6 +169,7 @@ class CascadeState:
     since: float = 0.0
     x: tuple[float, ...] = ()
     estimate: ParameterEstimate | None = None
+    target: ReferenceMotion | None = None
 
     @property
     def surface(self) -> Surface:
@@ -168,13 +180,22 @@ class CascadeState:
         """Return what is left of the plan in use at time t, s."""
         return self.plan.shifted(t - self.since)
 
+    def error(self, t: float, x: FloatArray) -> FloatArray:
+        """Return how far a state x, (…, 2n), is off the target at time t, s."""
+        return x if self.target is None else x - self.target.state(t)
+
+    def absolute(self, t: float, error: FloatArray) -> FloatArray:
+        """Return the state that is so far off the target at time t, s: the inverse."""
+        return error if self.target is None else error + self.target.state(t)
+
 
 @dataclass(frozen=True, eq=False)
 class Update:
     """One decision of the outer loop, as recorded.
 
     ``t`` and ``x`` are when and where; ``plan`` the one in use afterwards; ``predicted``
-    its J̃_k; ``spent`` the cost spent since the decision before.
+    its J̃_k; ``spent`` the cost spent since the decision before; ``task`` counts the
+    tasks before: a target that jumps begins one, and so does leaving a set-point once reached.
     """
 
     t: float
@@ -184,6 +205,7 @@ class Update:
     plan: Plan
     predicted: float
     spent: float
+    task: int = 0
 
     @property
     def surface(self) -> Surface:
@@ -310,12 +332,15 @@ class Run:
 
         Never negative, to integration tolerance, where belief and truth agree; for
         minimum time it is t_{f,k} − Δt − t_{f,k+1}.  NaN where one of the predictions is
-        infinite: a disturbed plant may leave what the belief can bring home.
+        infinite: a disturbed plant may leave what the belief can bring home; and where another task
+        begins, for instance because the target jumped.  While a reference moves, predictions
+        count to a horizon that moves along, and slack may be negative.
         """
         predicted = np.array([update.predicted for update in self.updates])
         spent = np.array([update.spent for update in self.updates])
         finite = np.isfinite(predicted)
-        known = finite[1:] & finite[:-1]
+        task = np.array([update.task for update in self.updates])
+        known = finite[1:] & finite[:-1] & (task[1:] == task[:-1])
         predicted = np.where(finite, predicted, 0.0)
         return np.where(known, predicted[:-1] - spent[1:] - predicted[1:], np.nan)
 
@@ -466,9 +491,22 @@ class Cascade:
         )
 
     @checked
-    def loop_at(self, state: CascadeState) -> ClosedLoop:
-        """The predicted closed loop with what is known by now of the plant."""
-        return self._loops(state.estimate)
+    def loop_at(self, state: CascadeState, t: float | None = None) -> ClosedLoop:
+        """The predicted closed loop with what is known by now of the plant, about the target.
+
+        Where the target is a reference on its way, it is taken to stay where it is at time t, s, by
+        default ``state.since``.
+        """
+        when = state.since if t is None else t
+        return self.about(self._loops(state.estimate), state.target, when)
+
+    @cached_property
+    def _loops_about(self) -> LoopsAbout:
+        return LoopsAbout(self.mechanism, self.objective)
+
+    def about(self, loop: ClosedLoop, target: ReferenceMotion | None, t: float) -> ClosedLoop:
+        """A loop of this cascade about a target, as it is at the time t."""
+        return loop if target is None else self._loops_about.loop(loop, target.position(t))
 
     @cached_property
     def _loops(self) -> Callable[[ParameterEstimate | None], ClosedLoop]:
@@ -521,13 +559,18 @@ class Cascade:
         larger = smooth and slow and even and not any(self.mechanism.disturbance_bounds)
         return loop.with_steps(self.step * (2 if larger else 1), TAIL_RTOL)
 
-    def _planner(self, exact: ClosedLoop) -> Planner:
+    def _planner(
+        self, exact: ClosedLoop, target: ReferenceMotion | None = None, t: float = 0.0
+    ) -> Planner:
         """Who is asked for plans: ``planner``, or else the optimiser of a predicted closed loop."""
         if self.planner is not None:
             return self.planner
-        if exact is self.loop:
-            return self.optimiser
-        return self.optimiser.on(self._for_search(exact))
+        optimiser = self.optimiser
+        if exact is not self.loop:
+            optimiser = optimiser.on(self._for_search(exact))
+        if target is None:
+            return optimiser
+        return self._loops_about.optimiser(optimiser, target.position(t))
 
     def __repr__(self) -> str:
         """Show what is controlled, for what, and how often it is planned anew."""
@@ -541,41 +584,125 @@ class Cascade:
     # -- the state machine ----------------------------------------------------------------
 
     @checked
-    def start(self, x: ArrayLike) -> tuple[CascadeState, Proposal]:
-        """Run the first, global optimisation from x: at the start, and again after a jump.
+    def start(
+        self,
+        x: ArrayLike,
+        target: Target | Mapping[str, float] | None = None,
+        t: float = 0.0,
+    ) -> tuple[CascadeState, Proposal]:
+        """Run the first, global optimisation from x: at the start, and again after a jump of x.
 
-        A target of one's own is moved by taking it off the state: x is always the way to the
-        target.  When it jumps, so does x, and what was planned is for another task: call this
-        again.
+        A target that jumps asks for :meth:`retarget`.
+
+        Parameters
+        ----------
+        x
+            State, (2n,), absolute: what it is off the target is taken off by the cascade, here and
+            in every other method.
+        target
+            Where to, see :meth:`simulate`; x = 0 by default.
+        t
+            When that is, s.
 
         Raises
         ------
         InfeasibleError
             When no admissible surface was found.
+        InvalidInputError
+            For a target that cannot be one, see :meth:`simulate`.
         """
-        return self._start(self.mechanism.check_state(x))
+        motion = None if target is None else self._target_at(target, t)
+        return self.start_to(self.mechanism.check_state(x), motion, t)
 
-    def _start(self, x: FloatArray) -> tuple[CascadeState, Proposal]:
-        self.objective.check_start(self.mechanism, x)
+    @checked
+    def retarget(
+        self,
+        state: CascadeState,
+        x: ArrayLike,
+        target: Target | Mapping[str, float],
+        t: float = 0.0,
+    ) -> tuple[CascadeState, Proposal]:
+        """Go for another target from now on: a new task, optimised as afresh.
+
+        The warm search of :meth:`propose` looks near the plan in use, which was for another way:
+        after a jump that may cost many times as much.  The number of the decision goes on, and so
+        does what was learnt of the plant.
+
+        Parameters
+        ----------
+        state
+            Memory of the cascade.
+        x
+            State at the time of the jump, (2n,), absolute.
+        target
+            Where to now, see :meth:`simulate`.
+        t
+            When that is, s.
+
+        Raises
+        ------
+        InfeasibleError
+            When no admissible surface was found: the old task may go on.
+        InvalidInputError
+            For a target that cannot be one.
+        """
+        return self.retarget_to(state, self.mechanism.check_state(x), self._target_at(target, t), t)
+
+    def retarget_to(
+        self, state: CascadeState, x: FloatArray, motion: ReferenceMotion, t: float
+    ) -> tuple[CascadeState, Proposal]:
+        """:meth:`retarget` to a leg of a target, which was checked before."""
+        begun, proposal = self.start_to(x, motion, t)
+        number = state.sequence + 1
+        begun = replace(begun, sequence=number, estimate=state.estimate)
+        return begun, replace(proposal, sequence=number, computed_for=t)
+
+    def _target_at(self, target: Target | Mapping[str, float], t: float) -> ReferenceMotion:
+        """The leg of a target that is in force at the time t."""
+        legs = legs_of(self.mechanism, self.objective, target, t + self.objective.horizon)
+        return [motion for begin, motion in legs if begin <= t][-1]
+
+    def start_to(
+        self, x: FloatArray, target: ReferenceMotion | None = None, t: float = 0.0
+    ) -> tuple[CascadeState, Proposal]:
+        """:meth:`start` towards a leg of a target, which was checked before."""
+        if target is not None:
+            x = x - target.state(t)
+        here = self.about(self.loop, target, t)
+        here.objective.check_start(here.mechanism, x)
         known = None if self.known is None else self.known.prior
         tries = self._first_tries()
         for number, (loop, small) in enumerate(tries, 1):
-            planner = self.optimiser.on(loop) if small else self._planner(loop)
+            about = self.about(loop, target, t)
+            planner = self.optimiser.on(about) if small else self._planner(loop, target, t)
             proposal = planner.propose(
                 x, incumbent=None, horizon=None, sequence=0, computed_for=0.0, resolution=0.0
             )
             if proposal.plan is None and loop is not self.loop:
                 continue
-            plan, horizon = proposal.required(self.loop).plan, self.objective.horizon
+            plan, horizon = proposal.required(here).plan, self.objective.horizon
             assert plan is not None  # required
-            cost = float(loop.batch(x, plan, duration=horizon).score(horizon)[0])
+            cost = float(about.batch(x, plan, duration=horizon).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
             if loop is not self.loop:  # every plausible plant lives to see the next decision
-                good &= self.survives(CascadeState(plan, estimate=known), x, 0.0)
+                good &= self._survives(here, x, plan)
             if good or number == len(tries):
-                return CascadeState(plan, 0, cost, cost, x=_kept(x), estimate=known), proposal
+                if target is not None and target.moves:
+                    plan, cost = self._first_along(plan, x, target, t)
+                begun = CascadeState(plan, 0, cost, cost, t, _kept(x), known, target)
+                return begun, proposal
         raise AssertionError("the last try returns or raises")
+
+    def _first_along(
+        self, plan: Plan, x: FloatArray, target: ReferenceMotion, t: float
+    ) -> tuple[Plan, float]:
+        """The first plan, or the designed surface where that is better along a reference."""
+        plans = [plan, Plan.of(self.optimiser.anchor)]
+        absolute, span = x + target.state(t), self.objective.horizon
+        costs = [cost_along(self.loop, absolute, p, target, duration=span, start=t) for p in plans]
+        best = int(np.argmin(costs))
+        return plans[best], costs[best]
 
     def _first_tries(self) -> list[tuple[ClosedLoop, bool]]:
         """What the first plan is to be best on, one after the other; and whether in small steps.
@@ -598,7 +725,7 @@ class Cascade:
 
         The admission says what the gate would have said; ``accepted`` is always true.
         """
-        current = self.mechanism.check_state(x)
+        current = state.error(state.since, self.mechanism.check_state(x))
         asked = self.gate(self.loop_at(state), state.plan, state.plan, current, horizon)
         reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
         return Admission(True, reason, state.predicted, asked.verdict)
@@ -607,11 +734,15 @@ class Cascade:
     def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
         """Fast step: the input at (t, x) on the surface in use; never NaN, never past limits.
 
-        It follows the plan in use wherever x is: after a jump of the target, too, which asks for
-        :meth:`start`.
+        While the target moves, its acceleration is fed forward: ṡ = −K sw(s/ε) holds on the
+        way, too.  It follows the plan in use wherever x is: a target that jumps asks for
+        :meth:`retarget`.
         """
         surface, law = state.plan.at(t - state.since)
-        believed = self.loop_at(state).mechanism
+        believed = self._loops(state.estimate).mechanism
+        if state.target is not None:
+            x = state.error(t, self.mechanism.check_state(x))
+            believed = state.target.error_dynamics(believed, t)
         return SlidingModeLaw(believed, surface, law or self.reaching)(t, x)
 
     @checked
@@ -636,7 +767,9 @@ class Cascade:
         Notes
         -----
         The search is warm: it looks near the plan in use.  Where the state has jumped, or the
-        target, the optimum may be far from it: :meth:`apply_gate` says so, :meth:`start` finds it.
+        target, the optimum may be far from it: :meth:`apply_gate` says so, :meth:`retarget` finds
+        it.  Of a target that moves, the search leaves the motion out: it sees the error, and the
+        target at rest where it is at the time t.  :meth:`apply_gate` sees the motion.
         """
         return self._propose(state, x, t, horizon)
 
@@ -645,8 +778,9 @@ class Cascade:
     ) -> Proposal:
         sequence = state.sequence + 1
         try:
-            return self._planner(self.loop_at(state)).propose(
-                self.mechanism.check_state(x),
+            planner = self._planner(self._loops(state.estimate), state.target, t)
+            return planner.propose(
+                state.error(t, self.mechanism.check_state(x)),
                 incumbent=state.at(t),
                 horizon=horizon,
                 sequence=sequence,
@@ -674,6 +808,9 @@ class Cascade:
         moment than ``JUMP`` = 0.1 rad or m and ``PART`` = half of the way that it was to move them
         since, the admission's reason says so: after a jump the cost is compared with that of a plan
         for another task, and "cost not raised" is little.
+
+        Where the target moves, what the gate admits is also rolled out along the reference, as is
+        the plan in use: constraints have to hold there, and the cost must not rise.
         """
         span = self.objective.horizon if horizon is None else horizon
         current = self.mechanism.check_state(x)
@@ -681,9 +818,9 @@ class Cascade:
             stale = f"stale: number {proposal.sequence} after {state.sequence}"
             return state, Admission(False, stale, state.predicted)
         t = proposal.computed_for
-        old = state.at(t)
+        old, current = state.at(t), state.error(t, current)
         jump = self._jump(state, t, current)
-        loop = self.loop_at(state)
+        loop = self.loop_at(state, t)
         state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
         if proposal.plan is None:
             kept = self.gate(loop, old, old, current, span)
@@ -691,9 +828,27 @@ class Cascade:
             admission = replace(kept, accepted=False, reason=reason)
             return replace(state, predicted=kept.cost), admission
         admission = self.gate(loop, old, proposal.plan, current, span)
+        if state.target is not None and state.target.moves:
+            admission = self._along(state, old, proposal.plan, admission, span)
         admission = replace(admission, reason=f"{admission.reason}{jump}")
         plan = proposal.plan if admission.accepted else old
         return replace(state, plan=plan, predicted=admission.cost), admission
+
+    def _along(
+        self, state: CascadeState, old: Plan, new: Plan, admission: Admission, span: float
+    ) -> Admission:
+        """Judge again what the gate admitted: both plans along the reference, as it will move."""
+        assert state.target is not None  # there is no reference without one
+        loop, target, t = self._loops(state.estimate), state.target, state.since
+        x = state.absolute(t, np.array(state.x))
+        cost = cost_along(loop, x, old, target, duration=span, start=t)
+        if not admission.accepted:
+            return replace(admission, cost=cost)
+        found = cost_along(loop, x, new, target, duration=span, start=t)
+        if found <= cost and found < math.inf:
+            return replace(admission, cost=found)
+        words = f"raises the cost along the reference: {found:.6g} > {cost:.6g}"
+        return Admission(False, words, cost, admission.verdict)
 
     def _jump(self, state: CascadeState, t: float, x: FloatArray) -> str:
         """Say how far a state is off what the plan in use predicted for it, where it is far."""
@@ -720,14 +875,17 @@ class Cascade:
         state
             Memory of the cascade.
         x
-            Present state, (2n,).
+            Present state, (2n,), absolute.
         t
             When that is, s.
         """
-        loop = self.loop_at(state)
+        loop = self.loop_at(state, t)
         if loop.ensemble is None:
             return True
-        event = loop.batch(x, state.at(t), duration=2 * self.period).event[0]
+        return self._survives(loop, state.error(t, self.mechanism.check_state(x)), state.at(t))
+
+    def _survives(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
+        event = loop.batch(error, plan, duration=2 * self.period).event[0]
         return event in (Event.HORIZON, Event.REACHED)
 
     # -- simulation -----------------------------------------------------------------------
@@ -737,9 +895,8 @@ class Cascade:
 
         Decisions come each period, learning some times within it; ``marks`` are strides besides.
         """
-        stride = self._stride
+        stride, parts = self._stride, self._parts
         strides = round(self.period / stride)
-        parts = 1 if self.known is None else min(strides, max(1, round(self.period / LEARNING)))
         within = {round(strides * part / parts) for part in range(parts)}
         for k in range(math.ceil(total / self.period - 1e-9)):
             begin = k * self.period
@@ -749,6 +906,17 @@ class Cascade:
                 if t < total - 1e-9:
                     span = self.period if end - part == strides else (end - part) * stride
                     yield t, min(span, total - t), part == 0
+
+    @property
+    def _parts(self) -> int:
+        """How often a period learns."""
+        most = round(self.period / self._stride)
+        return 1 if self.known is None else min(most, max(1, round(self.period / LEARNING)))
+
+    @property
+    def learning_period(self) -> float:
+        """About how often what the motion shows is learnt, s; the period where nothing is."""
+        return round(self.period / self._stride / self._parts) * self._stride
 
     @property
     def _stride(self) -> float:
@@ -762,6 +930,7 @@ class Cascade:
         *,
         plant: Mechanism | Mapping[float, Mechanism] | None = None,
         duration: float | None = None,
+        target: Target | Mapping[str, float] | None = None,
         progress: Callable[[float, float], None] | None = None,
         **state: float,
     ) -> Run:
@@ -777,6 +946,12 @@ class Cascade:
             time, s, to what the plant is from then on.
         duration
             Longest run, s; the objective's horizon by default.  Predictions end there too.
+        target
+            Where to, x = 0 by default: a mapping of coordinates to positions, rad or m;
+            :class:`undertow.SetPoints`, which jump; or a :class:`undertow.Reference`, which moves.
+            With a duration the run then goes on to its end, holding what it has reached; without
+            one until the last set-point, or the end of a horizon.  See
+            :mod:`undertow.cascade.following`.
         progress
             Called with (time, duration) after each period.
 
@@ -785,9 +960,21 @@ class Cascade:
         InfeasibleError
             When the first optimisation finds no admissible surface.
         InvalidInputError
-            For an unknown state name, a state that is not finite, or no start at all.
+            For an unknown state name, a state that is not finite, or no start at all; for a target
+            where the mechanism cannot rest or go, before anything moves.
         """
         x = self.mechanism.initial_state(x0, state)
+        if target is not None:
+            from undertow.cascade.following import follow
+
+            if isinstance(plant, Mapping):
+                raise InvalidInputError(
+                    "plant of a run to a target",
+                    value="one that changes while it runs",
+                    limit="one plant",
+                    remedy="Leave the target out, or give the plant that it is",
+                )
+            return follow(self, x, target, plant, duration, progress)
         total = self.objective.horizon if duration is None else duration
         positive("duration of a run, s", total, "Leave it out for the objective's horizon")
         usual = None if self.known is None else self.mechanism
@@ -803,7 +990,7 @@ class Cascade:
             for t, moving in {0.0: usual, **changes}.items()
         }
         truth = truths[0]
-        memory, proposal = self._start(x)
+        memory, proposal = self.start_to(x)
         admission = self.first_admission(memory, x, total)
         updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
         pieces: list[Trajectory] = []

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from undertow.base import InvalidInputError
 from undertow.cascade import Cascade, Gate
 from undertow.cli import options
 from undertow.cli.options import folder, option
-from undertow.cli.parsing import parse_surface, parse_task, parse_values
+from undertow.cli.parsing import parse_surface, parse_target, parse_task, parse_values
 from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
 from undertow.closed_loop import ClosedLoop
 from undertow.law import check_surface, first_surface
@@ -25,11 +26,13 @@ from undertow.runtime import default_gate
     "undertow simulate rotary_pendulum --objective time --control one-time --plant m=0.13",
     "undertow simulate rotary_pendulum --start phi=20deg --box theta=60deg "
     "--limit voltage=8 --hard-input",
+    "undertow simulate overhead_crane --target x=1m --target x=-1m@2s --objective bench-time",
     "undertow simulate model.py:bar",
 )
 def simulate(
     name: options.AnyName,
     start: options.Start = None,
+    target: options.Target = None,
     objective: options.Goal = "energy",
     control: Annotated[
         str | None,
@@ -76,24 +79,39 @@ def simulate(
     seed: options.Seed = 0,
     out: Annotated[Path | None, folder("motion.csv, motion.png and manifest.json")] = None,
 ) -> None:
-    """Simulate a mechanism under its sliding-mode law, from a start to the target."""
+    """Simulate a mechanism under its sliding-mode law, from a start to the target.
+
+    A target that moves is followed to the end of the horizon, or until the last set-point is
+    reached.
+    """
     request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.studies.motion import motion_files, motion_report
 
     options.check_control(control, ("cascade", "one-time", "designed"), surface)
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
+    goes_to = parse_target(belief, target)
     truth = belief.with_parameters(**parse_values(plant)) if plant else None
     given = None if surface is None else parse_surface(belief, surface)
     request["control"] = steering = control or ("cascade" if given is None else "given surface")
     check_out(out)
     run = gate = None
+    if goes_to is not None and steering != "cascade":
+        raise InvalidInputError(
+            f"--target with --control {steering}" if given is None else "--target with --surface",
+            value=steering,
+            limit="cascade, which follows targets",
+            remedy="Leave one of them out",
+        )
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
         known = known or ("usual" if accept is None else "exact")
         cascade = Cascade(belief, goal, period=period, gate=gate, seed=seed, belief=known)
         with progress_bar() as progress:
             run = cascade.simulate(
-                x0, plant=truth, progress=lambda t, end: progress("cascade", t / end)
+                x0,
+                plant=truth,
+                target=goes_to,
+                progress=lambda t, end: progress("cascade", t / end),
             )
         motion, surfaces = run.trajectory, run.surfaces
     else:
@@ -104,7 +122,8 @@ def simulate(
         check_surface(belief, given, x0)
         motion, surfaces = ClosedLoop(belief, goal, plant=truth).simulate(x0, given), (given,)
     written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run))
-    show(motion_report(belief, goal, x0, motion, surfaces[0], run, gate), *written)
+    words = ", ".join(target or ())
+    show(motion_report(belief, goal, x0, motion, surfaces[0], run, gate, words), *written)
     exit_unless(motion.event.name == "REACHED")
 
 

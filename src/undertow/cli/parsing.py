@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from undertow.base import InvalidInputError, one_of
-from undertow.law import Surface
+from undertow.law import Reference, SetPoints, Surface, Target
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, normal_name
 from undertow.objective import Constraint, Objective, check_travel, objective_for, state_box
@@ -29,7 +29,7 @@ UNITS: Mapping[str, tuple[str, bool, float]] = {
     "m/s": ("m", True, 1.0),
 }
 
-_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z/]*)")
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z/]*)")
 
 
 def mechanism_named(
@@ -230,6 +230,70 @@ def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray
         number, unit = _quantity(text, units, f"initial state '{name}'", example)
         values[name] = number * UNITS[unit][2]
     return mechanism.state(**values)
+
+
+def parse_target(mechanism: Mechanism, words: Sequence[str] | None) -> Target | None:
+    """Read a target from words with units; ``None`` without any: x = 0.
+
+    Parameters
+    ----------
+    mechanism
+        Whose coordinates they are.
+    words
+        Set-points, ``x=2m`` from the start or ``x=-1m@2s`` from a time on; sines of the same
+        frequency about 0, ``theta=45deg@0.5Hz``; or one CSV file with a path, see
+        :meth:`undertow.Reference.read`.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown state, a missing or wrong unit, what is no number, words of several kinds,
+        and a file that is no path.
+    ArtefactError
+        For a file that cannot be read.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> crane = ut.mechanisms.overhead_crane()
+    >>> parse_target(crane, ["x=1m", "x=-50cm@2s"])
+    Traceback (most recent call last):
+        ...
+    undertow.base.errors.InvalidInputError: target 'x': got '-50cm', must be a number with its \
+unit, m. Write for instance --target x=1m
+    >>> parse_target(crane, ["x=1m", "x=-0.5m@2s"]).times
+    (0.0, 2.0)
+    """
+    if not words:
+        return None
+    if len(words) == 1 and "=" not in words[0]:
+        return Reference.read(words[0])
+    points: dict[float, dict[str, float]] = {}
+    sines: dict[float, dict[str, float]] = {}
+    for word in words:
+        name, text = _split(word, "x=1m")
+        value, at, when = text.partition("@")
+        units = _units_of(mechanism, name, "target")
+        number, unit = _quantity(value, units, f"target '{name}'", f"--target {name}=1{units[0]}")
+        example = f"--target {name}=1{units[0]}@2s or --target {name}=1{units[0]}@0.5Hz"
+        time, kind = _quantity(when, ("s", "Hz"), f"target '{name}'", example) if at else (0.0, "s")
+        group = (points if kind == "s" else sines).setdefault(time, {})
+        if name in group:
+            raise InvalidInputError(
+                "target", value=f"'{name}' twice", limit="each name once at a time"
+            )
+        group[name] = number * UNITS[unit][2]
+    if sines and (points or len(sines) > 1):
+        raise InvalidInputError(
+            "target",
+            value=" ".join(words),
+            limit="set-points, or sines of one frequency",
+            remedy="Other references: a CSV file, or undertow.Reference in Python",
+        )
+    if sines:
+        ((frequency, amplitudes),) = sines.items()
+        return Reference.sine(frequency, **amplitudes)
+    return SetPoints(sorted(points.items()))
 
 
 def parse_box(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[Constraint, ...]:

@@ -1,6 +1,7 @@
 """The control law: surfaces and their schedule, reaching law, stability margins."""
 
 from undertow.law.inner_loop import LAYOUT, InnerLoop, law_module, pack_law_parameters
+from undertow.law.reference import Reference, ReferenceMotion, SetPoints, Target, target_of
 from undertow.law.schedule import Plan, rising_from_zero
 from undertow.law.sliding import (
     Control,
@@ -33,9 +34,13 @@ __all__ = [
     "Plan",
     "ProvedSet",
     "ReachingLaw",
+    "Reference",
+    "ReferenceMotion",
+    "SetPoints",
     "SlidingModeLaw",
     "Surface",
     "Switching",
+    "Target",
     "build_law_graph",
     "check_surface",
     "check_surface_shape",
@@ -50,4 +55,5 @@ __all__ = [
     "sliding_matrix",
     "stability_margin",
     "surface_margins",
+    "target_of",
 ]

@@ -249,6 +249,7 @@ class SlidingModeLaw:
         """
         state = self.mechanism.check_state(x)
         return self._function(
+            self.mechanism,
             state,
             self.surface.vector,
             self.reaching.vector(self.mechanism.m),
@@ -257,10 +258,9 @@ class SlidingModeLaw:
 
 
 class _LawFunction:
-    """The law of a mechanism compiled to NumPy."""
+    """The law of all mechanisms of one structure, compiled to NumPy."""
 
     def __init__(self, mechanism: Mechanism, switching: Switching) -> None:
-        self.mechanism = mechanism
         symbols = LawSymbols.of(mechanism.n, mechanism.m)
         tape = Tape()
         law = build_law_graph(
@@ -275,12 +275,13 @@ class _LawFunction:
 
     def __call__(
         self,
+        mechanism: Mechanism,
         x: FloatArray,
         surface: FloatArray,
         reaching: FloatArray,
         gamma_target: float | FloatArray,
     ) -> Control:
-        m = self.mechanism.m
+        m = mechanism.m
         # At absurd states powers overflow; the lines below turn what comes out into limits.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             values = self.run(
@@ -288,11 +289,11 @@ class _LawFunction:
                 *surface,
                 *reaching,
                 gamma_target,
-                *self.mechanism.parameter_values,
+                *mechanism.parameter_values,
             )
         shape = x.shape[:-1]
         stacked = np.stack([np.broadcast_to(v, shape) for v in values], axis=-1)
-        limit = self.mechanism.input_limits
+        limit = mechanism.input_limits
         demand = np.nan_to_num(stacked[..., :m], nan=0.0, posinf=1e300, neginf=-1e300)
         return Control(
             np.clip(demand, -limit, limit),
@@ -307,7 +308,7 @@ _LAW_CACHE: dict[tuple[str, Switching], _LawFunction] = {}
 
 
 def _law_function(mechanism: Mechanism, switching: Switching) -> _LawFunction:
-    key = (mechanism.fingerprint, switching)
+    key = (mechanism.structure, switching)
     if key not in _LAW_CACHE:
         _LAW_CACHE[key] = _LawFunction(mechanism, switching)
     return _LAW_CACHE[key]
@@ -367,4 +368,6 @@ def gains_at_target(mechanism: Mechanism, surfaces: FloatArray, eta: FloatArray)
     m = mechanism.m
     reaching = np.concatenate([eta, np.ones_like(eta)], axis=-1)
     origin = np.zeros((len(surfaces), 2 * mechanism.n))
-    return function(origin, surfaces.T, reaching.T, np.ones(len(surfaces))).gains.reshape(-1, m)
+    return function(
+        mechanism, origin, surfaces.T, reaching.T, np.ones(len(surfaces))
+    ).gains.reshape(-1, m)

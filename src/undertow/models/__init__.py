@@ -1,5 +1,11 @@
 """What moves: a mechanism, its physical parameters, and whether its model is valid."""
 
+from undertow.models.error_dynamics import (
+    error_dynamics,
+    invariant_coordinates,
+    reference_names,
+    with_positions,
+)
 from undertow.models.linearisation import (
     Linearisation,
     controllability,
@@ -42,8 +48,10 @@ __all__ = [
     "by_names",
     "check_symbols",
     "controllability",
+    "error_dynamics",
     "expression_of",
     "has_linear_model",
+    "invariant_coordinates",
     "is_smooth",
     "kinks",
     "linear_numbers",
@@ -51,7 +59,9 @@ __all__ = [
     "normal_name",
     "number_of",
     "numbers",
+    "reference_names",
     "require_smooth",
     "shortened",
     "vocabulary",
+    "with_positions",
 ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -150,14 +150,20 @@ class Constraint:
 
 @dataclass(frozen=True)
 class _Within:
-    """w of low ≤ x_i ≤ high, for a state by its name or number; one end may be infinite."""
+    """w of low ≤ x_i ≤ high, for a state by its name or number; one end may be infinite.
+
+    x_i is counted from the target; ``target`` names the parameter that says where that is.
+    """
 
     state: str | int
     low: float
     high: float
+    target: str = ""
 
     def __call__(self, v: Names) -> sp.Expr:
         x = v.states[self.state] if isinstance(self.state, int) else getattr(v, self.state)
+        if self.target:
+            x += getattr(v, self.target)
         if not math.isfinite(self.low):
             return x - self.high
         if not math.isfinite(self.high):
@@ -169,6 +175,18 @@ class _Within:
         """How far from the bound large steps stay."""
         ends = [abs(end) for end in (self.low, self.high) if math.isfinite(end)]
         return SPARE * sum(ends) / len(ends)
+
+
+@dataclass(frozen=True)
+class _Shifted:
+    """w of a constraint on absolute positions, as a function of the error: x = error + target."""
+
+    formula: Formula
+    targets: tuple[tuple[str, str], ...]
+
+    def __call__(self, v: Names) -> sp.Expr:
+        moved = {getattr(v, x): getattr(v, x) + getattr(v, target) for x, target in self.targets}
+        return sp.sympify(self.formula(v)).xreplace(moved)
 
 
 def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
@@ -358,6 +376,33 @@ class Objective:
         constraints = own + declared
         return self if constraints == self.constraints else replace(self, constraints=constraints)
 
+    def about(self, mechanism: Mechanism, names: Sequence[str]) -> Self:
+        """Return the problem in the error from a target that lies elsewhere along some coordinates.
+
+        Stage cost and terminal set are about the error; constraints stay about absolute positions.
+
+        Parameters
+        ----------
+        mechanism
+            Whose travel joins the constraints.
+        names
+            Coordinates whose target is a parameter, ``<name>_target``, see
+            :func:`undertow.models.with_positions`.
+        """
+        targets = {name: f"{name}_target" for name in names}
+
+        def moved(c: Constraint) -> Constraint:
+            within = isinstance(c.formula, _Within)
+            formula: Formula = c.formula
+            if within and c.state in targets:
+                formula = replace(c.formula, target=targets[c.state])  # type: ignore[type-var]
+            elif not within:
+                formula = _Shifted(c.formula, tuple(targets.items()))
+            return Constraint(c.words, formula, c.unit, c.state)
+
+        constraints = tuple(moved(c) for c in self.on(mechanism).constraints)
+        return replace(self, constraints=constraints, travel=False)
+
     @checked
     def meaning(self, mechanism: Mechanism) -> str:
         """Return in one line what is minimised, until when, and within which bounds.
@@ -480,9 +525,10 @@ class Objective:
 
         Empty where there are none, and where one is no :func:`state_box` and no travel.
         """
-        found = []
+        found, data = [], {*mechanism.parameter_symbols}
         for constraint, margin in zip(self.constraints, self.path_margins(mechanism), strict=True):
-            bounded = [i for i, x in enumerate(mechanism.x) if margin.free_symbols == {x}]
+            free = margin.free_symbols - data
+            bounded = [i for i, x in enumerate(mechanism.x) if free == {x}]
             if not (bounded and isinstance(constraint.formula, _Within)):
                 return ()
             found.append((bounded[0], constraint.formula.spare))

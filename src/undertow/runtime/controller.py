@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undertow.cascade import Cascade, CascadeState
+from undertow.cascade import Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray
@@ -32,6 +32,10 @@ from undertow.runtime.steps import BEYOND_TRAVEL, all_finite, limit_output, step
 #: Least time from asking for a catch to its use, s; and how far the state may be off the one
 #: it was made for, in units of 1 + |entry|.
 CATCH_LEAD, CATCH_PREDICTION_ERROR = 0.02, 0.1
+
+#: Time from asking for the first plan to another target to its use, s: a global search; and the
+#: most that it grows to, when answers are late.
+JUMP_LEAD, MOST_JUMP_LEAD = 1.0, 8.0
 
 #: How the reason begins for which an answer is refused that no sound slow loop gives.
 UNSOUND = "unsound: "
@@ -89,6 +93,9 @@ class Controller:
         Brings the mechanism up, and says from where it may be caught; the slow loop is asked for
         the surface that catches it.  ``None``: the law waits until the mechanism is brought
         near its target.
+    legs
+        When the target jumps, s, and where to, the first at 0: what the cascade started with.  The
+        target jumps when the first plan to it is there, not before.
 
     Attributes
     ----------
@@ -117,6 +124,7 @@ class Controller:
         period: float,
         settings: Settings | None = None,
         swing_up: SwingUpAndCatch | None = None,
+        legs: Legs = (),
     ) -> None:
         mechanism = cascade.mechanism
         settings = Settings() if settings is None else settings
@@ -157,7 +165,10 @@ class Controller:
         self._followed, self._free, self._t = True, False, 0.0
         self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
         self._lead = settings.lead_time
-        self._catch_lead = CATCH_LEAD
+        self._catch_lead, self._jump_lead = CATCH_LEAD, JUMP_LEAD
+        self._ahead = list(legs[1:])
+        if memory.target is not None:
+            self._turn[:] = memory.target.state(0.0)
 
     # -- one step --------------------------------------------------------------------------
 
@@ -220,6 +231,7 @@ class Controller:
             new, most = self._next[1][0], self._max_error
             if mode is Mode.SWING_UP and self.swing_up is not None:
                 self._turn[:] = self.swing_up.region.turns(estimate)
+            self._aim(pending)
         waited = ""
         if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up_timeout:
             waited = self._waiting()
@@ -243,6 +255,7 @@ class Controller:
             if used:
                 self.memory, self._law_vectors, self._times = self._next
                 self._segment, self._law_vector = 0, new
+            self._landed(pending, used)
         if why:
             reason = Reason(why).text
             if why == Reason.FAULT:
@@ -256,6 +269,22 @@ class Controller:
             limit_output(self._wanted, self.u, self.limits, self.slew)
         elif mode is not Mode.BALANCE and mode is not Mode.CATCH:
             self._free = False
+
+    def _aim(self, answer: Answer | None) -> None:
+        """Count the state from the new target, where an answer that is due brings one."""
+        if answer is not None and answer.jump and answer.memory.target is not None:
+            self._turn[:] = answer.memory.target.state(answer.use)
+
+    def _landed(self, answer: Answer | None, used: bool) -> None:
+        """Note that the target has jumped, or count from the old one again."""
+        if answer is None or not answer.jump:
+            return
+        if used:
+            begin, _ = self._ahead.pop(0)
+            self.notes.append(Note("target", f"jumps, asked for at {begin:g} s"))
+        else:
+            target = self.memory.target
+            self._turn[:] = 0.0 if target is None else target.state(self._t)
 
     def _describe(self, wrong: int, place: int) -> str:
         """Return in words what a step found wrong with the estimate."""
@@ -316,14 +345,19 @@ class Controller:
             if t > self._asked.use + self.settings.optimiser_timeout:
                 self.notes.append(Note("answer", f"{self._asked.sequence}: never came"))
                 self._sequence = max(self._sequence, self._asked.sequence)
-                self._asked, self.optimiser_timed_out = None, True
                 self._adapt_lead_time(1.5)
+                self._asked, self.optimiser_timed_out = None, True
             return
         if self._pending is not None:
             return
         if self.memory.sequence != self._sequence:
             self.memory = replace(self.memory, sequence=self._sequence)
-        if self.mode is not Mode.SWING_UP:
+        if self._ahead and t >= self._ahead[0][0] - self._jump_lead - 2 * self._lead:
+            begin, motion = self._ahead[0]
+            step = self.cascade.step
+            use = t + math.ceil(max(self._jump_lead, begin - t) / step - 1e-9) * step
+            self._asked = Request(t, self.wrapped.copy(), use, self.memory, -1, motion)
+        elif self.mode is not Mode.SWING_UP:
             self._asked = Request(t, self.wrapped.copy(), t + self._lead, self.memory)
         elif self.swing_up is not None and self.swing_up.worth_asking(self.x):
             use = t + self._catch_lead
@@ -333,6 +367,9 @@ class Controller:
     def _adapt_lead_time(self, factor: float) -> None:
         """Change how far ahead proposals are computed, in whole steps of the predictions."""
         step, settings = self.cascade.step, self.settings
+        if self._ahead and self._asked is not None and self._asked.target is not None:
+            self._jump_lead = min(MOST_JUMP_LEAD, max(JUMP_LEAD, 2 * self._jump_lead))
+            return
         most = max(settings.lead_time, settings.max_lead_time)
         if self.mode is Mode.SWING_UP:
             lead = max(CATCH_LEAD, min(0.1, factor * self._catch_lead))
@@ -355,7 +392,7 @@ class Controller:
                 self._sequence = max(self._sequence, answer.sequence)
                 self._asked = None
         else:
-            if answer.use - t > 0.5 * self._lead:
+            if answer.use - t > 0.5 * self._lead and not answer.jump:
                 self._adapt_lead_time(0.9)
             self._asked, self._pending = None, answer
             self._make_ready(answer)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self, TypeGuard
 import numpy as np
 
 from undertow.cascade import Admission, CascadeState
-from undertow.law import Plan, ReachingLaw, Surface
+from undertow.law import Plan, ReachingLaw, ReferenceMotion, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import Proposal
 from undertow.plants import Measurement
@@ -204,13 +204,16 @@ def memory_to(memory: CascadeState) -> dict[str, Any]:
         "scale": memory.scale,
         "since": memory.since,
         "x": list(memory.x),
+        "target": None if memory.target is None else list(memory.target.position(0.0)),
     }
 
 
 def memory_from(value: Mapping[str, Any]) -> CascadeState:
     """Return the memory that was encoded."""
-    x = tuple(value.get("x", ()))  # logs before this one have none
-    return CascadeState(**{**value, "plan": _plan_from(value["plan"]), "x": x})
+    x, q = tuple(value.get("x", ())), value.get("target")  # logs before this one have none
+    target = None if q is None else ReferenceMotion.at_rest(np.array(q, dtype=float))
+    changed = {"plan": _plan_from(value["plan"]), "x": x, "target": target}
+    return CascadeState(**{**value, **changed})
 
 
 def _is_sound(plan: object) -> TypeGuard[Plan]:
@@ -235,6 +238,7 @@ def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
         "computed_for": proposal.computed_for,
         "message": proposal.message,
         "swing": answer.swing,
+        "jump": answer.jump,
     }
     return (
         k, answer.sequence, answer.use, int(admission.accepted), admission.reason, proposal.status,
@@ -273,4 +277,5 @@ def answer_from(row: Mapping[str, Any]) -> Answer:
         np.array(body["law_vectors"]),
         row["seconds"],
         body["swing"],
+        body.get("jump", False),
     )

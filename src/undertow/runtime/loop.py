@@ -426,7 +426,7 @@ class Runtime:
             if note.kind == "state":
                 report.entered[controller.mode.name] += 1
                 self._note_transition(note.text, inputs.t)
-            else:
+            elif note.kind == "answer":
                 report.invalid_answers += UNSOUND in note.text
                 report.answers[note.text.split(": ", 1)[1].split(",")[0].split(" by ")[0]] += 1
 

@@ -10,10 +10,10 @@ from functools import cached_property
 from typing import Any, Literal, Self, get_args
 
 from undertow.base import InvalidInputError, UndertowError, one_of
-from undertow.cascade import Cascade, CascadeState, cost_gate, derate_actuator
+from undertow.cascade import Cascade, CascadeState, Legs, cost_gate, derate_actuator, legs_of
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import Belief, KalmanFilter
-from undertow.law import Plan, ReachingLaw
+from undertow.law import Plan, ReachingLaw, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, number_of
@@ -79,6 +79,10 @@ class Recipe:
         Of the fast loop, s.
     swing_up
         Begin hanging at rest, where no other start is given, and swing up.
+    target
+        Set-points, pairs of a time, s, and coordinates with positions, rad or m, see
+        :class:`undertow.SetPoints`; without any x = 0.  Times count from the start of the run, and
+        the target jumps once there is a plan for it.
     settings
         Limits and timeouts.
     design
@@ -102,6 +106,7 @@ class Recipe:
     seconds: float = math.inf
     period: float = 0.001
     swing_up: bool = False
+    target: tuple[tuple[float, Mapping[str, float]], ...] = ()
     settings: Settings = field(default_factory=Settings)
     design: Cascade | None = None
 
@@ -134,6 +139,14 @@ class Recipe:
                 "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
             )
         one_of("rig of a run", self.rig, ("ideal", "realistic"))
+        if self.target and self.swing_up:
+            raise InvalidInputError(
+                "target of a run with a swing-up",
+                value=list(self.target),
+                limit="one of them",
+                remedy="Swing up first, and run to the target from there",
+            )
+        assert self.legs is not None  # found here, so that its checks run before anything moves
 
     @cached_property
     def belief(self) -> Mechanism:
@@ -216,6 +229,14 @@ class Recipe:
         region = CatchRegion(self.belief, reaching=self.cascade.reaching, prove=provable)
         return SwingUpAndCatch(designed(self.belief), region)
 
+    @cached_property
+    def legs(self) -> Legs:
+        """When the target jumps, s, and where to; empty for x = 0."""
+        if not self.target:
+            return ()
+        goal = SetPoints(self.target)
+        return legs_of(self.belief, self.cascade.objective, goal, goal.times[-1])
+
     def first(self) -> CascadeState:
         """Return what the cascade starts with: the first optimum, or what awaits a catch.
 
@@ -226,6 +247,8 @@ class Recipe:
         """
         if self.swing is not None:
             return CascadeState(Plan.of(self.swing.region.surfaces[0]))
+        if self.legs:
+            return self.cascade.start_to(self.belief.check_state(self.x0), self.legs[0][1])[0]
         return self.cascade.start(self.x0)[0]
 
     def respond(self, request: Request) -> Answer:
@@ -244,7 +267,7 @@ class Recipe:
                 memory = cascade.start(x)[0]
             self.respond(Request(0.0, x, step, memory, 0))
         self.respond(Request(0.0, x, step, memory))
-        derate_actuator(cascade.loop, RESERVE).batch(x, memory.plan, duration=step)
+        derate_actuator(cascade.loop_at(memory), RESERVE).batch(x, memory.plan, duration=step)
 
     @property
     def output_bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -279,6 +302,7 @@ class Recipe:
             period=self.period,
             settings=self.settings,
             swing_up=self.swing,
+            legs=self.legs,
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -302,7 +326,9 @@ class Recipe:
                 raise InvalidInputError(f"{name} of a recipe", value=kind, limit="numbers")
         renamed = {OLD_SETTINGS.get(name, name): v for name, v in taken["settings"].items()}
         settings = Settings(**_of_types(Settings, renamed))
-        return cls(**{**taken, "start": tuple(taken["start"]), "settings": settings})
+        target = SetPoints(taken["target"]).pairs if taken["target"] else ()
+        changed = {"start": tuple(taken["start"]), "target": target, "settings": settings}
+        return cls(**{**taken, **changed})
 
 
 def _of_types(made: type, values: Mapping[str, Any]) -> dict[str, Any]:

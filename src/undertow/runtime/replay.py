@@ -26,7 +26,7 @@ from undertow.runtime.encoding import Columns, answer_from, memory_from, memory_
 from undertow.runtime.log import Recording, read_log
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
-from undertow.runtime.slow_loop import Answer, judge
+from undertow.runtime.slow_loop import Answer, judge, law_vectors_of
 from undertow.symbolic import processor, sources_digest
 
 
@@ -293,6 +293,8 @@ def _same_decision(controller: Controller, answer: Answer) -> bool:
         return controller.swing_up.region.surface(answer.x) == answer.proposal.surface
     if answer.proposal.plan is None and answer.proposal.status not in ("failed", "infeasible"):
         return True  # what the optimiser said could not be written down
+    if answer.jump:  # the first plan of a task is compared with none
+        return np.array_equal(law_vectors_of(cascade, answer.memory.plan), answer.law_vectors)
     _, admission, law_vectors = judge(cascade, answer.before, answer.proposal, answer.x, answer.use)
     cost = admission.cost == answer.admission.cost or (
         math.isnan(admission.cost) and math.isnan(answer.admission.cost)

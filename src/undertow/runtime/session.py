@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
+from undertow.law import SetPoints
 from undertow.models.importers.python_file import in_a_file
 from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
 from undertow.runtime.clock import SimulatedClock, WallClock
@@ -190,6 +191,7 @@ def run(
     simulated: bool = False,
     processes: int = 3,
     settings: Settings | None = None,
+    target: Mapping[str, float] | SetPoints | None = None,
     progress: Callable[[str, float], None] | None = None,
     **state: float,
 ) -> Report:
@@ -220,6 +222,9 @@ def run(
         For the optimiser; 0: a thread.
     settings
         Limits and timeouts of the run.
+    target
+        Where to, x = 0 by default: coordinates to positions, or :class:`undertow.SetPoints` that
+        jump at times since the start of the run, each as soon as there is a plan for it.
     progress
         Called with (what, fraction) while the run is prepared.
 
@@ -250,6 +255,7 @@ def run(
             seed=cascade.seed,
             period=0.001 if rig is None else rig.period,
             seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
+            target=() if target is None else _points(target),
             settings=settings,
             design=cascade,
         )
@@ -264,6 +270,10 @@ def run(
         with prepared as runtime:
             kept.clear()  # a run closes its rig
             return runtime.run(seconds)
+
+
+def _points(target: Mapping[str, float] | SetPoints) -> tuple[tuple[float, dict[str, float]], ...]:
+    return (target if isinstance(target, SetPoints) else SetPoints(target)).pairs
 
 
 def warm_up(recipe: Recipe, memory: CascadeState) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 from undertow.base import ResourceError
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
-from undertow.law import Plan, SlidingModeLaw, pack_law_parameters
+from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, pack_law_parameters
 from undertow.models import FloatArray
 from undertow.optimiser import Proposal
 from undertow.runtime.processes import START_TIMEOUT, STOPPING, Background, fork, pipe
@@ -41,8 +41,9 @@ OTHERS = tuple(number for number in STOPPING if number != signal.SIGTERM)
 class Request:
     """What the fast loop asks: re-optimise ``memory.plan`` from x at t for use at ``use``, s.
 
-    With ``swing`` ≥ 0 the mechanism is being swung up, with these gains: is there a surface
-    that catches it?
+    x is counted from ``memory.target``.  With ``target`` the target jumps there at the time of use:
+    the plan is for a new task.  With ``swing`` ≥ 0 the mechanism is being swung up, with these
+    gains: is there a surface that catches it?
     """
 
     t: float
@@ -50,6 +51,7 @@ class Request:
     use: float
     memory: CascadeState
     swing: int = -1
+    target: ReferenceMotion | None = None
 
     @property
     def sequence(self) -> int:
@@ -77,6 +79,8 @@ class Answer:
         Time from request to answer, s.
     swing
         That of the request.
+    jump
+        Whether the target jumps at the time of use: ``x`` is counted from the new one.
     """
 
     sequence: int
@@ -89,6 +93,7 @@ class Answer:
     law_vectors: FloatArray
     seconds: float
     swing: int = -1
+    jump: bool = False
 
 
 Compute = Callable[[Request], Answer]
@@ -135,7 +140,9 @@ def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None
         return _catch(cascade, request, swing_up, began)
     x = _predicted(cascade, request)
     memory = request.memory
-    proposal: object = cascade.propose(memory, x, request.use)
+    if request.target is not None:
+        return _retarget(cascade, request, x, began)
+    proposal: object = cascade.propose(memory, memory.absolute(request.use, x), request.use)
     if not isinstance(proposal, Proposal):
         what = f"not a proposal but a {type(proposal).__name__}"
         proposal = Proposal(
@@ -143,6 +150,27 @@ def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None
         )
     judged = judge(cascade, memory, proposal, x, request.use)
     return _answer(request, x, proposal, *judged, began)
+
+
+def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -> Answer:
+    """Return an answer with the first plan for a new target; without one the old one stays."""
+    memory, use = request.memory, request.use
+    assert request.target is not None  # who asks for another target gives one
+    try:
+        place = memory.absolute(use, x)
+        after, proposal = cascade.retarget_to(memory, place, request.target, use)
+        admission = Admission(True, "first optimum for another target", after.predicted)
+        answer = _answer(
+            request, after.error(use, place), proposal, after, admission,
+            law_vectors_of(cascade, after.plan), began,
+        )  # fmt: skip
+        return replace(answer, jump=True)
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+        proposal = Proposal(
+            None, "failed", math.inf, math.inf, (), 0, 0.0, request.sequence, use, message
+        )
+        return _answer(request, x, proposal, *judge(cascade, memory, proposal, x, use), began)
 
 
 def _answer(
@@ -189,7 +217,7 @@ def judge(
 ) -> tuple[CascadeState, Admission, FloatArray]:
     """Pass a proposal through the cascade's gate; whatever goes wrong refuses it."""
     try:
-        after, admission = cascade.apply_gate(memory, proposal, x)
+        after, admission = cascade.apply_gate(memory, proposal, memory.absolute(use, x))
         return after, admission, law_vectors_of(cascade, after.plan)
     except Exception as error:  # an optimiser's answer may be anything
         reason = f"gate: {type(error).__name__}: {error}"
@@ -202,7 +230,8 @@ def judge(
 def _predicted(cascade: Cascade, request: Request) -> FloatArray:
     plan, span = request.memory.at(request.t), request.use - request.t
     try:
-        batch = cascade.loop.batch(request.x, plan, duration=span, terminal=0.0)
+        loop = cascade.about(cascade.loop, request.memory.target, request.t)
+        batch = loop.batch(request.x, plan, duration=span, terminal=0.0)
         return np.asarray(batch.x[0])
     except Exception:  # then the optimiser fails on it too, and says so
         return np.full_like(request.x, math.nan)

@@ -77,6 +77,7 @@ def motion_report(
     surface: Surface,
     run: Run | None = None,
     gate: Gate | None = None,
+    target: str = "",
 ) -> RenderableType:
     """Return a simulated motion for the terminal.
 
@@ -92,8 +93,12 @@ def motion_report(
         The cascade's record, where a cascade was run.
     gate
         Who admitted its surfaces.
+    target
+        Where to, in words, where that is not x = 0.
     """
     rows = _head(mechanism, objective, start, gate)
+    if target:
+        rows.append(("target", target))
     if run is None:
         rows.append(("surface", _surface_words(surface)))
     else:
@@ -131,7 +136,11 @@ def _slack_words(run: Run, objective: Objective) -> str:
     known = slack[np.isfinite(slack)]
     unknown = len(slack) - len(known)
     without = (
-        f"; {unknown} of {len(slack)} decisions without a finite prediction" if unknown else ""
+        f"; {unknown} of {len(slack)} decisions begin another task or lack a finite prediction"
+        if unknown and run.updates[-1].task
+        else f"; {unknown} of {len(slack)} decisions without a finite prediction"
+        if unknown
+        else ""
     )
     if not len(known):
         return f"no slack is known{without}"

@@ -1,0 +1,213 @@
+"""One motion along a reference that moves: law on the error, plant as it is.
+
+The law acts on the error from x_r(t), with the model of the error's own dynamics
+(:func:`undertow.models.error_dynamics`); the plant moves in absolute coordinates, under absolute
+constraints.  Runge-Kutta steps of the loop's length, the reference at their ends and middles.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from undertow.closed_loop.rollout import ClosedLoop
+from undertow.closed_loop.trajectory import Event, Trajectory
+from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, law_module, pack_law_parameters
+from undertow.models import TIME, FloatArray, error_dynamics
+from undertow.symbolic import (
+    PREAMBLE,
+    Tape,
+    content_key,
+    docstring,
+    function_source,
+    generated,
+)
+
+_BODY = f"""
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def along(
+    x, reference, lanes, segments, belief, plant, limits, start, h, steps, hold, radius, escape,
+    hard, record,
+):
+    # Fills a row of record at each step: x, u, s, cost, det Γ(q)/det Γ(0); returns how many, and
+    # the event.
+    n, m = x.shape[0] // 2, limits.shape[0]
+    e, u, demand, s, margin = (
+        np.empty(2 * n), np.zeros(m), np.zeros(m), np.zeros(m), np.ones(1)
+    )
+    rates, acceleration = np.empty(1 + PATH), np.empty(n)
+    at, slope, total = np.empty(2 * n), np.empty(2 * n), np.empty(2 * n)
+    own = belief.shape[0] - 3 * n
+    cost, code = 0.0, {Event.HORIZON:d}
+    for k in range(steps + 1):
+        lane = lanes[segments[min(k, steps - 1)]]
+        total[:], spent = 0.0, 0.0
+        at[:] = x
+        for stage in range(4):
+            half = 2 * k + (0, 1, 1, 2)[stage]
+            if k == steps and stage > 0:
+                break
+            belief[own:] = reference[half]
+            for i in range(2 * n):
+                e[i] = at[i] - reference[half, i]
+            if hold == 0 or (stage == 0 and k % hold == 0):
+                law(e, lane, belief, demand, s, margin)
+                for i in range(m):
+                    wanted = demand[i] if abs(demand[i]) < math.inf else 0.0
+                    u[i] = max(-limits[i], min(limits[i], wanted))
+            measures(e, at, u, plant, rates)
+            if stage == 0:
+                away = math.sqrt((e * e).sum())
+                for i in range(2 * n):
+                    record[k, i] = x[i]
+                for i in range(m):
+                    record[k, 2 * n + i], record[k, 2 * n + m + i] = u[i], s[i]
+                record[k, 2 * n + 2 * m], record[k, 2 * n + 2 * m + 1] = cost, margin[0]
+                if not margin[0] >= 0.0:
+                    code = {Event.SINGULAR:d}
+                elif not away < escape:
+                    code = {Event.DIVERGED:d}
+                for i in range(PATH):
+                    if not rates[1 + i] >= 0.0:
+                        code = {Event.CONSTRAINT:d}
+                for i in range(m):
+                    if hard and not abs(demand[i]) <= limits[i]:
+                        code = {Event.CONSTRAINT:d}
+                if code != {Event.HORIZON:d}:
+                    return k + 1, code
+                if k == steps:
+                    return k + 1, {Event.REACHED:d} if away <= radius else code
+            flow(start + (k + 0.5 * (half - 2 * k)) * h, at, u, plant, acceleration)
+            weight = 1.0 if stage == 0 or stage == 3 else 2.0
+            for i in range(n):
+                slope[i], slope[n + i] = at[n + i], acceleration[i]
+            for i in range(2 * n):
+                total[i] += weight * slope[i]
+                at[i] = x[i] + (0.5, 0.5, 1.0, 0.0)[stage] * h * slope[i]
+            spent += weight * rates[0]
+        for i in range(2 * n):
+            x[i] += h / 6.0 * total[i]
+        if away > radius:
+            cost += h / 6.0 * spent
+    return steps + 1, code
+"""
+
+
+#: Modules by what they are made of.
+_MODULES: dict[object, Any] = {}
+
+
+def _module(loop: ClosedLoop) -> Any:
+    """Return the compiled module of a loop along references: ``along``."""
+    key = (
+        loop.mechanism.structure, loop.mechanism.name, loop.truth.structure, loop.objective,
+        loop.reaching.switching,
+    )  # fmt: skip
+    if key not in _MODULES:
+        _MODULES[key] = _made(loop)
+    return _MODULES[key]
+
+
+def _made(loop: ClosedLoop) -> Any:
+    plant, objective = loop.truth, loop.objective
+    law = law_module(error_dynamics(loop.mechanism), loop.reaching.switching)
+    stage, path = objective.stage_cost(plant), objective.path_margins(plant)
+    key = content_key(law.__name__, plant.structure, plant.name, sp.srepr([stage, *path]), _BODY)
+
+    def write() -> str:
+        tape = Tape()
+        flow = function_source(
+            "flow",
+            tape,
+            {"t": TIME, "x": plant.x, "u": plant.u, "parameters": plant.parameter_symbols},
+            {"out": plant.partition(tape).accelerations(sp.Matrix(plant.u))},
+        )
+        errors = [sp.Symbol(f"_error_{i}", real=True) for i in range(2 * plant.n)]
+        tape = Tape()
+        measures = function_source(
+            "measures",
+            tape,
+            {"e": errors, "x": plant.x, "u": plant.u, "parameters": plant.parameter_symbols},
+            {"out": tape.let_all([stage.xreplace(dict(zip(plant.x, errors, strict=True))), *path])},
+        )
+        header = docstring(f"{plant.name} along a reference; generated, do not edit. {key[:16]}")
+        own = f"from {law.__name__} import law\n\nPATH = {len(path)}\n"
+        return f"{header}{PREAMBLE}{own}\n\n{flow}\n\n{measures}\n{_BODY}"
+
+    return generated("along", plant.name, key, write)
+
+
+def cost_along(
+    loop: ClosedLoop,
+    x: FloatArray,
+    plan: Plan,
+    motion: ReferenceMotion,
+    *,
+    duration: float,
+    start: float = 0.0,
+) -> float:
+    """Return what a plan costs along a reference; infinite where the motion breaks off.
+
+    See :func:`simulate_along`; of an ensemble the belief alone moves.
+    """
+    alone = loop if loop.ensemble is None else replace(loop, ensemble=None)
+    run = simulate_along(alone, x, plan, motion, duration=duration, start=start)
+    return run.cost if run.event in (Event.HORIZON, Event.REACHED) else math.inf
+
+
+def simulate_along(
+    loop: ClosedLoop,
+    x: FloatArray,
+    plan: Plan,
+    motion: ReferenceMotion,
+    *,
+    duration: float,
+    start: float = 0.0,
+) -> Trajectory:
+    """Simulate and record one motion along a reference, in absolute coordinates.
+
+    Parameters
+    ----------
+    loop
+        Law, plant and objective; about x = 0.
+    x
+        Initial state, (2n,), absolute.
+    plan
+        What is slid on, counted from the reference.
+    motion
+        Where the target is at which time.
+    duration, start
+        Length, and clock at the start, s.
+
+    Returns
+    -------
+    Trajectory
+        Its event is ``REACHED`` where it ends within the terminal radius of the reference; cost
+        counts while it is outside.
+    """
+    steps = max(1, round(duration / loop.step))
+    plain, plant, m = loop.mechanism, loop.truth, loop.mechanism.m
+    laws = zip(plan.surfaces, plan.laws(loop.reaching), strict=True)
+    lanes = np.stack([pack_law_parameters(SlidingModeLaw(plain, s, law)) for s, law in laws])
+    times = np.arange(steps) * loop.step
+    segments = np.searchsorted(plan.times, times + 1e-9, side="right") - 1
+    halves = start + np.arange(2 * steps + 1) * (0.5 * loop.step)
+    record = np.empty((steps + 1, 2 * plain.n + 2 * m + 2))
+    rows, code = _module(loop).along(
+        np.array(x, dtype=float), motion.rows(halves), lanes, segments,
+        np.append(plain.parameter_values, np.zeros(3 * plain.n)), plant.parameter_values,
+        plant.input_limits, start, loop.step, steps, loop.zoh_steps,
+        loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, record,
+    )  # fmt: skip
+    n = plain.n
+    states, u, s, cost, margin = np.split(
+        record[:rows], [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1
+    )
+    t = start + np.arange(rows) * loop.step
+    return Trajectory(
+        plant, t, states, u, s, cost[:, 0], margin[:, 0], Event(code), loop.objective.unit
+    )

@@ -1,0 +1,606 @@
+"""Targets: where a mechanism is to be, at rest or on its way.
+
+A *set-point* is a place where the mechanism rests: a position along coordinates on which neither M
+nor f depends.  A *reference* r(t) moves actuated ones of them.  What surface and law see is the
+error x − x_r(t), whose dynamics are a mechanism's again
+(:func:`undertow.models.error_dynamics`): the law feeds r̈ forward, so that ṡ = −K sw(s/ε) holds
+on the way, too.
+
+While r moves, the unactuated coordinates cannot stay at 0: what is asked of them is the bounded
+motion φ_r of the internal dynamics that r leaves,
+
+    M_uu φ̈ + M_ua r̈ = f_u(r, φ, ṙ, φ̇),
+
+found on a grid in time by stable inversion (Devasia, Chen, Paden, IEEE Trans. Automatic Control
+41 (1996) 930): Fourier series in the place of forward and backward integration, and Newton steps
+with the derivative at the target.  For a periodic reference that is the periodic motion, and the
+error can be zero throughout.  For others a mode that swings (a hanging load) would swing on for
+ever after the reference has stopped: it is given damping, :data:`SWING_DAMPING` of critical, that
+the mechanism lacks.  What the mechanism then does otherwise is left to the surface, which trades it
+against the actuated error.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base import InvalidInputError, checked, floats, one_of, positive, read_file
+from undertow.models import (
+    FloatArray,
+    Mechanism,
+    by_names,
+    error_dynamics,
+    invariant_coordinates,
+    linearise,
+    normal_name,
+    number_of,
+)
+
+#: Damping of swinging modes in the reference of the unactuated coordinates, of critical.
+SWING_DAMPING = 0.5
+
+#: Spacing of the grid of a reference, s; what is added before and after it, s.
+GRID, REST = 0.01, 10.0
+
+#: Newton steps of the inversion, and the last change that ends them, rad or m.
+ROUNDS, ENOUGH = 60, 1e-9
+
+#: Largest file with a reference, bytes.
+LARGEST = 1 << 24
+
+#: Units that a file's header may have, to SI.
+FILE_UNITS = {
+    "s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180,
+}  # fmt: skip
+
+#: r at the times t, (N,) to (N,).
+Function = Callable[[FloatArray], ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceMotion:
+    """x_r(t) of a mechanism, on a grid: at rest before its first row and after its last.
+
+    Attributes
+    ----------
+    t
+        Times, (N,), s, rising; one row is a set-point.
+    q, v, a
+        q_r, q̇_r and q̈_r, (N, n) each, SI units.
+    """
+
+    t: FloatArray
+    q: FloatArray
+    v: FloatArray
+    a: FloatArray
+
+    @classmethod
+    def at_rest(cls, q: FloatArray) -> Self:
+        """Return the set-point at the positions q, (n,)."""
+        still = np.zeros((1, len(q)))
+        return cls(np.zeros(1), np.array(q, dtype=float)[None], still, still)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is no set-point."""
+        return len(self.t) > 1
+
+    def rows(self, t: ArrayLike) -> FloatArray:
+        """Return q_r, q̇_r and q̈_r at the times t, (N,) to (N, 3n).
+
+        q_r and q̇_r are cubic between rows, q̈_r is linear.
+        """
+        t = np.atleast_1d(np.asarray(t, dtype=float))
+        if not self.moves:
+            return np.repeat(np.hstack([self.q, self.v, self.a]), len(t), axis=0)
+        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
+        h = (self.t[k + 1] - self.t[k])[:, None]
+        z = np.clip((t - self.t[k])[:, None] / h, 0.0, 1.0)
+        q = _hermite(z, h, self.q[k], self.q[k + 1], self.v[k], self.v[k + 1])
+        v = _hermite(z, h, self.v[k], self.v[k + 1], self.a[k], self.a[k + 1])
+        a = (1 - z) * self.a[k] + z * self.a[k + 1]
+        outside = (t < self.t[0]) | (t > self.t[-1])
+        v[outside] = a[outside] = 0.0
+        return np.hstack([q, v, a])
+
+    def position(self, t: float) -> tuple[float, ...]:
+        """Return q_r(t), n numbers."""
+        return tuple(self.rows(t)[0, : self.q.shape[1]].tolist())
+
+    def state(self, t: float) -> FloatArray:
+        """Return x_r(t), (2n,)."""
+        return np.asarray(self.rows(t)[0, : 2 * self.q.shape[1]])
+
+    def error_dynamics(self, mechanism: Mechanism, t: float) -> Mechanism:
+        """Return the mechanism as the error x − x_r(t) sees it at the time t."""
+        if not self.moves:
+            return mechanism
+        return error_dynamics(mechanism, self.rows(t)[0])
+
+
+def _hermite(
+    z: FloatArray, h: FloatArray, a: FloatArray, b: FloatArray, da: FloatArray, db: FloatArray
+) -> FloatArray:
+    """Return the cubic from a to b with these slopes, at the part z of the interval h."""
+    rest = 1 - z
+    return np.asarray(
+        rest**2 * ((1 + 2 * z) * a + h * z * da) + z**2 * ((3 - 2 * z) * b - h * rest * db)
+    )
+
+
+# -- set-points ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SetPoints:
+    """Places to rest at, one after another, each at once.
+
+    Parameters
+    ----------
+    points
+        Coordinate name to position, rad or m; or pairs (t, such a mapping) with rising times, s.
+        Coordinates that are not named stay where the point before had them, at first at 0.
+
+    Raises
+    ------
+    InvalidInputError
+        For times that do not rise, and values that are no numbers.
+
+    Examples
+    --------
+    >>> SetPoints([(0, {"x": 1.0}), (2, {"x": -1.0})]).times
+    (0.0, 2.0)
+    """
+
+    points: Mapping[str, float] | Sequence[tuple[float, Mapping[str, float]]]
+
+    def __post_init__(self) -> None:
+        """Write a mapping as one point, and check times."""
+        given: Any = self.points
+        pairs = [(0.0, given)] if isinstance(given, Mapping) else list(given)
+        if not all(
+            isinstance(p, Sequence) and len(p) == 2 and isinstance(p[1], Mapping) for p in pairs
+        ):
+            raise InvalidInputError(
+                "set-points",
+                value=repr(given)[:80],
+                limit="coordinates to positions, or pairs (time, such a mapping)",
+                remedy='Write SetPoints([(0, {"x": 1.0}), (2, {"x": -1.0})])',
+            )
+        times = [number_of("time of a set-point", t) for t, _ in pairs]
+        rising = all(a < b for a, b in itertools.pairwise(times))
+        if not (pairs and rising and times[0] >= 0 and math.isfinite(times[-1])):
+            raise InvalidInputError(
+                "times of set-points",
+                value=times,
+                limit="finite, ≥ 0, each later than the one before, s",
+                remedy="Put them in order",
+            )
+        points = [
+            (t, {normal_name(str(k)): number_of(f"set-point of '{k}'", v) for k, v in p.items()})
+            for t, (_, p) in zip(times, pairs, strict=True)
+        ]
+        object.__setattr__(self, "points", tuple(points))
+
+    @property
+    def pairs(self) -> tuple[tuple[float, dict[str, float]], ...]:
+        """When each is asked for, s, and where it is, by names."""
+        pairs: Any = self.points
+        return tuple(pairs)
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """When each is asked for, s."""
+        return tuple(t for t, _ in self.pairs)
+
+    def legs(
+        self, mechanism: Mechanism, _seconds: float
+    ) -> tuple[tuple[float, ReferenceMotion], ...]:
+        """Return when each set-point begins, s, the first at 0, and where it is.
+
+        Raises
+        ------
+        InvalidInputError
+            For a name that the mechanism has not, a velocity that is not zero, and a position where
+            it does not rest.
+        """
+        q, found = np.zeros(mechanism.n), []
+        names = [c.name for c in mechanism.coordinates]
+        if self.times[0] > 0:
+            found.append((0.0, ReferenceMotion.at_rest(q)))
+        for t, point in self.pairs:
+            for name, value in by_names(f"set-point of '{mechanism.name}'", point).items():
+                one_of(f"set-point of '{mechanism.name}'", name, mechanism.state_names)
+                if name not in names:
+                    _refuse_velocity(mechanism, name, value)
+                elif value != q[names.index(name)]:
+                    _check_invariant(mechanism, name, value)
+                    q[names.index(name)] = value
+            found.append((t, ReferenceMotion.at_rest(q)))
+        return tuple(found)
+
+
+def _refuse_velocity(mechanism: Mechanism, name: str, value: float) -> None:
+    if value != 0:
+        raise InvalidInputError(
+            f"set-point of '{mechanism.name}'",
+            value=f"{name} = {value:g}",
+            limit="velocity 0: a set-point is at rest",
+            remedy="What moves is a reference: undertow.Reference.through(times, ...)",
+        )
+
+
+def _check_invariant(mechanism: Mechanism, name: str, value: float) -> None:
+    """Refuse to move the target along a coordinate on which the equations depend."""
+    free = invariant_coordinates(mechanism)
+    if name not in free or not math.isfinite(value):
+        raise InvalidInputError(
+            f"target of '{mechanism.name}'",
+            value=f"{name} = {value:g}",
+            limit=f"moved along {', '.join(free)}, on which neither M nor f depends"
+            if free
+            else "x = 0: its equations depend on all of its coordinates",
+            remedy="Another equilibrium is the target of a mechanism whose coordinates and inputs "
+            "are measured from it: write them so in Mechanism.from_energies",
+        )
+
+
+# -- references ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sine:
+    """r(t) = centre + amplitude sin(2π frequency t + phase)."""
+
+    amplitude: float
+    frequency: float
+    phase: float = 0.0
+    centre: float = 0.0
+
+    def __call__(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return r, ṙ and r̈."""
+        w = 2 * math.pi * self.frequency
+        s, c = np.sin(w * t + self.phase), np.cos(w * t + self.phase)
+        A = self.amplitude
+        return self.centre + A * s, A * w * c, -A * w**2 * s
+
+
+@dataclass(frozen=True)
+class Spline:
+    """The cubic spline through points, at rest at both ends."""
+
+    times: tuple[float, ...]
+    values: tuple[float, ...]
+
+    def __call__(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return r, ṙ and r̈."""
+        from scipy.interpolate import CubicSpline
+
+        spline = CubicSpline(self.times, self.values, bc_type="clamped")
+        inside = (t >= self.times[0]) & (t <= self.times[-1])
+        at = np.clip(t, self.times[0], self.times[-1])
+        return spline(at), inside * spline(at, 1), inside * spline(at, 2)
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """From one value to another, as the polynomial of least jerk: at rest at both ends."""
+
+    begin: float
+    end: float
+    start: float
+    seconds: float
+
+    def __call__(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return r, ṙ and r̈."""
+        z, T = np.clip((t - self.start) / self.seconds, 0.0, 1.0), self.seconds
+        way = self.end - self.begin
+        return (
+            self.begin + way * z**3 * (10 - 15 * z + 6 * z**2),
+            way * 30 * z**2 * (1 - z) ** 2 / T,
+            way * 60 * z * (1 - z) * (1 - 2 * z) / T**2,
+        )
+
+
+#: r, ṙ and r̈ at the times t, (N,) each.
+ReferencePath = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True)
+class Differentiated:
+    """A function r(t) of one's own; its derivatives are central differences over 1 ms."""
+
+    function: Function
+
+    def __call__(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return r, ṙ and r̈."""
+        h = 1e-3
+
+        def r(at: FloatArray) -> FloatArray:
+            try:
+                values = np.asarray(self.function(at), dtype=float)
+            except (TypeError, ValueError):  # written for one time, with math.sin
+                values = np.array([self.function(one) for one in at], dtype=float)
+            return np.broadcast_to(values, at.shape).astype(float)
+
+        before, now, after = r(t - h), r(t), r(t + h)
+        return now, (after - before) / (2 * h), (after - 2 * now + before) / h**2
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What actuated coordinates are to do over time: r(t) with two derivatives.
+
+    Parameters
+    ----------
+    paths
+        Coordinate name to a function of times, (N,), s, that returns r, ṙ and r̈, (N,) each,
+        SI units.  Other actuated coordinates stay at 0.
+    period
+        After which it repeats itself, s; 0: never.
+
+    See Also
+    --------
+    Reference.sine, Reference.through, Reference.ramp, Reference.of, Reference.read
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> reference = Reference.sine(0.5, theta=ut.deg(45))
+    >>> ((_, motion),) = reference.legs(rig, 4.0)
+    >>> bool(abs(motion.q[:, 1]).max() < ut.deg(10))  # how far the pendulum leans meanwhile
+    True
+    """
+
+    paths: Mapping[str, ReferencePath]
+    period: float = 0.0
+
+    @classmethod
+    @checked
+    def sine(cls, frequency: float, **amplitudes: float) -> Self:
+        """Return amplitude · sin(2π frequency t), Hz and rad or m, for each named coordinate."""
+        positive("frequency of a reference, Hz", frequency, "0.5 is once in two seconds")
+        named = by_names("amplitudes of a reference", amplitudes)
+        return cls({name: Sine(a, frequency) for name, a in named.items()}, 1 / frequency)
+
+    @classmethod
+    @checked
+    def through(cls, times: ArrayLike, **values: ArrayLike) -> Self:
+        """Return the cubic splines through points at these times, s, at rest at both ends."""
+        t = floats("times of a reference", times)
+        good = t.ndim == 1 and len(t) > 1 and np.isfinite(t).all() and (np.diff(t) > 0).all()
+        if not (good and t[0] >= 0):
+            raise InvalidInputError(
+                "times of a reference", value=t.tolist(), limit="two or more, finite, ≥ 0, rising"
+            )
+        paths = {}
+        for name, given in by_names("points of a reference", values).items():
+            r = floats(f"points of '{name}'", given)
+            if r.shape != t.shape or not np.isfinite(r).all():
+                raise InvalidInputError(
+                    f"points of '{name}'",
+                    value=f"shape {r.shape}" if r.shape != t.shape else "NaN or infinity",
+                    limit=f"{len(t)} finite numbers, one for each time",
+                )
+            paths[name] = Spline(tuple(t.tolist()), tuple(r.tolist()))
+        return cls(paths)
+
+    @classmethod
+    @checked
+    def ramp(cls, seconds: float, start: float = 0.0, **ends: float | tuple[float, float]) -> Self:
+        """Return ways from 0, or (begin, end), of least jerk within so many s after ``start``."""
+        positive("length of a ramp, s", seconds)
+        paths = {}
+        for name, end in by_names("ends of a ramp", ends).items():
+            low, high = end if isinstance(end, tuple) else (0.0, end)
+            paths[name] = Ramp(low, high, start, seconds)
+        return cls(paths)
+
+    @classmethod
+    @checked
+    def of(cls, **functions: Function) -> Self:
+        """Return functions r(t) of one's own, differentiated twice by central differences."""
+        return cls({name: Differentiated(f) for name, f in functions.items()})
+
+    @classmethod
+    @checked
+    def read(cls, path: str | Path) -> Self:
+        """Return the cubic splines through the points of a CSV file.
+
+        Parameters
+        ----------
+        path
+            The first line names the columns with their units, ``t (s), x (m), theta (deg)``; the
+            first column is the time.  Units: s, ms; m, cm, mm; rad, deg.
+
+        Raises
+        ------
+        ArtefactError
+            For a file that cannot be read, or is too large.
+        InvalidInputError
+            For a header, a number or times that cannot be used, with the line.
+        """
+        path = Path(path)
+        try:
+            text = read_file(path, "reference", most=LARGEST).decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise InvalidInputError(
+                f"reference '{path}'", value="no UTF-8 text", limit="comma-separated values"
+            ) from error
+        return cls.through(**_columns(path, text))
+
+    def __repr__(self) -> str:
+        """Show what moves."""
+        return (
+            f"Reference({', '.join(self.paths)}{f', period={self.period:g} s' * (self.period > 0)})"
+        )
+
+    def legs(
+        self, mechanism: Mechanism, seconds: float
+    ) -> tuple[tuple[float, ReferenceMotion], ...]:
+        """Return 0 and the motion x_r that is asked for from 0 to ``seconds``.
+
+        Raises
+        ------
+        InvalidInputError
+            For a coordinate that is not actuated, or that the equations depend on; for values that
+            are no finite numbers; and where the unactuated coordinates have no bounded motion.
+        """
+        positive("length of a reference, s", seconds, "Give duration=")
+        window = self.period if self.period else seconds + 2 * REST
+        count = max(64, math.ceil(window / GRID))
+        count += count % 2
+        before = 0.0 if self.period else REST
+        t = np.linspace(-before, window - before, count, endpoint=False)
+        q, v, a = (np.zeros((count, mechanism.n)) for _ in range(3))
+        names = [c.name for c in mechanism.coordinates]
+        inside = np.ones(count, bool) if self.period else (t >= 0) & (t <= seconds)
+        for name, path in by_names(f"reference of '{mechanism.name}'", self.paths).items():
+            one_of(f"reference of '{mechanism.name}'", name, names[: mechanism.m])
+            _check_invariant(mechanism, name, 0.0)
+            k = names.index(name)
+            q[:, k], v[:, k], a[:, k] = path(t if self.period else np.clip(t, 0.0, seconds))
+            for part in (v, a):
+                part[~inside, k] = 0.0
+            if not np.isfinite(q[:, k] + v[:, k] + a[:, k]).all():
+                raise InvalidInputError(
+                    f"reference of '{name}'", value="NaN or infinity", limit="finite numbers"
+                )
+        _stable_inversion(mechanism, window, q, v, a, periodic=self.period > 0)
+        if self.period:
+            times = math.ceil(seconds / self.period) + 1
+            t = np.linspace(0.0, times * window, times * count + 1)
+            q, v, a = (np.vstack([*[part] * times, part[:1]]) for part in (q, v, a))
+        keep = (t >= -GRID) & (t <= seconds + REST)
+        return ((0.0, ReferenceMotion(t[keep], q[keep], v[keep], a[keep])),)
+
+
+def _columns(path: Path, text: str) -> dict[str, Any]:
+    """Return ``times`` and the columns of a file with a reference, by name, SI units."""
+    lines = csv.reader(io.StringIO(text))
+    head = [cell.strip() for cell in next(lines, [])]
+    names: list[str] = []
+    factors: list[float] = []
+    for cell in head:
+        match = re.fullmatch(r"(\w+)\s*[(\[]\s*(\w+)\s*[)\]]", cell)
+        if match is None or match[2] not in FILE_UNITS:
+            raise InvalidInputError(
+                f"column '{cell}' of '{path}'",
+                value=repr(cell),
+                limit=f"a name with its unit, one of {', '.join(FILE_UNITS)}",
+                remedy="Write the first line like: t (s), x (m), theta (deg)",
+            )
+        names.append("times" if not names else normal_name(match[1]))
+        factors.append(FILE_UNITS[match[2]])
+    if len(set(names)) < 2 or len(set(names)) < len(names):
+        raise InvalidInputError(
+            f"columns of '{path}'",
+            value=", ".join(head) or "none",
+            limit="the time and one coordinate or more, each once",
+        )
+    rows = []
+    for number, line in enumerate(lines, 2):
+        if not line or not "".join(line).strip():
+            continue
+        try:
+            row = [float(cell) for cell in line]
+        except ValueError:
+            row = []
+        if len(row) != len(names) or not np.isfinite(row).all():
+            raise InvalidInputError(
+                f"line {number} of '{path}'",
+                value=repr(",".join(line))[:60],
+                limit=f"{len(names)} finite numbers",
+            )
+        rows.append(row)
+    table = np.array(rows).reshape(-1, len(names)) * factors
+    return dict(zip(names, table.T, strict=True))
+
+
+def _stable_inversion(
+    mechanism: Mechanism,
+    window: float,
+    q: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    *,
+    periodic: bool,
+) -> None:
+    """Fill in the unactuated columns of q, v and a, (N, n), with what the actuated ones leave.
+
+    Raises
+    ------
+    InvalidInputError
+        Where there is no bounded motion, or the reference is too fast to find it.
+    """
+    m = mechanism.m
+    linear = linearise(mechanism)
+    mass, stiffness, drag = linear.M[m:, m:], -linear.F[m:, m:], -linear.D[m:, m:]
+    damping = np.zeros_like(mass) if periodic else _swing_damping(mass, stiffness)
+    rate = 2 * math.pi * np.fft.rfftfreq(len(q), window / len(q))
+    jw = 1j * rate[:, None, None]
+    operator = jw**2 * mass + jw * (drag + damping) + stiffness
+    if np.linalg.cond(operator).max() > 1e8:
+        raise InvalidInputError(
+            f"reference of '{mechanism.name}'",
+            value="unactuated coordinates without a bounded motion of their own",
+            limit="an internal dynamics whose modes grow, fade or swing",
+            remedy="Give set-points, undertow.SetPoints",
+        )
+    shape = np.zeros((len(rate), mechanism.n - m), dtype=complex)
+    change = math.inf
+    for _ in range(ROUNDS):
+        for part, power in ((q, 0), (v, 1), (a, 2)):
+            part[:, m:] = np.fft.irfft((1j * rate[:, None]) ** power * shape, len(q), axis=0)
+        rest = mechanism.forces(0.0, np.hstack([q, v]), a)[:, m:] + v[:, m:] @ damping.T
+        if change < ENOUGH:
+            break
+        step = np.linalg.solve(operator, np.fft.rfft(rest, axis=0)[..., None])[..., 0]
+        shape -= step
+        change = float(np.abs(np.fft.irfft(step, len(q), axis=0)).max())
+        if not change < 1e6:
+            break
+    if not change < ENOUGH:
+        raise InvalidInputError(
+            f"reference of '{mechanism.name}'",
+            value=f"largest acceleration {np.abs(a[:, :m]).max():.3g}",
+            limit="one that the unactuated coordinates can follow, bounded",
+            remedy="Make the reference slower",
+        )
+    # q̈_u from the equations themselves: where r̈ jumps, so does it, and no series does.
+    a[:, m:] = 0.0
+    left = mechanism.forces(0.0, np.hstack([q, v]), a)[:, m:] + v[:, m:] @ damping.T
+    a[:, m:] = -np.linalg.solve(mechanism.M(q)[:, m:, m:], left[..., None])[..., 0]
+
+
+def _swing_damping(mass: FloatArray, stiffness: FloatArray) -> FloatArray:
+    """Return 2ζ M^½ (M^-½ K M^-½)₊^½ M^½: damping of the modes with positive stiffness alone."""
+    values, vectors = np.linalg.eigh(mass)
+    root = vectors * np.sqrt(values) @ vectors.T
+    inverse = np.linalg.inv(root)
+    squares, modes = np.linalg.eigh(inverse @ ((stiffness + stiffness.T) / 2) @ inverse)
+    rates = np.sqrt(np.maximum(squares, 0.0))
+    return np.asarray(2 * SWING_DAMPING * root @ (modes * rates @ modes.T) @ root)
+
+
+#: What may be given as a target.
+Target = SetPoints | Reference
+
+
+def target_of(given: Target | Mapping[str, float] | Iterable[Any]) -> Target:
+    """Return a target as it is, a mapping or pairs (t, mapping) as :class:`SetPoints`."""
+    if isinstance(given, SetPoints | Reference):
+        return given
+    return SetPoints(given)  # type: ignore[arg-type]

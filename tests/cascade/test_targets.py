@@ -1,0 +1,147 @@
+"""Targets: a set-point is 0 seen from elsewhere, and a jump is a fresh start."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.base import InvalidInputError
+
+CRANE = ut.mechanisms.overhead_crane()
+JUMPS = ut.SetPoints([(0, {"x": 1.0}), (2, {"x": -1.0}), (4, {"x": 0.5})])
+
+
+@pytest.fixture(scope="module")
+def cascade() -> ut.Cascade:
+    """Least energy within 8 s, with short searches."""
+    objective = ut.MinimumEnergy(horizon=8.0, unit="N² s")
+    return ut.Cascade(CRANE, objective, cold=ut.Budget(600), warm=ut.Budget(96), belief="exact")
+
+
+@pytest.fixture(scope="module")
+def run(cascade: ut.Cascade) -> ut.Run:
+    return cascade.simulate(CRANE.state(), target=JUMPS, duration=16.0)
+
+
+def leg(run: ut.Run, begin: float, end: float) -> float:
+    """The cost of a run between two times."""
+    t, cost = run.trajectory.t, run.trajectory.accumulated_cost
+    return float(np.interp(end, t, cost) - np.interp(begin, t, cost))
+
+
+def test_the_last_set_point_is_reached_and_held(run: ut.Run) -> None:
+    """The load hangs still at the last set-point; travel was kept on the way, absolute."""
+    x = run.trajectory.x
+    assert run.reached
+    assert run.time == pytest.approx(16.0)
+    assert abs(x[-1, 0] - 0.5) < 0.01
+    assert np.degrees(np.abs(x[run.trajectory.t > 14.0, 1]).max()) < 0.5
+    assert np.abs(x[:, 0]).max() <= 0.95 * 1.5
+
+
+@pytest.mark.parametrize(("begin", "end", "goal"), [(0, 2, 1.0), (2, 4, -1.0), (4, 16, 0.5)])
+def test_a_jump_costs_what_a_fresh_start_costs(
+    cascade: ut.Cascade, run: ut.Run, begin: float, end: float, goal: float
+) -> None:
+    """From the state at the jump, taken off by hand: the same first prediction, the same cost."""
+    at = int(np.searchsorted(run.trajectory.t, begin - 1e-9))
+    wide = replace(CRANE, coordinates=(replace(CRANE.coordinates[0], low=-9, high=9),
+                                       CRANE.coordinates[1]))  # fmt: skip
+    by_hand = replace(cascade, mechanism=wide, objective=replace(cascade.objective, constraints=()))
+    fresh = by_hand.simulate(run.trajectory.x[at] - CRANE.state(x=goal))
+    (jump,) = (u for u in run.updates if u.t == pytest.approx(begin))
+    assert jump.predicted <= 1.02 * fresh.updates[0].predicted
+    assert leg(run, begin, end) <= 1.1 * leg(fresh, 0.0, end - begin)
+
+
+def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
+    """Slack is unknown at the jumps, and not negative elsewhere."""
+    tasks = np.array([update.task for update in run.updates])
+    assert sorted(set(tasks)) == [0, 1, 2]
+    assert (np.isnan(run.lemma3_slack) == (np.diff(tasks) > 0)).all()
+    assert np.nanmin(run.lemma3_slack) >= -1e-9
+
+
+def test_targets_are_refused_before_anything_moves(cascade: ut.Cascade) -> None:
+    """Names, places where it cannot rest, velocities, travel: each with value, limit, remedy."""
+    for target, words in (
+        ({"x": 2.0}, "got x = 2 m, must be .x. ≤ 1.425 m: 95 % of the travel"),
+        ({"y": 1.0}, "'y', must be one of x, theta"),
+        ({"theta": 0.2}, "theta = 0.2, must be moved along x"),
+        ({"x_dot": 1.0}, "x_dot = 1, must be velocity 0.*Reference"),
+        ({"x": float("nan")}, "nan"),
+        (ut.SetPoints([(0, {"x": 1.0}), (3, {"x": -2.0})]), "at 3 s: got x = -2 m"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            cascade.simulate(CRANE.state(), target=target)
+        with pytest.raises(InvalidInputError, match=words):
+            cascade.start(CRANE.state(), target, 3.0)
+    with pytest.raises(InvalidInputError, match="all of its coordinates"):
+        ut.Cascade(ut.mechanisms.pendubot(), belief="exact").start([0, 0, 0, 0], {"q_1": 0.1})
+    with pytest.raises(InvalidInputError, match="each later than the one before"):
+        ut.SetPoints([(1, {"x": 1.0}), (0, {"x": 2.0})])
+
+
+def test_the_state_machine_takes_the_target_off(cascade: ut.Cascade) -> None:
+    """With and without a target: the same plan, the same input, counted from elsewhere."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)  # no travel: nothing is about absolute places
+    plain = ut.Cascade(
+        rig, ut.MinimumTime(), cold=ut.Budget(600), warm=ut.Budget(96), belief="exact"
+    )
+    x, away = rig.state(phi=0.3), rig.state(theta=2.0)
+    old, new = plain.start(x)[0], plain.start(x + away, {"theta": 2.0})[0]
+    assert new.plan == old.plan
+    assert (plain.control(new, 0.0, x + away).u == plain.control(old, 0.0, x).u).all()
+    mine, theirs = plain.propose(old, x, 0.1), plain.propose(new, x + away, 0.1)
+    assert mine.plan == theirs.plan
+    assert plain.apply_gate(old, mine, x)[1] == plain.apply_gate(new, theirs, x + away)[1]
+    again, _ = plain.retarget(new, x + away, {"theta": 1.0}, 0.1)
+    assert (again.sequence, again.since) == (1, 0.1)
+    assert again.error(0.1, x + away) == pytest.approx(x + rig.state(theta=1.0))
+
+
+def test_constraints_are_about_absolute_positions() -> None:
+    """A formula of one's own, too: the way to x = 1 keeps |x| ≤ 1.05 m, the error does not."""
+    wall = ut.Constraint("wall", lambda v: v.x**2 - 1.05**2)
+    objective = ut.MinimumEnergy(horizon=4.0, constraints=(wall,))
+    short = ut.Cascade(CRANE, objective, cold=ut.Budget(600), warm=ut.Budget(96), belief="exact")
+    run = short.simulate(CRANE.state(x=-1.0), target={"x": 1.0})
+    assert run.reached
+    assert np.abs(run.trajectory["x"]).max() <= 1.05 + 1e-4
+
+
+def test_the_upright_pendulum_follows_a_sine_of_the_arm() -> None:
+    """±45° at 0.5 Hz: from rest onto the reference, and then on it."""
+    rig = ut.mechanisms.rotary_pendulum()
+    reference = ut.Reference.sine(0.5, theta=ut.deg(45))
+    cascade = ut.Cascade(rig, ut.objective_for(rig, "bench-time", horizon=6.0), belief="exact")
+    run = cascade.simulate(rig.state(), target=reference, duration=6.0)
+    assert run.reached
+    late = run.trajectory.t > 4.0
+    t, theta = run.trajectory.t[late], run.trajectory["theta"][late]
+    assert np.degrees(np.abs(theta - ut.deg(45) * np.sin(np.pi * t)).max()) < 0.5
+    assert np.degrees(np.abs(run.trajectory["phi"][late]).max()) < 9.0
+
+
+def test_the_gate_sees_the_reference_move(cascade: ut.Cascade) -> None:
+    """A plan that the gate admits about the target at rest is refused where the way breaks it."""
+    reference = ut.Reference.sine(0.2, x=1.2)
+    state, proposal = cascade.start(CRANE.state(), reference)
+    slow = ut.placed_surface(CRANE, [-0.2, -0.21, -0.22])
+    other = replace(proposal, plan=ut.Plan.of(slow), sequence=1, computed_for=0.1)
+    from undertow.cascade import Admission
+
+    yes = replace(cascade, gate=lambda *_: Admission(True, "yes", 1.0))
+    _, admission = yes.apply_gate(state, other, CRANE.state())
+    assert not admission.accepted
+    assert "along the reference" in admission.reason
+    assert np.isfinite(admission.cost)
+
+
+def test_references_past_the_travel_are_refused(cascade: ut.Cascade) -> None:
+    """With where and when they first do so most."""
+    with pytest.raises(InvalidInputError, match=r"at 1.2\d? s: got x = 1.6 m, must be .x."):
+        cascade.simulate(CRANE.state(), target=ut.Reference.sine(0.2, x=1.6), duration=5.0)

@@ -1,0 +1,184 @@
+"""References: the error's dynamics, the motion asked of the unactuated coordinates, files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import undertow as ut
+from undertow.base import ArtefactError, InvalidInputError
+from undertow.closed_loop import Event, simulate_along
+from undertow.law import Plan, ReferenceMotion
+from undertow.models import error_dynamics, invariant_coordinates
+
+RIG = ut.mechanisms.rotary_pendulum()
+CRANE = ut.mechanisms.overhead_crane()
+GANTRY = ut.mechanisms.gantry_crane()
+SURFACE = ut.Surface(-1, -1.59, 1.96, 12.1)
+
+
+def motion(mechanism: ut.Mechanism, reference: ut.Reference, seconds: float) -> ReferenceMotion:
+    ((_, found),) = reference.legs(mechanism, seconds)
+    return found
+
+
+@pytest.mark.parametrize("mechanism", [RIG, GANTRY, ut.mechanisms.pendubot()])
+def test_the_error_has_the_dynamics_of_the_mechanism(mechanism: ut.Mechanism) -> None:
+    """q̃̈ + q̈_r of the error's model is q̈ of the mechanism, at any state, reference and input."""
+    n, rng = mechanism.n, np.random.default_rng(0)
+    for _ in range(5):
+        e, reference, u = (
+            rng.normal(size=2 * n),
+            rng.normal(size=3 * n),
+            rng.normal(size=mechanism.m),
+        )
+        moved = error_dynamics(mechanism, reference)
+        found = moved.accelerations(0.0, e, u) + reference[2 * n :]
+        assert found == pytest.approx(
+            mechanism.accelerations(0.0, e + reference[: 2 * n], u), rel=1e-9, abs=1e-9
+        )
+
+
+def test_what_is_invariant_is_found_symbolically() -> None:
+    """Carts, arms and wheels; a coordinate that cancels counts, a slope does not."""
+    assert invariant_coordinates(ut.mechanisms.wheeled_inverted_pendulum()) == ("phi",)
+    assert invariant_coordinates(ut.mechanisms.reaction_wheel_pendulum()) == ("psi",)
+    assert invariant_coordinates(ut.mechanisms.tora()) == ()
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "reference"),
+    [(CRANE, ut.Reference.sine(0.2, x=0.5)), (GANTRY, ut.Reference.sine(0.25, x=0.4, y=0.2))],
+)
+def test_a_periodic_reference_is_a_motion_of_the_mechanism(
+    mechanism: ut.Mechanism, reference: ut.Reference
+) -> None:
+    """Open loop, with the inputs of the inverse dynamics alone, the crane stays on x_r for 8 s."""
+    asked, n, m = motion(mechanism, reference, 10.0), mechanism.n, mechanism.m
+
+    def rates(t: float, x: np.ndarray) -> np.ndarray:
+        row = asked.rows(t)[0]
+        force = mechanism.forces(t, row[: 2 * n], row[2 * n :])[:m]
+        u = np.linalg.solve(np.array(mechanism.input_matrix, dtype=float), force)
+        return np.concatenate([x[n:], mechanism.accelerations(t, x, u)])
+
+    solved = solve_ivp(rates, (0, 8), asked.state(0.0), rtol=1e-9, atol=1e-11, max_step=0.02)
+    assert np.abs(solved.y[:, -1] - asked.state(8.0)).max() < 2e-4
+
+
+def test_the_upright_pendulum_leans_before_the_arm_starts() -> None:
+    """Stable inversion is not causal: φ_r solves the unactuated equation, bounded on both sides."""
+    asked = motion(RIG, ut.Reference.ramp(1.0, start=2.0, theta=1.0), 6.0)
+    x = np.hstack([asked.q, asked.v])
+    assert np.abs(RIG.forces(0.0, x, asked.a)[:, 1]).max() < 1e-9
+    before = (asked.t > 1.8) & (asked.t < 1.99)
+    assert np.abs(asked.q[before, 0]).max() == 0.0
+    assert np.abs(asked.q[before, 1]).min() > 1e-3
+    assert np.abs(asked.q[[0, -1], 1]).max() < 1e-6
+    t = np.linspace(0.5, 5.5, 2001)  # rates belong to positions, between rows too
+    rows = asked.rows(t)
+    assert np.abs(np.gradient(rows[:, 1], t)[1:-1] - rows[1:-1, 3]).max() < 1e-4
+
+
+def test_a_swing_is_given_damping_that_it_lacks() -> None:
+    """After a path has ended a hanging load is asked to be still within seconds."""
+    asked = motion(CRANE, ut.Reference.through([0, 2, 4], x=[0, 1, 0]), 12.0)
+    assert np.degrees(np.abs(asked.q[asked.t > 9.0, 1]).max()) < 0.05
+    assert asked.rows([30.0])[0, 2:] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_law_feeds_the_acceleration_forward() -> None:
+    """On x_r the law asks for the input of the inverse dynamics, and off it ṡ = −K sw(s/ε)."""
+    asked, surface, t = motion(RIG, ut.Reference.sine(0.5, theta=0.7), 4.0), SURFACE, 1.3
+    row = asked.rows(t)[0]
+    law = ut.SlidingModeLaw(asked.error_dynamics(RIG, t), surface)
+    force = RIG.forces(t, row[:4], row[4:])[0]
+    assert law(t, np.zeros(4)).demand == pytest.approx(force / 0.1285, rel=1e-6)
+    for e in ([0.3, 0.1, -0.5, 0.4], [0.01, 0.002, 0.0, 0.01]):
+        control = law(t, e)
+        acceleration = RIG.accelerations(t, row[:4] + e, control.demand) - row[4:]
+        s_dot = surface.matrix @ np.concatenate([np.array(e)[2:], acceleration])
+        eta, layer = ut.ReachingLaw().vector(1)
+        assert s_dot == pytest.approx(-eta * np.clip(control.s / layer, -1, 1), rel=1e-6)
+
+
+def test_a_motion_along_a_reference_is_that_of_the_equations() -> None:
+    """The compiled motion against solve_ivp of the mechanism's own dynamics under the law."""
+    asked = motion(RIG, ut.Reference.sine(0.5, theta=0.7), 4.0)
+    loop, x0 = ut.ClosedLoop(RIG, ut.MinimumTime()), RIG.state(theta=0.1, phi=0.15)
+
+    def rates(t: float, x: np.ndarray) -> np.ndarray:
+        law = ut.SlidingModeLaw(asked.error_dynamics(RIG, t), SURFACE)
+        u = law(t, x - asked.state(t)).u
+        return np.concatenate([x[2:], RIG.accelerations(t, x, u)])
+
+    solved = solve_ivp(rates, (0, 1.0), x0, rtol=1e-7, atol=1e-9, max_step=0.01)
+    run = simulate_along(loop, x0, Plan.of(SURFACE), asked, duration=1.0)
+    assert run.x[-1] == pytest.approx(solved.y[:, -1], abs=2e-4)
+    far = simulate_along(loop, x0, Plan.of(SURFACE), asked, duration=4.0)
+    assert far.event == Event.REACHED
+    away = np.linalg.norm(far.x - asked.rows(far.t)[:, :4], axis=1)
+    assert away[-1] < 0.01
+    assert far.cost == pytest.approx(far.t[away > 0.01].max(), abs=0.01)  # time outside the ball
+
+
+def test_a_file_is_read_with_its_units(tmp_path: Path) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(
+        "t (ms), x (cm), y [m]\n0, 0, 0\n2000, 50, 0.1\n\n4000, 0, 0\n", encoding="utf-8"
+    )
+    read = ut.Reference.read(file)
+    same = ut.Reference.through([0, 2, 4], x=[0, 0.5, 0], y=[0, 0.1, 0])
+    assert read.paths == same.paths
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t, x (m)\n0,0\n1,1\n", "column 't'.*a name with its unit"),
+        ("t (s), x (miles)\n0,0\n1,1\n", "column 'x .miles.'"),
+        ("t (s), x (m)\n0,0\n1,one\n", "line 3 of"),
+        ("t (s), x (m)\n0,0\n1,nan\n", "line 3 of"),
+        ("t (s), x (m)\n0,0\n1\n", "line 3 of"),
+        ("t (s), x (m)\n1,0\n0,1\n", "times of a reference"),
+        ("t (s), x (m)\n0,0\n", "times of a reference"),
+        ("t (s)\n0\n1\n", "the time and one coordinate"),
+        ("", "the time and one coordinate"),
+    ],
+)
+def test_a_file_that_is_no_reference_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InvalidInputError, match=words):
+        ut.Reference.read(file)
+
+
+def test_references_are_refused_by_name() -> None:
+    """No file, unactuated coordinates, those that the equations depend on, no numbers, too fast."""
+    with pytest.raises(ArtefactError):
+        ut.Reference.read("nowhere.csv")
+    for mechanism, reference, words in (
+        (CRANE, ut.Reference.sine(0.2, theta=0.1), "'theta', must be one of x"),
+        (CRANE, ut.Reference.of(x=lambda t: t * np.nan), "NaN or infinity"),
+        (ut.mechanisms.pendubot(), ut.Reference.sine(0.2, q_1=0.1), "depend on all"),
+        (RIG, ut.Reference.sine(5.0, theta=3.0), "slower"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            reference.legs(mechanism, 4.0)
+    with pytest.raises(InvalidInputError, match="finite and > 0"):
+        ut.Reference.sine(0.0, x=1.0)
+
+
+def test_a_function_of_ones_own_is_differentiated_twice() -> None:
+    """Also one that is written for a single time."""
+    import math
+
+    t = np.linspace(0.0, 3.0, 7)
+    for f in (lambda t: 0.3 * np.sin(t), lambda t: 0.3 * math.sin(t)):
+        r, v, a = ut.Reference.of(x=f).paths["x"](t)
+        assert r == pytest.approx(0.3 * np.sin(t))
+        assert v == pytest.approx(0.3 * np.cos(t), abs=1e-6)
+        assert a == pytest.approx(-0.3 * np.sin(t), abs=1e-6)

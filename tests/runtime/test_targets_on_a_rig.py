@@ -1,0 +1,70 @@
+"""Set-points on a rig: the target jumps with the first plan for it, and the log tells it again."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from runs import run
+from undertow.base import InvalidInputError
+from undertow.plants import IdealRig
+from undertow.runtime import Recipe, Settings, session
+
+CRANE = ut.mechanisms.overhead_crane()
+POINTS = ut.SetPoints([(0, {"x": 0.4}), (2.5, {"x": -0.3})])
+
+
+@pytest.fixture(scope="module")
+def cascade() -> ut.Cascade:
+    """Fast, with short searches."""
+    objective = ut.objective_for(CRANE, "bench-time", horizon=8.0)
+    return ut.Cascade(CRANE, objective, cold=ut.Budget(600), warm=ut.Budget(96), belief="exact")
+
+
+def test_a_run_goes_from_set_point_to_set_point_and_is_replayed(tmp_path: Path) -> None:
+    """Each jump at its time, each with a plan of its own; bit for bit from the log, judged too."""
+    log = tmp_path / "run.db"
+    recipe = Recipe(
+        "overhead_crane", start=(-0.2, 0, 0, 0), objective="bench-time", horizon=8.0,
+        evaluations=256, target=POINTS.pairs, settings=Settings(lead_time=0.5),
+    )  # fmt: skip
+    with session(recipe, log=log, simulated=True) as runtime:
+        report = runtime.run(6.0)
+    assert report.verdict.ending == "balanced"
+    jumps = [(t, text) for t, what, text in report.events if what == "target"]
+    assert [text for _, text in jumps] == ["jumps, asked for at 2.5 s"]
+    assert jumps[0][0] == pytest.approx(2.5, abs=0.003)
+    assert report.final_error < 0.12
+    with sqlite3.connect(log) as book:
+        (x,) = book.execute("SELECT x FROM steps ORDER BY k DESC LIMIT 1").fetchone()
+    assert abs(x + 0.3) < 0.12  # absolute, as the rig measures it
+    found = ut.replay(log)
+    assert found.identical
+    assert found.misjudged == 0
+
+
+def test_a_target_past_the_travel_is_refused_before_the_rig_is_read(cascade: ut.Cascade) -> None:
+    """And one beside a swing-up, and a reference on the command line."""
+    rig = IdealRig(CRANE, CRANE.state(), period=0.001)
+    with pytest.raises(InvalidInputError, match="got x = 2 m"):
+        ut.run(cascade, rig, seconds=1.0, x0=CRANE.state(), simulated=True, target={"x": 2.0})
+    with pytest.raises(InvalidInputError, match="with a swing-up"):
+        Recipe("rotary_pendulum", swing_up=True, target=((0.0, {"theta": 1.0}),))
+    status, _, said = run(
+        "run", "overhead_crane", "--simulated", "--target", "x=0.2m@0.2Hz", "--seconds", "1"
+    )
+    assert status == 2
+    assert "References are followed in simulation" in " ".join(said.split())
+
+
+def test_a_recipe_with_a_target_is_data() -> None:
+    """Through JSON values and back."""
+    recipe = Recipe("overhead_crane", target=POINTS.pairs)
+    again = Recipe.from_dict(recipe.as_dict())
+    assert again == recipe
+    assert [begin for begin, _ in again.legs] == [0.0, 2.5]
+    assert np.allclose(again.legs[1][1].state(9.0), CRANE.state(x=-0.3))
