@@ -187,3 +187,26 @@ def test_a_motion_of_a_loop_with_an_ensemble_is_that_of_its_mechanism(
     x, surface = rig.state(phi=0.1), ut.Surface(-1, -1.59, 1.96, 12.1)
     alone = replace(loop, ensemble=None).simulate(x, surface)
     assert np.array_equal(loop.simulate(x, surface).x, alone.x)
+
+
+def test_members_with_errors_of_surface_and_state(loop: ut.ClosedLoop, rig: ut.Mechanism) -> None:
+    """A plan on a member that is off is worth what the other plan from the other state is."""
+    values = np.tile(rig.parameter_values, (2, 1))
+    off, aside = np.array([0.0, 0.02, -0.01, 0.03]), np.array([0.01, -0.02, 0.0, 0.0])
+    slips = Ensemble(
+        rig, values, "worst", surface_errors=np.stack([0 * off, off]),
+        state_errors=np.stack([0 * aside, aside]),
+    )  # fmt: skip
+    x, vector = rig.state(phi=0.3), np.array([-1, -1.59, 1.96, 12.1])
+    both = replace(loop, ensemble=slips).batch(x, vector).cost[0]
+    alone = replace(loop, ensemble=None)
+    costs = [
+        alone.batch(x, vector).cost[0],
+        alone.batch(x + aside, vector * (1 + off)).cost[0],
+    ]
+    assert both == pytest.approx(max(costs), rel=1e-12)
+    assert costs[0] != pytest.approx(costs[1], rel=1e-3)
+    with pytest.raises(InvalidInputError, match="surface_errors"):
+        Ensemble(rig, values, surface_errors=np.zeros((2, 3)))
+    with pytest.raises(InvalidInputError, match="state_errors"):
+        Ensemble(rig, values, state_errors=np.full((2, 4), np.nan))

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.estimators import Belief
-from undertow.estimators.belief import EVEN, LEAST
+from undertow.estimators.belief import EVEN, LEAST, SLIPS
 from undertow.models import FloatArray
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
@@ -155,10 +155,16 @@ def test_a_plant_beyond_its_tolerances_is_found_all_the_same(belief: Belief) -> 
 
 def test_the_design_of_the_ensemble(belief: Belief) -> None:
     """The estimate first; at the prior each parameter, and each pair, is as often high as low."""
-    members = belief.ensemble(belief.prior).values
-    nominal = belief.mechanism.parameter_values
-    assert (members[0] == nominal).all()
-    off = (members[1:] - nominal)[:, belief._places] / belief._scale
+    ensemble = belief.ensemble(belief.prior)
+    members, nominal = ensemble.values, belief.mechanism.parameter_values
+    assert (members[: 1 + SLIPS] == nominal).all()
+    for errors in (ensemble.surface_errors, ensemble.state_errors):  # of the estimate, in pairs
+        assert not errors[0].any()
+        assert not errors[1 + SLIPS :].any()
+        assert errors[1 : 1 + SLIPS].any(axis=1).all()
+        assert errors.sum(axis=0) == pytest.approx(0.0, abs=1e-15)
+    assert not ensemble.surface_errors[:, 0].any()  # α_a stays −1
+    off = (members[1 + SLIPS :] - nominal)[:, belief._places] / belief._scale
     assert np.abs(off) == pytest.approx(np.sqrt(1 / 3 + 0.2**2))
     assert off.T @ off == pytest.approx(len(off) * np.eye(5) * (1 / 3 + 0.2**2), abs=1e-12)
 
@@ -166,11 +172,12 @@ def test_the_design_of_the_ensemble(belief: Belief) -> None:
 def test_what_is_known_weighs_more(belief: Belief) -> None:
     """Corners count as the estimate's own uncertainty does; the margin around it costs nothing."""
     before = belief.ensemble(belief.prior).shares
-    assert before[0] == pytest.approx(1 - EVEN**2 / (EVEN**2 + LEAST**2))
-    assert np.ptp(before[1:]) == 0
+    estimate = slice(0, 1 + SLIPS)
+    assert before[estimate].sum() == pytest.approx(1 - EVEN**2 / (EVEN**2 + LEAST**2))
+    assert np.ptp(before[1 + SLIPS :]) == 0
     known = replace(belief.prior, information=1e8 * np.eye(len(belief.tolerances)))
     after = belief.ensemble(known).shares
-    assert after[0] > 0.999
+    assert after[estimate].sum() > 0.999
     assert after.sum() == pytest.approx(1.0)
 
 

@@ -33,7 +33,6 @@ from undertow.cascade.targets import LoopsAbout, legs_of
 from undertow.closed_loop import (
     INADMISSIBLE,
     ClosedLoop,
-    Ensemble,
     Event,
     Trajectory,
     cost_along,
@@ -715,7 +714,7 @@ class Cascade:
             return [(self.loop, False)]
         loops = [self.loop]
         if self.known is not None:
-            one = Ensemble(self.mechanism, self.known.values(self.known.prior.offset[None]))
+            one = self.known.alone(self.known.prior)
             loops.insert(0, self.loop.believing(self.mechanism, one))
         return list(itertools.product(loops, (False, True)))
 

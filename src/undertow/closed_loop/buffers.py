@@ -121,6 +121,15 @@ class RolloutBuffers:
         plan = np.minimum(np.arange(buffers.padded) // size_of_ensemble, self.count - 1)
         buffers.lanes[:, :, :size] = self.lanes[plan]
         buffers.states[:] = self.states[plan]
+        ensemble = self.loop.ensemble
+        assert ensemble is not None
+        if ensemble.surface_errors.size:
+            surfaces = buffers.lanes[:, :, self.layout.surface]
+            surfaces *= 1.0 + ensemble.surface_errors[buffers.member][:, None]
+            coupling = self.loop.numbers.coupling
+            buffers.lanes[:, :, size - 1] = gamma_determinant(coupling, surfaces)
+        if ensemble.state_errors.size:
+            buffers.states += ensemble.state_errors[buffers.member]
         return buffers
 
     def batch(self, start: float) -> Batch:

@@ -42,6 +42,11 @@ class Ensemble:
     weights
         How much each member counts in the mean and in the dearest third, (K,), none negative; all
         alike by default.  A member without weight still has to arrive.
+    surface_errors
+        How far each member's surfaces are off the plan's, as a part of every entry, (K, 2mn); none
+        by default.
+    state_errors
+        How far each member's initial state is off, (K, 2n); none by default.
 
     Raises
     ------
@@ -53,6 +58,8 @@ class Ensemble:
     values: FloatArray
     risk: Risk = "mean"
     weights: FloatArray = field(default_factory=lambda: np.empty(0))
+    surface_errors: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    state_errors: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
         """Check shapes and words."""
@@ -82,6 +89,18 @@ class Ensemble:
                 value=weights,
                 limit=f"{len(values)} numbers ≥ 0, not all of them 0",
             )
+
+        n, m = self.plant.n, self.plant.m
+        for name, size in (("surface_errors", 2 * m * n), ("state_errors", 2 * n)):
+            errors = floats(f"{name} of an ensemble", getattr(self, name))
+            if errors.size and not (
+                errors.shape == (len(values), size) and np.isfinite(errors).all()
+            ):
+                raise InvalidInputError(
+                    f"{name} of an ensemble",
+                    value=f"shape {errors.shape}",
+                    limit=f"({len(values)}, {size}), finite",
+                )
 
     @cached_property
     def shares(self) -> FloatArray:

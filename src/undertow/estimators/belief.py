@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, check_fields, checked, floats, one_of, positive
 from undertow.closed_loop import Ensemble, Risk
+from undertow.law import LawLayout
 from undertow.models import FloatArray, Mechanism, linear_numbers, number_of
 
 #: Standard deviation of what is evenly spread over ± a tolerance, as a part of it.
@@ -42,6 +43,12 @@ NOISE = {"rad": 0.004, "m": 0.001}
 
 #: How many axes of what is uncertain span an ensemble, at most: those that matter most.
 AXES = 7
+
+#: Members with small errors of state and surface; the errors, as a part of a surface's entries,
+#: and of positions, rad and m.
+SLIPS = 8
+SLIP_OF_SURFACE = 1e-3
+SLIP_OF_STATE = {"rad": 1e-3, "m": 1e-4}
 
 #: Relative step of the differences by which accelerations are linearised in the parameters.
 STEP = 1e-5
@@ -245,13 +252,37 @@ class Belief:
         corners = hadamard(1 << count.bit_length())[:, 1 : count + 1] @ axes.T
         limits = np.maximum(1.0, np.abs(estimate.offset))
         around = np.clip(estimate.offset + self.confidence * corners, -limits, limits)
-        offsets = np.vstack([estimate.offset, around])
+        offsets = np.vstack([np.tile(estimate.offset, (1 + SLIPS, 1)), around])
         # Of what the corners span, only the estimate's own uncertainty is expected; the rest is a
         # margin: it has to be survived, and costs nothing.
         expected = float(np.mean(variances / (variances + LEAST**2)))
-        weights = np.full(len(offsets), expected / (len(offsets) - 1))
-        weights[0] = 1.0 - expected
-        return Ensemble(self.mechanism, self.values(offsets), self.risk, weights)
+        weights = np.full(len(offsets), expected / len(around))
+        weights[: 1 + SLIPS] = (1.0 - expected) / (1 + SLIPS)
+        return self._slipping(self.values(offsets), weights)
+
+    def alone(self, estimate: ParameterEstimate) -> Ensemble:
+        """Return an ensemble of the estimate alone, with small errors of state and surface."""
+        values = self.values(np.tile(estimate.offset, (1 + SLIPS, 1)))
+        return self._slipping(values, np.ones(len(values)))
+
+    def _slipping(self, values: FloatArray, weights: FloatArray) -> Ensemble:
+        """Return an ensemble whose members 1 to ``SLIPS`` have small errors of state and surface.
+
+        What is best for exact numbers alone may stand on a knife's edge: least time into a small
+        ball does.
+        """
+        mechanism, rng = self.mechanism, np.random.default_rng(0)
+        n, m = mechanism.n, mechanism.m
+        scale = [SLIP_OF_STATE[c.unit] for c in mechanism.coordinates]
+        surface_errors = np.zeros((len(values), 2 * m * n))
+        state_errors = np.zeros((len(values), 2 * n))
+        half = SLIPS // 2  # then the same with the other sign
+        surface_errors[1 : 1 + half] = SLIP_OF_SURFACE * rng.choice([-1.0, 1.0], (half, 2 * m * n))
+        LawLayout(n, m).blocks(surface_errors).alpha_a[:] = 0.0
+        state_errors[1 : 1 + half, :n] = scale * rng.choice([-1.0, 1.0], (half, n))
+        for errors in (surface_errors, state_errors):
+            errors[1 + half : 1 + SLIPS] = -errors[1 : 1 + half]
+        return Ensemble(mechanism, values, self.risk, weights, surface_errors, state_errors)
 
     def _effects(self, offset: FloatArray) -> FloatArray:
         """Return how accelerations near the target depend on the offsets, (E, p), relative."""
