@@ -296,7 +296,11 @@ def test_the_clock_at_the_start_does_not_matter_to_what_is_autonomous(rig: ut.Me
     early, late = (
         loop.roll_out(
             RolloutBuffers(loop, 1, 1).fill(x, surface.vector),
-            (0.0,), duration, start=start, terminal=0.0, seek=True,
+            (0.0,),
+            duration,
+            start=start,
+            terminal=0.0,
+            seek=True,
         )  # fmt: skip
         for start in (0.0, 5.0)
     )
