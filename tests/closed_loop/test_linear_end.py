@@ -301,7 +301,7 @@ def test_the_clock_at_the_start_does_not_matter_to_what_is_autonomous(rig: ut.Me
             start=start,
             terminal=0.0,
             seek=True,
-        )  # fmt: skip
+        )
         for start in (0.0, 5.0)
     )
     assert early.closest_time[0] == pytest.approx(motion.t[least], abs=loop.step)

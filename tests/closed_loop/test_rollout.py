@@ -724,10 +724,8 @@ def test_gains_that_the_step_cannot_follow_are_refused_or_switched_off(
     """(13) at the target: k/ε times the period of the law below 2, of the worst of all surfaces."""
     believed = rig.with_disturbance_bounds(2.0, 0.01)
     law = ut.SlidingModeLaw(believed, base)
-    rate = max(
-        float(ut.SlidingModeLaw(believed, s)(0.0, np.zeros(4)).gains[0]) / 0.1
-        for s in (quick, base)
-    )
+    each = [ut.SlidingModeLaw(believed, s)(0.0, np.zeros(4)).gains[0] for s in (quick, base)]
+    rate = max(each) / 0.1
     assert rate > float(law.reaching.vector(1)[0]) / 0.1
     x0, plan = rig.state(phi=0.1), Plan((quick, base), (0.0, 1.0))
     for hold in (0, 3):
