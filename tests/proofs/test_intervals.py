@@ -241,6 +241,15 @@ def test_extremes_at_corners_and_at_the_target_are_tried_first() -> None:
             found = minimise_proved(low_at(corner), [(-1.0, 2.0)] * size, stop_below=1e-12)
             assert found.boxes == 0
             assert found.point == tuple(corner)
+    calls = 0
+
+    def flat(balls: list[Any]) -> Any:
+        nonlocal calls
+        calls += 1
+        return 1.0 + 0 * balls[0]
+
+    minimise_proved(flat, [(-1.0, 2.0)] * 7)
+    assert calls == 3  # the target, the middle, all of it
     for low, high, nearest in ((-1.0, 2.0, 0.0), (0.5, 2.0, 0.5), (-2.0, -0.5, -0.5)):
         found = minimise_proved(low_at([nearest] * 8), [(low, high)] * 8, stop_below=1e-12)
         assert (found.boxes, found.point) == (0, (nearest,) * 8)
