@@ -171,8 +171,11 @@ def survives(mutant: Mutant) -> bool:
     package = mutant.file.relative_to(PACKAGE).parts[0]
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         tree = Path(folder) / "undertow"
-        # Without what numba keeps of functions: those that call what is changed contain it.
-        shutil.copytree(PACKAGE, tree, ignore=shutil.ignore_patterns("*.nbi", "*.nbc"))
+        # What numba keeps of functions contains those that they call: none of it, if one changes.
+        compiled = b"njit" in mutant.file.read_bytes()
+        shutil.copytree(
+            PACKAGE, tree, ignore=shutil.ignore_patterns("*.nbi", "*.nbc") if compiled else None
+        )
         (tree / mutant.file.relative_to(PACKAGE)).write_bytes(mutant.text())
         environment = os.environ | {
             "PYTHONPATH": folder, "UNDERTOW_CACHE": str(Path(tempfile.gettempdir()) / "mutants"),
