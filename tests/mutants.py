@@ -119,11 +119,21 @@ def _of_types(test: ast.expr) -> bool:
     return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
 
 
+def _is_true(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is True
+
+
 def _computing(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield what computes: no words, no annotations, no settings of caches, no errors' texts."""
+    """Yield what computes: no words, no annotations, no settings of caches, no errors' texts.
+
+    Nor ``strict=True`` of ``zip``: it asserts that what is paired is equally long, and where that
+    holds the program does the same without it.
+    """
     if isinstance(node, ast.JoinedStr | ast.Raise) or (
         isinstance(node, ast.FunctionDef) and node.name in ("__repr__", "__str__")
     ):
+        return
+    if isinstance(node, ast.keyword) and node.arg == "strict" and _is_true(node.value):
         return
     yield node
     for name, value in ast.iter_fields(node):
@@ -161,7 +171,11 @@ def survives(mutant: Mutant) -> bool:
     package = mutant.file.relative_to(PACKAGE).parts[0]
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         tree = Path(folder) / "undertow"
-        shutil.copytree(PACKAGE, tree)
+        # What numba keeps of functions contains those that they call: none of it, if one changes.
+        compiled = b"njit" in mutant.file.read_bytes()
+        shutil.copytree(
+            PACKAGE, tree, ignore=shutil.ignore_patterns("*.nbi", "*.nbc") if compiled else None
+        )
         (tree / mutant.file.relative_to(PACKAGE)).write_bytes(mutant.text())
         environment = os.environ | {
             "PYTHONPATH": folder, "UNDERTOW_CACHE": str(Path(tempfile.gettempdir()) / "mutants"),

@@ -11,7 +11,9 @@ import pytest
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.closed_loop import INADMISSIBLE, Ensemble, Event
-from undertow.closed_loop.ensemble import Risk
+from undertow.closed_loop.buffers import RolloutBuffers
+from undertow.closed_loop.ensemble import Risk, summarise
+from undertow.closed_loop.work_array import LANES
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
 
@@ -128,6 +130,101 @@ def test_weights_count_in_the_cost_alone(
     assert (first_alone == loop.batch(far, quick).reached).all()
 
 
+def test_the_dearest_counts_as_worst_without_weight_too(
+    loop: ut.ClosedLoop, quick: ut.Surface
+) -> None:
+    x, ensemble = loop.mechanism.state(phi=0.4), loop.ensemble
+    assert ensemble is not None
+    alone = [
+        replace(loop, ensemble=replace(ensemble, values=one[None])).batch(x, quick).cost[0]
+        for one in ensemble.values
+    ]
+    weights = np.ones(6)
+    weights[int(np.argmax(alone))] = 0.0
+    worst = replace(loop, ensemble=replace(ensemble, risk="worst", weights=weights))
+    assert worst.batch(x, quick).cost[0] == pytest.approx(max(alone), rel=1e-14)
+
+
+def test_one_result_for_each_plan_is_put_together_as_documented() -> None:
+    """:func:`summarise` on rows drawn at random, with all events and many ties, and in words.
+
+    What breaks off stands before what is late or dear, the earlier before the later; what is late
+    or dear before what arrives, the farther before the nearer; of equals the first member.
+    """
+    rng, plans, members, margins, states = np.random.default_rng(12), 300, 5, 3, 4
+    broken = (Event.CONSTRAINT, Event.SINGULAR, Event.DIVERGED, Event.UNSTABLE)
+    rows = rng.integers(0, 4, (plans, members, 7 + margins + 2 * states)).astype(float)
+    rows[..., 0] = rng.uniform(0, 9, (plans, members))
+    kinds = [[Event.REACHED], [Event.REACHED, Event.HORIZON, Event.COSTLY], list(Event)]
+    for k in range(plans):
+        rows[k, :, 2] = rng.choice(kinds[k % 3], members)
+    weights = np.array([0.1, 0.3, 0.0, 0.25, 0.35])
+    for tail in (0.0, 1 / 3, 1.0):
+        out = np.empty((plans, rows.shape[-1]))
+        summarise(rows.reshape(plans * members, -1), weights, tail, margins, out)
+        for all_of_plan, found in zip(rows, out, strict=True):
+            events = all_of_plan[:, 2]
+            if np.isin(events, broken).any():
+                worst = min((k for k in range(members) if events[k] in broken),
+                            key=lambda k: all_of_plan[k, 1])  # fmt: skip
+            else:
+                late = [k for k in range(members) if events[k] != Event.REACHED]
+                worst = max(late or range(members), key=lambda k: all_of_plan[k, 3])
+            expected = all_of_plan[worst].copy()
+            if (events == Event.REACHED).all():
+                expected[0] = _dearest_part(all_of_plan[:, 0], weights, tail)
+                expected[1] = all_of_plan[:, 1].max()
+            expected[4 : 4 + margins] = all_of_plan[:, 4 : 4 + margins].min(axis=0)
+            near = slice(4 + margins, 6 + margins + states)
+            expected[near] = all_of_plan[int(np.argmax(all_of_plan[:, near.start])), near]
+            final = slice(6 + margins + states, 6 + margins + 2 * states)
+            expected[final] = all_of_plan[0, final]
+            expected[-1] = all_of_plan[:, -1].sum()
+            np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def _dearest_part(costs: FloatArray, weights: FloatArray, tail: float) -> float:
+    """Mean over the dearest of ten thousand copies, as many of each as it weighs."""
+    if tail == 0.0:
+        return float(costs.max())
+    copies = np.sort(np.repeat(costs, np.round(6e4 * weights).astype(int)))
+    return float(copies[-round(6e4 * tail) :].mean())
+
+
+def test_blocks_are_filled_with_the_last_lane(loop: ut.ClosedLoop, quick: ut.Surface) -> None:
+    """Buffers, those of all members and parts of them: whole blocks, and nothing made up."""
+    ensemble, size = loop.ensemble, loop.mechanism.n * 2 + 3
+    assert ensemble is not None
+    rng = np.random.default_rng(2)
+    vectors, states = rng.uniform(1, 2, (7, 2, 4)), rng.uniform(-1, 1, (7, 4))
+    laws = rng.uniform(1, 2, (7, 2, 2))
+    buffers = RolloutBuffers(loop, 7, 2).fill(states, vectors, laws)
+    assert buffers.padded == LANES
+    for k in range(LANES):
+        own = min(k, 6)
+        np.testing.assert_array_equal(buffers.states[k], states[own])
+        np.testing.assert_array_equal(buffers.lanes[k, :, :4], vectors[own])
+        np.testing.assert_array_equal(buffers.lanes[k, :, 4:6], laws[own])
+    members = buffers.spread()
+    assert (members.count, members.padded) == (42, 48)
+    for k in range(48):
+        plan, member = divmod(min(k, 41), 6)
+        assert members.member[k] == member
+        np.testing.assert_array_equal(members.states[k], states[plan])
+        np.testing.assert_array_equal(members.lanes[k, :, :size], buffers.lanes[plan])
+        np.testing.assert_array_equal(members.lanes[k, 0, size:], ensemble.values[member])
+    chosen = np.array([3, 17, 40])
+    part = members.part(chosen)
+    assert (part.count, part.padded) == (3, LANES)
+    for k in range(LANES):
+        own = chosen[min(k, 2)]
+        assert part.member[k] == members.member[own]
+        np.testing.assert_array_equal(part.lanes[k], members.lanes[own])
+        np.testing.assert_array_equal(part.states[k], members.states[own])
+    assert len(buffers.part(chosen[:1]).member) == 0
+    assert RolloutBuffers(loop, LANES, 1).fill(states[0], vectors[0, :1]).padded == LANES
+
+
 def test_large_steps_know_each_plant(loop: ut.ClosedLoop, surfaces: list[ut.Surface]) -> None:
     """They agree with small steps to the end, and are far fewer."""
     x = loop.mechanism.state(phi=0.4)
@@ -146,8 +243,6 @@ def test_linear_model_of_another_plant(
     assert end is not None
     buffers = loop.batch(rig.state(phi=0.1), quick)  # what a batch writes is not needed here
     assert buffers.reached[0]
-    from undertow.closed_loop.buffers import RolloutBuffers
-
     filled = RolloutBuffers(loop, 1, 1).fill(rig.state(phi=0.1), quick.vector).spread()
     room = end.buffers(filled.padded)
     end.prepare(filled.lanes, None, room, filled.member)
@@ -171,6 +266,14 @@ def test_what_makes_no_ensemble(loop: ut.ClosedLoop, rig: ut.Mechanism) -> None:
     broken = np.where(np.array([p.name for p in rig.parameters]) == "m", np.nan, good)[None]
     with pytest.raises(InvalidInputError, match="parameter 'm' of member 0"):
         Ensemble(rig, broken)
+    for values in (good[None, None], np.tile(good, (1, 2))):
+        with pytest.raises(InvalidInputError, match="members of an ensemble"):
+            Ensemble(rig, values)
+    with pytest.raises(InvalidInputError, match="plant of Ensemble"):
+        Ensemble("rig", good[None])  # type: ignore[arg-type]
+    np.testing.assert_allclose(Ensemble(rig, np.tile(good, (4, 1))).shares, 0.25)
+    half = Ensemble(rig, np.tile(good, (3, 1)), weights=np.array([0.0, 2.0, 6.0]))
+    np.testing.assert_allclose(half.shares, [0.0, 0.25, 0.75])
     with pytest.raises(InvalidInputError, match="risk"):
         Ensemble(rig, good[None], "median")  # type: ignore[arg-type]
     for weights in ([1.0, 1.0], [-1.0], [0.0], [np.nan]):

@@ -27,7 +27,7 @@ from support import (
     runge_kutta,
 )
 from undertow.closed_loop.kernel import build_loop_graph
-from undertow.closed_loop.kernel_source import kernel_source
+from undertow.closed_loop.kernel_source import _hoist, kernel_source
 from undertow.closed_loop.work_array import LANES
 from undertow.law import Switching
 from undertow.models import TIME, FloatArray
@@ -157,6 +157,54 @@ def test_sampled_kernels_hold_the_input_of_a_belief_that_is_wrong(n: int, m: int
     np.testing.assert_allclose(run.x, expected, rtol=1e-10, atol=1e-12)
     assert run.t[0] == 0.3
     assert len(np.unique(run.u[:-1], axis=0)) == 4
+
+
+@pytest.mark.parametrize("many_plants", [False, True])
+@pytest.mark.parametrize("wrong", [False, True])
+@pytest.mark.parametrize("hard_input", [False, True])
+def test_lines_are_computed_as_seldom_as_they_may(
+    many_plants: bool, wrong: bool, hard_input: bool
+) -> None:
+    """What parameters alone decide once a call, what the surface decides once a surface.
+
+    And of either only what something later reads.
+    """
+    belief = ut.mechanisms.reaction_wheel_pendulum().with_disturbance_bounds(0.1, 0.1)
+    plant = belief if wrong or many_plants else None
+    objective = ut.MinimumEnergy(hard_input=hard_input)
+    program = build_loop_graph(belief, plant, objective, "tanh", many_plants=many_plants)
+    calls = {*program.plant_parameters, *program.belief_parameters, *program.limits}
+    lanes = {*program.lane_inputs}
+    outputs = [*program.demand, *program.s, program.singular, *program.derivative, program.stage]
+    outputs += [program.input_margin] if program.input_margin is not None else []
+    live = program.tape.live(outputs)
+    bases: dict[sp.Basic, set[sp.Basic]] = {}
+    read_by: dict[sp.Basic, set[str]] = {}
+    levels: dict[sp.Basic, str] = {}
+    for line in live:
+        read = line.expression.free_symbols
+        bases[line.symbol] = set().union(*(bases.get(s, {s}) for s in read))
+        under = bases[line.symbol]
+        levels[line.symbol] = (
+            "call" if under <= calls else "lane" if under <= calls | lanes else "state"
+        )
+        for symbol in read:
+            read_by.setdefault(symbol, set()).add(levels[line.symbol])
+    for output in outputs:
+        for symbol in sp.sympify(output).free_symbols:
+            read_by.setdefault(symbol, set()).add("state")
+    of_call, of_lane = _hoist(program)
+    assert of_lane
+    assert of_call or (many_plants and not wrong)
+    assert set(of_call) == {
+        s for s, level in levels.items() if level == "call" and read_by[s] & {"lane", "state"}
+    }
+    assert set(of_lane) == {
+        s for s, level in levels.items() if level == "lane" and "state" in read_by[s]
+    }
+    order = [line.symbol for line in live]
+    assert of_call == sorted(of_call, key=order.index)
+    assert of_lane == sorted(of_lane, key=order.index)
 
 
 # -- files -----------------------------------------------------------------------------------

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
+import sympy as sp
 
 import undertow as ut
+from support import SHAPES, random_mechanism, random_surface
 from undertow.cascade.cascade import TAIL_RTOL
-from undertow.closed_loop import ClosedLoop
-from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
+from undertow.closed_loop import ClosedLoop, Ensemble, Event, RolloutBuffers
+from undertow.closed_loop.linear_model import NOBODY, Prepared, TerminalLinearModel, _solve
 from undertow.closed_loop.work_array import LANES
-from undertow.law import sliding_matrix
+from undertow.law import gains_at_target, pack_law_parameters, sliding_matrix
 from undertow.models import FloatArray
 
 
@@ -72,6 +76,137 @@ def test_linear_ends_agree_with_scipy(build: Callable[[], ut.Mechanism]) -> None
     assert stable >= LANES // 2
 
 
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+@pytest.mark.parametrize("members", [0, 2])
+def test_linear_models_are_those_of_the_law_and_the_plant(n: int, m: int, members: int) -> None:
+    """A by central differences of plant and law, xᵀQx by the stage cost along the law, any n, m.
+
+    With gains (13) at work, two surfaces of which the last counts, and plants unlike the belief.
+    """
+    belief = random_mechanism(n, m).with_disturbance_bounds(*(0.2,) * n)
+    rng = np.random.default_rng([n, m])
+    root = rng.uniform(-1, 1, (2 * n + m, 2 * n + m))
+
+    def cost(v: Any) -> sp.Expr:
+        z = sp.Matrix(root) * sp.Matrix([*v.states, *v.inputs])
+        return 2.0 + (z.T * z)[0] + v.inputs[0] ** 4
+
+    plants = [belief.with_parameters(scale=1.3 + k, friction=0.05 + 0.3 * k) for k in (1, 2)]
+    ensemble = None
+    if members:
+        ensemble = Ensemble(belief, np.stack([plant.parameter_values for plant in plants]))
+    objective = ut.Objective("quadratic", cost)
+    end = TerminalLinearModel(belief, objective, ensemble)
+    assert end.stage is not None
+    assert end.stage.rest == pytest.approx(2.0)
+    end._blocks = SimpleNamespace(double=lambda *_: None)  # the model alone
+    reaching = ut.ReachingLaw(tuple(2.0 + k for k in range(m)), tuple(0.5 + k for k in range(m)))
+    surfaces = [random_surface(n, m, seed) for seed in range(LANES)]
+    law_vectors = np.stack(
+        [pack_law_parameters(ut.SlidingModeLaw(belief, s, reaching)) for s in surfaces]
+    )
+    lanes = np.stack([law_vectors[::-1], law_vectors], axis=1)
+    gains = gains_at_target(
+        belief, np.stack([s.vector for s in surfaces]), np.tile(reaching.eta, (LANES, 1))
+    )
+    member = np.arange(LANES) % 2 if members else NOBODY
+    room = end.buffers(LANES)
+    end.prepare(lanes, gains, room, member)
+    h = 1e-5
+    for lane in (0, 1, 2):
+        law = ut.SlidingModeLaw(belief, surfaces[lane], reaching)
+        plant = plants[lane % 2] if members else belief
+        steps = h * np.vstack([np.eye(2 * n), -np.eye(2 * n)])
+        rates = plant.accelerations(0.0, steps, law(0.0, steps).demand)
+        A = ((rates[: 2 * n] - rates[2 * n :]) / (2 * h)).T
+        np.testing.assert_allclose(room.A[lane], A, rtol=1e-6, atol=1e-6 * np.abs(A).max())
+        x = rng.uniform(-1, 1, (20, 2 * n))
+        u = (law(0.0, h * x).demand - law(0.0, -h * x).demand) / (2 * h)
+        exact = (np.hstack([x, u]) @ root.T) ** 2
+        quadratic = np.einsum("ki,ij,kj->k", x, room.Q[lane], x)
+        np.testing.assert_allclose(quadratic, exact.sum(1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_small_systems_are_solved_with_their_largest_pivots(size: int) -> None:
+    """Zeros and tiny numbers on the diagonal do no harm."""
+    rng = np.random.default_rng(size)
+    for _ in range(20):
+        a, b = rng.standard_normal((size, size)), rng.standard_normal((size, 4))
+        a[np.diag_indices(size)] *= rng.choice([0.0, 1e-15, 1.0], size) if size > 1 else 1.0
+        if np.linalg.cond(a) > 1e4:
+            continue
+        found = b.copy()
+        _solve(a.copy(), found)
+        np.testing.assert_allclose(found, np.linalg.solve(a, b), rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("cost", "smooth"),
+    [
+        (lambda v: 1 + v.phi**2 + v.voltage**2 * (2 + sp.cos(v.phi)), True),
+        (lambda v: sp.Abs(v.phi), False),  # a corner
+        (lambda v: (v.phi + 0.1) ** 2, False),  # a slope
+        (lambda v: sp.sqrt(v.phi**2 + v.theta**2), False),
+        (lambda v: (v.phi**2) ** sp.Float(0.7), False),  # no second derivative
+    ],
+)
+def test_costs_without_a_second_order_model_take_small_steps(
+    rig: ut.Mechanism, cost: Callable[[Any], sp.Expr], smooth: bool
+) -> None:
+    loop = ClosedLoop(rig, ut.Objective("own", cost), tail_rtol=TAIL_RTOL)
+    assert loop.takes_large_steps == smooth
+    assert loop.linear_end is not None
+    assert (loop.linear_end.stage is not None) == smooth
+
+
+def test_who_takes_large_steps(rig: ut.Mechanism) -> None:
+    """A continuous law with a layer, on its own belief or an ensemble, if they are asked for."""
+    loop = ClosedLoop(rig, ut.MinimumEnergy(), tail_rtol=TAIL_RTOL)
+    members = Ensemble(rig, np.tile(rig.parameter_values, (2, 1)))
+    rubbing = rig.disturbed({"phi": -0.01 * sp.sign(rig.coordinates[1].velocity)})
+    sign = ut.ReachingLaw(switching="sign")
+    assert loop.takes_large_steps
+    assert replace(loop, ensemble=members).takes_large_steps
+    assert replace(loop, reaching=ut.ReachingLaw(switching="tanh")).takes_large_steps
+    assert not replace(loop, tail_rtol=0.0).takes_large_steps
+    assert replace(loop, tail_rtol=0.0).linear_end is not None
+    for other in (
+        replace(loop, zoh_steps=2),
+        replace(loop, reaching=sign),
+        replace(loop, plant=rig.with_parameters(m=0.2)),
+        replace(loop, ensemble=Ensemble(rubbing, members.values)),
+    ):
+        assert other.linear_end is None
+        assert not other.takes_large_steps
+
+
+def test_large_steps_leave_alone_what_has_ended(rig: ut.Mechanism) -> None:
+    """Arrived at once or on the way, singular, lost, unstable: bit for bit as in small steps."""
+    quick, base = ut.Surface(-1, -1.59, 1.96, 12.1), ut.Surface(-1, -0.5, 5, 10)
+    unstable = ut.Surface(-1, -0.5, 1.0, 0.5)
+    cases = [
+        (rig.state(phi=0.009), quick),
+        (rig.state(theta=0.005, phi=0.002), quick),
+        (rig.state(phi=math.radians(80)), base),
+        (rig.state(phi=math.radians(70), phi_dot=6.0), base),
+        (rig.state(phi=0.1, theta_dot=1e200), quick),
+        (rig.state(phi=0.3), unstable),
+        (rig.state(phi=0.0005, phi_dot=0.012), quick),
+    ]
+    states = np.array([x for x, _ in cases])
+    small = ClosedLoop(rig, ut.MinimumEnergy())
+    exact, large = (
+        replace(small, tail_rtol=tail).batch(states, [s for _, s in cases], stable_only=True)
+        for tail in (0.0, TAIL_RTOL)
+    )
+    assert {Event.REACHED, Event.SINGULAR, Event.DIVERGED, Event.UNSTABLE} <= set(exact.event)
+    ended = exact.time < 0.03  # before a lane may hand over
+    assert ended.sum() >= 6
+    for name in ("cost", "time", "event", "radius", "singular", "x", "steps"):
+        np.testing.assert_array_equal(getattr(large, name)[ended], getattr(exact, name)[ended])
+
+
 def _drawn(count: int) -> tuple[FloatArray, FloatArray]:
     """Random surfaces and states of the rotary pendulum, many of them admissible."""
     rng = np.random.default_rng(5)
@@ -115,15 +250,19 @@ def test_what_is_too_fast_for_large_steps_takes_small_ones_first(rig: ut.Mechani
     loop = replace(exact, tail_rtol=TAIL_RTOL)
     tried = []
 
+    taken = []
+
     def etd_integrate(*args: FloatArray) -> None:
         tried.append(float(args[-1][0, 1]))
         exact._kernels.etd_integrate(*args)
+        taken.append(float(args[-1][0, -1]))
 
     kernels = SimpleNamespace(rollout=exact._kernels.rollout, etd_integrate=etd_integrate)
     object.__setattr__(loop, "_kernels", kernels)
     small, large = exact.batch(x, surface), loop.batch(x, surface)
     assert len(tried) == 2  # in vain, and again half a second later
     assert tried[0] + 0.4 < tried[1]
+    assert large.steps[0] == sum(taken)  # those in vain were taken, too
     assert small.reached[0]
     assert large.cost[0] == pytest.approx(small.cost[0], rel=TAIL_RTOL)
     assert large.time[0] == pytest.approx(small.time[0], rel=TAIL_RTOL)
@@ -144,6 +283,31 @@ def test_a_fast_pass_through_the_terminal_set_is_seen(rig: ut.Mechanism) -> None
         assert batch.reached[0]
         assert batch.time[0] == pytest.approx(near.closest_time[0], abs=0.02)
         assert np.linalg.norm(batch.x[0]) == pytest.approx(radius, rel=1e-6)
+
+
+def test_the_clock_at_the_start_does_not_matter_to_what_is_autonomous(rig: ut.Mechanism) -> None:
+    """Times are counted from the start: of the end and of the closest approach."""
+    loop, x = ClosedLoop(rig, ut.MinimumTime()), rig.state(phi=ut.deg(38))
+    surface = ut.Surface(-1, -3.6, 1.38, 9.07)
+    motion = loop.simulate(x, surface, terminal=0.0, duration=3.0)
+    radii = np.linalg.norm(motion.x, axis=1)
+    least = next(k for k in range(1, 1500) if radii[k] < min(radii[:k].min(), radii[k + 1]))
+    duration = round(float(motion.t[least]) + 0.02, 3)
+    early, late = (
+        loop.roll_out(
+            RolloutBuffers(loop, 1, 1).fill(x, surface.vector),
+            (0.0,),
+            duration,
+            start=start,
+            terminal=0.0,
+            seek=True,
+        )
+        for start in (0.0, 5.0)
+    )
+    assert early.closest_time[0] == pytest.approx(motion.t[least], abs=loop.step)
+    assert late.closest_time[0] == pytest.approx(early.closest_time[0], abs=1e-9)
+    assert late.time[0] == pytest.approx(duration, abs=1e-9)
+    np.testing.assert_allclose(late.x, early.x, atol=1e-12)
 
 
 def test_the_closest_approach_is_that_of_the_recorded_motion(rig: ut.Mechanism) -> None:

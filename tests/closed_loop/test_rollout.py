@@ -22,7 +22,9 @@ from support import (
     runge_kutta,
 )
 from undertow.base import InvalidInputError
+from undertow.closed_loop import INADMISSIBLE, UNSTABLE, Event
 from undertow.closed_loop.trajectory import Batch
+from undertow.law import Plan
 from undertow.models import TIME, FloatArray
 
 PUSH = ut.Parameter("push", 0.05, "N m", "size of the disturbance")
@@ -554,6 +556,46 @@ def test_scores_rank_admissible_then_slow_then_broken(
     assert slow.score(0.4).argmax() == slow.radius.argmax()
 
 
+def test_scores_grade_every_end() -> None:
+    """Costs as they are; late 1e9 to 2e9 by distance; broken 2e9 to 3e9 by time; unstable above."""
+    late, broken = Event.HORIZON, [Event.CONSTRAINT, Event.SINGULAR, Event.DIVERGED, Event.COSTLY]
+    events = [Event.REACHED, *[late] * 5, *broken * 3, Event.UNSTABLE]
+    count = len(events)
+    radius = np.array([0.01, 0.0, 0.5, 3.0, np.inf, np.nan, *[1.0] * 13])
+    times = np.array([1.5, *[8.0] * 5, *[0.0] * 4, *[2.0] * 4, *[8.0] * 4, 0.0])
+    nothing = np.zeros(count)
+    batch = Batch(
+        np.full(count, 7.5), times, np.array(events), radius, nothing, nothing,
+        nothing[:, None], nothing, nothing, nothing[:, None], nothing[:, None], nothing,
+    )  # fmt: skip
+    scores = batch.score(8.0)
+    assert scores[0] == 7.5
+    np.testing.assert_allclose(scores[1:6] - 1e9, 1e9 * np.array([0, *np.tanh([0.5, 3]), 1, 1]))
+    np.testing.assert_allclose(scores[6:10], 3e9)
+    np.testing.assert_allclose(scores[10:14], 2.75e9)
+    np.testing.assert_allclose(scores[14:18], 2e9)
+    assert scores[18] == UNSTABLE > 3e9
+    assert (batch.reached == (scores < INADMISSIBLE)).all()
+    assert (scores[~batch.reached] > INADMISSIBLE).all()
+
+
+def test_a_rollout_is_given_up_where_it_costs_too_much(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """With a cap just above its cost it arrives; with one just below it is given up at the end."""
+    x0 = rig.state(phi=0.4)
+    whole = loop.batch(x0, quick)
+    cost, time = float(whole.cost[0]), float(whole.time[0])
+    assert loop.batch(x0, quick, cap=cost * (1 + 1e-9)).event[0] == Event.REACHED
+    given_up = loop.batch(x0, quick, cap=0.5 * cost)
+    run = loop.simulate(x0, quick)
+    assert given_up.event[0] == Event.COSTLY
+    first = int(np.argmax(run.accumulated_cost > 0.5 * cost))
+    assert given_up.time[0] == pytest.approx(run.t[first])
+    assert given_up.time[0] < time
+    assert not given_up.reached[0]
+
+
 # -- trajectories and refusals ---------------------------------------------------------------
 
 
@@ -567,6 +609,173 @@ def test_recording_less_often_keeps_the_ends(
     np.testing.assert_array_equal(coarse.x[-1], fine.x[-1])
     assert (coarse.cost, coarse.time, coarse.event) == (fine.cost, fine.time, fine.event)
     np.testing.assert_array_equal(fine["phi"], fine.x[:, 1])
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_the_last_input_of_a_sampled_loop_is_the_one_held(
+    rig: ut.Mechanism, quick: ut.Surface, every: int
+) -> None:
+    """The last row is of the last state with the input, s and margin of the sample before."""
+    loop, x0 = ut.ClosedLoop(rig, zoh_steps=4), rig.state(phi=0.3)
+    run = loop.simulate(x0, quick, duration=0.05, terminal=0.0, every=every, start=2.0)
+    batch = loop.batch(x0, quick, duration=0.05, terminal=0.0)
+    np.testing.assert_array_equal(run.x[-1], batch.x[0])
+    assert run.cost == batch.cost[0]
+    for column in (run.u, run.s, run.margin):
+        np.testing.assert_array_equal(column[-1], column[-2])
+    np.testing.assert_allclose(run.t[:-1], 2.0 + 0.002 * every * np.arange(len(run.t) - 1))
+    assert run.time == pytest.approx(2.05, abs=1e-12)
+    assert len(run.t) == -(-25 // every) + 1
+
+
+@pytest.mark.parametrize("hold", [0, 4])
+@pytest.mark.parametrize("duration", [None, 0.0, 0.0015])
+def test_the_shortest_motions_have_a_beginning_and_an_end(
+    rig: ut.Mechanism, quick: ut.Surface, hold: int, duration: float | None
+) -> None:
+    """In the terminal set at once, of no length, of one step: no cost but that of a step."""
+    loop = ut.ClosedLoop(rig, zoh_steps=hold)
+    x0 = rig.state(phi=0.009 if duration is None else 0.3)
+    run = loop.simulate(x0, quick, duration=duration)
+    assert run.event == (Event.REACHED if duration is None else Event.HORIZON)
+    np.testing.assert_array_equal(run.x[0], x0)
+    assert (run.t[0], run.accumulated_cost[0]) == (0.0, 0.0)
+    assert run.time == pytest.approx(0.002 if duration else 0.0)
+    assert (run.cost > 0.0) == bool(duration)
+    for row in run.x[1:] if not duration else ():
+        np.testing.assert_array_equal(row, x0)
+    law = ut.SlidingModeLaw(rig, quick)(0.0, x0)
+    if hold == 0 or duration:
+        assert run.u[0] == pytest.approx(law.u, rel=1e-9)
+
+
+def test_pieces_of_a_motion_are_joined_at_their_ends(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """Each instant once, in order, costs added up, and the end of the last."""
+    x0 = rig.state(phi=0.4)
+    whole = loop.simulate(x0, quick, duration=0.3, terminal=0.0)
+    pieces, x = [], x0
+    for k in range(3):
+        pieces.append(loop.simulate(x, quick, duration=0.1, terminal=0.0, start=0.1 * k))
+        x = pieces[-1].x[-1]
+    joined = ut.Trajectory.join(pieces)
+    np.testing.assert_allclose(joined.t, whole.t, atol=1e-12)
+    np.testing.assert_array_equal(joined.x, whole.x)
+    np.testing.assert_allclose(joined.accumulated_cost, whole.accumulated_cost, rtol=1e-12)
+    assert (joined.event, joined.cost_unit) == (pieces[-1].event, whole.cost_unit)
+    assert ut.Trajectory.join(pieces[:1]).time == pieces[0].time
+    with pytest.raises(InvalidInputError, match="number of pieces"):
+        ut.Trajectory.join([])
+
+
+def test_a_notebook_shows_the_first_and_the_last_rows(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """All rows of a short motion; three at either end of a long one with an ellipsis between."""
+    for steps in (5, 6, 50):
+        run = loop.simulate(rig.state(phi=0.4), quick, duration=0.002 * steps, terminal=0.0)
+        html = run._repr_html_()
+        rows = re.findall(r"<tr>(<td>.*?)</tr>", html)
+        cells = [re.findall(r"<td>(.*?)</td>", row) for row in rows]
+        indices = range(len(run.t)) if steps == 5 else (0, 1, 2, -1, -3, -2, -1)
+        assert len(rows) == len(indices)
+        for place, (index, row) in enumerate(zip(indices, cells, strict=True)):
+            if steps > 5 and place == 3:
+                assert set(row) == {"…"}
+            else:
+                shown = [run.t[index], *run.x[index], *run.u[index], *run.s[index]]
+                shown += [run.accumulated_cost[index], run.margin[index]]
+                assert row == [f"{value:.4g}" for value in shown]
+        assert "<th>phi<br>rad</th>" in html
+        assert "<th>phi_dot<br>rad/s</th>" in html
+        assert "<th>s_0</th>" in html
+
+
+def test_columns_of_equal_names_are_told_apart() -> None:
+    """A mechanism may call a coordinate ``cost`` and its input ``margin``: nothing is hidden."""
+    mechanism = random_mechanism(2, 1)
+    rng, names = np.random.default_rng(0), ("s_0", "cost")
+    named = ut.Mechanism(
+        "names",
+        tuple(ut.Coordinate(name, "m") for name in names),
+        (ut.Input("margin", "N"),),
+        sp.ImmutableDenseMatrix(mechanism.M([0, 0])),
+        sp.ImmutableDenseMatrix([0, 0]),
+    )
+    x, (u, s, cost, margin) = rng.random((3, 4)), rng.random((4, 3))
+    run = ut.Trajectory(
+        named, np.arange(3.0), x, u[:, None], s[:, None], cost, margin, Event.HORIZON, "J"
+    )
+    columns = run.columns
+    expected = [*x.T, u, s, cost, margin]
+    assert list(columns) == [
+        "s_0", "cost", "s_0_dot", "cost_dot", "margin", "s_0_", "cost_", "margin_"
+    ]  # fmt: skip
+    assert [unit for _, unit in columns.values()] == ["m", "m", "m/s", "m/s", "N", "", "J", ""]
+    for (values, _), wanted in zip(columns.values(), expected, strict=True):
+        np.testing.assert_array_equal(values, wanted)
+    np.testing.assert_array_equal(run["cost_dot"], x[:, 3])
+
+
+def test_gains_that_the_step_cannot_follow_are_refused_or_switched_off(
+    rig: ut.Mechanism, quick: ut.Surface, base: ut.Surface
+) -> None:
+    """(13) at the target: k/ε times the period of the law below 2, of the worst of all surfaces."""
+    believed = rig.with_disturbance_bounds(2.0, 0.01)
+    law = ut.SlidingModeLaw(believed, base)
+    each = [ut.SlidingModeLaw(believed, s)(0.0, np.zeros(4)).gains[0] for s in (quick, base)]
+    rate = max(each) / 0.1
+    assert rate > float(law.reaching.vector(1)[0]) / 0.1
+    x0, plan = rig.state(phi=0.1), Plan((quick, base), (0.0, 1.0))
+    for hold in (0, 3):
+        period = 2 / rate
+        step = period / max(1, hold)
+        slow = ut.ClosedLoop(believed, step=1.0001 * step, zoh_steps=hold)
+        with pytest.raises(InvalidInputError, match=r"gains \(13\)"):
+            slow.batch(x0, [plan], duration=10 * slow.step)
+        good = interpreted(ut.ClosedLoop(believed, step=0.9999 * step, zoh_steps=hold))
+        assert good.batch(x0, [quick], duration=good.step).event[0] == Event.HORIZON
+        found = interpreted(slow).batch(x0, [quick, base], duration=slow.step, stable_only=True)
+        worst = int(np.argmax(each))
+        assert found.event[worst] == Event.UNSTABLE
+        assert found.event[1 - worst] == Event.HORIZON
+    sign = ut.ClosedLoop(believed, step=1.0, reaching=ut.ReachingLaw(switching="sign"))
+    sign._check_gains(np.empty((1, 1, 7)), np.ones(1), stable_only=False)  # no layer, no limit
+
+
+def test_a_step_may_be_as_long_as_the_layer_bears(rig: ut.Mechanism) -> None:
+    """Below 2 ε/η of the worst input; a law without a layer has no such limit."""
+    assert ut.ClosedLoop(rig, step=0.0099).step == 0.0099
+    assert ut.ClosedLoop(rig, step=0.0049, zoh_steps=2).zoh_steps == 2
+    assert ut.ClosedLoop(rig, step=0.5, reaching=ut.ReachingLaw(switching="sign")).step == 0.5
+    two = random_mechanism(4, 2)
+    uneven = ut.ReachingLaw((1.0, 10.0), (0.5, 0.1))  # 1 s and 0.02 s
+    assert ut.ClosedLoop(two, reaching=uneven, step=0.019).step == 0.019
+    with pytest.raises(InvalidInputError, match="rollout step"):
+        ut.ClosedLoop(two, reaching=uneven, step=0.021)
+
+
+def test_the_usual_values_are_the_documented_ones(
+    loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """Without them a batch is one at time 0, to the objective's horizon and terminal set."""
+    x0 = rig.state(phi=0.3)
+    spelt = ut.ClosedLoop(
+        rig, step=0.002, zoh_steps=0, escape=200.0, tail_rtol=0.0, reaching=ut.ReachingLaw()
+    )
+    goal = spelt.objective
+    assert_same(
+        loop.batch(x0, quick),
+        spelt.batch(
+            x0, quick.vector, reaching=np.array([20.0, 0.1]), switch_times=(0.0,),
+            duration=goal.horizon, terminal=goal.terminal_radius, cap=math.inf, stable_only=False,
+            seek=False,
+        ),
+    )  # fmt: skip
+    for radius, event in ((199.0, Event.HORIZON), (201.0, Event.DIVERGED)):
+        far = loop.batch(rig.state(theta=radius), ut.Surface(-1, -1e-9, 0, 1), duration=0.002)
+        assert far.event[0] == event
 
 
 def refusals(rig: ut.Mechanism, s: ut.Surface) -> dict[str, tuple[Callable[[], object], str]]:
@@ -609,6 +818,37 @@ def refusals(rig: ut.Mechanism, s: ut.Surface) -> dict[str, tuple[Callable[[], o
         ),
         "no noise at all": (lambda: sampled.simulate(x0, s, noise=np.zeros((0, 4))), r"\(0, 4\)"),
         "NaN noise": (lambda: sampled.simulate(x0, s, noise=np.full((3, 4), math.nan)), "nan"),
+        "noise of one sample": (lambda: sampled.simulate(x0, s, noise=np.zeros(4)), r"\(4,\)"),
+        "negative escape": (lambda: ut.ClosedLoop(rig, escape=-1.0), "escape.*-1"),
+        "negative tolerance": (lambda: ut.ClosedLoop(rig, tail_rtol=-1e-3), "tail_rtol"),
+        "no step": (lambda: ut.ClosedLoop(rig, step=0.0), "rollout step"),
+        "no objective": (
+            lambda: ut.ClosedLoop(rig, 3.0),  # type: ignore[arg-type]
+            "objective of ClosedLoop.*3",
+        ),
+        "vectors that are NaN": (lambda: loop.batch(x0, [-1, math.nan, 2, 3]), "NaN"),
+        "η of zero": (lambda: loop.batch(x0, s.vector, reaching=np.array([0.0, 0.1])), "gains.*0"),
+        "a negative terminal set": (lambda: loop.batch(x0, s, terminal=-0.1), "terminal.*-0.1"),
+        "a negative cap": (lambda: loop.batch(x0, s, cap=-1.0), "cap.*-1"),
+        "a negative duration": (lambda: loop.batch(x0, s, duration=-1.0), "duration.*-1"),
+        "a duration of NaN": (lambda: loop.simulate(x0, s, duration=math.nan), "duration.*nan"),
+        "less than a step": (lambda: loop.batch(x0, s, duration=0.0009), r"0\.0009.*0\.002 s"),
+        "too many steps": (lambda: loop.batch(x0, s, duration=3e4), "30000 s.*20000 s"),
+        "states and surfaces": (
+            lambda: loop.batch(np.tile(x0, (2, 1)), [s, s, s]),
+            r"2.* states and 3 surfaces",
+        ),
+        "states of states": (lambda: loop.batch(np.tile(x0, (2, 2, 1)), s), r"\(2, 2\) states"),
+        "plans and laws": (
+            lambda: loop.batch(x0, s, reaching=np.array([20.0, 0.1])),
+            "plans alone",
+        ),
+        "plans and times": (lambda: loop.batch(x0, s, switch_times=(0.0, 0.1)), "plans alone"),
+        "nothing recorded": (lambda: loop.simulate(x0, s, every=0), "every.*0"),
+        "a late first switch": (
+            lambda: loop.batch(x0, np.ones((1, 1, 4)), switch_times=(0.1,)),
+            r"switch_times.*\[0\.1\]",
+        ),
         "name of a series": (
             lambda: interpreted(loop).simulate(x0, s, duration=0.004)["psi"],
             "'psi'.*theta, phi",

@@ -9,7 +9,8 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
-from undertow.law import InnerLoop
+from undertow.law import InnerLoop, LawLayout, pack_law_parameters
+from undertow.law.inner_loop import law_memory
 
 
 @pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link"])
@@ -24,6 +25,42 @@ def test_the_compiled_step_equals_the_law(name: str) -> None:
         np.testing.assert_allclose(fast.demand, wanted.demand, rtol=1e-9)
         np.testing.assert_allclose(fast.u, wanted.u, rtol=1e-9)
         assert fast.margin[0] == pytest.approx(float(wanted.margin), rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link"])
+def test_a_law_vector_lies_where_its_layout_says(name: str) -> None:
+    """The parts of a law vector, taken by their slices, are what the law was made of."""
+    mechanism = ut.mechanisms.LIBRARY[name]()
+    n, m = mechanism.n, mechanism.m
+    reaching = ut.ReachingLaw(tuple(3.0 + k for k in range(m)), tuple(0.4 + k for k in range(m)))
+    law = ut.SlidingModeLaw(mechanism, ut.first_surface(mechanism), reaching)
+    vector, layout = pack_law_parameters(law), LawLayout(n, m)
+    assert vector.shape == (layout.size,)
+    np.testing.assert_array_equal(vector[layout.surface], law.surface.vector)
+    np.testing.assert_array_equal(vector[layout.eta], reaching.eta)
+    np.testing.assert_array_equal(vector[layout.layer], reaching.layer)
+    np.testing.assert_array_equal(vector[layout.reaching], reaching.vector(m))
+    assert vector[-1] == law.gamma_target
+    rows = np.stack([vector, 2 * vector])
+    for k, row in enumerate(rows):
+        surface = ut.Surface(*(block[k] for block in layout.blocks(rows)))
+        np.testing.assert_array_equal(surface.vector, row[layout.surface])
+
+
+def test_a_reaching_law_is_exchanged_with_the_surface_or_stays(
+    rig: ut.Mechanism, base: ut.Surface, quick: ut.Surface
+) -> None:
+    """What is not given is kept; narrower limits than the mechanism's hold where they are given."""
+    x, soft = rig.state(phi=0.02, theta=0.1), ut.ReachingLaw(3.0, 0.5)
+    law = InnerLoop(rig, base, soft)
+    law.use(quick)
+    assert law.reaching == soft
+    assert law(x)[0] == pytest.approx(float(ut.SlidingModeLaw(rig, quick, soft)(0.0, x).u[0]))
+    hard = ut.ReachingLaw(8.0, 0.2)
+    law.use(quick, hard)
+    assert law(x)[0] == pytest.approx(float(ut.SlidingModeLaw(rig, quick, hard)(0.0, x).u[0]))
+    assert law_memory(rig, np.array([0.25]))["limits"] == [0.25]
+    assert law_memory(rig)["limits"] == [rig.inputs[0].limit]
 
 
 def test_no_state_brings_the_input_past_its_limits_or_to_nan(

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import undertow as ut
 from support import SHAPES, corners, random_mechanism, random_states, random_surface, runge_kutta
 from undertow.base import InvalidInputError, SingularSurfaceError, UndertowError
-from undertow.law import Switching
+from undertow.law import Switching, gains_at_target
 from undertow.law.sliding import singularity
 from undertow.models import TIME, FloatArray
 
@@ -152,6 +152,19 @@ def test_gains_are_those_of_13(n: int, m: int) -> None:
     )
     law = ut.SlidingModeLaw(mechanism, surface, ut.ReachingLaw(eta=tuple(eta)))
     np.testing.assert_allclose(law(0.0, x).gains, expected, rtol=1e-10)
+
+
+@shapes
+def test_gains_at_the_target_are_the_laws_own_there(n: int, m: int) -> None:
+    """For many surfaces and η at once, each as a law of its own says at x = 0."""
+    mechanism = declared(random_mechanism(n, m))
+    surfaces = [random_surface(n, m, seed) for seed in range(4)]
+    eta = 1.0 + np.arange(4.0 * m).reshape(4, m)
+    together = gains_at_target(mechanism, np.stack([s.vector for s in surfaces]), eta)
+    assert together.shape == (4, m)
+    for surface, own, found in zip(surfaces, eta, together, strict=True):
+        law = ut.SlidingModeLaw(mechanism, surface, ut.ReachingLaw(tuple(own)))
+        np.testing.assert_allclose(found, law(0.0, np.zeros(2 * n)).gains, rtol=1e-12)
 
 
 @shapes
@@ -341,6 +354,52 @@ def test_at_a_singular_state_the_margin_is_zero_and_the_input_finite(switching: 
         assert (np.abs(control.u) <= 7.0).all()
 
 
+@switchings
+def test_12_holds_where_gamma_is_small_one_or_a_number_like_any_other(
+    switching: Switching,
+) -> None:
+    """Zero alone is singular: ṡ = −η sw(s/ε) at det Γ = 1 and at 1e-5, and a leap at 0."""
+    mechanism, _ = vanishing_gamma()
+    surface = ut.Surface(-1, -1, -2, -3)  # Γ = −1 + 2 (1 + z²): 1 at the target
+    reaching = ut.ReachingLaw(4.0, 0.5, switching)
+    law = ut.SlidingModeLaw(mechanism, surface, reaching)
+    x = np.array([0.2, 0.0, 0.1, -0.3])
+    assert law.gamma_target == 1.0
+    control = law(0.0, x)
+    qdd = mechanism.accelerations(0.0, x, control.demand)
+    expected = -4.0 * SWITCHING_FUNCTIONS[switching](control.s / 0.5)
+    np.testing.assert_allclose(s_dot(surface, x, qdd), expected, rtol=1e-10)
+    near = ut.Surface(-2, -1, -2 * (1 - 5e-6), -3)  # det Γ(0) = −1e-5
+    control = ut.SlidingModeLaw(mechanism, near, reaching)(0.0, x)
+    qdd = mechanism.accelerations(0.0, x, control.demand)
+    expected = -4.0 * SWITCHING_FUNCTIONS[switching](control.s / 0.5)
+    np.testing.assert_allclose(s_dot(near, x, qdd), expected, rtol=1e-6)
+    singular = ut.SlidingModeLaw(mechanism, ut.Surface(-2, -1, -1, -3), reaching)
+    assert abs(singular(0.0, [0.2, 1.0, 0.1, -0.3]).demand[0]) > 1e200
+
+
+@shapes
+def test_a_surface_in_other_units_is_the_same_surface(n: int, m: int) -> None:
+    """With s, η and ε a millionth of what they were nothing else changes: law, margins, checks."""
+    mechanism, surface = random_mechanism(n, m), random_surface(n, m)
+    small = ut.Surface.from_vector(1e-6 * surface.vector / (1e-6 ** (1 - 1 / m)), n, m)
+    scale = float(small.vector[0] / surface.vector[0])
+    x = usable_states(mechanism, surface, 50)
+    one = ut.SlidingModeLaw(mechanism, surface, ut.ReachingLaw(5.0, 0.5))(0.0, x)
+    other = ut.SlidingModeLaw(mechanism, small, ut.ReachingLaw(5.0 * scale, 0.5 * scale))(0.0, x)
+    np.testing.assert_allclose(other.demand, one.demand, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(other.s, scale * one.s, rtol=1e-12)
+    np.testing.assert_allclose(other.margin, one.margin, rtol=1e-9)
+
+
+def test_what_is_not_a_number_in_the_end_is_no_input() -> None:
+    """∞ − ∞ in the law gives no force at all, in NumPy as in the compiled step."""
+    law = limited_law("saturation")
+    x = np.array([0.0, 1e300, 1e300, -1e300])
+    assert law(0.0, x).demand[0] == 0.0
+    assert law(0.0, x).u[0] == 0.0
+
+
 def test_a_surface_singular_at_the_target_is_refused() -> None:
     mechanism, _ = vanishing_gamma()
     with pytest.raises(SingularSurfaceError) as caught:
@@ -445,6 +504,39 @@ def test_normalising_keeps_the_surface_as_a_set(n: int, m: int) -> None:
     np.testing.assert_allclose(normal.matrix @ kernel.T, 0.0, atol=1e-12)
 
 
+def test_a_surface_equals_its_like_alone(base: ut.Surface, quick: ut.Surface) -> None:
+    """Entry by entry, and nothing that is no surface; one that is normal stays as it is."""
+    assert base != quick
+    assert base != ut.Surface(-1, -0.5, 5, 10.5)
+    assert base != base.vector.tolist()
+    assert base.normalised() is base
+    np.testing.assert_array_equal(ut.Surface(1, 0.5, -5, -10).normalised().vector, base.vector)
+
+
+def test_two_surfaces_may_be_tied_crosswise() -> None:
+    """α_a with zeros on its diagonal is regular; with equal rows it is not."""
+    swapped = ut.Surface([[0, 1], [1, 0]], np.eye(2), [[1], [2]], [[3], [4]])
+    np.testing.assert_allclose(swapped.normalised().alpha_u, [[-2], [-1]])
+    with pytest.raises(InvalidInputError, match="invertible"):
+        ut.Surface([[1, 1], [1, 1]], np.eye(2), [[1], [2]], [[3], [4]])
+
+
+def test_a_notebook_shows_the_equation_of_a_surface() -> None:
+    """Each block stands before what it weighs: numbers for one input, rows of numbers for two."""
+    latex = ut.Surface(-1, -0.5, 5, 10)._repr_latex_()
+    for number, what in (
+        ("-1", r"\dot{q}_a"),
+        ("-0.5", "q_a"),
+        ("+5", r"\dot{q}_u"),
+        ("+10", "q_u"),
+    ):
+        assert rf"{number}\,{what}" in latex
+    surface = ut.Surface([[-1, 0.5], [0, -2]], -np.eye(2), [[3], [4]], [[5], [6]])
+    latex = surface._repr_latex_()
+    assert r"{pmatrix} -1 & 0.5 \\ 0 & -2 \end{pmatrix}\,\dot{q}_a" in latex
+    assert r"{pmatrix} 5 \\ 6 \end{pmatrix}\,q_u" in latex
+
+
 def test_surfaces_cannot_be_changed_by_accident() -> None:
     entries = np.array([[5.0]])
     surface = ut.Surface(-1, -0.5, entries, 10)
@@ -470,6 +562,43 @@ REFUSALS: dict[str, tuple[Callable[[], object], tuple[str, ...]]] = {
     "unknown switching": (
         lambda: ut.ReachingLaw(switching="smooth"),  # type: ignore[arg-type]
         ("'smooth'", "saturation, tanh, sign"),
+    ),
+    "a law that is none": (
+        lambda: ut.SlidingModeLaw(
+            ut.mechanisms.rotary_pendulum(),
+            ut.Surface(-1, -0.5, 5, 10),
+            0.1,  # type: ignore[arg-type]
+        ),
+        ("reaching", "0.1", "ReachingLaw"),
+    ),
+    "a plant that depends on time": (
+        lambda: ut.SlidingModeLaw(
+            ut.mechanisms.rotary_pendulum().disturbed({"phi": sp.sin(TIME)}),
+            ut.Surface(-1, -0.5, 5, 10),
+        ),
+        ("time", "autonomous"),
+    ),
+    "too few entries": (
+        lambda: ut.Surface.from_vector([-1, -0.5, 5], 2, 1),
+        ("shape (3,)", "(4,)"),
+    ),
+    "no inputs": (lambda: ut.Surface.from_vector([], 2, 0), ("number of inputs", "0")),
+    "no free coordinate": (
+        lambda: ut.Surface.from_vector([-1, -0.5], 1, 1),
+        ("number of coordinates", "1", "2"),
+    ),
+    "a state of another length": (
+        lambda: ut.Surface(-1, -0.5, 5, 10).s([0.1, 0.2, 0.3]),
+        ("states of a surface", "(3,)", "4"),
+    ),
+    "one number for a state": (
+        lambda: ut.Surface(-1, -0.5, 5, 10).s(0.1),
+        ("states of a surface", "()", "4"),
+    ),
+    "gains of no inputs": (lambda: ut.ReachingLaw().vector(0), ("number of inputs", "0")),
+    "text for a gain": (
+        lambda: ut.ReachingLaw(eta="20"),  # type: ignore[arg-type]
+        ("eta", "'20'"),
     ),
     "too many η": (
         lambda: ut.ReachingLaw(eta=(1.0, 2.0)).vector(1),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -216,6 +217,162 @@ def test_complex_poles_can_be_placed(rig: ut.Mechanism) -> None:
     match_spectra(found, np.array(poles), 1e-9)
 
 
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_the_usual_weights_are_the_documented_ones(n: int, m: int) -> None:
+    """1 on q_a, 10 on q_u and 0.1 on the velocities, and no rate asked for."""
+    mechanism = random_mechanism(n, m, np.random.default_rng([n, m, 3]))
+    weights = [1.0] * m + [10.0] * (n - m) + [0.1] * n
+    assert ut.first_surface(mechanism) == ut.first_surface(mechanism, weights, rate=0.0)
+    assert ut.first_surface(mechanism) != ut.first_surface(mechanism, weights, rate=0.001)
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_quadratic_design_minimises_its_integral_on_the_surface(n: int, m: int) -> None:
+    """∫ xᵀQx dt on the surface, by Lyapunov's equation, is stationary and rises on both sides.
+
+    Starts are the states that no input moves at once, one of each: the same for all surfaces.
+    """
+    mechanism = random_mechanism(n, m, np.random.default_rng([n, m, 4]))
+    weights = np.linspace(0.5, 2.0, 2 * n)
+    best = ut.first_surface(mechanism, weights)
+    unmoved = scipy.linalg.null_space(linearise(mechanism).input.T).T
+
+    def cost(vector: NDArray[Any]) -> float:
+        A_s = sliding_matrix(mechanism, vector)
+        x_of_z = np.insert(np.eye(2 * n - m), [n] * m, A_s[:m], axis=0)  # q̇_a on the surface
+        P = scipy.linalg.solve_continuous_lyapunov(A_s.T, -x_of_z.T @ np.diag(weights) @ x_of_z)
+        z_of_start = np.linalg.inv(unmoved @ x_of_z)
+        return float(np.trace(z_of_start.T @ P @ z_of_start))
+
+    least = cost(best.vector)
+    for k in range(m * m, 2 * m * n):
+        step = 1e-3 * np.eye(2 * m * n)[k]
+        below, above = (cost(best.vector + side * step) - least for side in (-1, 1))
+        assert min(below, above) > 0
+        assert abs(above - below) < 0.1 * (above + below)
+
+
+def test_a_design_is_kept_on_disk(
+    rig: ut.Mechanism, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second time no Riccati equation is solved; another wish is another design."""
+    monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path / "designs"))
+    weights = [1.0, 7.0, 0.3, 0.2]
+    first = ut.first_surface(rig, weights, rate=0.25)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("solved again")
+
+    monkeypatch.setattr(scipy.linalg, "solve_continuous_are", refuse)
+    assert ut.first_surface(rig, weights, rate=0.25) == first
+    with pytest.raises(AssertionError, match="solved again"):
+        ut.first_surface(rig, weights, rate=0.26)
+
+
+def test_poles_whose_placing_is_not_the_best_there_is_are_placed_without_a_word() -> None:
+    """SciPy's search for the best conditioning may stop early: that is no warning to a user."""
+    mechanism = random_mechanism(5, 2, np.random.default_rng([5, 2, 2]))
+    poles = [-1.0, -1.0, -1.1, -1.1, -1.2, -1.2, -30.0, -31.0]
+    found = np.sort(
+        np.linalg.eigvals(sliding_matrix(mechanism, ut.placed_surface(mechanism, poles))).real
+    )
+    np.testing.assert_allclose(found, np.sort(poles), rtol=1e-4)
+
+
+# -- margins ------------------------------------------------------------------------------
+
+
+def pair(F: list[list[float]], D: list[list[float]], coupling: float = -1.0) -> ut.Mechanism:
+    """Two coordinates, one input, M = [[3, c], [c, 2]] and forces F q + D q̇."""
+    a, b = ut.Coordinate("a"), ut.Coordinate("b")
+    q, v = sp.Matrix([a.symbol, b.symbol]), sp.Matrix([a.velocity, b.velocity])
+    return ut.Mechanism(
+        "pair",
+        (a, b),
+        (ut.Input("u", "N m"),),
+        sp.ImmutableDenseMatrix([[3, coupling], [coupling, 2]]),
+        sp.ImmutableDenseMatrix(sp.Matrix(F) * q + sp.Matrix(D) * v),
+    )
+
+
+NO_DAMPING = [[-0.4, 0.0], [0.0, 0.0]]  # of the free joint; the actuated one may have it
+
+
+@pytest.mark.parametrize("coupling", [-1.0, 1.0])
+def test_35_and_36_are_given_where_the_paper_derives_them(coupling: float) -> None:
+    """The free joint falls, nothing damps it and q_a does not push it: four closed forms."""
+    mechanism = pair([[0.0, 0.0], [0.0, 0.3]], NO_DAMPING, coupling)
+    side = -np.sign(coupling)
+    surface = ut.Surface(-2, -1, side * 10, side * 20)
+    margins = {m.name: m.value for m in ut.law.surface_margins(mechanism, surface)}
+    sign = "" if coupling < 0 else "−"
+    assert margins["(35) λ_a < 0 at α_a = −1"] == pytest.approx(0.5)
+    assert margins[f"(35) {sign}α_u > 0 at α_a = −1"] == pytest.approx(5.0)
+    assert margins[f"(35) {sign}λ_u > 0 at α_a = −1"] == pytest.approx(10.0)
+    assert margins["(36) λ_a/α_a < λ_u/α_u"] == pytest.approx(2.0 - 0.5)
+    assert float(stability_margin(mechanism, surface)) > 0
+    flat = ut.law.surface_margins(mechanism, ut.Surface(-1, -1, 0, 1))
+    assert {m.name: m.value for m in flat}["(36) λ_a/α_a < λ_u/α_u"] == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("F", "D"),
+    [
+        ([[0.0, 0.0], [0.2, 0.3]], NO_DAMPING),  # q_a pushes the free joint
+        ([[0.0, 0.0], [0.0, 0.3]], [[0.0, 0.0], [0.0, -0.1]]),  # damped
+        ([[0.0, 0.0], [0.0, 0.3]], [[0.0, 0.0], [-0.1, 0.0]]),  # pushed by q̇_a
+        ([[0.0, 0.0], [0.0, -0.3]], NO_DAMPING),  # it hangs
+        ([[0.0, 0.0], [0.0, 0.0]], NO_DAMPING),  # nothing moves it
+    ],
+)
+def test_35_and_36_are_not_given_where_the_paper_derives_none(
+    F: list[list[float]], D: list[list[float]]
+) -> None:
+    margins = ut.law.surface_margins(pair(F, D), ut.Surface(-1, -0.5, 5, 10))
+    assert [m.name.split(":")[0] for m in margins] == ["stability", "(37) singularity"]
+
+
+def test_37_is_the_worst_of_the_positions_asked_for(rig: ut.Mechanism, base: ut.Surface) -> None:
+    """det Γ(q)/det Γ(0) = (α_u b cos φ − c)/(α_u b − c): 1 at the target, less to either side."""
+    b, c, _ = constants(rig)
+    angles = np.array([0.1, -0.9, 0.4])
+    positions = np.column_stack([np.zeros(3), angles])
+
+    def margin(q: NDArray[Any] | None) -> float:
+        return ut.law.surface_margins(rig, base, q)[-1].value
+
+    assert margin(None) == pytest.approx(1.0)
+    expected = (5 * b * np.cos(angles) - c) / (5 * b - c)
+    assert margin(positions) == pytest.approx(expected.min(), rel=1e-12)
+    assert margin(positions[2]) == pytest.approx(expected[2], rel=1e-12)
+    with pytest.raises(InvalidInputError, match="surface for"):
+        ut.law.surface_margins(rig, random_surface(3, 1, np.random.default_rng(0)))
+
+
+def test_a_surface_that_is_exactly_singular_has_no_margin() -> None:
+    """det Γ(0) = 0 in floating point too: −∞ for stability and for (37), alone and in a batch."""
+    mechanism = pair([[0.0, 0.0], [0.0, 0.3]], NO_DAMPING)  # X = −1/2
+    singular = ut.Surface(-1, -1, 2, 3)
+    *_, stability, singularity = ut.law.surface_margins(mechanism, singular)
+    assert stability.value == singularity.value == -np.inf
+    vectors = np.stack([singular.vector, [0.0, -1, 2, 3], [-1.0, -1, 5, 10]])
+    margins = stability_margin(mechanism, vectors)
+    np.testing.assert_array_equal(margins[:2], -np.inf)
+    assert margins[2] == stability_margin(mechanism, vectors[2]) > 0
+    np.testing.assert_array_equal(stability_margin(mechanism, vectors[:2]), -np.inf)
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_margins_do_not_depend_on_the_units_of_s(n: int, m: int) -> None:
+    """A surface whose entries are all small is as stable as it was, and as sound."""
+    mechanism = random_mechanism(n, m, np.random.default_rng([n, m, 5]))
+    surface = ut.first_surface(mechanism)
+    small = ut.Surface.from_vector(1e-6 ** (1 / m) * surface.vector, n, m)
+    margin = float(stability_margin(mechanism, surface))
+    assert float(stability_margin(mechanism, small)) == pytest.approx(margin, rel=1e-6)
+    ut.check_surface(mechanism, small, np.zeros(2 * n))
+
+
 # -- refusals -----------------------------------------------------------------------------
 
 
@@ -273,6 +430,22 @@ def test_uncontrollable_linearisation_is_refused() -> None:
         ut.first_surface(mechanism)
 
 
+def test_poles_that_cannot_be_placed_are_refused(rig: ut.Mechanism) -> None:
+    """No input reaches the free coordinate, or there are more equal poles than inputs."""
+    a, b = ut.Coordinate("a"), ut.Coordinate("b")
+    rooms = ut.Mechanism(
+        "two_rooms",
+        (a, b),
+        (ut.Input("u", "N m"),),
+        sp.ImmutableDenseMatrix(sp.eye(2)),
+        sp.ImmutableDenseMatrix([0, 3 * b.symbol]),
+    )
+    with pytest.raises(ModelError, match="uncontrollable pair"):
+        ut.placed_surface(rooms, [-1.0, -2.0, -3.0])
+    with pytest.raises(InvalidInputError, match="poles"):
+        ut.placed_surface(rig, [-1.0, -1.0, -3.0])
+
+
 def test_target_that_is_no_equilibrium_is_refused() -> None:
     """f_u(0, 0) ≠ 0 is named with its value."""
     a, b = ut.Coordinate("a"), ut.Coordinate("b")
@@ -302,7 +475,7 @@ def test_unusable_weights_are_refused(rig: ut.Mechanism, weights: list[float]) -
         ut.first_surface(rig, weights)
 
 
-@pytest.mark.parametrize("poles", [[-1, -2], [-1, -2, 0.5], [-1, -2, -3, -4]])
+@pytest.mark.parametrize("poles", [[-1, -2], [-1, -2, 0.5], [-1, -2, 0], [-1, -2, -3, -4]])
 def test_unusable_poles_are_refused(rig: ut.Mechanism, poles: list[complex]) -> None:
     """Wrong number, or not left of the imaginary axis."""
     with pytest.raises(InvalidInputError, match="poles"):

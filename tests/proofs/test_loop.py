@@ -205,6 +205,14 @@ def test_lost_tubes_are_told_apart() -> None:
     end = run_tubes(MOTION, tubes, TERMINAL, 0.002, 0.8, stop_early=False)
     assert np.isfinite(end.entered[0])
     assert np.isnan(end.entered[1])
+    given_up = run_tubes(MOTION, tubes, TERMINAL, 0.002, 0.8)
+    assert np.isnan(given_up.entered).all()
+    assert given_up.lost.tolist() == end.lost.tolist() == [False, True]
+    for horizon, steps in ((0.0005, 1), (0.002, 1), (0.004, 2)):
+        short = run_tubes(MOTION, tubes.take(np.array([True, False])), TERMINAL, 0.002, horizon)
+        assert short.steps == steps
+        assert (short.peak > 0).all()
+    assert given_up.steps < end.steps == round(float(end.entered[0]) / 0.002)
 
 
 # -- a held input, a plant in a box ----------------------------------------------------------

@@ -366,7 +366,7 @@ def gains_at_target(mechanism: Mechanism, surfaces: FloatArray, eta: FloatArray)
     """Return the gains (13) at the target for surface vectors (N, 2mn) and η (N, m)."""
     function = _law_function(mechanism, "saturation")
     m = mechanism.m
-    reaching = np.concatenate([eta, np.ones_like(eta)], axis=-1)
+    reaching = np.hstack([eta, np.ones_like(eta)])
     origin = np.zeros((len(surfaces), 2 * mechanism.n))
     return function(
         mechanism, origin, surfaces.T, reaching.T, np.ones(len(surfaces))

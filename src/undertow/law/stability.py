@@ -125,7 +125,7 @@ def surface_margins(
         mechanism is of the paper's kind, the closed forms (35) and (36).
     """
     check_surface_shape(mechanism, surface)
-    positions = np.zeros((1, mechanism.n)) if q is None else np.atleast_2d(np.asarray(q, float))
+    positions = np.zeros(mechanism.n) if q is None else np.asarray(q, float)
     gamma = singularity(mechanism, surface.vector, positions)
     target = float(singularity(mechanism, surface.vector, np.zeros(mechanism.n)))
     ratio = float(np.min(gamma / target)) if target != 0 else -np.inf

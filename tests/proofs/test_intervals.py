@@ -1,0 +1,368 @@
+"""Interval kernels and branch and bound: they hold what is exact, and hardly more.
+
+A kernel that is too wide proves nothing, and no test of what is proved would tell why; so every
+operation of :mod:`undertow.proofs.intervals.outward` and every derivative of
+:mod:`undertow.proofs.intervals.program` is held against 50 digits, from both sides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+import sympy as sp
+
+pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+
+from undertow.base import InvalidInputError, ModelError
+from undertow.proofs.closed_loop.terminal_set import TerminalSet, exact_inverse, negative_by
+from undertow.proofs.intervals import outward as ops
+from undertow.proofs.intervals.batch import Interval
+from undertow.proofs.intervals.branch import minimise_proved
+from undertow.proofs.intervals.exact_model import exact_rates, is_odd, vanishes
+from undertow.proofs.intervals.program import Program
+from undertow.symbolic import Tape
+
+INF = math.inf
+
+#: Operations to their exact functions, where they turn, and the relative width they may add.
+FUNCTIONS: dict[int, tuple[Callable[[Any], Any], tuple[float, ...], float]] = {
+    ops.NEG: (lambda v: -v, (), 0.0),
+    ops.RECIPROCAL: (lambda v: 1 / v, (), 1e-15),
+    ops.SQRT: (mpmath.sqrt, (), 1e-15),
+    ops.SIN: (mpmath.sin, (-math.pi / 2, math.pi / 2), 5e-13),
+    ops.COS: (mpmath.cos, (0.0,), 5e-13),
+    ops.EXP: (mpmath.exp, (), 3e-11),
+    ops.LOG: (mpmath.log, (), 3e-14),
+    ops.TANH: (mpmath.tanh, (), 1e-10),
+    ops.ABS: (abs, (0.0,), 0.0),
+}
+
+#: Intervals inside the range of each, and what comes where nothing can be said.
+INSIDE = {
+    ops.RECIPROCAL: ((0.3, 0.3), (1e-3, 2.0), (-4.0, -0.1), (1e200, 1e201)),
+    ops.SQRT: ((0.0, 0.0), (0.0, 2.0), (2.0, 2.0), (1e-200, 1e200)),
+    ops.LOG: ((1.0, 1.0), (0.7, 0.71), (1e-3, 0.9), (0.5, 40.0), (1e-290, 1e290)),
+    ops.EXP: ((0.0, 0.0), (-1.0, 1.0), (-500.0, -499.0), (3.0, 511.0), (-20.0, 7.0)),
+    ops.TANH: ((0.0, 0.0), (-1.0, 2.0), (0.1, 0.1), (-20.0, -3.0), (2.0, 255.0)),
+}
+USUAL = (
+    (0.0, 0.0), (0.25, 0.25), (-1.0, 0.5), (0.5, 1.0), (1.0, 2.0), (1.5, 1.6), (-2.0, -1.0),
+    (-3.1, -1.4), (-0.1, 3.0), (-3.0, 3.0), (1.7, 3.1), (-1.2, 1.3),
+)  # fmt: skip
+OUTSIDE = {
+    ops.RECIPROCAL: (((-1.0, 1.0), (0.0, 1.0), (-1.0, 0.0)), (-INF, INF)),
+    ops.SQRT: (((-1e-9, 1.0), (-2.0, -1.0), (1.0, INF)), (-INF, INF)),
+    ops.LOG: (((0.0, 1.0), (-1.0, 2.0), (1.0, INF)), (-INF, INF)),
+    ops.EXP: (((0.0, 513.0), (-600.0, 600.0)), (-INF, INF)),
+    ops.SIN: (((-4.0, 0.0), (0.0, 3.2), (-INF, INF), (7.0, 7.0)), (-1.0, 1.0)),
+    ops.COS: (((-4.0, 0.0), (0.0, 3.2), (-INF, INF), (7.0, 7.0)), (-1.0, 1.0)),
+    ops.TANH: (((-INF, INF),), (-1.0, 1.0)),
+}
+
+
+def holds_hardly_more(found: tuple[float, float], exact: list[Any], part: float) -> bool:
+    """Whether [low, high] holds all exact values, and its ends are near the extreme ones."""
+    low, high = min(exact), max(exact)
+    slack = part * max(1, abs(low), abs(high)) + 1e-307
+    return bool(low - slack <= found[0] <= low and high <= found[1] <= high + slack)
+
+
+@pytest.mark.parametrize("op", FUNCTIONS)
+def test_functions_of_intervals_hold_their_range_and_hardly_more(op: int) -> None:
+    function, turns, part = FUNCTIONS[op]
+    with mpmath.workdps(50):
+        for a, b in INSIDE.get(op, USUAL):
+            places = [a, b, *(t for t in turns if a <= t <= b)]
+            exact = [function(mpmath.mpf(v)) for v in places]
+            found = ops.apply(op, a, b, 0.0, 0.0, 0)
+            scale = part if op != ops.RECIPROCAL or abs(exact[0]) > 1 else 1e-15
+            assert holds_hardly_more(found, exact, scale), (a, b, found)
+    for places, wanted in (OUTSIDE.get(op, ((), ())),):
+        for a, b in places:
+            assert ops.apply(op, a, b, 0.0, 0.0, 0) == wanted, (a, b)
+
+
+def test_what_is_far_out_is_bounded_where_it_can_be() -> None:
+    """e^x ≥ 0 and tanh within ±1 wherever x is; nothing more is said of e^x beyond 512."""
+    assert ops.exponential(-INF, 512.0) == (0.0, 2.5e222)
+    assert 2.2e222 < math.exp(512.0) < 2.5e222
+    low, high = ops.apply(ops.TANH, -300.0, -299.0, 0.0, 0.0, 0)
+    assert -1.0 <= low <= high <= 1.0
+    low, high = ops.apply(ops.TANH, 0.5, 300.0, 0.0, 0.0, 0)
+    assert low <= math.tanh(0.5) <= high == 1.0
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 4, 5, 8])
+def test_powers_hold_their_range_and_hardly_more(k: int) -> None:
+    with mpmath.workdps(50):
+        for a, b in (*USUAL, (-3.0, 2.0), (-2.0, 3.0), (-0.0, 2.0), (-2.0, 0.0), (-1e9, 1e-9)):
+            exact = [mpmath.mpf(v) ** k for v in (a, b, *((0.0,) if a <= 0 <= b else ()))]
+            found = ops.apply(ops.POWER, a, b, 0.0, 0.0, k)
+            assert holds_hardly_more(found, exact, 1e-14), (a, b, found)
+            if k % 2 == 0:
+                assert found[0] >= -1e-300
+    assert ops.apply(ops.POWER, -INF, 1.0, 0.0, 0.0, k) == (-INF, INF)
+    assert ops.apply(ops.POWER, 1.0, INF, 0.0, 0.0, k) == (-INF, INF)
+
+
+def test_pairs_of_intervals_hold_their_range_and_hardly_more() -> None:
+    """Sums, products, maxima and minima of all pairs; exact zeros stay, what overflows is lost."""
+    exact: dict[int, Callable[[Any, Any], Any]] = {
+        ops.ADD: lambda u, v: u + v, ops.MUL: lambda u, v: u * v, ops.MAX: max, ops.MIN: min,
+    }  # fmt: skip
+    with mpmath.workdps(50):
+        for a, b in (*USUAL, (0.1, 0.3)):
+            for c, d in (*USUAL, (-0.7, 1e5)):
+                for op, function in exact.items():
+                    ends = [function(mpmath.mpf(u), mpmath.mpf(v)) for u in (a, b) for v in (c, d)]
+                    found = ops.apply(op, a, b, c, d, 0)
+                    assert holds_hardly_more(found, ends, 1e-15), (op, a, b, c, d, found)
+    for a, b in USUAL:
+        assert ops.add(a, b, 0.0, 0.0) == ops.add(0.0, 0.0, a, b) == (a, b)
+        assert ops.mul(a, b, 0.0, 0.0) == ops.mul(0.0, 0.0, a, b) == (0.0, 0.0)
+    assert ops.mul(-INF, INF, 0.0, 0.0) == (0.0, 0.0)
+    for found in (ops.mul(1.0, 1e300, 1.0, 1e10), ops.mul(0.0, INF, 1.0, 2.0),
+                  ops.add(1.0, 1.7e308, 1.0, 1.7e308), ops.add(-INF, 1.0, 2.0, 3.0),
+                  ops.whole(2.0, 1.0), ops.whole(math.nan, 1.0)):  # fmt: skip
+        assert found == (-INF, INF)
+
+
+def test_derivatives_of_programs_are_those_of_calculus() -> None:
+    """At points: values and slopes to twelve digits, whichever side of a corner wins."""
+    x, y = sp.symbols("x y", real=True)
+    rows = [
+        sp.exp(x) * sp.tanh(y), sp.sin(x * y), sp.cos(x) ** 3, 1 / (2 + x * y), sp.sqrt(3 + x),
+        sp.log(3 + y), sp.Abs(x) * y, sp.Abs(y - x), sp.Max(x, y), sp.Min(x, y), sp.Max(y, x, 3),
+        sp.Min(y, x * y, -3), sp.Max(x, sp.Rational(-5)), x**7, -x + y, sp.pi * x, sp.Integer(4),
+    ]  # fmt: skip
+    tape = Tape()
+    program = Program.of(tape, [x, y], [], tape.let_all(rows))
+    values = sp.lambdify((x, y), rows, "mpmath")
+    jacobian = sp.Matrix(rows).jacobian([x, y])
+    slopes = sp.lambdify((x, y), list(jacobian), "mpmath")
+    for point in ((0.3, 0.7), (-0.4, 0.9), (1.1, -0.6), (-0.8, -1.2), (-0.5, -0.1)):
+        at = np.array(point)
+        value, slope = program(at, at)
+        with mpmath.workdps(50):
+            arguments = [mpmath.mpf(v) for v in point]
+            for found, exact in zip(value, values(*arguments), strict=True):
+                assert holds_hardly_more(tuple(found), [exact], 2e-11)
+            for found, exact in zip(slope.reshape(-1, 2), slopes(*arguments), strict=True):
+                assert holds_hardly_more(tuple(found), [exact], 2e-11)
+
+
+def test_corners_inside_a_box_have_both_slopes() -> None:
+    """|x|, max and min where either side may win: the hull of both, and no more."""
+    x, y = sp.symbols("x y", real=True)
+    tape = Tape()
+    rows = [sp.Abs(x), sp.Max(2 * x, 5 * y), sp.Min(2 * x, 5 * y)]
+    program = Program.of(tape, [x, y], [], tape.let_all(rows))
+    _, slope = program(np.array([-1.0, -1.0]), np.array([2.0, 1.0]))
+    np.testing.assert_allclose(slope[0], [[-1, 1], [0, 0]], atol=1e-14)
+    np.testing.assert_allclose(slope[1:], [[[0, 2], [0, 5]]] * 2, atol=1e-14)
+
+
+# -- branch and bound -------------------------------------------------------------------------
+
+
+def bowl(balls: list[Any]) -> Any:
+    """(x − 1)² + (y + ½)² + 2: 2 at (1, −½)."""
+    x, y = balls
+    return (x - 1) ** 2 + (y + 0.5) ** 2 + 2
+
+
+BOX = [(-2.0, 3.7), (-1.1, 2.3)]
+
+
+def test_a_minimum_is_enclosed_to_its_tolerance() -> None:
+    for tolerance in (1e-2, 1e-4):
+        found = minimise_proved(bowl, BOX, tolerance=tolerance)
+        assert found.finished
+        assert found.lower <= 2.0 <= found.value
+        assert found.value - found.lower <= tolerance * found.value
+        assert found.point == pytest.approx((1.0, -0.5), abs=math.sqrt(tolerance) * 3)
+        assert bowl(list(found.point)) <= found.value
+    coarse = minimise_proved(bowl, BOX, tolerance=0.0, absolute=0.5)
+    assert 0.1 < coarse.value - coarse.lower <= 0.5
+    assert coarse.boxes < found.boxes
+
+
+def test_a_search_for_a_sign_stops_when_it_is_known() -> None:
+    """As soon as a value is low enough, or all of them are shown to be high enough."""
+    whole = minimise_proved(bowl, BOX, tolerance=1e-9)
+    below = minimise_proved(bowl, BOX, stop_below=2.5)
+    assert below.finished
+    assert 2.0 <= below.value <= 2.5
+    above = minimise_proved(bowl, BOX, stop_above=1.0, tolerance=0.0, absolute=0.0)
+    assert above.finished
+    assert 1.0 < above.lower <= 2.0
+    assert max(below.boxes, above.boxes) < whole.boxes / 4
+    neither = minimise_proved(bowl, BOX, stop_below=1.9, stop_above=2.1)
+    assert neither.finished
+    assert neither.lower <= 2.0 <= neither.value
+
+
+def test_effort_is_counted_and_runs_out() -> None:
+    calls = 0
+
+    def counted(balls: list[Any]) -> Any:
+        nonlocal calls
+        calls += 1
+        return bowl(balls)
+
+    found = minimise_proved(counted, BOX, tolerance=1e-12, absolute=0.0, max_boxes=50)
+    assert not found.finished
+    assert found.boxes == 50
+    assert calls == 2 * 50 + 4 + 2 + 1  # each box and its middle; corners, target, middle, all
+    assert found.lower <= 2.0 <= found.value
+    stuck = found.stuck
+    assert all(low <= a < b <= high for (a, b), (low, high) in zip(stuck, BOX, strict=True))
+    point = minimise_proved(counted, [(0.25, 0.25), (0.5, 0.5)])
+    assert point.finished
+    assert point.value == pytest.approx(bowl([0.25, 0.5]))
+    assert point.lower == pytest.approx(point.value)
+
+
+def test_extremes_at_corners_and_at_the_target_are_tried_first() -> None:
+    """In up to six variables the corners, and always the point of the box nearest to 0."""
+
+    def low_at(place: list[float]) -> Callable[[list[Any]], Any]:
+        return lambda balls: sum(
+            ((b - p) ** 2 for b, p in zip(balls, place, strict=True)), start=1 * balls[0] * 0
+        )
+
+    for size in (1, 3, 6):
+        for corner in ([-1.0] * size, [2.0] * size, [-1.0, *[2.0] * (size - 1)]):
+            found = minimise_proved(low_at(corner), [(-1.0, 2.0)] * size, stop_below=1e-12)
+            assert found.boxes == 0
+            assert found.point == tuple(corner)
+    calls = 0
+
+    def flat(balls: list[Any]) -> Any:
+        nonlocal calls
+        calls += 1
+        return 1.0 + 0 * balls[0]
+
+    minimise_proved(flat, [(-1.0, 2.0)] * 7)
+    assert calls == 3  # the target, the middle, all of it
+    for low, high, nearest in ((-1.0, 2.0, 0.0), (0.5, 2.0, 0.5), (-2.0, -0.5, -0.5)):
+        found = minimise_proved(low_at([nearest] * 8), [(low, high)] * 8, stop_below=1e-12)
+        assert (found.boxes, found.point) == (0, (nearest,) * 8)
+
+
+def test_what_is_undefined_somewhere_is_not_bounded_there() -> None:
+    """1/x over 0: no lower bound and no end, whatever is found elsewhere."""
+    found = minimise_proved(lambda balls: 1 / balls[0], [(-1.0, 1.0)], max_boxes=40)
+    assert not found.finished
+    assert found.lower == -INF
+    assert found.value <= -1.0
+
+
+def test_a_minimum_becomes_a_verdict() -> None:
+    """Proved with its bound, refuted with its point, undecided with the box it stuck in."""
+    found = minimise_proved(bowl, BOX, max_boxes=20)
+    proved, refuted, neither = (
+        found.verdict("f > 0", ("x", "y"), "m", "balls", held) for held in (True, False, None)
+    )
+    assert (proved.kind, refuted.kind, neither.kind) == ("proved", "refuted", "undecided")
+    assert (proved.margin, refuted.margin) == (found.lower, found.value)
+    assert refuted.witness == {"x": found.point[0], "y": found.point[1]}
+    (a, b), _ = found.stuck
+    assert neither.witness["x"] == 0.5 * (a + b)
+    assert "gave up" in neither.method
+    assert "gave up" not in proved.method
+
+
+# -- exact matrices ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_inverses_of_float_matrices_are_enclosed_to_the_last_place(size: int) -> None:
+    rng = np.random.default_rng(size)
+    for _ in range(5):
+        T = rng.standard_normal((size, size))
+        T[0, 0] = 0.0 if size > 1 else T[0, 0]
+        inverse = exact_inverse(T)
+        with mpmath.workdps(50):
+            exact = mpmath.matrix(T.tolist()) ** -1
+            for i in range(size):
+                for j in range(size):
+                    low, high = inverse.lo[i, j], inverse.hi[i, j]
+                    assert low <= exact[i, j] <= high
+                    assert high - low <= 4 * np.spacing(abs(high))
+    with pytest.raises(InvalidInputError, match="singular"):
+        exact_inverse(np.ones((2, 2)))
+
+
+def test_a_matrix_is_negative_by_its_largest_eigenvalue() -> None:
+    """For floats to rounding; for intervals by what their widths may add; never for NaN."""
+    rng = np.random.default_rng(1)
+    for size in (1, 2, 4):
+        root = rng.standard_normal((size, size))
+        matrix = -(root @ root.T) - 0.1 * np.eye(size)
+        largest = float(np.linalg.eigvalsh(matrix)[-1])
+        assert negative_by(Interval(matrix), -largest * (1 - 1e-9))
+        assert not negative_by(Interval(matrix), -largest * (1 + 1e-9))
+        skew = np.triu(rng.standard_normal((size, size)), 1)
+        assert negative_by(Interval(matrix + skew - skew.T), -largest * (1 - 1e-6))
+        half = 0.01
+        wide = Interval(matrix - half, matrix + half)
+        assert negative_by(wide, -largest - size * half * (1 + 1e-9)) or size * half > -largest
+        assert not negative_by(wide, -largest - 0.5 * half)
+    assert not negative_by(Interval(np.array([[math.nan]])), 0.0)
+    assert not negative_by(Interval(np.array([[-INF]]), np.array([[-1.0]])), 0.0)
+    assert not negative_by(Interval(np.zeros((2, 2))), 0.0)
+
+
+def test_a_terminal_set_is_an_ellipsoid_with_a_band() -> None:
+    """W(z) = max(‖T⁻¹x‖, |s_i|/σ_i), 1 on its edge; grown it is smaller by as much."""
+    T = np.array([[2.0, 1.0], [0.0, 0.5]])
+    terminal = TerminalSet(T, [0.25, 0.5])
+    for angle in (0.0, 1.0, 2.5):
+        x = T @ [math.cos(angle), math.sin(angle)]
+        assert terminal.value([*x, 0.0, 0.0]) == pytest.approx(1.0)
+        assert terminal.value([*(0.3 * x), 0.1, -0.4]) == pytest.approx(0.8)
+        assert terminal.value([*(0.3 * x), -0.15, 0.0]) == pytest.approx(0.6)
+        assert terminal.times(2.0).value([*x, 0.5, 0.0]) == pytest.approx(1.0)
+    assert TerminalSet.from_dict(terminal.to_dict()).to_dict() == terminal.to_dict()
+    assert TerminalSet(1e-60 * np.eye(2), 0.1).value([1e-60, 0, 0]) == pytest.approx(1.0)
+    for scale, widths, what in (
+        (np.ones((2, 3)), 0.1, "square"),
+        ([1.0, 2.0], 0.1, "square"),
+        ([[math.nan]], 0.1, "square"),
+        (np.ones((2, 2)), 0.1, "invertible"),
+        (T, [0.1, 0.0], "> 0"),
+        (T, [0.1, -0.1], "> 0"),
+        (T, [0.1, INF], "finite"),
+    ):
+        with pytest.raises(InvalidInputError, match=what):
+            TerminalSet(scale, widths)
+
+
+# -- exact models -----------------------------------------------------------------------------
+
+
+def test_fields_must_be_smooth_everywhere_and_at_rest() -> None:
+    """Twice: |x|x³ has its corner at 0 smoothed away, |x − 1| has one elsewhere."""
+    x, p = sp.symbols("x p", real=True)
+    assert exact_rates([0.5 * x - x**3], [x], {}) == (x / 2 - x**3,)
+    for rate, values in ((-x + sp.Abs(x - 1), {}), (-x - sp.Abs(x), {}),
+                         (-x * sp.sqrt(x**2 + p), {p: 0.0})):  # fmt: skip
+        with pytest.raises(ModelError, match="vector field"):
+            exact_rates([rate], [x], values)
+    assert exact_rates([-x * sp.sqrt(x**2 + p)], [x], {p: 1.0})
+
+
+def test_parity_and_zeros_are_shown_symbolically() -> None:
+    x, y = sp.symbols("x y", real=True)
+    assert is_odd([sp.sin(x), x**3 * y**2], [x, y], [sp.cos(x), x * y])
+    assert not is_odd([sp.sin(x), x**2], [x, y])
+    assert not is_odd([sp.sin(x)], [x, y], [x])
+    assert is_odd([sp.sin(x) * y], [x])
+    assert vanishes([sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1 + y, x * y], [y])
+    assert not vanishes([x * y, x], [y])
