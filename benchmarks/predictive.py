@@ -3,8 +3,8 @@
 * :class:`RealTimeIteration`: least energy by multiple shooting to the deadline.  Each sample
   linearises the shifted plan once and solves one quadratic programme (Diehl, Bock, Schlöder,
   *A real-time iteration scheme*, SIAM J. Control Optim. 43, 2005), Gauss-Newton: the cost is
-  quadratic, so its Hessian is exact but for the curvature of the dynamics.  CasADi; QRQP, warm-started,
-  and HPIPM where that fails.
+  quadratic, so its Hessian is exact but for the curvature of the dynamics.  CasADi; QRQP,
+  warm-started, and HPIPM where that fails.
 * :class:`Acados`: the same in acados, in a process of another Python that has it.
 * :class:`Sampled`: holds what a controller asks for from sample to sample, and has its model's
   parameters learnt from the motion where there is a belief, the library's own.
@@ -12,9 +12,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import os
 import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,16 +30,16 @@ from harness import Clock, need
 from rivals import Box, dynamics, ends, parameters, riccati, runge_kutta
 from undertow.models import FloatArray, linearise
 
-__all__ = ["PERIOD", "RealTimeIteration", "Sampled", "grid"]
+__all__ = ["PERIOD", "Acados", "RealTimeIteration", "Sampled", "grid"]
 
 #: Time between samples, s.
 PERIOD = 0.01
 
 #: Intervals of a plan, the longest one, s, and how soon before the deadline plans arrive, s.
-INTERVALS, LONGEST, EARLY = 60, 0.3, 0.1
+INTERVALS, LONGEST, EARLY = 60, 0.3, 0.2
 
-#: The shortest span of a plan, s.
-SHORTEST = 0.06
+#: What has missed the target is to reach it so much later, s, again and again.
+AGAIN = 0.5
 
 #: Largest step of the integrator times the fastest rate of the linearised mechanism.
 RESOLVED = 1.0
@@ -55,7 +58,6 @@ def grid(span: float) -> FloatArray:
     None is longer than ``LONGEST`` where the span allows that; short spans are divided evenly.
     """
     numbers = np.arange(INTERVALS)
-    span = max(span, SHORTEST)
     if span <= INTERVALS * PERIOD:
         return np.full(INTERVALS, span / INTERVALS)
     cap = max(LONGEST, 1.5 * span / INTERVALS)
@@ -133,8 +135,11 @@ class _Task:
         return float(x @ P @ x) / float(self.limits.max()) ** 2
 
     def left(self, t: float) -> FloatArray:
-        """Return the grid from t on."""
-        return grid(self.deadline - EARLY - t)
+        """Return the grid from t on, to the aim or to the next try."""
+        span = self.deadline - EARLY - t
+        return grid(
+            span if span > PERIOD / 2 else AGAIN - (-span + PERIOD / 2) % AGAIN + PERIOD / 2
+        )
 
     def due(self, t: float) -> bool:
         """Whether it is planned anew at t."""
@@ -169,8 +174,7 @@ class RealTimeIteration(_Task):
     box
         How far coordinates may go, softly.
     deadline
-        When the terminal set is to be reached, s; plans aim at it a tenth of a second sooner, and
-        look 0.06 s ahead at least.
+        When the terminal set is to be reached, s; plans aim at it a fifth of a second sooner.
     radius
         ν of the terminal set.
     names
@@ -190,10 +194,16 @@ class RealTimeIteration(_Task):
     ) -> None:
         super().__init__(mechanism, box, deadline, radius)
         self.ca, self._now = need("casadi", "compare"), now
-        self.names, self.values = tuple(names), parameters(mechanism, names)
+        self.names = tuple(names)
         self._build()
+        self.forget()
+
+    def forget(self) -> None:
+        """Start from cold, with the model's own parameters."""
         self._plan: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._since = 0.0
+        self._prices: dict[str, Any] = {}
+        self.values = parameters(self.mechanism, self.names)
 
     def _move(self, substeps: int) -> Any:
         """Return (x, v, h, p) -> x after h, with inputs in parts of their limits."""
@@ -238,7 +248,6 @@ class RealTimeIteration(_Task):
                 "ng": [b] * INTERVALS + [0], "inf": 1e4, "error_on_fail": False,
             }),
         ]  # fmt: skip
-        self._prices: dict[str, Any] = {}
         weights, scale = ca.MX.sym("w", z.numel()), ca.MX.sym("f")
         cost = ca.dot(weights, z**2) / 2 / scale
         self._nlp = ca.nlpsol("nlp", "ipopt", {
@@ -332,3 +341,81 @@ class RealTimeIteration(_Task):
         span = t - self._since + np.array([0.0, PERIOD])
         spent = np.stack([np.interp(span, nodes, column) for column in area.T])
         return np.asarray(np.diff(spent, axis=1)[:, 0] / PERIOD * self.limits)
+
+
+class Acados(RealTimeIteration):
+    """The same programme by acados (HPIPM), in a process of another Python that has it.
+
+    The first plan is the one of :class:`RealTimeIteration`; ``seconds`` are acados' own, without
+    the pipe.  Its model stays as it is.
+
+    Parameters
+    ----------
+    python
+        The other Python, with acados, CasADi and NumPy; a C compiler besides.
+    mechanism, box, deadline, radius
+        As for :class:`RealTimeIteration`.
+    """
+
+    def __init__(
+        self, python: str, mechanism: ut.Mechanism, box: Box, deadline: float, radius: float
+    ) -> None:
+        super().__init__(mechanism, box, deadline, radius)
+        ca, n, m = self.ca, 2 * mechanism.n, mechanism.m
+        x, v = ca.SX.sym("x", n), ca.SX.sym("v", m)
+        rates = dynamics(ca, mechanism)(x, v * self.limits)
+        server = Path(__file__).with_name("acados_server.py")
+        self._process = subprocess.Popen(
+            [python, str(server)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+            env=os.environ | {"LD_LIBRARY_PATH": self._libraries(python), "PYTHONPATH": ""},
+        )  # fmt: skip
+        self._size = self.size(mechanism.usual_start)
+        weights = self._weights(self.lengths)[n + m : n + m + len(self.boxed)] / self.lengths[0]
+        self._ask({
+            "rates": ca.Function("rates", [x, v], [rates]).serialize(), "n": n, "m": m,
+            "lengths": self.lengths.tolist(), "substeps": self.substeps.tolist(),
+            "weights": self.weights.tolist(), "boxed": self.boxed.tolist(),
+            "low": self.low[self.boxed].tolist(), "high": self.high[self.boxed].tolist(),
+            "out": weights.tolist(),
+        })  # fmt: skip
+
+    @staticmethod
+    def _libraries(python: str) -> str:
+        """Return where acados' libraries are: the loader wants to know before Python starts."""
+        find = "import acados, pathlib; print(pathlib.Path(acados.__path__[0]) / 'install/lib')"
+        done = subprocess.run([python, "-c", find], capture_output=True, text=True, check=False)
+        known = os.environ.get("LD_LIBRARY_PATH", "")
+        return os.pathsep.join(filter(None, [done.stdout.strip(), known]))
+
+    def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            print(json.dumps(question), file=self._process.stdin, flush=True)
+        line = self._process.stdout.readline()
+        if not line:
+            words = self._process.communicate()[1].strip().splitlines()
+            sys.exit(f"error: acados did not answer: {words[-1] if words else 'no words'}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def _step(self, z: FloatArray, x: FloatArray, lengths: FloatArray) -> tuple[FloatArray, bool]:
+        """Return what one real-time iteration of acados makes of z."""
+        states, inputs = self._unpacked(z)
+        end = self._weights(lengths)[-len(x) :]
+        found = self._ask({
+            "x": x.tolist(), "lengths": lengths.tolist(), "states": states.tolist(),
+            "inputs": inputs.tolist(), "end": end.tolist(),
+        })  # fmt: skip
+        self._spent = found["seconds"]
+        new = self._packed(np.array(found["states"]), np.array(found["inputs"]))
+        return new, found["good"] and bool(np.isfinite(new).all())
+
+    def plan(self, t: float, x: FloatArray) -> bool:
+        """Take one step towards the best plan from x; False where acados failed."""
+        self._spent = math.nan
+        good = super().plan(t, x)
+        if not math.isnan(self._spent):
+            self.seconds[-1] = self._spent
+        return good

@@ -268,7 +268,7 @@ class ShootingMPC:
         self.ca, self._now = need("casadi", "compare"), now
         self.mechanism, self.goal, self.radius = mechanism, goal, radius
         self.period, self.hold = period, hold
-        self.names, self.values = tuple(names), parameters(mechanism, names)
+        self.names = tuple(names)
         self._ends = ends(mechanism, box or {})
         self.limits = mechanism.input_limits
         self.P, self.K = riccati(mechanism, SLOW if goal == "energy" else 1.0)
@@ -332,7 +332,8 @@ class ShootingMPC:
     # -- a plan: states (N+1, 2n) and inputs (N, m) on the grid, and its length ------------------
 
     def forget(self) -> None:
-        """Drop the plan: the next one is found from cold."""
+        """Drop the plan and what was learnt: the next one is found from cold."""
+        self.values = parameters(self.mechanism, self.names)
         self._plan: tuple[FloatArray, FloatArray, float] | None = None
         self._since = 0.0
 
@@ -456,6 +457,29 @@ class DoMPC:
     ``"energy"``: N = 25 intervals of 0.1 s, ∫ uᵀu dt + xᵀPx at their end.
     ``"time"``: N = 25 intervals whose lengths are inputs too; least sum, in a box inside the
     terminal set at the end.
+
+    Parameters
+    ----------
+    mechanism
+        The controller's model.
+    goal
+        ``"energy"`` or ``"time"``.
+    radius
+        ν of the terminal set.
+    tolerance
+        IPOPT's.
+    now
+        Clock for the seconds of each planning.
+    members
+        Values of the parameters ``names`` on plants that are plausible, (K, p): the plan is then
+        a tree of K scenarios that part after the first interval (robust horizon 1), and their
+        mean cost counts.
+    names
+        What they are values of.
+    box
+        How far coordinates may go, softly.
+    regulator
+        Least energy: what x costs, besides, on the way and at the end.
     """
 
     INTERVALS, PERIOD = 25, 0.1
@@ -467,12 +491,18 @@ class DoMPC:
         radius: float = 0.01,
         tolerance: float = 1e-4,
         now: Clock = time.perf_counter,
+        members: FloatArray | None = None,
+        names: Sequence[str] = (),
+        box: Box | None = None,
+        regulator: Regulator | None = None,
     ) -> None:
         self.ca, do_mpc = need("casadi", "compare"), need("do_mpc", "compare")
         self._now = now
         if hasattr(self.ca.GlobalOptions, "setNumpyMode"):
             self.ca.GlobalOptions.setNumpyMode(-1)  # what do-mpc was written for
         self.mechanism, self.goal = mechanism, goal
+        P, K = riccati(mechanism, SLOW)
+        self.regulator = regulator or Regulator(K, np.zeros_like(P), P)
         self.seconds: list[float] = []
         self.iterations: list[int] = []
         self.failures = 0
@@ -480,7 +510,8 @@ class DoMPC:
         model = do_mpc.model.Model("continuous", "SX")
         x, u = model.set_variable("_x", "x", (n, 1)), model.set_variable("_u", "u", (m, 1))
         pace = model.set_variable("_u", "pace") if timed else 1.0
-        model.set_rhs("x", pace * rates(ca, mechanism, x, u))
+        free = {name: model.set_variable("_p", name) for name in names}
+        model.set_rhs("x", pace * rates(ca, mechanism, x, u, free))
         model.setup()
         mpc = do_mpc.controller.MPC(model)
         mpc.settings.n_horizon = self.INTERVALS
@@ -489,6 +520,19 @@ class DoMPC:
         mpc.settings.collocation_deg = 3
         mpc.settings.supress_ipopt_output()
         mpc.settings.nlpsol_opts.update({"ipopt.tol": tolerance, "ipopt.max_iter": 200})
+        if members is not None:
+            mpc.settings.n_robust = 1
+            tree = mpc.get_p_template(len(members))
+            for index, values in enumerate(members):
+                tree["_p", index] = values
+            mpc.set_p_fun(lambda _t: tree)
+        for low, high, state in zip(*ends(mechanism, box or {}), ca.vertsplit(x), strict=True):
+            for sign, end in ((1, high), (-1, -low)):
+                if math.isfinite(end):
+                    mpc.set_nl_cons(
+                        f"{state.name()}{'< >'[sign + 1]}", sign * state, ub=end,
+                        soft_constraint=True, penalty_term_cons=self._penalty(end),
+                    )  # fmt: skip
         limits = mechanism.input_limits[:, None]
         mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = -limits, limits
         if timed:
@@ -499,9 +543,10 @@ class DoMPC:
             mpc.terminal_bounds["upper", "x"] = inside
             mpc.set_rterm(u=0.0, pace=0.0)
         else:
-            P, _ = riccati(mechanism, SLOW)
+            P, Q = self.regulator.P, self.regulator.Q
             X, U = model.x["x"], model.u["u"]
-            mpc.set_objective(lterm=self.PERIOD * ca.sumsqr(U), mterm=ca.bilin(P, X, X))
+            stage = ca.sumsqr(U) + ca.bilin(Q, X, X)
+            mpc.set_objective(lterm=self.PERIOD * stage, mterm=ca.bilin(P, X, X))
             mpc.set_rterm(u=0.0)
         mpc.setup()
         self.mpc = mpc
@@ -520,8 +565,11 @@ class DoMPC:
         if self.goal == "time":
             return float(inputs[:, -1].mean())
         end = np.array(plan["_x", count, 0, -1]).ravel()
-        P, _ = riccati(self.mechanism, SLOW)
-        return float(self.PERIOD * np.sum(inputs**2) + end @ P @ end)
+        return float(self.PERIOD * np.sum(inputs**2) + end @ self.regulator.P @ end)
+
+    def _penalty(self, end: float) -> float:
+        """Return what leaving the box costs: a tenth of its width as much as the full input."""
+        return float(np.sum(self.mechanism.input_limits**2) / end * 10)
 
     def plan(self, _t: float, x: FloatArray) -> bool:
         """Plan from x; False when IPOPT failed."""

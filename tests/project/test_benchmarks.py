@@ -15,7 +15,7 @@ import undertow as ut
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))
-HELPERS = {"__main__", "builds", "harness", "rivals"}
+HELPERS = {"__main__", "builds", "harness", "rivals", "predictive", "acados_server"}
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
