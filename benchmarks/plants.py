@@ -19,7 +19,8 @@ every sample, however long that takes.  *learnt* is the same with the parameters
 do-mpc, robust horizon 1, over the ensemble of the belief's prior, ten times a second, energy alone.
 *acados* is the real-time iteration of acados, energy alone, where ``--acados`` or
 ``UNDERTOW_ACADOS`` names a Python that has it.  Predictive control keeps 90 % of the travel that a
-mechanism declares, softly.  Nobody is charged for computing; *plan* is the median of a planning.
+mechanism declares, softly.  Nobody is charged for computing; *plan* is the median processor time of
+a planning.
 
 Reached is ‖x‖ ≤ 0.01 by the deadline, 10 s for energy and 6 s for time; cost counts until then.
 *Lost* counts plants that met the singularity, left 95 % of the travel or leant by a right angle;
@@ -41,6 +42,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from time import process_time
 from typing import Any, Literal
 
 import numpy as np
@@ -220,10 +222,15 @@ def predictive(name: str, objective: str, controller: str, start: tuple[float, .
         members = members[:, [known.index(one) for one in names]]
         regulators = tuned(rig, start, RADIUS, deadline, tuple(room.items()))
         best = regulators.get("energy")
-        return DoMPC(rig, "energy", members=members, names=names, box=room, regulator=best)
+        return DoMPC(
+            rig, "energy", RADIUS, now=process_time, members=members, names=names, box=room,
+            regulator=best,
+        )  # fmt: skip
     if objective == "energy":
-        return RealTimeIteration(rig, room, deadline, RADIUS, names)
-    return ShootingMPC(rig, "time", RADIUS, period=PERIOD, hold=PERIOD, box=room, names=names)
+        return RealTimeIteration(rig, room, deadline, RADIUS, names, now=process_time)
+    return ShootingMPC(
+        rig, "time", RADIUS, now=process_time, period=PERIOD, hold=PERIOD, box=room, names=names
+    )
 
 
 def peers(task: Task, controller: str, plant: ut.Mechanism) -> tuple[str, float, float]:

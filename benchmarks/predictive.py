@@ -324,9 +324,9 @@ class RealTimeIteration(_Task):
     def _cold(self, x: FloatArray, lengths: FloatArray) -> tuple[FloatArray, bool]:
         """Return the first plan, converged: there is time for it before anything moves."""
         low, high = self._bounds(x)
-        parameters = [lengths, self.values, self._weights(lengths), [self._size]]
+        known = [lengths, self.values, self._weights(lengths), np.array([self._size])]
         found = self._nlp(
-            x0=self._packed(*self.guess(x)), p=np.concatenate(parameters),
+            x0=self._packed(*self.guess(x)), p=np.concatenate(known),
             lbg=self._below, ubg=self._above, lbx=low, ubx=high,
         )  # fmt: skip
         return np.array(found["x"]).ravel(), bool(self._nlp.stats()["success"])
