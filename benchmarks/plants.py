@@ -382,7 +382,7 @@ def main() -> int:
     if asked.acados:
         os.environ["UNDERTOW_ACADOS"] = asked.acados
     there = (*OURS, *PEERS, *(["acados"] if "UNDERTOW_ACADOS" in os.environ else []))
-    usual = OURS if asked.quick else there
+    usual = tuple(name for name in there if name != "scenario") if asked.quick else there
     controllers = tuple(asked.controller or usual)
     if "acados" in controllers and "acados" not in there:
         parser.error("acados needs --acados, a Python that has it")
@@ -394,7 +394,7 @@ def main() -> int:
     names = list(LARGER) if "all" in names else names
     angles = asked.angle or ([30.0] if asked.quick else [30.0, 37.0])
     factors = asked.start or ([1.0] if asked.quick and asked.mechanism else None)
-    aims = asked.objective or list(OBJECTIVES)
+    aims = asked.objective or list(OBJECTIVES)[: 1 if asked.quick else None]
     tasks = [
         Task(name, aim, tuple(map(float, x0)))
         for name in names
