@@ -285,12 +285,13 @@ def outcomes(job: Job, controllers: tuple[str, ...], seed: int, bounds: bool) ->
     return found
 
 
-def every(jobs: list[Job], run: Callable[[Job], list[Outcome]], workers: int) -> Iterator[Outcome]:
+def every(
+    jobs: list[Job], run: Callable[[Job], list[Outcome]], workers: int
+) -> Iterator[list[Outcome]]:
     """Run all jobs on all cores; what comes does not depend on how many there are."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        for some in progress(pool.map(run, jobs), "plants", len(jobs)):
-            yield from some
+        yield from progress(pool.map(run, jobs), "plants", len(jobs))
 
 
 def row(some: list[Outcome], kept: dict[int, float]) -> list[str]:
@@ -310,6 +311,19 @@ def row(some: list[Outcome], kept: dict[int, float]) -> list[str]:
     figures = [np.median(costs) / usual, np.median(over), np.quantile(over, 0.99), over.max()]
     cells += ["—" if math.isnan(value) else f"{value:.3f}" for value in figures]
     return [*cells, last]
+
+
+def shown(task: Task, here: list[Outcome], seed: str) -> None:
+    """Print the table of a task."""
+    header = ["", "reached", "lost", "median", "worst", "of kept's"]
+    header += ["over the bound", "99 %", "worst", "plan, ms"]
+    kept = {one.plant: one.cost for one in here if one.controller == "kept" and one.reached}
+    groups = [[o for o in here if o.controller == name] for name in CONTROLLERS]
+    unit = ut.objective_for(task.rig, task.objective).unit
+    plants = len({one.plant for one in here})
+    title = f"{task.mechanism}, {task.objective}, {unit}, from "
+    title += f"{state_words(task.rig, task.x0)}, {plants} plants, {seed}"
+    table(title, header, [row(group, kept) for group in groups if group])
 
 
 def starts(name: str, factors: list[float] | None, angles: list[float]) -> list[FloatArray]:
@@ -404,19 +418,14 @@ def main() -> int:
     uncertain(names)
     jobs = [(task, k) for task in tasks for k in range(plants)]
     run = partial(outcomes, controllers=controllers, seed=asked.seed, bounds=asked.bounds)
-    found = list(every(jobs, run, asked.workers))
-    if asked.out:
-        written(found, asked.out)
-    header = ["", "reached", "lost", "median", "worst", "of kept's"]
-    header += ["over the bound", "99 %", "worst", "plan, ms"]
-    for task in tasks:
-        here = [one for one in found if one.task == task]
-        kept = {one.plant: one.cost for one in here if one.controller == "kept" and one.reached}
-        groups = [[one for one in here if one.controller == name] for name in controllers]
-        unit = ut.objective_for(task.rig, task.objective).unit
-        title = f"{task.mechanism}, {task.objective}, {unit}, from "
-        title += f"{state_words(task.rig, task.x0)}, {plants} plants, seed {asked.seed}"
-        table(title, header, [row(group, kept) for group in groups if group])
+    found: list[Outcome] = []
+    for index, some in enumerate(every(jobs, run, asked.workers), 1):
+        found += some
+        if asked.out:
+            written(found, asked.out)
+        if index % plants == 0:
+            task = jobs[index - 1][0]
+            shown(task, [one for one in found if one.task == task], f"seed {asked.seed}")
     return 0
 
 

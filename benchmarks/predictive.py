@@ -167,6 +167,9 @@ def shifted(
 class RealTimeIteration(_Task):
     """Least energy by the deadline, one quadratic programme a sample.
 
+    Where that programme fails, or its steps have led to what is no number, IPOPT plans anew from
+    cold: ``failures`` counts how often.
+
     Parameters
     ----------
     mechanism
@@ -297,15 +300,19 @@ class RealTimeIteration(_Task):
             states, inputs, before = self._plan
             states, inputs = shifted(states, inputs, before, t - self._since, lengths)
             z, good = self._step(self._packed(states, inputs), x, lengths)
+            if not good:  # full steps may lead astray
+                self.failures += 1
+                z, good = self._cold(x, lengths)
         if good or self._plan is None:
             self._plan, self._since = (*self._unpacked(z), lengths), t
-        self.failures += not good
         self.seconds.append(self._now() - began)
         return good
 
     def _step(self, z: FloatArray, x: FloatArray, lengths: FloatArray) -> tuple[FloatArray, bool]:
         """Return the solution of one quadratic programme, linearised at z."""
         g, J = self._rows(z, lengths, self.values)
+        if not (np.isfinite(np.array(g)).all() and np.isfinite(np.array(J.nonzeros())).all()):
+            return z, False
         low, high = self._bounds(x)
         weights = self._weights(lengths)
         rest = np.array(g).ravel() - np.array(J @ z).ravel()
@@ -329,7 +336,8 @@ class RealTimeIteration(_Task):
             x0=self._packed(*self.guess(x)), p=np.concatenate(known),
             lbg=self._below, ubg=self._above, lbx=low, ubx=high,
         )  # fmt: skip
-        return np.array(found["x"]).ravel(), bool(self._nlp.stats()["success"])
+        new = np.array(found["x"]).ravel()
+        return new, bool(self._nlp.stats()["success"]) and bool(np.isfinite(new).all())
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at t, for one sample; after a failure what was planned."""
