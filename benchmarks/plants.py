@@ -12,12 +12,12 @@ learnt as it goes, every 20 ms.  Their law acts continuously.
 
 *lqr* is clipped linear-quadratic feedback, continuous too, the best on the model of 39 weights,
 by hindsight.  *predictive* plans anew a hundred times a second and holds its input in between: for
-energy the real-time iteration (multiple shooting to the deadline, one Gauss-Newton programme a
-sample, warm-started; CasADi), for time multiple shooting with a free final time, converged by IPOPT at
-every sample, however long that takes.  *learnt* is the same with the parameters that the library's
-``Belief.learn`` finds in the motion so far.  *scenario* is multi-stage predictive control in
-do-mpc, robust horizon 1, over the ensemble of the belief's prior, ten times a second, energy alone.
-*acados* is the real-time iteration of acados, energy alone, where ``--acados`` or
+energy the real-time iteration in CasADi (multiple shooting to the deadline, one Gauss-Newton
+programme a sample, warm-started), for time multiple shooting with a free final time, converged by
+IPOPT at every sample, however long that takes.  *learnt* is the same with the parameters that the
+library's ``Belief.learn`` finds in the motion so far.  *scenario* is multi-stage predictive control
+in do-mpc, robust horizon 1, over the ensemble of the belief's prior, ten times a second, energy
+alone.  *acados* is the real-time iteration of acados, energy alone, where ``--acados`` or
 ``UNDERTOW_ACADOS`` names a Python that has it.  Predictive control keeps 90 % of the travel that a
 mechanism declares, softly.  Nobody is charged for computing; *plan* is the median processor time of
 a planning.
