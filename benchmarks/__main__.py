@@ -21,11 +21,8 @@ CLOCKED = (
     "kernel", "budget", "tail", "growth", "searchers", "reoptimise", "closed_loop", "gap",
     "admission",
 )  # fmt: skip
-OTHERS = sorted(
-    path.stem
-    for path in HERE.glob("*.py")
-    if path.stem not in (*CLOCKED, "__main__", "builds", "harness", "rivals")
-)
+HELPERS = ("__main__", "builds", "harness", "rivals", "predictive", "acados_server")
+OTHERS = sorted(path.stem for path in HERE.glob("*.py") if path.stem not in (*CLOCKED, *HELPERS))
 NAMES = (*CLOCKED, *OTHERS)
 
 

@@ -27,17 +27,15 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import sympy as sp
 
 import undertow as ut
-from rivals import DoMPC, Outcome, Plant, ShootingMPC
+from rivals import DoMPC, Outcome, Plant, ShootingMPC, tuned
 from undertow.base import UndertowError
-from undertow.models import FloatArray, Parameter, linearise
+from undertow.models import FloatArray, Parameter
 
 HORIZON, RADIUS = 60.0, 0.01
 
@@ -98,29 +96,6 @@ def scenes() -> dict[str, Scene]:
         "rotary-41": Scene(rotary, at(41), ("m",), "theta", 0.02, 0.05, "phi"),
         "rotary-25": Scene(rotary, at(25), ("m",), "theta", 0.02, 0.05, "phi"),
         "cart-20": Scene(cart, at(20), ("m_p",), "x", 0.5, 0.01, "phi"),
-    }
-
-
-@lru_cache(maxsize=16)
-def tuned(scene: Scene) -> dict[str, FloatArray]:
-    """Return the gains of the LQRs of least energy and of least time on the model."""
-    rig = scene.rig
-    lin, plant = linearise(rig), Plant(rig, RADIUS, HORIZON)
-    found: list[tuple[Outcome, FloatArray]] = []
-    grid = [(w, a) for w in np.logspace(-3, 3, 13) for a in (0.1, 1.0, 10.0)]
-    for weight, actuated in progress(grid, "LQR weights"):
-        Q = weight * np.eye(2 * rig.n)
-        Q[0, 0] *= actuated
-        P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, np.eye(rig.m))
-        K = np.asarray(lin.input.T @ P, dtype=float)
-        outcome = plant.regulated(scene.x0, K)
-        if outcome.reached:
-            found.append((outcome, K))
-    if not found:
-        return {}
-    return {
-        "energy": min(found, key=lambda pair: pair[0].energy)[1],
-        "time": min(found, key=lambda pair: pair[0].time)[1],
     }
 
 
@@ -199,8 +174,8 @@ def controllers(
         return (truth if mpc.goal == "energy" else hasty).held(scene.x0, mpc), mpc.seconds
 
     def regulated(goal: str) -> Result:
-        gains = tuned(scene)
-        return (truth.regulated(scene.x0, gains[goal]) if gains else None), []
+        found = tuned(scene.rig, tuple(scene.x0), RADIUS, HORIZON)
+        return (truth.regulated(scene.x0, found[goal].K) if found else None), []
 
     energy, time = ut.MinimumEnergy(horizon=HORIZON), ut.MinimumTime(horizon=PATIENCE)
     everything: dict[str, Callable[[], Result]] = {

@@ -15,7 +15,7 @@ import undertow as ut
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))
-HELPERS = {"__main__", "builds", "harness", "rivals"}
+HELPERS = {"__main__", "builds", "harness", "rivals", "predictive", "acados_server"}
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -42,6 +42,14 @@ def rivals(harness: ModuleType) -> ModuleType:
     import rivals
 
     return rivals
+
+
+@pytest.fixture
+def predictive(rivals: ModuleType) -> ModuleType:
+    """Predictive control at 100 Hz."""
+    import predictive
+
+    return predictive
 
 
 def test_the_one_command_knows_every_benchmark() -> None:
@@ -121,10 +129,54 @@ def test_predictive_control_of_least_time_is_near_the_bound(
     assert 0.98 * least < outcome.time < 1.15 * least
 
 
+@pytest.mark.parametrize("span", [0.01, 0.3, 0.6, 2.0, 9.8])
+def test_the_intervals_of_a_plan_fill_its_span(predictive: ModuleType, span: float) -> None:
+    lengths = predictive.grid(span)
+    assert len(lengths) == predictive.INTERVALS
+    assert abs(lengths.sum() - span) < 1e-12
+    assert (np.diff(lengths) > -1e-12).all()
+    assert lengths.max() <= max(predictive.LONGEST, 1.5 * span / predictive.INTERVALS) + 1e-9
+
+
+def test_a_real_time_iteration_stays_at_a_converged_plan(
+    predictive: ModuleType, rig: ut.Mechanism
+) -> None:
+    x = rig.state(phi=ut.deg(20))
+    control = predictive.RealTimeIteration(rig, {"phi": (-1.5, 1.5)}, 3.0)
+    assert control.plan(0.0, x)
+    before = control._plan
+    assert control.plan(0.0, x)
+    assert control.failures == 0
+    np.testing.assert_allclose(control._plan[0], before[0], atol=1e-4)
+    np.testing.assert_allclose(control._plan[1], before[1], atol=1e-4)
+
+
+def test_what_predictive_control_learns_is_the_librarys_belief(
+    predictive: ModuleType, rivals: ModuleType, rig: ut.Mechanism
+) -> None:
+    belief = ut.Belief.relative(rig, m=0.2, d_e=0.5)
+    m, damping = (p.value for p in rig.parameters if p.name in ("m", "d_e"))
+    plant = rig.with_parameters(m=1.15 * m, d_e=0.7 * damping)
+    control = predictive.RealTimeIteration(
+        rig, {"phi": (-1.5, 1.5)}, 3.0, names=tuple(belief.tolerances)
+    )
+    wrapped = predictive.Sampled(control, rig.input_limits, belief)
+    outcome = rivals.Plant(plant, 0.01, 3.0).held(rig.state(phi=ut.deg(30)), wrapped)
+    assert outcome.event == "REACHED"
+    np.testing.assert_allclose(control.values, [1.15 * m, 0.7 * damping], rtol=0.03)
+
+
+def test_a_plant_that_leaves_its_box_is_lost(rivals: ModuleType, rig: ut.Mechanism) -> None:
+    plant = rivals.Plant(rig, 0.01, 3.0, {"phi": (-1.0, 1.0)})
+    outcome = plant.held(rig.state(phi=ut.deg(30)), lambda _t, _x: np.zeros(1))
+    assert outcome.event == "CONSTRAINT"
+    assert outcome.time < 1.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(SCRIPTS) - HELPERS))
 def test_quick_run(name: str) -> None:
-    if name in ("kernel", "reoptimise", "closed_loop", "gap", "searchers"):
+    if name in ("kernel", "reoptimise", "closed_loop", "gap", "searchers", "plants"):
         pytest.importorskip("casadi")
     finished = run(str(FOLDER / f"{name}.py"), "--quick")
     assert finished.returncode == 0, finished.stderr

@@ -1,0 +1,109 @@
+"""The real-time iteration of acados behind two pipes: what predictive.py starts in another Python.
+
+acados comes without the library, and the library without acados: this file needs acados, CasADi
+and NumPy alone, and a C compiler.  Each line in is a JSON object and is answered by one: the first
+describes the problem, each further one is a sample.  ``pip install comma-deps-acados casadi`` makes
+a Python that can run it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+
+def template() -> Any:
+    """Return acados' Python interface, from wherever its wheel has put it."""
+    with contextlib.suppress(ImportError):
+        return importlib.import_module("acados_template")
+    root = Path(importlib.import_module("acados").__path__[0])
+    installed = root / "install"
+    os.environ["ACADOS_SOURCE_DIR"] = str(installed)
+    os.environ["PATH"] = f"{installed / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    expected = installed / "interfaces" / "acados_template" / "acados_template"
+    if not expected.exists():
+        expected.parent.mkdir(parents=True, exist_ok=True)
+        expected.symlink_to(root / "acados_template")
+    sys.path.insert(0, str(root))
+    return importlib.import_module("acados_template")
+
+
+def programme(acados: Any, asked: dict[str, Any]) -> Any:
+    """Return acados' solver for a problem."""
+    import casadi as ca
+    import numpy as np
+
+    n, m, grid = asked["n"], asked["m"], np.array(asked["lengths"])
+    x, v, slope = ca.SX.sym("x", n), ca.SX.sym("v", m), ca.SX.sym("slope", n)
+    rates = ca.Function.deserialize(asked["rates"])(x, v)
+    ocp, model = acados.AcadosOcp(), acados.AcadosModel()
+    model.name, model.x, model.u, model.xdot = "rig", x, v, slope
+    model.f_expl_expr, model.f_impl_expr = rates, slope - rates
+    ocp.model, ocp.dims.N = model, len(grid)
+    cost, limits, options = ocp.cost, ocp.constraints, ocp.solver_options
+    cost.cost_type, cost.cost_type_e = "LINEAR_LS", "LINEAR_LS"
+    cost.Vx, cost.Vu, cost.Vx_e = np.zeros((m, n)), np.eye(m), np.eye(n)
+    cost.W, cost.W_e = 2 * np.diag(asked["weights"]), np.eye(n)
+    cost.yref, cost.yref_e = np.zeros(m), np.zeros(n)
+    limits.x0, limits.idxbu = np.zeros(n), np.arange(m)
+    limits.lbu, limits.ubu = -np.ones(m), np.ones(m)
+    boxed = np.array(asked["boxed"], dtype=int)
+    if len(boxed):
+        limits.idxbx, limits.idxsbx = boxed, np.arange(len(boxed))
+        limits.lbx, limits.ubx = np.array(asked["low"]), np.array(asked["high"])
+        cost.zl = cost.zu = np.zeros(len(boxed))
+        cost.Zl = cost.Zu = np.array(asked["out"])
+    options.tf, options.time_steps = float(grid.sum()), grid
+    options.qp_solver, options.hessian_approx = "PARTIAL_CONDENSING_HPIPM", "GAUSS_NEWTON"
+    options.integrator_type, options.sim_method_num_stages = "ERK", 4
+    options.sim_method_num_steps = np.array(asked["substeps"])
+    options.nlp_solver_type, options.print_level = "SQP_RTI", 0
+    return acados.AcadosOcpSolver(ocp, json_file="rig.json")
+
+
+def sample(solver: Any, asked: dict[str, Any]) -> dict[str, Any]:
+    """Take one real-time iteration."""
+    import numpy as np
+
+    states, inputs = np.array(asked["states"]), np.array(asked["inputs"])
+    solver.set_new_time_steps(np.array(asked["lengths"]))
+    solver.cost_set(len(inputs), "W", np.diag(asked["end"]))
+    for k, state in enumerate(states):
+        solver.set(k, "x", state)
+    for k, value in enumerate(inputs):
+        solver.set(k, "u", value)
+    for bound in ("lbx", "ubx"):
+        solver.set(0, bound, np.array(asked["x"]))
+    began = time.perf_counter()
+    status = solver.solve()
+    seconds = time.perf_counter() - began
+    return {
+        "states": [solver.get(k, "x").tolist() for k in range(len(states))],
+        "inputs": [solver.get(k, "u").tolist() for k in range(len(inputs))],
+        "good": status == 0,
+        "seconds": seconds,
+    }
+
+
+def main() -> int:
+    """Answer line by line until there are no more."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what compilers and acados print
+    acados = template()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        solver = programme(acados, json.loads(sys.stdin.readline()))
+        print(json.dumps({"ready": True}), file=answers, flush=True)
+        for line in sys.stdin:
+            print(json.dumps(sample(solver, json.loads(line))), file=answers, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
