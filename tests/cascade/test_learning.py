@@ -140,9 +140,11 @@ def test_a_plant_that_changes_while_it_runs(pendulum: ut.Mechanism) -> None:
     for part in ({"m": 1.0}, {"a_e": -0.4}):
         plant = changed(pendulum, part)
         seen: list[float] = []
-        run = cascade.simulate(
-            phi=0.5, plant={0.31: plant}, progress=lambda t, _, seen=seen: seen.append(t)
-        )
+
+        def note(t: float, _total: float, seen: list[float] = seen) -> None:
+            seen.append(t)
+
+        run = cascade.simulate(phi=0.5, plant={0.31: plant}, progress=note)
         assert run.reached
         assert 0.31 in np.round(seen, 9)
         before = ut.ClosedLoop(pendulum, cascade.objective).simulate(

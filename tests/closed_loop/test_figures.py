@@ -127,7 +127,7 @@ def test_a_motion_figure_shows_all_of_every_motion(motion: ut.Trajectory) -> Non
     for axes, name in ((theta, "theta"), (phi, "phi")):
         for line, run in zip(axes.lines, (motion, short), strict=True):
             np.testing.assert_array_equal(line.get_xdata(), run.t)
-            np.testing.assert_allclose(line.get_ydata(), np.degrees(run[name]))
+            np.testing.assert_allclose(np.asarray(line.get_ydata()), np.degrees(run[name]))
     for line, run in zip(voltage.lines, (motion, short), strict=True):
         np.testing.assert_array_equal(line.get_ydata(), run.u[:, 0])
     assert [axes.get_xlabel() for axes in figure.axes] == ["", "", "time (s)"]

@@ -99,7 +99,8 @@ def test_linear_models_are_those_of_the_law_and_the_plant(n: int, m: int, member
     end = TerminalLinearModel(belief, objective, ensemble)
     assert end.stage is not None
     assert end.stage.rest == pytest.approx(2.0)
-    end._blocks = SimpleNamespace(double=lambda *_: None)  # the model alone
+    blocks: Any = SimpleNamespace(double=lambda *_: None)  # the model alone
+    end._blocks = blocks
     reaching = ut.ReachingLaw(tuple(2.0 + k for k in range(m)), tuple(0.5 + k for k in range(m)))
     surfaces = [random_surface(n, m, seed) for seed in range(LANES)]
     law_vectors = np.stack(

@@ -531,7 +531,9 @@ def test_a_notebook_shows_the_equation_of_a_surface() -> None:
         ("+10", "q_u"),
     ):
         assert rf"{number}\,{what}" in latex
-    surface = ut.Surface([[-1, 0.5], [0, -2]], -np.eye(2), [[3], [4]], [[5], [6]])
+    surface = ut.Surface(
+        np.array([[-1, 0.5], [0, -2]]), -np.eye(2), np.array([[3], [4]]), np.array([[5], [6]])
+    )
     latex = surface._repr_latex_()
     assert r"{pmatrix} -1 & 0.5 \\ 0 & -2 \end{pmatrix}\,\dot{q}_a" in latex
     assert r"{pmatrix} 5 \\ 6 \end{pmatrix}\,q_u" in latex

@@ -234,7 +234,7 @@ def test_quadratic_design_minimises_its_integral_on_the_surface(n: int, m: int) 
     """
     mechanism = random_mechanism(n, m, np.random.default_rng([n, m, 4]))
     weights = np.linspace(0.5, 2.0, 2 * n)
-    best = ut.first_surface(mechanism, weights)
+    best = ut.first_surface(mechanism, weights.tolist())
     unmoved = scipy.linalg.null_space(linearise(mechanism).input.T).T
 
     def cost(vector: NDArray[Any]) -> float:
