@@ -207,3 +207,12 @@ def test_what_makes_no_belief() -> None:
         Belief(rig, {"m": 0.01}, risk="median")  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match="another object"):
         ut.Cascade(rig, belief=Belief(ut.mechanisms.rotary_pendulum(), {"m": 0.01}))
+
+
+def test_noise_has_the_scale_of_each_coordinate() -> None:
+    """By default a part of what full inputs do in 2 ms; where they do nothing, a number."""
+    rig = ut.mechanisms.overhead_crane()
+    full = rig.accelerations(0.0, np.zeros(4), rig.input_limits)
+    np.testing.assert_allclose(Belief(rig, {}).deviations, 1e-5 * np.abs(full), rtol=1e-12)
+    assert Belief(ut.mechanisms.ball_and_beam(), {}).deviations[1] == 0.004
+    np.testing.assert_array_equal(Belief(rig, {}, noise=0.01).deviations, [0.01, 0.01])

@@ -38,9 +38,6 @@ LEAST = 0.2
 USUAL = {"kg": 0.2, "kg m²": 0.2, "m": 0.05, "N m s/rad": 0.5, "N s/m": 0.5}
 OTHERS, EXACT = 0.1, ("", "m/s²")
 
-#: Usual deviations of a change of velocity over a sample, by the unit of the coordinate.
-NOISE = {"rad": 0.004, "m": 0.001}
-
 #: How many axes of what is uncertain span an ensemble, at most: those that matter most.
 AXES = 7
 
@@ -49,6 +46,9 @@ AXES = 7
 SLIPS = 8
 SLIP_OF_SURFACE = 1e-3
 SLIP_OF_STATE = {"rad": 1e-3, "m": 1e-4}
+#: Half a percent of the change of velocity over 2 ms at full inputs, s, is noise; and the noise of
+#: what no input moves at the target, rad/s or m/s.
+SMALL, UNDRIVEN = 0.005 * 0.002, 0.004
 
 #: Relative step of the differences by which accelerations are linearised in the parameters.
 STEP = 1e-5
@@ -103,8 +103,9 @@ class Belief:
         Names of uncertain parameters and how far they may be off, SI units.
     noise
         Standard deviation of how a velocity changes over one sample beyond what the model says, in
-        the units of the velocities: one number, or one for each coordinate.  The usual 0.004 rad/s
-        (0.001 m/s) over a sample of 2 ms is 2 rad/s² (0.5 m/s²).
+        the units of the velocities: one number, or one for each coordinate.  By default half a
+        percent of what the full inputs do to each of them in 2 ms at the target: 0.004 rad/s for
+        the rotary pendulum's, 0.0001 m/s for the cart of a crane.
     confidence
         How many standard deviations from the estimate the members of the ensemble stand; a
         deviation counts as a fifth of the tolerance at least.
@@ -152,7 +153,7 @@ class Belief:
                     f"{parameter.value:g} leaves",
                     remedy="Leave certain parameters out",
                 )
-        noise = self.deviations if self.noise is None else np.asarray(self.noise, dtype=float)
+        noise = np.asarray(1.0 if self.noise is None else self.noise, dtype=float)
         if (
             noise.shape not in ((), (self.mechanism.n,))
             or not (np.isfinite(noise) & (noise > 0)).all()
@@ -191,12 +192,17 @@ class Belief:
                 found[p.name] = tolerance
         return cls(mechanism, found)
 
-    @property
+    @cached_property
     def deviations(self) -> FloatArray:
         """Standard deviations of the changes of velocity, (n,)."""
-        if self.noise is None:
-            return np.array([NOISE[c.unit] for c in self.mechanism.coordinates])
-        return np.broadcast_to(np.asarray(self.noise, dtype=float), self.mechanism.n)
+        if self.noise is not None:
+            return np.broadcast_to(np.asarray(self.noise, dtype=float), self.mechanism.n)
+        limits, rest = self.mechanism.input_limits, np.zeros(2 * self.mechanism.n)
+        full = np.diag(np.where(np.isfinite(limits), limits, 1.0))
+        still = self.mechanism.accelerations(0.0, rest, 0.0 * limits)
+        driven = sum(np.abs(self.mechanism.accelerations(0.0, rest, u) - still) for u in full)
+        scale = SMALL * np.asarray(driven, dtype=float)
+        return np.where(scale > 0, scale, UNDRIVEN)
 
     @cached_property
     def _places(self) -> list[int]:
