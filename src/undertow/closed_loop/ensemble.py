@@ -194,4 +194,4 @@ def _dearest(costs, weights, tail):  # type: ignore[no-untyped-def]
         part = min(weights[k], left)
         total += part * costs[k]
         left -= part
-    return total / (tail - left)
+    return total / tail
