@@ -408,7 +408,7 @@ def main() -> int:
     names = list(LARGER) if "all" in names else names
     angles = asked.angle or ([30.0] if asked.quick else [30.0, 37.0])
     factors = asked.start or ([1.0] if asked.quick and asked.mechanism else None)
-    aims: Any = asked.objective or list(OBJECTIVES)[: 1 if asked.quick else None]
+    aims: list[Any] = asked.objective or list(OBJECTIVES)[: 1 if asked.quick else None]
     tasks = [
         Task(name, aim, tuple(map(float, x0)))
         for name in names
