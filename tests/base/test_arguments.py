@@ -72,6 +72,7 @@ def parts() -> dict[str, Any]:
     joint = ut.modelling.Joint("a", "hinge", "world", "arm")
     tree = ut.modelling.read_urdf(URDF)[0]
     motor = ut.modelling.DCMotor(1.0, 1.0)
+    reference = ut.Reference.sine(1.0, theta=0.1)
     return {
         "Belief": belief, "Budget": budget, "Cascade": cascade, "ClosedLoop": loop,
         "Mechanism": rig,
@@ -84,6 +85,10 @@ def parts() -> dict[str, Any]:
         "ReachingLaw": ut.ReachingLaw(), "Run": run, "Surface": surface,
         "SlidingModeLaw": ut.SlidingModeLaw(rig, surface), "Trajectory": run.trajectory,
         "MechanismReport": ut.check_mechanism(rig, samples=1, compiled=False),
+        "SetPoints": ut.SetPoints({"theta": 0.1}), "Reference": reference,
+        "points": {"theta": 0.1}, "paths": dict(reference.paths), "names": ["theta"],
+        "target": {"theta": 0.1}, "motion": reference.legs(rig, 0.05)[0][1], "frequency": 1.0,
+        "times": [0.0, 1.0],
         "Tree": tree, "Link": link, "Joint": joint, "DCMotor": motor,
         "Actuator": ut.modelling.Actuator("u", {"a": 1.0}),
         "Coupling": ut.modelling.Coupling("c", {"a": 1.0}),
@@ -150,6 +155,8 @@ def kane() -> tuple[Any, dict[Any, ut.Input]]:
 ELSEWHERE: dict[str, Callable[[], Any]] = {
     "ClosedLoop.with_steps.step": lambda: 0.002,
     "ClosedLoop.with_steps.tail_rtol": lambda: 1e-3,
+    "Cascade.about.target": lambda: None,
+    "Reference.read.path": lambda: "path.csv",
     "Belief.relative.tolerances": lambda: {"m": 0.1},
     "Belief.learn.t": lambda: [0.0, 0.1],
     "Belief.learn.x": lambda: np.zeros((2, 4)),

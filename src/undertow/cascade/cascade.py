@@ -503,6 +503,7 @@ class Cascade:
     def _loops_about(self) -> LoopsAbout:
         return LoopsAbout(self.mechanism, self.objective)
 
+    @checked
     def about(self, loop: ClosedLoop, target: ReferenceMotion | None, t: float) -> ClosedLoop:
         """A loop of this cascade about a target, as it is at the time t."""
         return loop if target is None else self._loops_about.loop(loop, target.position(t))
@@ -647,6 +648,7 @@ class Cascade:
         """
         return self.retarget_to(state, self.mechanism.check_state(x), self._target_at(target, t), t)
 
+    @checked
     def retarget_to(
         self, state: CascadeState, x: FloatArray, motion: ReferenceMotion, t: float
     ) -> tuple[CascadeState, Proposal]:
@@ -658,15 +660,17 @@ class Cascade:
 
     def _target_at(self, target: Target | Mapping[str, float], t: float) -> ReferenceMotion:
         """The leg of a target that is in force at the time t."""
+        positive("time of a target, s", t, "0 is the start", zero=True)
         legs = legs_of(self.mechanism, self.objective, target, t + self.objective.horizon)
         return [motion for begin, motion in legs if begin <= t][-1]
 
+    @checked
     def start_to(
         self, x: FloatArray, target: ReferenceMotion | None = None, t: float = 0.0
     ) -> tuple[CascadeState, Proposal]:
         """:meth:`start` towards a leg of a target, which was checked before."""
         if target is not None:
-            x = x - target.state(t)
+            x = self.mechanism.check_state(x) - target.state(t)
         here = self.about(self.loop, target, t)
         here.objective.check_start(here.mechanism, x)
         known = None if self.known is None else self.known.prior

@@ -266,6 +266,7 @@ class Belief:
         weights[: 1 + SLIPS] = (1.0 - expected) / (1 + SLIPS)
         return self._slipping(self.values(offsets), weights)
 
+    @checked
     def alone(self, estimate: ParameterEstimate) -> Ensemble:
         """Return an ensemble of the estimate alone, with small errors of state and surface."""
         values = self.values(np.tile(estimate.offset, (1 + SLIPS, 1)))

@@ -35,7 +35,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, checked, floats, one_of, positive, read_file
+from undertow.base import (
+    InvalidInputError,
+    check_fields,
+    checked,
+    floats,
+    one_of,
+    positive,
+    read_file,
+)
 from undertow.models import (
     FloatArray,
     Mechanism,
@@ -167,6 +175,7 @@ class SetPoints:
 
     def __post_init__(self) -> None:
         """Write a mapping as one point, and check times."""
+        check_fields(self)
         given: Any = self.points
         pairs = [(0.0, given)] if isinstance(given, Mapping) else list(given)
         if not all(
@@ -204,8 +213,9 @@ class SetPoints:
         """When each is asked for, s."""
         return tuple(t for t, _ in self.pairs)
 
+    @checked
     def legs(
-        self, mechanism: Mechanism, _seconds: float
+        self, mechanism: Mechanism, seconds: float
     ) -> tuple[tuple[float, ReferenceMotion], ...]:
         """Return when each set-point begins, s, the first at 0, and where it is.
 
@@ -215,6 +225,7 @@ class SetPoints:
             For a name that the mechanism has not, a velocity that is not zero, and a position where
             it does not rest.
         """
+        del seconds  # a rest lasts
         q, found = np.zeros(mechanism.n), []
         names = [c.name for c in mechanism.coordinates]
         if self.times[0] > 0:
@@ -367,6 +378,19 @@ class Reference:
     paths: Mapping[str, ReferencePath]
     period: float = 0.0
 
+    def __post_init__(self) -> None:
+        """Refuse what is no function of time."""
+        check_fields(self)
+        positive("period of a reference, s", self.period, "0 never repeats", zero=True)
+        for name, path in by_names("paths of a reference", self.paths).items():
+            if not callable(path):
+                raise InvalidInputError(
+                    f"path of '{name}'",
+                    value=repr(path)[:80],
+                    limit="a function of times that returns r, its velocity and its acceleration",
+                    remedy=f"Reference.of({name}=function) differentiates one that returns r alone",
+                )
+
     @classmethod
     @checked
     def sine(cls, frequency: float, **amplitudes: float) -> Self:
@@ -447,6 +471,7 @@ class Reference:
             f"Reference({', '.join(self.paths)}{f', period={self.period:g} s' * (self.period > 0)})"
         )
 
+    @checked
     def legs(
         self, mechanism: Mechanism, seconds: float
     ) -> tuple[tuple[float, ReferenceMotion], ...]:

@@ -376,6 +376,7 @@ class Objective:
         constraints = own + declared
         return self if constraints == self.constraints else replace(self, constraints=constraints)
 
+    @checked
     def about(self, mechanism: Mechanism, names: Sequence[str]) -> Self:
         """Return the problem in the error from a target that lies elsewhere along some coordinates.
 
@@ -520,6 +521,7 @@ class Objective:
             for c in self.constraints
         ]
 
+    @checked
     def boxes(self, mechanism: Mechanism) -> tuple[tuple[int, float], ...]:
         """Return which state each constraint bounds, and how far large steps stay from the bound.
 
