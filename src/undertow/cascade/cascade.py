@@ -83,6 +83,9 @@ RESOLVED = 1.0
 #: that jumps shows in positions at once; what a model does not know shows in velocities first.
 JUMP, PART = 0.1, 0.5
 
+#: How far an estimate moves, in tolerances, before what was planned with it is planned anew.
+NEWS = 0.1
+
 #: How often what a motion shows is learnt, about, s.
 LEARNING = 0.02
 
@@ -887,6 +890,13 @@ class Cascade:
             return True
         return self._survives(loop, state.error(t, self.mechanism.check_state(x)), state.at(t))
 
+    @staticmethod
+    def _news(before: ParameterEstimate | None, now: ParameterEstimate | None) -> bool:
+        """Whether so much was learnt since a decision that it is worth another one."""
+        if before is None or now is None:
+            return False
+        return bool(np.abs(now.offset - before.offset).max() > NEWS)
+
     def _survives(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
         event = loop.batch(error, plan, duration=2 * self.period).event[0]
         return event in (Event.HORIZON, Event.REACHED)
@@ -997,12 +1007,14 @@ class Cascade:
         admission = self.first_admission(memory, x, total)
         updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
         pieces: list[Trajectory] = []
-        since = 0  # the last decision, in pieces
+        since, planned_with = 0, memory.estimate  # the last decision, in pieces
         for t, span, due in self._moments(total, truths):
             changed = truths.get(round(t / self._stride))
             if changed is not None and t > 0:
                 truth = changed.believing(self.loop_at(memory).mechanism)
-            if t > 0 and (due or not self.survives(memory, x, t)):
+            news = self._news(planned_with, memory.estimate)
+            if t > 0 and (due or news or not self.survives(memory, x, t)):
+                planned_with = memory.estimate
                 proposal = self._propose(memory, x, t, total - t)
                 memory, admission = self.apply_gate(memory, proposal, x, total - t)
                 spent = sum(piece.cost for piece in pieces[since:])
