@@ -270,6 +270,30 @@ def test_what_is_too_fast_for_large_steps_takes_small_ones_first(rig: ut.Mechani
     assert large.steps[0] < 0.5 * small.steps[0]
 
 
+def test_what_breaks_a_bound_is_not_tried_again(rig: ut.Mechanism) -> None:
+    """An end in small steps is an end: one call of each kernel, and the event is kept."""
+    box = ut.state_box(phi=0.5)
+    loop = ClosedLoop(rig, ut.MinimumEnergy(constraints=box), tail_rtol=TAIL_RTOL)
+    assert loop.takes_large_steps
+    kernels, calls = loop._kernels, list[str]()
+
+    def rollout(*args: Any) -> None:
+        calls.append("small")
+        kernels.rollout.py_func(*args)
+
+    def etd_integrate(*args: Any) -> None:
+        calls.append("large")
+        kernels.etd_integrate.py_func(*args)
+
+    counted = SimpleNamespace(rollout=rollout, etd_integrate=etd_integrate)
+    object.__setattr__(loop, "_kernels", counted)
+    quick = ut.Surface(-1, -1.59, 1.96, 12.1)
+    found = loop.batch(rig.state(phi=0.6), quick, duration=2.0)
+    assert found.event[0] == Event.CONSTRAINT
+    assert found.time[0] == 0.0
+    assert calls == ["small", "large"]
+
+
 def test_a_fast_pass_through_the_terminal_set_is_seen(rig: ut.Mechanism) -> None:
     """The chord of a step counts: a pass between two samples is an arrival, whatever the step."""
     surface = ut.Surface(-1, -3.6, 1.38, 9.07)

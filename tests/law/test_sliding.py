@@ -392,6 +392,16 @@ def test_a_surface_in_other_units_is_the_same_surface(n: int, m: int) -> None:
     np.testing.assert_allclose(other.margin, one.margin, rtol=1e-9)
 
 
+def test_demands_beyond_all_numbers_keep_their_sign() -> None:
+    """The law of the rotary pendulum is odd, and stays so where its demand overflows."""
+    law = limited_law("saturation")
+    x = np.random.default_rng(3).uniform(-1, 1, (200, 4)) * [0.3, 0.3, 0.0, 1e160]
+    one, other = law(0.0, x), law(0.0, -x)
+    assert (np.abs(one.demand) > 1e299).any()
+    np.testing.assert_array_equal(one.u, -other.u)
+    assert (np.abs(one.u) == 15.0).any()
+
+
 def test_what_is_not_a_number_in_the_end_is_no_input() -> None:
     """∞ − ∞ in the law gives no force at all, in NumPy as in the compiled step."""
     law = limited_law("saturation")

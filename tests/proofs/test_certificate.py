@@ -39,7 +39,7 @@ from undertow.proofs.claims.reaching import reaching
 from undertow.proofs.claims.region import reaches
 from undertow.proofs.claims.stability import StabilityClaim, hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
-from undertow.proofs.claims.verify import proved_sets, verify
+from undertow.proofs.claims.verify import match, proved_sets, verify
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.terminal import TerminalSet
 from undertow.proofs.gate import Policy, assess
@@ -324,6 +324,8 @@ def test_another_model_is_refused(written: bytes) -> None:
     # By name alone the file's parameters count, and the proof is about them.
     checked = verify(Certificate.from_bytes(edited(written, only("stability"))), heavier)
     assert checked[0].verdict
+    certified = match(certificate, heavier)
+    assert {p.name: p.value for p in certified.parameters}["m"] == 0.125
 
 
 def test_a_parameter_changed_and_signed_again_meets_the_proof(written: bytes) -> None:

@@ -23,6 +23,7 @@ import undertow as ut
 from undertow.base import Verdict
 from undertow.base.errors import InfeasibleError
 from undertow.models import FloatArray
+from undertow.proofs.claims.region import reaches
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.run import _inside
 from undertow.proofs.closed_loop.terminal import TerminalSet
@@ -35,7 +36,8 @@ from undertow.proofs.region.lyapunov import (
     unit,
 )
 from undertow.proofs.region.motion import SurfaceMotion, VectorField
-from undertow.proofs.search.basis import Basis, linear_part, slowest_rate
+from undertow.proofs.region.region import _clear
+from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
 from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _on_axis, grow
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
 from undertow.proofs.search.closed_loop import _boxes, _terminal, follow
@@ -136,6 +138,31 @@ def test_a_stretched_function_reaches_no_further_than_its_pole() -> None:
     assert extent(flat, [-2.0, 0.0, 0.0]) == pytest.approx(V.pole / 2, rel=0.02)
     np.testing.assert_allclose(V.times(4.0)(V.points([[0.1, 0.2, 0.3]])),
                                4 * V(V.points([[0.1, 0.2, 0.3]])))  # fmt: skip
+
+
+def test_a_stretched_set_reaches_the_points_on_its_axis() -> None:
+    """Proved on the whole line from 0: up to the edge, not past it, and never at the pole."""
+    V = stretched(4)
+    reach = extent(V, [1.0, 0.0, 0.0])
+    assert reaches(V, [0.98 * reach, 0.0, 0.0])
+    assert reaches(V, [-0.98 * reach, 0.0, 0.0])
+    assert not reaches(V, [1.02 * reach, 0.0, 0.0])
+    assert not reaches(V.times(1e-12), [V.pole, 0.0, 0.0])
+    assert not reaches(V, [0.1, 0.0])
+
+
+def test_the_motion_is_clear_up_to_its_singularity() -> None:
+    """As far as V is defined, or ten times its size where it is defined everywhere."""
+    edge = singular_distance_on_axis(MOTION, math.pi)
+    way = np.array([1.0, 0.0, 0.0])
+    wide, small = (LyapunovFunction.quadratic(size * np.eye(3)) for size in (0.5, 0.07))
+    assert _clear(MOTION, wide, way) == pytest.approx(edge, abs=5.0 / 2000)
+    assert edge > 0.7
+    assert _clear(MOTION, small, way) == INF
+    S = np.zeros((1, 3, 3))
+    for pole, clear in ((0.9 * edge, 0.9 * edge), (1.5 * edge, edge)):
+        V = LyapunovFunction.quadratic(np.eye(3), S, pole)
+        assert _clear(MOTION, V, way) == pytest.approx(clear, abs=pole / 1000)
 
 
 def test_points_on_the_way_are_where_they_were_asked_for() -> None:
@@ -258,6 +285,22 @@ def test_first_sets_are_as_large_as_the_fall_allows(start: str, most: float) -> 
     edge = V.points(0.97 * rays)
     rates = np.sum(rays * V.coordinate_rates(edge, motion(edge)), axis=1)
     assert (rates < 0).all()
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_first_sets_keep_clear_of_the_singularity_and_of_the_pole(bent: bool) -> None:
+    """Whatever falls beyond: a stable line with a margin that ends at 0.6, a pole at 0.7."""
+
+    class Ending(VectorField):
+        def margin(self, y: FloatArray) -> FloatArray:
+            return np.asarray(1.0 if bent else 1 - np.abs(y[..., 0]) / 0.6)
+
+    x, y = sp.symbols("x y", real=True)
+    motion = Ending((x, y), (-x, -y))
+    stretch = (np.zeros((1, 2, 2)), 0.7) if bent else None
+    V = quadratic(motion, stretch, np.ones(2), np.random.default_rng(0), "round")
+    end = 0.7 * POLE_PART if bent else 0.6 * (1 - CLEARANCE)
+    assert 0.9 * end < extent(V, [1.0, 0.0]) <= end * (1 + 1e-6)
 
 
 def test_a_chain_grows_within_its_budget() -> None:
