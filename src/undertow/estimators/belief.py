@@ -126,7 +126,7 @@ class Belief:
     >>> belief.tolerances["m"]
     0.025
     >>> len(belief.ensemble(belief.prior))
-    5
+    13
     """
 
     mechanism: Mechanism
