@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sympy as sp
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
@@ -292,8 +293,8 @@ def test_first_sets_keep_clear_of_the_singularity_and_of_the_pole(bent: bool) ->
     """Whatever falls beyond: a stable line with a margin that ends at 0.6, a pole at 0.7."""
 
     class Ending(VectorField):
-        def margin(self, y: FloatArray) -> FloatArray:
-            return np.asarray(1.0 if bent else 1 - np.abs(y[..., 0]) / 0.6)
+        def margin(self, z: ArrayLike) -> FloatArray:
+            return np.asarray(1.0 if bent else 1 - np.abs(np.asarray(z)[..., 0]) / 0.6)
 
     x, y = sp.symbols("x y", real=True)
     motion = Ending((x, y), (-x, -y))
