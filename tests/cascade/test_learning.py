@@ -157,6 +157,7 @@ def test_a_plant_that_changes_while_it_runs(pendulum: ut.Mechanism) -> None:
         cascade.simulate(phi=0.5, plant={-1.0: pendulum})
 
 
+@pytest.mark.slow
 def test_friction_is_learnt(pendulum: ut.Mechanism) -> None:
     """A level in the joint is found, which without a parameter of its own leaves the arm short."""
     with_friction = pendulum.with_friction(theta=0.02)

@@ -32,6 +32,7 @@ def leg(run: ut.Run, begin: float, end: float) -> float:
     return float(np.interp(end, t, cost) - np.interp(begin, t, cost))
 
 
+@pytest.mark.slow
 def test_the_last_set_point_is_reached_and_held(run: ut.Run) -> None:
     """The load hangs still at the last set-point; travel was kept on the way, absolute."""
     x = run.trajectory.x
@@ -42,6 +43,7 @@ def test_the_last_set_point_is_reached_and_held(run: ut.Run) -> None:
     assert np.abs(x[:, 0]).max() <= 0.95 * 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("begin", "end", "goal"), [(0, 2, 1.0), (2, 4, -1.0), (4, 16, 0.5)])
 def test_a_jump_costs_what_a_fresh_start_costs(
     cascade: ut.Cascade, run: ut.Run, begin: float, end: float, goal: float
@@ -57,6 +59,7 @@ def test_a_jump_costs_what_a_fresh_start_costs(
     assert leg(run, begin, end) <= 1.1 * leg(fresh, 0.0, end - begin)
 
 
+@pytest.mark.slow
 def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
     """Slack is unknown at the jumps, and not negative elsewhere."""
     tasks = np.array([update.task for update in run.updates])
@@ -103,6 +106,7 @@ def test_the_state_machine_takes_the_target_off(cascade: ut.Cascade) -> None:
     assert again.error(0.1, x + away) == pytest.approx(x + rig.state(theta=1.0))
 
 
+@pytest.mark.slow
 def test_constraints_are_about_absolute_positions() -> None:
     """A formula of one's own, too: the way to x = 1 keeps |x| ≤ 1.05 m, the error does not."""
     wall = ut.Constraint("wall", lambda v: v.x**2 - 1.05**2)
@@ -113,6 +117,7 @@ def test_constraints_are_about_absolute_positions() -> None:
     assert np.abs(run.trajectory["x"]).max() <= 1.05 + 1e-4
 
 
+@pytest.mark.slow
 def test_the_upright_pendulum_follows_a_sine_of_the_arm() -> None:
     """±45° at 0.5 Hz: from rest onto the reference, and then on it."""
     rig = ut.mechanisms.rotary_pendulum()
@@ -126,6 +131,7 @@ def test_the_upright_pendulum_follows_a_sine_of_the_arm() -> None:
     assert np.degrees(np.abs(run.trajectory["phi"][late]).max()) < 9.0
 
 
+@pytest.mark.slow
 def test_the_gate_sees_the_reference_move(cascade: ut.Cascade) -> None:
     """A plan that the gate admits about the target at rest is refused where the way breaks it."""
     reference = ut.Reference.sine(0.2, x=1.2)

@@ -142,6 +142,7 @@ def test_run_and_compare(names: dict[str, Any]) -> None:
     assert "balanced" in str(table)
 
 
+@pytest.mark.slow
 def test_a_target_that_moves(names: dict[str, Any]) -> None:
     """The crane rests at the last set-point, the arm is where the sine is."""
     made = does("A target that moves", names)

@@ -25,6 +25,7 @@ def cascade() -> ut.Cascade:
     return ut.Cascade(CRANE, objective, cold=ut.Budget(600), warm=ut.Budget(96), belief="exact")
 
 
+@pytest.mark.slow
 def test_a_run_goes_from_set_point_to_set_point_and_is_replayed(tmp_path: Path) -> None:
     """Each jump at its time, each with a plan of its own; bit for bit from the log, judged too."""
     log = tmp_path / "run.db"

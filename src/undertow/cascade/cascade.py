@@ -651,7 +651,6 @@ class Cascade:
         """
         return self.retarget_to(state, self.mechanism.check_state(x), self._target_at(target, t), t)
 
-    @checked
     def retarget_to(
         self, state: CascadeState, x: FloatArray, motion: ReferenceMotion, t: float
     ) -> tuple[CascadeState, Proposal]:
@@ -667,7 +666,6 @@ class Cascade:
         legs = legs_of(self.mechanism, self.objective, target, t + self.objective.horizon)
         return [motion for begin, motion in legs if begin <= t][-1]
 
-    @checked
     def start_to(
         self, x: FloatArray, target: ReferenceMotion | None = None, t: float = 0.0
     ) -> tuple[CascadeState, Proposal]:
