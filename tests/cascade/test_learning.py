@@ -61,6 +61,7 @@ def test_a_cascade_learns_the_plant(pendulum: ut.Mechanism) -> None:
     assert control.u == pytest.approx(asked.u)
 
 
+@pytest.mark.slow
 def test_the_first_plan_is_the_best_for_the_estimate(pendulum: ut.Mechanism) -> None:
     """Nothing is known better yet, and the next decision knows more: no premium for all plants."""
     objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.5)

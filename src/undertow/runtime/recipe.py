@@ -178,7 +178,8 @@ class Recipe:
             made = replace(made, objective=named_goal, horizon=goal.horizon)
         if self.design is not None:
             usual = Cascade(self.design.mechanism, self.design.objective, seed=self.seed)
-            settings = [f.name for f in fields(usual) if f.name not in ("mechanism", "objective")]
+            others = ("mechanism", "objective", "belief")  # a run is exact in any case
+            settings = [f.name for f in fields(usual) if f.name not in others]
             if any(getattr(self.design, name) != getattr(usual, name) for name in settings):
                 return None
         return replace(made, design=None)
