@@ -26,7 +26,14 @@ from undertow.closed_loop.ensemble import Ensemble
 from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT, linear_source
 from undertow.closed_loop.work_array import LANES
 from undertow.law import LawLayout
-from undertow.models import FloatArray, Mechanism, is_smooth, linear_numbers, linearise, numbers
+from undertow.models import (
+    FloatArray,
+    Mechanism,
+    is_smooth,
+    linear_accelerations,
+    linearise,
+    numbers,
+)
 from undertow.objective import Objective
 from undertow.symbolic import load_module, numba
 
@@ -83,14 +90,6 @@ NOBODY = np.zeros(0, dtype=np.int64)
 
 #: Stands for the plants of a law that acts on its own belief.
 _ITSELF = np.empty((0, 0, 0)), np.empty((0, 0, 0))
-
-
-def _linear_plants(ensemble: Ensemble) -> tuple[FloatArray, FloatArray]:
-    """Return q̈ = drift x + push u of every member at the target, (K, n, 2n) and (K, n, m)."""
-    plant = ensemble.plant
-    mass, forces, gain = linear_numbers(plant, ensemble.values)
-    inputs = np.pad(gain, [(0, 0), (0, plant.n - plant.m), (0, 0)])
-    return np.linalg.solve(mass, forces).astype(float), np.linalg.solve(mass, inputs).astype(float)
 
 
 class Prepared(NamedTuple):
@@ -156,7 +155,9 @@ class TerminalLinearModel:
         self.H = np.ascontiguousarray(forces[:m] - M_au @ self.Y)
         self.S = lin.M[:m, :m] - M_au @ self.X
         self.B_inverse = np.linalg.inv(lin.B)
-        self._plants = _ITSELF if ensemble is None else _linear_plants(ensemble)
+        self._plants = (
+            _ITSELF if ensemble is None else linear_accelerations(ensemble.plant, ensemble.values)
+        )
 
     def believing(self, mechanism: Mechanism, ensemble: Ensemble | None) -> TerminalLinearModel:
         """Return this model with other parameters, and with another ensemble."""

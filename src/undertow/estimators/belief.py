@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, check_fields, checked, floats, one_of, positive
 from undertow.closed_loop import Ensemble, Risk
 from undertow.law import LawLayout
-from undertow.models import FloatArray, Mechanism, linear_numbers, number_of
+from undertow.models import FloatArray, Mechanism, linear_accelerations, number_of
 
 #: Standard deviation of what is evenly spread over ± a tolerance, as a part of it.
 EVEN = 1.0 / math.sqrt(3.0)
@@ -295,11 +295,9 @@ class Belief:
         """Return how accelerations near the target depend on the offsets, (E, p), relative."""
         size = len(offset)
         values = self.values(np.vstack([offset, offset + STEP * np.eye(size)]))
-        mass, forces, gain = linear_numbers(self.mechanism, values)
-        inputs = np.pad(gain, [(0, 0), (0, self.mechanism.n - self.mechanism.m), (0, 0)])
         effects = []
-        for side in (forces, inputs):
-            rates = np.linalg.solve(mass, side).reshape(size + 1, -1)
+        for side in linear_accelerations(self.mechanism, values):
+            rates = side.reshape(size + 1, -1)
             effects.append((rates[1:] - rates[0]).T / (STEP * max(np.abs(rates[0]).max(), 1e-12)))
         return np.vstack(effects)
 

@@ -10,7 +10,7 @@ from undertow.models.linearisation import (
     Linearisation,
     controllability,
     has_linear_model,
-    linear_numbers,
+    linear_accelerations,
     linearise,
 )
 from undertow.models.mechanism import Mechanism
@@ -54,7 +54,7 @@ __all__ = [
     "invariant_coordinates",
     "is_smooth",
     "kinks",
-    "linear_numbers",
+    "linear_accelerations",
     "linearise",
     "normal_name",
     "number_of",

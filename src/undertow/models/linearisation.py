@@ -142,6 +142,16 @@ def linear_numbers(
     return mass.reshape(count, n, n), slopes, _gain(mechanism, values)
 
 
+def linear_accelerations(mechanism: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ∂q̈/∂x, (K, n, 2n), and ∂q̈/∂u, (K, n, m), at the target for K plants.
+
+    ``values`` are those of all parameters, (K, P), SI units; nothing is checked.
+    """
+    mass, forces, gain = linear_numbers(mechanism, values)
+    inputs = np.pad(gain, [(0, 0), (0, mechanism.n - mechanism.m), (0, 0)])
+    return np.linalg.solve(mass, forces).astype(float), np.linalg.solve(mass, inputs).astype(float)
+
+
 def _gain(mechanism: Mechanism, values: FloatArray) -> FloatArray:
     """Return B of K plants, (K, m, m), from all their parameters, (K, P)."""
     function = compiled(mechanism.input_matrix, mechanism.parameter_symbols)
