@@ -102,7 +102,7 @@ def test_the_truth_is_as_far_off_as_the_deviations_say(belief: Belief) -> None:
         noisy = x.copy()
         noisy[:, 2:] += rng.normal(0.0, 0.004 / np.sqrt(2), noisy[:, 2:].shape)
         estimate = belief.learn(belief.prior, t, noisy, u)
-        truth = (plant.parameter_values - belief.mechanism.parameter_values)[belief._places]
+        truth = (plant.parameter_values - belief.mechanism.parameter_values)[belief.places]
         off = truth / belief._scale - estimate.offset
         ratios.append(off @ estimate.information @ off / len(off))
     assert 0.1 < np.mean(ratios) < 1.3
@@ -164,7 +164,7 @@ def test_the_design_of_the_ensemble(belief: Belief) -> None:
         assert errors[1 : 1 + SLIPS].any(axis=1).all()
         assert errors.sum(axis=0) == pytest.approx(0.0, abs=1e-15)
     assert not ensemble.surface_errors[:, 0].any()  # α_a stays −1
-    off = (members[1 + SLIPS :] - nominal)[:, belief._places] / belief._scale
+    off = (members[1 + SLIPS :] - nominal)[:, belief.places] / belief._scale
     assert np.abs(off) == pytest.approx(np.sqrt(1 / 3 + 0.2**2))
     assert off.T @ off == pytest.approx(len(off) * np.eye(5) * (1 / 3 + 0.2**2), abs=1e-12)
 

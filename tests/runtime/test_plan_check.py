@@ -12,7 +12,7 @@ import pytest
 
 import undertow as ut
 from runs import RECIPE
-from undertow.cascade import Admission
+from undertow.cascade import Admission, CascadeState
 from undertow.law import Plan, ReachingLaw, first_surface, sliding_matrix
 from undertow.runtime import (
     Columns,
@@ -84,11 +84,9 @@ def test_a_plan_is_packed_as_the_slow_loop_packs_it(name: str) -> None:
         Plan((surface, other), (0.0, 0.1), (ReachingLaw(), ReachingLaw(5.0, 0.5))),
     )
     for plan in plans:
-        law_vectors = test.pack(plan)
-        np.testing.assert_array_equal(law_vectors[:, :-1], law_vectors_of(cascade, plan)[:, :-1])
-        np.testing.assert_allclose(
-            law_vectors[:, -1], law_vectors_of(cascade, plan)[:, -1], rtol=1e-12
-        )
+        law_vectors, expected = test.pack(plan), law_vectors_of(cascade, CascadeState(plan))
+        np.testing.assert_array_equal(law_vectors[:, :-1], expected[:, :-1])
+        np.testing.assert_allclose(law_vectors[:, -1], expected[:, -1], rtol=1e-12)
         assert test.fault(law_vectors) == ""
     for column, number in ((-2, 0.0), (-3, -1.0), (-1, 0.0), (-2, np.inf), (-3, np.nan)):
         law_vectors = test.pack(plans[0])
@@ -96,6 +94,32 @@ def test_a_plan_is_packed_as_the_slow_loop_packs_it(name: str) -> None:
         assert test.fault(law_vectors)
     with pytest.raises(ValueError, match="switches by 'sign'"):
         test.pack(Plan((surface,), (0.0,), (ReachingLaw(switching="sign"),)))
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", "gantry_crane", "two_motor_three_link"])
+def test_what_is_learnt_is_tested_with(name: str) -> None:
+    """With other parameters det Γ(0) and stability are those of the mechanism that has them."""
+    mechanism = getattr(ut.mechanisms, name)()
+    cascade = ut.Cascade(mechanism, ut.MinimumTime())
+    known = cascade.known
+    assert known is not None
+    rng = np.random.default_rng(3)
+    estimate = replace(known.prior, offset=rng.uniform(-1, 1, len(known.tolerances)))
+    other = known.believed(estimate)
+    test = PlanCheck(mechanism, ReachingLaw())
+    test.believe(known.values(estimate.offset))
+    stable = first_surface(other)
+    memory = CascadeState(Plan.of(stable), estimate=estimate)
+    np.testing.assert_allclose(
+        test.pack(memory.plan), law_vectors_of(cascade, memory), rtol=1e-12, atol=1e-12
+    )
+    surfaces = stable.vector * (1 + 0.3 * rng.normal(size=(500, stable.vector.size)))
+    worst = np.linalg.eigvals(sliding_matrix(other, surfaces)).real.max(axis=1)
+    found = np.array([test.stable(surface) for surface in surfaces])
+    clear = np.abs(worst) > 1e-9
+    np.testing.assert_array_equal(found[clear], worst[clear] < 0)
+    nominal = PlanCheck(mechanism, ReachingLaw()).pack(memory.plan)[0, -1]
+    assert abs(test.pack(memory.plan)[0, -1] - nominal) > 1e-3 * abs(nominal)  # they matter
 
 
 # -- forged answers ------------------------------------------------------------------------------
@@ -118,7 +142,7 @@ def _flipped(answer: Answer) -> Answer:
     s = answer.memory.plan.surfaces[0]
     plan = Plan.of(ut.Surface(s.alpha_a, -s.lambda_a, s.alpha_u, -s.lambda_u))
     memory = replace(answer.memory, plan=plan, since=answer.use)
-    return _admitted(answer, law_vectors=law_vectors_of(RECIPE.cascade, plan), memory=memory)
+    return _admitted(answer, law_vectors=law_vectors_of(RECIPE.cascade, memory), memory=memory)
 
 
 FORGERIES = {

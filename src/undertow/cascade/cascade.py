@@ -391,6 +391,10 @@ class Cascade:
         what the motion shows narrows it: law, search and gate go on with the estimated parameters,
         and a plan that some plausible plant would not survive is replaced before its period ends.
         ``"exact"``: the mechanism is taken for the plant, as in the paper.
+    covariance
+        Of the error of the estimated state at the target, (2n, 2n), SI units: predictions count the
+        cost of the input that it becomes near the target, see :class:`undertow.ClosedLoop`.
+        ``None``: states are exact.
 
     Raises
     ------
@@ -423,6 +427,7 @@ class Cascade:
     seed: int = 0
     planner: Planner | None = None
     belief: Belief | Literal["usual", "exact"] = "usual"
+    covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
@@ -490,6 +495,7 @@ class Cascade:
             step=self.step,
             zoh_steps=self.zoh_steps,
             ensemble=None if belief is None else belief.ensemble(belief.prior),
+            covariance=self.covariance,
         )
 
     @checked
@@ -501,6 +507,11 @@ class Cascade:
         """
         when = state.since if t is None else t
         return self.about(self._loops(state.estimate), state.target, when)
+
+    @checked
+    def believed(self, state: CascadeState) -> Mechanism:
+        """The mechanism with the parameters that are estimated by now: the law's."""
+        return self._loops(state.estimate).mechanism
 
     @cached_property
     def _loops_about(self) -> LoopsAbout:
@@ -743,7 +754,7 @@ class Cascade:
         :meth:`retarget`.
         """
         surface, law = state.plan.at(t - state.since)
-        believed = self._loops(state.estimate).mechanism
+        believed = self.believed(state)
         if state.target is not None:
             x = state.error(t, self.mechanism.check_state(x))
             believed = state.target.error_dynamics(believed, t)

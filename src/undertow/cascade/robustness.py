@@ -190,9 +190,10 @@ def _refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: st
 
 
 def derate_actuator(loop: ClosedLoop, reserve: float) -> ClosedLoop:
-    """Return the loop on a plant whose input limits are lower by a part of them."""
+    """Return the loop on the believed plant with input limits that are lower by a part of them."""
     limits = (1.0 - reserve) * loop.mechanism.input_limits
-    return replace(loop, plant=loop.mechanism.with_input_limit(*limits), tail_rtol=0.0)
+    weak = loop.mechanism.with_input_limit(*limits)
+    return replace(loop, plant=weak, ensemble=None, tail_rtol=0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,8 +96,9 @@ class Prepared(NamedTuple):
     """Linear ends of C closed loops.
 
     ``A`` (C, n, 2n) acceleration rows; ``Q`` (C, 2n, 2n) stage cost, or (1, 2n, 2n) for all;
-    ``P`` (C, 2n, 2n); ``stable`` (C,), 1 or 0; ``powers`` of e^{At} and ``forced`` responses,
-    see :mod:`.linear_blocks`; ``reach`` of bounded states (C/16, STEP_SIZES, w·2n·16), see
+    ``P`` (C, 2n, 2n); ``stable`` (C,), 1 or 0; ``feedback`` K (C, m, 2n) of u = K x, zeros where
+    the cost needs none; ``powers`` of e^{At} and ``forced`` responses, see
+    :mod:`.linear_blocks`; ``reach`` of bounded states (C/16, STEP_SIZES, w·2n·16), see
     :mod:`.exponential_integrator`.
     """
 
@@ -105,6 +106,7 @@ class Prepared(NamedTuple):
     Q: FloatArray
     P: FloatArray
     stable: FloatArray
+    feedback: FloatArray
     powers: FloatArray
     forced: FloatArray
     reach: FloatArray
@@ -176,10 +178,21 @@ class TerminalLinearModel:
             np.empty((count, N, N)) if self.counts_cost else np.eye(N)[None],
             np.empty((count, N, N)),
             np.empty(count),
+            np.zeros((count, self.X.shape[1], N)),
             np.empty((count // LANES, STEP_SIZES, N * N * LANES)),
             np.empty((count // LANES, STEP_SIZES, 2, N * N * LANES)),
             np.empty((count // LANES, STEP_SIZES, len(self._bounded) * N * LANES)),
         )
+
+    def noise_cost(self, ends: Prepared, covariance: FloatArray) -> FloatArray:
+        """Return tr(R K P Kᵀ) of closed loops, (C,), cost per second.
+
+        What an estimator does not know of the state, with the covariance P, (2n, 2n), becomes input
+        near the target; R is what the stage cost has of uuᵀ.
+        """
+        K, R = ends.feedback, self._weights.uu
+        rate: FloatArray = np.einsum("cij,jk,clk,il->c", K, covariance, K, R)
+        return rate
 
     def prepare(
         self,
@@ -206,7 +219,7 @@ class TerminalLinearModel:
         _close(
             lanes, self._layout.starts, _SAME if gains is None else gains, self.X, self.Y, self.H,
             self.S, self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, member,
-            *self._plants, into.A, into.Q,
+            *self._plants, into.A, into.Q, into.feedback,
         )  # fmt: skip
         self._blocks.double(into.A, into.Q, into.P, into.stable, into.powers, into.forced)
         if len(self._bounded):
@@ -215,9 +228,28 @@ class TerminalLinearModel:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _close(  # type: ignore[no-untyped-def]
-    lanes, starts, gains, X, Y, H, S, B_inverse, xx, xu, uu, counts_cost, member, drift, push, A, Q
+    lanes,
+    starts,
+    gains,
+    X,
+    Y,
+    H,
+    S,
+    B_inverse,
+    xx,
+    xu,
+    uu,
+    counts_cost,
+    member,
+    drift,
+    push,
+    A,
+    Q,
+    feedback,
 ):
-    """Write the acceleration rows A and the stage cost Q of each closed loop; NaN if singular.
+    """Write the acceleration rows A and stage cost Q of each closed loop, and its feedback K.
+
+    NaN where it is singular.
 
     The law is that of the belief; with a ``member`` for each lane it acts on that plant, whose
     accelerations are ``drift`` x + ``push`` u.
@@ -227,7 +259,7 @@ def _close(  # type: ignore[no-untyped-def]
     N = 2 * n
     _, lambda_a, alpha_u, lambda_u, eta, layer = starts
     gamma, drive = np.empty((m, m)), np.empty((m, N))
-    K, D = np.empty((m, N)), np.empty((m, N))
+    D = np.empty((m, N))
     for lane in range(lanes.shape[0]):
         p = lanes[lane, lanes.shape[1] - 1]
         for i in range(m):
@@ -259,6 +291,7 @@ def _close(  # type: ignore[no-untyped-def]
                 A[lane, m + f, j] = value
         if not counts_cost and member.size == 0:
             continue
+        K = feedback[lane]
         for i in range(m):
             for j in range(N):
                 value = -H[i, j]

@@ -92,6 +92,10 @@ class ClosedLoop:
     ensemble
         Plausible plants instead of one: every plan is rolled out on all of them, and a batch has
         one result for each plan, see :mod:`undertow.closed_loop.ensemble`.
+    covariance
+        Of the error of the estimated state, (2n, 2n), that the law acts on.  Batches count the cost
+        of what it makes of it near the target, tr(R K P Kᵀ) per second, where they have a linear
+        model; motions are without noise.
 
     Examples
     --------
@@ -112,6 +116,7 @@ class ClosedLoop:
     escape: float = 200.0
     tail_rtol: float = 0.0
     ensemble: Ensemble | None = None
+    covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
@@ -311,6 +316,7 @@ class ClosedLoop:
         # Large steps see no closest approach, and leave nothing to record.
         large = self.takes_large_steps and not every and not seek
         part, calm_from = buffers, 0 if large else steps
+        noisy = self.covariance is not None and end is not None and end.counts_cost
         where: NDArray[np.intp] | slice = slice(buffers.count)
         while True:
             live, out = part.live, part.out
@@ -318,7 +324,7 @@ class ClosedLoop:
             self._check_gains(part.lanes, live, stable_only)
             goes_on = calm_from < steps
             prepared = None
-            if goes_on or stable_only:
+            if goes_on or stable_only or (noisy and part is buffers):
                 prepared = self._linearised(part)
             if prepared is not None and stable_only:
                 live *= prepared.stable
@@ -339,15 +345,23 @@ class ClosedLoop:
                 taken = buffers.out[where, -1]
                 buffers.out[where] = out[: part.count]
                 buffers.out[where, -1] += taken
-            if not goes_on:
-                return buffers.batch(start)
             again = np.flatnonzero(out[: part.count, 2] == GIVEN_BACK)
-            if not len(again):
+            if not (goes_on and len(again)):
+                if noisy:
+                    self._count_noise(buffers, start)
                 return buffers.batch(start)
             # Too fast for large steps, or at a limit again: small steps until later.
             failed = round((float(out[again, 1].max()) - start) / self.step)
             calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
             part, where = part.part(again), np.arange(buffers.count)[where][again]
+
+    def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
+        """Add what noise costs near the target to the costs of motions, while they last."""
+        assert self.linear_end is not None
+        assert buffers.ends is not None
+        assert self.covariance is not None
+        rate = self.linear_end.noise_cost(buffers.ends, self.covariance)
+        buffers.out[:, 0] += rate * (buffers.out[:, 1] - start)
 
     def _linearised(self, buffers: RolloutBuffers) -> Prepared | None:
         """Linearise the last surface of every lane."""

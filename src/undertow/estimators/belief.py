@@ -197,15 +197,21 @@ class Belief:
         """Standard deviations of the changes of velocity, (n,)."""
         if self.noise is not None:
             return np.broadcast_to(np.asarray(self.noise, dtype=float), self.mechanism.n)
+        scale = SMALL * self.full_accelerations
+        return np.where(scale > 0, scale, UNDRIVEN)
+
+    @cached_property
+    def full_accelerations(self) -> FloatArray:
+        """What the full inputs do to each acceleration at the target, (n,), rad/s² or m/s²."""
         limits, rest = self.mechanism.input_limits, np.zeros(2 * self.mechanism.n)
         full = np.diag(np.where(np.isfinite(limits), limits, 1.0))
         still = self.mechanism.accelerations(0.0, rest, 0.0 * limits)
         driven = sum(np.abs(self.mechanism.accelerations(0.0, rest, u) - still) for u in full)
-        scale = SMALL * np.asarray(driven, dtype=float)
-        return np.where(scale > 0, scale, UNDRIVEN)
+        return np.asarray(driven, dtype=float)
 
     @cached_property
-    def _places(self) -> list[int]:
+    def places(self) -> list[int]:
+        """Which of the mechanism's parameters are uncertain."""
         names = [p.name for p in self.mechanism.parameters]
         return [names.index(name) for name in self.tolerances]
 
@@ -230,7 +236,7 @@ class Belief:
             )
         nominal = self.mechanism.parameter_values
         values = np.broadcast_to(nominal, (*offsets.shape[:-1], len(nominal))).copy()
-        values[..., self._places] += self._scale * offsets
+        values[..., self.places] += self._scale * offsets
         return values
 
     @checked
@@ -344,9 +350,9 @@ class Belief:
         return replace(self.prior, information=self.prior.information / BEYOND**2)
 
     @cached_property
-    def _room(self) -> FloatArray:
+    def room(self) -> FloatArray:
         """How far parameters may be off at all, in tolerances, (p,): within their intervals."""
-        p = [self.mechanism.parameters[place] for place in self._places]
+        p = [self.mechanism.parameters[place] for place in self.places]
         room = [min(each.value - each.low, each.high - each.value) for each in p]
         return np.maximum(1.0, 0.95 * np.array(room) / self._scale)
 
@@ -363,7 +369,7 @@ class Belief:
         It stays within ``reach`` tolerances, or as far out as it was before.
         """
         size, offset = len(before.offset), before.offset
-        limits = np.minimum(self._room, np.maximum(reach, np.abs(offset)))
+        limits = np.minimum(self.room, np.maximum(reach, np.abs(offset)))
         information = before.information
         for _ in range(ROUNDS):
             around = np.vstack([offset, offset + STEP * np.eye(size)])

@@ -4,7 +4,8 @@ The mean moves by a Runge-Kutta step of the model; the covariance by the step's 
 ``I + hA + ½h²A²`` with A from differences of the compiled dynamics; positions come in one
 by one, so that nothing is inverted and a missing one is left out.  Optionally a matched
 disturbance d, in the units of the inputs, is estimated with the state as a random walk:
-a disturbance observer, whose estimate the controller can take off its output.
+a disturbance observer, whose estimate the controller can take off its output.  So are, where a
+belief says that they are uncertain, parameters: the filter moves with what it has learnt of them.
 """
 
 from __future__ import annotations
@@ -17,18 +18,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError
+from undertow.estimators.belief import EVEN, Belief, ParameterEstimate
 from undertow.estimators.interface import positive
 from undertow.models import FloatArray, Mechanism, require_smooth
 from undertow.plants import Measurement
 from undertow.plants.stepping import compiled_module
 from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 
+#: Parameters are learnt while some acceleration is larger than this part of what the full inputs do
+#: to it at the target: what the model leaves out, dry friction, is small beside it.
+EXCITED = 0.1
+
 
 @numba.njit(cache=True, error_model="numpy")
 def predict_covariance(
-    F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: float
+    F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: float, moving: int
 ) -> None:
-    """Turn P into F P Fᵀ + h diag(noise), exactly symmetric; A, of P's size, is scratch."""
+    """Turn P into F P Fᵀ + h diag(noise), exactly symmetric; A, of P's size, is scratch.
+
+    Numbers from ``moving`` on have no noise.
+    """
     size = P.shape[0]
     for i in range(size):
         for j in range(size):
@@ -43,14 +52,19 @@ def predict_covariance(
                 total += A[i, k] * F[j, k]
             P[i, j] = total
             P[j, i] = total
-        P[i, i] += h * noise[i]
+        if i < moving:
+            P[i, i] += h * noise[i]
 
 
 @numba.njit(cache=True, error_model="numpy")
 def measurement_update(
-    x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray
-) -> None:
-    """Take in positions one by one, nothing inverted; a missing one (NaN) is left out."""
+    x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray,
+    moving: int,
+) -> None:  # fmt: skip
+    """Take in positions one by one, nothing inverted; a missing one (NaN) is left out.
+
+    Numbers from ``moving`` on are considered and stay as they are (Schmidt's filter).
+    """
     size = x.shape[0]
     for i in range(q.shape[0]):
         if q[i] != q[i]:
@@ -59,33 +73,40 @@ def measurement_update(
         error = q[i] - x[i]
         column[:size] = P[:, i]
         for k in range(size):
-            x[k] += column[k] * (error / spread)
-            for j in range(size):
+            if k < moving:
+                x[k] += column[k] * (error / spread)
+            for j in range(size if k < moving else moving):
                 P[k, j] -= column[k] * column[j] / spread
 
 
-#: What the filter remembers: ``size`` numbers are estimated, inputs act ``lead`` periods late.
+#: What the filter remembers: ``size`` numbers are estimated, the last ``known`` of them offsets of
+#: parameters, in tolerances; inputs act ``lead`` periods late.
 _LAYOUT = {
     "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
     "F": "size, size", "A": "size, size", "work": "6, size",
+    "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
+    "excited": "n",
 }  # fmt: skip
 
 _BODY = f"""
 {COMPILED}
-def move(h, x, u, n, m, parameters, stage, total, qdd, viscous, driven):
-    # Runge-Kutta's step of the mean; x may end with the estimated disturbance.
+def move(h, x, u, n, m, disturbed, parameters, stage, total, qdd, viscous, driven):
+    # Runge-Kutta's step of the mean; with ``disturbed``, x goes on with the estimated disturbance.
     for i in range(m):
-        driven[i] = u[i] + (x[2 * n + i] if x.shape[0] > 2 * n else 0.0)
+        driven[i] = u[i] + (x[2 * n + i] if disturbed else 0.0)
     rk4_step(0.0, h, 0.0, n, x, driven, viscous, parameters, stage, total, qdd)
 
 
 {COMPILED}
-def jacobian(h, x, u, n, m, parameters, F, A, qdd, base, viscous, driven):
+def jacobian(
+    h, x, u, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous, driven
+):
     # I + hA + h²A²/2, A by differences of the accelerations.
     size = x.shape[0]
+    learnt = size - place.shape[0]
     for i in range(m):
-        driven[i] = u[i] + (x[2 * n + i] if size > 2 * n else 0.0)
+        driven[i] = u[i] + (x[2 * n + i] if disturbed else 0.0)
     forward(0.0, x, driven, viscous, parameters, base)
     A[:] = 0.0
     for i in range(n):
@@ -97,6 +118,12 @@ def jacobian(h, x, u, n, m, parameters, F, A, qdd, base, viscous, driven):
             x[j] = kept + small
             forward(0.0, x, driven, viscous, parameters, qdd)
             x[j] = kept
+        elif j >= learnt:
+            at = int(place[j - learnt])
+            kept = parameters[at]
+            parameters[at] = kept + small * tolerance[j - learnt]
+            forward(0.0, x, driven, viscous, parameters, qdd)
+            parameters[at] = kept
         else:
             kept = driven[j - 2 * n]
             driven[j - 2 * n] = kept + small
@@ -113,8 +140,10 @@ def jacobian(h, x, u, n, m, parameters, F, A, qdd, base, viscous, driven):
 
 
 {BRIEF}
-def estimate(h, q, u, block, size, lead):
+def estimate(h, q, u, block, size, lead, known):
 {unpacked(_LAYOUT)}
+    learnt = size - known
+    disturbed = learnt > 2 * n
     start = int(count[0])
     stage, total, qdd, base, viscous, driven = (
         work[0], work[1], work[2], work[3], work[4], work[5]
@@ -122,15 +151,24 @@ def estimate(h, q, u, block, size, lead):
     for i in range(m):
         past[start % (lead + 1), i] = max(-limits[i], min(limits[i], u[i]))
     then = past[(start + 1) % (lead + 1)]
-    jacobian(h, x, then, n, m, parameters, F, A, qdd, base, viscous, driven)
-    move(h, x, then, n, m, parameters, stage, total, qdd, viscous, driven)
-    predict_covariance(F, P, A, noise, h)
-    measurement_update(x, P, q, variance, total)
+    jacobian(
+        h, x, then, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous, driven
+    )
+    move(h, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
+    moving = learnt
+    for i in range(n):
+        if abs(base[i]) > excited[i]:
+            moving = size
+    predict_covariance(F, P, A, noise, h, moving)
+    measurement_update(x, P, q, variance, total, moving)
+    for j in range(known):
+        x[learnt + j] = max(-reach[j], min(reach[j], x[learnt + j]))
+        parameters[int(place[j])] = nominal[j] + tolerance[j] * x[learnt + j]
     count[0] = start + 1.0
     out[:] = x
     for k in range(lead):
         then = past[(start + 2 + k) % (lead + 1)]
-        move(h, out, then, n, m, parameters, stage, total, qdd, viscous, driven)
+        move(h, out, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
 """
 
 
@@ -161,11 +199,19 @@ class KalmanFilter:
     delay
         Known delay of measurement and input together, s, rounded to periods: the estimate is
         for the moment when the answer to it acts.
+    belief
+        What is not known of the mechanism's parameters, which are then estimated with the state;
+        ``None``: they are exact.
+    parameter_drift
+        Density of the drift of uncertain parameters, in their tolerances per √s: how fast what was
+        learnt is forgotten.
 
     Attributes
     ----------
     disturbance
         The estimated matched disturbance, in units of the inputs, (m,); written over.
+    parameters
+        Values of all parameters of the mechanism that it moves with, (P,), SI units; written over.
 
     Raises
     ------
@@ -191,6 +237,8 @@ class KalmanFilter:
         acceleration_noise: ArrayLike = 0.5,
         disturbance_drift: float = 0.0,
         delay: float = 0.0,
+        belief: Belief | None = None,
+        parameter_drift: float = 0.1,
     ) -> None:
         require_smooth(
             f"a Kalman filter's model, M or f of '{mechanism.name}',",
@@ -198,36 +246,53 @@ class KalmanFilter:
             mechanism.x,
         )
         n, m = mechanism.n, mechanism.m
-        if not (0 <= disturbance_drift < math.inf and 0 <= delay < math.inf):
+        settings = disturbance_drift, delay, parameter_drift
+        if not all(0 <= setting < math.inf for setting in settings):
             raise InvalidInputError(
-                "disturbance_drift and delay of a Kalman filter",
-                value=(disturbance_drift, delay),
+                "disturbance_drift, delay and parameter_drift of a Kalman filter",
+                value=settings,
                 limit="finite and ≥ 0",
-                remedy="0 turns either off",
+                remedy="0 turns each off",
+            )
+        if belief is not None and belief.mechanism.fingerprint != mechanism.fingerprint:
+            raise InvalidInputError(
+                "belief of a Kalman filter",
+                value=f"about another '{belief.mechanism.name}'",
+                limit="about the filter's own mechanism",
             )
         self._arguments: dict[str, Any] = {
             "mechanism": mechanism, "period": period, "position_noise": position_noise,
             "acceleration_noise": acceleration_noise, "disturbance_drift": disturbance_drift,
-            "delay": delay,
+            "delay": delay, "belief": belief, "parameter_drift": parameter_drift,
         }  # fmt: skip
         self.mechanism = mechanism
         self.period = float(positive("period of an estimator", [period], 1)[0])
-        size = 2 * n + (m if disturbance_drift > 0 else 0)
+        self._known = known = 0 if belief is None else len(belief.tolerances)
+        self._learnt = 2 * n + (m if disturbance_drift > 0 else 0)
+        size = self._learnt + known
         self._size, self._lead = size, round(delay / period)
         memory = Workspace(
-            _LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, lead=self._lead
+            _LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, lead=self._lead, known=known
         )
         self._block, self._count, self._past = memory.block, memory["count"], memory["past"]
         self._x, self._out = memory["x"], memory["out"]
         self._P: FloatArray = memory["P"]
-        self._variance = memory["variance"]
+        self._variance, self._F = memory["variance"], memory["F"]
         self._variance[:] = positive("position_noise", position_noise, n) ** 2
         memory["noise"][n : 2 * n] = positive("acceleration_noise", acceleration_noise, n) ** 2
-        memory["noise"][2 * n :] = disturbance_drift**2
+        memory["noise"][2 * n : self._learnt] = disturbance_drift**2
         memory["limits"][:] = self._limits = mechanism.input_limits
-        memory["parameters"][:] = mechanism.parameter_values
+        self.parameters: FloatArray = memory["parameters"]
+        if belief is not None:
+            memory["noise"][self._learnt :] = parameter_drift**2
+            memory["place"][:] = belief.places
+            memory["nominal"][:] = mechanism.parameter_values[belief.places]
+            memory["tolerance"][:] = list(belief.tolerances.values())
+            memory["reach"][:] = belief.room
+            memory["excited"][:] = EXCITED * belief.full_accelerations
+        self.belief = belief
         self._state: FloatArray = self._out[: 2 * n]
-        self.disturbance = self._x[2 * n :] if size > 2 * n else np.zeros(m)
+        self.disturbance = self._x[2 * n : self._learnt] if disturbance_drift > 0 else np.zeros(m)
         self._estimate = _module(mechanism).estimate
         self.reset(np.zeros(2 * n))
 
@@ -235,17 +300,20 @@ class KalmanFilter:
         """Start again from the state x0, (2n,), at rest as far as is known.
 
         ``spread`` is the standard deviation of the velocities, rad/s or m/s; that of the
-        positions is a measurement's, and the disturbance may be a tenth of its limit.
+        positions is a measurement's, and the disturbance may be a tenth of its limit.  What was
+        learnt of parameters is forgotten.
         """
-        n = self.mechanism.n
+        n, learnt = self.mechanism.n, self._learnt
         self._x[:] = 0.0
         self._x[: 2 * n] = x0
         self._P[:] = 0.0
         variances = np.zeros(len(self._x))
         variances[:n], variances[n : 2 * n] = self._variance, spread**2
-        if len(self._x) > 2 * n:
-            variances[2 * n :] = np.minimum(0.1 * self._limits, 1.0) ** 2
+        if learnt > 2 * n:
+            variances[2 * n : learnt] = np.minimum(0.1 * self._limits, 1.0) ** 2
+        variances[learnt:] = EVEN**2
         np.fill_diagonal(self._P, variances)
+        self.parameters[:] = self.mechanism.parameter_values
         self._past[:], self._count[0], self._t = 0.0, 0, math.nan
         self._out[:] = self._x
 
@@ -255,20 +323,49 @@ class KalmanFilter:
         self._t = measurement.t
         if not 0.0 < h < 100.0 * self.period:
             h = self.period
-        self._estimate(h, measurement.q, u, self._block, self._size, self._lead)
+        self._estimate(h, measurement.q, u, self._block, self._size, self._lead, self._known)
         return self._state
 
-    def steady_covariance(self, seconds: float = 0.5) -> FloatArray:
-        """Return the covariance that a filter like this one comes to, at rest at the target.
+    @property
+    def learnt(self) -> ParameterEstimate | None:
+        """What is known by now of the uncertain parameters; ``None`` without a belief."""
+        if self.belief is None or not self._known:
+            return None
+        place = slice(self._learnt, self._size)
+        information = np.linalg.inv(self._P[place, place])
+        information = 0.5 * (information + information.T)
+        return ParameterEstimate(self._x[place].copy(), information, int(self._count[0]))
 
-        It is the filter's own, after so long, s.
-        """
+    def _at_rest(self, seconds: float = 0.5) -> KalmanFilter:
+        """Return a filter like this one, after so long at rest at the target, s."""
         double = KalmanFilter(**self._arguments)
         n, m = self.mechanism.n, self.mechanism.m
         double.reset(np.zeros(2 * n))
         for k in range(round(seconds / self.period)):
             double.estimate(Measurement(k * self.period, np.zeros(n)), np.zeros(m))
-        return double.covariance
+        return double
+
+    def steady_covariance(self) -> FloatArray:
+        """Return the covariance that a filter like this one comes to, at rest at the target."""
+        return self._at_rest().covariance
+
+    def noise_covariance(self) -> FloatArray:
+        """Return what the sensors' noise alone makes of the estimate at the target, (2n, 2n).
+
+        The filter's own covariance counts besides what the model may leave out.  With the gain L of
+        the filter at rest, e⁺ = (I − L C) F e + L v, and the estimate runs ahead by the delay.
+        """
+        from scipy.linalg import solve_discrete_lyapunov  # slow to import
+
+        rest, n = self._at_rest(), self.mechanism.n
+        size = self._learnt  # parameters stay as they are at rest
+        F, P = rest._F[:size, :size], rest._P[:size, :size]
+        R = np.diag(rest._variance)
+        gain = P[:, :n] @ np.linalg.inv(R)  # of a covariance after its update
+        ahead = np.linalg.matrix_power(F, self._lead)
+        noise = gain @ R @ gain.T
+        error = solve_discrete_lyapunov(F - gain @ F[:n], noise)
+        return np.asarray((ahead @ error @ ahead.T)[: 2 * n, : 2 * n])
 
     @property
     def covariance(self) -> FloatArray:

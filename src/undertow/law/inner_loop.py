@@ -47,6 +47,9 @@ class InnerLoop:
     u, demand, s
         What the last step gave, (m,): clipped, not clipped, values of the surface.  The
         arrays are written over by the next step.
+    parameters
+        Values of the mechanism's parameters that the steps believe in, (P,), SI units: who learns
+        them writes them here.
 
     Examples
     --------
@@ -66,6 +69,7 @@ class InnerLoop:
         memory = law_memory(self.mechanism)
         self.u, self.demand, self.s = memory["u"], memory["demand"], memory["s"]
         self.margin, self._block = memory["margin"], memory.block
+        self.parameters: FloatArray = memory["parameters"]
         self.use(self.surface, self.reaching)
 
     @cached_property

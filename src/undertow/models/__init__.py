@@ -11,6 +11,7 @@ from undertow.models.linearisation import (
     controllability,
     has_linear_model,
     linear_accelerations,
+    linear_numbers,
     linearise,
 )
 from undertow.models.mechanism import Mechanism
@@ -55,6 +56,7 @@ __all__ = [
     "is_smooth",
     "kinks",
     "linear_accelerations",
+    "linear_numbers",
     "linearise",
     "normal_name",
     "number_of",

@@ -2,7 +2,12 @@
 
 from undertow.runtime.clock import Histogram, SimulatedClock, WallClock
 from undertow.runtime.controller import Controller, Inputs
-from undertow.runtime.controller_defaults import default_gate, estimator_for, reaching_for
+from undertow.runtime.controller_defaults import (
+    default_gate,
+    estimator_for,
+    for_rig,
+    reaching_for,
+)
 from undertow.runtime.encoding import Columns
 from undertow.runtime.log import Log, Recording, read_log
 from undertow.runtime.loop import Runtime
@@ -52,6 +57,7 @@ __all__ = [
     "background_worker",
     "default_gate",
     "estimator_for",
+    "for_rig",
     "reaching_for",
     "read_log",
     "replay",

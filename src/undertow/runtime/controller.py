@@ -19,7 +19,7 @@ import numpy as np
 
 from undertow.cascade import Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
-from undertow.estimators.interface import Estimator
+from undertow.estimators import Estimator, KalmanFilter
 from undertow.models import FloatArray
 from undertow.plants import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
@@ -84,7 +84,8 @@ class Controller:
     memory
         What the cascade starts with, from :meth:`undertow.Cascade.start`.
     estimator
-        Measurements to states.  What it knows of a matched disturbance is taken off the output.
+        Measurements to states.  What it knows of a matched disturbance is taken off the output;
+        the parameters that it learns are the law's, and what the next request is planned with.
     period
         Of the fast loop, s.
     settings
@@ -133,6 +134,10 @@ class Controller:
         fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
         fast = step_memory(mechanism, settings, period, fall_angle)
         self._block = fast.block
+        self._parameters: FloatArray = fast["parameters"]
+        self._learning: KalmanFilter | None = None
+        if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
+            self._learning = estimator
         self.u: FloatArray = fast["output"]
         self.x, self.wrapped, self.s = fast["x"], fast["wrapped"], fast["s"]
         self.demand, self.margin = fast["demand"], fast["margin"]
@@ -151,7 +156,7 @@ class Controller:
         self.sensors = SensorMonitor(mechanism, settings, period)
         self._names = [c.name for c in mechanism.coordinates]
         self._plans = PlanCheck(mechanism, cascade.reaching)
-        self._law_vectors, self._times = law_vectors_of(cascade, memory.plan), memory.plan.times
+        self._law_vectors, self._times = law_vectors_of(cascade, memory), memory.plan.times
         self._segment, self._law_vector = 0, self._law_vectors[0]
         self._next = memory, self._law_vectors, self._times
         self._packed = self._law_vectors
@@ -223,6 +228,8 @@ class Controller:
             if sensors.first:
                 self.estimator.reset(np.concatenate([accepted.q, np.zeros_like(accepted.q)]))
             estimate = self.estimator.estimate(accepted, self.u)
+            if self._learning is not None:
+                self._parameters[:] = self._learning.parameters
         if self._segment + 1 < len(self._times):
             self._proceed(t)
         new, most = self._law_vector, -1.0
@@ -350,7 +357,10 @@ class Controller:
             return
         if self._pending is not None:
             return
-        if self.memory.sequence != self._sequence:
+        if self._learning is not None:
+            learnt = self._learning.learnt
+            self.memory = replace(self.memory, sequence=self._sequence, estimate=learnt)
+        elif self.memory.sequence != self._sequence:
             self.memory = replace(self.memory, sequence=self._sequence)
         if self._ahead and t >= self._ahead[0][0] - self._jump_lead - 2 * self._lead:
             begin, motion = self._ahead[0]
@@ -438,7 +448,10 @@ class Controller:
             return ""  # its plan is not used
         if answer.memory.since != answer.use:
             return f"{UNSOUND}its plan is of another time"
-        plan = answer.memory.plan
+        plan, known = answer.memory.plan, self.cascade.known
+        asked = None if self._asked is None else self._asked.memory.estimate
+        if known is not None and asked is not None:
+            self._plans.believe(known.values(asked.offset))
         self._packed = self._plans.pack(plan)
         if not np.array_equal(self._packed[:, :-1], answer.law_vectors[:, :-1]):
             return f"{UNSOUND}its numbers are not those of its plan"

@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from undertow.base import MissingExtraError
-from undertow.cascade import Gate, cost_gate, noise_share, robustness_gate
-from undertow.estimators import KalmanFilter
+from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
+from undertow.estimators import Belief, KalmanFilter
 from undertow.law import ProvedSet, ReachingLaw, Surface, first_surface
-from undertow.models import Mechanism
+from undertow.models import FloatArray, Mechanism
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
 
@@ -33,7 +34,9 @@ DRIFT = 0.1
 EXACT = 1e-6
 
 
-def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -> KalmanFilter:
+def estimator_for(
+    belief: Mechanism, bench: Bench, drift: float | None = None, known: Belief | None = None
+) -> KalmanFilter:
     """Return the Kalman filter that knows a bench's encoders, period and delays, nothing else.
 
     Parameters
@@ -45,6 +48,8 @@ def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -
     drift
         Density of the matched disturbance's drift, input units per √s; ``DRIFT`` of the
         smallest limit by default.  0 estimates none.
+    known
+        What is not known of the model's parameters, which are then learnt.
     """
     sigmas = []
     for c in belief.coordinates:
@@ -57,6 +62,7 @@ def estimator_for(belief: Mechanism, bench: Bench, drift: float | None = None) -
         position_noise=sigmas,
         disturbance_drift=DRIFT * float(finite_limits(belief).min()) if drift is None else drift,
         delay=timing.input_delay + timing.measurement_delay,
+        belief=known,
     )
 
 
@@ -76,11 +82,28 @@ def default_gate(estimator: KalmanFilter | None = None) -> Gate:
     """
     if estimator is None:
         return cost_gate
-    period, size = estimator.period, 2 * estimator.mechanism.n
-    covariance = estimator.steady_covariance()[:size, :size]
     return robustness_gate(
-        BEARS * period, RESERVE, period=period, covariance=covariance, noise=NOISE
+        BEARS * estimator.period,
+        RESERVE,
+        period=estimator.period,
+        covariance=steady_covariance(estimator),
+        noise=NOISE,
     )
+
+
+def for_rig(cascade: Cascade, estimator: KalmanFilter) -> Cascade:
+    """Return a cascade whose gate and covariance suit a rig, where they are for exact states."""
+    gate = default_gate(estimator) if cascade.gate is cost_gate else cascade.gate
+    covariance = cascade.covariance
+    if covariance is None:
+        covariance = estimator.noise_covariance()
+    return replace(cascade, gate=gate, covariance=covariance)
+
+
+def steady_covariance(estimator: KalmanFilter) -> FloatArray:
+    """Return what an estimator does not know of the state at the target, (2n, 2n)."""
+    size = 2 * estimator.mechanism.n
+    return estimator.steady_covariance()[:size, :size]
 
 
 def reaching_for(estimator: KalmanFilter) -> ReachingLaw:
@@ -89,8 +112,7 @@ def reaching_for(estimator: KalmanFilter) -> ReachingLaw:
     The gains near the target go with η/ε: ε is doubled until what the estimator does not know
     takes no more than ``NOISE`` of the input on the first surface, ``DOUBLED`` times at most.
     """
-    mechanism, size = estimator.mechanism, 2 * estimator.mechanism.n
-    covariance = estimator.steady_covariance()[:size, :size]
+    mechanism, covariance = estimator.mechanism, steady_covariance(estimator)
     surface = first_surface(mechanism)
     laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
     quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)

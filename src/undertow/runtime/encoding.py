@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self, TypeGuard
 import numpy as np
 
 from undertow.cascade import Admission, CascadeState
+from undertow.estimators import ParameterEstimate
 from undertow.law import Plan, ReachingLaw, ReferenceMotion, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import Proposal
@@ -205,14 +206,34 @@ def memory_to(memory: CascadeState) -> dict[str, Any]:
         "since": memory.since,
         "x": list(memory.x),
         "target": None if memory.target is None else list(memory.target.position(0.0)),
+        "estimate": None if memory.estimate is None else _estimate_to(memory.estimate),
     }
+
+
+def _estimate_to(estimate: ParameterEstimate) -> dict[str, Any]:
+    return {
+        "offset": estimate.offset.tolist(),
+        "information": estimate.information.tolist(),
+        "samples": estimate.samples,
+    }
+
+
+def _estimate_from(value: Mapping[str, Any]) -> ParameterEstimate:
+    offset, information = np.array(value["offset"]), np.array(value["information"])
+    return ParameterEstimate(offset, information, value["samples"])
 
 
 def memory_from(value: Mapping[str, Any]) -> CascadeState:
     """Return the memory that was encoded."""
     x, q = tuple(value.get("x", ())), value.get("target")  # logs before this one have none
     target = None if q is None else ReferenceMotion.at_rest(np.array(q, dtype=float))
-    changed = {"plan": _plan_from(value["plan"]), "x": x, "target": target}
+    learnt = value.get("estimate")
+    changed = {
+        "plan": _plan_from(value["plan"]),
+        "x": x,
+        "target": target,
+        "estimate": None if learnt is None else _estimate_from(learnt),
+    }
     return CascadeState(**{**value, **changed})
 
 

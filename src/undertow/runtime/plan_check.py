@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from undertow.law import LawLayout, Plan, ReachingLaw, coupling
-from undertow.models import FloatArray, Mechanism, linearise
+from undertow.law import LawLayout, Plan, ReachingLaw
+from undertow.models import FloatArray, Mechanism, linear_numbers
 from undertow.symbolic import Workspace, numba
 
 #: What the test knows and works on: M, F and D of the unactuated rows at the target, X = M_uu⁻¹
@@ -38,15 +38,21 @@ class PlanCheck:
         n, m = mechanism.n, mechanism.m
         self._m, self._layout = m, LawLayout(n, m)
         self._reaching, self._usual = reaching, reaching.vector(m)
-        linear, free = linearise(mechanism), n - m
+        self._mechanism, free = mechanism, n - m
         self._parts = Workspace(
             _LAYOUT, n=n, m=m, free=free, size=n + free, width=max(m, free)
         )  # fmt: skip
-        for name, whole in (("M", linear.M), ("F", linear.F), ("D", linear.D)):
-            self._parts[name][:] = whole[m:]
-        self._parts["X"][:] = coupling(mechanism, np.zeros(n))
+        self.believe(mechanism.parameter_values)
         self._arrays = tuple(self._parts[name] for name in _LAYOUT)
         self._gamma(), self._judge()  # compiled by now
+
+    def believe(self, values: FloatArray) -> None:
+        """Test from now on with other values of the mechanism's parameters, (P,), SI units."""
+        (mass,), (slopes,), _ = linear_numbers(self._mechanism, values[None])
+        m, n = self._m, len(mass)
+        for name, whole in (("M", mass), ("F", slopes[:, :n]), ("D", slopes[:, n:])):
+            self._parts[name][:] = whole[m:]
+        self._parts["X"][:] = np.linalg.solve(mass[m:, m:], mass[m:, :m])
 
     def pack(self, plan: Plan) -> FloatArray:
         """Return the numbers of the law for each surface of a plan, (S, 2mn + 2m + 1).

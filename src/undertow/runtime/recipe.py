@@ -10,9 +10,9 @@ from functools import cached_property
 from typing import Any, Literal, Self, get_args
 
 from undertow.base import InvalidInputError, UndertowError, one_of
-from undertow.cascade import Cascade, CascadeState, Legs, cost_gate, derate_actuator, legs_of
+from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator, legs_of
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
-from undertow.estimators import Belief, KalmanFilter
+from undertow.estimators import KalmanFilter
 from undertow.law import Plan, ReachingLaw, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
@@ -24,8 +24,8 @@ from undertow.plants.bench import bench_for
 from undertow.runtime.controller import Controller
 from undertow.runtime.controller_defaults import (
     RESERVE,
-    default_gate,
     estimator_for,
+    for_rig,
     provable,
     reaching_for,
 )
@@ -36,8 +36,9 @@ from undertow.runtime.slow_loop import Answer, Request, respond
 SHORTEST, FARTHEST = 1e-5, 3600.0
 
 #: Which words a recipe's objective is written in.  Logs before had no such number: their
-#: "energy" and "time" are "bench-energy" and "bench-time" now.
-WORDS = 2
+#: "energy" and "time" are "bench-energy" and "bench-time" now.  Runs before 3 took their mechanism
+#: for exact.
+WORDS = 3
 
 #: Names of settings in logs before version 0.2.0, and what they are now.
 OLD_SETTINGS = {
@@ -83,11 +84,15 @@ class Recipe:
         Set-points, pairs of a time, s, and coordinates with positions, rad or m, see
         :class:`undertow.SetPoints`; without any x = 0.  Times count from the start of the run, and
         the target jumps once there is a plan for it.
+    learns
+        Whether the mechanism's parameters, within their tolerances, are learnt as it runs;
+        otherwise they are exact.
     settings
         Limits and timeouts.
     design
-        A cascade with further settings, for the same mechanism and objective.  Its gate and
-        reaching law are kept if they are not the defaults, which are for exact states.
+        A cascade with further settings, for the same mechanism and objective.  Its gate,
+        covariance and reaching law are kept if they are not the defaults, which are for exact
+        states.
 
     Raises
     ------
@@ -107,6 +112,7 @@ class Recipe:
     period: float = 0.001
     swing_up: bool = False
     target: tuple[tuple[float, Mapping[str, float]], ...] = ()
+    learns: bool = True
     settings: Settings = field(default_factory=Settings)
     design: Cascade | None = None
 
@@ -177,8 +183,13 @@ class Recipe:
                 return None
             made = replace(made, objective=named_goal, horizon=goal.horizon)
         if self.design is not None:
-            usual = Cascade(self.design.mechanism, self.design.objective, seed=self.seed)
-            others = ("mechanism", "objective", "belief")  # a run is exact in any case
+            usual = Cascade(
+                self.design.mechanism,
+                self.design.objective,
+                seed=self.seed,
+                belief="usual" if self.learns else "exact",
+            )
+            others = ("mechanism", "objective")
             settings = [f.name for f in fields(usual) if f.name not in others]
             if any(getattr(self.design, name) != getattr(usual, name) for name in settings):
                 return None
@@ -195,32 +206,25 @@ class Recipe:
 
     @cached_property
     def cascade(self) -> Cascade:
-        """Law, optimiser and gate; the mechanism is taken to be exact: a run does not learn yet.
-
-        Raises
-        ------
-        InvalidInputError
-            For a design with a belief of its own.
-        """
-        estimator, goal = self.make_estimator(), self.objective
-        if not isinstance(goal, Objective):
-            goal = objective_for(self.belief, goal, horizon=self.horizon)
-        design = self.design or Cascade(self.belief, goal, seed=self.seed)
-        if isinstance(design.belief, Belief):
-            raise InvalidInputError(
-                "belief of a run",
-                value=f"tolerances of {', '.join(design.belief.tolerances)}",
-                limit='"exact": a run does not learn yet',
-                remedy="Leave it out, or simulate the cascade",
-            )
+        """Law, optimiser and gate."""
+        estimator, design = self.make_estimator(), self._designed
         given = design.reaching != ReachingLaw()
         return replace(
-            design,
-            belief="exact",
+            for_rig(design, estimator),
             reaching=design.reaching if given else reaching_for(estimator),
             warm=design.warm or Budget(self.evaluations, self.seconds),
-            gate=default_gate(estimator) if design.gate is cost_gate else design.gate,
         )
+
+    @cached_property
+    def _designed(self) -> Cascade:
+        """The cascade as it is for exact states."""
+        if self.design is not None:
+            return self.design
+        goal = self.objective
+        if not isinstance(goal, Objective):
+            goal = objective_for(self.belief, goal, horizon=self.horizon)
+        known: Literal["usual", "exact"] = "usual" if self.learns else "exact"
+        return Cascade(self.belief, goal, seed=self.seed, belief=known)
 
     @cached_property
     def swing(self) -> SwingUpAndCatch | None:
@@ -289,10 +293,11 @@ class Recipe:
 
     def make_estimator(self) -> KalmanFilter:
         """Return the estimator that suits the rig's sensors and delays."""
+        known = self._designed.known
         if self.rig == "ideal":  # belief is truth: nothing disturbs it
             exact = Bench(self.belief).with_timing(period=self.period)
-            return estimator_for(self.belief, exact, drift=0.0)
-        return estimator_for(self.belief, self.bench)
+            return estimator_for(self.belief, exact, drift=0.0, known=known)
+        return estimator_for(self.belief, self.bench, known=known)
 
     def make_controller(self, memory: CascadeState) -> Controller:
         """Return the controller, idle."""
@@ -365,8 +370,11 @@ _KINDS: Mapping[type, tuple[type, ...]] = {
 
 
 def _in_words_of_now(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a recipe's values, the objective of an older one by the word that it has now."""
+    """Return a recipe's values, those of an older one as they are written now."""
     known = dict(values)
-    if known.pop("words", None) is None and "objective" in known:
+    words = known.pop("words", None)
+    if words is None and "objective" in known:
         known["objective"] = f"bench-{known['objective']}"
+    if words is None or words < WORDS:
+        known["learns"] = False
     return known

@@ -294,7 +294,7 @@ def _same_decision(controller: Controller, answer: Answer) -> bool:
     if answer.proposal.plan is None and answer.proposal.status not in ("failed", "infeasible"):
         return True  # what the optimiser said could not be written down
     if answer.jump:  # the first plan of a task is compared with none
-        return np.array_equal(law_vectors_of(cascade, answer.memory.plan), answer.law_vectors)
+        return np.array_equal(law_vectors_of(cascade, answer.memory), answer.law_vectors)
     _, admission, law_vectors = judge(cascade, answer.before, answer.proposal, answer.x, answer.use)
     cost = admission.cost == answer.admission.cost or (
         math.isnan(admission.cost) and math.isnan(answer.admission.cost)

@@ -198,8 +198,9 @@ def run(
     """Run a cascade on a rig, against the clock, and return how it went.
 
     What the cascade leaves at its default for exact states is replaced by what suits a rig: its
-    gate by :func:`undertow.runtime.controller_defaults.default_gate`, its reaching law by one with
-    a boundary layer as thick as the sensors need.
+    gate by :func:`undertow.runtime.controller_defaults.default_gate`, its covariance by the
+    estimator's, its reaching law by one with a boundary layer as thick as the sensors need.  The
+    estimator learns the parameters that the cascade's belief leaves open.
 
     Parameters
     ----------
@@ -256,6 +257,7 @@ def run(
             period=0.001 if rig is None else rig.period,
             seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
             target=() if target is None else _points(target),
+            learns=cascade.belief != "exact",
             settings=settings,
             design=cascade,
         )

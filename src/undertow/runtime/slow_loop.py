@@ -115,19 +115,17 @@ def is_answer(said: object) -> TypeGuard[Answer]:
     )
 
 
-def law_vectors_of(cascade: Cascade, plan: Plan) -> FloatArray:
-    """Return the numbers of the compiled law for each surface of a plan, (S, 2mn + 2m + 1).
+def law_vectors_of(cascade: Cascade, memory: CascadeState) -> FloatArray:
+    """Return the numbers of the compiled law for each surface of its plan, (S, 2mn + 2m + 1).
 
     Raises
     ------
     UndertowError
         For a plan that does not fit the mechanism, or is singular at the target.
     """
-    laws = plan.reaching or (cascade.reaching,) * len(plan.surfaces)
-    pairs = zip(plan.surfaces, laws, strict=True)
-    return np.stack(
-        [pack_law_parameters(SlidingModeLaw(cascade.mechanism, s, law)) for s, law in pairs]
-    )
+    plan, believed = memory.plan, cascade.believed(memory)
+    pairs = zip(plan.surfaces, plan.laws(cascade.reaching), strict=True)
+    return np.stack([pack_law_parameters(SlidingModeLaw(believed, s, law)) for s, law in pairs])
 
 
 def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None = None) -> Answer:
@@ -162,7 +160,7 @@ def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -
         admission = Admission(True, "first optimum for another target", after.predicted)
         answer = _answer(
             request, after.error(use, place), proposal, after, admission,
-            law_vectors_of(cascade, after.plan), began,
+            law_vectors_of(cascade, after), began,
         )  # fmt: skip
         return replace(answer, jump=True)
     except Exception as error:
@@ -208,7 +206,7 @@ def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began:
     words = "not to be caught from here" if surface is None else "comes home from here"
     after = replace(memory, plan=plan, since=request.use, sequence=request.sequence, x=())
     admission = Admission(surface is not None, words, math.inf)
-    vectors = law_vectors_of(cascade, plan)
+    vectors = law_vectors_of(cascade, after)
     return _answer(request, home, proposal, after, admission, vectors, began)
 
 
@@ -218,19 +216,19 @@ def judge(
     """Pass a proposal through the cascade's gate; whatever goes wrong refuses it."""
     try:
         after, admission = cascade.apply_gate(memory, proposal, memory.absolute(use, x))
-        return after, admission, law_vectors_of(cascade, after.plan)
+        return after, admission, law_vectors_of(cascade, after)
     except Exception as error:  # an optimiser's answer may be anything
         reason = f"gate: {type(error).__name__}: {error}"
         admission = Admission(False, reason, memory.predicted)
         number = memory.sequence + 1
         after = replace(memory, plan=memory.at(use), since=use, sequence=number, x=())
-        return after, admission, law_vectors_of(cascade, after.plan)
+        return after, admission, law_vectors_of(cascade, after)
 
 
 def _predicted(cascade: Cascade, request: Request) -> FloatArray:
     plan, span = request.memory.at(request.t), request.use - request.t
     try:
-        loop = cascade.about(cascade.loop, request.memory.target, request.t)
+        loop = cascade.loop_at(request.memory, request.t)
         batch = loop.batch(request.x, plan, duration=span, terminal=0.0)
         return np.asarray(batch.x[0])
     except Exception:  # then the optimiser fails on it too, and says so

@@ -21,7 +21,7 @@ from undertow.models import FloatArray, Mechanism
 from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, srv02_rig
-from undertow.runtime import default_gate, estimator_for
+from undertow.runtime import estimator_for, for_rig
 from undertow.studies.trials.steering import CascadeSteering, steady
 from undertow.studies.trials.trial import MakeController, Outcome, trial, undisturbed
 
@@ -82,8 +82,8 @@ def controllers(
     re-optimisations may spend ``budget`` rollouts each.  Of the bench the gate knows what its
     estimator does.
     """
-    gate = default_gate(estimator_for(belief, bench))
-    cascade = Cascade(belief, objective, warm=Budget(budget), gate=gate, seed=seed, belief="exact")
+    exact = Cascade(belief, objective, warm=Budget(budget), seed=seed)
+    cascade = for_rig(exact, estimator_for(belief, bench))
     start = cascade.start(x0)
     once = start[1].surface
     assert once is not None  # start() raises otherwise

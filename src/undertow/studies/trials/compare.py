@@ -13,11 +13,13 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, at_least, checked, positive, require_extra
 from undertow.cascade import Cascade
+from undertow.estimators import Belief
 from undertow.law import InnerLoop, Surface
 from undertow.models import Mechanism
 from undertow.objective import Objective
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
+from undertow.runtime import estimator_for
 from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, predictive, steady
 from undertow.studies.trials.trial import MakeController, Outcome, trial, undisturbed
 
@@ -143,8 +145,9 @@ def compare(
 ) -> Comparison:
     """Run each controller on each plant from the same start, in simulated time.
 
-    All have the same estimator, and what it knows of a disturbance at the inputs is taken off the
-    output of each.
+    All have the same kind of estimator, and what it knows of a disturbance at the inputs is taken
+    off the output of each.  It learns the usual parameters, for a cascade those that its belief
+    leaves open.
 
     Parameters
     ----------
@@ -197,9 +200,11 @@ def compare(
         make = _maker(mechanism, controller, start)
         for place, plant in meets.items():
             bench = undisturbed(plant) if isinstance(plant, Mechanism) else plant
+            known = controller.known if isinstance(controller, Cascade) else Belief.usual(mechanism)
             outcomes[name, place] = trial(
-                mechanism, bench, make, start, seconds, seed, objective=objective
-            )
+                mechanism, bench, make, start, seconds, seed,
+                objective=objective, estimator=estimator_for(mechanism, bench, known=known),
+            )  # fmt: skip
     return Comparison(outcomes, "" if objective is None else objective.unit)
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from undertow.base import MissingExtraError, Progress, no_progress, versions
+from undertow.estimators import Belief
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.plants import Bench, Push, srv02_rig
@@ -231,7 +232,8 @@ def robustness(
         known = book.known.get((name, what, value, seed))
         if known is not None:
             return known
-        told, length = estimator_for(belief, bench), seconds if what == "random" else SINGLE
+        told = estimator_for(belief, bench, known=Belief.usual(belief))
+        length = seconds if what == "random" else SINGLE
         outcome = trial(
             belief, truth, makers[name], x0, length, seed, objective=objective, estimator=told
         )

@@ -9,6 +9,7 @@ cascade's answers come a period late.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import sympy as sp
 from undertow.base import require_extra
 from undertow.bounds.expressions import translate
 from undertow.cascade import Cascade, CascadeState
-from undertow.estimators import StateFeedback
+from undertow.estimators import Estimator, KalmanFilter, StateFeedback
 from undertow.law import InnerLoop
 from undertow.models import FloatArray, Mechanism, linearise, require_smooth
 from undertow.objective import Objective
@@ -36,7 +37,8 @@ class CascadeSteering:
     """The cascade in simulated time; its optimiser answers one period later, as on a real rig.
 
     At every multiple of the period the answer asked for one period ago is judged from the
-    present state, then the next one is asked for: for the state predicted one period ahead.
+    present state, then the next one is asked for: for the state predicted one period ahead.  Where
+    it has a belief, its estimator learns what that leaves open, see :meth:`listen`.
 
     Parameters
     ----------
@@ -58,9 +60,20 @@ class CascadeSteering:
         self.law = InnerLoop(cascade.mechanism, self.memory.surface, cascade.reaching)
         self.waiting: Proposal | None = None
         self.ticks = self.admitted = self.refused = 0
+        self.learning: KalmanFilter | None = None
+
+    def listen(self, estimator: Estimator) -> None:
+        """Go on with the parameters that an estimator learns, if it is for the same belief."""
+        known = self.cascade.known
+        if known is None or not isinstance(estimator, KalmanFilter) or estimator.belief is None:
+            return
+        if estimator.belief.tolerances == known.tolerances:
+            self.learning = estimator
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x)."""
+        if self.learning is not None:
+            self.law.parameters[:] = self.learning.parameters
         if t >= self.ticks * self.cascade.period - 1e-9:
             self._slow(self.ticks * self.cascade.period, x)
             self.ticks += 1
@@ -77,13 +90,16 @@ class CascadeSteering:
         cascade = self.cascade
         if not np.isfinite(x).all():
             return
+        if self.learning is not None:
+            self.memory = replace(self.memory, estimate=self.learning.learnt)
         if self.waiting is not None:
             self.memory, admission = cascade.apply_gate(self.memory, self.waiting, x)
             self.admitted += admission.accepted
             self.refused += not admission.accepted
             self._use(t)
         later = t + cascade.period
-        ahead = cascade.loop.batch(x, self.memory.at(t), duration=cascade.period, terminal=0.0)
+        loop = cascade.loop_at(self.memory, t)
+        ahead = loop.batch(x, self.memory.at(t), duration=cascade.period, terminal=0.0)
         self.waiting = cascade.propose(self.memory, ahead.x[0], later)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.closed_loop import Event, Trajectory
-from undertow.estimators import Estimator, Record, StateFeedback, compensated, run_recorded
+from undertow.estimators import Belief, Estimator, Record, StateFeedback, compensated, run_recorded
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.plants import Bench, RealisticRig
@@ -96,16 +96,21 @@ def trial(
     objective
         What the cost is counted by.
     estimator
-        By default :func:`undertow.runtime.controller_defaults.estimator_for` the bench.  What it
-        knows of a matched disturbance is taken off the controller's output.
+        By default :func:`undertow.runtime.controller_defaults.estimator_for` the bench, which
+        learns the usual parameters.  What it knows of a matched disturbance is taken off the
+        controller's output; a controller that has a method ``listen`` is given it.
     compensates
         Asked at each step: whether it is.
     """
     rig = RealisticRig(bench, x0, seed)
     seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
-    estimator = estimator_for(belief, bench) if estimator is None else estimator
+    if estimator is None:
+        estimator = estimator_for(belief, bench, known=Belief.usual(belief))
     estimator.reset(seen)
-    controller = compensated(make(seen), estimator, belief.input_limits, compensates)
+    steering = make(seen)
+    if hasattr(steering, "listen"):
+        steering.listen(estimator)
+    controller = compensated(steering, estimator, belief.input_limits, compensates)
     record = run_recorded(rig, estimator, controller, seconds)
     return judge(belief, record, seed, objective)
 

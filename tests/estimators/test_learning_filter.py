@@ -1,0 +1,193 @@
+"""The Kalman filter that learns parameters: against a dense one in NumPy, and on plants."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.base import InvalidInputError
+from undertow.cascade.robustness import feedback
+from undertow.closed_loop import ClosedLoop
+from undertow.estimators import Belief, KalmanFilter
+from undertow.law import InnerLoop
+from undertow.models import FloatArray, Mechanism
+from undertow.plants import IdealRig, Measurement
+
+PERIOD, NOISE = 0.001, 2e-4
+
+
+@pytest.fixture(scope="module")
+def arm() -> Mechanism:
+    return ut.mechanisms.rotary_pendulum(d_e=0.073)
+
+
+def _learning(arm: Mechanism, **settings: float) -> KalmanFilter:
+    return KalmanFilter(arm, PERIOD, position_noise=NOISE, belief=Belief.usual(arm), **settings)
+
+
+def _reference(
+    arm: Mechanism, belief: Belief, readings: FloatArray, inputs: FloatArray, drifts: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The textbook's extended filter of (q, q̇, θ), dense, all positions taken in at once."""
+    n, known = arm.n, len(belief.tolerances)
+    size = 2 * n + known
+
+    def rates(z: FloatArray, u: FloatArray) -> FloatArray:
+        plant = arm.with_values(belief.values(z[2 * n :]))
+        return np.concatenate(
+            [z[n : 2 * n], plant.accelerations(0.0, z[: 2 * n], u), 0.0 * z[2 * n :]]
+        )
+
+    z, P = np.zeros(size), np.diag([NOISE**2] * n + [1.0] * n + [1.0 / 3.0] * known)
+    z[:n] = readings[0]
+    C, R = np.eye(n, size), NOISE**2 * np.eye(n)
+    for q, u in zip(readings, inputs, strict=True):
+        A = np.column_stack(
+            [(rates(z + e, u) - rates(z - e, u)) / 2e-6 for e in 1e-6 * np.eye(size)]
+        )
+        F = np.eye(size) + PERIOD * A + 0.5 * (PERIOD * A) @ (PERIOD * A)
+        k1 = rates(z, u)
+        k2 = rates(z + 0.5 * PERIOD * k1, u)
+        k3 = rates(z + 0.5 * PERIOD * k2, u)
+        k4 = rates(z + PERIOD * k3, u)
+        z = z + PERIOD / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        P = F @ P @ F.T + PERIOD * np.diag(drifts**2)
+        gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
+        z = z + gain @ (q - C @ z)
+        P = P - gain @ C @ P
+    return z, P
+
+
+def test_it_is_the_textbooks_filter_of_state_and_parameters(
+    arm: Mechanism, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """60 samples of a motion of another plant; it learns from each."""
+    monkeypatch.setattr("undertow.estimators.kalman.EXCITED", 0.0)
+    belief, rng = Belief.usual(arm), np.random.default_rng(4)
+    plant = arm.with_parameters(m=1.1 * 0.125)
+    kalman = _learning(arm)
+    rig, rows, inputs = IdealRig(plant, arm.state(phi=0.4), PERIOD), [], []
+    u = np.zeros(1)
+    for k in range(60):
+        seen = rig.read()
+        q = seen.q + NOISE * rng.standard_normal(2)
+        rows.append(q)
+        inputs.append(u)
+        if k == 0:
+            kalman.reset(np.concatenate([q, np.zeros(2)]))
+        kalman.estimate(Measurement(k * PERIOD, q), u)
+        u = np.array([8.0 + np.sin(0.2 * k)])
+        rig.write(u)
+    drifts = np.array([0.0] * 2 + [0.5] * 2 + [0.1] * len(belief.tolerances))
+    z, P = _reference(arm, belief, np.array(rows), np.array(inputs), drifts)
+    learnt = kalman.learnt
+    assert learnt is not None
+    np.testing.assert_allclose(kalman.covariance[:4, :4], P[:4, :4], rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(learnt.deviation**2, np.diag(P)[4:], rtol=1e-4)
+    np.testing.assert_allclose(learnt.offset, z[4:], atol=1e-4)
+    assert np.abs(learnt.offset).max() > 0.01
+
+
+def test_it_finds_the_plant_that_moves(arm: Mechanism) -> None:
+    """Of twelve plants the accelerations come nearer than the model's; within what it says.
+
+    Which of six parameters it was, a motion of half a second does not tell.
+    """
+    belief, rng = Belief.usual(arm), np.random.default_rng(5)
+    law = InnerLoop(arm, ut.first_surface(arm))
+    model, learned, sizes = [], [], []
+    for _ in range(12):
+        truth = rng.uniform(-1, 1, len(belief.tolerances))
+        plant = arm.with_values(belief.values(truth))
+        rig, kalman, u = IdealRig(plant, arm.state(phi=0.4), PERIOD), _learning(arm), np.zeros(1)
+        kalman.reset(arm.state(phi=0.4))
+        for _ in range(500):
+            seen = rig.read()
+            q = seen.q + NOISE * rng.standard_normal(2)
+            u = law(kalman.estimate(Measurement(seen.t, q), u)).copy()
+            rig.write(u)
+        learnt = kalman.learnt
+        assert learnt is not None
+        off = learnt.offset - truth
+        sizes.append(off @ learnt.information @ off)
+        x, push = arm.state(phi=0.3, theta_dot=1.0, phi_dot=-1.0), np.array([5.0])
+        true = plant.accelerations(0.0, x, push)
+        model.append(arm.accelerations(0.0, x, push) - true)
+        learned.append(belief.believed(learnt).accelerations(0.0, x, push) - true)
+    assert np.sqrt(np.mean(np.square(learned))) < 0.3 * np.sqrt(np.mean(np.square(model)))
+    assert np.mean(sizes) < 2.0 * len(belief.tolerances)  # χ² of so many numbers
+
+
+def test_at_rest_nothing_is_learnt_and_a_reset_forgets(arm: Mechanism) -> None:
+    """What dry friction does near rest would be taken for parameters."""
+    kalman, rng = _learning(arm), np.random.default_rng(6)
+    kalman.reset(np.zeros(4))
+    first = kalman.learnt
+    for k in range(300):
+        kalman.estimate(Measurement(k * PERIOD, NOISE * rng.standard_normal(2)), np.zeros(1))
+    rest = kalman.learnt
+    assert first is not None
+    assert rest is not None
+    np.testing.assert_array_equal(rest.offset, first.offset)
+    np.testing.assert_allclose(rest.information, first.information, rtol=1e-9)
+    for k in range(100):  # nonsense
+        kalman.estimate(Measurement(0.3 + k * PERIOD, rng.standard_normal(2)), np.array([10.0]))
+    moved = kalman.learnt
+    assert moved is not None
+    assert np.abs(moved.offset).max() > 0.01
+    room = Belief.usual(arm).room
+    assert (np.abs(moved.offset) <= room).all()
+    assert (kalman.parameters > [p.low for p in arm.parameters]).all()
+    kalman.reset(np.zeros(4))
+    np.testing.assert_array_equal(kalman.parameters, arm.parameter_values)
+
+
+def test_noise_of_the_estimate_at_rest(arm: Mechanism) -> None:
+    """Predicted from the filter's gain, and sampled from 60 s of white noise; with a delay too."""
+    for delay in (0.0, 0.003):
+        kalman = KalmanFilter(arm, PERIOD, position_noise=NOISE, disturbance_drift=0.5, delay=delay)
+        kalman.reset(np.zeros(4))
+        law, rng = np.zeros(1), np.random.default_rng(7)
+        rows = []
+        for k in range(60_000):
+            seen = Measurement(k * PERIOD, NOISE * rng.standard_normal(2))
+            rows.append(kalman.estimate(seen, law).copy())
+        sampled = np.cov(np.array(rows[1000:]).T)
+        predicted = kalman.noise_covariance()
+        scale = np.sqrt(np.diag(predicted))
+        np.testing.assert_allclose(
+            sampled / np.outer(scale, scale), predicted / np.outer(scale, scale), atol=0.1
+        )
+
+
+def test_what_noise_costs_is_its_share_of_the_input(arm: Mechanism) -> None:
+    """tr(R K P Kᵀ) per second, K by differences of the law; with an ensemble and without."""
+    rng = np.random.default_rng(8)
+    root = 0.01 * rng.normal(size=(4, 4))
+    P = root @ root.T
+    surfaces = [ut.first_surface(arm), ut.Surface(-1, -1.59, 1.96, 12.1)]
+    x, belief = arm.state(phi=0.3), Belief.relative(arm, m=0.1)
+    for ensemble in (None, belief.ensemble(belief.prior)):
+        for tolerance in (0.0, 1e-4):
+            plain = ClosedLoop(arm, ut.MinimumEnergy(), tail_rtol=tolerance, ensemble=ensemble)
+            noisy = ClosedLoop(
+                arm, ut.MinimumEnergy(), tail_rtol=tolerance, ensemble=ensemble, covariance=P
+            )
+            before, after = plain.batch(x, surfaces), noisy.batch(x, surfaces)
+            costs, times = before.cost.copy(), before.time.copy()
+            K = np.array([feedback(InnerLoop(arm, surface)) for surface in surfaces])
+            rate = np.einsum("cij,jk,cik->c", K, P, K)
+            if ensemble is None:
+                np.testing.assert_allclose(after.cost - costs, rate * times, rtol=1e-4)
+            else:  # members arrive at other times, and some have other surfaces
+                np.testing.assert_allclose(after.cost - costs, rate * times, rtol=0.3)
+            assert (after.cost > costs).all()
+
+
+def test_senseless_beliefs_are_refused(arm: Mechanism) -> None:
+    other = Belief.usual(ut.mechanisms.rotary_pendulum(d_e=0.025))
+    with pytest.raises(InvalidInputError, match="about another"):
+        KalmanFilter(arm, belief=other)
+    with pytest.raises(InvalidInputError, match="parameter_drift"):
+        KalmanFilter(arm, belief=Belief.usual(arm), parameter_drift=-1.0)
