@@ -38,8 +38,7 @@ MADE = {"MechanismReport", "Proposal", "Run", "Trajectory"}
 #: Not meant for arguments of users: a number's own methods, ``math.radians``, tape and symbols.
 NOT_OURS = {
     "deg", "Mechanism.partition", "ClosedLoop.roll_out", "Cascade.gate",
-    "Cascade.start_to", "Cascade.retarget_to", "MinimumEnergy.stage",
-    "MinimumTime.stage",
+    "Cascade.start_to", "MinimumEnergy.stage", "MinimumTime.stage",
 }  # fmt: skip
 
 URDF = """<robot name="r"><link name="base"/><link name="cart"><inertial><mass value="1"/>

@@ -9,6 +9,7 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
+from undertow.cascade.simulation import legs_to, moments
 
 CRANE = ut.mechanisms.overhead_crane()
 JUMPS = ut.SetPoints([(0, {"x": 1.0}), (2, {"x": -1.0}), (4, {"x": 0.5})])
@@ -66,6 +67,41 @@ def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
     assert sorted(set(tasks)) == [0, 1, 2]
     assert (np.isnan(run.lemma3_slack) == (np.diff(tasks) > 0)).all()
     assert np.nanmin(run.lemma3_slack) >= -1e-9
+
+
+def test_a_set_point_is_0_seen_from_elsewhere() -> None:
+    """On a plant that changes on the way, too: early decisions, and an end on arrival."""
+    rig = ut.mechanisms.rotary_pendulum()
+    mass = next(p.value for p in rig.parameters if p.name == "m")
+    plant = {0.0: rig.with_parameters(m=1.1 * mass), 0.31: rig.with_parameters(m=2 * mass)}
+    cascade = ut.Cascade(rig, ut.MinimumTime(horizon=6.0))
+    x, away, seen = rig.state(phi=0.5), rig.state(theta=2.0), []
+    here = cascade.simulate(x, plant=plant)
+    there = cascade.simulate(
+        x + away, plant=plant, target={"theta": 2.0}, progress=lambda t, _: seen.append(t)
+    )
+    assert 0.31 in np.round(seen, 9)
+    assert there.reached
+    assert there.time == pytest.approx(here.time, rel=0.02)
+    assert there.cost == pytest.approx(there.time)
+    assert np.linalg.norm(there.trajectory.x[-1] - away) == pytest.approx(0.01, rel=1e-3)
+    late = np.array([update.t for update in there.updates]) % cascade.period
+    assert (np.minimum(late, cascade.period - late) > 1e-6).any()
+    assert {update.task for update in there.updates} == {0}
+
+
+def test_the_pieces_of_a_run_leave_no_gap() -> None:
+    """They begin where a decision is due, at a jump, and where the plant changes."""
+    cascade = ut.Cascade(CRANE, ut.MinimumTime(horizon=2.0), period=0.05)
+    legs = legs_to(cascade, ut.SetPoints([(0, {"x": 0.5}), (0.1234, {"x": 0.0})]), 0.333)
+    assert [leg.begin for leg in legs] == pytest.approx([0.0, 0.124])
+    marks = {0, 31, 101}
+    pieces = list(moments(cascade, legs, marks))
+    begins = np.array([t for _, t, _, _ in pieces])
+    assert begins + [span for _, _, span, _ in pieces] == pytest.approx([*begins[1:], 0.333])
+    assert np.isin([0.062, 0.202], begins.round(9)).all()
+    due = [t for _, t, _, due in pieces if due]
+    assert due == pytest.approx([0.0, 0.05, 0.1, *np.arange(0.124, 0.333, 0.05)])
 
 
 def test_targets_are_refused_before_anything_moves(cascade: ut.Cascade) -> None:

@@ -5,13 +5,12 @@ from undertow.cascade.cascade import (
     Cascade,
     CascadeState,
     Gate,
-    Run,
-    Update,
     cost_gate,
     gate_words,
     problem_words,
 )
 from undertow.cascade.robustness import derate_actuator, noise_share, robustness_gate
+from undertow.cascade.simulation import Run, Update
 from undertow.cascade.targets import Legs, legs_of
 
 __all__ = [

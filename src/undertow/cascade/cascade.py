@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from html import escape
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,16 +25,18 @@ from undertow.base import (
     checked,
     one_of,
     positive,
-    write_file,
+)
+from undertow.cascade.simulation import (
+    Run,
+    Update,
+    is_news,
+    legs_to,
+    moments,
+    moving_loops,
+    simulate_piece,
 )
 from undertow.cascade.targets import LoopsAbout, legs_of
-from undertow.closed_loop import (
-    INADMISSIBLE,
-    ClosedLoop,
-    Event,
-    Trajectory,
-    cost_along,
-)
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event, Trajectory, simulate_along
 from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import (
     Control,
@@ -52,10 +52,6 @@ from undertow.law import (
 from undertow.models import TIME, FloatArray, Mechanism, number_of
 from undertow.objective import MinimumEnergy, Objective
 from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Proposal
-
-if TYPE_CHECKING:
-    from undertow.closed_loop.figures import MotionFigure
-    from undertow.display.sketches import Sketch
 
 
 @dataclass(frozen=True)
@@ -82,12 +78,6 @@ RESOLVED = 1.0
 #: so: this much, rad or m, and this part of how far the plan was to move them meanwhile.  A target
 #: that jumps shows in positions at once; what a model does not know shows in velocities first.
 JUMP, PART = 0.1, 0.5
-
-#: How far an estimate moves, in tolerances, before what was planned with it is planned anew.
-NEWS = 0.1
-
-#: How often what a motion shows is learnt, about, s.
-LEARNING = 0.02
 
 Gate = Callable[[ClosedLoop, Plan, Plan, FloatArray, float], Admission]
 
@@ -192,162 +182,6 @@ class CascadeState:
 
 
 @dataclass(frozen=True, eq=False)
-class Update:
-    """One decision of the outer loop, as recorded.
-
-    ``t`` and ``x`` are when and where; ``plan`` the one in use afterwards; ``predicted``
-    its J̃_k; ``spent`` the cost spent since the decision before; ``task`` counts the
-    tasks before: a target that jumps begins one, and so does leaving a set-point once reached.
-    """
-
-    t: float
-    x: FloatArray
-    proposal: Proposal
-    admission: Admission
-    plan: Plan
-    predicted: float
-    spent: float
-    task: int = 0
-
-    @property
-    def surface(self) -> Surface:
-        """The surface in use after the decision."""
-        return self.plan.surfaces[0]
-
-    def __repr__(self) -> str:
-        """Show when, what was decided and why."""
-        decided = "admitted" if self.admission.accepted else "kept"
-        return f"Update(t={self.t:g} s, {decided}: {self.admission.reason})"
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A simulated run of the cascade.
-
-    Attributes
-    ----------
-    trajectory
-        The motion of the plant.
-    updates
-        The decisions of the outer loop, in order.
-    """
-
-    trajectory: Trajectory
-    updates: tuple[Update, ...]
-
-    def __repr__(self) -> str:
-        """Show how it ended."""
-        admitted = sum(update.admission.accepted for update in self.updates)
-        return (
-            f"Run({self.trajectory.mechanism.name}, {self.trajectory.event.name.lower()} at "
-            f"{self.time:.4g} s, cost {self.cost:.6g}, {len(self.updates)} decisions, "
-            f"{admitted} admitted)"
-        )
-
-    @property
-    def cost(self) -> float:
-        """Cost of the whole motion."""
-        return self.trajectory.cost
-
-    @property
-    def time(self) -> float:
-        """Time at which the terminal set was reached, or the run ended, s."""
-        return self.trajectory.time
-
-    @property
-    def reached(self) -> bool:
-        """Whether the terminal set was reached."""
-        return self.trajectory.event == Event.REACHED
-
-    def plot(self) -> MotionFigure:
-        """Return a figure of the motion; dotted lines mark where another surface took over.
-
-        A Matplotlib figure: save it with ``.savefig("motion.png")``; a notebook shows it.
-        """
-        motion = self.trajectory
-        cost = f"{self.cost:.4g} {motion.cost_unit}".strip()
-        end = f"{motion.event.name.lower()} at {self.time:.4g} s"
-        figure = motion.plot(f"{motion.mechanism.name}: {end}, cost {cost}")
-        figure.axes[-1].set_xlabel("time (s); dotted: another surface takes over")
-        for before, update in itertools.pairwise(self.updates):
-            if update.surface != before.surface:
-                for axes in figure.axes:
-                    axes.axvline(update.t, color="black", linewidth=0.7, linestyle=":")
-        return figure
-
-    @checked
-    def animate(
-        self,
-        path: str | Path,
-        *,
-        fps: float = 25.0,
-        longest: float = 8.0,
-        speed: float = 1.0,
-        figure: Sketch | None = None,
-    ) -> Path:
-        """Write a film of the motion, a GIF, and return where it is.
-
-        Parameters
-        ----------
-        path
-            The file, for instance ``"film.gif"``.
-        fps, longest, speed
-            Frames in a second, the longest film, s, and seconds of motion in a second of film.
-        figure
-            What to draw; by default the mechanism's own stick figure, or dials.
-
-        Raises
-        ------
-        ArtefactError
-            When the file cannot be written.
-        InvalidInputError
-            For a frame rate, length or speed that is not positive.
-        """
-        from undertow.display.animation import Film, gif
-        from undertow.display.sketches import Sketch
-
-        if not (figure is None or isinstance(figure, Sketch)):
-            raise InvalidInputError(
-                "figure of an animation", value=repr(figure), limit="an undertow.display Sketch"
-            )
-
-        film = Film.of(self.trajectory, fps=fps, longest=longest, speed=speed, figure=figure)
-        return write_file(Path(path), gif(film))
-
-    def _repr_html_(self) -> str:
-        """Show its end and its motion in a notebook."""
-        return f"<p>{escape(repr(self))}</p>{self.trajectory._repr_html_()}"
-
-    @property
-    def surfaces(self) -> tuple[Surface, ...]:
-        """The surface in use after each decision."""
-        return tuple(update.surface for update in self.updates)
-
-    @property
-    def verdicts(self) -> tuple[Verdict | None, ...]:
-        """What is known of the plan in use, at each decision."""
-        return tuple(update.admission.verdict for update in self.updates)
-
-    @property
-    def lemma3_slack(self) -> FloatArray:
-        """Slack of Lemma 3 at each decision, J̃_k − spent − J̃_{k+1}, in units of cost.
-
-        Never negative, to integration tolerance, where belief and truth agree; for
-        minimum time it is t_{f,k} − Δt − t_{f,k+1}.  NaN where one of the predictions is
-        infinite: a disturbed plant may leave what the belief can bring home; and where another task
-        begins, for instance because the target jumped.  While a reference moves, predictions
-        count to a horizon that moves along, and slack may be negative.
-        """
-        predicted = np.array([update.predicted for update in self.updates])
-        spent = np.array([update.spent for update in self.updates])
-        finite = np.isfinite(predicted)
-        task = np.array([update.task for update in self.updates])
-        known = finite[1:] & finite[:-1] & (task[1:] == task[:-1])
-        predicted = np.where(finite, predicted, 0.0)
-        return np.where(known, predicted[:-1] - spent[1:] - predicted[1:], np.nan)
-
-
-@dataclass(frozen=True, eq=False)
 class Cascade:
     """The controller a user runs: law, optimiser and gate.
 
@@ -448,7 +282,7 @@ class Cascade:
         )
         at_least("seed", self.seed, 0)
         assert self.loop is not None  # built here, so that its checks run first
-        stride = self._stride
+        stride = self.stride
         count = number_of("period of the cascade", self.period) / stride
         if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
             raise InvalidInputError(
@@ -660,16 +494,7 @@ class Cascade:
         InvalidInputError
             For a target that cannot be one.
         """
-        return self.retarget_to(state, self.mechanism.check_state(x), self._target_at(target, t), t)
-
-    def retarget_to(
-        self, state: CascadeState, x: FloatArray, motion: ReferenceMotion, t: float
-    ) -> tuple[CascadeState, Proposal]:
-        """:meth:`retarget` to a leg of a target, which was checked before."""
-        begun, proposal = self.start_to(x, motion, t)
-        number = state.sequence + 1
-        begun = replace(begun, sequence=number, estimate=state.estimate)
-        return begun, replace(proposal, sequence=number, computed_for=t)
+        return self.start_to(self.mechanism.check_state(x), self._target_at(target, t), t, state)
 
     def _target_at(self, target: Target | Mapping[str, float], t: float) -> ReferenceMotion:
         """The leg of a target that is in force at the time t."""
@@ -678,20 +503,26 @@ class Cascade:
         return [motion for begin, motion in legs if begin <= t][-1]
 
     def start_to(
-        self, x: FloatArray, target: ReferenceMotion | None = None, t: float = 0.0
+        self,
+        x: FloatArray,
+        target: ReferenceMotion | None = None,
+        t: float = 0.0,
+        before: CascadeState | None = None,
     ) -> tuple[CascadeState, Proposal]:
-        """:meth:`start` towards a leg of a target, which was checked before."""
+        """:meth:`start`, or :meth:`retarget` from ``before``, to a leg that was checked before."""
         if target is not None:
             x = self.mechanism.check_state(x) - target.state(t)
         here = self.about(self.loop, target, t)
         here.objective.check_start(here.mechanism, x)
-        known = None if self.known is None else self.known.prior
+        number, known = 0, None if self.known is None else self.known.prior
+        if before is not None:
+            number, known = before.sequence + 1, before.estimate
         tries = self._first_tries()
-        for number, (loop, small) in enumerate(tries, 1):
+        for count, (loop, small) in enumerate(tries, 1):
             about = self.about(loop, target, t)
             planner = self.optimiser.on(about) if small else self._planner(loop, target, t)
             proposal = planner.propose(
-                x, incumbent=None, horizon=None, sequence=0, computed_for=0.0, resolution=0.0
+                x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
             )
             if proposal.plan is None and loop is not self.loop:
                 continue
@@ -702,20 +533,19 @@ class Cascade:
             good = math.isfinite(cost)
             if loop is not self.loop:  # every plausible plant lives to see the next decision
                 good &= self._survives(here, x, plan)
-            if good or number == len(tries):
+            if good or count == len(tries):
                 if target is not None and target.moves:
                     plan, cost = self._first_along(plan, x, target, t)
-                begun = CascadeState(plan, 0, cost, cost, t, _kept(x), known, target)
-                return begun, proposal
+                begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
+                return begun, replace(proposal, sequence=number)
         raise AssertionError("the last try returns or raises")
 
     def _first_along(
-        self, plan: Plan, x: FloatArray, target: ReferenceMotion, t: float
+        self, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float
     ) -> tuple[Plan, float]:
         """The first plan, or the designed surface where that is better along a reference."""
         plans = [plan, Plan.of(self.optimiser.anchor)]
-        absolute, span = x + target.state(t), self.objective.horizon
-        costs = [cost_along(self.loop, absolute, p, target, duration=span, start=t) for p in plans]
+        costs = _costs_along(self.loop, error, plans, target, t, self.objective.horizon)
         best = int(np.argmin(costs))
         return plans[best], costs[best]
 
@@ -854,12 +684,12 @@ class Cascade:
     ) -> Admission:
         """Judge again what the gate admitted: both plans along the reference, as it will move."""
         assert state.target is not None  # there is no reference without one
-        loop, target, t = self._loops(state.estimate), state.target, state.since
-        x = state.absolute(t, np.array(state.x))
-        cost = cost_along(loop, x, old, target, duration=span, start=t)
+        loop, error = self._loops(state.estimate), np.array(state.x)
+        plans = [old, new] if admission.accepted else [old]
+        costs = _costs_along(loop, error, plans, state.target, state.since, span)
         if not admission.accepted:
-            return replace(admission, cost=cost)
-        found = cost_along(loop, x, new, target, duration=span, start=t)
+            return replace(admission, cost=costs[0])
+        cost, found = costs
         if found <= cost and found < math.inf:
             return replace(admission, cost=found)
         words = f"raises the cost along the reference: {found:.6g} > {cost:.6g}"
@@ -899,49 +729,14 @@ class Cascade:
             return True
         return self._survives(loop, state.error(t, self.mechanism.check_state(x)), state.at(t))
 
-    @staticmethod
-    def _news(before: ParameterEstimate | None, now: ParameterEstimate | None) -> bool:
-        """Whether so much was learnt since a decision that it is worth another one."""
-        if before is None or now is None:
-            return False
-        return bool(np.abs(now.offset - before.offset).max() > NEWS)
-
     def _survives(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
         event = loop.batch(error, plan, duration=2 * self.period).event[0]
         return event in (Event.HORIZON, Event.REACHED)
 
     # -- simulation -----------------------------------------------------------------------
 
-    def _moments(self, total: float, marks: Iterable[int]) -> Iterator[tuple[float, float, bool]]:
-        """Times of a run, s, until the next one, and whether a decision is due.
-
-        Decisions come each period, learning some times within it; ``marks`` are strides besides.
-        """
-        stride, parts = self._stride, self._parts
-        strides = round(self.period / stride)
-        within = {round(strides * part / parts) for part in range(parts)}
-        for k in range(math.ceil(total / self.period - 1e-9)):
-            begin = k * self.period
-            extra = {mark - k * strides for mark in marks if 0 < mark - k * strides < strides}
-            for part, end in itertools.pairwise([*sorted(within | extra), strides]):
-                t = begin + part * stride
-                if t < total - 1e-9:
-                    span = self.period if end - part == strides else (end - part) * stride
-                    yield t, min(span, total - t), part == 0
-
     @property
-    def _parts(self) -> int:
-        """How often a period learns."""
-        most = round(self.period / self._stride)
-        return 1 if self.known is None else min(most, max(1, round(self.period / LEARNING)))
-
-    @property
-    def learning_period(self) -> float:
-        """About how often what the motion shows is learnt, s; the period where nothing is."""
-        return round(self.period / self._stride / self._parts) * self._stride
-
-    @property
-    def _stride(self) -> float:
+    def stride(self) -> float:
         """Time between two inputs of the inner loop, or a step of a continuous one, s."""
         return self.step * max(1, self.zoh_steps)
 
@@ -973,9 +768,9 @@ class Cascade:
             :class:`undertow.SetPoints`, which jump; or a :class:`undertow.Reference`, which moves.
             With a duration the run then goes on to its end, holding what it has reached; without
             one until the last set-point, or the end of a horizon.  See
-            :mod:`undertow.cascade.following`.
+            :mod:`undertow.cascade.simulation`.
         progress
-            Called with (time, duration) after each period.
+            Called with (time, duration) each time that it decides or learns.
 
         Raises
         ------
@@ -986,59 +781,40 @@ class Cascade:
             where the mechanism cannot rest or go, before anything moves.
         """
         x = self.mechanism.initial_state(x0, state)
-        if target is not None:
-            from undertow.cascade.following import follow
-
-            if isinstance(plant, Mapping):
-                raise InvalidInputError(
-                    "plant of a run to a target",
-                    value="one that changes while it runs",
-                    limit="one plant",
-                    remedy="Leave the target out, or give the plant that it is",
-                )
-            return follow(self, x, target, plant, duration, progress)
-        total = self.objective.horizon if duration is None else duration
-        positive("duration of a run, s", total, "Leave it out for the objective's horizon")
-        usual = None if self.known is None else self.mechanism
-        changes = (
-            dict(sorted(plant.items())) if isinstance(plant, Mapping) else {0.0: plant or usual}
-        )
-        for t in changes:
-            positive("time of a plant, s", t, "Plants change after the start, at 0", zero=True)
-        truths = {
-            round(number_of("time of a plant, s", t) / self._stride): replace(
-                self.loop, plant=moving or usual, ensemble=None
-            )
-            for t, moving in {0.0: usual, **changes}.items()
-        }
-        truth = truths[0]
-        memory, proposal = self.start_to(x)
-        admission = self.first_admission(memory, x, total)
-        updates = [Update(0.0, x, proposal, admission, memory.plan, memory.predicted, 0.0)]
+        legs, truths = legs_to(self, target, duration), moving_loops(self, plant)
+        updates: list[Update] = []
         pieces: list[Trajectory] = []
-        since, planned_with = 0, memory.estimate  # the last decision, in pieces
-        for t, span, due in self._moments(total, truths):
-            changed = truths.get(round(t / self._stride))
-            if changed is not None and t > 0:
-                truth = changed.believing(self.loop_at(memory).mechanism)
-            news = self._news(planned_with, memory.estimate)
-            if t > 0 and (due or news or not self.survives(memory, x, t)):
-                planned_with = memory.estimate
-                proposal = self._propose(memory, x, t, total - t)
-                memory, admission = self.apply_gate(memory, proposal, x, total - t)
-                spent = sum(piece.cost for piece in pieces[since:])
-                since = len(pieces)
-                update = Update(t, x, proposal, admission, memory.plan, memory.predicted, spent)
-                updates.append(update)
-            pieces.append(truth.simulate(x, memory.at(t), duration=span, start=t))
-            x = pieces[-1].x[-1]
-            if self.known is not None:
-                motion = pieces[-1]
-                memory = self.learn(memory, motion.t, motion.x, motion.u)
-                truth = truth.believing(self.loop_at(memory).mechanism)
+        memory: CascadeState | None = None
+        planned_with: ParameterEstimate | None = None
+        truth, task, arrived = truths[0], -1, False
+        spent = since = 0.0  # cost since the last decision; when it was last at the target, s
+        for leg, t, span, due in moments(self, legs, truths):
+            truth = truths.get(round(t / self.stride), truth)
+            proposal: Proposal | None = None
+            if memory is None or t == leg.begin:
+                since = t
+                memory, proposal = self.start_to(x, leg.target, t, memory)
+                admission = self.first_admission(memory, x, leg.longest)
+            elif np.linalg.norm(memory.error(t, x)) <= self.objective.terminal_radius:
+                since = t
+            elif due or is_news(planned_with, memory.estimate) or not self.survives(memory, x, t):
+                left = leg.longest - (t - since)
+                if left <= 0.5 * self.step:  # a disturbed plant came too late: a new horizon
+                    since, left = t, leg.longest
+                proposal = self._propose(memory, x, t, left)
+                memory, admission = self.apply_gate(memory, proposal, x, left)
+            if proposal is not None:
+                task += t == leg.begin or arrived  # left what was reached: another task
+                plan, predicted = memory.plan, memory.predicted
+                updates.append(Update(t, x, proposal, admission, plan, predicted, spent, task))
+                spent, planned_with = 0.0, memory.estimate
+            pieces.append(simulate_piece(self, truth, memory, x, t, span, leg.stays))
+            motion = pieces[-1]
+            memory = self.learn(memory, motion.t, motion.x, motion.u)
+            x, spent, arrived = motion.x[-1], spent + motion.cost, motion.event == Event.REACHED
             if progress is not None:
-                progress(t + span, total)
-            if pieces[-1].event != Event.HORIZON:
+                progress(t + span, legs[-1].end)
+            if not (motion.event == Event.HORIZON or (arrived and leg.stays)):
                 break
         return Run(Trajectory.join(pieces), tuple(updates))
 
@@ -1046,3 +822,13 @@ class Cascade:
 def _kept(x: FloatArray) -> tuple[float, ...]:
     """Return a state as plain numbers; several of them are none."""
     return tuple(x.tolist()) if x.ndim == 1 else ()
+
+
+def _costs_along(
+    loop: ClosedLoop, error: FloatArray, plans: list[Plan], target: ReferenceMotion, t: float,
+    span: float,
+) -> list[float]:  # fmt: skip
+    """What each plan costs along a reference from t on, s; infinite where the motion breaks off."""
+    x = error + target.state(t)
+    runs = [simulate_along(loop, x, plan, target, duration=span, start=t) for plan in plans]
+    return [run.cost if run.event in (Event.HORIZON, Event.REACHED) else math.inf for run in runs]

@@ -4,7 +4,7 @@
 ones of :mod:`.exponential_integrator`, with the linear model of :mod:`.linear_model`.
 """
 
-from undertow.closed_loop.along_reference import cost_along, simulate_along
+from undertow.closed_loop.along_reference import simulate_along
 from undertow.closed_loop.buffers import RolloutBuffers
 from undertow.closed_loop.ensemble import Ensemble, Risk
 from undertow.closed_loop.kernel import compile_loop
@@ -23,6 +23,5 @@ __all__ = [
     "RolloutBuffers",
     "Trajectory",
     "compile_loop",
-    "cost_along",
     "simulate_along",
 ]

@@ -7,7 +7,6 @@ constraints.  Runge-Kutta steps of the loop's length, the reference at their end
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -141,24 +140,6 @@ def _made(loop: ClosedLoop) -> Any:
     return generated("along", plant.name, key, write)
 
 
-def cost_along(
-    loop: ClosedLoop,
-    x: FloatArray,
-    plan: Plan,
-    motion: ReferenceMotion,
-    *,
-    duration: float,
-    start: float = 0.0,
-) -> float:
-    """Return what a plan costs along a reference; infinite where the motion breaks off.
-
-    See :func:`simulate_along`; of an ensemble the belief alone moves.
-    """
-    alone = loop if loop.ensemble is None else replace(loop, ensemble=None)
-    run = simulate_along(alone, x, plan, motion, duration=duration, start=start)
-    return run.cost if run.event in (Event.HORIZON, Event.REACHED) else math.inf
-
-
 def simulate_along(
     loop: ClosedLoop,
     x: FloatArray,
@@ -173,7 +154,7 @@ def simulate_along(
     Parameters
     ----------
     loop
-        Law, plant and objective; about x = 0.
+        Law, plant and objective; about x = 0.  Of an ensemble the belief alone moves.
     x
         Initial state, (2n,), absolute.
     plan
@@ -189,6 +170,7 @@ def simulate_along(
         Its event is ``REACHED`` where it ends within the terminal radius of the reference; cost
         counts while it is outside.
     """
+    loop = loop if loop.ensemble is None else replace(loop, ensemble=None)
     steps = max(1, round(duration / loop.step))
     plain, plant, m = loop.mechanism, loop.truth, loop.mechanism.m
     laws = zip(plan.surfaces, plan.laws(loop.reaching), strict=True)

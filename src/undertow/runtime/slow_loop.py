@@ -156,7 +156,7 @@ def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -
     assert request.target is not None  # who asks for another target gives one
     try:
         place = memory.absolute(use, x)
-        after, proposal = cascade.retarget_to(memory, place, request.target, use)
+        after, proposal = cascade.start_to(place, request.target, use, memory)
         admission = Admission(True, "first optimum for another target", after.predicted)
         answer = _answer(
             request, after.error(use, place), proposal, after, admission,
