@@ -174,6 +174,33 @@ def test_friction_is_learnt(pendulum: ut.Mechanism) -> None:
         pendulum.with_friction(theta=-0.1)
 
 
+def test_a_motor_that_loses_its_strength_on_the_way_is_learnt() -> None:
+    """A cart's motor at 60 % from 0.3 s on: the gain is found, and the cascade arrives."""
+    cart = ut.mechanisms.cart_pendulum()
+    weak = cart.with_input_gain(force=0.5).with_parameters(gain_force=0.6)
+    x, u = cart.state(phi=0.3, x_dot=1.0), np.array([4.0])
+    np.testing.assert_allclose(
+        weak.accelerations(0.0, x, u), cart.accelerations(0.0, x, 0.6 * u), rtol=1e-12
+    )
+    believed = cart.with_input_gain(force=0.5)
+    cascade = ut.Cascade(believed, ut.MinimumTime())
+    run = cascade.simulate(plant={0.0: cart, 0.3: weak})
+    assert run.reached
+    known = cascade.known
+    assert known is not None
+    memory, _ = cascade.start(believed.usual_start)
+    motion = ut.ClosedLoop(believed, cascade.objective, plant=weak).simulate(
+        believed.usual_start, memory.plan, duration=0.3
+    )
+    learnt = cascade.learn(memory, motion.t, motion.x, motion.u).estimate
+    assert learnt is not None
+    assert known.believed(learnt).parameter_values[-1] == pytest.approx(0.6, abs=0.03)
+    with pytest.raises(InvalidInputError, match="unknown input"):
+        cart.with_input_gain(voltage=0.1)
+    with pytest.raises(InvalidInputError, match="below 1"):
+        cart.with_input_gain(force=1.0)
+
+
 def test_usual_tolerances_and_those_that_parameters_carry(pendulum: ut.Mechanism) -> None:
     """By unit where nobody says; a parameter's own tolerance counts, and 0 is exact."""
     usual = ut.Belief.usual(pendulum)

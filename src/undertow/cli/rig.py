@@ -64,6 +64,14 @@ def run(
         bool, option("--swing-up", "Begin hanging at rest: swing up, catch, balance.")
     ] = False,
     setting: options.Settings = None,
+    known: Annotated[
+        Literal["usual", "exact"],
+        option(
+            "--belief",
+            "What the controller takes for known. usual: parameters within their tolerances, "
+            "learnt as it runs. exact: the model.",
+        ),
+    ] = "usual",
     period: Annotated[float, option("Period of the fast loop, s.")] = 0.001,
     lead: Annotated[
         float,
@@ -128,6 +136,7 @@ def run(
         swing_up=swing_up,
         target=() if points is None else points.pairs,
         objective=cast(Goal, objective),  # the recipe refuses what is none
+        learns=known == "usual",
         rig="realistic" if rig == "realistic" or in_a_file(rig) else "ideal",
         seed=seed,
         period=period,

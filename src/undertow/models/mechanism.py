@@ -394,6 +394,55 @@ class Mechanism:
             force[name] = -level.symbol * sp.tanh(velocities[name] / width)
         return self.disturbed(force, parameters)
 
+    @checked
+    def with_input_gain(self, **tolerances: float) -> Self:
+        """Return the mechanism with motors that may be stronger or weaker than the model's.
+
+        Column i of B is multiplied by a parameter ``gain_<input>``, 1 ± its tolerance: a belief
+        learns it.
+
+        Parameters
+        ----------
+        **tolerances
+            Input name to how far its gain may be off, as a part of it: 0.1 is ±10 %.
+
+        Raises
+        ------
+        InvalidInputError
+            For unknown inputs, and for tolerances that are not between 0 and 1.
+
+        Examples
+        --------
+        >>> import undertow as ut
+        >>> cart = ut.mechanisms.cart_pendulum().with_input_gain(force=0.4)
+        >>> ut.Belief.usual(cart).tolerances["gain_force"]
+        0.4
+        """
+        names = [i.name for i in self.inputs]
+        scale, parameters = sp.eye(self.m), []
+        for name, given in tolerances.items():
+            one_of(f"unknown input of '{self.name}'", name, names)
+            positive(f"tolerance of the gain of '{name}'", given, "0.1 is ±10 %")
+            tolerance = number_of(f"tolerance of the gain of '{name}'", given)
+            if not tolerance < 1:
+                raise InvalidInputError(
+                    f"tolerance of the gain of '{name}'",
+                    value=f"{tolerance:g}",
+                    limit="below 1",
+                    remedy="A motor that may turn the other way cannot be controlled",
+                )
+            gain = Parameter(
+                f"gain_{name}", 1.0, "", f"gain of {name}", 0.0, math.inf, tolerance=tolerance
+            )
+            place = names.index(name)
+            scale[place, place] = gain.symbol
+            parameters.append(gain)
+        return replace(
+            self,
+            input_matrix=sp.ImmutableDenseMatrix(self.input_matrix * scale),
+            parameters=(*self.parameters, *parameters),
+        )
+
     # -- names and symbols --------------------------------------------------------------
 
     @property
