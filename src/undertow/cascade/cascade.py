@@ -312,11 +312,10 @@ class Cascade:
     @cached_property
     def known(self) -> Belief | None:
         """What is known of the mechanism; ``None`` where it is exact."""
-        if isinstance(self.belief, Belief):
-            return self.belief
-        one_of("belief of the cascade", self.belief, ("usual", "exact"))
-        usual = None if self.belief == "exact" else Belief.usual(self.mechanism)
-        return usual if usual is not None and usual.tolerances else None
+        if not isinstance(self.belief, Belief):
+            one_of("belief of the cascade", self.belief, ("usual", "exact"))
+        known = Belief.usual(self.mechanism) if self.belief == "usual" else self.belief
+        return known if isinstance(known, Belief) and known.tolerances else None
 
     @cached_property
     def loop(self) -> ClosedLoop:
