@@ -43,9 +43,9 @@ AXES = 7
 
 #: Members with small errors of state and surface; the errors, as a part of a surface's entries,
 #: and of positions, rad and m.
-SLIPS = 8
+SLIPS = 16
 SLIP_OF_SURFACE = 1e-3
-SLIP_OF_STATE = {"rad": 1e-3, "m": 1e-4}
+SLIP_OF_STATE = {"rad": 2e-3, "m": 2e-4}
 #: Half a percent of the change of velocity over 2 ms at full inputs, s, is noise; and the noise of
 #: what no input moves at the target, rad/s or m/s.
 SMALL, UNDRIVEN = 0.005 * 0.002, 0.004
