@@ -77,12 +77,14 @@ def estimator(subject: Subject) -> Iterator[Difference]:
     for x, u in zip(subject.states, subject.inputs(), strict=True):
         stage, total, qdd, base, viscous, driven = np.zeros((6, 2 * n))
         F, A = np.zeros((2, 2 * n, 2 * n))
-        after = x.copy()
-        module.move(STEP, after, u, n, m, parameters, stage, total, qdd, viscous, driven)
+        after, none = x.copy(), np.zeros(0)
+        module.move(STEP, after, u, n, m, False, parameters, stage, total, qdd, viscous, driven)
         yield from subject.compared(
             "estimator: prediction", x, after, _moved(subject, x, u, None), names
         )
-        module.jacobian(STEP, x.copy(), u, n, m, parameters, F, A, qdd, base, viscous, driven)
+        module.jacobian(
+            STEP, x.copy(), u, n, m, False, parameters, none, none, F, A, qdd, base, viscous, driven
+        )
         here = subject.model.accelerations(0.0, exactly(x), exactly(u))
         slopes = [[Number(int(j == n + i)) for j in range(2 * n)] for i in range(n)]
         columns = []

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cascade import noise_share, robustness_gate
-from undertow.cascade.robustness import DelayGate, delay_margin, feedback
+from undertow.cascade.robustness import DelayGate, _exponential, delay_margin, feedback
 from undertow.law import InnerLoop, Plan
 from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
 from undertow.runtime.controller_defaults import NOISE, estimator_for, reaching_for
@@ -113,3 +114,13 @@ def test_a_weaker_motor_must_do(arm: ut.Mechanism) -> None:
 def test_senseless_periods_are_refused(arm: ut.Mechanism, base: ut.Surface) -> None:
     with pytest.raises(InvalidInputError, match="period"):
         delay_margin(arm, base, period=0.0)
+
+
+def test_the_exponential_is_scipys() -> None:
+    """200 matrices of norms from 10⁻⁴ to 10, and one of zeros."""
+    rng = np.random.default_rng(0)
+    for size in 10 ** rng.uniform(-4, 1, 200):
+        A = size * rng.normal(size=(5, 5))
+        exact = scipy.linalg.expm(A)
+        np.testing.assert_allclose(_exponential(A), exact, atol=1e-11 * np.abs(exact).max())
+    np.testing.assert_array_equal(_exponential(np.zeros((3, 3))), np.eye(3))

@@ -92,6 +92,7 @@ def test_a_cascade_holds_plants_that_differ_from_its_model(pendulum: ut.Mechanis
     assert np.median(times) < 1.0
 
 
+@pytest.mark.slow
 def test_decisions_come_early_when_what_is_learnt_breaks_the_plan(pendulum: ut.Mechanism) -> None:
     """Of twelve plants some need a decision between two; spent cost is counted to each."""
     cascade = ut.Cascade(pendulum, ut.MinimumTime(horizon=6.0))
@@ -174,6 +175,7 @@ def test_friction_is_learnt(pendulum: ut.Mechanism) -> None:
         pendulum.with_friction(theta=-0.1)
 
 
+@pytest.mark.slow
 def test_a_motor_that_loses_its_strength_on_the_way_is_learnt() -> None:
     """A cart's motor at 60 % from 0.3 s on: the gain is found, and the cascade arrives."""
     cart = ut.mechanisms.cart_pendulum()

@@ -169,7 +169,9 @@ def test_risks_are_ordered_whatever_costs_and_weights_are() -> None:
 
 PROBLEMS = (
     ("rotary_pendulum", ut.MinimumTime(horizon=6.0), {"phi": 0.5}),
-    ("overhead_crane", ut.MinimumEnergy(horizon=4.0), {"x": 0.3}),
+    pytest.param(
+        "overhead_crane", ut.MinimumEnergy(horizon=4.0), {"x": 0.3}, marks=pytest.mark.slow
+    ),
 )
 
 

@@ -38,17 +38,29 @@ def feedback(law: InnerLoop) -> FloatArray:
     return np.column_stack(columns)
 
 
+def _exponential(A: FloatArray) -> FloatArray:
+    """Return e^A by Taylor's series and squaring.
+
+    SciPy's, in a process that may have no thread more, waits for ever.
+    """
+    halvings = max(0, math.ceil(math.log2(max(float(np.abs(A).sum(axis=1).max()), 1e-300))) + 2)
+    part = A / 2.0**halvings
+    term = total = np.eye(len(A))
+    for k in range(1, 15):
+        term = term @ part / k
+        total = total + term
+    return np.asarray(np.linalg.matrix_power(total, 2**halvings))
+
+
 @lru_cache(maxsize=32)
 def _sampled(mechanism: Mechanism, period: float) -> tuple[FloatArray, FloatArray]:
     """Return the linear model at the target with its input held for a period."""
-    from scipy.linalg import expm  # slow to import
-
     lin = linearise(mechanism)
     A, B = lin.A, lin.input
     size = A.shape[0] + B.shape[1]
     whole = np.zeros((size, size))
     whole[: len(A)] = np.hstack([A, B])
-    held = expm(whole * period)
+    held = _exponential(whole * period)
     return held[: len(A), : len(A)], held[: len(A), len(A) :]
 
 

@@ -45,6 +45,10 @@ MOST_STEPS = 10_000_000
 #: Small steps before large ones are tried again, s; each time as long again as all before.
 CALMER = 0.5
 
+#: Part of its time that a motion counts as near the target, where noise costs what the gains there
+#: make of it.  Twice as much makes surfaces so soft that dry friction moves more than noise did.
+NEAR = 0.5
+
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
 
@@ -94,8 +98,8 @@ class ClosedLoop:
         one result for each plan, see :mod:`undertow.closed_loop.ensemble`.
     covariance
         Of the error of the estimated state, (2n, 2n), that the law acts on.  Batches count the cost
-        of what it makes of it near the target, tr(R K P Kᵀ) per second, where they have a linear
-        model; motions are without noise.
+        of what it makes of it near the target, tr(R K P Kᵀ) per second for half of their time,
+        where they have a linear model; motions are without noise.
 
     Examples
     --------
@@ -356,12 +360,12 @@ class ClosedLoop:
             part, where = part.part(again), np.arange(buffers.count)[where][again]
 
     def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
-        """Add what noise costs near the target to the costs of motions, while they last."""
+        """Add what noise costs near the target to the costs of motions, part of their time."""
         assert self.linear_end is not None
         assert buffers.ends is not None
         assert self.covariance is not None
         rate = self.linear_end.noise_cost(buffers.ends, self.covariance)
-        buffers.out[:, 0] += rate * (buffers.out[:, 1] - start)
+        buffers.out[:, 0] += NEAR * rate * (buffers.out[:, 1] - start)
 
     def _linearised(self, buffers: RolloutBuffers) -> Prepared | None:
         """Linearise the last surface of every lane."""

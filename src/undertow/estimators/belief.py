@@ -126,7 +126,7 @@ class Belief:
     >>> belief.tolerances["m"]
     0.025
     >>> len(belief.ensemble(belief.prior))
-    13
+    21
     """
 
     mechanism: Mechanism
@@ -253,15 +253,16 @@ class Belief:
         so is every pair of axes.  Of more than ``AXES`` parameters the axes that change the
         accelerations near the target most span the ensemble.
         """
-        from scipy.linalg import hadamard  # slow to import
-
         size = len(estimate.offset)
         variances, axes = np.linalg.eigh(np.linalg.inv(estimate.information))
         axes = axes * np.sqrt(variances + LEAST**2)
         if size > AXES:
             axes = axes @ np.linalg.svd(self._effects(estimate.offset) @ axes)[2][:AXES].T
         count = axes.shape[1]
-        corners = hadamard(1 << count.bit_length())[:, 1 : count + 1] @ axes.T
+        signs = np.ones((1, 1))  # Sylvester's matrix, of columns at right angles
+        while len(signs) <= count:
+            signs = np.block([[signs, signs], [signs, -signs]])
+        corners = signs[:, 1 : count + 1] @ axes.T
         limits = np.maximum(1.0, np.abs(estimate.offset))
         around = np.clip(estimate.offset + self.confidence * corners, -limits, limits)
         offsets = np.vstack([np.tile(estimate.offset, (1 + SLIPS, 1)), around])

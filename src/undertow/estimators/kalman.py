@@ -355,16 +355,15 @@ class KalmanFilter:
         The filter's own covariance counts besides what the model may leave out.  With the gain L of
         the filter at rest, e⁺ = (I − L C) F e + L v, and the estimate runs ahead by the delay.
         """
-        from scipy.linalg import solve_discrete_lyapunov  # slow to import
-
         rest, n = self._at_rest(), self.mechanism.n
         size = self._learnt  # parameters stay as they are at rest
         F, P = rest._F[:size, :size], rest._P[:size, :size]
         R = np.diag(rest._variance)
         gain = P[:, :n] @ np.linalg.inv(R)  # of a covariance after its update
         ahead = np.linalg.matrix_power(F, self._lead)
-        noise = gain @ R @ gain.T
-        error = solve_discrete_lyapunov(F - gain @ F[:n], noise)
+        step, error = F - gain @ F[:n], gain @ R @ gain.T
+        for _ in range(30):  # Σ stepᵏ L R Lᵀ stepᵏᵀ of twice as many samples each time
+            error, step = error + step @ error @ step.T, step @ step
         return np.asarray((ahead @ error @ ahead.T)[: 2 * n, : 2 * n])
 
     @property
