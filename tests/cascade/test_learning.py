@@ -136,6 +136,7 @@ def test_where_no_plan_suits_all_the_one_that_lives_longest_is_kept(
     assert cascade.loop.batch(x, kept.plan).time[0] > pair.time.min()
 
 
+@pytest.mark.slow
 def test_a_plant_that_changes_while_it_runs(pendulum: ut.Mechanism) -> None:
     """Mass doubled, motor 40 % weaker, both beyond the tolerances: held, and the change learnt."""
     cascade = ut.Cascade(pendulum, ut.MinimumTime(horizon=6.0))

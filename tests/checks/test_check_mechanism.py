@@ -225,6 +225,7 @@ def test_a_nearly_massless_direction_is_reported() -> None:
     assert not check_mechanism(almost, compiled=False)["M > 0"].passed
 
 
+@pytest.mark.slow
 def test_strict_names_the_condition_with_its_numbers() -> None:
     """Claim: the error carries the value, the limit and the remedy."""
     with pytest.raises(ModelError) as caught:

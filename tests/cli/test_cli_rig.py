@@ -34,6 +34,7 @@ def test_help_has_examples_that_parse(command: str) -> None:
     assert set(re.findall(r"--[a-z-]+", examples)) <= options
 
 
+@pytest.mark.slow
 def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
     """The log of ``run``, through ``replay``, with pictures; a changed output is found."""
     log = tmp_path / "run.db"

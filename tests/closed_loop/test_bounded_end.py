@@ -147,6 +147,7 @@ def test_a_late_touch_is_seen_and_a_near_miss_is_none(name: str) -> None:
     assert shorter > 100
 
 
+@pytest.mark.slow
 def test_a_constraint_of_another_kind_keeps_small_steps() -> None:
     """A formula of the user's own is tested in every small step, and so is a bound of an input."""
     rig = ut.mechanisms.cart_pendulum()

@@ -155,6 +155,7 @@ def test_state_constraint_binds_and_is_kept(rig: ut.Mechanism) -> None:
     assert 0 <= proposal.margins[-1].value < 0.1
 
 
+@pytest.mark.slow
 def test_what_a_best_candidate_breaks_is_said_with_its_unit(rig: ut.Mechanism) -> None:
     """The constraint that is broken, not the smallest number of whatever unit."""
     box = (ut.Constraint("arm below 5°", lambda v: v.theta - ut.deg(5), "rad"),)
@@ -175,6 +176,7 @@ def test_a_start_outside_the_constraints_is_refused_before_a_search(rig: ut.Mech
     assert "_kernels" not in vars(loop)  # not even compiled
 
 
+@pytest.mark.slow
 def test_hard_input_limit_is_a_constraint_on_the_unclipped_law(rig: ut.Mechanism) -> None:
     """(38) as a constraint: the demand itself stays within the limit."""
     weak = rig.with_input_limit(4.0)
