@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -305,15 +305,26 @@ class ClosedLoop:
         """
         switches, steps = self._switch_steps(switch_times), self._steps(duration)
         if self.ensemble is not None and not len(buffers.member):
-            members = buffers.spread()
-            self.roll_out(
-                members, switch_times, duration, start=start, terminal=terminal, cap=cap,
-                stable_only=stable_only, seek=seek,
+            members, size = buffers.spread(), len(self.ensemble)
+            plans, out = np.arange(buffers.count), buffers.out
+            roll_out = partial(
+                self.roll_out, switch_times=switch_times, duration=duration, start=start,
+                terminal=terminal, cap=cap, stable_only=stable_only, seek=seek,
             )  # fmt: skip
-            count, size = buffers.count, len(self.ensemble)
-            weights, tail = self.ensemble.shares, TAIL[self.ensemble.risk]
-            margins = 2 + len(self.objective.constraints)
-            summarise(members.out[: count * size], weights, tail, margins, buffers.out[:count])
+            if math.isfinite(cap):  # what breaks off or is too dear on the first needs no others
+                first = members.part(plans * size)
+                roll_out(first)
+                out[:] = first.out
+                plans = np.flatnonzero(out[: buffers.count, 2] == Event.REACHED)
+                if len(plans) < buffers.count:
+                    members = members.part((plans[:, None] * size + np.arange(size)).ravel())
+            if len(plans):
+                roll_out(members)
+                weights, tail = self.ensemble.shares, TAIL[self.ensemble.risk]
+                margins = 2 + len(self.objective.constraints)
+                found = np.empty((len(plans), out.shape[1]))
+                summarise(members.out[: members.count], weights, tail, margins, found)
+                out[plans] = found
             return buffers.batch(start)
         numbers, end = self.numbers, self.linear_end
         radius = self.objective.terminal_radius if terminal is None else terminal
