@@ -38,7 +38,18 @@ import numpy as np
 import sympy as sp
 
 import undertow as ut
-from plants import OBJECTIVES, RADIUS, ROTARY, Task, cascade, drawn, every, first_optimum, model
+from plants import (
+    OBJECTIVES,
+    RADIUS,
+    ROTARY,
+    Task,
+    belief,
+    cascade,
+    drawn,
+    every,
+    first_optimum,
+    model,
+)
 from undertow.base import UndertowError
 from undertow.cascade.simulation import LEARNING, is_news
 from undertow.display.plot import state_words
@@ -50,7 +61,7 @@ from undertow.plants import Bench, Friction, RealisticRig, Timing
 from undertow.runtime import estimator_for
 
 NAME = "rotary_pendulum"
-CONTROLLERS = ("kept", "exact", "belief", "level")
+CONTROLLERS = ("kept", "exact", "belief", "level", "free")
 PERIOD, STEPS = 0.001, 4
 #: What is watched after arriving, s; how far the pendulum may lean.
 AFTER, FALLEN = 1.0, math.pi / 2
@@ -121,6 +132,13 @@ def level_cascade(objective: str, friction: float) -> ut.Cascade:
     return ut.Cascade(rig, OBJECTIVES[objective], belief=ut.Belief(rig, tolerances))
 
 
+@cache
+def free_cascade(objective: str) -> ut.Cascade:
+    """Return the cascade with a belief that also chooses how fast it reaches its surfaces."""
+    freedom = ut.DecisionVariables(reaching=True)
+    return ut.Cascade(model(NAME), OBJECTIVES[objective], belief=belief(NAME), freedom=freedom)
+
+
 class Steering:
     """A cascade in simulated time, its decisions as in ``Cascade.simulate``, on estimates.
 
@@ -134,13 +152,14 @@ class Steering:
         self.run, self.estimator, self.deadline = run, estimator, run.objective.horizon
         self.memory, _ = run.start(x0)
         self.eager = eager and run.known is not None
-        self.law = InnerLoop(run.mechanism, self.memory.surface, run.reaching)
+        surface, reaching = self.memory.plan.at(0.0)
+        self.law = InnerLoop(run.mechanism, surface, reaching or run.reaching)
         self.planned_with, self.ticks = self.memory.estimate, 1
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x)."""
         if self.eager:
-            self.law.parameters[:] = self.estimator.parameters
+            self.law.believe(self.estimator.parameters, x)
         if t >= self.ticks * LEARNING - 1e-9:
             self._decide(self.ticks * LEARNING, x)
             self.ticks += 1
@@ -160,7 +179,8 @@ class Steering:
             proposal = run.propose(self.memory, x, t, left)
             self.memory, _ = run.apply_gate(self.memory, proposal, x, left)
             self.planned_with = self.memory.estimate
-            self.law.use(self.memory.surface, run.reaching)
+            surface, reaching = self.memory.plan.at(0.0)
+            self.law.use(surface, reaching or run.reaching)
 
 
 def steered(task: Task, controller: str, plant: Plant, most: float) -> Outcome:
@@ -172,10 +192,13 @@ def steered(task: Task, controller: str, plant: Plant, most: float) -> Outcome:
         kept = InnerLoop(task.rig, first_optimum(task))
         law = lambda t, x: kept(x)  # noqa: E731
     else:
-        level = controller == "level"
-        run = level_cascade(task.objective, most) if level else None
-        run = run or cascade(NAME, task.objective, controller)
-        drift = 0.0 if level else None
+        if controller == "level":
+            run = level_cascade(task.objective, most)
+        elif controller == "free":
+            run = free_cascade(task.objective)
+        else:
+            run = cascade(NAME, task.objective, controller)
+        drift = 0.0 if controller == "level" else None
         estimator = estimator_for(run.mechanism, plant.bench, drift, known=run.known)
         law = Steering(run, x0, estimator)
     estimator.reset(x0)
