@@ -1,18 +1,19 @@
 """Plants that are not the model, on a bench: inputs held, late, and with dry friction.
 
-The rotary pendulums of plants.py.  Each also draws Coulomb friction of its motor axis, evenly from 0
-to ``--friction``, and a delay of its input, evenly from 0 to ``--delay`` in quarters of a
+The rotary pendulums of plants.py.  Each also draws Coulomb friction of its motor axis, evenly from
+0 to ``--friction``, and a delay of its input, evenly from 0 to ``--delay`` in quarters of a
 millisecond.  The law runs at 1 kHz, its input held from sample to sample; friction sticks (it is
-not smoothed).  Positions are measured without noise or counts.  The rest is what the library
-gives a user on a rig: ``estimator_for`` the bench, a Kalman filter which knows the period and the
-delay, rounded to periods, and runs ahead by it; which estimates a matched disturbance, taken off the
-law's output; and which learns the parameters that the belief leaves open.  Nobody is told of the
-friction.
+not smoothed).  Positions are measured without noise or counts.  The estimator is what a user of the
+library gets on a rig, ``estimator_for`` the bench: a Kalman filter which knows the period and the
+delay, rounded to periods, and runs ahead by it; which estimates a matched disturbance, taken off
+the law's output; and which learns the parameters that the belief leaves open.  Nobody is told of
+the friction.  ``--drift`` sets how fast the disturbance may drift; 0 estimates none.
 
-*kept*, *exact* and *belief* are those of plants.py; *level* is a belief that has friction in its
-model, of a level that it learns (``Mechanism.with_friction``), and no disturbance besides.  As
-there, a decision is due every 0.1 s, and after what was learnt in 20 ms where that is news;
-nobody is charged for computing.
+*kept*, *exact* and *belief* are those of plants.py.  Where they are asked for: *level*, a belief
+that has friction in its model, of a level that it learns (``Mechanism.with_friction``), and no
+disturbance besides; *free*, a belief whose plans also choose the reaching law.  As in
+``Cascade.simulate``, a decision is due every 0.1 s, and after what was learnt in 20 ms where that
+is news; it has the time until the deadline, and nobody is charged for computing.
 
 Reached is ‖x‖ ≤ 0.01 of the true state at a sample, by the deadline, 10 s for energy and 6 s for
 time; cost counts the input as written, until then.  *Over the bound* compares with the best that an
@@ -29,6 +30,7 @@ from harness import command_line, need, table  # isort: skip  first: one thread
 
 import csv
 import math
+import os
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -146,20 +148,15 @@ class Steering:
     them: taken over at every sample, they turn the input's sign near a singular plant.
     """
 
-    def __init__(
-        self, run: ut.Cascade, x0: FloatArray, estimator: KalmanFilter, eager: bool = False
-    ) -> None:
+    def __init__(self, run: ut.Cascade, x0: FloatArray, estimator: KalmanFilter) -> None:
         self.run, self.estimator, self.deadline = run, estimator, run.objective.horizon
         self.memory, _ = run.start(x0)
-        self.eager = eager and run.known is not None
         surface, reaching = self.memory.plan.at(0.0)
         self.law = InnerLoop(run.mechanism, surface, reaching or run.reaching)
         self.planned_with, self.ticks = self.memory.estimate, 1
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x)."""
-        if self.eager:
-            self.law.believe(self.estimator.parameters, x)
         if t >= self.ticks * LEARNING - 1e-9:
             self._decide(self.ticks * LEARNING, x)
             self.ticks += 1
@@ -183,12 +180,14 @@ class Steering:
             self.law.use(surface, reaching or run.reaching)
 
 
-def steered(task: Task, controller: str, plant: Plant, most: float) -> Outcome:
+def steered(
+    task: Task, controller: str, plant: Plant, most: float, drift: float | None = None
+) -> Outcome:
     """Run a controller on a plant."""
     rig, x0 = RealisticRig(plant.bench, task.x0), task.x0
     law: Any
     if controller == "kept":
-        estimator = estimator_for(task.rig, plant.bench, known=ut.Belief.usual(task.rig))
+        estimator = estimator_for(task.rig, plant.bench, drift, ut.Belief.usual(task.rig))
         kept = InnerLoop(task.rig, first_optimum(task))
         law = lambda t, x: kept(x)  # noqa: E731
     else:
@@ -198,8 +197,8 @@ def steered(task: Task, controller: str, plant: Plant, most: float) -> Outcome:
             run = free_cascade(task.objective)
         else:
             run = cascade(NAME, task.objective, controller)
-        drift = 0.0 if controller == "level" else None
-        estimator = estimator_for(run.mechanism, plant.bench, drift, known=run.known)
+        drift = 0.0 if controller == "level" else drift
+        estimator = estimator_for(run.mechanism, plant.bench, drift, run.known)
         law = Steering(run, x0, estimator)
     estimator.reset(x0)
     law = compensated(law, estimator, task.rig.input_limits)
@@ -248,7 +247,7 @@ def least(task: Task, plant: Plant) -> float:
 
 def outcomes(
     job: tuple[Task, int], controllers: tuple[str, ...], seed: int, friction: float, delay: float,
-    bounds: bool,
+    drift: float | None, bounds: bool,
 ) -> list[Any]:  # fmt: skip
     """Run all controllers on one plant."""
     task, number = job
@@ -256,7 +255,7 @@ def outcomes(
     lowest = least(task, plant) if bounds else math.nan
     found = []
     for name in controllers:
-        one = steered(task, name, plant, friction)
+        one = steered(task, name, plant, friction, drift)
         found.append(replace(one, plant=number, bound=lowest))
     return found
 
@@ -304,27 +303,29 @@ def main() -> int:
     parser = command_line(
         __doc__,
         "--friction 0 --delay 0 --plants 60",
-        "--plants 10 --seed 7 --objective energy --angle 37 --controller belief",
+        "--objective time --controller belief --controller free",
+        "--plants 10 --seed 7 --objective energy --angle 37 --controller belief --drift 0",
         clocks=False,
     )
     parser.add_argument("--plants", type=int, default=30, help="how many are drawn")
     parser.add_argument("--seed", type=int, default=0, help="of the plants")
     parser.add_argument("--friction", type=float, default=0.02, help="at most, N m")
     parser.add_argument("--delay", type=float, default=0.003, help="at most, s")
+    parser.add_argument("--drift", type=float, help="of the disturbance, V/√s; the filter's 1.5")
     parser.add_argument("--angle", type=float, action="append", help="degrees; 30 and 37")
     parser.add_argument("--objective", choices=tuple(OBJECTIVES), action="append", help="both")
-    parser.add_argument("--controller", choices=CONTROLLERS, action="append", help="all")
+    parser.add_argument("--controller", choices=CONTROLLERS, action="append",
+                        help="kept, exact and belief")  # fmt: skip
     parser.add_argument("--no-bounds", action="store_true", help="no bound of any plant")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--out", type=Path, help="a CSV file for every single outcome")
     asked = parser.parse_args()
     plants = 2 if asked.quick else asked.plants
-    if plants < 1 or asked.workers < 1 or asked.friction < 0 or asked.delay < 0:
+    if plants < 1 or asked.workers < 1 or min(asked.friction, asked.delay) < 0:
         parser.error("--plants and --workers must be at least 1, --friction and --delay 0")
     if not asked.no_bounds:
         need("casadi", "compare")
-    usual = CONTROLLERS if asked.friction else CONTROLLERS[:3]
-    controllers = tuple(asked.controller or usual)
+    controllers = tuple(asked.controller or CONTROLLERS[:3])
     if "level" in controllers and not asked.friction:
         parser.error("level needs --friction")
     angles = asked.angle or ([30.0] if asked.quick else [30.0, 37.0])
@@ -337,11 +338,13 @@ def main() -> int:
     ]
     run: Any = partial(
         outcomes, controllers=controllers, seed=asked.seed, friction=asked.friction,
-        delay=asked.delay, bounds=not asked.no_bounds,
+        delay=asked.delay, drift=asked.drift, bounds=not asked.no_bounds,
     )  # fmt: skip
-    jobs, found = [(task, k) for task in tasks for k in range(plants)], []
+    jobs = [(task, k) for task in tasks for k in range(plants)]
+    found: list[Any] = []
     what = f"{plants} plants, seed {asked.seed}, friction to {asked.friction:g} N m, "
     what += f"delay to {1e3 * asked.delay:g} ms"
+    what += "" if asked.drift is None else f", drift {asked.drift:g} V/√s"
     for index, some in enumerate(every(jobs, run, asked.workers), 1):
         found += some
         if asked.out:
