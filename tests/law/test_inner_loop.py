@@ -85,3 +85,23 @@ def test_a_surface_is_exchanged_between_steps_or_refused(
     with pytest.raises(InvalidInputError, match="surface for"):
         law.use(ut.Surface(-np.eye(2), np.eye(2), np.ones((2, 1)), np.ones((2, 1))))
     assert law.surface == quick
+
+
+def test_parameters_with_which_the_input_would_turn_are_not_taken_over() -> None:
+    """Close to where a surface is singular, what is learnt waits for the next surface."""
+    rig = ut.mechanisms.rotary_pendulum()
+    belief = ut.Belief.relative(rig, m=0.2, l=0.05, I_e=0.2, a_e=0.1, d_e=0.5)
+    learnt = belief.values([0.4, 0.14, 0.32, -0.34, 0.02])
+    law = InnerLoop(rig, ut.Surface(-1, -4.039, 1.306, 8.926))
+    x, home = rig.state(phi=ut.deg(37)), rig.state(phi=ut.deg(10))
+    before = float(law(x)[0])
+    assert not law.believe(learnt, x)
+    assert float(law(x)[0]) == before
+    np.testing.assert_array_equal(law.parameters, rig.parameter_values)
+    law.parameters[:] = learnt
+    assert float(law(x)[0]) == -before
+    law.parameters[:] = rig.parameter_values
+    assert law.believe(learnt, home)
+    np.testing.assert_array_equal(law.parameters, learnt)
+    law.parameters[:] = rig.parameter_values
+    assert law.believe(learnt, rig.state(phi=ut.deg(60)))  # singular in any case

@@ -49,7 +49,7 @@ class InnerLoop:
         arrays are written over by the next step.
     parameters
         Values of the mechanism's parameters that the steps believe in, (P,), SI units: who learns
-        them writes them here.
+        them writes them here, or calls :meth:`believe`.
 
     Examples
     --------
@@ -89,6 +89,25 @@ class InnerLoop:
         law = SlidingModeLaw(self.mechanism, surface, reaching or self.reaching)
         self.lane = pack_law_parameters(law)
         self.surface, self.reaching = surface, law.reaching
+
+    def believe(self, parameters: FloatArray, x: FloatArray) -> bool:
+        """Go on with other values of the parameters, (P,), if the surface bears them at x, (2n,).
+
+        Where det Γ(q) would change its sign with them, so would the input: a surface that was
+        chosen with what was known before, close to where it is singular, is kept with that until
+        another one is chosen.  Whether they were taken over.
+        """
+        before = self.parameters.copy()
+        self.parameters[:] = parameters
+        self._step(x, self.lane, self._block)
+        if self.margin[0] > 0.0:
+            return True
+        after, self.parameters[:] = self.parameters.copy(), before
+        self._step(x, self.lane, self._block)
+        if self.margin[0] > 0.0:
+            return False
+        self.parameters[:] = after  # it is singular here in any case
+        return True
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the input at the state x, (2n,): never NaN, never past the limits, (m,)."""

@@ -73,7 +73,7 @@ class CascadeSteering:
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x)."""
         if self.learning is not None:
-            self.law.parameters[:] = self.learning.parameters
+            self.law.believe(self.learning.parameters, x)
         if t >= self.ticks * self.cascade.period - 1e-9:
             self._slow(self.ticks * self.cascade.period, x)
             self.ticks += 1
