@@ -162,7 +162,7 @@ def test_noise_of_the_estimate_at_rest(arm: Mechanism) -> None:
 
 
 def test_what_noise_costs_is_its_share_of_the_input(arm: Mechanism) -> None:
-    """tr(R K P Kᵀ) per second for half of the time, K by differences of the law."""
+    """tr(R K P Kᵀ) per second for a quarter of the time, K by differences of the law."""
     rng = np.random.default_rng(8)
     root = 0.01 * rng.normal(size=(4, 4))
     P = root @ root.T
@@ -177,7 +177,7 @@ def test_what_noise_costs_is_its_share_of_the_input(arm: Mechanism) -> None:
             before, after = plain.batch(x, surfaces), noisy.batch(x, surfaces)
             costs, times = before.cost.copy(), before.time.copy()
             K = np.array([feedback(InnerLoop(arm, surface)) for surface in surfaces])
-            rate = 0.5 * np.einsum("cij,jk,cik->c", K, P, K)
+            rate = 0.25 * np.einsum("cij,jk,cik->c", K, P, K)
             if ensemble is None:
                 np.testing.assert_allclose(after.cost - costs, rate * times, rtol=1e-4)
             else:  # members arrive at other times, and some have other surfaces

@@ -46,8 +46,9 @@ MOST_STEPS = 10_000_000
 CALMER = 0.5
 
 #: Part of its time that a motion counts as near the target, where noise costs what the gains there
-#: make of it.  Twice as much makes surfaces so soft that dry friction moves more than noise did.
-NEAR = 0.5
+#: make of it.  Twice or four times as much costs no less on a rig, and makes surfaces so soft that
+#: dry friction moves more than noise did.
+NEAR = 0.25
 
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
@@ -98,7 +99,7 @@ class ClosedLoop:
         one result for each plan, see :mod:`undertow.closed_loop.ensemble`.
     covariance
         Of the error of the estimated state, (2n, 2n), that the law acts on.  Batches count the cost
-        of what it makes of it near the target, tr(R K P Kᵀ) per second for half of their time,
+        of what it makes of it near the target, tr(R K P Kᵀ) per second for a quarter of their time,
         where they have a linear model; motions are without noise.
 
     Examples
