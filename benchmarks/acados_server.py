@@ -42,16 +42,20 @@ def programme(acados: Any, asked: dict[str, Any]) -> Any:
 
     n, m, grid = asked["n"], asked["m"], np.array(asked["lengths"])
     x, v, slope = ca.SX.sym("x", n), ca.SX.sym("v", m), ca.SX.sym("slope", n)
-    rates = ca.Function.deserialize(asked["rates"])(x, v)
+    p = ca.SX.sym("p", len(asked["values"]))
+    rates = ca.Function.deserialize(asked["rates"])(x, v, p)
     ocp, model = acados.AcadosOcp(), acados.AcadosModel()
-    model.name, model.x, model.u, model.xdot = "rig", x, v, slope
+    model.name, model.x, model.u, model.xdot, model.p = "rig", x, v, slope, p
+    ocp.parameter_values = np.array(asked["values"])
     model.f_expl_expr, model.f_impl_expr = rates, slope - rates
     ocp.model, ocp.dims.N = model, len(grid)
     cost, limits, options = ocp.cost, ocp.constraints, ocp.solver_options
     cost.cost_type, cost.cost_type_e = "LINEAR_LS", "LINEAR_LS"
-    cost.Vx, cost.Vu, cost.Vx_e = np.zeros((m, n)), np.eye(m), np.eye(n)
-    cost.W, cost.W_e = 2 * np.diag(asked["weights"]), np.eye(n)
-    cost.yref, cost.yref_e = np.zeros(m), np.zeros(n)
+    state = asked["weight"]
+    both = np.eye(n + m) if state else np.eye(n + m)[n:]  # inputs alone, where states are free
+    cost.Vx, cost.Vu, cost.Vx_e = both[:, :n], both[:, n:], np.eye(n)
+    cost.W = 2 * np.diag([state] * (len(both) - m) + asked["weights"])
+    cost.W_e, cost.yref, cost.yref_e = np.eye(n), np.zeros(len(both)), np.zeros(n)
     limits.x0, limits.idxbu = np.zeros(n), np.arange(m)
     limits.lbu, limits.ubu = -np.ones(m), np.ones(m)
     boxed = np.array(asked["boxed"], dtype=int)
@@ -69,24 +73,28 @@ def programme(acados: Any, asked: dict[str, Any]) -> Any:
 
 
 def sample(solver: Any, asked: dict[str, Any]) -> dict[str, Any]:
-    """Take one real-time iteration."""
+    """Take one real-time iteration: from a plan that is told, or else from the last solution."""
     import numpy as np
 
-    states, inputs = np.array(asked["states"]), np.array(asked["inputs"])
-    solver.set_new_time_steps(np.array(asked["lengths"]))
-    solver.cost_set(len(inputs), "W", np.diag(asked["end"]))
+    told = "states" in asked
+    states, inputs = np.array(asked.get("states", [])), np.array(asked.get("inputs", []))
+    if told:
+        solver.set_new_time_steps(np.array(asked["lengths"]))
+        solver.cost_set(len(inputs), "W", np.array(asked["end"]))
     for k, state in enumerate(states):
         solver.set(k, "x", state)
     for k, value in enumerate(inputs):
         solver.set(k, "u", value)
+    for k in range(asked["nodes"]):
+        solver.set(k, "p", np.array(asked["values"]))
     for bound in ("lbx", "ubx"):
         solver.set(0, bound, np.array(asked["x"]))
-    began = time.perf_counter()
+    began = time.process_time()
     status = solver.solve()
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     return {
         "states": [solver.get(k, "x").tolist() for k in range(len(states))],
-        "inputs": [solver.get(k, "u").tolist() for k in range(len(inputs))],
+        "inputs": [solver.get(k, "u").tolist() for k in range(max(1, len(inputs)))],
         "good": status == 0,
         "seconds": seconds,
     }

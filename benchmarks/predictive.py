@@ -5,7 +5,8 @@
   *A real-time iteration scheme*, SIAM J. Control Optim. 43, 2005), Gauss-Newton: the cost is
   quadratic, so its Hessian is exact but for the curvature of the dynamics.  A step that makes
   cost and defects worse is shortened: with two motors and three links full steps never settle.
-  CasADi; QRQP, warm-started, and HPIPM where that fails.
+  CasADi; QRQP, warm-started, and HPIPM where that fails.  With a weight of the state it balances
+  for ever instead: the horizon recedes, and the regulator's price stands for all that comes after.
 * :class:`Acados`: the same in acados, with full steps, in a process of another Python that has it.
 * :class:`Sampled`: holds what a controller asks for from sample to sample, and has its model's
   parameters learnt from the motion where there is a belief, the library's own.
@@ -56,21 +57,21 @@ SLOW = 1e-4
 MISS, OUTSIDE = 0.1, 0.1
 
 
-def grid(span: float) -> FloatArray:
+def grid(span: float, first: float = PERIOD) -> FloatArray:
     """Return the intervals of a plan over a span, s: the first a sample, each longer than the last.
 
     None is longer than ``LONGEST`` where the span allows that; short spans are divided evenly.
     """
     numbers = np.arange(INTERVALS)
-    if span <= INTERVALS * PERIOD:
+    if span <= INTERVALS * first:
         return np.full(INTERVALS, span / INTERVALS)
     cap = max(LONGEST, 1.5 * span / INTERVALS)
     low, high = 1.0, 2.0
     for _ in range(60):
         ratio = (low + high) / 2
-        total = np.minimum(PERIOD * ratio**numbers, cap).sum()
+        total = np.minimum(first * ratio**numbers, cap).sum()
         low, high = (ratio, high) if total < span else (low, ratio)
-    lengths = np.minimum(PERIOD * low**numbers, cap)
+    lengths = np.minimum(first * low**numbers, cap)
     return np.asarray(lengths * span / lengths.sum())
 
 
@@ -119,12 +120,21 @@ class Sampled:
 class _Task:
     """What both real-time iterations share: the grid, the penalties, the first guess."""
 
-    def __init__(self, mechanism: ut.Mechanism, box: Box, deadline: float, radius: float) -> None:
+    def __init__(
+        self,
+        mechanism: ut.Mechanism,
+        box: Box,
+        deadline: float,
+        radius: float,
+        period: float,
+        weight: float,
+    ) -> None:
         self.mechanism, self.deadline = mechanism, deadline
+        self.period, self.weight = period, weight
         self.limits = mechanism.input_limits
         self.low, self.high = ends(mechanism, box)
         self.boxed = np.flatnonzero(np.isfinite(self.low) | np.isfinite(self.high))
-        self.lengths = grid(deadline - EARLY)
+        self.lengths = self.left(0.0)
         rate = np.abs(np.linalg.eigvals(linearise(mechanism).A)).max()
         self.substeps = np.ceil(self.lengths * rate / RESOLVED).astype(int).clip(1, 40)
         self.radius = radius
@@ -132,6 +142,11 @@ class _Task:
         self.failures = 0
         #: Σ (u_i/u_i,max)² weighed so that it is proportional to uᵀu.
         self.weights = (self.limits / self.limits.max()) ** 2
+        #: x_N in units in which the price of where a plan ends is a sum of squares.
+        self.tip = np.eye(2 * mechanism.n)
+        if weight:
+            price = riccati(mechanism, weight)[0] / float(self.limits.max()) ** 2
+            self.tip = np.linalg.inv(np.linalg.cholesky(price)).T
 
     def size(self, x: FloatArray) -> float:
         """Return about what the whole task costs, in units of the largest input squared."""
@@ -139,15 +154,16 @@ class _Task:
         return float(x @ P @ x) / float(self.limits.max()) ** 2
 
     def left(self, t: float) -> FloatArray:
-        """Return the grid from t on, to the aim or to the next try."""
+        """Return the grid from t on, to the aim or to the next try; or as far as plans look."""
+        if self.weight:
+            return grid(self.deadline, self.period)
         span = self.deadline - EARLY - t
-        return grid(
-            span if span > PERIOD / 2 else AGAIN - (-span + PERIOD / 2) % AGAIN + PERIOD / 2
-        )
+        half = self.period / 2
+        return grid(span if span > half else AGAIN - (-span + half) % AGAIN + half, self.period)
 
     def due(self, t: float) -> bool:
         """Whether it is planned anew at t."""
-        return abs(t / PERIOD - round(t / PERIOD)) < 1e-6
+        return abs(t / self.period - round(t / self.period)) < 1e-6
 
     def guess(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return states and inputs to start from: straight home."""
@@ -181,13 +197,18 @@ class RealTimeIteration(_Task):
     box
         How far coordinates may go, softly.
     deadline
-        When the terminal set is to be reached, s; plans aim at it a fifth of a second sooner.
+        When the terminal set is to be reached, s; plans aim at it a fifth of a second sooner.  With
+        a weight, how far each plan looks ahead, s.
     radius
         ν of the terminal set.
     names
         Parameters whose ``values`` may change from sample to sample.
     now
         Clock for the seconds of each planning.
+    period
+        Time between samples, s.
+    weight
+        Of xᵀx beside uᵀu: then x = 0 is approached for ever, and nothing is to be reached.
     """
 
     def __init__(
@@ -198,8 +219,10 @@ class RealTimeIteration(_Task):
         radius: float = 0.01,
         names: Sequence[str] = (),
         now: Clock = time.perf_counter,
+        period: float = PERIOD,
+        weight: float = 0.0,
     ) -> None:
-        super().__init__(mechanism, box, deadline, radius)
+        super().__init__(mechanism, box, deadline, radius, period, weight)
         self.ca, self._now = need("casadi", "compare"), now
         self.names = tuple(names)
         self._build()
@@ -234,9 +257,13 @@ class RealTimeIteration(_Task):
         V = [ca.MX.sym(f"v{k}", m + b) for k in range(INTERVALS)]
         h, p = ca.MX.sym("h", INTERVALS), ca.MX.sym("p", len(self.names))
         moves = {count: self._move(int(count)) for count in set(self.substeps)}
+        self._forward = self._move(2)
         rows = []
         for k, count in enumerate(self.substeps):
-            rows.append(moves[count](X[k], V[k][:m], h[k], p) - X[k + 1])
+            end = moves[count](X[k], V[k][:m], h[k], p)
+            if k == INTERVALS - 1 and self.weight:
+                end = ca.DM(np.linalg.inv(self.tip)) @ end
+            rows.append(end - X[k + 1])
             rows += [X[k][i] + V[k][m + j] for j, i in enumerate(self.boxed)]
         z = ca.vertcat(*(part for pair in zip(X, V, strict=False) for part in pair), X[-1])
         g = ca.vertcat(*rows)
@@ -265,16 +292,20 @@ class RealTimeIteration(_Task):
             "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 300},
         })  # fmt: skip
 
+    def ahead(self, x: FloatArray, u: FloatArray, seconds: float) -> FloatArray:
+        """Return the state after some seconds under an input that is held."""
+        end = self._forward(x, u / self.limits, seconds, self.values)
+        return np.asarray(end, dtype=float).ravel()
+
     def _weights(self, lengths: FloatArray) -> FloatArray:
         """Return the diagonal of the Hessian."""
-        n, m = 2 * self.mechanism.n, self.mechanism.m
+        n = 2 * self.mechanism.n
         width = (self.high - self.low)[self.boxed]
         out = 2 * OUTSIDE * self._size / (0.01 * np.where(np.isfinite(width), width, 1.0)) ** 2
-        stage = np.concatenate([np.zeros(n), np.zeros(m), out])
-        body = np.tile(stage, (INTERVALS, 1))
-        body[:, n : n + m] = 2 * lengths[:, None] * self.weights
-        body[:, n + m :] *= lengths[:, None]
-        end = np.full(n, 2 * MISS * self._size / self.radius**2)
+        state = np.full(n, 2 * self.weight / float(self.limits.max()) ** 2)
+        stage = np.concatenate([state, 2 * self.weights, out])
+        body = lengths[:, None] * np.tile(stage, (INTERVALS, 1))
+        end = np.full(n, 2.0 if self.weight else 2 * MISS * self._size / self.radius**2)
         return np.concatenate([body.ravel(), end])
 
     def _bounds(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -287,12 +318,13 @@ class RealTimeIteration(_Task):
 
     def _packed(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         slack = np.zeros((INTERVALS, len(self.boxed)))
-        return np.concatenate([np.hstack([states[:-1], inputs, slack]).ravel(), states[-1]])
+        last = np.linalg.solve(self.tip, states[-1]) if self.weight else states[-1]
+        return np.concatenate([np.hstack([states[:-1], inputs, slack]).ravel(), last])
 
     def _unpacked(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         n, m = 2 * self.mechanism.n, self.mechanism.m
         body = z[:-n].reshape(INTERVALS, -1)
-        return np.vstack([body[:, :n], z[-n:]]), body[:, n : n + m]
+        return np.vstack([body[:, :n], self.tip @ z[-n:]]), body[:, n : n + m]
 
     def plan(self, t: float, x: FloatArray) -> bool:
         """Take one step towards the best plan from x; False where the programme failed."""
@@ -370,32 +402,44 @@ class RealTimeIteration(_Task):
         _, inputs, lengths = self._plan
         nodes = np.concatenate([[0.0], np.cumsum(lengths)])
         area = np.vstack([np.zeros(inputs.shape[1]), np.cumsum(lengths[:, None] * inputs, axis=0)])
-        span = t - self._since + np.array([0.0, PERIOD])
+        span = t - self._since + np.array([0.0, self.period])
         spent = np.stack([np.interp(span, nodes, column) for column in area.T])
-        return np.asarray(np.diff(spent, axis=1)[:, 0] / PERIOD * self.limits)
+        return np.asarray(np.diff(spent, axis=1)[:, 0] / self.period * self.limits)
 
 
 class Acados(RealTimeIteration):
     """The same programme by acados (HPIPM), in a process of another Python that has it.
 
     The first plan is the one of :class:`RealTimeIteration`; steps are full; ``seconds`` are
-    acados' own, without the pipe.  Its model stays as it is.
+    acados' own, without the pipe.  Faster than ``PERIOD`` it starts each step from its own last
+    solution, which is not shifted: the way of its examples.
 
     Parameters
     ----------
     python
         The other Python, with acados, CasADi and NumPy; a C compiler besides.
-    mechanism, box, deadline, radius
+    mechanism, box, deadline, radius, names, period, weight
         As for :class:`RealTimeIteration`.
     """
 
     def __init__(
-        self, python: str, mechanism: ut.Mechanism, box: Box, deadline: float, radius: float
+        self,
+        python: str,
+        mechanism: ut.Mechanism,
+        box: Box,
+        deadline: float,
+        radius: float = 0.01,
+        names: Sequence[str] = (),
+        period: float = PERIOD,
+        weight: float = 0.0,
     ) -> None:
-        super().__init__(mechanism, box, deadline, radius)
+        super().__init__(mechanism, box, deadline, radius, names, period=period, weight=weight)
         ca, n, m = self.ca, 2 * mechanism.n, mechanism.m
-        x, v = ca.SX.sym("x", n), ca.SX.sym("v", m)
-        rates = dynamics(ca, mechanism)(x, v * self.limits)
+        x, v, p = ca.SX.sym("x", n), ca.SX.sym("v", m), ca.SX.sym("p", len(self.names))
+        f = dynamics(ca, mechanism, self.names)
+        rates = f(x, v * self.limits, p) if self.names else f(x, v * self.limits)
+        self._said: FloatArray
+        self._going: bool
         server = Path(__file__).with_name("acados_server.py")
         self._process = subprocess.Popen(
             [python, str(server)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -405,7 +449,8 @@ class Acados(RealTimeIteration):
         self._size = self.size(mechanism.usual_start)
         weights = self._weights(self.lengths)[n + m : n + m + len(self.boxed)] / self.lengths[0]
         self._ask({
-            "rates": ca.Function("rates", [x, v], [rates]).serialize(), "n": n, "m": m,
+            "rates": ca.Function("rates", [x, v, p], [rates]).serialize(), "n": n, "m": m,
+            "values": self.values.tolist(), "weight": self.weight / float(self.limits.max()) ** 2,
             "lengths": self.lengths.tolist(), "substeps": self.substeps.tolist(),
             "weights": self.weights.tolist(), "boxed": self.boxed.tolist(),
             "low": self.low[self.boxed].tolist(), "high": self.high[self.boxed].tolist(),
@@ -435,14 +480,39 @@ class Acados(RealTimeIteration):
     def _step(self, z: FloatArray, x: FloatArray, lengths: FloatArray) -> tuple[FloatArray, bool]:
         """Return what one real-time iteration of acados makes of z."""
         states, inputs = self._unpacked(z)
-        end = self._weights(lengths)[-len(x) :]
+        tip = np.linalg.inv(self.tip)
+        end = tip.T @ np.diag(self._weights(lengths)[-len(x) :]) @ tip
         found = self._ask({
             "x": x.tolist(), "lengths": lengths.tolist(), "states": states.tolist(),
-            "inputs": inputs.tolist(), "end": end.tolist(),
+            "inputs": inputs.tolist(), "end": end.tolist(), **self._told(),
         })  # fmt: skip
-        self._spent = found["seconds"]
+        self._spent, self._going = found["seconds"], found["good"]
         new = self._packed(np.array(found["states"]), np.array(found["inputs"]))
         return new, found["good"] and bool(np.isfinite(new).all())
+
+    def _told(self) -> dict[str, Any]:
+        """Return what acados is told of the parameters: nothing while they stay."""
+        nodes = INTERVALS + 1 if not np.array_equal(self.values, self._said) else 0
+        self._said = self.values.copy()
+        return {"values": self.values.tolist(), "nodes": nodes}
+
+    def forget(self) -> None:
+        """Start from cold, with the model's own parameters."""
+        super().forget()
+        self._going = False
+        self._said = np.full(len(self.values), math.nan)
+
+    def __call__(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at t, for one sample."""
+        if self._going and self.period < PERIOD:
+            found = self._ask({"x": x.tolist(), **self._told()})
+            u = np.array(found["inputs"][0]) * self.limits
+            if found["good"] and np.isfinite(u).all():
+                self.seconds.append(found["seconds"])
+                return u
+            self.failures += 1
+            self._plan, self._going = None, False
+        return super().__call__(t, x)
 
     def plan(self, t: float, x: FloatArray) -> bool:
         """Take one step towards the best plan from x; False where acados failed."""

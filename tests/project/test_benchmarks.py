@@ -176,7 +176,7 @@ def test_a_plant_that_leaves_its_box_is_lost(rivals: ModuleType, rig: ut.Mechani
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(SCRIPTS) - HELPERS))
 def test_quick_run(name: str) -> None:
-    if name in ("kernel", "reoptimise", "closed_loop", "gap", "searchers", "plants"):
+    if name in ("kernel", "reoptimise", "closed_loop", "gap", "searchers", "plants", "rig_peers"):
         pytest.importorskip("casadi")
     finished = run(str(FOLDER / f"{name}.py"), "--quick")
     assert finished.returncode == 0, finished.stderr
