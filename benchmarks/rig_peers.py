@@ -15,7 +15,7 @@ the price of its linear-quadratic regulator at the end.  *Learnt* plan with the 
 filter has learnt, as the cascade does; the others with the model's.  They run at 100 Hz and as fast
 as they can: a period is the 99th percentile of the processor time of their own plannings on the
 first rig, in whole ms, and so is what each answer comes late; its start is predicted so far ahead.
-The cascade's answers come a period late, 20 ms; NMPC is not charged.  A pendulum that leans by a
+The cascade's answers come a period late, 0.1 s; NMPC is not charged.  A pendulum that leans by a
 right angle is lost, and no iteration plans for it any more.
 
 Balanced: home, the arm within 20° and the pendulum within 2°, for the last second.  The cost
