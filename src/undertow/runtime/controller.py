@@ -37,6 +37,9 @@ CATCH_LEAD, CATCH_PREDICTION_ERROR = 0.02, 0.1
 #: most that it grows to, when answers are late.
 JUMP_LEAD, MOST_JUMP_LEAD = 1.0, 8.0
 
+#: Time after which a target is asked for again for which no plan was found, s.
+JUMP_RETRY = 1.0
+
 #: How the reason begins for which an answer is refused that no sound slow loop gives.
 UNSOUND = "unsound: "
 
@@ -58,6 +61,9 @@ class Inputs:
     alarm
         What the runtime itself found wrong (a stall, failed writes, deadlines missed, a clock
         that runs wrong); stops the run.
+    target
+        Another target that was asked for meanwhile: when it jumps, s after this step, and where
+        to.  It takes the place of what was asked for before and has not been reached.
     """
 
     t: float
@@ -65,6 +71,7 @@ class Inputs:
     answer: Answer | None = None
     command: Command = Command.NONE
     alarm: str = ""
+    target: Legs = ()
 
 
 class Note(NamedTuple):
@@ -96,7 +103,8 @@ class Controller:
         near its target.
     legs
         When the target jumps, s, and where to, the first at 0: what the cascade started with.  The
-        target jumps when the first plan to it is there, not before.
+        target jumps when the first plan to it is there, not before; with a swing-up not before it
+        balances at x = 0, and the first of them, too.
 
     Attributes
     ----------
@@ -171,7 +179,11 @@ class Controller:
         self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
         self._lead = settings.lead_time
         self._catch_lead, self._jump_lead = CATCH_LEAD, JUMP_LEAD
-        self._ahead = list(legs[1:])
+        self._ahead, self._not_before = list(legs[1:]), 0.0
+        if swing_up is not None and legs and legs[0][1].q.any():
+            self._ahead.insert(0, legs[0])
+        self._turns: FloatArray = np.zeros_like(self.x)
+        self._told: Legs = ()
         if memory.target is not None:
             self._turn[:] = memory.target.state(0.0)
 
@@ -194,7 +206,7 @@ class Controller:
         if self.notes:
             self.notes.clear()
         self.request, self.optimiser_timed_out = None, False
-        self._t, self._free = inputs.t, False
+        self._t, self._free, self._told = inputs.t, False, inputs.target
         try:
             self._compute(inputs)
         except Exception as error:  # whatever it was, the output goes to zero within its slew
@@ -210,6 +222,8 @@ class Controller:
         try:
             if used is not None:
                 self._note_outcome(used)
+            if self._told:
+                self._retarget(self._t, self._told)
             if answer is not None:
                 self._take_answer(self._t, answer)
             elif self._free:
@@ -237,7 +251,7 @@ class Controller:
         if due:
             new, most = self._next[1][0], self._max_error
             if mode is Mode.SWING_UP and self.swing_up is not None:
-                self._turn[:] = self.swing_up.region.turns(estimate)
+                self._turns[:] = self._turn[:] = self.swing_up.region.turns(estimate)
             self._aim(pending)
         waited = ""
         if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up_timeout:
@@ -280,7 +294,7 @@ class Controller:
     def _aim(self, answer: Answer | None) -> None:
         """Count the state from the new target, where an answer that is due brings one."""
         if answer is not None and answer.jump and answer.memory.target is not None:
-            self._turn[:] = answer.memory.target.state(answer.use)
+            self._turn[:] = self._turns + answer.memory.target.state(answer.use)
 
     def _landed(self, answer: Answer | None, used: bool) -> None:
         """Note that the target has jumped, or count from the old one again."""
@@ -291,7 +305,33 @@ class Controller:
             self.notes.append(Note("target", f"jumps, asked for at {begin:g} s"))
         else:
             target = self.memory.target
-            self._turn[:] = 0.0 if target is None else target.state(self._t)
+            self._turn[:] = self._turns + (0.0 if target is None else target.state(self._t))
+
+    @property
+    def aim(self) -> FloatArray:
+        """Positions of the target that was asked for last and whose time has come, (n,)."""
+        due = [motion for begin, motion in tuple(self._ahead) if begin <= self._t]
+        target = due[-1] if due else self.memory.target
+        return np.zeros(len(self.x) // 2) if target is None else target.q[0]
+
+    @property
+    def ahead(self) -> Legs:
+        """When the target was asked to jump, or will be, s, and where to: what is still to come."""
+        return tuple(self._ahead)
+
+    def _retarget(self, t: float, legs: Legs) -> None:
+        """Go for what was asked for meanwhile; what is planned for another jump is given up."""
+        self._told = ()
+        self._ahead, self._not_before = [(t + begin, motion) for begin, motion in legs], t
+        asked, pending = self._asked, self._pending
+        if asked is not None and asked.target is not None:
+            self._sequence, self._asked = max(self._sequence, asked.sequence), None
+        if pending is not None and pending.jump:
+            self._sequence, self._pending = max(self._sequence, pending.sequence), None
+        for begin, motion in self._ahead:
+            places = zip(self._names, motion.q[0].tolist(), strict=True)
+            where = ", ".join(f"{name} = {value:g}" for name, value in places if value)
+            self.notes.append(Note("target", f"asked for at {begin:g} s: {where or 'x = 0'}"))
 
     def _describe(self, wrong: int, place: int) -> str:
         """Return in words what a step found wrong with the estimate."""
@@ -328,6 +368,8 @@ class Controller:
             self._began = t
         elif mode is Mode.SWING_UP:
             self._swinging, self._pending = t, None
+            if self.memory.target is not None:  # what catches does so at x = 0
+                self._ahead.insert(0, (t, self.memory.target))
         elif mode is Mode.CATCH and self.mode is Mode.BRING_UP:
             self.memory = replace(self.memory, since=t)  # a schedule starts with the catch
             self._segment, self._law_vector = 0, self._law_vectors[0]
@@ -362,7 +404,7 @@ class Controller:
             self.memory = replace(self.memory, sequence=self._sequence, estimate=learnt)
         elif self.memory.sequence != self._sequence:
             self.memory = replace(self.memory, sequence=self._sequence)
-        if self._ahead and t >= self._ahead[0][0] - self._jump_lead - 2 * self._lead:
+        if self._jumps_next(t):
             begin, motion = self._ahead[0]
             step = self.cascade.step
             use = t + math.ceil(max(self._jump_lead, begin - t) / step - 1e-9) * step
@@ -373,6 +415,13 @@ class Controller:
             use = t + self._catch_lead
             self._asked = Request(t, self.x.copy(), use, self.memory, self._gains_in_use(t))
         self.request = self._asked
+
+    def _jumps_next(self, t: float) -> bool:
+        """Whether the next request is for a plan to another target."""
+        if not self._ahead or t < self._not_before or self.mode is Mode.SWING_UP:
+            return False
+        early = t < self._ahead[0][0] - self._jump_lead - 2 * self._lead
+        return not early and (self.swing_up is None or self.mode is Mode.BALANCE)
 
     def _adapt_lead_time(self, factor: float) -> None:
         """Change how far ahead proposals are computed, in whole steps of the predictions."""
@@ -401,6 +450,12 @@ class Controller:
                     self._adapt_lead_time(1.5)
                 self._sequence = max(self._sequence, answer.sequence)
                 self._asked = None
+        elif self._asked is not None and self._asked.target is not None and not answer.jump:
+            self._sequence, self._asked = max(self._sequence, answer.sequence), None
+            self._not_before = t + JUMP_RETRY
+            why = answer.proposal.message
+            self.notes.append(Note("answer", f"{answer.sequence}: kept the old plan, {why}"))
+            self.notes.append(Note("target", f"stays, there is no plan for another: {why}"))
         else:
             if answer.use - t > 0.5 * self._lead and not answer.jump:
                 self._adapt_lead_time(0.9)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self, TypeGuard
 
 import numpy as np
 
-from undertow.cascade import Admission, CascadeState
+from undertow.cascade import Admission, CascadeState, Legs
 from undertow.estimators import ParameterEstimate
 from undertow.law import Plan, ReachingLaw, ReferenceMotion, Surface
 from undertow.models import FloatArray, Mechanism
@@ -167,6 +167,9 @@ class Columns:
         return positions, inputs, [name for name in names if name.startswith(_SURFACE)]
 
 
+#: Kind of the events that hold the targets which were asked for during a run.
+TOLD = "set-points"
+
 #: Keys of an answer's ``body`` in logs before version 0.2.0, and what they are now.
 OLD_KEYS = {"lanes": "law_vectors"}
 
@@ -235,6 +238,19 @@ def memory_from(value: Mapping[str, Any]) -> CascadeState:
         "estimate": None if learnt is None else _estimate_from(learnt),
     }
     return CascadeState(**{**value, **changed})
+
+
+def legs_to(legs: Legs) -> str:
+    """Return the set-points that were asked for during a run as JSON: times, s, and positions."""
+    return json.dumps([[begin, list(motion.position(0.0))] for begin, motion in legs])
+
+
+def legs_from(text: str) -> Legs:
+    """Return the set-points that were encoded."""
+    return tuple(
+        (float(begin), ReferenceMotion.at_rest(np.array(q, dtype=float)))
+        for begin, q in json.loads(text)
+    )
 
 
 def _is_sound(plan: object) -> TypeGuard[Plan]:

@@ -9,14 +9,16 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
 
+import numpy as np
+
 from undertow.base import InvalidInputError, UndertowError, one_of
-from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator, legs_of
+from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import KalmanFilter
-from undertow.law import Plan, ReachingLaw, SetPoints
+from undertow.law import Plan, ReachingLaw, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
-from undertow.models import FloatArray, Mechanism, number_of
+from undertow.models import FloatArray, Mechanism, invariant_coordinates, number_of
 from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, IdealRig, RealisticRig
@@ -31,6 +33,7 @@ from undertow.runtime.controller_defaults import (
 )
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow_loop import Answer, Request, respond
+from undertow.runtime.targets import checked_legs
 
 #: Shortest period, and longest prediction, of a run, s.
 SHORTEST, FARTHEST = 1e-5, 3600.0
@@ -83,7 +86,7 @@ class Recipe:
     target
         Set-points, pairs of a time, s, and coordinates with positions, rad or m, see
         :class:`undertow.SetPoints`; without any x = 0.  Times count from the start of the run, and
-        the target jumps once there is a plan for it.
+        the target jumps once there is a plan for it; after a swing-up once it balances at x = 0.
     learns
         Whether the mechanism's parameters, within their tolerances, are learnt as it runs;
         otherwise they are exact.
@@ -145,13 +148,6 @@ class Recipe:
                 "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
             )
         one_of("rig of a run", self.rig, ("ideal", "realistic"))
-        if self.target and self.swing_up:
-            raise InvalidInputError(
-                "target of a run with a swing-up",
-                value=list(self.target),
-                limit="one of them",
-                remedy="Swing up first, and run to the target from there",
-            )
         assert self.legs is not None  # found here, so that its checks run before anything moves
 
     @cached_property
@@ -240,7 +236,7 @@ class Recipe:
         if not self.target:
             return ()
         goal = SetPoints(self.target)
-        return legs_of(self.belief, self.cascade.objective, goal, goal.times[-1])
+        return checked_legs(self.belief, self.cascade.objective, self.settings, goal)
 
     def first(self) -> CascadeState:
         """Return what the cascade starts with: the first optimum, or what awaits a catch.
@@ -260,11 +256,12 @@ class Recipe:
         """Answer a request of the fast loop: what the slow loop computes."""
         return respond(self.cascade, request, self.swing)
 
-    def precompile(self, memory: CascadeState) -> None:
+    def precompile(self, memory: CascadeState, *, jumps: bool = False) -> None:
         """Make everything compile that an answer may need, whatever the gate refuses before.
 
         A run that begins balanced has most of it from its first optimum; one that swings up
         meets the optimiser in the middle of the run.  ``memory`` is what :meth:`first` returned.
+        ``jumps``: the target may jump, also where no set-point says so yet.
         """
         x, cascade, step = self.belief.state(**self.belief.start), self.cascade, self.cascade.step
         if self.swing is not None:
@@ -272,6 +269,12 @@ class Recipe:
                 memory = cascade.start(x)[0]
             self.respond(Request(0.0, x, step, memory, 0))
         self.respond(Request(0.0, x, step, memory))
+        if self.legs or (jumps and invariant_coordinates(self.belief)):
+            home = SetPoints({})
+            checked_legs(self.belief, cascade.objective, self.settings, home)
+            still = ReferenceMotion.at_rest(np.zeros(self.belief.n))
+            there = self.respond(Request(0.0, x, step, memory, -1, still)).memory
+            self.respond(Request(step, x, 2 * step, there))
         derate_actuator(cascade.loop_at(memory), RESERVE).batch(x, memory.plan, duration=step)
 
     @property

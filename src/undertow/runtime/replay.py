@@ -22,7 +22,14 @@ from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
 from undertow.runtime.controller import Controller, Inputs
-from undertow.runtime.encoding import Columns, answer_from, memory_from, memory_to
+from undertow.runtime.encoding import (
+    TOLD,
+    Columns,
+    answer_from,
+    legs_from,
+    memory_from,
+    memory_to,
+)
 from undertow.runtime.log import Recording, read_log
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
@@ -259,6 +266,7 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
             arrived[0] if arrived else None,
             command,
             said.get((k, "alarm"), ""),
+            legs_from(said.get((k, TOLD), "[]")),
         )
         u = controller.step(inputs)
         outputs.append(u.copy())

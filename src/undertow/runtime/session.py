@@ -32,6 +32,7 @@ from undertow.runtime.replay import about
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow_loop import InlineWorker, Worker, background_worker
 from undertow.runtime.supervisor import SupervisedRig
+from undertow.runtime.targets import Listener
 from undertow.runtime.verdict import Report
 
 
@@ -120,7 +121,8 @@ def session(
     recipe
         What to run.
     log
-        File for the log.
+        File for the log.  A run with one, against the wall clock, takes targets from other
+        processes, see :func:`undertow.runtime.send_target`.
     simulated
         In simulated time, as fast as it goes; otherwise against the wall clock.
     processes
@@ -160,7 +162,7 @@ def session(
             plant = recipe.make_rig() if rig is None else rig
             memory = recipe.first()
             tell("warming up", 0.6)
-            warm_up(recipe, memory)
+            warm_up(recipe, memory, jumps=not simulated)
             controller = recipe.make_controller(memory)
             meta, book = about(controller, recipe, simulated=simulated), None
             with signals_deferred():  # what is opened is closed
@@ -175,6 +177,10 @@ def session(
             clock = SimulatedClock() if simulated else WallClock()
             double = recipe.make_controller(memory) if lockstep and not simulated else None
             runtime = Runtime(controller, plant, worker, clock=clock, log=book, lockstep=double)
+            if log is not None and not simulated:
+                with signals_deferred():
+                    listener = stack.enter_context(Listener(runtime, log))
+                runtime.deaf = listener.failure
             tell("ready", 1.0)
             signals.runtime = runtime
         yield runtime
@@ -216,7 +222,8 @@ def run(
         Where the mechanism is held at the start, (2n,), or its non-zero entries by name
         (``phi=0.7``).  With neither, the mechanism's usual ``start``.
     log
-        File for the log, an SQLite database.
+        File for the log, an SQLite database.  A run with one takes other targets while it goes on:
+        :func:`undertow.runtime.send_target`.
     simulated
         In simulated time, as fast as it goes: for simulated rigs.
     processes
@@ -278,9 +285,9 @@ def _points(target: Mapping[str, float] | SetPoints) -> tuple[tuple[float, dict[
     return (target if isinstance(target, SetPoints) else SetPoints(target)).pairs
 
 
-def warm_up(recipe: Recipe, memory: CascadeState) -> None:
+def warm_up(recipe: Recipe, memory: CascadeState, *, jumps: bool = False) -> None:
     """Make a short run in simulated time and throw it away, so that everything is compiled."""
-    recipe.precompile(memory)
+    recipe.precompile(memory, jumps=jumps)
     controller, lead = recipe.make_controller(memory), recipe.settings.lead_time
     worker = InlineWorker(recipe.respond, 0.5 * lead)
     runtime = Runtime(controller, recipe.make_rig(), worker, clock=SimulatedClock())

@@ -204,7 +204,9 @@ def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began:
         request.use,
     )
     words = "not to be caught from here" if surface is None else "comes home from here"
-    after = replace(memory, plan=plan, since=request.use, sequence=request.sequence, x=())
+    after = replace(
+        memory, plan=plan, since=request.use, sequence=request.sequence, x=(), target=None
+    )
     admission = Admission(surface is not None, words, math.inf)
     vectors = law_vectors_of(cascade, after)
     return _answer(request, home, proposal, after, admission, vectors, began)
