@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from runs import run
 from undertow.base import InvalidInputError
 from undertow.law import ReferenceMotion
 from undertow.plants import IdealRig
@@ -51,15 +50,9 @@ def test_a_run_goes_from_set_point_to_set_point_and_is_replayed(tmp_path: Path) 
 
 
 def test_a_target_past_the_travel_is_refused_before_the_rig_is_read(cascade: ut.Cascade) -> None:
-    """And a reference on the command line."""
     rig = IdealRig(CRANE, CRANE.state(), period=0.001)
     with pytest.raises(InvalidInputError, match="got x = 2 m"):
         ut.run(cascade, rig, seconds=1.0, x0=CRANE.state(), simulated=True, target={"x": 2.0})
-    status, _, said = run(
-        "run", "overhead_crane", "--simulated", "--target", "x=0.2m@0.2Hz", "--seconds", "1"
-    )
-    assert status == 2
-    assert "References are followed in simulation" in " ".join(said.split())
 
 
 def test_a_jump_is_planned_on_the_estimate_of_its_request() -> None:

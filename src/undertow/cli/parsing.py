@@ -306,7 +306,7 @@ def parse_new_target(units: Mapping[str, str], words: Sequence[str]) -> SetPoint
             "target of a run that goes on",
             value=" ".join(words),
             limit="set-points: x=2m, x=-1m@5s",
-            remedy="A reference is given before the start: undertow simulate --target",
+            remedy="A reference is given before the start: undertow run --target",
         )
     return found
 

@@ -36,7 +36,7 @@ from undertow.cli.terminal import (
     show,
     write,
 )
-from undertow.law import Reference
+from undertow.law import Reference, SetPoints
 from undertow.mechanisms.named import from_anywhere
 from undertow.models.importers.python_file import in_a_file
 from undertow.objective import Goal
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
     "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     "undertow run overhead_crane --target x=0.5m --target x=-0.5m@8s --seconds 16",
+    "undertow run rotary_pendulum --target theta=20deg@0.25Hz --seconds 20",
     "undertow run rotary_pendulum --rig realistic --swing-up --seconds 20",
     "undertow run rotary_pendulum --seconds 600 --log run.db",
     "undertow run rotary_pendulum --rig examples/serial_rig.py:emulated",
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
 def run(
     name: options.AnyName,
     start: options.Start = None,
-    target: options.SetPoints = None,
+    target: options.Target = None,
     seconds: Annotated[float, option("Length of the run, s.", min=0.001)] = 10.0,
     rig: Annotated[
         str,
@@ -131,20 +132,14 @@ def run(
 
     belief = mechanism_named(name, setting)
     hanging = swing_up and not start
-    points = parse_target(belief, target)
-    if isinstance(points, Reference):
-        raise InvalidInputError(
-            "target of a run",
-            value=" ".join(target or ()),
-            limit="set-points: x=0.5m, x=-0.5m@8s",
-            remedy="References are followed in simulation: undertow simulate",
-        )
+    goal = parse_target(belief, target)
     recipe = Recipe(
         mechanism=from_anywhere(name),  # a log of it can be replayed from anywhere
         parameters=parse_values(setting),
         start=() if hanging else tuple(parse_start(belief, start).tolist()),
         swing_up=swing_up,
-        target=() if points is None else points.pairs,
+        target=goal.pairs if isinstance(goal, SetPoints) else goal or (),
+        duration=max(1.0, seconds) if isinstance(goal, Reference) else 60.0,
         objective=cast(Goal, objective),  # the recipe refuses what is none
         learns=known == "usual",
         rig="realistic" if rig == "realistic" or in_a_file(rig) else "ideal",

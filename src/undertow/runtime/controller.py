@@ -20,14 +20,22 @@ import numpy as np
 from undertow.cascade import Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators import Estimator, KalmanFilter
-from undertow.models import FloatArray
+from undertow.law import ReferenceMotion
+from undertow.models import FloatArray, error_dynamics
 from undertow.plants import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.plan_check import PlanCheck
 from undertow.runtime.sensors import LAST_HARMLESS, SensorMonitor
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow_loop import Answer, Request, law_vectors_of
-from undertow.runtime.steps import BEYOND_TRAVEL, all_finite, limit_output, step_memory, step_module
+from undertow.runtime.steps import (
+    BEYOND_TRAVEL,
+    all_finite,
+    limit_output,
+    reference_row,
+    step_memory,
+    step_module,
+)
 
 #: Least time from asking for a catch to its use, s; and how far the state may be off the one
 #: it was made for, in units of 1 + |entry|.
@@ -102,7 +110,8 @@ class Controller:
         the surface that catches it.  ``None``: the law waits until the mechanism is brought
         near its target.
     legs
-        When the target jumps, s, and where to, the first at 0: what the cascade started with.  The
+        When the target jumps, s, and where to, the first at 0: what the cascade started with.  One
+        of them may move: its acceleration is fed forward from step to step.  The
         target jumps when the first plan to it is there, not before; with a swing-up not before it
         balances at x = 0, and the first of them, too.
 
@@ -116,6 +125,8 @@ class Controller:
         det Γ(q)/det Γ(0) of the last step, (1,).
     mode, stopped_by
         State, and why the last safe stop was made.
+    reference
+        The target that moves, if one does.
     notes
         What happened in the last step.
     request
@@ -140,9 +151,14 @@ class Controller:
         self.cascade, self.estimator, self.period = cascade, estimator, period
         self.settings, self.swing_up = settings, swing_up
         fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
-        fast = step_memory(mechanism, settings, period, fall_angle)
+        moving = [motion for _, motion in legs if motion.moves]
+        self.reference = moving[0] if moving else None
+        acted_on = error_dynamics(mechanism) if moving else mechanism
+        fast = step_memory(acted_on, settings, period, fall_angle)
         self._block = fast.block
-        self._parameters: FloatArray = fast["parameters"]
+        own = len(mechanism.parameters)
+        self._parameters: FloatArray = fast["parameters"][:own]
+        self._row: FloatArray = fast["parameters"][own:]
         self._learning: KalmanFilter | None = None
         if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
             self._learning = estimator
@@ -154,7 +170,7 @@ class Controller:
         limit_output(
             self._wanted, self.u, self.limits, self.slew
         )  # compiled before a stop needs it
-        self._act = step_module(mechanism, cascade.reaching.switching).act
+        self._act = step_module(acted_on, cascade.reaching.switching).act
         self._swings = swing_up is not None
         self.mode, self.stopped_by = Mode.IDLE, ""
         self.memory = memory
@@ -186,6 +202,8 @@ class Controller:
         self._told: Legs = ()
         if memory.target is not None:
             self._turn[:] = memory.target.state(0.0)
+        if self.reference is not None:
+            self._follow(0.0, memory.target or self.reference)  # compiled before a step needs it
 
     # -- one step --------------------------------------------------------------------------
 
@@ -253,6 +271,9 @@ class Controller:
             if mode is Mode.SWING_UP and self.swing_up is not None:
                 self._turns[:] = self._turn[:] = self.swing_up.region.turns(estimate)
             self._aim(pending)
+        if self.reference is not None:
+            jumps = due and pending is not None and pending.jump
+            self._follow(t, self._next[0].target if jumps else self.memory.target)
         waited = ""
         if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up_timeout:
             waited = self._waiting()
@@ -307,12 +328,20 @@ class Controller:
             target = self.memory.target
             self._turn[:] = self._turns + (0.0 if target is None else target.state(self._t))
 
+    def _follow(self, t: float, target: ReferenceMotion | None) -> None:
+        """Count the state from where a reference is at the time t, and feed its motion forward."""
+        self._row[:] = 0.0
+        if target is not None and self.mode is not Mode.SWING_UP:
+            reference_row(t, target.t, target.q, target.v, target.a, self._row)
+            self._turn[:] = self._turns
+            self._turn += self._row[: len(self._turn)]
+
     @property
     def aim(self) -> FloatArray:
         """Positions of the target that was asked for last and whose time has come, (n,)."""
         due = [motion for begin, motion in tuple(self._ahead) if begin <= self._t]
         target = due[-1] if due else self.memory.target
-        return np.zeros(len(self.x) // 2) if target is None else target.q[0]
+        return np.zeros(len(self.x) // 2) if target is None else np.array(target.position(self._t))
 
     @property
     def ahead(self) -> Legs:
@@ -329,7 +358,7 @@ class Controller:
         if pending is not None and pending.jump:
             self._sequence, self._pending = max(self._sequence, pending.sequence), None
         for begin, motion in self._ahead:
-            places = zip(self._names, motion.q[0].tolist(), strict=True)
+            places = zip(self._names, motion.position(begin), strict=True)
             where = ", ".join(f"{name} = {value:g}" for name, value in places if value)
             self.notes.append(Note("target", f"asked for at {begin:g} s: {where or 'x = 0'}"))
 

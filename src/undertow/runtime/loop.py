@@ -184,14 +184,18 @@ class Runtime:
         controller, mechanism = self.controller, self.controller.cascade.mechanism
         t = max(0.0, min(self._heartbeat, self.clock.now()) - self._origin)
         target = controller.memory.target
+        now = None if target is None else np.array(target.position(t))
         ahead = tuple((t + begin, motion) for begin, motion in new) or controller.ahead
         free = invariant_coordinates(mechanism)
         return RunTarget(
             mechanism.name,
             {c.name: c.unit for c in mechanism.coordinates if c.name in free},
             t,
-            {} if target is None else named_positions(mechanism, target.q[0]),
-            tuple((begin, named_positions(mechanism, motion.q[0])) for begin, motion in ahead),
+            {} if now is None else named_positions(mechanism, now),
+            tuple(
+                (begin, named_positions(mechanism, np.array(motion.position(begin))))
+                for begin, motion in ahead
+            ),
             "" if new else self._said_of_target,
         )
 

@@ -15,7 +15,7 @@ from undertow.base import InvalidInputError, UndertowError, one_of
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import KalmanFilter
-from undertow.law import Plan, ReachingLaw, ReferenceMotion, SetPoints
+from undertow.law import Plan, ReachingLaw, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, invariant_coordinates, number_of
@@ -31,6 +31,7 @@ from undertow.runtime.controller_defaults import (
     provable,
     reaching_for,
 )
+from undertow.runtime.encoding import MOVING, reference_from, reference_to
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow_loop import Answer, Request, respond
 from undertow.runtime.targets import checked_legs
@@ -87,6 +88,9 @@ class Recipe:
         Set-points, pairs of a time, s, and coordinates with positions, rad or m, see
         :class:`undertow.SetPoints`; without any x = 0.  Times count from the start of the run, and
         the target jumps once there is a plan for it; after a swing-up once it balances at x = 0.
+        Or a :class:`undertow.Reference`, which is followed from the start of the run on.
+    duration
+        How long a reference is followed, s; then it rests.
     learns
         Whether the mechanism's parameters, within their tolerances, are learnt as it runs;
         otherwise they are exact.
@@ -114,7 +118,8 @@ class Recipe:
     seconds: float = math.inf
     period: float = 0.001
     swing_up: bool = False
-    target: tuple[tuple[float, Mapping[str, float]], ...] = ()
+    target: tuple[tuple[float, Mapping[str, float]], ...] | Reference = ()
+    duration: float = 60.0
     learns: bool = True
     settings: Settings = field(default_factory=Settings)
     design: Cascade | None = None
@@ -132,7 +137,7 @@ class Recipe:
         """Refuse an unknown objective, a period that no loop keeps, and a horizon too far."""
         if not isinstance(self.objective, Objective):
             one_of("objective of a run", self.objective, get_args(Goal))
-        for what in ("period", "horizon"):
+        for what in ("period", "horizon", "duration"):
             number_of(f"{what} of a run", getattr(self, what))
         stall = self.settings.max_step_interval
         if not SHORTEST <= self.period < stall:
@@ -146,6 +151,13 @@ class Recipe:
         if not 0 < self.horizon <= FARTHEST:
             raise InvalidInputError(
                 "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
+            )
+        if not 0 < self.duration <= FARTHEST:
+            raise InvalidInputError(
+                "length of a reference",
+                value=f"{self.duration:g} s",
+                limit=f"> 0, ≤ {FARTHEST:g} s",
+                remedy="Make the run shorter, or give set-points",
             )
         one_of("rig of a run", self.rig, ("ideal", "realistic"))
         assert self.legs is not None  # found here, so that its checks run before anything moves
@@ -178,6 +190,8 @@ class Recipe:
             if named_goal is None or goal.horizon > FARTHEST:
                 return None
             made = replace(made, objective=named_goal, horizon=goal.horizon)
+        if isinstance(self.target, Reference) and reference_to(self.target) is None:
+            return None
         if self.design is not None:
             usual = Cascade(
                 self.design.mechanism,
@@ -235,8 +249,15 @@ class Recipe:
         """When the target jumps, s, and where to; empty for x = 0."""
         if not self.target:
             return ()
-        goal = SetPoints(self.target)
-        return checked_legs(self.belief, self.cascade.objective, self.settings, goal)
+        objective, settings, goal = self.cascade.objective, self.settings, self.target
+        if not isinstance(goal, Reference):
+            return checked_legs(self.belief, objective, settings, SetPoints(goal))
+        return checked_legs(self.belief, objective, settings, goal, self.duration)
+
+    @property
+    def reference(self) -> ReferenceMotion | None:
+        """The target that moves, if one does."""
+        return next((motion for _, motion in self.legs if motion.moves), None)
 
     def first(self) -> CascadeState:
         """Return what the cascade starts with: the first optimum, or what awaits a catch.
@@ -318,6 +339,8 @@ class Recipe:
         """JSON values from which :meth:`from_dict` makes the recipe again, if it is all data."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         del values["design"]
+        if isinstance(self.target, Reference):
+            values["target"] = [MOVING, reference_to(self.target)]
         return values | {"settings": asdict(self.settings), "words": WORDS}
 
     @classmethod
@@ -335,7 +358,11 @@ class Recipe:
                 raise InvalidInputError(f"{name} of a recipe", value=kind, limit="numbers")
         renamed = {OLD_SETTINGS.get(name, name): v for name, v in taken["settings"].items()}
         settings = Settings(**_of_types(Settings, renamed))
-        target = SetPoints(taken["target"]).pairs if taken["target"] else ()
+        target: Any = taken["target"]
+        if len(target) == 2 and target[0] == MOVING:
+            target = reference_from(target[1])
+        else:
+            target = SetPoints(target).pairs if target else ()
         changed = {"start": tuple(taken["start"]), "target": target, "settings": settings}
         return cls(**{**taken, **changed})
 

@@ -160,7 +160,7 @@ def replay(
         if isinstance(mechanism, Mechanism):
             recipe = replace(recipe, mechanism=mechanism)
         _check_mechanism(recording, recipe.belief)  # before anything is designed for it
-        memory = memory_from(recording.meta["memory"])
+        memory = memory_from(recording.meta["memory"], recipe.reference)
         controller = recipe.make_controller(memory)
     found = replay_controller(recording, controller, decisions=decisions)
     return replace(found, remarks=(*remarks, *found.remarks))
@@ -248,7 +248,7 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
     mechanism = controller.cascade.mechanism
     answers: dict[int, list[Answer]] = defaultdict(list)
     for row in recording.answers:
-        answers[row["k"]].append(answer_from(row))
+        answers[row["k"]].append(answer_from(row, controller.reference))
     said: dict[tuple[int, str], str] = {(k, kind): text for k, _, kind, text in recording.events}
     columns = Columns.of(mechanism)
     outputs: list[FloatArray] = []

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
-from undertow.law import SetPoints
+from undertow.law import Reference, SetPoints, Target
 from undertow.models.importers.python_file import in_a_file
 from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
 from undertow.runtime.clock import SimulatedClock, WallClock
@@ -169,7 +169,8 @@ def session(
                 # First the processes are forked, then threads begin.
                 worker: Worker = InlineWorker(recipe.respond)
                 if not simulated:
-                    worker = background_worker(recipe.respond, processes=processes)
+                    moving = [] if recipe.reference is None else [recipe.reference]
+                    worker = background_worker(recipe.respond, processes=processes, shared=moving)
                 stack.callback(worker.close)
                 if log is not None:
                     columns = Columns.of(recipe.belief)
@@ -197,7 +198,7 @@ def run(
     simulated: bool = False,
     processes: int = 3,
     settings: Settings | None = None,
-    target: Mapping[str, float] | SetPoints | None = None,
+    target: Mapping[str, float] | Target | None = None,
     progress: Callable[[str, float], None] | None = None,
     **state: float,
 ) -> Report:
@@ -232,7 +233,8 @@ def run(
         Limits and timeouts of the run.
     target
         Where to, x = 0 by default: coordinates to positions, or :class:`undertow.SetPoints` that
-        jump at times since the start of the run, each as soon as there is a plan for it.
+        jump at times since the start of the run, each as soon as there is a plan for it; or a
+        :class:`undertow.Reference` to follow, whose time is that of the run.
     progress
         Called with (what, fraction) while the run is prepared.
 
@@ -264,6 +266,7 @@ def run(
             period=0.001 if rig is None else rig.period,
             seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
             target=() if target is None else _points(target),
+            duration=max(1.0, seconds) if isinstance(target, Reference) else 60.0,
             learns=cascade.belief != "exact",
             settings=settings,
             design=cascade,
@@ -281,7 +284,11 @@ def run(
             return runtime.run(seconds)
 
 
-def _points(target: Mapping[str, float] | SetPoints) -> tuple[tuple[float, dict[str, float]], ...]:
+def _points(
+    target: Mapping[str, float] | Target,
+) -> tuple[tuple[float, dict[str, float]], ...] | Reference:
+    if isinstance(target, Reference):
+        return target
     return (target if isinstance(target, SetPoints) else SetPoints(target)).pairs
 
 

@@ -33,8 +33,8 @@ from undertow.base import (
     read_file,
 )
 from undertow.cascade import Legs, legs_of
-from undertow.law import SetPoints
-from undertow.models import FloatArray, Mechanism
+from undertow.law import SetPoints, Target
+from undertow.models import FloatArray, Mechanism, invariant_coordinates
 from undertow.objective import Objective
 from undertow.runtime.processes import Background
 from undertow.runtime.settings import Settings
@@ -96,9 +96,12 @@ class Steered(Protocol):
 
 
 def checked_legs(
-    mechanism: Mechanism, objective: Objective, settings: Settings, goal: SetPoints
-) -> Legs:
+    mechanism: Mechanism, objective: Objective, settings: Settings, goal: Target,
+    seconds: float = 0.0,
+) -> Legs:  # fmt: skip
     """Return when the target jumps, s, and where to, the first at 0; see :func:`legs_of`.
+
+    A reference is followed for so many seconds.
 
     Raises
     ------
@@ -106,15 +109,14 @@ def checked_legs(
         For what the mechanism cannot rest at, for what the constraints exclude, and for positions
         past the travel at which a run stops.
     """
-    legs = legs_of(mechanism, objective, goal, goal.times[-1])
+    legs = legs_of(mechanism, objective, goal, max(seconds, 1e-3))
     low, high = settings.travels(mechanism).T
     for begin, motion in legs:
-        beyond = np.flatnonzero(~((low < motion.q[0]) & (motion.q[0] < high)))
-        for i in beyond:
+        for k, i in np.argwhere(~((low < motion.q) & (motion.q < high)))[:1].tolist():
             name, unit = mechanism.coordinates[i].name, mechanism.coordinates[i].unit
             raise InvalidInputError(
-                f"target of '{mechanism.name}' at {begin:g} s",
-                value=f"{name} = {motion.q[0, i]:.4g} {unit}",
+                f"target of '{mechanism.name}' at {begin + motion.t[k]:g} s",
+                value=f"{name} = {motion.q[k, i]:.4g} {unit}",
                 limit=f"between {low[i]:g} and {high[i]:g} {unit}, where a run stops",
                 remedy="Choose a target further inside, or a larger Settings(max_travel=...)",
             )
@@ -143,9 +145,9 @@ def legs_from_here(
 
 
 def named_positions(mechanism: Mechanism, q: FloatArray) -> dict[str, float]:
-    """Return the positions that are not 0, by name."""
-    pairs = zip(mechanism.coordinates, q.tolist(), strict=True)
-    return {c.name: value for c, value in pairs if value}
+    """Return where a target is that is not at 0, by the names of what it may be moved along."""
+    pairs, free = zip(mechanism.coordinates, q, strict=True), invariant_coordinates(mechanism)
+    return {c.name: float(value) for c, value in pairs if value and c.name in free}
 
 
 # -- from another process --------------------------------------------------------------------
