@@ -19,6 +19,7 @@ from undertow.base import ArtefactError, InvalidInputError
 from undertow.law import ReferenceMotion
 from undertow.plants import Measurement
 from undertow.runtime import (
+    Command,
     InlineWorker,
     Inputs,
     Mode,
@@ -161,6 +162,65 @@ def test_where_there_is_no_plan_the_target_stays_and_the_run_goes_on(
     assert runtime.target.now == {}
     with pytest.raises(InvalidInputError, match="the run has stopped: operator: stop"):
         runtime.retarget({"theta": 0.5})
+
+
+HERE, ELSEWHERE = (ReferenceMotion.at_rest(np.array([q, 0.0])) for q in (0.3, 0.4))
+
+
+@pytest.mark.parametrize(
+    ("asked", "jump", "target"),
+    [
+        (False, True, ELSEWHERE), (False, True, None), (False, False, ELSEWHERE),
+        (True, True, ELSEWHERE), (True, True, None), (True, True, HERE),
+    ],
+)  # fmt: skip
+def test_an_answer_for_another_target_is_refused(
+    asked: bool, jump: bool, target: ReferenceMotion | None
+) -> None:
+    """A jump that nobody asked for, one that goes elsewhere, and a target that slips in."""
+    recipe = Recipe(start=(0.0, 0.05, 0.0, 0.0), evaluations=32)
+    controller, rig = recipe.make_controller(recipe.first()), recipe.make_rig()
+    told = ((0.0, HERE),) if asked else ()
+    answer, said, asks = None, [], 0
+    for k in range(1200):
+        command = Command.START if k == 0 else Command.NONE
+        inputs = Inputs(1e-3 * k, rig.read(), answer, command, target=told if k == 5 else ())
+        rig.write(controller.step(inputs))
+        said += [note.text for note in controller.notes]
+        answer, request = None, controller.request
+        if request is not None and (request.target is not None) == asked and not asks:
+            asks += 1
+            honest = recipe.respond(request)
+            answer = replace(honest, memory=replace(honest.memory, target=target), jump=jump)
+    assert asks == 1
+    assert controller.mode is Mode.BALANCE
+    good = asked and target is HERE
+    assert any("unsound: its plan is for another target" in text for text in said) == (not good)
+    assert controller.memory.target is (HERE if good else None)
+
+
+def test_a_jump_is_not_made_where_the_state_is_not_the_expected_one() -> None:
+    """The output of that step is the old plan's about the old target."""
+    recipe = Recipe(start=(0.0, 0.05, 0.0, 0.0), evaluations=32)
+    there = ReferenceMotion.at_rest(np.array([1.0, 0.0]))
+    outputs = []
+    for told in ((), ((0.0, there),)):
+        controller, rig = recipe.make_controller(recipe.first()), recipe.make_rig()
+        answer, said, u = None, [], []
+        for k in range(1200):
+            command = Command.START if k == 0 else Command.NONE
+            inputs = Inputs(1e-3 * k, rig.read(), answer, command, target=told if k == 5 else ())
+            u.append(controller.step(inputs).copy())
+            rig.write(u[-1])
+            said += [note.text for note in controller.notes]
+            answer = None
+            if controller.request is not None and (not told or controller.request.target):
+                honest = recipe.respond(controller.request)
+                answer = replace(honest, x=honest.x + 1.1) if told else None
+        outputs.append(np.array(u))
+    assert any("refused, the state is off its prediction by" in text for text in said)
+    assert controller.memory.target is None
+    assert np.array_equal(outputs[0], outputs[1])
 
 
 # -- what is refused -------------------------------------------------------------------------

@@ -33,6 +33,7 @@ from undertow.runtime.steps import (
     all_finite,
     limit_output,
     reference_row,
+    relative_error,
     step_memory,
     step_module,
 )
@@ -195,6 +196,7 @@ class Controller:
         self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
         self._lead = settings.lead_time
         self._catch_lead, self._jump_lead = CATCH_LEAD, JUMP_LEAD
+        self._jump_error = relative_error(self.x, self.x)  # compiled before a step needs it
         self._ahead, self._not_before = list(legs[1:]), 0.0
         if swing_up is not None and legs and legs[0][1].q.any():
             self._ahead.insert(0, legs[0])
@@ -264,15 +266,16 @@ class Controller:
                 self._parameters[:] = self._learning.parameters
         if self._segment + 1 < len(self._times):
             self._proceed(t)
-        new, most = self._law_vector, -1.0
+        new, most, jumps = self._law_vector, -1.0, False
         due = pending is not None and t >= self._due
         if due:
             new, most = self._next[1][0], self._max_error
             if mode is Mode.SWING_UP and self.swing_up is not None:
                 self._turns[:] = self._turn[:] = self.swing_up.region.turns(estimate)
-            self._aim(pending)
+            if pending is not None and pending.jump:
+                jumps = self._aim(pending, estimate)
+                most = most if jumps else -1.0
         if self.reference is not None:
-            jumps = due and pending is not None and pending.jump
             self._follow(t, self._next[0].target if jumps else self.memory.target)
         waited = ""
         if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up_timeout:
@@ -312,10 +315,16 @@ class Controller:
         elif mode is not Mode.BALANCE and mode is not Mode.CATCH:
             self._free = False
 
-    def _aim(self, answer: Answer | None) -> None:
-        """Count the state from the new target, where an answer that is due brings one."""
-        if answer is not None and answer.jump and answer.memory.target is not None:
-            self._turn[:] = self._turns + answer.memory.target.state(answer.use)
+    def _aim(self, answer: Answer, estimate: FloatArray) -> bool:
+        """Count the state from the new target, if it is near the one that the answer is for."""
+        target = answer.memory.target
+        assert target is not None  # a jump brings one
+        there = self._turns + target.state(answer.use)
+        self._jump_error = relative_error(estimate - there, self._expected)
+        near = self._jump_error <= self._max_error
+        if near:
+            self._turn[:] = there
+        return near
 
     def _landed(self, answer: Answer | None, used: bool) -> None:
         """Note that the target has jumped, or count from the old one again."""
@@ -532,6 +541,8 @@ class Controller:
             return ""  # its plan is not used
         if answer.memory.since != answer.use:
             return f"{UNSOUND}its plan is of another time"
+        if not self._is_asked_target(answer):
+            return f"{UNSOUND}its plan is for another target"
         plan, known = answer.memory.plan, self.cascade.known
         asked = None if self._asked is None else self._asked.memory.estimate
         if known is not None and asked is not None:
@@ -542,9 +553,24 @@ class Controller:
         fault = self._plans.fault(self._packed)
         return fault and f"{UNSOUND}{fault}"
 
+    def _is_asked_target(self, answer: Answer) -> bool:
+        """Whether an answer's plan is for the target that was asked for, to the bit."""
+        found, asked = answer.memory.target, self._asked
+        if asked is None or answer.jump != (asked.target is not None):
+            return False
+        wanted = asked.target if answer.jump else asked.memory.target
+        if answer.swing >= 0:  # what catches does so at x = 0
+            wanted = None
+        if found is None or wanted is None:
+            return found is wanted
+        pairs = ((found.t, wanted.t), (found.q, wanted.q), (found.v, wanted.v), (found.a, wanted.a))
+        return found is wanted or all(np.array_equal(a, b) for a, b in pairs)
+
     def _note_outcome(self, answer: Answer) -> None:
         """Note what became of an answer at its time of use."""
         (off, margin), most = self._off.tolist(), self._max_error
+        if answer.jump and not self._jump_error <= most:
+            off = self._jump_error
         self._sequence = max(self._sequence, answer.sequence)
         if not answer.admission.accepted:
             verdict = f"kept the old plan, {answer.admission.reason}"

@@ -150,6 +150,8 @@ def is_answer(said: object) -> TypeGuard[Answer]:
         and isinstance(said.admission, Admission)
         and isinstance(said.memory, CascadeState)
         and isinstance(said.memory.plan, Plan)
+        and isinstance(said.memory.target, ReferenceMotion | None)
+        and isinstance(said.jump, bool)
         and all(
             isinstance(part, np.ndarray) and part.dtype == float
             for part in (said.x, said.law_vectors)
