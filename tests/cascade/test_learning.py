@@ -13,6 +13,7 @@ import sympy as sp
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cascade import CascadeState, cost_gate
+from undertow.estimators import ParameterEstimate
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
 
@@ -73,6 +74,28 @@ def test_the_first_plan_is_the_best_for_the_estimate(pendulum: ut.Mechanism) -> 
         )
     ]
     assert cost[0] == pytest.approx(cost[1], rel=0.01)
+
+
+def test_a_jump_of_the_target_is_planned_on_what_was_learnt(pendulum: ut.Mechanism) -> None:
+    """Its first plan costs, on the plant that was learnt, what one that knew this plant finds."""
+    objective = ut.objective_for(pendulum, "bench-energy", horizon=10.0)
+    cascade = ut.Cascade(pendulum, objective, belief=ut.Belief.relative(pendulum, **SPREAD))
+    assert cascade.known is not None
+    offset = np.array([0.8, 0.0, 0.8, -0.9, 0.5])
+    learnt = ParameterEstimate(offset, np.eye(5) * 1e6, 500)
+    plant, x = cascade.known.believed(learnt), pendulum.state(phi=0.2)
+    before, _ = cascade.start(x)
+    naive, _ = cascade.retarget(before, x, {"theta": 1.0}, 1.0)
+    after, _ = cascade.retarget(replace(before, estimate=learnt), x, {"theta": 1.0}, 1.0)
+    assert after.estimate is learnt
+    knew = ut.Cascade(plant, objective.on(plant), belief="exact")
+    best, _ = knew.start(x, {"theta": 1.0})
+    error = x - pendulum.state(theta=1.0)
+    costs = [knew.loop.batch(error, state.plan).cost[0] for state in (after, best, naive)]
+    assert after.predicted == pytest.approx(costs[0], rel=0.02)
+    assert costs[0] == pytest.approx(costs[1], rel=0.01)
+    assert costs[0] < costs[2]
+    assert abs(naive.predicted - costs[2]) > 0.05 * costs[2]
 
 
 def test_a_cascade_holds_plants_that_differ_from_its_model(pendulum: ut.Mechanism) -> None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import undertow as ut
-from runs import run
 from undertow.base import InvalidInputError
+from undertow.law import ReferenceMotion
 from undertow.plants import IdealRig
-from undertow.runtime import Recipe, Settings, session
+from undertow.runtime import Recipe, Request, Settings, session
 
 CRANE = ut.mechanisms.overhead_crane()
 POINTS = ut.SetPoints([(0, {"x": 0.4}), (2.5, {"x": -0.3})])
@@ -49,17 +50,33 @@ def test_a_run_goes_from_set_point_to_set_point_and_is_replayed(tmp_path: Path) 
 
 
 def test_a_target_past_the_travel_is_refused_before_the_rig_is_read(cascade: ut.Cascade) -> None:
-    """And one beside a swing-up, and a reference on the command line."""
     rig = IdealRig(CRANE, CRANE.state(), period=0.001)
     with pytest.raises(InvalidInputError, match="got x = 2 m"):
         ut.run(cascade, rig, seconds=1.0, x0=CRANE.state(), simulated=True, target={"x": 2.0})
-    with pytest.raises(InvalidInputError, match="with a swing-up"):
-        Recipe("rotary_pendulum", swing_up=True, target=((0.0, {"theta": 1.0}),))
-    status, _, said = run(
-        "run", "overhead_crane", "--simulated", "--target", "x=0.2m@0.2Hz", "--seconds", "1"
+
+
+def test_a_jump_is_planned_on_the_estimate_of_its_request() -> None:
+    """The slow loop's first plan for a new target, predicted for the plant that was learnt."""
+    recipe = Recipe(start=(0.0, 0.1, 0.0, 0.0), evaluations=64)
+    memory, known = recipe.first(), recipe.cascade.known
+    assert memory.estimate is not None
+    assert known is not None
+    heavy = replace(memory.estimate, offset=np.full(len(memory.estimate.offset), 0.5))
+    there, x = ReferenceMotion.at_rest(np.array([0.6, 0.0])), recipe.belief.state(phi=0.05)
+    before, after = (
+        recipe.respond(Request(0.0, x, 0.1, replace(memory, estimate=estimate), -1, there))
+        for estimate in (memory.estimate, heavy)
     )
-    assert status == 2
-    assert "References are followed in simulation" in " ".join(said.split())
+    assert before.jump
+    assert after.jump
+    assert after.memory.estimate is heavy
+    loop = recipe.cascade.loop_at(after.memory)
+    exact = replace(recipe.cascade, mechanism=known.believed(heavy), belief="exact")
+    judged = exact.loop.batch(np.array(after.memory.x), after.memory.plan).cost[0]
+    believed = known.believed(heavy)
+    assert np.array_equal(loop.mechanism.parameter_values, believed.parameter_values)
+    assert after.memory.predicted == pytest.approx(judged, rel=0.1)
+    assert abs(before.memory.predicted - judged) > 0.1 * judged
 
 
 def test_a_recipe_with_a_target_is_data() -> None:

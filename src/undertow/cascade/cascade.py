@@ -473,7 +473,7 @@ class Cascade:
 
         The warm search of :meth:`propose` looks near the plan in use, which was for another way:
         after a jump that may cost many times as much.  The number of the decision goes on, and so
-        does what was learnt of the plant.
+        does what was learnt of the plant: the first plan is best for what is estimated by now.
 
         Parameters
         ----------
@@ -511,56 +511,57 @@ class Cascade:
         """:meth:`start`, or :meth:`retarget` from ``before``, to a leg that was checked before."""
         if target is not None:
             x = self.mechanism.check_state(x) - target.state(t)
-        here = self.about(self.loop, target, t)
-        here.objective.check_start(here.mechanism, x)
         number, known = 0, None if self.known is None else self.known.prior
         if before is not None:
-            number, known = before.sequence + 1, before.estimate
-        tries = self._first_tries()
+            number, known = before.sequence + 1, before.estimate or known
+        whole = self._loops(known)
+        here = self.about(whole, target, t)
+        here.objective.check_start(here.mechanism, x)
+        tries = self._first_tries(known)
         for count, (loop, small) in enumerate(tries, 1):
             about = self.about(loop, target, t)
             planner = self.optimiser.on(about) if small else self._planner(loop, target, t)
             proposal = planner.propose(
                 x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
             )
-            if proposal.plan is None and loop is not self.loop:
+            if proposal.plan is None and loop is not whole:
                 continue
             plan, horizon = proposal.required(here).plan, self.objective.horizon
             assert plan is not None  # required
             cost = float(about.batch(x, plan, duration=horizon).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
-            if loop is not self.loop:  # every plausible plant lives to see the next decision
+            if loop is not whole:  # every plausible plant lives to see the next decision
                 good &= self._survives(here, x, plan)
             if good or count == len(tries):
                 if target is not None and target.moves:
-                    plan, cost = self._first_along(plan, x, target, t)
+                    plan, cost = self._first_along(whole, plan, x, target, t)
                 begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
                 return begun, replace(proposal, sequence=number)
         raise AssertionError("the last try returns or raises")
 
     def _first_along(
-        self, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float
+        self, loop: ClosedLoop, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float
     ) -> tuple[Plan, float]:
         """The first plan, or the designed surface where that is better along a reference."""
         plans = [plan, Plan.of(self.optimiser.anchor)]
-        costs = _costs_along(self.loop, error, plans, target, t, self.objective.horizon)
+        costs = _costs_along(loop, error, plans, target, t, self.objective.horizon)
         best = int(np.argmin(costs))
         return plans[best], costs[best]
 
-    def _first_tries(self) -> list[tuple[ClosedLoop, bool]]:
+    def _first_tries(self, estimate: ParameterEstimate | None) -> list[tuple[ClosedLoop, bool]]:
         """What the first plan is to be best on, one after the other; and whether in small steps.
 
         Before anything has moved, what suits every plausible plant suits none of them well: the
         estimate alone comes first, for a plan that the next decision replaces.  Where large steps
         were too hopeful, small ones throughout follow.
         """
+        whole = self._loops(estimate)
         if self.planner is not None:
-            return [(self.loop, False)]
-        loops = [self.loop]
-        if self.known is not None:
-            one = self.known.alone(self.known.prior)
-            loops.insert(0, self.loop.believing(self.mechanism, one))
+            return [(whole, False)]
+        loops = [whole]
+        if self.known is not None and estimate is not None:
+            loops.insert(0, whole.believing(whole.mechanism, self.known.alone(estimate)))
         return list(itertools.product(loops, (False, True)))
 
     @checked

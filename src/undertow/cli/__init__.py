@@ -26,7 +26,7 @@ __all__ = ["app", "main"]
 #: The order in which help shows the commands: look, steer, prove, run, repeat.
 _ORDER = (
     "mechanisms", "derive", "animate", "survey", "optimise", "simulate", "certify", "verify",
-    "bench", "run", "replay", "drill", "trials", "reproduce",
+    "bench", "run", "target", "replay", "drill", "trials", "reproduce",
 )  # fmt: skip
 
 app.registered_commands.sort(

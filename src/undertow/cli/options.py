@@ -91,17 +91,9 @@ Target = Annotated[
         "--target",
         "Where to, with units. x=1m: a set-point; x=-1m@2s: another one from 2 s on; "
         "theta=45deg@0.5Hz: a sine; FILE.csv: a path through its points, 't (s), x (m)' in its "
-        "first line. Repeatable. Default: x = 0.",
+        "first line. Repeatable. Default: x = 0. On a rig a set-point is gone to as soon as there "
+        "is a plan for it.",
         metavar="STATE=VALUE[@TIME]|FILE.csv",
-    ),
-]
-SetPoints = Annotated[
-    list[str] | None,
-    option(
-        "--target",
-        "Set-point, with units: x=1m, or x=-1m@8s from 8 s after the start on, as soon as there "
-        "is a plan for it. Repeatable. Default: x = 0.",
-        metavar="STATE=VALUE[@TIME]",
     ),
 ]
 SurfaceText = Annotated[

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -171,8 +171,12 @@ def _units_of(mechanism: Mechanism, name: str, what: str) -> tuple[str, ...]:
     """Return the units in which a state may be typed."""
     one_of(f"{what} of '{mechanism.name}'", name, mechanism.state_names)
     index = mechanism.state_names.index(name)
-    kind = (mechanism.coordinates[index % mechanism.n].unit, index >= mechanism.n)
-    return tuple(unit for unit, (si, rate, _) in UNITS.items() if (si, rate) == kind)
+    return _units_like(mechanism.coordinates[index % mechanism.n].unit, rate=index >= mechanism.n)
+
+
+def _units_like(si: str, *, rate: bool = False) -> tuple[str, ...]:
+    """Return the units in which a quantity with this unit, or its rate of change, is typed."""
+    return tuple(unit for unit, (base, per_s, _) in UNITS.items() if (base, per_s) == (si, rate))
 
 
 def _shown(number: float, unit: str) -> str:
@@ -268,14 +272,58 @@ unit, m. Write for instance --target x=1m
         return None
     if len(words) == 1 and "=" not in words[0]:
         return Reference.read(words[0])
+    return _target_of_words(words, lambda name: _units_of(mechanism, name, "target"), "--target ")
+
+
+def parse_new_target(units: Mapping[str, str], words: Sequence[str]) -> SetPoints:
+    """Read set-points for a run that goes on; their times count from now.
+
+    Parameters
+    ----------
+    units
+        Of the coordinates along which they may be, SI: ``m`` or ``rad``.
+    words
+        Like ``x=2m``, or ``x=-1m@5s``.
+
+    Raises
+    ------
+    InvalidInputError
+        For another coordinate, a missing or wrong unit, and what is no number.
+
+    Examples
+    --------
+    >>> parse_new_target({"theta": "rad"}, ["theta=90deg", "theta=0deg@5s"]).times
+    (0.0, 5.0)
+    """
+
+    def units_of(name: str) -> tuple[str, ...]:
+        one_of("target", name, tuple(units))
+        return _units_like(units[name])
+
+    found = _target_of_words(words, units_of, "")
+    if isinstance(found, Reference):
+        raise InvalidInputError(
+            "target of a run that goes on",
+            value=" ".join(words),
+            limit="set-points: x=2m, x=-1m@5s",
+            remedy="A reference is given before the start: undertow run --target",
+        )
+    return found
+
+
+def _target_of_words(
+    words: Sequence[str], units_of: Callable[[str], tuple[str, ...]], option: str
+) -> Target:
+    """Return the set-points or sines of words, with the units in which each may be."""
     points: dict[float, dict[str, float]] = {}
     sines: dict[float, dict[str, float]] = {}
     for word in words:
         name, text = _split(word, "x=1m")
         value, at, when = text.partition("@")
-        units = _units_of(mechanism, name, "target")
-        number, unit = _quantity(value, units, f"target '{name}'", f"--target {name}=1{units[0]}")
-        example = f"--target {name}=1{units[0]}@2s or --target {name}=1{units[0]}@0.5Hz"
+        units = units_of(name)
+        one = f"{option}{name}=1{units[0]}"
+        number, unit = _quantity(value, units, f"target '{name}'", one)
+        example = f"{one}@2s or {one}@0.5Hz"
         time, kind = _quantity(when, ("s", "Hz"), f"target '{name}'", example) if at else (0.0, "s")
         group = (points if kind == "s" else sines).setdefault(time, {})
         if name in group:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
+import shlex
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
@@ -14,11 +16,17 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import typer
 from rich.console import RenderableType
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, printable
 from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.options import folder, option
-from undertow.cli.parsing import mechanism_named, parse_start, parse_target, parse_values
+from undertow.cli.parsing import (
+    mechanism_named,
+    parse_new_target,
+    parse_start,
+    parse_target,
+    parse_values,
+)
 from undertow.cli.terminal import (
     check_out,
     command,
@@ -28,13 +36,14 @@ from undertow.cli.terminal import (
     show,
     write,
 )
-from undertow.law import Reference
+from undertow.law import Reference, SetPoints
 from undertow.mechanisms.named import from_anywhere
 from undertow.models.importers.python_file import in_a_file
 from undertow.objective import Goal
 
 if TYPE_CHECKING:
-    from undertow.runtime import Report, Runtime
+    from undertow.models import Coordinate
+    from undertow.runtime import Report, RunTarget, Runtime
 
 
 @command(
@@ -42,13 +51,15 @@ if TYPE_CHECKING:
     "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
     "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     "undertow run overhead_crane --target x=0.5m --target x=-0.5m@8s --seconds 16",
+    "undertow run rotary_pendulum --target theta=20deg@0.25Hz --seconds 20",
     "undertow run rotary_pendulum --rig realistic --swing-up --seconds 20",
+    "undertow run rotary_pendulum --seconds 600 --log run.db",
     "undertow run rotary_pendulum --rig examples/serial_rig.py:emulated",
 )
 def run(
     name: options.AnyName,
     start: options.Start = None,
-    target: options.SetPoints = None,
+    target: options.Target = None,
     seconds: Annotated[float, option("Length of the run, s.", min=0.001)] = 10.0,
     rig: Annotated[
         str,
@@ -121,20 +132,14 @@ def run(
 
     belief = mechanism_named(name, setting)
     hanging = swing_up and not start
-    points = parse_target(belief, target)
-    if isinstance(points, Reference):
-        raise InvalidInputError(
-            "target of a run",
-            value=" ".join(target or ()),
-            limit="set-points: x=0.5m, x=-0.5m@8s",
-            remedy="References are followed in simulation: undertow simulate",
-        )
+    goal = parse_target(belief, target)
     recipe = Recipe(
         mechanism=from_anywhere(name),  # a log of it can be replayed from anywhere
         parameters=parse_values(setting),
         start=() if hanging else tuple(parse_start(belief, start).tolist()),
         swing_up=swing_up,
-        target=() if points is None else points.pairs,
+        target=goal.pairs if isinstance(goal, SetPoints) else goal or (),
+        duration=max(1.0, seconds) if isinstance(goal, Reference) else 60.0,
         objective=cast(Goal, objective),  # the recipe refuses what is none
         learns=known == "usual",
         rig="realistic" if rig == "realistic" or in_a_file(rig) else "ideal",
@@ -168,6 +173,9 @@ def run(
                 progress=progress,
             )
             runtime = stack.enter_context(ready)
+        if log is not None and not simulated:
+            free = [c for c in belief.coordinates if c.name in runtime.target.units]
+            _say_where_to_ask(log, runtime.deaf, free)
         hold = f"Ready. Hold {name} at its start, press Enter and let go."
         if in_a_file(rig) and not enter_pressed(hold):
             runtime.stop()
@@ -223,6 +231,64 @@ def _seconds_on_terminal(seconds: float) -> Iterator[None]:
         over.set()
         if sys.stderr.isatty():
             sys.stderr.write("\r\033[K")
+
+
+def _say_where_to_ask(log: Path, deaf: str, free: Sequence[Coordinate]) -> None:
+    """Say how a run is steered from another terminal while it goes on."""
+    if deaf:
+        show(f"Other targets are not taken while it runs: {deaf}", stderr=True)
+    elif free:
+        units = {"rad": "10deg", "m": "0.1m"}
+        words = " ".join(f"{c.name}={units.get(c.unit, '1')}" for c in free)
+        show(f"Another target while it runs: undertow target {shlex.quote(str(log))} {words}",
+             stderr=True)  # fmt: skip
+
+
+@command(
+    "undertow target run.db theta=45deg",
+    "undertow target run.db x=0.5m x=-0.5m@8s",
+    "undertow target run.db",
+)
+def target(
+    log: Annotated[Path, typer.Argument(help="Log of a run that goes on.", metavar="LOG")],
+    points: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Set-points, with units: x=1m, or x=-1m@8s for 8 s from now. They take the place "
+            "of those that are not reached yet; coordinates that are not named stay where the "
+            "target is. Without any: say where the target is.",
+            metavar="STATE=VALUE[@TIME]",
+        ),
+    ] = None,
+) -> None:
+    """Give a run that goes on another target.
+
+    The run, started with --log in another terminal of this machine, checks
+    the target first. One where it cannot rest, or past its travel, is refused
+    with the reason, and nothing changes. The target jumps once the optimiser
+    has a plan for it, usually after a second.
+    """
+    from undertow.runtime import send_target, target_of_run
+
+    found = target_of_run(log)
+    if points:
+        found = send_target(log, parse_new_target(found.units, points))
+    show(f"{found.mechanism}, {found.t:.1f} s: the target is {_places(found, found.now)}")
+    for begin, place in found.ahead:
+        when = "at once" if begin <= found.t else f"from {begin:.1f} s on"
+        show(f"asked for, {when}: {_places(found, place)}")
+    if not points and found.said:
+        show(f"last said of it: {printable(found.said)}")
+
+
+def _places(run: RunTarget, q: Mapping[str, float]) -> str:
+    """Return positions in words, angles in degrees."""
+    words = []
+    for name, value in q.items():
+        degrees = run.units.get(name) == "rad"
+        shown = f"{math.degrees(value):.4g}°" if degrees else f"{value:.4g} m"
+        words.append(f"{name} = {shown}")
+    return ", ".join(words) or "x = 0"
 
 
 @command(

@@ -26,6 +26,7 @@ from undertow.runtime.slow_loop import (
     respond,
 )
 from undertow.runtime.supervisor import SupervisedRig
+from undertow.runtime.targets import RunTarget, send_target, target_of_run
 from undertow.runtime.verdict import EXIT_CODES, Ending, Report, RunVerdict
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "Replay",
     "Report",
     "Request",
+    "RunTarget",
     "RunVerdict",
     "Runtime",
     "Settings",
@@ -64,5 +66,7 @@ __all__ = [
     "replay_controller",
     "respond",
     "run",
+    "send_target",
     "session",
+    "target_of_run",
 ]

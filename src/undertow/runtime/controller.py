@@ -20,14 +20,23 @@ import numpy as np
 from undertow.cascade import Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators import Estimator, KalmanFilter
-from undertow.models import FloatArray
+from undertow.law import ReferenceMotion
+from undertow.models import FloatArray, error_dynamics
 from undertow.plants import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.plan_check import PlanCheck
 from undertow.runtime.sensors import LAST_HARMLESS, SensorMonitor
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow_loop import Answer, Request, law_vectors_of
-from undertow.runtime.steps import BEYOND_TRAVEL, all_finite, limit_output, step_memory, step_module
+from undertow.runtime.steps import (
+    BEYOND_TRAVEL,
+    all_finite,
+    limit_output,
+    reference_row,
+    relative_error,
+    step_memory,
+    step_module,
+)
 
 #: Least time from asking for a catch to its use, s; and how far the state may be off the one
 #: it was made for, in units of 1 + |entry|.
@@ -36,6 +45,9 @@ CATCH_LEAD, CATCH_PREDICTION_ERROR = 0.02, 0.1
 #: Time from asking for the first plan to another target to its use, s: a global search; and the
 #: most that it grows to, when answers are late.
 JUMP_LEAD, MOST_JUMP_LEAD = 1.0, 8.0
+
+#: Time after which a target is asked for again for which no plan was found, s.
+JUMP_RETRY = 1.0
 
 #: How the reason begins for which an answer is refused that no sound slow loop gives.
 UNSOUND = "unsound: "
@@ -58,6 +70,9 @@ class Inputs:
     alarm
         What the runtime itself found wrong (a stall, failed writes, deadlines missed, a clock
         that runs wrong); stops the run.
+    target
+        Another target that was asked for meanwhile: when it jumps, s after this step, and where
+        to.  It takes the place of what was asked for before and has not been reached.
     """
 
     t: float
@@ -65,6 +80,7 @@ class Inputs:
     answer: Answer | None = None
     command: Command = Command.NONE
     alarm: str = ""
+    target: Legs = ()
 
 
 class Note(NamedTuple):
@@ -95,8 +111,10 @@ class Controller:
         the surface that catches it.  ``None``: the law waits until the mechanism is brought
         near its target.
     legs
-        When the target jumps, s, and where to, the first at 0: what the cascade started with.  The
-        target jumps when the first plan to it is there, not before.
+        When the target jumps, s, and where to, the first at 0: what the cascade started with.  One
+        of them may move: its acceleration is fed forward from step to step.  The
+        target jumps when the first plan to it is there, not before; with a swing-up not before it
+        balances at x = 0, and the first of them, too.
 
     Attributes
     ----------
@@ -108,6 +126,8 @@ class Controller:
         det Γ(q)/det Γ(0) of the last step, (1,).
     mode, stopped_by
         State, and why the last safe stop was made.
+    reference
+        The target that moves, if one does.
     notes
         What happened in the last step.
     request
@@ -132,9 +152,14 @@ class Controller:
         self.cascade, self.estimator, self.period = cascade, estimator, period
         self.settings, self.swing_up = settings, swing_up
         fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
-        fast = step_memory(mechanism, settings, period, fall_angle)
+        moving = [motion for _, motion in legs if motion.moves]
+        self.reference = moving[0] if moving else None
+        acted_on = error_dynamics(mechanism) if moving else mechanism
+        fast = step_memory(acted_on, settings, period, fall_angle)
         self._block = fast.block
-        self._parameters: FloatArray = fast["parameters"]
+        own = len(mechanism.parameters)
+        self._parameters: FloatArray = fast["parameters"][:own]
+        self._row: FloatArray = fast["parameters"][own:]
         self._learning: KalmanFilter | None = None
         if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
             self._learning = estimator
@@ -146,7 +171,7 @@ class Controller:
         limit_output(
             self._wanted, self.u, self.limits, self.slew
         )  # compiled before a stop needs it
-        self._act = step_module(mechanism, cascade.reaching.switching).act
+        self._act = step_module(acted_on, cascade.reaching.switching).act
         self._swings = swing_up is not None
         self.mode, self.stopped_by = Mode.IDLE, ""
         self.memory = memory
@@ -171,9 +196,16 @@ class Controller:
         self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
         self._lead = settings.lead_time
         self._catch_lead, self._jump_lead = CATCH_LEAD, JUMP_LEAD
-        self._ahead = list(legs[1:])
+        self._jump_error = relative_error(self.x, self.x)  # compiled before a step needs it
+        self._ahead, self._not_before = list(legs[1:]), 0.0
+        if swing_up is not None and legs and legs[0][1].q.any():
+            self._ahead.insert(0, legs[0])
+        self._turns: FloatArray = np.zeros_like(self.x)
+        self._told: Legs = ()
         if memory.target is not None:
             self._turn[:] = memory.target.state(0.0)
+        if self.reference is not None:
+            self._follow(0.0, memory.target or self.reference)  # compiled before a step needs it
 
     # -- one step --------------------------------------------------------------------------
 
@@ -194,7 +226,7 @@ class Controller:
         if self.notes:
             self.notes.clear()
         self.request, self.optimiser_timed_out = None, False
-        self._t, self._free = inputs.t, False
+        self._t, self._free, self._told = inputs.t, False, inputs.target
         try:
             self._compute(inputs)
         except Exception as error:  # whatever it was, the output goes to zero within its slew
@@ -210,6 +242,8 @@ class Controller:
         try:
             if used is not None:
                 self._note_outcome(used)
+            if self._told:
+                self._retarget(self._t, self._told)
             if answer is not None:
                 self._take_answer(self._t, answer)
             elif self._free:
@@ -232,13 +266,17 @@ class Controller:
                 self._parameters[:] = self._learning.parameters
         if self._segment + 1 < len(self._times):
             self._proceed(t)
-        new, most = self._law_vector, -1.0
+        new, most, jumps = self._law_vector, -1.0, False
         due = pending is not None and t >= self._due
         if due:
             new, most = self._next[1][0], self._max_error
             if mode is Mode.SWING_UP and self.swing_up is not None:
-                self._turn[:] = self.swing_up.region.turns(estimate)
-            self._aim(pending)
+                self._turns[:] = self._turn[:] = self.swing_up.region.turns(estimate)
+            if pending is not None and pending.jump:
+                jumps = self._aim(pending, estimate)
+                most = most if jumps else -1.0
+        if self.reference is not None:
+            self._follow(t, self._next[0].target if jumps else self.memory.target)
         waited = ""
         if mode is Mode.BRING_UP and t - self._began > self.settings.bring_up_timeout:
             waited = self._waiting()
@@ -277,10 +315,16 @@ class Controller:
         elif mode is not Mode.BALANCE and mode is not Mode.CATCH:
             self._free = False
 
-    def _aim(self, answer: Answer | None) -> None:
-        """Count the state from the new target, where an answer that is due brings one."""
-        if answer is not None and answer.jump and answer.memory.target is not None:
-            self._turn[:] = answer.memory.target.state(answer.use)
+    def _aim(self, answer: Answer, estimate: FloatArray) -> bool:
+        """Count the state from the new target, if it is near the one that the answer is for."""
+        target = answer.memory.target
+        assert target is not None  # a jump brings one
+        there = self._turns + target.state(answer.use)
+        self._jump_error = relative_error(estimate - there, self._expected)
+        near = self._jump_error <= self._max_error
+        if near:
+            self._turn[:] = there
+        return near
 
     def _landed(self, answer: Answer | None, used: bool) -> None:
         """Note that the target has jumped, or count from the old one again."""
@@ -291,7 +335,41 @@ class Controller:
             self.notes.append(Note("target", f"jumps, asked for at {begin:g} s"))
         else:
             target = self.memory.target
-            self._turn[:] = 0.0 if target is None else target.state(self._t)
+            self._turn[:] = self._turns + (0.0 if target is None else target.state(self._t))
+
+    def _follow(self, t: float, target: ReferenceMotion | None) -> None:
+        """Count the state from where a reference is at the time t, and feed its motion forward."""
+        self._row[:] = 0.0
+        if target is not None and self.mode is not Mode.SWING_UP:
+            reference_row(t, target.t, target.q, target.v, target.a, self._row)
+            self._turn[:] = self._turns
+            self._turn += self._row[: len(self._turn)]
+
+    @property
+    def aim(self) -> FloatArray:
+        """Positions of the target that was asked for last and whose time has come, (n,)."""
+        due = [motion for begin, motion in tuple(self._ahead) if begin <= self._t]
+        target = due[-1] if due else self.memory.target
+        return np.zeros(len(self.x) // 2) if target is None else np.array(target.position(self._t))
+
+    @property
+    def ahead(self) -> Legs:
+        """When the target was asked to jump, or will be, s, and where to: what is still to come."""
+        return tuple(self._ahead)
+
+    def _retarget(self, t: float, legs: Legs) -> None:
+        """Go for what was asked for meanwhile; what is planned for another jump is given up."""
+        self._told = ()
+        self._ahead, self._not_before = [(t + begin, motion) for begin, motion in legs], t
+        asked, pending = self._asked, self._pending
+        if asked is not None and asked.target is not None:
+            self._sequence, self._asked = max(self._sequence, asked.sequence), None
+        if pending is not None and pending.jump:
+            self._sequence, self._pending = max(self._sequence, pending.sequence), None
+        for begin, motion in self._ahead:
+            places = zip(self._names, motion.position(begin), strict=True)
+            where = ", ".join(f"{name} = {value:g}" for name, value in places if value)
+            self.notes.append(Note("target", f"asked for at {begin:g} s: {where or 'x = 0'}"))
 
     def _describe(self, wrong: int, place: int) -> str:
         """Return in words what a step found wrong with the estimate."""
@@ -328,6 +406,8 @@ class Controller:
             self._began = t
         elif mode is Mode.SWING_UP:
             self._swinging, self._pending = t, None
+            if self.memory.target is not None:  # what catches does so at x = 0
+                self._ahead.insert(0, (t, self.memory.target))
         elif mode is Mode.CATCH and self.mode is Mode.BRING_UP:
             self.memory = replace(self.memory, since=t)  # a schedule starts with the catch
             self._segment, self._law_vector = 0, self._law_vectors[0]
@@ -362,7 +442,7 @@ class Controller:
             self.memory = replace(self.memory, sequence=self._sequence, estimate=learnt)
         elif self.memory.sequence != self._sequence:
             self.memory = replace(self.memory, sequence=self._sequence)
-        if self._ahead and t >= self._ahead[0][0] - self._jump_lead - 2 * self._lead:
+        if self._jumps_next(t):
             begin, motion = self._ahead[0]
             step = self.cascade.step
             use = t + math.ceil(max(self._jump_lead, begin - t) / step - 1e-9) * step
@@ -373,6 +453,13 @@ class Controller:
             use = t + self._catch_lead
             self._asked = Request(t, self.x.copy(), use, self.memory, self._gains_in_use(t))
         self.request = self._asked
+
+    def _jumps_next(self, t: float) -> bool:
+        """Whether the next request is for a plan to another target."""
+        if not self._ahead or t < self._not_before or self.mode is Mode.SWING_UP:
+            return False
+        early = t < self._ahead[0][0] - self._jump_lead - 2 * self._lead
+        return not early and (self.swing_up is None or self.mode is Mode.BALANCE)
 
     def _adapt_lead_time(self, factor: float) -> None:
         """Change how far ahead proposals are computed, in whole steps of the predictions."""
@@ -401,6 +488,12 @@ class Controller:
                     self._adapt_lead_time(1.5)
                 self._sequence = max(self._sequence, answer.sequence)
                 self._asked = None
+        elif self._asked is not None and self._asked.target is not None and not answer.jump:
+            self._sequence, self._asked = max(self._sequence, answer.sequence), None
+            self._not_before = t + JUMP_RETRY
+            why = answer.proposal.message
+            self.notes.append(Note("answer", f"{answer.sequence}: kept the old plan, {why}"))
+            self.notes.append(Note("target", f"stays, there is no plan for another: {why}"))
         else:
             if answer.use - t > 0.5 * self._lead and not answer.jump:
                 self._adapt_lead_time(0.9)
@@ -448,6 +541,8 @@ class Controller:
             return ""  # its plan is not used
         if answer.memory.since != answer.use:
             return f"{UNSOUND}its plan is of another time"
+        if not self._is_asked_target(answer):
+            return f"{UNSOUND}its plan is for another target"
         plan, known = answer.memory.plan, self.cascade.known
         asked = None if self._asked is None else self._asked.memory.estimate
         if known is not None and asked is not None:
@@ -458,9 +553,24 @@ class Controller:
         fault = self._plans.fault(self._packed)
         return fault and f"{UNSOUND}{fault}"
 
+    def _is_asked_target(self, answer: Answer) -> bool:
+        """Whether an answer's plan is for the target that was asked for, to the bit."""
+        found, asked = answer.memory.target, self._asked
+        if asked is None or answer.jump != (asked.target is not None):
+            return False
+        wanted = asked.target if answer.jump else asked.memory.target
+        if answer.swing >= 0:  # what catches does so at x = 0
+            wanted = None
+        if found is None or wanted is None:
+            return found is wanted
+        pairs = ((found.t, wanted.t), (found.q, wanted.q), (found.v, wanted.v), (found.a, wanted.a))
+        return found is wanted or all(np.array_equal(a, b) for a, b in pairs)
+
     def _note_outcome(self, answer: Answer) -> None:
         """Note what became of an answer at its time of use."""
         (off, margin), most = self._off.tolist(), self._max_error
+        if answer.jump and not self._jump_error <= most:
+            off = self._jump_error
         self._sequence = max(self._sequence, answer.sequence)
         if not answer.admission.accepted:
             verdict = f"kept the old plan, {answer.admission.reason}"

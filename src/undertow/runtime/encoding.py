@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, Self, TypeGuard
 
 import numpy as np
 
-from undertow.cascade import Admission, CascadeState
+from undertow.cascade import Admission, CascadeState, Legs
 from undertow.estimators import ParameterEstimate
-from undertow.law import Plan, ReachingLaw, ReferenceMotion, Surface
+from undertow.law import Plan, ReachingLaw, Reference, ReferenceMotion, Surface
+from undertow.law.reference import Ramp, Sine, Spline
 from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import Proposal
 from undertow.plants import Measurement
@@ -167,6 +168,15 @@ class Columns:
         return positions, inputs, [name for name in names if name.startswith(_SURFACE)]
 
 
+#: Paths of references that are data, by name.
+PATHS: Mapping[str, type[Any]] = {"Ramp": Ramp, "Sine": Sine, "Spline": Spline}
+
+#: What stands for the target of a run that moves.
+MOVING = "reference"
+
+#: Kind of the events that hold the targets which were asked for during a run.
+TOLD = "set-points"
+
 #: Keys of an answer's ``body`` in logs before version 0.2.0, and what they are now.
 OLD_KEYS = {"lanes": "law_vectors"}
 
@@ -205,9 +215,14 @@ def memory_to(memory: CascadeState) -> dict[str, Any]:
         "scale": memory.scale,
         "since": memory.since,
         "x": list(memory.x),
-        "target": None if memory.target is None else list(memory.target.position(0.0)),
+        "target": None if memory.target is None else _target_to(memory.target),
         "estimate": None if memory.estimate is None else _estimate_to(memory.estimate),
     }
+
+
+def _target_to(target: ReferenceMotion) -> list[float] | str:
+    """Return where a target is; of the one that moves that it does: the recipe has it."""
+    return MOVING if target.moves else list(target.position(0.0))
 
 
 def _estimate_to(estimate: ParameterEstimate) -> dict[str, Any]:
@@ -223,10 +238,14 @@ def _estimate_from(value: Mapping[str, Any]) -> ParameterEstimate:
     return ParameterEstimate(offset, information, value["samples"])
 
 
-def memory_from(value: Mapping[str, Any]) -> CascadeState:
-    """Return the memory that was encoded."""
+def memory_from(value: Mapping[str, Any], reference: ReferenceMotion | None = None) -> CascadeState:
+    """Return the memory that was encoded, in a run whose target moved as ``reference`` does."""
     x, q = tuple(value.get("x", ())), value.get("target")  # logs before this one have none
-    target = None if q is None else ReferenceMotion.at_rest(np.array(q, dtype=float))
+    target = None if q is None else reference
+    if q == MOVING and reference is None:
+        raise ValueError("a target that moves, in a run without one")
+    if q is not None and q != MOVING:
+        target = ReferenceMotion.at_rest(np.array(q, dtype=float))
     learnt = value.get("estimate")
     changed = {
         "plan": _plan_from(value["plan"]),
@@ -235,6 +254,39 @@ def memory_from(value: Mapping[str, Any]) -> CascadeState:
         "estimate": None if learnt is None else _estimate_from(learnt),
     }
     return CascadeState(**{**value, **changed})
+
+
+def legs_to(legs: Legs) -> str:
+    """Return the set-points that were asked for during a run as JSON: times, s, and positions."""
+    return json.dumps([[begin, list(motion.position(0.0))] for begin, motion in legs])
+
+
+def legs_from(text: str) -> Legs:
+    """Return the set-points that were encoded."""
+    return tuple(
+        (float(begin), ReferenceMotion.at_rest(np.array(q, dtype=float)))
+        for begin, q in json.loads(text)
+    )
+
+
+def reference_to(reference: Reference) -> dict[str, Any] | None:
+    """Return a reference as JSON values; ``None`` for functions of somebody's own."""
+    paths = {}
+    for name, path in reference.paths.items():
+        kind = type(path).__name__
+        if PATHS.get(kind) is not type(path):
+            return None
+        paths[name] = {"kind": kind, **asdict(path)}  # type: ignore[call-overload]
+    return {"paths": paths, "period": reference.period}
+
+
+def reference_from(value: Mapping[str, Any]) -> Reference:
+    """Return the reference that was encoded."""
+    paths = {}
+    for name, path in value["paths"].items():
+        fields = {k: tuple(v) if isinstance(v, list) else v for k, v in path.items() if k != "kind"}
+        paths[name] = PATHS[path["kind"]](**fields)
+    return Reference(paths, value["period"])
 
 
 def _is_sound(plan: object) -> TypeGuard[Plan]:
@@ -268,8 +320,8 @@ def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
     )  # fmt: skip
 
 
-def answer_from(row: Mapping[str, Any]) -> Answer:
-    """Return the answer that a line of the log tells of."""
+def answer_from(row: Mapping[str, Any], reference: ReferenceMotion | None = None) -> Answer:
+    """Return the answer that a line of the log tells of, see :func:`memory_from`."""
 
     def number(name: str) -> float:
         return math.nan if row[name] is None else float(row[name])
@@ -293,8 +345,8 @@ def answer_from(row: Mapping[str, Any]) -> Answer:
         np.array(body["x"]),
         proposal,
         Admission(bool(row["accepted"]), row["reason"], number("predicted")),
-        memory_from(body["before"]),
-        memory_from(body["after"]),
+        memory_from(body["before"], reference),
+        memory_from(body["after"], reference),
         np.array(body["law_vectors"]),
         row["seconds"],
         body["swing"],

@@ -8,13 +8,15 @@ import math
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 
 import numpy as np
 
-from undertow.base import InvalidInputError
-from undertow.models import FloatArray
+from undertow.base import InvalidInputError, checked
+from undertow.cascade import Legs
+from undertow.law import SetPoints
+from undertow.models import FloatArray, invariant_coordinates
 from undertow.plants import Measurement, OutputOnError, Rig
 from undertow.runtime.clock import (
     SECOND,
@@ -27,12 +29,13 @@ from undertow.runtime.clock import (
     real_time_priority,
 )
 from undertow.runtime.controller import UNSOUND, Controller, Inputs
-from undertow.runtime.encoding import Stamps, answer_row
+from undertow.runtime.encoding import TOLD, Stamps, answer_row, legs_to
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.processes import Background, resource_errors
 from undertow.runtime.slow_loop import Answer, Worker, is_answer
 from undertow.runtime.steps import limit_output, stage_module
+from undertow.runtime.targets import RunTarget, legs_from_here, named_positions
 from undertow.runtime.verdict import Report
 
 #: How long before a step is due the lockstep check makes the last one again, s.
@@ -67,6 +70,11 @@ class Runtime:
         A second controller, built as the first.  It makes every step again, one step behind,
         in the last moments before the next one is due: that brings code and data back into
         the processor's caches, and shows at once when the same inputs give other outputs.
+
+    Attributes
+    ----------
+    deaf
+        Why it takes no targets from other processes; empty where it does.
 
     Raises
     ------
@@ -105,6 +113,10 @@ class Runtime:
             log=log,
         )
         self._stopping, self._watchdog_alarm = False, ""
+        self._asked_for: deque[Legs] = deque()
+        self._asking = threading.Lock()
+        self._said_of_target = ""
+        self.deaf = "a run listens that has a log, against the wall clock"
         self._time_without_reading = self._time_without_write = 0.0
         self._reads, self._writes = (FailureRatio(settings.fault_window, period) for _ in range(2))
         self._overruns, self._rig_clock = FailureRatio(SECOND, period), RigClock(settings, period)
@@ -125,6 +137,67 @@ class Runtime:
     def stop(self) -> None:
         """Ask for a safe stop, as an operator does: from anywhere, also before the run."""
         self._stopping = True
+
+    @checked
+    def retarget(self, target: Mapping[str, float] | SetPoints) -> RunTarget:
+        """Ask for another target, from another thread, while the run goes on or before.
+
+        The fast loop takes it with its next step, and the target jumps once there is a plan for it.
+        Another process asks by :func:`undertow.runtime.send_target`.
+
+        Parameters
+        ----------
+        target
+            Coordinates to positions, rad or m, or :class:`undertow.SetPoints` whose times count
+            from now.  Coordinates that are not named stay where the target is; what was asked for
+            before and has not been reached is given up.
+
+        Raises
+        ------
+        InvalidInputError
+            For a target that cannot be one, and when the run is over: nothing has changed then.
+        """
+        goal = target if isinstance(target, SetPoints) else SetPoints(target)
+        controller, cascade = self.controller, self.controller.cascade
+        with self._asking:
+            if self._released or self._stopping or controller.mode is Mode.SAFE_STOP:
+                raise InvalidInputError(
+                    "target of a run",
+                    value=f"the run has stopped: {controller.stopped_by or 'operator'}",
+                    limit="one that goes on",
+                    remedy="Start another one, with --target or target=",
+                )
+            before = self._asked_for
+            here = before[-1][-1][1].q[0] if before else controller.aim
+            legs = legs_from_here(
+                cascade.mechanism, cascade.objective, controller.settings, here, goal
+            )
+            before.append(legs)
+            return self._steered(legs)
+
+    @property
+    def target(self) -> RunTarget:
+        """Where the run is steered: where the target is, and where it is to jump to."""
+        return self._steered(())
+
+    def _steered(self, new: Legs) -> RunTarget:
+        controller, mechanism = self.controller, self.controller.cascade.mechanism
+        t = max(0.0, min(self._heartbeat, self.clock.now()) - self._origin)
+        target = controller.memory.target
+        now = None if target is None else np.array(target.position(t))
+        ahead = tuple((t + begin, motion) for begin, motion in new) or controller.ahead
+        free = invariant_coordinates(mechanism)
+        return RunTarget(
+            mechanism.name,
+            {c.name: c.unit for c in mechanism.coordinates if c.name in free},
+            t,
+            {} if now is None else named_positions(mechanism, now),
+            tuple(
+                (begin, named_positions(mechanism, np.array(motion.position(begin))))
+                for begin, motion in ahead
+            ),
+            "" if new else self._said_of_target,
+        )
 
     def run(self, seconds: float) -> Report:
         """Run from start to a safe stop; the operator's stop comes after ``seconds``.
@@ -264,7 +337,8 @@ class Runtime:
                 report.stopped_early = t < seconds
             measurement, alarm = self._read(alarm)
             read = clock.now()
-            inputs = Inputs(t, measurement, self._take(t), command, alarm)
+            told = self._asked_for.popleft() if self._asked_for else ()
+            inputs = Inputs(t, measurement, self._take(t), command, alarm, told)
             u = self.controller.decide(inputs)
             computed = clock.now()
             alarm = self._write(u)
@@ -419,6 +493,8 @@ class Runtime:
                 log.event(k, inputs.t, "command", inputs.command.name)
             if inputs.alarm:
                 log.event(k, inputs.t, "alarm", inputs.alarm)
+            if inputs.target:
+                log.event(k, inputs.t, TOLD, legs_to(inputs.target))
             if inputs.answer is not None:
                 log.answer(partial(answer_row, k, inputs.answer))
         for note in controller.notes:
@@ -426,6 +502,8 @@ class Runtime:
             if note.kind == "state":
                 report.entered[controller.mode.name] += 1
                 self._note_transition(note.text, inputs.t)
+            elif note.kind == "target":
+                self._said_of_target = note.text
             elif note.kind == "answer":
                 report.invalid_answers += UNSOUND in note.text
                 report.answers[note.text.split(": ", 1)[1].split(",")[0].split(" by ")[0]] += 1

@@ -9,14 +9,16 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
 
+import numpy as np
+
 from undertow.base import InvalidInputError, UndertowError, one_of
-from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator, legs_of
+from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import KalmanFilter
-from undertow.law import Plan, ReachingLaw, SetPoints
+from undertow.law import Plan, ReachingLaw, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
-from undertow.models import FloatArray, Mechanism, number_of
+from undertow.models import FloatArray, Mechanism, invariant_coordinates, number_of
 from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, IdealRig, RealisticRig
@@ -29,8 +31,10 @@ from undertow.runtime.controller_defaults import (
     provable,
     reaching_for,
 )
+from undertow.runtime.encoding import MOVING, reference_from, reference_to
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow_loop import Answer, Request, respond
+from undertow.runtime.targets import checked_legs
 
 #: Shortest period, and longest prediction, of a run, s.
 SHORTEST, FARTHEST = 1e-5, 3600.0
@@ -83,7 +87,10 @@ class Recipe:
     target
         Set-points, pairs of a time, s, and coordinates with positions, rad or m, see
         :class:`undertow.SetPoints`; without any x = 0.  Times count from the start of the run, and
-        the target jumps once there is a plan for it.
+        the target jumps once there is a plan for it; after a swing-up once it balances at x = 0.
+        Or a :class:`undertow.Reference`, which is followed from the start of the run on.
+    duration
+        How long a reference is followed, s; then it rests.
     learns
         Whether the mechanism's parameters, within their tolerances, are learnt as it runs;
         otherwise they are exact.
@@ -111,7 +118,8 @@ class Recipe:
     seconds: float = math.inf
     period: float = 0.001
     swing_up: bool = False
-    target: tuple[tuple[float, Mapping[str, float]], ...] = ()
+    target: tuple[tuple[float, Mapping[str, float]], ...] | Reference = ()
+    duration: float = 60.0
     learns: bool = True
     settings: Settings = field(default_factory=Settings)
     design: Cascade | None = None
@@ -129,7 +137,7 @@ class Recipe:
         """Refuse an unknown objective, a period that no loop keeps, and a horizon too far."""
         if not isinstance(self.objective, Objective):
             one_of("objective of a run", self.objective, get_args(Goal))
-        for what in ("period", "horizon"):
+        for what in ("period", "horizon", "duration"):
             number_of(f"{what} of a run", getattr(self, what))
         stall = self.settings.max_step_interval
         if not SHORTEST <= self.period < stall:
@@ -144,14 +152,14 @@ class Recipe:
             raise InvalidInputError(
                 "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
             )
-        one_of("rig of a run", self.rig, ("ideal", "realistic"))
-        if self.target and self.swing_up:
+        if not 0 < self.duration <= FARTHEST:
             raise InvalidInputError(
-                "target of a run with a swing-up",
-                value=list(self.target),
-                limit="one of them",
-                remedy="Swing up first, and run to the target from there",
+                "length of a reference",
+                value=f"{self.duration:g} s",
+                limit=f"> 0, ≤ {FARTHEST:g} s",
+                remedy="Make the run shorter, or give set-points",
             )
+        one_of("rig of a run", self.rig, ("ideal", "realistic"))
         assert self.legs is not None  # found here, so that its checks run before anything moves
 
     @cached_property
@@ -182,6 +190,8 @@ class Recipe:
             if named_goal is None or goal.horizon > FARTHEST:
                 return None
             made = replace(made, objective=named_goal, horizon=goal.horizon)
+        if isinstance(self.target, Reference) and reference_to(self.target) is None:
+            return None
         if self.design is not None:
             usual = Cascade(
                 self.design.mechanism,
@@ -239,8 +249,15 @@ class Recipe:
         """When the target jumps, s, and where to; empty for x = 0."""
         if not self.target:
             return ()
-        goal = SetPoints(self.target)
-        return legs_of(self.belief, self.cascade.objective, goal, goal.times[-1])
+        objective, settings, goal = self.cascade.objective, self.settings, self.target
+        if not isinstance(goal, Reference):
+            return checked_legs(self.belief, objective, settings, SetPoints(goal))
+        return checked_legs(self.belief, objective, settings, goal, self.duration)
+
+    @property
+    def reference(self) -> ReferenceMotion | None:
+        """The target that moves, if one does."""
+        return next((motion for _, motion in self.legs if motion.moves), None)
 
     def first(self) -> CascadeState:
         """Return what the cascade starts with: the first optimum, or what awaits a catch.
@@ -260,11 +277,12 @@ class Recipe:
         """Answer a request of the fast loop: what the slow loop computes."""
         return respond(self.cascade, request, self.swing)
 
-    def precompile(self, memory: CascadeState) -> None:
+    def precompile(self, memory: CascadeState, *, jumps: bool = False) -> None:
         """Make everything compile that an answer may need, whatever the gate refuses before.
 
         A run that begins balanced has most of it from its first optimum; one that swings up
         meets the optimiser in the middle of the run.  ``memory`` is what :meth:`first` returned.
+        ``jumps``: the target may jump, also where no set-point says so yet.
         """
         x, cascade, step = self.belief.state(**self.belief.start), self.cascade, self.cascade.step
         if self.swing is not None:
@@ -272,6 +290,12 @@ class Recipe:
                 memory = cascade.start(x)[0]
             self.respond(Request(0.0, x, step, memory, 0))
         self.respond(Request(0.0, x, step, memory))
+        if self.legs or (jumps and invariant_coordinates(self.belief)):
+            home = SetPoints({})
+            checked_legs(self.belief, cascade.objective, self.settings, home)
+            still = ReferenceMotion.at_rest(np.zeros(self.belief.n))
+            there = self.respond(Request(0.0, x, step, memory, -1, still)).memory
+            self.respond(Request(step, x, 2 * step, there))
         derate_actuator(cascade.loop_at(memory), RESERVE).batch(x, memory.plan, duration=step)
 
     @property
@@ -315,6 +339,8 @@ class Recipe:
         """JSON values from which :meth:`from_dict` makes the recipe again, if it is all data."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         del values["design"]
+        if isinstance(self.target, Reference):
+            values["target"] = [MOVING, reference_to(self.target)]
         return values | {"settings": asdict(self.settings), "words": WORDS}
 
     @classmethod
@@ -332,7 +358,11 @@ class Recipe:
                 raise InvalidInputError(f"{name} of a recipe", value=kind, limit="numbers")
         renamed = {OLD_SETTINGS.get(name, name): v for name, v in taken["settings"].items()}
         settings = Settings(**_of_types(Settings, renamed))
-        target = SetPoints(taken["target"]).pairs if taken["target"] else ()
+        target: Any = taken["target"]
+        if len(target) == 2 and target[0] == MOVING:
+            target = reference_from(target[1])
+        else:
+            target = SetPoints(target).pairs if target else ()
         changed = {"start": tuple(taken["start"]), "target": target, "settings": settings}
         return cls(**{**taken, **changed})
 

@@ -22,7 +22,14 @@ from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
 from undertow.runtime.controller import Controller, Inputs
-from undertow.runtime.encoding import Columns, answer_from, memory_from, memory_to
+from undertow.runtime.encoding import (
+    TOLD,
+    Columns,
+    answer_from,
+    legs_from,
+    memory_from,
+    memory_to,
+)
 from undertow.runtime.log import Recording, read_log
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
@@ -153,7 +160,7 @@ def replay(
         if isinstance(mechanism, Mechanism):
             recipe = replace(recipe, mechanism=mechanism)
         _check_mechanism(recording, recipe.belief)  # before anything is designed for it
-        memory = memory_from(recording.meta["memory"])
+        memory = memory_from(recording.meta["memory"], recipe.reference)
         controller = recipe.make_controller(memory)
     found = replay_controller(recording, controller, decisions=decisions)
     return replace(found, remarks=(*remarks, *found.remarks))
@@ -241,7 +248,7 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
     mechanism = controller.cascade.mechanism
     answers: dict[int, list[Answer]] = defaultdict(list)
     for row in recording.answers:
-        answers[row["k"]].append(answer_from(row))
+        answers[row["k"]].append(answer_from(row, controller.reference))
     said: dict[tuple[int, str], str] = {(k, kind): text for k, _, kind, text in recording.events}
     columns = Columns.of(mechanism)
     outputs: list[FloatArray] = []
@@ -259,6 +266,7 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
             arrived[0] if arrived else None,
             command,
             said.get((k, "alarm"), ""),
+            legs_from(said.get((k, TOLD), "[]")),
         )
         u = controller.step(inputs)
         outputs.append(u.copy())

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
-from undertow.law import SetPoints
+from undertow.law import Reference, SetPoints, Target
 from undertow.models.importers.python_file import in_a_file
 from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
 from undertow.runtime.clock import SimulatedClock, WallClock
@@ -32,6 +32,7 @@ from undertow.runtime.replay import about
 from undertow.runtime.settings import Settings
 from undertow.runtime.slow_loop import InlineWorker, Worker, background_worker
 from undertow.runtime.supervisor import SupervisedRig
+from undertow.runtime.targets import Listener
 from undertow.runtime.verdict import Report
 
 
@@ -120,7 +121,8 @@ def session(
     recipe
         What to run.
     log
-        File for the log.
+        File for the log.  A run with one, against the wall clock, takes targets from other
+        processes, see :func:`undertow.runtime.send_target`.
     simulated
         In simulated time, as fast as it goes; otherwise against the wall clock.
     processes
@@ -160,14 +162,15 @@ def session(
             plant = recipe.make_rig() if rig is None else rig
             memory = recipe.first()
             tell("warming up", 0.6)
-            warm_up(recipe, memory)
+            warm_up(recipe, memory, jumps=not simulated)
             controller = recipe.make_controller(memory)
             meta, book = about(controller, recipe, simulated=simulated), None
             with signals_deferred():  # what is opened is closed
                 # First the processes are forked, then threads begin.
                 worker: Worker = InlineWorker(recipe.respond)
                 if not simulated:
-                    worker = background_worker(recipe.respond, processes=processes)
+                    moving = [] if recipe.reference is None else [recipe.reference]
+                    worker = background_worker(recipe.respond, processes=processes, shared=moving)
                 stack.callback(worker.close)
                 if log is not None:
                     columns = Columns.of(recipe.belief)
@@ -175,6 +178,10 @@ def session(
             clock = SimulatedClock() if simulated else WallClock()
             double = recipe.make_controller(memory) if lockstep and not simulated else None
             runtime = Runtime(controller, plant, worker, clock=clock, log=book, lockstep=double)
+            if log is not None and not simulated:
+                with signals_deferred():
+                    listener = stack.enter_context(Listener(runtime, log))
+                runtime.deaf = listener.failure
             tell("ready", 1.0)
             signals.runtime = runtime
         yield runtime
@@ -191,7 +198,7 @@ def run(
     simulated: bool = False,
     processes: int = 3,
     settings: Settings | None = None,
-    target: Mapping[str, float] | SetPoints | None = None,
+    target: Mapping[str, float] | Target | None = None,
     progress: Callable[[str, float], None] | None = None,
     **state: float,
 ) -> Report:
@@ -216,7 +223,8 @@ def run(
         Where the mechanism is held at the start, (2n,), or its non-zero entries by name
         (``phi=0.7``).  With neither, the mechanism's usual ``start``.
     log
-        File for the log, an SQLite database.
+        File for the log, an SQLite database.  A run with one takes other targets while it goes on:
+        :func:`undertow.runtime.send_target`.
     simulated
         In simulated time, as fast as it goes: for simulated rigs.
     processes
@@ -225,7 +233,8 @@ def run(
         Limits and timeouts of the run.
     target
         Where to, x = 0 by default: coordinates to positions, or :class:`undertow.SetPoints` that
-        jump at times since the start of the run, each as soon as there is a plan for it.
+        jump at times since the start of the run, each as soon as there is a plan for it; or a
+        :class:`undertow.Reference` to follow, whose time is that of the run.
     progress
         Called with (what, fraction) while the run is prepared.
 
@@ -257,6 +266,7 @@ def run(
             period=0.001 if rig is None else rig.period,
             seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
             target=() if target is None else _points(target),
+            duration=max(1.0, seconds) if isinstance(target, Reference) else 60.0,
             learns=cascade.belief != "exact",
             settings=settings,
             design=cascade,
@@ -274,13 +284,17 @@ def run(
             return runtime.run(seconds)
 
 
-def _points(target: Mapping[str, float] | SetPoints) -> tuple[tuple[float, dict[str, float]], ...]:
+def _points(
+    target: Mapping[str, float] | Target,
+) -> tuple[tuple[float, dict[str, float]], ...] | Reference:
+    if isinstance(target, Reference):
+        return target
     return (target if isinstance(target, SetPoints) else SetPoints(target)).pairs
 
 
-def warm_up(recipe: Recipe, memory: CascadeState) -> None:
+def warm_up(recipe: Recipe, memory: CascadeState, *, jumps: bool = False) -> None:
     """Make a short run in simulated time and throw it away, so that everything is compiled."""
-    recipe.precompile(memory)
+    recipe.precompile(memory, jumps=jumps)
     controller, lead = recipe.make_controller(memory), recipe.settings.lead_time
     worker = InlineWorker(recipe.respond, 0.5 * lead)
     runtime = Runtime(controller, recipe.make_rig(), worker, clock=SimulatedClock())

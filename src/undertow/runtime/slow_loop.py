@@ -9,22 +9,26 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import io
 import math
 import os
+import pickle
 import signal
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Protocol, TypeGuard
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
 from undertow.base import ResourceError
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
+from undertow.closed_loop import Event
+from undertow.closed_loop.along_reference import simulate_along
 from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, pack_law_parameters
 from undertow.models import FloatArray
 from undertow.optimiser import Proposal
@@ -32,6 +36,44 @@ from undertow.runtime.processes import START_TIMEOUT, STOPPING, Background, fork
 
 #: The first that a process says which is to compute.
 BEGUN = "begun"
+
+
+class Packer:
+    """Writes what goes between two processes; motions that both of them have go by number.
+
+    Parameters
+    ----------
+    shared
+        What the other process has, too, for it was forked from this one.
+    """
+
+    def __init__(self, shared: Sequence[object] = ()) -> None:
+        self.shared = tuple(shared)
+        self._numbers = {id(one): number for number, one in enumerate(self.shared)}
+
+    def pack(self, what: object) -> bytes:
+        """Return bytes from which :meth:`unpack` makes it again."""
+        if not self.shared:
+            return pickle.dumps(what, pickle.HIGHEST_PROTOCOL)
+        numbers, buffer = self._numbers, io.BytesIO()
+
+        class Pickler(pickle.Pickler):
+            def persistent_id(self, one: object) -> int | None:
+                return numbers.get(id(one))
+
+        Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(what)
+        return buffer.getvalue()
+
+    def unpack(self, content: bytes) -> Any:
+        """Return what was written."""
+        shared = self.shared
+
+        class Unpickler(pickle.Unpickler):
+            def persistent_load(self, number: int) -> object:
+                return shared[number]
+
+        return Unpickler(io.BytesIO(content)).load()
+
 
 #: What asks the fast loop for a stop, which decides when its processes end, by SIGTERM.
 OTHERS = tuple(number for number in STOPPING if number != signal.SIGTERM)
@@ -108,6 +150,8 @@ def is_answer(said: object) -> TypeGuard[Answer]:
         and isinstance(said.admission, Admission)
         and isinstance(said.memory, CascadeState)
         and isinstance(said.memory.plan, Plan)
+        and isinstance(said.memory.target, ReferenceMotion | None)
+        and isinstance(said.jump, bool)
         and all(
             isinstance(part, np.ndarray) and part.dtype == float
             for part in (said.x, said.law_vectors)
@@ -204,7 +248,9 @@ def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began:
         request.use,
     )
     words = "not to be caught from here" if surface is None else "comes home from here"
-    after = replace(memory, plan=plan, since=request.use, sequence=request.sequence, x=())
+    after = replace(
+        memory, plan=plan, since=request.use, sequence=request.sequence, x=(), target=None
+    )
     admission = Admission(surface is not None, words, math.inf)
     vectors = law_vectors_of(cascade, after)
     return _answer(request, home, proposal, after, admission, vectors, began)
@@ -226,8 +272,16 @@ def judge(
 
 
 def _predicted(cascade: Cascade, request: Request) -> FloatArray:
-    plan, span = request.memory.at(request.t), request.use - request.t
+    memory, plan, span = request.memory, request.memory.at(request.t), request.use - request.t
+    target = memory.target
     try:
+        if target is not None and target.moves:
+            still = cascade.loop_at(replace(memory, target=None))
+            x = memory.absolute(request.t, request.x)
+            motion = simulate_along(still, x, plan, target, duration=span, start=request.t)
+            if motion.event not in (Event.HORIZON, Event.REACHED):  # it broke off before
+                return np.full_like(request.x, math.nan)
+            return memory.error(request.use, motion.x[-1])
         loop = cascade.loop_at(request.memory, request.t)
         batch = loop.batch(request.x, plan, duration=span, terminal=0.0)
         return np.asarray(batch.x[0])
@@ -357,11 +411,12 @@ class _Computer:
 class _Child(_Computer):
     """A forked process: it has everything compiled already, and can be ended at any time."""
 
-    def __init__(self, compute: Compute) -> None:
+    def __init__(self, compute: Compute, packer: Packer) -> None:
         self.pipe, theirs = pipe()
+        self._packer = packer
         try:
             self.process = fork(
-                _serve, (compute, theirs, self.pipe), "undertow slow loop", ignores=OTHERS
+                _serve, (compute, theirs, self.pipe, packer), "undertow slow loop", ignores=OTHERS
             )
         except BaseException:
             self.pipe.close()  # which ends it
@@ -390,8 +445,8 @@ class _Child(_Computer):
             super()._carry()  # by another may by then belong to another file
 
     def _exchange(self, request: Request) -> Answer:
-        self.pipe.send(request)
-        answer: Answer = self.pipe.recv()
+        self.pipe.send_bytes(self._packer.pack(request))
+        answer: Answer = self._packer.unpack(self.pipe.recv_bytes())
         return answer
 
     def close(self) -> None:
@@ -400,7 +455,7 @@ class _Child(_Computer):
         super().close()
 
 
-def _serve(compute: Compute, ours: Connection, theirs: Connection) -> None:
+def _serve(compute: Compute, ours: Connection, theirs: Connection, packer: Packer) -> None:
     """Answer requests until the other end is gone."""
     theirs.close()
     with contextlib.suppress(OSError, AttributeError):  # Linux: do not outlive the fast loop
@@ -408,10 +463,12 @@ def _serve(compute: Compute, ours: Connection, theirs: Connection) -> None:
     with contextlib.suppress(EOFError, OSError):
         ours.send(BEGUN)
         while True:
-            ours.send(compute(ours.recv()))
+            ours.send_bytes(packer.pack(compute(packer.unpack(ours.recv_bytes()))))
 
 
-def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWorker:
+def background_worker(
+    compute: Compute, *, processes: int = 3, shared: Sequence[object] = ()
+) -> BackgroundWorker:
     """Return a worker on another core: one process computes, the others stand by.
 
     Parameters
@@ -421,6 +478,8 @@ def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWork
     processes
         Processes to fork now, while the fast loop does not run yet: one to compute, the
         rest to take over from one that hangs or dies.  0: a thread of this process.
+    shared
+        What requests and answers hold that both sides have: a long reference.
 
     Raises
     ------
@@ -431,7 +490,7 @@ def background_worker(compute: Compute, *, processes: int = 3) -> BackgroundWork
     computers: list[_Computer] = []
     try:
         for _ in range(max(1, processes)):
-            computers.append(_Child(compute) if forked else _Computer(compute))
+            computers.append(_Child(compute, Packer(shared)) if forked else _Computer(compute))
     except BaseException:
         for computer in computers:
             computer.close()
