@@ -90,21 +90,22 @@ class InnerLoop:
         self.lane = pack_law_parameters(law)
         self.surface, self.reaching = surface, law.reaching
 
-    def believe(self, parameters: FloatArray, x: FloatArray) -> bool:
+    def believe(self, parameters: FloatArray, x: FloatArray, least: float = 0.0) -> bool:
         """Go on with other values of the parameters, (P,), if the surface bears them at x, (2n,).
 
         Where det Γ(q) would change its sign with them, so would the input: a surface that was
         chosen with what was known before, close to where it is singular, is kept with that until
-        another one is chosen.  Whether they were taken over.
+        another one is chosen.  ``least`` is the det Γ(q)/det Γ(0) that has to be left.  Whether
+        they were taken over.
         """
         before = self.parameters.copy()
         self.parameters[:] = parameters
         self._step(x, self.lane, self._block)
-        if self.margin[0] > 0.0:
+        if self.margin[0] > least:
             return True
         after, self.parameters[:] = self.parameters.copy(), before
         self._step(x, self.lane, self._block)
-        if self.margin[0] > 0.0:
+        if self.margin[0] > least:
             return False
         self.parameters[:] = after  # it is singular here in any case
         return True

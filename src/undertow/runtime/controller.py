@@ -20,7 +20,7 @@ import numpy as np
 from undertow.cascade import Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators import Estimator, KalmanFilter
-from undertow.law import ReferenceMotion
+from undertow.law import InnerLoop, ReferenceMotion
 from undertow.models import FloatArray, error_dynamics
 from undertow.plants import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
@@ -163,6 +163,7 @@ class Controller:
         self._learning: KalmanFilter | None = None
         if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
             self._learning = estimator
+        self._bears = InnerLoop(mechanism, memory.surface, cascade.reaching)
         self.u: FloatArray = fast["output"]
         self.x, self.wrapped, self.s = fast["x"], fast["wrapped"], fast["s"]
         self.demand, self.margin = fast["demand"], fast["margin"]
@@ -242,6 +243,8 @@ class Controller:
         try:
             if used is not None:
                 self._note_outcome(used)
+            if self._learning is not None:
+                self._believe(self._learning.parameters)
             if self._told:
                 self._retarget(self._t, self._told)
             if answer is not None:
@@ -250,6 +253,13 @@ class Controller:
                 self._ask(self._t)
         except Exception as error:
             self._stop(f"{type(error).__name__}: {error}")
+
+    def _believe(self, learnt: FloatArray) -> None:
+        """Have the next step go on with what is learnt, if the surface in use bears it."""
+        if math.isfinite(self.margin[0]):
+            self._bears.lane[:] = self._law_vector
+            if self._bears.believe(learnt, self.wrapped, self.settings.min_margin):
+                self._parameters[:] = learnt
 
     def _compute(self, inputs: Inputs) -> None:
         t, sensors, mode, pending = inputs.t, self.sensors, self.mode, self._pending
@@ -262,8 +272,9 @@ class Controller:
             if sensors.first:
                 self.estimator.reset(np.concatenate([accepted.q, np.zeros_like(accepted.q)]))
             estimate = self.estimator.estimate(accepted, self.u)
-            if self._learning is not None:
-                self._parameters[:] = self._learning.parameters
+            if self._learning is not None and sensors.first:
+                values = self.cascade.mechanism.parameter_values
+                self._parameters[:] = self._bears.parameters[:] = values
         if self._segment + 1 < len(self._times):
             self._proceed(t)
         new, most, jumps = self._law_vector, -1.0, False
