@@ -3,7 +3,9 @@
 Controllers, all built from the model alone:
 
 * *cascade*: undertow's, re-optimised every 0.1 s; for energy, for time, and for time with the
-  reaching law free.
+  reaching law free.  It takes its model for the plant.
+* *belief*: the same with what is usually not known of the model, learnt as it goes: the default.
+  *plan* is by the wall clock here.
 * *LQR, clipped*: u = −K x, continuous; its weights are the best by hindsight on the model, of 39
   pairs, once for energy and once for time.
 * *NMPC*: multiple shooting in CasADi with IPOPT, re-planned every 0.1 s, its plan applied
@@ -27,7 +29,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import sympy as sp
@@ -124,13 +126,15 @@ def cascade(
     objective: ut.Objective,
     freedom: ut.DecisionVariables,
     now: Clock,
+    belief: Literal["usual", "exact"] = "exact",
 ) -> Result:
     """Run undertow's cascade; also return the seconds of each optimisation."""
-    controller = ut.Cascade(scene.rig, objective, freedom=freedom, belief="exact")
+    controller = ut.Cascade(scene.rig, objective, freedom=freedom, belief=belief)
     seconds: list[float] = []
     for incumbent in (None, ut.first_surface(scene.rig)):  # compile
         controller.optimiser.propose(scene.x0, incumbent=incumbent, budget=ut.Budget(64))
-    controller = replace(controller, planner=Timed(controller.optimiser, now, seconds))
+    if belief == "exact":
+        controller = replace(controller, planner=Timed(controller.optimiser, now, seconds))
     truth = None if plant is scene.rig else plant
     try:
         run = controller.simulate(scene.x0, plant=truth)
@@ -142,6 +146,8 @@ def cascade(
     if objective.name == "energy":
         energy = run.cost
     radius = float(np.linalg.norm(motion.x[-1]))
+    if belief != "exact":
+        seconds = [update.proposal.seconds for update in run.updates]
     return Outcome(energy, run.time, radius, run.reached), seconds
 
 
@@ -185,6 +191,11 @@ def controllers(
         "do-mpc 10 Hz, energy": lambda: predictive(DoMPC(scene.rig, "energy", now=now)),
         "cascade, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now),
         "cascade, time, reaching free": lambda: cascade(scene, plant, time, free, now),
+        "belief, energy": lambda: cascade(
+            scene, plant, energy, ut.DecisionVariables(), now, "usual"
+        ),
+        "belief, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now, "usual"),
+        "belief, time, reaching free": lambda: cascade(scene, plant, time, free, now, "usual"),
         "LQR clipped, time": lambda: regulated("time"),
         "NMPC 10 Hz, time": lambda: predictive(ShootingMPC(scene.rig, "time", now=now)),
     }
