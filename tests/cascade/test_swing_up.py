@@ -208,7 +208,8 @@ def test_the_next_gains_meet_what_those_before_have_left() -> None:
     np.testing.assert_array_equal(meets.starts[count:], batch.starts[~missed])
     np.testing.assert_array_equal(meets.plants[:count], batch.plants[missed])
     parts = batch.plants / mechanism.parameter_values
-    assert np.abs(parts[:, 0] - 1).max() > 0.15  # m_1, whose usual tolerance is 20 %
+    off = np.abs(parts[:, 0] - 1).max()  # m_1: 20 % is usual, a standard deviation is 12 %
+    assert 0.09 < off < 0.12
 
 
 def test_a_pendubot_that_is_heavier_and_rubs_more_than_its_model_is_swung_up() -> None:

@@ -39,8 +39,8 @@ from undertow.symbolic import (
     generated,
 )
 
-#: While the kinetic energy is below this part of what is missing, the law pushes: at rest
-#: its formula gives nothing.
+#: While the kinetic energy is below this part of what is missing, the law pushes the way the joint
+#: moves, or inwards: at rest its formula gives nothing.
 STILL = 0.002
 #: How hard it pushes, part of the input's limit.
 KICK = 0.3
@@ -55,7 +55,8 @@ def swing(x, gains, parameters, limit, middle, work):
     n = x.shape[0] // 2
     away = x[0] - middle
     if kinetic < {STILL} * abs(missing - kinetic):
-        return {KICK} * limit * (-1.0 if away * B > 0.0 else 1.0)
+        along = x[n] if x[n] != 0.0 else -away
+        return {KICK} * limit * (-1.0 if along * B < 0.0 else 1.0)
     weight = max(missing + gains[0] / S, 1e-9)
     pump = gains[4] * missing * work[5]
     force = -(gains[1] * away + gains[2] * x[n] + gains[0] * h / S - pump) / weight

@@ -3,9 +3,10 @@
 From rest a swing-up is chaotic: a change in the last bit of a state, or a plant off by one
 per cent, sends it past the target on the other side.  What one swing on the model says of
 gains is therefore chance, and the gains that are quickest there may fail on a bench.  Here
-gains are judged by the average of many swings: plants drawn within the tolerances of the
-model's parameters, or the usual ones where it has none, dry friction and the hand that lets go
-differ from swing to swing, and some begin where a mechanism that was thrown out may be.
+gains are judged by the average of many swings: plants drawn within a standard deviation of the
+model's parameters (0.58 of their tolerances, or of the usual ones where they have none), dry
+friction and the hand that lets go differ from swing to swing, and some begin where a mechanism
+that was thrown out may be.
 
 No gains suit all plants.  A swing-up that has not led to a catch goes on with the next ones, so
 these are searched for on the swings that the ones before have not brought up, from where those
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from undertow.base import InfeasibleError
 from undertow.cascade.swing_up.catch import unclipped
 from undertow.cascade.swing_up.law import Gains, SwingUp, hanging, periods, swing_source
-from undertow.estimators import Belief
+from undertow.estimators.belief import EVEN, Belief
 from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import CMAES
 from undertow.plants.bench import plausible_rig
@@ -60,7 +61,7 @@ REACH, EVERY, HOME = 4.0, 5, 3.0
 #: Random gains and the swings that each is tried on; those that are tried on all swings; so many
 #: generations refine the best.  Gains that are found, one after the other; swings of which those
 #: that are left are searched for; swings that judge what is taken.
-RANDOM, FEW, GOOD, GENERATIONS, SWINGS = 2000, 4, 60, 24, 32
+RANDOM, FEW, GOOD, GENERATIONS, SWINGS = 2000, 4, 60, 24, 48
 TURNS, LOOKED, FRESH = 6, 1024, 512
 
 #: Where gains lie, decades about their scales: k_D, k_P, k_V, surplus, k_E.
@@ -196,7 +197,7 @@ class _Swings:
         self.mechanism, self.seed = mechanism, seed
         values = {p.name: abs(p.value) for p in mechanism.parameters}
         known = Belief.usual(mechanism).tolerances
-        parts = {name: tolerance / values[name] for name, tolerance in known.items()}
+        parts = {name: EVEN * tolerance / values[name] for name, tolerance in known.items()}
         self.bench = replace(plausible_rig(mechanism), tolerance=parts)
         self.low, n = hanging(mechanism), mechanism.n
         self.P, self.level, self.k = unclipped(mechanism)
