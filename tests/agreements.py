@@ -110,7 +110,7 @@ def swing_up(subject: Subject) -> Iterator[Difference]:
     module, parameters = swing_law._module(mechanism), mechanism.parameter_values
     rest = evaluate(mechanism.potential, subject.model.known(0.0, exactly(np.zeros(2 * n))))
     for x in subject.states:
-        energies, blocks = np.zeros(2), np.zeros(3)
+        energies, blocks = np.zeros(2), np.zeros(4)
         module.energies(x, parameters, energies)
         module.blocks(x, parameters, blocks)
         known = subject.model.known(0.0, exactly(x))
@@ -125,7 +125,11 @@ def swing_up(subject: Subject) -> Iterator[Difference]:
         unit = [[Number(int(i == 0)), v] for i, v in enumerate(f)]
         inverse, moved = solve(M, unit)[0]
         S = Number(1) / inverse
-        yield from subject.compared("swing-up: S, h, B", x, blocks, [S, S * moved, B[0][0]])
+        coupling = Number(0)
+        for i in range(1, n):
+            coupling = coupling + M[0][i] * exactly(x)[n + i]
+        true = [S, S * moved, B[0][0], coupling]
+        yield from subject.compared("swing-up: S, h, B, M_au q̇_u", x, blocks, true)
 
 
 def loop_programme(subject: Subject) -> Iterator[Difference]:

@@ -182,3 +182,19 @@ def test_quick_run(name: str) -> None:
     assert finished.returncode == 0, finished.stderr
     assert "Traceback" not in finished.stderr
     assert len(finished.stdout.split()) > 5
+
+
+def test_swing_ups_meet_the_plant_that_a_seed_says(harness: ModuleType) -> None:
+    """The plant moves, not the model; the same number of the same seed does the same again."""
+    import plants
+    import swing_ups
+
+    first, again = (swing_ups.swung("rotary_pendulum", 5, 1, rig=False) for _ in range(2))
+    assert first.outcome.balanced
+    np.testing.assert_array_equal(first.outcome.record.truth, again.outcome.record.truth)
+    record, plant = first.outcome.record, plants.drawn("rotary_pendulum", 5, 1)
+    assert plant.fingerprint != plants.model("rotary_pendulum").fingerprint
+    rig = ut.plants.IdealRig(plant, record.truth[300], 0.001)
+    rig.write(record.u[300])
+    np.testing.assert_allclose(rig.truth, record.truth[301], atol=1e-12)
+    assert swing_ups.row("rotary_pendulum", [first])[1] == "1 of 1"

@@ -17,6 +17,7 @@ import numpy as np
 from undertow.base import InvalidInputError, UndertowError
 from undertow.cascade.swing_up.law import SwingUp, periods
 from undertow.closed_loop import ClosedLoop
+from undertow.estimators import Estimator, KalmanFilter
 from undertow.law import InnerLoop, ProvedSet, ReachingLaw, Surface, first_surface
 from undertow.models import FloatArray, Mechanism, linearise
 from undertow.objective import MinimumTime, state_box
@@ -202,10 +203,17 @@ class SwingUpAndCatch:
     lost: float = math.radians(60.0)
     events: list[tuple[float, str]] = field(default_factory=list)
     _law: InnerLoop | None = None
+    _learning: KalmanFilter | None = None
     _offset: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
     _next: float = 0.0
     _since: float | None = None
     _choice: int = 0
+
+    def listen(self, estimator: Estimator) -> None:
+        """Balance with the parameters that an estimator learns, if it is for the same mechanism."""
+        if isinstance(estimator, KalmanFilter) and estimator.belief is not None:
+            same = estimator.mechanism.fingerprint == self.region.mechanism.fingerprint
+            self._learning = estimator if same else None
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x), (1,)."""
@@ -213,7 +221,7 @@ class SwingUpAndCatch:
         if self._law is not None:
             home = x - self._offset
             if np.abs(home[m:n]).max() <= self.lost:
-                return self._law(home)
+                return self._balanced(home)
             self._law, self._since = None, None
             self.events.append((t, "lost"))
         if self._since is None:
@@ -228,8 +236,15 @@ class SwingUpAndCatch:
                 self._law = InnerLoop(self.region.mechanism, surface, self.region.reaching)
                 self._offset = offset
                 self.events.append((t, "catch"))
-                return self._law(x - offset)
+                return self._balanced(x - offset)
         return self.swing(x, self._choice)
+
+    def _balanced(self, home: FloatArray) -> FloatArray:
+        """Return the input of the law, with what has been learnt by now, (1,)."""
+        assert self._law is not None  # it was asked for
+        if self._learning is not None:
+            self._law.parameters[:] = self._learning.parameters
+        return self._law(home)
 
     def worth_asking(self, x: FloatArray) -> bool:
         """Whether a catch from x is worth the rollouts that answer it: a cheap test."""

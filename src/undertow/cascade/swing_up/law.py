@@ -10,6 +10,11 @@ Fantoni and Lozano's (*Non-linear Control for Underactuated Mechanical Systems*,
 where Ẽ + k_D/S > 0; with a clipped input, small gains k_D swing up by bang-bang instead and
 no proof is left: gains are found by search (``search.py``).  The surplus, which the books
 leave at zero, pays for what friction takes on the way to the top.
+
+Then (4) drives q_a home before what hangs from it has its energy: a second link stays hanging
+where it is heavy or rubs.  −k_E Ẽ M_au q̇_u more, inside the brackets, accelerates q_a as
+Spong's pumping does (*IEEE Control Systems* 15(1), 1995): while energy is missing, so that what
+is not driven gains it.
 """
 
 from __future__ import annotations
@@ -34,8 +39,8 @@ from undertow.symbolic import (
     generated,
 )
 
-#: While the kinetic energy is below this part of what is missing, the law pushes: at rest
-#: its formula gives nothing.
+#: While the kinetic energy is below this part of what is missing, the law pushes the way the joint
+#: moves, or inwards: at rest its formula gives nothing.
 STILL = 0.002
 #: How hard it pushes, part of the input's limit.
 KICK = 0.3
@@ -44,15 +49,17 @@ _BODY = f"""
 {COMPILED}
 def swing(x, gains, parameters, limit, middle, work):
     energies(x, parameters, work[0:2])
-    blocks(x, parameters, work[2:5])
+    blocks(x, parameters, work[2:6])
     kinetic, S, h, B = work[0], work[2], work[3], work[4]
     missing = work[1] - gains[3]
     n = x.shape[0] // 2
     away = x[0] - middle
     if kinetic < {STILL} * abs(missing - kinetic):
-        return {KICK} * limit * (-1.0 if away * B > 0.0 else 1.0)
+        along = x[n] if x[n] != 0.0 else -away
+        return {KICK} * limit * (-1.0 if along * B < 0.0 else 1.0)
     weight = max(missing + gains[0] / S, 1e-9)
-    force = -(gains[1] * away + gains[2] * x[n] + gains[0] * h / S) / weight
+    pump = gains[4] * missing * work[5]
+    force = -(gains[1] * away + gains[2] * x[n] + gains[0] * h / S - pump) / weight
     return max(-limit, min(limit, force / B))
 """
 
@@ -60,8 +67,8 @@ def swing(x, gains, parameters, limit, middle, work):
 def swing_source(mechanism: Mechanism) -> str:
     """Return compiled ``swing(x, gains, parameters, limit, middle, work)``, as source.
 
-    It gives the input, within its limit, for k_D, k_P, k_V and the surplus, about q_a =
-    ``middle``; ``work`` holds five numbers.
+    It gives the input, within its limit, for k_D, k_P, k_V, the surplus and k_E, about q_a =
+    ``middle``; ``work`` holds six numbers.
     """
     tape = Tape()
     part = mechanism.partition(tape)
@@ -71,7 +78,8 @@ def swing_source(mechanism: Mechanism) -> str:
     at_target = mechanism.potential.subs(dict.fromkeys(mechanism.q, 0))
     energies = tape.let_all([kinetic, kinetic + mechanism.potential - at_target])
     given = {"x": mechanism.x, "parameters": mechanism.parameter_symbols}
-    blocks = [part.S[0, 0], part.h[0], part.B[0, 0]]
+    coupling = (sp.Matrix(mechanism.mass_matrix)[:1, 1:] * velocities[1:, :])[0]
+    blocks = [part.S[0, 0], part.h[0], part.B[0, 0], tape.let_all([coupling])[0]]
     return "\n\n".join(
         [
             function_source("energies", tape, given, {"E": energies}),
@@ -123,13 +131,15 @@ def hanging(mechanism: Mechanism) -> FloatArray:
 class Gains:
     """k_D, k_P and k_V of the swing-up, in SI units, relative to a gain of 1 on the energy.
 
-    ``surplus`` is what it aims at above the energy of the target, J.
+    ``surplus`` is what it aims at above the energy of the target, J; ``on_coupling`` is k_E, which
+    pumps energy into what is not driven.
     """
 
     on_acceleration: float
     on_position: float
     on_velocity: float
     surplus: float = 0.0
+    on_coupling: float = 0.0
 
 
 def periods(mechanism: Mechanism) -> FloatArray:
@@ -162,7 +172,7 @@ class SwingUp:
 
     mechanism: Mechanism
     gains: tuple[Gains, ...]
-    _work: FloatArray = field(default_factory=lambda: np.zeros(5), repr=False)
+    _work: FloatArray = field(default_factory=lambda: np.zeros(6), repr=False)
 
     def __post_init__(self) -> None:
         """Refuse several inputs, no potential, no limit."""

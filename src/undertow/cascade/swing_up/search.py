@@ -3,10 +3,14 @@
 From rest a swing-up is chaotic: a change in the last bit of a state, or a plant off by one
 per cent, sends it past the target on the other side.  What one swing on the model says of
 gains is therefore chance, and the gains that are quickest there may fail on a bench.  Here
-gains are judged by the average of many swings, on benches of usual quality: parameters, dry
+gains are judged by the average of many swings: plants drawn within a standard deviation of the
+model's parameters (0.58 of their tolerances, or of the usual ones where they have none), dry
 friction and the hand that lets go differ from swing to swing, and some begin where a mechanism
-that was thrown out may be.  The gains that are taken are judged once more, by swings that the
-search has not seen.
+that was thrown out may be.
+
+No gains suit all plants.  A swing-up that has not led to a catch goes on with the next ones, so
+these are searched for on the swings that the ones before have not brought up, from where those
+have left them.  All are judged once more, in turn, by swings that the search has not seen.
 """
 
 from __future__ import annotations
@@ -14,16 +18,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from undertow.base import InfeasibleError
 from undertow.cascade.swing_up.catch import unclipped
 from undertow.cascade.swing_up.law import Gains, SwingUp, hanging, periods, swing_source
+from undertow.estimators.belief import EVEN, Belief
 from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import CMAES
 from undertow.plants.bench import plausible_rig
@@ -52,15 +58,14 @@ DRAG, ANYWHERE = 0.03, 0.25
 #: tried whether it comes home, clipped, every so many steps, within so long, s.
 REACH, EVERY, HOME = 4.0, 5, 3.0
 
-#: Random gains and the swings that each is tried on; those that are tried on all swings; those
-#: that are refined, for so many generations; swings that judge what is taken.
-RANDOM, FEW, GOOD, STARTS, GENERATIONS, SWINGS, FRESH = 2000, 4, 60, 4, 24, 32, 128
+#: Random gains and the swings that each is tried on; those that are tried on all swings; so many
+#: generations refine the best.  Gains that are found, one after the other; swings of which those
+#: that are left are searched for; swings that judge what is taken.
+RANDOM, FEW, GOOD, GENERATIONS, SWINGS = 2000, 4, 60, 24, 48
+TURNS, LOOKED, FRESH = 6, 1024, 512
 
-#: Where gains lie, decades about their scales: k_D, k_P, k_V, surplus.
-DECADES = np.array([[-2.5, 1.5], [-2.5, 1.5], [-2.5, 1.5], [-3.0, -0.3]])
-
-#: Gains are kept to be tried in turn while they need less than this times the best one's time.
-WORSE = 2.5
+#: Where gains lie, decades about their scales: k_D, k_P, k_V, surplus, k_E.
+DECADES = np.array([[-2.5, 1.5], [-2.5, 1.5], [-2.5, 1.5], [-3.0, -0.3], [-2.5, 1.5]])
 
 _BODY = f"""
 {COMPILED}
@@ -85,11 +90,12 @@ def distance(x, P):
 
 
 {COMPILED}
-def attempt(x0, gains, belief, plant, drag, limit, stops, P, level, k, wraps, seconds, h, out):
+def attempt(x, gains, belief, plant, drag, limit, stops, P, level, k, wraps, seconds, h, out):
     # Time from which the regulator brings it home, infinite where there is none; least xᵀPx/level.
-    n = x0.shape[0] // 2
-    x, near, stages = x0.copy(), x0.copy(), np.zeros((3, 2 * n))
-    viscous, u, work = np.zeros(n), np.zeros(1), np.zeros(5)
+    # It leaves x where it ended; where it met a stop, as it was.
+    n = x.shape[0] // 2
+    x0, near, stages = x.copy(), x.copy(), np.zeros((3, 2 * n))
+    viscous, u, work = np.zeros(n), np.zeros(1), np.zeros(6)
     out[0], out[1] = math.inf, math.inf
     wait = 0
     for step in range(int(seconds / h)):
@@ -97,6 +103,7 @@ def attempt(x0, gains, belief, plant, drag, limit, stops, P, level, k, wraps, se
         gain = work[4]
         if not advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
             out[1] = math.inf
+            x[:] = x0
             return
         for i in range(n):
             turn = wraps[i]
@@ -155,9 +162,10 @@ class RatedGains:
     Attributes
     ----------
     gains
-        k_D, k_P, k_V, surplus.
+        k_D, k_P, k_V, surplus, k_E.
     arrives
-        Part of the swings that came near the target in time.
+        Part of the swings that came near the target in time, of those that the gains before
+        had not brought there, or of ``SWINGS`` where fewer were left.
     expected
         Time until one does, s, when such swings follow one another.
     """
@@ -167,11 +175,30 @@ class RatedGains:
     expected: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Swings: where they begin, (N, 2n), the plants' parameters, (N, P), dry friction, (N,)."""
+
+    starts: FloatArray
+    plants: FloatArray
+    drags: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.drags)
+
+    def __getitem__(self, rows: slice | NDArray[np.intp]) -> _Batch:
+        return _Batch(self.starts[rows], self.plants[rows], self.drags[rows])
+
+
 class _Swings:
     """Swings on benches of usual quality, drawn one after the other from a seed."""
 
     def __init__(self, mechanism: Mechanism, seed: int) -> None:
-        self.mechanism, self.bench, self.seed = mechanism, plausible_rig(mechanism), seed
+        self.mechanism, self.seed = mechanism, seed
+        values = {p.name: abs(p.value) for p in mechanism.parameters}
+        known = Belief.usual(mechanism).tolerances
+        parts = {name: EVEN * tolerance / values[name] for name, tolerance in known.items()}
+        self.bench = replace(plausible_rig(mechanism), tolerance=parts)
         self.low, n = hanging(mechanism), mechanism.n
         self.P, self.level, self.k = unclipped(mechanism)
         self.wraps = periods(mechanism)
@@ -179,18 +206,13 @@ class _Swings:
         self.missing = float(mechanism.energy(np.zeros(2 * n)) - mechanism.energy(self.low))
         self._module, self._limit = _module(mechanism), mechanism.inputs[0].limit
         self._belief = mechanism.parameter_values
-        self._starts: list[FloatArray] = []
-        self._plants: list[FloatArray] = []
-        self._drags: list[float] = []
 
-    def _draw(self) -> None:
-        rng = np.random.default_rng([self.seed, len(self._drags)])
+    def _draw(self, number: int) -> tuple[FloatArray, FloatArray, float]:
+        rng = np.random.default_rng([self.seed, number])
         plant = self.bench.drawn(rng)
         anywhere = rng.uniform() < ANYWHERE
         start = self._anywhere(rng) if anywhere else self.bench.released(self.low, rng)
-        self._starts.append(start)
-        self._plants.append(plant.parameter_values)
-        self._drags.append(rng.uniform(0.0, DRAG))
+        return start, plant.parameter_values, rng.uniform(0.0, DRAG)
 
     def _anywhere(self, rng: np.random.Generator) -> FloatArray:
         """Return a state with no more than half the missing energy above the target's, (2n,)."""
@@ -203,18 +225,34 @@ class _Swings:
         x[n:] *= math.sqrt(max(spare, 0.0) * rng.uniform() / kinetic)
         return x
 
-    def __call__(self, gains: FloatArray, first: int, last: int) -> FloatArray:
-        """Return times and nearest distances of some of the swings, (N, 2)."""
-        while len(self._drags) < last:
-            self._draw()
-        some = slice(first, last)
-        out = np.empty((last - first, 2))
+    def drawn(self, first: int, last: int) -> _Batch:
+        """Return some of the swings."""
+        starts, plants, drags = zip(*(self._draw(k) for k in range(first, last)), strict=True)
+        return _Batch(np.array(starts), np.array(plants), np.array(drags))
+
+    def __call__(self, gains: FloatArray, batch: _Batch) -> tuple[FloatArray, FloatArray]:
+        """Return times and nearest distances, (N, 2), and where swings have got to, (N, 2n)."""
+        out, states = np.empty((len(batch), 2)), batch.starts.copy()
         self._module.attempts(
-            np.array(self._starts[some]), gains, self._belief, np.array(self._plants[some]),
-            np.array(self._drags[some]), self._limit, self.stops, self.P, self.level,
-            self.k, self.wraps, SECONDS, STEP, out,
+            states, gains, self._belief, batch.plants, batch.drags, self._limit, self.stops,
+            self.P, self.level, self.k, self.wraps, SECONDS, STEP, out,
         )  # fmt: skip
-        return out
+        return out, states
+
+    def left(self, found: Sequence[FloatArray], batch: _Batch) -> tuple[_Batch, int]:
+        """Return what the next gains meet after those that were found, and how many are left.
+
+        First those that none has brought up, from where they have been left, then the others
+        from their starts.
+        """
+        rest, starts = np.arange(len(batch)), batch.starts.copy()
+        for gains in found:
+            if len(rest):
+                ends, starts[rest] = self(gains, replace(batch, starts=starts)[rest])
+                rest = rest[np.isinf(ends[:, 0])]
+        others = np.setdiff1d(np.arange(len(batch)), rest)
+        starts[others] = batch.starts[others]
+        return replace(batch, starts=starts)[np.concatenate([rest, others])], len(rest)
 
 
 def _merit(ends: FloatArray) -> float:
@@ -236,6 +274,15 @@ def _judged(row: FloatArray, ends: FloatArray) -> RatedGains:
     return RatedGains(Gains(*(float(v) for v in row)), part, expected)
 
 
+def _in_turn(swings: _Swings, rows: Sequence[FloatArray], batch: _Batch) -> list[RatedGains]:
+    """Return gains with what swings say of them that come to each after those before."""
+    found = []
+    for k, row in enumerate(rows):
+        meets, count = swings.left(rows[:k], batch)
+        found.append(_judged(row, swings(row, meets[: max(count, SWINGS)])[0]))
+    return found
+
+
 def search(
     mechanism: Mechanism,
     seed: int = 0,
@@ -243,8 +290,9 @@ def search(
 ) -> tuple[RatedGains, ...]:
     """Search for gains that swing a mechanism up, whatever is a little different.
 
-    Random gains are tried on a few swings, the best of them on more, and the best of those
-    are refined by CMA-ES.  Nothing that was found before is looked at.
+    Random gains are tried on a few swings, the best of them on more, and the best one is refined
+    by CMA-ES; then the same on the swings that it has not brought up, from where it has left
+    them, and so on.  Nothing that was found before is looked at.
 
     Parameters
     ----------
@@ -258,7 +306,7 @@ def search(
     Returns
     -------
     tuple of RatedGains
-        The best first; empty where nothing arrives.
+        In the order in which they are to be tried; empty where nothing arrives.
 
     Raises
     ------
@@ -267,26 +315,27 @@ def search(
     """
     SwingUp(mechanism, (Gains(1.0, 1.0, 1.0),))  # refuses what the formula does not cover
     swings, rng = _Swings(mechanism, seed), np.random.default_rng(seed)
-    inertia = float(mechanism.M(swings.low[: mechanism.n])[0, 0])
-    scale = swings.missing * np.array([inertia, 1.0, 0.1, 1.0])
-    rows = 10.0 ** rng.uniform(DECADES[:, 0], DECADES[:, 1], (RANDOM, 4)) * scale
+    inertia, missing = float(mechanism.M(swings.low[: mechanism.n])[0, 0]), swings.missing
+    pump = 1.0 / (missing * math.sqrt(missing * inertia))
+    scale = missing * np.array([inertia, 1.0, 0.1, 1.0, pump])
+    seen, fresh = swings.drawn(0, LOOKED), swings.drawn(LOOKED, LOOKED + FRESH)
+    found: list[FloatArray] = []
+    for number in range(TURNS):
+        batch = swings.left(found, seen)[0][:SWINGS]
 
-    def merits(some: FloatArray, last: int) -> FloatArray:
-        return np.array([_merit(swings(row, 0, last)) for row in some])
+        def merits(some: FloatArray, batch: _Batch = batch) -> FloatArray:
+            return np.array([_merit(swings(row, batch)[0]) for row in some])
 
-    rows = rows[np.argsort(merits(rows, FEW), kind="stable")[:GOOD]]
-    rows = rows[np.argsort(merits(rows, SWINGS), kind="stable")[:STARTS]]
-    found = []
-    for number, row in enumerate(rows):
-        climb = CMAES(np.log(row), 0.3, 12, rng)
+        rows = 10.0 ** rng.uniform(DECADES[:, 0], DECADES[:, 1], (RANDOM, 5)) * scale
+        rows = rows[np.argsort(merits(rows, batch[:FEW]), kind="stable")[:GOOD]]
+        best = rows[np.argmin(merits(rows))]
+        climb = CMAES(np.log(best), 0.3, 12, rng)
         for generation in range(GENERATIONS):
-            progress((number + generation / GENERATIONS) / STARTS)
+            progress((number + generation / GENERATIONS) / TURNS)
             asked = climb.ask()
-            climb.tell(asked, merits(np.exp(asked), SWINGS))
-        best = np.exp(climb.best_x)
-        found.append(_judged(best, swings(best, SWINGS, SWINGS + FRESH)))
-    found.sort(key=lambda one: one.expected)
-    return tuple(one for one in found if one.arrives and one.expected <= WORSE * found[0].expected)
+            climb.tell(asked, merits(np.exp(asked)))
+        found.append(np.exp(climb.best_x))
+    return tuple(one for one in _in_turn(swings, found, fresh) if one.arrives)
 
 
 def designs_for(

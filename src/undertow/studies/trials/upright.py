@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +13,7 @@ from undertow.base import Progress, no_progress
 from undertow.cascade import Cascade
 from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
 from undertow.cascade.swing_up.search import RatedGains, designs_for
-from undertow.estimators import StateFeedback, compensated, run_recorded
+from undertow.estimators import Estimator, StateFeedback, compensated, run_recorded
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.optimiser import Budget
@@ -83,6 +84,75 @@ class SwingResult:
     stops: int
 
 
+@dataclass(frozen=True, eq=False)
+class SwingRun:
+    """One swing-up.
+
+    Attributes
+    ----------
+    outcome
+        The run, angles counted from the upright that it ended in.
+    catch
+        Time of the last catch, s; NaN for a run that did not end in one.
+    thrown
+        How often it was thrown out.
+    stop
+        Whether it hit an end stop.
+    """
+
+    outcome: Outcome
+    catch: float
+    thrown: int
+    stop: bool
+
+
+def swing_trial(
+    bench: Bench,
+    swing: SwingUp,
+    region: CatchRegion,
+    *,
+    seed: int = 0,
+    seconds: float = SWING_SECONDS,
+    estimator: Estimator | None = None,
+) -> SwingRun:
+    """Swing a mechanism up on a realistic rig, once, from hanging at rest.
+
+    Parameters
+    ----------
+    bench
+        The truth.
+    swing, region
+        The energy law and the catch, both with the controller's belief.
+    seed
+        Of the rig.
+    seconds
+        Length of the run, s.
+    estimator
+        See :func:`undertow.studies.trials.trial.trial`.
+    """
+    mechanism = region.mechanism
+    controller = SwingUpAndCatch(swing, region)
+    run = trial(
+        mechanism,
+        bench,
+        partial(_given, controller),
+        hanging(mechanism),
+        seconds,
+        seed,
+        estimator=estimator,
+        compensates=partial(getattr, controller, "balancing"),
+    )
+    truth = run.record.truth - controller.offset
+    edges = np.array([[c.low, c.high] for c in mechanism.coordinates])
+    positions = run.record.truth[:, : mechanism.n]
+    return SwingRun(
+        judge(mechanism, replace(run.record, truth=truth), seed),
+        controller.events[-1][0] if controller.balancing else math.nan,
+        sum(what == "lost" for _, what in controller.events),
+        bool(((positions <= edges[:, 0]) | (positions >= edges[:, 1])).any()),
+    )
+
+
 def swing_trials(
     mechanism: Mechanism,
     *,
@@ -111,29 +181,17 @@ def swing_trials(
     """
     bench = bench_of(mechanism) if bench is None else bench
     swing = designed(mechanism) if swing is None else swing
-    region = CatchRegion(mechanism)
-    outcomes, catches, thrown, stops = [], [], 0, 0
-    edges = np.array([[c.low, c.high] for c in mechanism.coordinates])
+    region, runs = CatchRegion(mechanism), []
     for seed in range(seeds):
         progress(seed / seeds)
-        controller = SwingUpAndCatch(swing, region)
-        run = trial(
-            mechanism,
-            bench,
-            partial(_given, controller),
-            hanging(mechanism),
-            seconds,
-            seed,
-            compensates=partial(getattr, controller, "balancing"),
-        )
-        truth = run.record.truth - controller.offset
-        outcomes.append(judge(mechanism, replace(run.record, truth=truth), seed))
-        caught = [t for t, what in controller.events if what == "catch"]
-        thrown += sum(what == "lost" for _, what in controller.events)
-        catches += caught[-1:] if controller.balancing else []
-        positions = run.record.truth[:, : mechanism.n]
-        stops += bool(((positions <= edges[:, 0]) | (positions >= edges[:, 1])).any())
-    return SwingResult(mechanism, outcomes, catches, thrown, stops)
+        runs.append(swing_trial(bench, swing, region, seed=seed, seconds=seconds))
+    return SwingResult(
+        mechanism,
+        [run.outcome for run in runs],
+        [run.catch for run in runs if math.isfinite(run.catch)],
+        sum(run.thrown for run in runs),
+        sum(run.stop for run in runs),
+    )
 
 
 @dataclass(frozen=True, eq=False)
