@@ -243,7 +243,7 @@ class SwingUpAndCatch:
         """Return the input of the law, with what has been learnt by now, (1,)."""
         assert self._law is not None  # it was asked for
         if self._learning is not None:
-            self._law.parameters[:] = self._learning.parameters
+            self._law.believe(self._learning.parameters, home)
         return self._law(home)
 
     def worth_asking(self, x: FloatArray) -> bool:
