@@ -8,7 +8,7 @@ within ±20, ±5, ±20, ±10 and ±50 % of the model's, everyone else's masses a
 
 States are exact, and inputs act at once, a thousand times a second.  With ``--rig`` the plant
 stands on a realistic bench: encoders, delay, jitter, dry friction, a Kalman filter that knows the
-model and what is usually uncertain of it.
+model and learns what is usually uncertain of it; the law balances with that.
 
 *Balanced* was home for the last second: what is not driven within 2°, what is driven within 20° or
 0.35 m.  *Caught* is the last hand-over to the law, *thrown out* how often one was lost again, in

@@ -149,6 +149,8 @@ def test_from_hanging_to_balanced_and_again_after_a_knock(
     assert controller.events[0][0] < 6.0
     assert "lost" in kinds
     assert kinds[-1] == "catch"
+    assert controller._law is not None  # it balances with what the filter has learnt
+    assert np.abs(controller._law.parameters - arm.parameter_values).max() > 0.0
     final = run.record.truth[-1000:] - controller.offset
     assert np.abs(final[:, 1]).max() < ut.deg(2)
     assert np.abs(run.record.u).max() <= 15.0

@@ -377,7 +377,8 @@ def designs_for(
             f"no gains found that swing up '{mechanism.name}'",
             value=f"inputs up to {mechanism.inputs[0].limit:g} {mechanism.inputs[0].unit}",
             limit=f"near the target within {SECONDS:g} s",
-            remedy="Give it a larger input limit",
+            remedy="Give it a larger input limit; one that needs longer than that, as a reaction "
+            "wheel does, is not searched for",
         )
     remember("swing_gains", key, json.dumps([asdict(one) for one in found]))
     return found
