@@ -74,7 +74,7 @@ def test_a_set_point_is_0_seen_from_elsewhere() -> None:
     rig = ut.mechanisms.rotary_pendulum()
     mass = next(p.value for p in rig.parameters if p.name == "m")
     plant = {0.0: rig.with_parameters(m=1.1 * mass), 0.31: rig.with_parameters(m=2 * mass)}
-    cascade = ut.Cascade(rig, ut.MinimumTime(horizon=6.0))
+    cascade = ut.Cascade(rig, ut.MinimumEnergy(horizon=3.0))
     x, away, seen = rig.state(phi=0.5), rig.state(theta=2.0), []
     here = cascade.simulate(x, plant=plant)
     there = cascade.simulate(
@@ -82,8 +82,8 @@ def test_a_set_point_is_0_seen_from_elsewhere() -> None:
     )
     assert 0.31 in np.round(seen, 9)
     assert there.reached
-    assert there.time == pytest.approx(here.time, rel=0.02)
-    assert there.cost == pytest.approx(there.time)
+    assert there.time == pytest.approx(here.time, rel=1e-3)
+    assert there.cost == pytest.approx(here.cost, rel=1e-4)
     assert np.linalg.norm(there.trajectory.x[-1] - away) == pytest.approx(0.01, rel=1e-3)
     late = np.array([update.t for update in there.updates]) % cascade.period
     assert (np.minimum(late, cascade.period - late) > 1e-6).any()

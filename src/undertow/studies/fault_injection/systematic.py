@@ -232,7 +232,7 @@ class Systematic:
         for rig, recipe in self.recipes.items():
             recipe.precompile(self.memory)
             vars(recipe)["first"] = lambda: self.memory  # a session finds it done
-            vars(recipe)["precompile"] = lambda memory: None
+            vars(recipe)["precompile"] = lambda memory, jumps=False: None
             self._tallied(rig, live=False)  # compiles the rest
         self.counts: dict[str, dict[str, int]] = {}
 
