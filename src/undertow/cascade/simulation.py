@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from undertow.base import InvalidInputError, Verdict, checked, positive, write_file
+from undertow.cascade.gate import Admission
 from undertow.cascade.targets import legs_of
 from undertow.closed_loop import ClosedLoop, Event, Trajectory, simulate_along
 from undertow.estimators import ParameterEstimate
@@ -28,7 +29,7 @@ from undertow.models import FloatArray, Mechanism, number_of
 from undertow.optimiser import Proposal
 
 if TYPE_CHECKING:
-    from undertow.cascade.cascade import Admission, Cascade, CascadeState
+    from undertow.cascade.cascade import Cascade, CascadeState
     from undertow.closed_loop.figures import MotionFigure
     from undertow.display.sketches import Sketch
 
