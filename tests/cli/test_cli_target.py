@@ -64,7 +64,7 @@ def test_what_is_typed_reaches_the_run_and_what_it_says_the_person(tmp_path: Pat
         assert "a number with its unit, m. Write for instance x=1m" in err
     code, out, err = run("target", str(log), "x=0.25m")
     assert (code, out) == (1, "")
-    assert "it has ended" in err
+    assert "no such log" in err
     assert "--log run.db" in err
 
 

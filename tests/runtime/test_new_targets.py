@@ -393,7 +393,10 @@ def test_who_says_nothing_keeps_others_waiting_for_a_while_alone(
 def test_nobody_who_listens_is_said_in_one_line(tmp_path: Path) -> None:
     """Ended, killed, or something else of that name."""
     log = tmp_path / "run.db"
-    with pytest.raises(ArtefactError, match="it has ended, has not begun, or is in simulated"):
+    with pytest.raises(ArtefactError, match="no such log"):
+        send_target(log, {"x": 0.1})
+    log.touch()
+    with pytest.raises(ArtefactError, match="one that has ended, has not begun, or is"):
         send_target(log, {"x": 0.1})
     with socket.socket() as door:
         door.bind(("127.0.0.1", 0))

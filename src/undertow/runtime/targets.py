@@ -345,7 +345,9 @@ def _asked(log: Path, request: Mapping[str, object]) -> RunTarget:
         )
 
     if not os.path.lexists(path):
-        raise silent("it has ended, has not begun, or is in simulated time")
+        if not os.path.lexists(log):
+            raise silent("no such log")
+        raise silent("one that has ended, has not begun, or is in simulated time")
     try:
         address = parse_json(read_file(path, "address of a run", most=1 << 10))
         port, token = address["port"], address["token"]
