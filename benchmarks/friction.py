@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from harness import command_line, need, table  # isort: skip  first: one thread
 
-import csv
 import math
 import os
 from dataclasses import dataclass, replace
@@ -48,9 +47,9 @@ from plants import (
     belief,
     cascade,
     drawn,
-    every,
     first_optimum,
     model,
+    studied,
 )
 from undertow.base import UndertowError
 from undertow.cascade.simulation import LEARNING, is_news
@@ -287,17 +286,6 @@ def shown(task: Task, here: list[Outcome], what: str) -> None:
     table(title, header, [row(group) for group in groups if group])
 
 
-def written(found: list[Outcome], path: Path) -> None:
-    """Write every outcome to a CSV file."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        fields = [name for name in Outcome.__dataclass_fields__ if name != "task"]
-        writer.writerow(["objective", "start", *fields])
-        for one in found:
-            first = [one.task.objective, state_words(one.task.rig, one.task.x0)]
-            writer.writerow([*first, *(getattr(one, field) for field in fields)])
-
-
 def main() -> int:
     """Run the study and print its tables."""
     parser = command_line(
@@ -341,17 +329,10 @@ def main() -> int:
         delay=asked.delay, drift=asked.drift, bounds=not asked.no_bounds,
     )  # fmt: skip
     jobs = [(task, k) for task in tasks for k in range(plants)]
-    found: list[Any] = []
     what = f"{plants} plants, seed {asked.seed}, friction to {asked.friction:g} N m, "
     what += f"delay to {1e3 * asked.delay:g} ms"
     what += "" if asked.drift is None else f", drift {asked.drift:g} V/√s"
-    for index, some in enumerate(every(jobs, run, asked.workers), 1):
-        found += some
-        if asked.out:
-            written(found, asked.out)
-        if index % plants == 0:
-            task = jobs[index - 1][0]
-            shown(task, [one for one in found if one.task == task], what)
+    studied(jobs, run, asked.workers, asked.out, partial(shown, what=what))
     return 0
 
 

@@ -348,17 +348,31 @@ def uncertain(names: list[str]) -> None:
     table("what is uncertain", ["", "n, m", "members", "parameters"], rows)
 
 
-def written(found: list[Outcome], path: Path) -> None:
-    """Write every outcome to a CSV file."""
+def written(found: list[Any], path: Path) -> None:
+    """Write every outcome to a CSV file: its task, and its other fields."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        fields = ["mechanism", "objective", "start"]
-        fields += [name for name in Outcome.__dataclass_fields__ if name != "task"]
-        writer.writerow(fields)
+        fields = [name for name in found[0].__dataclass_fields__ if name != "task"]
+        writer.writerow(["mechanism", "objective", "start", *fields])
         for one in found:
             task = one.task
             first = [task.mechanism, task.objective, state_words(task.rig, task.x0)]
-            writer.writerow([*first, *(getattr(one, field) for field in fields[3:])])
+            writer.writerow([*first, *(getattr(one, field) for field in fields)])
+
+
+def studied(
+    jobs: list[Job], run: Callable[[Job], list[Any]], workers: int, out: Path | None,
+    tell: Callable[[Task, list[Any]], None],
+) -> None:  # fmt: skip
+    """Run all jobs, keep their outcomes in a file, and tell of each task when it is done."""
+    found: list[Any] = []
+    for index, some in enumerate(every(jobs, run, workers), 1):
+        found += some
+        if out:
+            written(found, out)
+        task = jobs[index - 1][0]
+        if index == len(jobs) or jobs[index][0] != task:
+            tell(task, [one for one in found if one.task == task])
 
 
 def main() -> int:
@@ -418,14 +432,7 @@ def main() -> int:
     uncertain(names)
     jobs = [(task, k) for task in tasks for k in range(plants)]
     run = partial(outcomes, controllers=controllers, seed=asked.seed, bounds=asked.bounds)
-    found: list[Outcome] = []
-    for index, some in enumerate(every(jobs, run, asked.workers), 1):
-        found += some
-        if asked.out:
-            written(found, asked.out)
-        if index % plants == 0:
-            task = jobs[index - 1][0]
-            shown(task, [one for one in found if one.task == task], f"seed {asked.seed}")
+    studied(jobs, run, asked.workers, asked.out, partial(shown, seed=f"seed {asked.seed}"))
     return 0
 
 

@@ -111,7 +111,7 @@ def test_a_swing_up_with_set_points_catches_at_0_and_goes_there(tmp_path: Path) 
     )  # fmt: skip
     log = tmp_path / "run.db"
     with session(recipe, log=log, simulated=True) as runtime:
-        report = runtime.run(12.0)
+        report = runtime.run(16.0)
     assert report.verdict.ending == "balanced"
     texts = [text for _, text in of_target(report)]
     assert texts == ["jumps, asked for at 0 s", "jumps, asked for at 6 s"]
@@ -119,7 +119,8 @@ def test_a_swing_up_with_set_points_catches_at_0_and_goes_there(tmp_path: Path) 
     assert of_target(report)[0][0] > balanced
     again = ut.replay(log)
     assert again.identical
-    assert abs(again.recording["theta"][-1] + 0.3) < 0.2
+    late = again.recording["t"] > 12.0  # friction keeps it wandering about there
+    assert abs(again.recording["theta"][late].mean() + 0.3) < 0.15
 
 
 def test_thrown_out_the_target_is_asked_for_again() -> None:

@@ -163,7 +163,7 @@ class Controller:
         self._learning: KalmanFilter | None = None
         if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
             self._learning = estimator
-        self._bears = InnerLoop(mechanism, memory.surface, cascade.reaching)
+            self._bears = InnerLoop(mechanism, memory.surface, cascade.reaching)
         self.u: FloatArray = fast["output"]
         self.x, self.wrapped, self.s = fast["x"], fast["wrapped"], fast["s"]
         self.demand, self.margin = fast["demand"], fast["margin"]
