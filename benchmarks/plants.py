@@ -6,9 +6,10 @@ mass, half length, inertia, motor and damping (d_e = 0.073) are drawn evenly wit
 ±3 %, damping within ±50 %, told apart by their units.  Plant number k of a seed is always the same
 one.  States are exact; every controller meets the same plants and knows the model alone.
 
-*kept* is the optimum for the model from the start, kept to the end; *exact* the cascade that takes
-its model for the plant; *belief* the cascade with a belief: an ensemble of what is plausible,
-learnt as it goes, every 20 ms.  Their law acts continuously.
+*kept* is the optimum for the model from the start, small errors of state and surface allowed for,
+kept to the end; *exact* the cascade that takes its model for the plant; *belief* the cascade with a
+belief: an ensemble of what is plausible, learnt as it goes, every 20 ms; *free* the same that may
+choose the reaching law, too.  Their law acts continuously.
 
 *lqr* is clipped linear-quadratic feedback, continuous too, the best on the model of 39 weights,
 by hindsight.  *predictive* plans anew a hundred times a second and holds its input in between: for
@@ -75,7 +76,7 @@ LARGER = {
 }
 OBJECTIVES = {"energy": ut.MinimumEnergy(horizon=10.0), "time": ut.MinimumTime(horizon=6.0)}
 RADIUS = 0.01
-OURS = ("kept", "exact", "belief")
+OURS = ("kept", "exact", "belief", "free")
 PEERS = ("lqr", "predictive", "learnt", "scenario")
 CONTROLLERS = (*OURS, *PEERS, "acados")
 #: Of the travel, what predictive control plans with; how far it lets angles lean that it does not
@@ -181,15 +182,16 @@ def box(name: str, travel: float, lean: float) -> Box:
 def cascade(name: str, objective: str, controller: str) -> ut.Cascade:
     """Return a cascade; one for each process."""
     rig, aim = model(name), OBJECTIVES[objective]
-    if controller == "belief":
-        return ut.Cascade(rig, aim, belief=belief(name))
+    if controller in ("belief", "free"):
+        freedom = ut.DecisionVariables(reaching=controller == "free")
+        return ut.Cascade(rig, aim, belief=belief(name), freedom=freedom)
     return ut.Cascade(rig, aim, belief="exact")
 
 
 @cache
 def first_optimum(task: Task) -> ut.Surface:
-    """Return the surface that is best for the model from the start."""
-    memory, _ = cascade(task.mechanism, task.objective, "exact").start(task.x0)
+    """Return the first surface of the cascade with a belief."""
+    memory, _ = cascade(task.mechanism, task.objective, "belief").start(task.x0)
     return memory.plan.surfaces[0]
 
 

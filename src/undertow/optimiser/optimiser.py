@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import at_least, check_fields, checked
+from undertow.base import UndertowError, at_least, check_fields, checked
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, Surface, check_surface, first_surface
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
 from undertow.optimiser.search_space import DecisionVariables, SearchSpace
 from undertow.optimiser.task import Optimisation
+
+#: Quadratic designs that a global search begins with.
+DESIGNS = 64
 
 
 class Planner(Protocol):
@@ -80,8 +86,8 @@ class Optimiser:
     def on(self, loop: ClosedLoop) -> Optimiser:
         """Return this optimiser for a loop of the same structure, with the same first surface."""
         other = object.__new__(type(self))
-        kept = {k: v for k, v in vars(self).items() if k not in ("space", "shoots")}
-        other.__dict__.update(kept, loop=loop, anchor=self.anchor)
+        kept = {k: v for k, v in vars(self).items() if k not in ("space", "aims")}
+        other.__dict__.update(kept, loop=loop, anchor=self.anchor, designs=self.designs)
         return other
 
     @cached_property
@@ -103,19 +109,29 @@ class Optimiser:
         return end.stage.rest > 0 and not end.counts_cost
 
     @cached_property
-    def shoots(self) -> bool:
-        """Whether this is a minimum-time task with enough parameters to aim with, at one plant."""
-        enough = self.space.size >= 2 * self.loop.mechanism.n
-        return self.counts_time and enough and self.loop.ensemble is None
+    def aims(self) -> bool:
+        """Whether this is a minimum-time task with enough parameters to aim with."""
+        return self.counts_time and self.space.size >= 2 * self.loop.mechanism.n
+
+    @cached_property
+    def designs(self) -> tuple[Surface, ...]:
+        """The first surface, and quadratic designs of random weights: all locally stable."""
+        mechanism, rng = self.loop.mechanism, np.random.default_rng(self.seed)
+        found = [self.anchor]
+        for weights in 10 ** rng.uniform(-2, 2, (DESIGNS, 2 * mechanism.n)):
+            with contextlib.suppress(UndertowError):
+                found.append(first_surface(mechanism, list(weights)))
+        return tuple(found)
 
     def _budget(self, warm: bool) -> Budget:
         given = self.warm if warm else self.cold
         if given is not None:
             return given
-        if self.shoots:
-            return Budget(40_000 if warm else 800_000)
+        size = self.space.size
         if warm:
-            return Budget(576 if self.counts_time else 1024)
+            return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
+        if self.counts_time:
+            return Budget(6144 * size)
         # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
         n, m = self.loop.mechanism.n, self.loop.mechanism.m
         return Budget(1024 * (2 * m * n - m * m) ** 2 // 3)
@@ -158,27 +174,44 @@ class Optimiser:
         at_least("sequence of a proposal", sequence, 0)
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
-        early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
-        task = Optimisation(
-            self,
-            self.loop.mechanism.check_state(x),
-            longest * early,
-            budget or self._budget(warm),
-            resolution=resolution,
-            sequence=sequence,
-            warm=warm,
-        )
+        task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
         if incumbent is None:
-            converged = task.global_search()
+            *_, converged = task.global_search()
         elif self.counts_time:
             converged = task.search_earlier(Plan.of(incumbent))
         else:
             converged = task.local_search(Plan.of(incumbent))
-        if self.shoots:
-            converged = task.shoot()
         if warm and self.loop.ensemble is not None:
             task.fall_back()
         return task.answer(converged, computed_for)
+
+    @checked
+    def improve(self, x: ArrayLike, *, budget: Budget | None = None) -> Iterator[Proposal]:
+        """Optimise the plan from the state x from cold: one answer soon, and better ones later.
+
+        The first one is the best of some designs, improved; the last one is what :meth:`propose`
+        returns, without its margins.  Until the next one is asked for, nothing is computed.
+
+        Parameters
+        ----------
+        x
+            State, (2n,).
+        budget
+            Overrides ``cold``, for all answers together.
+        """
+        longest = self.loop.objective.horizon
+        task = self._task(x, longest, budget or self._budget(False), 0.0, 0, False)
+        return (task.answer(done, 0.0, judged=False) for done in task.global_search())
+
+    def _task(
+        self, x: ArrayLike, horizon: float, budget: Budget, resolution: float, sequence: int,
+        warm: bool,
+    ) -> Optimisation:  # fmt: skip
+        early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
+        return Optimisation(
+            self, self.loop.mechanism.check_state(x), horizon * early, budget,
+            resolution=resolution, sequence=sequence, warm=warm,
+        )  # fmt: skip
 
     @checked
     def require(self, x: ArrayLike) -> Proposal:

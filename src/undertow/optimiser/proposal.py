@@ -61,8 +61,8 @@ class Proposal:
         Predicted cost of keeping the old surface; ``inf`` at the first optimisation.
     margins
         Signed margins of the surface and of its predicted motion, ≥ 0 is satisfied.  A
-        re-optimisation that found a plan leaves them out: its gate judges for itself, and
-        :func:`motion_margins` tells them.
+        re-optimisation that found a plan leaves them out, and so do the answers of
+        :meth:`Optimiser.improve`: a gate judges for itself, and :func:`motion_margins` tells them.
     evaluations, seconds
         What it took.
     sequence

@@ -2,26 +2,28 @@
 
 A population search over the coordinates of :mod:`undertow.optimiser.search_space`.  Unstable
 surfaces are not rolled out; inadmissible motions get a graded penalty, see
-:meth:`undertow.closed_loop.trajectory.Batch.score`.  Minimum time with at least 2n free parameters
-is left to :mod:`undertow.optimiser.shooting` in the end.
+:meth:`undertow.closed_loop.trajectory.Batch.score`.  A global search first improves the best of
+some quadratic designs, which is an answer already, and then looks elsewhere: for a smooth cost by
+descents from the best of many draws, for the time of arrival by
+:mod:`undertow.optimiser.arrival`.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.base import UndertowError
 from undertow.closed_loop import INADMISSIBLE, LANES, UNSTABLE, Event, RolloutBuffers
-from undertow.law import Margin, Plan, first_surface, stability_margin
+from undertow.law import Margin, Plan, stability_margin
 from undertow.models import FloatArray
+from undertow.optimiser.arrival import SHORTER, Approach, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
-from undertow.optimiser.shooting import Shooting
 from undertow.optimiser.trust_region import TrustRegion
 from undertow.symbolic import numba
 
@@ -59,8 +61,20 @@ PATIENCE, GAIN = 8, 3e-3
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
 
-#: Stands for a final state of a motion that broke off.
-MISSED = 1e3
+#: Evaluations at most that improve a plan along its ridge: of a first answer, and where searches
+#: for an earlier arrival lead nowhere.
+POLISH = 512
+
+#: A search for arrivals far and wide: its members, draws for each of them, the spread of these, and
+#: the first window as a part of the best time: what arrives late may lead to what arrives early.
+CROWD, DRAWS, WIDE, WINDOW = 96, 16, 1.5, 2.0
+
+#: The same around the best plan: the spread is between two powers of ten; and how many of these
+#: searches in turn may lead nowhere before the next one far and wide.
+FEW, AROUND, NEAR_AND_FAR, FRUITLESS = 24, 8, (-1.5, 0.3), 6
+
+#: Time constants of the first surface after which, without any plan, an arrival is looked for.
+LONG = 10.0
 
 
 class Optimisation:
@@ -216,26 +230,33 @@ class Optimisation:
         )
         return search.converged
 
-    def global_search(self) -> bool:
-        """Sample widely, then descend from the three best; refine the winner."""
-        optimiser, rng = self.optimiser, self.rng
-        anchor = self.space.encode(Plan.of(optimiser.anchor))
-        total = self.budget.evaluations
-        if optimiser.shoots:  # leave the rest to shooting
-            total = min(total, 3072)
+    def global_search(self) -> Iterator[bool]:
+        """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
+        self.cost(self._firsts()[: max(1, self.left)])
+        if self.optimiser.counts_time:
+            yield self._earlier(min(POLISH, self.left))
+            yield self.arrive_earlier(wide=True)
+            return
+        if self._centre().size <= MODEL_SIZE:
+            self._model_search(self._centre())
+            yield False
+        optimiser, rng, total = self.optimiser, self.rng, self.budget.evaluations
         draws = max(optimiser.population, total // 6)
-        draw = anchor + self.space.steps(rng, np.ones(draws))
-        z = np.vstack([anchor, *self._designs(16), draw])
+        z = self._firsts()[0] + self.space.steps(rng, np.ones(draws))
         scores = self.cost(z[: max(1, self.left)])
         starts = z[np.argsort(scores, kind="stable")[:3]]
         share = (total - len(z)) // 4
         for start in starts:
             self._descend(start, 0.3, share, 3e-3)
         converged = self._descend(self._centre(), 0.03, share, 1e-4)
-        while not optimiser.shoots and self.left >= optimiser.population and not self.late():
+        while self.left >= optimiser.population and not self.late():
             start = self._centre() + self.space.steps(rng, np.ones(1))[0]
             self._descend(start, 0.3, self.left, 3e-3)
-        return converged
+        yield converged
+
+    def _firsts(self) -> FloatArray:
+        """Coordinates of the first surface and of the designs."""
+        return np.vstack([self.space.encode(Plan.of(p)) for p in self.optimiser.designs])
 
     def local_search(self, incumbent: Plan) -> bool:
         """Start from the incumbent; look further away where that gains nothing."""
@@ -309,14 +330,22 @@ class Optimisation:
         here = self._begin(incumbent)
         if self._unscored is not None:
             self.cost(here[None])
-        most = min(self.left, 1024) if self.optimiser.shoots else self.left
         if not self.best_cost < INADMISSIBLE:
             self._look_around(here)
-            return self._descend(self._centre(), 0.1, most, 1e-3)
+        if not self.optimiser.aims:
+            return self._earlier(self.left)
+        self._earlier(min(POLISH, self.left))
+        return self.arrive_earlier()
+
+    def _earlier(self, most: int) -> bool:
+        """Search from the best plan along its ridge, with so many evaluations at most."""
+        here = self._centre()
+        if not self.best_cost < INADMISSIBLE:
+            return self._descend(here, 0.1, most, 1e-3)
         d, loop = here.size, self.loop
         if self.best_cost <= loop.step:  # all but there
             return True
-        if self.left < 2 * d + LANES or self.late():
+        if most < 2 * d + LANES or self.late():
             return False
         vectors, gains = self.space.decode(here + 1e-4 * np.vstack([np.eye(d), -np.eye(d)]))
         self.evaluations += len(vectors)
@@ -354,77 +383,63 @@ class Optimisation:
             around = here + self.space.steps(self.rng, np.geomspace(0.1, 1.0, wide))
             self.cost(around, hopeless=1.0)
 
-    def shoot(self) -> bool:
-        """Shrink the time of arrival from a fresh start, then from the best plan; and so on.
+    def arrive_earlier(self, wide: bool = False) -> bool:
+        """Search for earlier arrivals around the best plan, or first far and wide.
 
-        Each time it ends with hops: a part of the plan is changed, the rest is corrected, and what
-        arrives earlier is kept.
+        And far and wide again when that leads nowhere any more.
         """
-        loop, rng = self.loop, self.rng
-        aim = Shooting(self._miss, 0.9 * loop.objective.terminal_radius, loop.step, self._exhausted)
-        fresh = True
-        while not self._exhausted():
-            before = self.best_cost
-            shot = None
-            if fresh:
-                shot = aim.nearest(*self._far_and_wide(aim), 4)
-            elif self.best_cost < INADMISSIBLE:
-                shot = aim.nearest(self._centre()[None], aim.on_grid(self.best_cost), 1)
-            if shot is not None:
-                z, T = aim.shrink(*shot)
-                for _ in range(15):
-                    if self._exhausted():
-                        break
-                    # Most mutants are far off, and one batch tells which is not.
-                    mutants = self._mutants(z, 256)
-                    hop = aim.nearest(mutants, aim.on_grid(T * rng.uniform(0.93, 1.0)), 1, 12)
-                    if hop is not None:
-                        shorter, earlier = aim.shrink(*hop)
-                        if earlier < T:
-                            z, T = shorter, earlier
-                self.cost(z[None])
-            fresh = not fresh and self.best_cost >= before
+        rng, space, spent = self.rng, self.space, -1
+        anchor = space.encode(Plan.of(self.optimiser.anchor))
+        search = ArrivalSearch(
+            self._approach, self._admits, 0.9 * self.loop.objective.terminal_radius, self._without
+        )
+        fruitless = FRUITLESS if wide else 0
+        while self.left > 0 and not self.late() and self.evaluations > spent:
+            before, spent = self.best_cost, self.evaluations
+            if before <= self.loop.step:  # all but there
+                return True
+            if not before < INADMISSIBLE or fruitless == FRUITLESS:
+                z = anchor + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
+                search.run(z, WINDOW * before if before < INADMISSIBLE else self._long(), CROWD)
+                fruitless = 0
+                continue
+            spread = 10.0 ** rng.uniform(*NEAR_AND_FAR, FEW * AROUND)
+            search.run(self._centre() + space.steps(rng, spread), SHORTER * before, FEW)
+            fruitless += 1
+            if self.best_cost < (1.0 - WORTHWHILE) * before:
+                fruitless = 0
+            elif fruitless == 1:
+                self._earlier(min(POLISH, self.left))
         return False
 
-    def _far_and_wide(self, aim: Shooting) -> tuple[FloatArray, float]:
-        """Return coordinates far and wide, and a time earlier than the best one."""
-        known = self.best_cost if self.best_cost < INADMISSIBLE else self.horizon
-        T = aim.on_grid(known * self.rng.uniform(0.5, 1.0))
-        anchors = np.stack([self.space.encode(Plan.of(self.optimiser.anchor)), self._centre()])
-        spread = 10 ** self.rng.uniform(-0.5, 0.3, 512)
-        return np.concatenate([a + self.space.steps(self.rng, spread) for a in anchors]), T
+    def _long(self) -> float:
+        """A time, s, in which something should have arrived."""
+        anchor = self.optimiser.anchor
+        rate = float(stability_margin(self.loop.mechanism, anchor.vector[None])[0])
+        return min(self.horizon, LONG / max(rate, LONG / self.horizon))
 
-    def _mutants(self, z: FloatArray, count: int) -> FloatArray:
-        """Return copies of a plan in each of which one of its surfaces is drawn anew."""
-        rng, segments = self.rng, self.space.segments
-        copies = np.repeat(z.reshape(1, segments, -1), count, axis=0)
-        size = 10 ** rng.uniform(-0.7, 0.5, (count, 1))
-        drawn = size * rng.standard_normal((count, copies.shape[2]))
-        copies[np.arange(count), rng.integers(segments, size=count)] += drawn
-        return copies.reshape(count, -1)
+    def _without(self, evaluations: int) -> bool:
+        """Whether there are not so many evaluations left, or no time."""
+        return self.left < evaluations or self.late()
 
-    def _exhausted(self) -> bool:
-        return self.left < 4 * self.space.size or self.late()
-
-    def _miss(self, z: FloatArray, T: float) -> FloatArray:
-        """Final states at T, (N, 2n); a motion that breaks off counts as far away."""
+    def _approach(self, z: FloatArray, T: float) -> Approach:
+        """Where motions come closest to the target before T; of an ensemble, its first member's."""
+        loop, space = self.loop, self.space
         self.evaluations += len(z)
-        buffers = self._filled(*self.space.decode(z))
-        batch = self.loop.roll_out(buffers, self.optimiser.freedom.times, T, terminal=0.0)
-        sound = (batch.event == Event.HORIZON) & np.isfinite(batch.x).all(axis=1)
-        return np.where(sound[:, None], batch.x, MISSED)
+        buffers = RolloutBuffers(loop, len(z), space.segments, plants=loop.ensemble is not None)
+        if loop.ensemble is not None:
+            buffers.lanes[:, :, buffers.layout.size :] = loop.ensemble.values[0]
+        buffers.fill(self.x, *space.decode(z))
+        batch = loop.roll_out(buffers, self.optimiser.freedom.times, T, terminal=0.0, seek=True)
+        return Approach(
+            np.nan_to_num(batch.closest_x),
+            np.where(np.isfinite(batch.closest), batch.closest, np.inf),
+            batch.closest_time.copy(),
+        )
 
-    def _designs(self, count: int) -> list[FloatArray]:
-        """Quadratic designs with random weights: all of them locally stable."""
-        mechanism = self.loop.mechanism
-        designs = []
-        for weights in 10 ** self.rng.uniform(-2, 2, (count, 2 * mechanism.n)):
-            try:
-                surface = first_surface(mechanism, list(weights))
-            except UndertowError:
-                continue
-            designs.append(self.space.encode(Plan.of(surface)))
-        return designs
+    def _admits(self, z: FloatArray) -> NDArray[np.bool_]:
+        """Score plans that arrive on the first plant."""
+        return np.asarray(self.cost(z) < INADMISSIBLE)
 
     def fall_back(self) -> None:
         """Where nothing suits every plausible plant, also try designs, whatever is left to spend.
@@ -432,15 +447,14 @@ class Optimisation:
         The best plan is then the one that all plants survive longest, and it is answered.
         """
         if not self.best_cost < INADMISSIBLE:
-            anchor = self.space.encode(Plan.of(self.optimiser.anchor))
-            self.cost(np.vstack([anchor, *self._designs(16)]))
+            self.cost(self._firsts())
 
-    def answer(self, converged: bool, computed_for: float) -> Proposal:
-        """Pack the best admissible plan with its margins."""
+    def answer(self, converged: bool, computed_for: float, *, judged: bool = True) -> Proposal:
+        """Pack the best admissible plan; a first one that is to be judged, with its margins."""
         found = self.best_cost < INADMISSIBLE
         margins: tuple[Margin, ...] = ()
         message = remedy = ""
-        if self.best is not None and not (found and self.warm):
+        if self.best is not None and not (found and (self.warm or not judged)):
             margins, message, remedy = motion_margins(self.loop, self.best, self.x, self.horizon)
         status: Status = "infeasible"
         if found:
