@@ -298,8 +298,10 @@ class Belief:
             low = -high
         else:
             low, high = self._box(estimate)
-            matters = np.linalg.norm(self._effects(offset), axis=0) * (high - low)
-            axes = np.eye(size)[np.sort(np.argsort(-matters, kind="stable")[:AXES])]
+            axes = np.eye(size)
+            if size > AXES:
+                matters = np.linalg.norm(self._effects(offset), axis=0) * (high - low)
+                axes = axes[np.argsort(-matters, kind="stable")[:AXES]]
             signs = _design(len(axes)) @ axes
             corners = signs * np.maximum(np.where(signs > 0, high - offset, offset - low), LEAST)
             low, high = np.minimum(low, -1.0), np.maximum(high, 1.0)
