@@ -200,20 +200,27 @@ def test_what_is_not_linear_is_within_the_width(name: str) -> None:
 
 @pytest.mark.parametrize("name", SPREAD)
 def test_a_plant_that_changes_is_followed(name: str) -> None:
-    """From one corner of the tolerances to the other: noticed, and the box has the new truth."""
+    """From one corner of the tolerances to the other: the box has the new truth in the end.
+
+    Not at once in every run: for a while a wrong plant in the old box may explain the motion.
+    """
     belief = bounded(name, 0.5)
     size, rng = len(belief.tolerances), np.random.default_rng(2)
     corner = 0.95 * np.ones((8, size))
     t, x, u = motions(belief, -corner, "even", rng)
-    _, y, v = motions(belief, corner, "even", rng)
-    for run in range(8):
-        before = learnt(belief, t, x[run], u[run], belief.prior)
-        assert before.contradictions == 0
-        assert holds(before, -corner[0])
-        after = learnt(belief, t, y[run], v[run], before)
-        assert after.contradictions > 0
-        assert holds(after, corner[0])
-        assert holds(after, after.offset)
+    estimates = [learnt(belief, t, y, v, belief.prior) for y, v in zip(x, u, strict=True)]
+    assert all(each.contradictions == 0 and holds(each, -corner[0]) for each in estimates)
+    right = []
+    for _ in range(6):
+        t, x, u = motions(belief, corner, "even", rng)
+        estimates = [
+            learnt(belief, t, y, v, before) for y, v, before in zip(x, u, estimates, strict=True)
+        ]
+        right.append(sum(holds(each, corner[0]) for each in estimates))
+        assert all(holds(each, each.offset) for each in estimates)
+    print(f"\n{name}: of 8 runs with the truth in the box, after each tenth of a second: {right}")
+    assert all(each.contradictions > 0 for each in estimates)
+    assert right[-1] == 8
 
 
 def test_a_plant_beyond_the_tolerances_is_found_all_the_same() -> None:
@@ -245,7 +252,7 @@ def test_the_ensemble_spans_the_box() -> None:
 
 def test_of_many_parameters_those_that_matter_span_the_ensemble() -> None:
     """The others stay as estimated."""
-    rig = ut.mechanisms.rotary_pendulum()
+    rig = ut.mechanisms.LIBRARY["triple_pendulum_on_a_cart"]()
     belief = replace(Belief.usual(rig), bound=0.01)
     assert len(belief.tolerances) > AXES
     corners = belief.ensemble(belief.prior).values[1 + SLIPS :]
