@@ -431,22 +431,32 @@ class Belief:
         """Return slope, (S, p), rest and width, (S,), of |rest − slope z| ≤ width, z from −1 to 1.
 
         One for each sample and coordinate; z are offsets in half the sides of the box, from its
-        middle.  What is not linear in z is at most half the sum of all second differences, to third
-        order; ``BENT`` stands for what is beyond.
+        middle.  M(q; θ) (Δq̇ − predicted(θ)) is small: it bends much less in θ than the prediction,
+        which has the inverse of M.  What is not linear in z is at most half the sum of all second
+        differences, to third order; ``BENT`` stands for what is beyond.
         """
         size, n = len(low), self.mechanism.n
         first, second = np.triu_indices(size, 1)
         unit = np.eye(size)
         z = np.vstack([np.zeros(size), unit, -unit, unit[first] + unit[second]])
-        changes, corners = self._changes(0.5 * (low + high) + 0.5 * (high - low) * z, t, x, u)
-        middle, up, down, both = np.split(changes, [1, 1 + size, 1 + 2 * size])
-        bent = 0.5 * np.abs(up + down - 2.0 * middle).sum(axis=0)
-        bent += np.abs(both - up[first] - up[second] + middle).sum(axis=0)
-        centre, farther, nearer, _ = np.split(corners, [1, 1 + size, 1 + 2 * size])
-        most = centre[0] + (np.maximum(farther, nearer) - centre).clip(0.0).sum(axis=0)
-        width = np.asarray(self.bound) + BENT * bent + (RECTANGLES / CORNER) * most
-        rest = np.diff(x[:, n:], axis=0) - middle[0]
-        return 0.5 * (up - down).reshape(size, -1).T, rest.ravel(), (1.0 + 1e-9) * width.ravel()
+        offsets = 0.5 * (low + high) + 0.5 * (high - low) * z
+        changes, corners = self._changes(offsets, t, x, u)
+        middle = 0.5 * (x[1:] + x[:-1])
+        entries = self.mechanism.function("mass")(
+            0.5 * (t[1:] + t[:-1]), *middle.T, *self.values(offsets).T[:, :, None]
+        )
+        mass = np.stack([np.broadcast_to(one, changes.shape[:2]) for one in entries], axis=-1)
+        mass = mass.reshape(*changes.shape, n)
+        error = (mass @ (np.diff(x[:, n:], axis=0) - changes)[..., None])[..., 0]
+        most = np.asarray(self.bound) + (RECTANGLES / CORNER) * corners
+        allowed = (np.abs(mass) @ most[..., None])[..., 0]
+        centre, up, down, both = np.split(error, [1, 1 + size, 1 + 2 * size])
+        width, farther, nearer, _ = np.split(allowed, [1, 1 + size, 1 + 2 * size])
+        bent = 0.5 * np.abs(up + down - 2.0 * centre).sum(axis=0)
+        bent += np.abs(both - up[first] - up[second] + centre).sum(axis=0)
+        more = (np.maximum(farther, nearer) - width).clip(0.0).sum(axis=0)
+        wide = (1.0 + 1e-9) * (width[0] + more + BENT * bent)
+        return -0.5 * (up - down).reshape(size, -1).T, centre.ravel(), wide.ravel()
 
     @cached_property
     def _beyond(self) -> ParameterEstimate:
