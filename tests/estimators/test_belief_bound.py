@@ -1,7 +1,7 @@
 """What a bound on the unexplained rules out, on many random runs: never the truth.
 
-A sample and a coordinate leave a slab, |Δq̇ − predicted(θ)| ≤ w, and what all slabs leave lies in the
-box that a belief with a bound keeps (bounded-error estimation: E. Fogel and Y. F. Huang,
+Samples leave slabs of parameters, |Δq̇ − predicted(θ)| ≤ w, and what all slabs leave lies in the box
+that a belief with a bound keeps (bounded-error estimation: E. Fogel and Y. F. Huang,
 *Automatica* 18(2), 1982; L. Jaulin, M. Kieffer, O. Didrit and É. Walter, *Applied Interval
 Analysis*, 2001).  The figures are printed by
 
@@ -80,7 +80,7 @@ def motions(
         elif kind == "outward":
             part = np.sign(rate(y, u[k], farther) - first)[:, n:]
         x[k + 1, :, n:] += most * part
-    return t, x.swapaxes(0, 1), u.swapaxes(0, 1)
+    return t, x.swapaxes(0, 1), np.asarray(u.swapaxes(0, 1))
 
 
 def learnt(
@@ -159,7 +159,8 @@ def test_the_box_has_that_of_linear_programming_in_it(name: str) -> None:
         slope, rest, width = belief._slabs(belief.prior.low, belief.prior.high, t, y, v)
         box = _contracted(slope, rest, width)
         assert box is not None
-        A, b = np.vstack([slope, -slope]), np.concatenate([rest + width, width - rest])
+        slope, rest = slope / width[:, None], rest / width
+        A, b = np.vstack([slope, -slope]), np.concatenate([1.0 + rest, 1.0 - rest])
         exact = [linprog(s * e, A, b, bounds=(-1, 1)).fun for e in np.eye(size) for s in (1, -1)]
         low, high = np.array(exact[::2]), -np.array(exact[1::2])
         assert (box[0] <= low + 1e-7).all()
@@ -286,7 +287,7 @@ def test_what_a_bound_cannot_be_and_where_it_is_refused() -> None:
         with pytest.raises(InvalidInputError, match="bound of a belief"):
             replace(belief, bound=wrong)
     with pytest.raises(InvalidInputError, match="bound of Belief"):
-        replace(belief, bound="small")
+        replace(belief, bound="small")  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match="bound=None"):
         KalmanFilter(belief.mechanism, belief=belief)
     KalmanFilter(belief.mechanism, belief=replace(belief, bound=None))
