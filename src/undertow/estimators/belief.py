@@ -133,8 +133,9 @@ class Belief:
     bound
         The largest change of velocity over one sample that the model does not explain, rad/s or
         m/s: one number, or one for each coordinate.  Parameters that contradict it are ruled out,
-        and the ensemble spans all that are not; ``confidence`` does not count then.  ``None``:
-        nothing is ruled out.
+        and the ensemble spans all that are not; ``confidence`` does not count then.  A plant that
+        changes is followed as soon as a motion contradicts all that was left.  ``None``: nothing is
+        ruled out.
 
     Raises
     ------
@@ -249,10 +250,8 @@ class Belief:
     def prior(self) -> ParameterEstimate:
         """What is known before anything moves: even spread within the tolerances."""
         size = len(self.tolerances)
-        prior = ParameterEstimate(np.zeros(size), np.eye(size) / EVEN**2)
-        return (
-            prior if self.bound is None else replace(prior, low=-np.ones(size), high=np.ones(size))
-        )
+        side = np.ones(0 if self.bound is None else size)
+        return ParameterEstimate(np.zeros(size), np.eye(size) / EVEN**2, low=-side, high=side)
 
     def values(self, offsets: ArrayLike) -> FloatArray:
         """Return the values of all parameters, (…, P), at some offsets, (…, p)."""
@@ -306,7 +305,7 @@ class Belief:
             corners = signs * np.maximum(np.where(signs > 0, high - offset, offset - low), LEAST)
             low, high = np.minimum(low, -1.0), np.maximum(high, 1.0)
         around = np.clip(offset + corners, low, high)
-        offsets = np.vstack([np.tile(estimate.offset, (1 + SLIPS, 1)), around])
+        offsets = np.vstack([np.tile(offset, (1 + SLIPS, 1)), around])
         # Of what the corners span, only the estimate's own uncertainty is expected; the rest is a
         # margin: it has to be survived, and costs nothing.
         expected = float(np.mean(variances / (variances + LEAST**2)))
@@ -541,7 +540,10 @@ def _contracted(
     for _ in range(SWEEPS):
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         left = (rest - slope @ middle)[:, None]
-        room = (width + sizes @ half)[:, None] - sizes * half
+        reach = width + sizes @ half
+        if (np.abs(left[:, 0]) > reach).any():
+            return None
+        room = reach[:, None] - sizes * half
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.stack([left - room, left + room]) / slope
         ends = np.where(sizes > 0, np.sort(ends, axis=0), [[[-np.inf]], [[np.inf]]])
