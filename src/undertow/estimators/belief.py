@@ -8,13 +8,17 @@ over a sample from t to t + h
 which is fitted to θ by least squares, sample after sample (an information filter whose new samples
 are linearised at their own solution).  What is left uncertain spans an ensemble: the estimate, and
 the corners of its confidence ellipsoid that a two-level orthogonal design names.
+
+Where the largest change of velocity that the model does not explain is known, each sample says more
+than that something is likely: all θ outside a slab are impossible.  What all slabs leave lies in a
+box, which the estimate does not leave and the ensemble spans (bounded-error estimation).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import get_args
 
@@ -56,6 +60,12 @@ STEP = 1e-5
 #: Part of how much an acceleration changes over a sample that its mean may be off.
 CORNER = 0.2
 
+#: How much an acceleration's mean over a sample may be off at most, in that part: one that runs one
+#: way, or jumps, is between the rectangles.  What a model bends over a box of parameters counts so
+#: many times its second differences.  A box that narrows by less than this part of its sides has
+#: come to rest, and so many sweeps over the slabs are made at most.
+RECTANGLES, BENT, RESTS, SWEEPS = 0.5, 1.5, 0.02, 20
+
 #: Gauss-Newton steps for one batch of samples, and the change of all parameters, as a part of
 #: their tolerances, that ends them.
 ROUNDS, ENOUGH = 4, 1e-4
@@ -79,11 +89,20 @@ class ParameterEstimate:
         Inverse covariance of ``offset``, (p, p), the prior's included.
     samples
         How many were used.
+    low, high
+        Between which offsets the truth is, (p,), if the bound of the belief holds; empty where it
+        has none.
+    contradictions
+        How often no plant in the box explained a motion: bound or tolerances are too small, or
+        the plant has changed.  The box was widened to the tolerances then.
     """
 
     offset: FloatArray
     information: FloatArray
     samples: int = 0
+    low: FloatArray = field(default_factory=lambda: np.empty(0))
+    high: FloatArray = field(default_factory=lambda: np.empty(0))
+    contradictions: int = 0
 
     @property
     def deviation(self) -> FloatArray:
@@ -111,12 +130,18 @@ class Belief:
         deviation counts as a fifth of the tolerance at least.
     risk
         How costs on the members count, see :class:`undertow.closed_loop.Ensemble`.
+    bound
+        The largest change of velocity over one sample that the model does not explain, rad/s or
+        m/s: one number, or one for each coordinate.  Parameters that contradict it are ruled out,
+        and the ensemble spans all that are not; ``confidence`` does not count then.  A plant that
+        changes is followed as soon as a motion contradicts all that was left.  ``None``: nothing is
+        ruled out.
 
     Raises
     ------
     InvalidInputError
         For unknown parameters, and for tolerances that are not positive or reach beyond what makes
-        physical sense.
+        physical sense; for a noise or a bound that is not positive.
 
     Examples
     --------
@@ -134,6 +159,7 @@ class Belief:
     noise: float | tuple[float, ...] | None = None
     confidence: float = 1.0
     risk: Risk = "mean"
+    bound: float | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check names and numbers."""
@@ -153,16 +179,17 @@ class Belief:
                     f"{parameter.value:g} leaves",
                     remedy="Leave certain parameters out",
                 )
-        noise = np.asarray(1.0 if self.noise is None else self.noise, dtype=float)
-        if (
-            noise.shape not in ((), (self.mechanism.n,))
-            or not (np.isfinite(noise) & (noise > 0)).all()
-        ):
-            raise InvalidInputError(
-                "noise of a belief",
-                value=self.noise,
-                limit=f"one number, or {self.mechanism.n}, finite and > 0",
-            )
+        for name, most in (("noise", self.noise), ("bound", self.bound)):
+            numbers = np.asarray(1.0 if most is None else most, dtype=float)
+            if (
+                numbers.shape not in ((), (self.mechanism.n,))
+                or not (np.isfinite(numbers) & (numbers > 0)).all()
+            ):
+                raise InvalidInputError(
+                    f"{name} of a belief",
+                    value=most,
+                    limit=f"one number, or {self.mechanism.n}, finite and > 0",
+                )
 
     @classmethod
     @checked
@@ -223,7 +250,8 @@ class Belief:
     def prior(self) -> ParameterEstimate:
         """What is known before anything moves: even spread within the tolerances."""
         size = len(self.tolerances)
-        return ParameterEstimate(np.zeros(size), np.eye(size) / EVEN**2)
+        side = np.ones(0 if self.bound is None else size)
+        return ParameterEstimate(np.zeros(size), np.eye(size) / EVEN**2, low=-side, high=side)
 
     def values(self, offsets: ArrayLike) -> FloatArray:
         """Return the values of all parameters, (…, P), at some offsets, (…, p)."""
@@ -252,20 +280,32 @@ class Belief:
         estimate's covariance, kept within the tolerances: every axis is as often high as low, and
         so is every pair of axes.  Of more than ``AXES`` parameters the axes that change the
         accelerations near the target most span the ensemble.
+
+        With a bound they are corners of the estimate's box instead, a fifth of a tolerance out at
+        least: each side is reached, by half of them.  They are not all its corners, 8 of 32 for
+        five parameters, so a plan that suits them all is not proven for what is between.  Of more
+        than ``AXES`` parameters those that matter least stay as estimated.
         """
-        size = len(estimate.offset)
+        size, offset = len(estimate.offset), estimate.offset
         variances, axes = np.linalg.eigh(np.linalg.inv(estimate.information))
-        axes = axes * np.sqrt(variances + LEAST**2)
-        if size > AXES:
-            axes = axes @ np.linalg.svd(self._effects(estimate.offset) @ axes)[2][:AXES].T
-        count = axes.shape[1]
-        signs = np.ones((1, 1))  # Sylvester's matrix, of columns at right angles
-        while len(signs) <= count:
-            signs = np.block([[signs, signs], [signs, -signs]])
-        corners = signs[:, 1 : count + 1] @ axes.T
-        limits = np.maximum(1.0, np.abs(estimate.offset))
-        around = np.clip(estimate.offset + self.confidence * corners, -limits, limits)
-        offsets = np.vstack([np.tile(estimate.offset, (1 + SLIPS, 1)), around])
+        if self.bound is None:
+            axes = axes * np.sqrt(variances + LEAST**2)
+            if size > AXES:
+                axes = axes @ np.linalg.svd(self._effects(offset) @ axes)[2][:AXES].T
+            corners = self.confidence * (_design(axes.shape[1]) @ axes.T)
+            high = np.maximum(1.0, np.abs(offset))
+            low = -high
+        else:
+            low, high = self._box(estimate)
+            axes = np.eye(size)
+            if size > AXES:
+                matters = np.linalg.norm(self._effects(offset), axis=0) * (high - low)
+                axes = axes[np.argsort(-matters, kind="stable")[:AXES]]
+            signs = _design(len(axes)) @ axes
+            corners = signs * np.maximum(np.where(signs > 0, high - offset, offset - low), LEAST)
+            low, high = np.minimum(low, -1.0), np.maximum(high, 1.0)
+        around = np.clip(offset + corners, low, high)
+        offsets = np.vstack([np.tile(offset, (1 + SLIPS, 1)), around])
         # Of what the corners span, only the estimate's own uncertainty is expected; the rest is a
         # margin: it has to be survived, and costs nothing.
         expected = float(np.mean(variances / (variances + LEAST**2)))
@@ -335,15 +375,87 @@ class Belief:
             )
         if rows < 2 or not self.tolerances:
             return estimate
-        found = self._fitted(estimate, *motion)
+        box, contradictions = None, estimate.contradictions
+        if self.bound is not None:
+            box = self._narrowed(*self._box(estimate), *motion)
+            if box is None:
+                contradictions += 1
+                box = self._narrowed(self.prior.low, self.prior.high, *motion)
+        found = self._fitted(estimate, *motion, box=box)
         if found is None:
             return estimate
         for prior, reach in ((self.prior, 1.0), (self._beyond, BEYOND)):
             if found[1] > CHANGED:
-                again = self._fitted(prior, *motion, reach=reach)
+                again = self._fitted(prior, *motion, reach=reach, box=box)
                 if again is not None and again[1] < found[1]:
                     found = again
-        return found[0]
+        if self.bound is None:
+            return found[0]
+        if box is None:  # no plant within the tolerances explains it
+            offset = found[0].offset
+            box = np.minimum(self.prior.low, offset), np.maximum(self.prior.high, offset)
+        return replace(found[0], low=box[0], high=box[1], contradictions=contradictions)
+
+    def _box(self, estimate: ParameterEstimate) -> tuple[FloatArray, FloatArray]:
+        """Return between which offsets the truth is, or refuse an estimate that does not say."""
+        if not len(estimate.low) == len(estimate.high) == len(self.tolerances):
+            raise InvalidInputError(
+                "estimate of a belief with a bound",
+                value="one without low and high",
+                limit="one that such a belief learnt",
+                remedy="Begin with Belief.prior, or leave the bound out",
+            )
+        return estimate.low, estimate.high
+
+    def _narrowed(
+        self, low: FloatArray, high: FloatArray, t: FloatArray, x: FloatArray, u: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return a box of offsets, (p,) each, without what the motion rules out; None if all."""
+        for _ in range(ROUNDS):
+            slope, rest, width = self._slabs(low, high, t, x, u)
+            if not (np.isfinite(slope).all() and np.isfinite(rest + width).all()):
+                break
+            half = 0.5 * (high - low)
+            sides = _contracted(slope, rest, width)
+            if sides is None:
+                return None
+            low, high = low + half * (sides[0] + 1.0), high + half * (sides[1] - 1.0)
+            if max((sides[0] + 1.0).max(), (1.0 - sides[1]).max()) < RESTS:
+                break
+        return low, high
+
+    def _slabs(
+        self, low: FloatArray, high: FloatArray, t: FloatArray, x: FloatArray, u: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return slope, (S, p), rest and width, (S,), of |rest − slope z| ≤ width, z from −1 to 1.
+
+        One for each sample and coordinate; z are offsets in half the sides of the box, from its
+        middle.  M(q; θ) (Δq̇ − predicted(θ)) is small: it bends much less in θ than the prediction,
+        which has the inverse of M.  What is not linear in z is at most half the sum of all second
+        differences, to third order; ``BENT`` stands for what is beyond.
+        """
+        size, n = len(low), self.mechanism.n
+        first, second = np.triu_indices(size, 1)
+        unit = np.eye(size)
+        z = np.vstack([np.zeros(size), unit, -unit, unit[first] + unit[second]])
+        offsets = 0.5 * (low + high) + 0.5 * (high - low) * z
+        changes, corners = self._changes(offsets, t, x, u)
+        middle = 0.5 * (x[1:] + x[:-1])
+        entries = self.mechanism.function("mass")(
+            0.5 * (t[1:] + t[:-1]), *middle.T, *self.values(offsets).T[:, :, None]
+        )
+        mass = np.stack([np.broadcast_to(one, changes.shape[:2]) for one in entries], axis=-1)
+        mass = mass.reshape(*changes.shape, n)
+        error = (mass @ (np.diff(x[:, n:], axis=0) - changes)[..., None])[..., 0]
+        most = np.asarray(self.bound) + (RECTANGLES / CORNER) * corners
+        allowed = (np.abs(mass) @ most[..., None])[..., 0]
+        centre, up, down, both = np.split(error, [1, 1 + size, 1 + 2 * size])
+        width, farther, nearer, _ = np.split(allowed, [1, 1 + size, 1 + 2 * size])
+        bent = 0.5 * np.abs(up + down - 2.0 * centre).sum(axis=0)
+        bent += np.abs(both - up[first] - up[second] + centre).sum(axis=0)
+        more = (np.maximum(farther, nearer) - width).clip(0.0).sum(axis=0)
+        wide = (1.0 + 1e-9) * (width[0] + more + BENT * bent)
+        return -0.5 * (up - down).reshape(size, -1).T, centre.ravel(), wide.ravel()
 
     @cached_property
     def _beyond(self) -> ParameterEstimate:
@@ -364,18 +476,20 @@ class Belief:
         x: FloatArray,
         u: FloatArray,
         reach: float = 1.0,
+        box: tuple[FloatArray, FloatArray] | None = None,
     ) -> tuple[ParameterEstimate, float] | None:
         """Return the estimate after these samples, and the median of their squared residuals.
 
-        It stays within ``reach`` tolerances, or as far out as it was before.
+        It stays within a box, or else ``reach`` tolerances, or as far out as it was before.
         """
         size, offset = len(before.offset), before.offset
         limits = np.minimum(self.room, np.maximum(reach, np.abs(offset)))
+        low, high = (-limits, limits) if box is None else box
         information = before.information
         for _ in range(ROUNDS):
             around = np.vstack([offset, offset + STEP * np.eye(size)])
             predicted, corners = self._changes(around, t, x, u)
-            deviations = np.hypot(self.deviations, corners)
+            deviations = np.hypot(self.deviations, corners[0])
             rest = (np.diff(x[:, self.mechanism.n :], axis=0) - predicted[0]) / deviations
             slope = (predicted[1:] - predicted[0]) / (STEP * deviations)
             if not (np.isfinite(rest).all() and np.isfinite(slope).all()):
@@ -383,7 +497,7 @@ class Belief:
             slope = slope.reshape(size, -1)
             information = before.information + slope @ slope.T
             pull = before.information @ (before.offset - offset) + slope @ rest.ravel()
-            offset, last = _within(offset, information, pull, limits), offset
+            offset, last = _within(offset, information, pull, low, high), offset
             if np.abs(offset - last).max() < ENOUGH:
                 break
         samples = before.samples + len(t) - 1
@@ -394,8 +508,8 @@ class Belief:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the predicted changes of velocity over each sample, (K, N − 1, n).
 
-        And how far the trapezoidal rule may be off in the first of them, (N − 1, n): an
-        acceleration that runs up within a sample need not run straight.
+        And how far the trapezoidal rule may be off in each of them, (K, N − 1, n): an acceleration
+        that runs up within a sample need not run straight.
         """
         values = self.values(offsets).T[:, :, None]
         rates = self.mechanism.function("dynamics")(t, *x.T, *u.T, *values)
@@ -403,13 +517,51 @@ class Belief:
         qdd = np.stack([np.broadcast_to(rate, shape) for rate in rates], axis=-1)
         span = np.diff(t)[:, None]
         change: FloatArray = 0.5 * (qdd[:, 1:] + qdd[:, :-1]) * span
-        return change, CORNER * np.abs(np.diff(qdd[0], axis=0)) * span
+        return change, CORNER * np.abs(np.diff(qdd, axis=1)) * span
+
+
+def _design(count: int) -> FloatArray:
+    """Return signs, (C, count), whose columns are at right angles: Sylvester's matrix."""
+    signs = np.ones((1, 1))
+    while len(signs) <= count:
+        signs = np.block([[signs, signs], [signs, -signs]])
+    return signs[:, 1 : count + 1]
+
+
+def _contracted(
+    slope: FloatArray, rest: FloatArray, width: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return a box, (p,) low and high, of all z from −1 to 1 with |rest − slope z| ≤ width.
+
+    Each slab bounds each z by what the others leave it, until nothing moves.  None if no z is left.
+    """
+    low, high = -np.ones(slope.shape[1]), np.ones(slope.shape[1])
+    sizes = np.abs(slope)
+    for _ in range(SWEEPS):
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        left = (rest - slope @ middle)[:, None]
+        reach = width + sizes @ half
+        if (np.abs(left[:, 0]) > reach).any():
+            return None
+        room = reach[:, None] - sizes * half
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([left - room, left + room]) / slope
+        ends = np.where(sizes > 0, np.sort(ends, axis=0), [[[-np.inf]], [[np.inf]]])
+        new_low = np.maximum(low, middle + ends[0].max(axis=0))
+        new_high = np.minimum(high, middle + ends[1].min(axis=0))
+        if (new_low > new_high).any():
+            return None
+        moved = max((new_low - low).max(), (high - new_high).max())
+        low, high = new_low, new_high
+        if moved < RESTS:
+            break
+    return low, high
 
 
 def _within(
-    offset: FloatArray, information: FloatArray, pull: FloatArray, limits: FloatArray
+    offset: FloatArray, information: FloatArray, pull: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return where a quadratic in the offsets is least within ±limits; what is beyond stays there.
+    """Return where a quadratic in the offsets is least in a box; what is beyond stays there.
 
     ``information`` is its Hessian, ``pull`` its descent direction at ``offset``.
     """
@@ -419,9 +571,9 @@ def _within(
         held = ~free
         rest = pull[free] - information[np.ix_(free, held)] @ (new - offset)[held]
         new[free] = offset[free] + np.linalg.solve(information[np.ix_(free, free)], rest)
-        beyond = free & (np.abs(new) > limits)
+        beyond = free & ((new < low) | (new > high))
         if not beyond.any():
             break
-        new[beyond] = np.sign(new[beyond]) * limits[beyond]
+        new[beyond] = np.clip(new, low, high)[beyond]
         free &= ~beyond
     return new

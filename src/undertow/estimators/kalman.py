@@ -201,7 +201,7 @@ class KalmanFilter:
         for the moment when the answer to it acts.
     belief
         What is not known of the mechanism's parameters, which are then estimated with the state;
-        ``None``: they are exact.
+        ``None``: they are exact.  A belief with a bound is refused: a covariance rules nothing out.
     parameter_drift
         Density of the drift of uncertain parameters, in their tolerances per √s: how fast what was
         learnt is forgotten.
@@ -216,7 +216,7 @@ class KalmanFilter:
     Raises
     ------
     InvalidInputError
-        For noises that are not positive.
+        For noises that are not positive, and for a belief with a bound.
     ModelError
         For a model that is not smooth: the covariance moves by its derivatives.
 
@@ -259,6 +259,14 @@ class KalmanFilter:
                 "belief of a Kalman filter",
                 value=f"about another '{belief.mechanism.name}'",
                 limit="about the filter's own mechanism",
+            )
+        if belief is not None and belief.bound is not None:
+            raise InvalidInputError(
+                "belief of a Kalman filter",
+                value=f"one with a bound, {belief.bound}",
+                limit="without one: the filter's covariance rules nothing out",
+                remedy="Write belief=dataclasses.replace(belief, bound=None), or learn with "
+                "Belief.learn from exact states",
             )
         self._arguments: dict[str, Any] = {
             "mechanism": mechanism, "period": period, "position_noise": position_noise,

@@ -226,16 +226,23 @@ def _target_to(target: ReferenceMotion) -> list[float] | str:
 
 
 def _estimate_to(estimate: ParameterEstimate) -> dict[str, Any]:
-    return {
+    kept = {
         "offset": estimate.offset.tolist(),
         "information": estimate.information.tolist(),
         "samples": estimate.samples,
     }
+    if not len(estimate.low):  # no bound
+        return kept
+    box = {"low": estimate.low.tolist(), "high": estimate.high.tolist()}
+    return {**kept, **box, "contradictions": estimate.contradictions}
 
 
 def _estimate_from(value: Mapping[str, Any]) -> ParameterEstimate:
     offset, information = np.array(value["offset"]), np.array(value["information"])
-    return ParameterEstimate(offset, information, value["samples"])
+    box = np.array(value.get("low", ())), np.array(value.get("high", ()))
+    return ParameterEstimate(
+        offset, information, value["samples"], *box, value.get("contradictions", 0)
+    )
 
 
 def memory_from(value: Mapping[str, Any], reference: ReferenceMotion | None = None) -> CascadeState:
