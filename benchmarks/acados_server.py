@@ -69,7 +69,8 @@ def programme(acados: Any, asked: dict[str, Any], kind: str) -> Any:
     options.integrator_type, options.sim_method_num_stages = "ERK", 4
     options.sim_method_num_steps = np.array(asked["substeps"])
     options.nlp_solver_type, options.print_level = kind, 0
-    options.tol = asked.get("tolerance", 1e-6)
+    for name, value in asked["options"].items():
+        setattr(options, name, value)
     return acados.AcadosOcpSolver(ocp, json_file=f"{kind}.json")
 
 

@@ -440,6 +440,10 @@ class _Server:
         answer: dict[str, Any] = json.loads(line)
         return answer
 
+    def close(self) -> None:
+        """End the process."""
+        self._process.communicate()
+
 
 class Acados(RealTimeIteration):
     """The same programme by acados (HPIPM), in a process of another Python that has it.
@@ -477,7 +481,7 @@ class Acados(RealTimeIteration):
         self._size = self.size(mechanism.usual_start)
         weights = self._weights(self.lengths)[n + m : n + m + len(self.boxed)] / self.lengths[0]
         self._server = _Server(python, {
-            "kinds": ["SQP_RTI"],
+            "kinds": ["SQP_RTI"], "options": {},
             "rates": ca.Function("rates", [x, v, p], [rates]).serialize(), "n": n, "m": m,
             "values": self.values.tolist(), "weight": self.weight / float(self.limits.max()) ** 2,
             "lengths": self.lengths.tolist(), "substeps": self.substeps.tolist(),
@@ -556,8 +560,9 @@ class AcadosShooting(ShootingMPC):
         #: The largest input: acados plans inputs as parts of their limits.
         self._unit = float(self.limits.max())
         self._moves = self._move.map(len(self.grid))
-        self._server = _Server(python, {
-            "kinds": ["SQP", "SQP_RTI"], "tolerance": tolerance,
+        self.server = _Server(python, {
+            "kinds": ["SQP", "SQP_RTI"],
+            "options": {"tol": tolerance, "hpipm_mode": "SPEED", "qp_solver_cond_N": 10},
             "rates": ca.Function("rates", [x, v, p], [rates]).serialize(), "n": n, "m": m,
             "values": [], "weight": 0.0, "lengths": self.grid.tolist(),
             "substeps": [2] * len(self.grid), "weights": ((self.limits / self._unit) ** 2).tolist(),
@@ -567,11 +572,11 @@ class AcadosShooting(ShootingMPC):
     def _solve(
         self, x: FloatArray, guess: tuple[FloatArray, FloatArray, float], free: bool
     ) -> tuple[FloatArray, FloatArray, float] | None:
-        found = self._server.ask({
+        found = self.server.ask({
             "kind": "SQP" if self._plan is None else "SQP_RTI",
-            "x": x.tolist(), "states": guess[0].tolist(), "inputs": (guess[1] / self.limits).tolist(),
-            "lengths": self.grid.tolist(), "end": (2 * self.P / self._unit**2).tolist(),
-            "values": [], "nodes": 0,
+            "x": x.tolist(), "lengths": self.grid.tolist(), "states": guess[0].tolist(),
+            "inputs": (guess[1] / self.limits).tolist(),
+            "end": (2 * self.P / self._unit**2).tolist(), "values": [], "nodes": 0,
         })  # fmt: skip
         states, inputs = np.array(found["states"]), np.array(found["inputs"]) * self.limits
         self._spent += found["seconds"]
