@@ -19,6 +19,7 @@ import contextlib
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -412,6 +413,8 @@ class _Server:
     """acados_server.py in a process of another Python."""
 
     def __init__(self, python: str, problem: dict[str, Any]) -> None:
+        if shutil.which(python) is None:
+            sys.exit(f"error: there is no Python at {python}, where acados was to be")
         server = Path(__file__).with_name("acados_server.py")
         self._process = subprocess.Popen(
             [python, str(server)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -429,6 +432,7 @@ class _Server:
         return os.pathsep.join(filter(None, [done.stdout.strip(), known]))
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        """Return the answer to a question, or end with one line where there is none."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
