@@ -1,4 +1,4 @@
-"""The real-time iteration of acados behind two pipes: what predictive.py starts in another Python.
+"""Acados behind two pipes, SQP or its real-time iteration: predictive.py starts it elsewhere.
 
 acados comes without the library, and the library without acados: this file needs acados, CasADi
 and NumPy alone, and a C compiler.  Each line in is a JSON object and is answered by one: the first
@@ -35,8 +35,8 @@ def template() -> Any:
     return importlib.import_module("acados_template")
 
 
-def programme(acados: Any, asked: dict[str, Any]) -> Any:
-    """Return acados' solver for a problem."""
+def programme(acados: Any, asked: dict[str, Any], kind: str) -> Any:
+    """Return acados' solver for a problem: ``"SQP"`` or ``"SQP_RTI"``."""
     import casadi as ca
     import numpy as np
 
@@ -45,7 +45,7 @@ def programme(acados: Any, asked: dict[str, Any]) -> Any:
     p = ca.SX.sym("p", len(asked["values"]))
     rates = ca.Function.deserialize(asked["rates"])(x, v, p)
     ocp, model = acados.AcadosOcp(), acados.AcadosModel()
-    model.name, model.x, model.u, model.xdot, model.p = "rig", x, v, slope, p
+    model.name, model.x, model.u, model.xdot, model.p = f"rig_{kind}", x, v, slope, p
     ocp.parameter_values = np.array(asked["values"])
     model.f_expl_expr, model.f_impl_expr = rates, slope - rates
     ocp.model, ocp.dims.N = model, len(grid)
@@ -68,12 +68,14 @@ def programme(acados: Any, asked: dict[str, Any]) -> Any:
     options.qp_solver, options.hessian_approx = "PARTIAL_CONDENSING_HPIPM", "GAUSS_NEWTON"
     options.integrator_type, options.sim_method_num_stages = "ERK", 4
     options.sim_method_num_steps = np.array(asked["substeps"])
-    options.nlp_solver_type, options.print_level = "SQP_RTI", 0
-    return acados.AcadosOcpSolver(ocp, json_file="rig.json")
+    options.nlp_solver_type, options.print_level = kind, 0
+    for name, value in asked["options"].items():
+        setattr(options, name, value)
+    return acados.AcadosOcpSolver(ocp, json_file=f"{kind}.json")
 
 
 def sample(solver: Any, asked: dict[str, Any]) -> dict[str, Any]:
-    """Take one real-time iteration: from a plan that is told, or else from the last solution."""
+    """Solve, or take one real-time iteration: from a plan that is told, or the last solution."""
     import numpy as np
 
     told = "states" in asked
@@ -95,6 +97,8 @@ def sample(solver: Any, asked: dict[str, Any]) -> dict[str, Any]:
     return {
         "states": [solver.get(k, "x").tolist() for k in range(len(states))],
         "inputs": [solver.get(k, "u").tolist() for k in range(max(1, len(inputs)))],
+        "prices": [solver.get(k, "pi").tolist() for k in range(len(inputs))],
+        "iterations": int(np.max(solver.get_stats("sqp_iter"))),
         "good": status == 0,
         "seconds": seconds,
     }
@@ -106,10 +110,12 @@ def main() -> int:
     os.dup2(2, 1)  # what compilers and acados print
     acados = template()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        solver = programme(acados, json.loads(sys.stdin.readline()))
+        asked = json.loads(sys.stdin.readline())
+        solvers = {kind: programme(acados, asked, kind) for kind in asked["kinds"]}
         print(json.dumps({"ready": True}), file=answers, flush=True)
         for line in sys.stdin:
-            print(json.dumps(sample(solver, json.loads(line))), file=answers, flush=True)
+            asked = json.loads(line)
+            print(json.dumps(sample(solvers[asked["kind"]], asked)), file=answers, flush=True)
     return 0
 
 

@@ -8,6 +8,7 @@
   CasADi; QRQP, warm-started, and HPIPM where that fails.  With a weight of the state it balances
   for ever instead: the horizon recedes, and the regulator's price stands for all that comes after.
 * :class:`Acados`: the same in acados, with full steps, in a process of another Python that has it.
+* :class:`AcadosShooting`: what :class:`rivals.ShootingMPC` plans for least energy, by acados.
 * :class:`Sampled`: holds what a controller asks for from sample to sample, and has its model's
   parameters learnt from the motion where there is a belief, the library's own.
 """
@@ -18,6 +19,7 @@ import contextlib
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -29,10 +31,10 @@ import numpy as np
 
 import undertow as ut
 from harness import Clock, need
-from rivals import Box, dynamics, ends, parameters, riccati, runge_kutta
+from rivals import Box, ShootingMPC, dynamics, ends, parameters, riccati, runge_kutta
 from undertow.models import FloatArray, linearise
 
-__all__ = ["PERIOD", "Acados", "RealTimeIteration", "Sampled", "grid"]
+__all__ = ["PERIOD", "Acados", "AcadosShooting", "RealTimeIteration", "Sampled", "grid"]
 
 #: Time between samples, s.
 PERIOD = 0.01
@@ -407,6 +409,46 @@ class RealTimeIteration(_Task):
         return np.asarray(np.diff(spent, axis=1)[:, 0] / self.period * self.limits)
 
 
+class _Server:
+    """acados_server.py in a process of another Python."""
+
+    def __init__(self, python: str, problem: dict[str, Any]) -> None:
+        if shutil.which(python) is None:
+            sys.exit(f"error: there is no Python at {python}, where acados was to be")
+        server = Path(__file__).with_name("acados_server.py")
+        self._process = subprocess.Popen(
+            [python, str(server)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+            env=os.environ | {"LD_LIBRARY_PATH": self._libraries(python), "PYTHONPATH": ""},
+        )  # fmt: skip
+        self.ask(problem)
+
+    @staticmethod
+    def _libraries(python: str) -> str:
+        """Return where acados' libraries are: the loader wants to know before Python starts."""
+        find = "import acados, pathlib; print(pathlib.Path(acados.__path__[0]) / 'install/lib')"
+        done = subprocess.run([python, "-c", find], capture_output=True, text=True, check=False)
+        known = os.environ.get("LD_LIBRARY_PATH", "")
+        return os.pathsep.join(filter(None, [done.stdout.strip(), known]))
+
+    def ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        """Return the answer to a question, or end with one line where there is none."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            print(json.dumps(question), file=self._process.stdin, flush=True)
+        line = self._process.stdout.readline()
+        if not line:
+            words = self._process.communicate()[1].strip().splitlines()
+            sys.exit(f"error: acados did not answer: {words[-1] if words else 'no words'}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.communicate()
+
+
 class Acados(RealTimeIteration):
     """The same programme by acados (HPIPM), in a process of another Python that has it.
 
@@ -440,15 +482,10 @@ class Acados(RealTimeIteration):
         rates = f(x, v * self.limits, p) if self.names else f(x, v * self.limits)
         self._said: FloatArray
         self._going: bool
-        server = Path(__file__).with_name("acados_server.py")
-        self._process = subprocess.Popen(
-            [python, str(server)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
-            env=os.environ | {"LD_LIBRARY_PATH": self._libraries(python), "PYTHONPATH": ""},
-        )  # fmt: skip
         self._size = self.size(mechanism.usual_start)
         weights = self._weights(self.lengths)[n + m : n + m + len(self.boxed)] / self.lengths[0]
-        self._ask({
+        self._server = _Server(python, {
+            "kinds": ["SQP_RTI"], "options": {},
             "rates": ca.Function("rates", [x, v, p], [rates]).serialize(), "n": n, "m": m,
             "values": self.values.tolist(), "weight": self.weight / float(self.limits.max()) ** 2,
             "lengths": self.lengths.tolist(), "substeps": self.substeps.tolist(),
@@ -457,32 +494,12 @@ class Acados(RealTimeIteration):
             "out": weights.tolist(),
         })  # fmt: skip
 
-    @staticmethod
-    def _libraries(python: str) -> str:
-        """Return where acados' libraries are: the loader wants to know before Python starts."""
-        find = "import acados, pathlib; print(pathlib.Path(acados.__path__[0]) / 'install/lib')"
-        done = subprocess.run([python, "-c", find], capture_output=True, text=True, check=False)
-        known = os.environ.get("LD_LIBRARY_PATH", "")
-        return os.pathsep.join(filter(None, [done.stdout.strip(), known]))
-
-    def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):
-            print(json.dumps(question), file=self._process.stdin, flush=True)
-        line = self._process.stdout.readline()
-        if not line:
-            words = self._process.communicate()[1].strip().splitlines()
-            sys.exit(f"error: acados did not answer: {words[-1] if words else 'no words'}")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
-
     def _step(self, z: FloatArray, x: FloatArray, lengths: FloatArray) -> tuple[FloatArray, bool]:
         """Return what one real-time iteration of acados makes of z."""
         states, inputs = self._unpacked(z)
         tip = np.linalg.inv(self.tip)
         end = tip.T @ np.diag(self._weights(lengths)[-len(x) :]) @ tip
-        found = self._ask({
+        found = self._server.ask({
             "x": x.tolist(), "lengths": lengths.tolist(), "states": states.tolist(),
             "inputs": inputs.tolist(), "end": end.tolist(), **self._told(),
         })  # fmt: skip
@@ -494,7 +511,7 @@ class Acados(RealTimeIteration):
         """Return what acados is told of the parameters: nothing while they stay."""
         nodes = INTERVALS + 1 if not np.array_equal(self.values, self._said) else 0
         self._said = self.values.copy()
-        return {"values": self.values.tolist(), "nodes": nodes}
+        return {"kind": "SQP_RTI", "values": self.values.tolist(), "nodes": nodes}
 
     def forget(self) -> None:
         """Start from cold, with the model's own parameters."""
@@ -505,7 +522,7 @@ class Acados(RealTimeIteration):
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at t, for one sample."""
         if self._going and self.period < PERIOD:
-            found = self._ask({"x": x.tolist(), **self._told()})
+            found = self._server.ask({"x": x.tolist(), **self._told()})
             u = np.array(found["inputs"][0]) * self.limits
             if found["good"] and np.isfinite(u).all():
                 self.seconds.append(found["seconds"])
@@ -520,4 +537,65 @@ class Acados(RealTimeIteration):
         good = super().plan(t, x)
         if not math.isnan(self._spent):
             self.seconds[-1] = self._spent
+        return good
+
+
+class AcadosShooting(ShootingMPC):
+    """The least energy of :class:`rivals.ShootingMPC` by acados, in another Python that has it.
+
+    From cold by SQP with the Gauss-Newton Hessian, until it has converged; then one real-time
+    iteration for each planning, from the shifted plan.  ``seconds`` are acados' own, preparation
+    and feedback together.  A plan of one iteration leaves defects: ``cost`` counts them at acados'
+    own prices, all as if they were to be paid.
+
+    Parameters
+    ----------
+    python
+        The other Python, with acados, CasADi and NumPy; a C compiler besides.
+    mechanism, tolerance
+        As for :class:`rivals.ShootingMPC`.
+    """
+
+    def __init__(self, python: str, mechanism: ut.Mechanism, tolerance: float = 1e-4) -> None:
+        super().__init__(mechanism, "energy", tolerance=tolerance)
+        ca, n, m = self.ca, 2 * mechanism.n, mechanism.m
+        x, v, p = ca.SX.sym("x", n), ca.SX.sym("v", m), ca.SX.sym("p", 0)
+        rates = dynamics(ca, mechanism)(x, v * self.limits)
+        #: The largest input: acados plans inputs as parts of their limits.
+        self._unit = float(self.limits.max())
+        self._moves = self._move.map(len(self.grid))
+        self.server = _Server(python, {
+            "kinds": ["SQP", "SQP_RTI"],
+            "options": {"tol": tolerance, "hpipm_mode": "SPEED", "qp_solver_cond_N": 10},
+            "rates": ca.Function("rates", [x, v, p], [rates]).serialize(), "n": n, "m": m,
+            "values": [], "weight": 0.0, "lengths": self.grid.tolist(),
+            "substeps": [2] * len(self.grid), "weights": ((self.limits / self._unit) ** 2).tolist(),
+            "boxed": [], "low": [], "high": [], "out": [],
+        })  # fmt: skip
+
+    def _solve(
+        self, x: FloatArray, guess: tuple[FloatArray, FloatArray, float], free: bool
+    ) -> tuple[FloatArray, FloatArray, float] | None:
+        found = self.server.ask({
+            "kind": "SQP" if self._plan is None else "SQP_RTI",
+            "x": x.tolist(), "lengths": self.grid.tolist(), "states": guess[0].tolist(),
+            "inputs": (guess[1] / self.limits).tolist(),
+            "end": (2 * self.P / self._unit**2).tolist(), "values": [], "nodes": 0,
+        })  # fmt: skip
+        states, inputs = np.array(found["states"]), np.array(found["inputs"]) * self.limits
+        self._spent += found["seconds"]
+        self.iterations[-1] += found["iterations"]
+        ends = self._moves(states[:-1].T, inputs.T, self.grid, np.zeros((0, len(self.grid))))
+        defects = np.array(ends).T - states[1:]
+        owed = self._unit**2 * np.abs(np.array(found["prices"]) * defects).sum()
+        self.cost = float(
+            self.grid @ (inputs**2).sum(axis=1) + states[-1] @ self.P @ states[-1] + owed
+        )
+        return (states, inputs, guess[2]) if found["good"] else None
+
+    def plan(self, t: float, x: FloatArray) -> bool:
+        """Plan from x; False where acados failed."""
+        self._spent = 0.0
+        good = super().plan(t, x)
+        self.seconds[-1] = self._spent
         return good

@@ -3,7 +3,7 @@
 * :func:`riccati`, :func:`tuned` and :meth:`Plant.regulated`: linear-quadratic feedback, clipped,
   evaluated continuously.
 * :class:`ShootingMPC`: nonlinear model predictive control by multiple shooting in CasADi, solved
-  with exact derivatives and warm-started with the shifted plan.
+  by IPOPT or fatrop with exact derivatives and warm-started with the shifted plan.
 * :class:`DoMPC`: the same tasks in do-mpc, by collocation, solved by IPOPT; with an ensemble of
   plants it is scenario (multi-stage) predictive control.
 
@@ -13,7 +13,9 @@ iteration.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +37,10 @@ __all__ = ["Box", "DoMPC", "Outcome", "Plant", "Regulator", "ShootingMPC", "ricc
 #: Weight of ‖x‖² beside u² that stands for minimum energy: the infinite-horizon problem without
 #: any has no optimum where a mode neither grows nor decays.
 SLOW = 1e-2
+
+#: How CasADi compiles what it generates, in a folder that goes by itself.
+GCC = {"compiler": "gcc", "flags": ["-O3", "-march=native"], "cleanup": False}
+COMPILED = {"jit": True, "compiler": "shell", "jit_options": GCC, "jit_cleanup": False}
 
 
 #: Names of coordinates and how far each may go, (low, high).
@@ -236,7 +242,7 @@ class ShootingMPC:
     radius
         ν of the terminal set.
     tolerance
-        IPOPT's.
+        The solver's.
     now
         Clock for the seconds of each planning.
     period
@@ -247,6 +253,10 @@ class ShootingMPC:
         How far coordinates may go at the nodes of a plan.
     names
         Parameters whose ``values`` may change from planning to planning.
+    solver
+        ``"ipopt"``, or ``"fatrop"``, which makes use of the order of stages.
+    compiled
+        Whether functions and derivatives are compiled by gcc, or run by CasADi's virtual machine.
     """
 
     #: Energy: short intervals first, because the next 0.1 s are what is applied.
@@ -264,6 +274,8 @@ class ShootingMPC:
         hold: float = Plant.STEP,
         box: Box | None = None,
         names: Sequence[str] = (),
+        solver: Literal["ipopt", "fatrop"] = "ipopt",
+        compiled: bool = False,
     ) -> None:
         self.ca, self._now = need("casadi", "compare"), now
         self.mechanism, self.goal, self.radius = mechanism, goal, radius
@@ -276,10 +288,10 @@ class ShootingMPC:
         self.seconds: list[float] = []
         self.iterations: list[int] = []
         self.failures = 0
-        self._build(tolerance)
+        self._build(solver, tolerance, compiled)
         self.forget()
 
-    def _build(self, tolerance: float) -> None:
+    def _build(self, solver: str, tolerance: float, compiled: bool) -> None:
         ca, n, m = self.ca, 2 * self.mechanism.n, self.mechanism.m
         p = ca.SX.sym("p", len(self.names))
         moved = dynamics(ca, self.mechanism, self.names)
@@ -294,7 +306,7 @@ class ShootingMPC:
         end = z[:n]
         for _ in range(2):
             end = runge_kutta(lambda y: f(y, u), end, span / 2)
-        move = ca.Function("move", [z, u, h, p], [ca.vertcat(end, z[n:])])
+        self._move = move = ca.Function("move", [z, u, h, p], [ca.vertcat(end, z[n:])])
         Z = [ca.MX.sym(f"z{k}", width) for k in range(count + 1)]
         U = [ca.MX.sym(f"u{k}", m) for k in range(count)]
         start, haste = ca.MX.sym("start", n), ca.MX.sym("haste")
@@ -318,16 +330,28 @@ class ShootingMPC:
         self._lower = np.zeros(len(equal))
         self._upper = np.where(equal, 0.0, np.inf)
         unknowns = ca.vertcat(*(part for pair in zip(Z, U, strict=False) for part in pair), Z[-1])
-        options = {
+        options: dict[str, Any] = {
             "print_time": False,
             "error_on_fail": False,
             "show_eval_warnings": False,
-            "expand": True,
-            "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 100},
+            "expand": not compiled,  # gcc takes a minute for what is expanded, and it is no faster
         }
+        if solver == "ipopt":
+            options["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 100}
+        else:
+            options |= {
+                "structure_detection": "auto",
+                "equality": equal,
+                "fatrop": {
+                    "print_level": 0, "tolerance": tolerance, "max_iter": 100, "mu_init": 1e-3,
+                },
+            }  # fmt: skip
+        if compiled:
+            options |= COMPILED
         programme = {"x": unknowns, "f": cost, "g": ca.vertcat(*constraints),
                      "p": ca.vertcat(start, haste, values)}  # fmt: skip
-        self._solver = ca.nlpsol("mpc", "ipopt", programme, options)
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            self._solver = ca.nlpsol("mpc", solver, programme, options)
 
     # -- a plan: states (N+1, 2n) and inputs (N, m) on the grid, and its length ------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -113,6 +114,38 @@ def test_a_plan_of_least_time_arrives_when_it_says(rivals: ModuleType, rig: ut.M
     outcome = rivals.Plant(rig, 0.01, 3.0).held(x, mpc)
     assert outcome.reached
     assert abs(outcome.time - promised) < 0.02
+
+
+@pytest.mark.parametrize("goal", ["energy", "time"])
+def test_fatrop_finds_the_plan_of_ipopt(rivals: ModuleType, rig: ut.Mechanism, goal: str) -> None:
+    if shutil.which("gcc") is None:
+        pytest.skip("needs gcc")
+    ipopt = rivals.ShootingMPC(rig, goal, tolerance=1e-8)
+    fatrop = rivals.ShootingMPC(rig, goal, tolerance=1e-8, solver="fatrop", compiled=True)
+    for t, angle in ((0.0, 30.0), (0.1, 27.0)):  # from cold, and warm
+        x = rig.state(phi=ut.deg(angle))
+        assert ipopt.plan(t, x)
+        assert fatrop.plan(t, x)
+        np.testing.assert_allclose(fatrop.cost, ipopt.cost, rtol=1e-4)
+        np.testing.assert_allclose(fatrop._plan[0], ipopt._plan[0], atol=1e-4)
+    if goal == "energy":
+        assert fatrop.iterations[1] < fatrop.iterations[0]
+
+
+def test_acados_finds_the_plan_of_ipopt(predictive: ModuleType, rig: ut.Mechanism) -> None:
+    python = os.environ.get("UNDERTOW_ACADOS")
+    if not python:
+        pytest.skip("needs $UNDERTOW_ACADOS, a Python that has acados")
+    ipopt = predictive.ShootingMPC(rig, "energy", tolerance=1e-8)
+    acados = predictive.AcadosShooting(python, rig)
+    x = rig.state(phi=ut.deg(30))
+    for t, most in ((0.0, 1e-4), (0.1, 0.01)):  # converged, then one real-time iteration
+        assert ipopt.plan(t, x)
+        assert acados.plan(t, x)
+        assert -1e-4 < acados.cost / ipopt.cost - 1 < most
+        x = ipopt._plan[0][5]  # 0.1 s later
+    assert acados.iterations[1] == 1
+    acados.server.close()
 
 
 @pytest.mark.slow
