@@ -631,7 +631,7 @@ def test_an_interrupted_survey_keeps_its_rows(
             raise KeyboardInterrupt
         made.append(mechanism.name)
         return survey.Entry(
-            mechanism.name, 2, 1, "", "", 3.0, 2.0, 1.0, 4.0, 0.01, math.nan, 0.5, {}
+            "energy", mechanism.name, 2, 1, "", "", 3.0, 2.0, 1.0, 1.0, 4.0, 0.01, math.nan, 0.5
         )
 
     monkeypatch.setattr(survey, "survey_one", one)
@@ -639,11 +639,15 @@ def test_an_interrupted_survey_keeps_its_rows(
     result = CliRunner().invoke(app, [*words, "--no-bounds", "--out", str(tmp_path)])
     assert result.exit_code == 130
     assert "1 of 1" in result.stdout
-    assert "interrupted: 1 of 3" in result.stderr
-    assert "--only acrobot --only pendubot" in plain(result.stderr)
+    said = result.stderr.splitlines()
+    assert any(line.startswith("interrupted: 1 of 6 are done") for line in said)
+    first, then = "--only acrobot --only pendubot", "--only tora --only acrobot --only pendubot"
+    assert said[-2:] == [
+        f"undertow survey --objective energy {first}", f"undertow survey --objective time {then}"
+    ]  # fmt: skip
     rows = (tmp_path / "survey.csv").read_text().splitlines()
     assert len(rows) == 2
-    assert rows[1].startswith("tora")
+    assert rows[1].startswith("energy,tora")
 
 
 def test_interrupted_trials_keep_their_rows(

@@ -61,29 +61,38 @@ def derive(
     "undertow survey",
     "undertow survey --out survey",
     "undertow survey --only acrobot --only tora --no-bounds",
+    "undertow survey --objective time",
 )
 def survey(
     only: Annotated[
         list[str] | None, option("Survey this mechanism only. Repeatable.", metavar="NAME")
     ] = None,
-    objective: options.Goal = "energy",
+    objective: Annotated[
+        list[str] | None,
+        option(
+            "What is minimised, as for simulate; energy, then time. Repeatable.", metavar="WORD"
+        ),
+    ] = None,
     horizon: options.Horizon = 60.0,
     bounds: Annotated[bool, option("Also compute the optimal-control bounds.")] = True,
     seed: options.Seed = 0,
     out: Annotated[Path | None, folder("survey.csv and survey.md")] = None,
 ) -> None:
-    """Bring every mechanism to its target: cost, time, bound and gap of all in one table."""
+    """Bring every mechanism to its target: costs, bound and gaps of all in one table.
+
+    The cascade takes the mechanism for the plant; free: it may choose the reaching law, too.
+    """
     request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.studies import survey as study
 
     check_out(out)
     began, entries, interrupted = time.perf_counter(), list[study.Entry](), False
-    names = only or list(LIBRARY)
+    names, goals = only or list(LIBRARY), objective or list(study.GOALS)
     try:
         with progress_bar() as progress:
             study.survey(
                 names,
-                goal=objective,
+                goals=goals,
                 horizon=horizon,
                 seed=seed,
                 bounds=bounds,
@@ -95,13 +104,19 @@ def survey(
             raise
         interrupted = True
     written = write(out, lambda: study.files(request, entries))
-    show(study.survey_table(entries), least=80, crop=False, soft_wrap=True)
-    took = f"Took {time.perf_counter() - began:.0f} s, seed {seed}."
-    show(*study.summary(entries), *written, took)
+    for some in study.by_goal(entries):
+        show("", some[0].goal, study.survey_table(some), least=80, crop=False, soft_wrap=True)
+        show(*study.summary(some))
+    show(*written, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
     if interrupted:
-        left = " ".join(f"--only {name}" for name in names[len(entries) :])
-        words = f"interrupted: {len(entries)} of {len(names)} are done. The others: undertow survey"
-        show(f"{words} {left} and the options as before", stderr=True)
+        whole, part = divmod(len(entries), len(names))
+        left = dict.fromkeys(goals[whole:], names)
+        left[goals[whole]] = names[part:]
+        show(f"interrupted: {len(entries)} of {len(goals) * len(names)} are done. The others, with "
+             "the options as before:", stderr=True)  # fmt: skip
+        for goal, others in left.items():
+            words = " ".join(f"--only {name}" for name in others)
+            show(f"undertow survey --objective {goal} {words}", stderr=True)
         raise typer.Exit(INTERRUPTED)
 
 

@@ -20,7 +20,7 @@ from undertow.optimiser.search_space import DecisionVariables, SearchSpace
 from undertow.optimiser.task import Optimisation
 
 #: Quadratic designs that a global search begins with.
-DESIGNS = 64
+DESIGNS = 31
 
 
 class Planner(Protocol):
@@ -86,7 +86,7 @@ class Optimiser:
     def on(self, loop: ClosedLoop) -> Optimiser:
         """Return this optimiser for a loop of the same structure, with the same first surface."""
         other = object.__new__(type(self))
-        kept = {k: v for k, v in vars(self).items() if k not in ("space", "aims")}
+        kept = {k: v for k, v in vars(self).items() if k not in ("space", "firsts", "aims")}
         other.__dict__.update(kept, loop=loop, anchor=self.anchor, designs=self.designs)
         return other
 
@@ -122,6 +122,11 @@ class Optimiser:
             with contextlib.suppress(UndertowError):
                 found.append(first_surface(mechanism, list(weights)))
         return tuple(found)
+
+    @cached_property
+    def firsts(self) -> FloatArray:
+        """Search coordinates of the designs, (N, d)."""
+        return np.vstack([self.space.encode(Plan.of(design)) for design in self.designs])
 
     def _budget(self, warm: bool) -> Budget:
         given = self.warm if warm else self.cold
@@ -186,7 +191,9 @@ class Optimiser:
         return task.answer(converged, computed_for)
 
     @checked
-    def improve(self, x: ArrayLike, *, budget: Budget | None = None) -> Iterator[Proposal]:
+    def improve(
+        self, x: ArrayLike, *, sequence: int = 0, budget: Budget | None = None
+    ) -> Iterator[Proposal]:
         """Optimise the plan from the state x from cold: one answer soon, and better ones later.
 
         The first one is the best of some designs, improved; the last one is what :meth:`propose`
@@ -196,11 +203,14 @@ class Optimiser:
         ----------
         x
             State, (2n,).
+        sequence
+            Number of the proposals.
         budget
             Overrides ``cold``, for all answers together.
         """
+        at_least("sequence of a proposal", sequence, 0)
         longest = self.loop.objective.horizon
-        task = self._task(x, longest, budget or self._budget(False), 0.0, 0, False)
+        task = self._task(x, longest, budget or self._budget(False), 0.0, sequence, False)
         return (task.answer(done, 0.0, judged=False) for done in task.global_search())
 
     def _task(

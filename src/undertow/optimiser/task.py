@@ -232,7 +232,7 @@ class Optimisation:
 
     def global_search(self) -> Iterator[bool]:
         """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
-        self.cost(self._firsts()[: max(1, self.left)])
+        self.cost(self.optimiser.firsts[: max(1, self.left)])
         if self.optimiser.counts_time:
             yield self._earlier(min(POLISH, self.left))
             yield self.arrive_earlier(wide=True)
@@ -242,7 +242,7 @@ class Optimisation:
             yield False
         optimiser, rng, total = self.optimiser, self.rng, self.budget.evaluations
         draws = max(optimiser.population, total // 6)
-        z = self._firsts()[0] + self.space.steps(rng, np.ones(draws))
+        z = self.optimiser.firsts[0] + self.space.steps(rng, np.ones(draws))
         scores = self.cost(z[: max(1, self.left)])
         starts = z[np.argsort(scores, kind="stable")[:3]]
         share = (total - len(z)) // 4
@@ -253,10 +253,6 @@ class Optimisation:
             start = self._centre() + self.space.steps(rng, np.ones(1))[0]
             self._descend(start, 0.3, self.left, 3e-3)
         yield converged
-
-    def _firsts(self) -> FloatArray:
-        """Coordinates of the first surface and of the designs."""
-        return np.vstack([self.space.encode(Plan.of(p)) for p in self.optimiser.designs])
 
     def local_search(self, incumbent: Plan) -> bool:
         """Start from the incumbent; look further away where that gains nothing."""
@@ -389,7 +385,6 @@ class Optimisation:
         And far and wide again when that leads nowhere any more.
         """
         rng, space, spent = self.rng, self.space, -1
-        anchor = space.encode(Plan.of(self.optimiser.anchor))
         search = ArrivalSearch(
             self._approach, self._admits, 0.9 * self.loop.objective.terminal_radius, self._without
         )
@@ -399,7 +394,7 @@ class Optimisation:
             if before <= self.loop.step:  # all but there
                 return True
             if not before < INADMISSIBLE or fruitless == FRUITLESS:
-                z = anchor + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
+                z = self.optimiser.firsts[0] + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
                 search.run(z, WINDOW * before if before < INADMISSIBLE else self._long(), CROWD)
                 fruitless = 0
                 continue
@@ -447,7 +442,7 @@ class Optimisation:
         The best plan is then the one that all plants survive longest, and it is answered.
         """
         if not self.best_cost < INADMISSIBLE:
-            self.cost(self._firsts())
+            self.cost(self.optimiser.firsts)
 
     def answer(self, converged: bool, computed_for: float, *, judged: bool = True) -> Proposal:
         """Pack the best admissible plan; a first one that is to be judged, with its margins."""

@@ -1,17 +1,16 @@
-"""Every mechanism of the library brought to its target: cost, time, bound and gap in one table.
+"""Every mechanism of the library brought to its target: cost, bound and gaps in one table.
 
 Nothing is chosen by hand: designed surface, optimisation and cascade are those of
-``undertow simulate NAME``, from the mechanism's listed start.  The bound is a local optimum of
-the same task over *all* inputs, see :mod:`undertow.bounds`; the gap is what the cascade spends
-beyond it.  Where the gap is large, :data:`ABLATIONS` look for its cause: each removes one
-restriction, and the table shows what is left of the gap without it.
+``undertow simulate NAME --belief exact``, from the mechanism's listed start; *free* is the cascade
+that may choose the reaching law, too.  The bound is a local optimum of the same task over *all*
+inputs, see :mod:`undertow.bounds`; a gap is what a cascade spends beyond it.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -39,40 +38,13 @@ from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, linearise
 from undertow.objective import TRAVEL, Objective, objective_for
-from undertow.optimiser import Budget, DecisionVariables
+from undertow.optimiser import DecisionVariables
 
-#: A gap beyond this asks for its cause.
-LARGE = 0.10
+#: What is minimised where nothing else is asked for.
+GOALS = ("energy", "time")
 
 #: Intervals of the bound's first mesh for each swing of the free motion.
 PER_CYCLE = 12
-
-
-@dataclass(frozen=True)
-class Ablation:
-    """One restriction taken away from the one-time optimum.
-
-    Parameters
-    ----------
-    name
-        What is different, in words.
-    freedom
-        What may be chosen.
-    budget
-        What the optimisation may spend.
-    """
-
-    name: str
-    freedom: DecisionVariables
-    budget: Budget
-
-
-#: Tried in this order where the gap is large.
-ABLATIONS = (
-    Ablation("more evaluations (30 000)", DecisionVariables(), Budget(30_000)),
-    Ablation("reaching law free (10 000)", DecisionVariables(reaching=True), Budget(10_000)),
-    Ablation("both (40 000)", DecisionVariables(reaching=True), Budget(40_000)),
-)
 
 
 @dataclass(frozen=True)
@@ -81,11 +53,13 @@ class Entry:
 
     Attributes
     ----------
+    goal
+        The word of what was minimised.
     name, n, m, start, unit
         The mechanism, its start in words, and the unit of cost.
-    designed, one_time, cascade
-        Cost of the designed surface, of the surface optimised once, and of the cascade;
-        ``inf`` where the target was not reached.
+    designed, one_time, cascade, free
+        Cost of the designed surface, of the surface optimised once, of the cascade, and of the
+        cascade with a free reaching law; ``inf`` where the target was not reached.
     time
         When the cascade reached ‖x‖ ≤ ν, s; ``inf`` where it did not.
     radius
@@ -94,12 +68,11 @@ class Entry:
         Optimal-control bound, NaN where none was asked for or found.
     seconds
         Wall time of all of it, s.
-    trials
-        Name of each trial made to its cost.
     problem, travel
         What was minimised and who admitted surfaces, and the bounds of travel, in words.
     """
 
+    goal: str
     name: str
     n: int
     m: int
@@ -108,11 +81,11 @@ class Entry:
     designed: float
     one_time: float
     cascade: float
+    free: float
     time: float
     radius: float
     bound: float
     seconds: float
-    trials: Mapping[str, float]
     problem: str = ""
     travel: str = ""
 
@@ -121,15 +94,16 @@ class Entry:
         """What the cascade spends beyond the bound, relative; NaN without a bound."""
         return self.cascade / self.bound - 1.0
 
-    def gap_of(self, cost: float) -> float:
-        """Return the relative gap of another cost to the same bound."""
-        return cost / self.bound - 1.0
+    @property
+    def free_gap(self) -> float:
+        """The same for the cascade with a free reaching law."""
+        return self.free / self.bound - 1.0
 
 
 def survey(
     names: Sequence[str] | None = None,
     *,
-    goal: str = "energy",
+    goals: Sequence[str] = GOALS,
     horizon: float = 60.0,
     seed: int = 0,
     bounds: bool = True,
@@ -142,15 +116,14 @@ def survey(
     ----------
     names
         Which; all of the library by default.
-    goal
-        A word of :func:`undertow.objective_for`.
+    goals
+        Words of :func:`undertow.objective_for`, one after the other.
     horizon
         Longest motion, s.
     seed
         Seed of the optimisers.
     bounds
-        Also the optimal-control bound (extra ``bounds``) and, where the gap is large, the
-        trials.
+        Also the optimal-control bound (extra ``bounds``).
     progress
         Called with what is being done and the part that is done.
     done
@@ -164,20 +137,29 @@ def survey(
         When bounds are asked for without CasADi.
     """
     chosen = [named(name) for name in (LIBRARY if names is None else names)]
-    objectives = [objective_for(mechanism, goal, horizon=horizon) for mechanism in chosen]
-    for mechanism, objective in zip(chosen, objectives, strict=True):
+    jobs = [
+        (goal, mechanism, objective_for(mechanism, goal, horizon=horizon))
+        for goal in goals
+        for mechanism in chosen
+    ]
+    for _, mechanism, objective in jobs:
         objective.check_start(mechanism, mechanism.usual_start)
     entries = []
-    for index, (mechanism, objective) in enumerate(zip(chosen, objectives, strict=True)):
-        progress(mechanism.name, index / len(chosen))
-        entries.append(survey_one(mechanism, objective, seed=seed, bounds=bounds))
+    for index, (goal, mechanism, objective) in enumerate(jobs):
+        progress(f"{mechanism.name}, {goal}", index / len(jobs))
+        entries.append(survey_one(mechanism, objective, goal=goal, seed=seed, bounds=bounds))
         if done is not None:
             done(entries[-1])
     return tuple(entries)
 
 
 def survey_one(
-    mechanism: Mechanism, objective: Objective, *, seed: int = 0, bounds: bool = True
+    mechanism: Mechanism,
+    objective: Objective,
+    *,
+    goal: str = "",
+    seed: int = 0,
+    bounds: bool = True,
 ) -> Entry:
     """Bring one mechanism from its listed start to its target; the line of the survey."""
     began = time.perf_counter()
@@ -187,21 +169,18 @@ def survey_one(
     proposal = cascade.start(x0)[1]
     plan, first = proposal.plan, cascade.optimiser.anchor
     assert plan is not None  # start() raises otherwise
-    assert first is not None  # designed when the optimiser was made
     candidates: list[Surface | Plan] = [first, plan]
     costs = loop.batch(x0, candidates)
     run = cascade.simulate(x0)
-    limit = math.nan
-    trials: dict[str, float] = {}
-    if bounds:
-        limit = _bound(mechanism, objective, x0, run)
-        if run.cost / limit - 1.0 > LARGE:
-            trials = _trials(mechanism, objective, x0, seed)
+    free = replace(cascade, freedom=DecisionVariables(reaching=True)).simulate(x0)
+    longest = run.time if cascade.optimiser.counts_time else objective.horizon
+    limit = _bound(mechanism, objective, x0, (run, free), longest) if bounds else math.nan
     bare = replace(objective, unit="", constraints=(), travel=False)
     reached = [
         float(cost) if ok else math.inf for cost, ok in zip(costs.cost, costs.reached, strict=True)
     ]
     return Entry(
+        goal=goal,
         name=mechanism.name,
         n=mechanism.n,
         m=mechanism.m,
@@ -210,21 +189,28 @@ def survey_one(
         designed=reached[0],
         one_time=reached[1],
         cascade=run.cost if run.reached else math.inf,
+        free=free.cost if free.reached else math.inf,
         time=run.time if run.reached else math.inf,
         radius=float(math.hypot(*run.trajectory.x[-1])),
         bound=limit,
         seconds=time.perf_counter() - began,
-        trials=trials,
         problem=f"{bare.meaning(mechanism)}; gate: {gate_words(cascade.gate)}",
         travel=", ".join(constraint.name for constraint in loop.objective.constraints),
     )
 
 
-def _bound(mechanism: Mechanism, objective: Objective, x0: FloatArray, run: Run) -> float:
-    """Return the bound, NaN where none was found; the cascade's own motion is one guess."""
-    intervals = max(100, round(PER_CYCLE * _cycles(mechanism, objective.horizon)))
+def _bound(
+    mechanism: Mechanism,
+    objective: Objective,
+    x0: FloatArray,
+    runs: Sequence[Run],
+    longest: float,
+) -> float:
+    """Return the bound, NaN where none was found; the cascades' own motions are guesses."""
+    intervals = max(100, round(PER_CYCLE * _cycles(mechanism, longest)))
+    guesses = [run.trajectory for run in runs]
     try:
-        found = bound(mechanism, objective, x0, intervals=intervals, guess=run.trajectory)
+        found = bound(mechanism, objective, x0, intervals=intervals, guess=guesses)
     except InfeasibleError:
         return math.nan
     return found.cost
@@ -239,41 +225,27 @@ def _cycles(mechanism: Mechanism, horizon: float) -> float:
     return float(sum(swings))
 
 
-def _trials(
-    mechanism: Mechanism, objective: Objective, x0: FloatArray, seed: int
-) -> dict[str, float]:
-    costs = {}
-    for trial in ABLATIONS:
-        cascade = Cascade(
-            mechanism,
-            objective,
-            freedom=trial.freedom,
-            cold=trial.budget,
-            seed=seed,
-            belief="exact",
-        )
-        proposal = cascade.optimiser.propose(x0)
-        costs[trial.name] = math.inf
-        if proposal.plan is not None:
-            batch = cascade.loop.batch(x0, proposal.plan)
-            costs[trial.name] = float(batch.cost[0]) if batch.reached[0] else math.inf
-    return costs
-
-
-def median_gap(entries: Sequence[Entry]) -> float:
+def median_gap(gaps: Iterable[float]) -> float:
     """Return the median of the gaps that are known; NaN where none is."""
-    gaps = [entry.gap for entry in entries if math.isfinite(entry.bound)]
-    return median(gaps) if gaps else math.nan
+    known = [gap for gap in gaps if math.isfinite(gap)]
+    return median(known) if known else math.nan
 
 
 # -- what is shown and kept ----------------------------------------------------------------------
 
-_HEAD = ("mechanism", "n, m", "start", "designed", "one-time", "cascade", "bound", "gap", "time")
+_HEAD = (
+    "mechanism", "n, m", "start", "designed", "one-time", "cascade", "free", "bound", "gap",
+    "gap, free", "time",
+)  # fmt: skip
+
+
+def _percent(gap: float) -> str:
+    return f"{100 * gap:.1f} %" if math.isfinite(gap) else "—"
 
 
 def _cells(entry: Entry) -> tuple[str, ...]:
-    costs = (entry.designed, entry.one_time, entry.cascade, entry.bound)
-    designed, one_time, cascade, bound = (number(value, ".4g") for value in costs)
+    costs = (entry.designed, entry.one_time, entry.cascade, entry.free, entry.bound)
+    designed, one_time, cascade, free, bound = (number(value, ".4g") for value in costs)
     return (
         entry.name,
         f"{entry.n}, {entry.m}",
@@ -281,30 +253,31 @@ def _cells(entry: Entry) -> tuple[str, ...]:
         designed,
         one_time,
         f"{cascade} {entry.unit}",
+        free,
         bound,
-        f"{100 * entry.gap:.1f} %" if math.isfinite(entry.gap) else "—",
+        _percent(entry.gap),
+        _percent(entry.free_gap),
         f"{entry.time:.2f} s" if math.isfinite(entry.time) else "not reached",
     )
 
 
-def _trial_words(entry: Entry) -> str:
-    words = [f"{name}: {100 * entry.gap_of(cost):.1f} %" for name, cost in entry.trials.items()]
-    return f"{entry.name}, {100 * entry.gap:.1f} %: " + "; ".join(words)
-
-
 def survey_table(entries: Sequence[Entry]) -> Table:
-    """Return the survey for a terminal of 80 columns: start and unit stand on second lines."""
-    heads = ("mechanism, start", *_HEAD[3:7], "gap, %", "time, s")
+    """Return the survey for a terminal of 80 columns: start, gaps and unit on second lines."""
+    heads = ("mechanism, start", *_HEAD[3:8], "time, s")
     rows: list[tuple[RenderableType, ...]] = []
     for entry in entries:
-        name, _, start, designed, one_time, cascade, bound, gap, when = _cells(entry)
+        name, _, start, designed, one_time, cascade, free, bound, gap, free_gap, when = _cells(
+            entry
+        )
         cost, _, unit = cascade.partition(" ")
         rows.append(
             (
                 Text(name).append(f"\n{start}", "dim"),
-                *(designed, one_time, cost),
+                *(designed, one_time),
+                Text(cost).append(f"\n{gap}"),
+                Text(free).append(f"\n{free_gap}"),
                 Text(bound).append(f"\n{unit}", "dim"),
-                *(cell.removesuffix(" %").removesuffix(" s") for cell in (gap, when)),
+                when.removesuffix(" s"),
             )
         )
     made = table(heads, rows, whole=heads, padding=(0, 1, 0, 0))
@@ -312,15 +285,27 @@ def survey_table(entries: Sequence[Entry]) -> Table:
     return made
 
 
+def by_goal(entries: Sequence[Entry]) -> list[list[Entry]]:
+    """Return the entries of each goal, in the order in which they were made."""
+    return [
+        [e for e in entries if e.goal == goal] for goal in dict.fromkeys(e.goal for e in entries)
+    ]
+
+
 def summary(entries: Sequence[Entry]) -> list[str]:
-    """Return the sentences under the table: how many arrive, median gap, what larger gaps hold."""
+    """Return the sentences under the table of one goal: how many arrive, and the gaps."""
     arrived = sum(math.isfinite(entry.time) for entry in entries)
     lines = [f"{arrived} of {len(entries)} reach the target."]
-    if math.isfinite(median_gap(entries)):
-        lines.append(f"Median gap of the cascade to the bound: {100 * median_gap(entries):.1f} %.")
-    if any(entry.trials for entry in entries):
-        lines.append("Gap of a one-time optimum where a restriction is taken away:")
-        lines += [f"  {_trial_words(entry)}" for entry in entries if entry.trials]
+    for words, gaps in (
+        ("the cascade", [entry.gap for entry in entries]),
+        ("the cascade with a free reaching law", [entry.free_gap for entry in entries]),
+    ):
+        middle = median_gap(gaps)
+        if math.isfinite(middle):
+            most = max(gap for gap in gaps if not math.isnan(gap))
+            lines.append(
+                f"Gap of {words} to the bound: median {_percent(middle)}, worst {_percent(most)}."
+            )
     return lines + _problems(entries)
 
 
@@ -335,30 +320,32 @@ def _problems(entries: Sequence[Entry]) -> list[str]:
 
 
 def markdown(entries: Sequence[Entry]) -> str:
-    """Return the survey as a Markdown table, as it stands in the documentation."""
-    lines = markdown_table(_HEAD, map(_cells, entries), right=_HEAD[3:])
-    return "\n".join(lines) + "\n\n" + "\n\n".join(summary(entries)) + "\n"
+    """Return the survey as Markdown tables, one a goal, as they stand in the documentation."""
+    parts = []
+    for some in by_goal(entries):
+        lines = markdown_table(_HEAD, map(_cells, some), right=_HEAD[3:])
+        parts.append("\n".join(lines) + "\n\n" + "\n\n".join(summary(some)) + "\n")
+    return "\n".join(parts)
 
 
 def files(request: Mapping[str, object], entries: Sequence[Entry]) -> dict[str, bytes]:
     """Return ``survey.csv``, ``survey.md`` and ``manifest.json``."""
     header = (
-        "mechanism", "n", "m", "start", "unit", "designed", "one_time", "cascade", "bound",
-        "gap", "time_s", "radius", "seconds", *(trial.name for trial in ABLATIONS),
+        "objective", "mechanism", "n", "m", "start", "unit", "designed", "one_time", "cascade",
+        "free", "bound", "gap", "free_gap", "time_s", "radius", "seconds",
     )  # fmt: skip
     rows = [
         (
-            e.name, e.n, e.m, e.start, e.unit,
-            *map(finite, (e.designed, e.one_time, e.cascade, e.bound, e.gap)),
+            e.goal, e.name, e.n, e.m, e.start, e.unit,
+            *map(finite, (e.designed, e.one_time, e.cascade, e.free, e.bound, e.gap, e.free_gap)),
             *map(finite, (e.time, e.radius)),
             round(e.seconds, 2),
-            *(finite(e.trials.get(trial.name, math.nan)) for trial in ABLATIONS),
         )
         for e in entries
     ]  # fmt: skip
-    made = manifest("undertow survey", request, median_gap=finite(median_gap(entries)))
+    gaps = {some[0].goal: finite(median_gap(e.gap for e in some)) for some in by_goal(entries)}
     return {
         "survey.csv": to_csv(header, rows),
         "survey.md": markdown(entries).encode(),
-        "manifest.json": made,
+        "manifest.json": manifest("undertow survey", request, median_gap=gaps),
     }
