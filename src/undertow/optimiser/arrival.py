@@ -1,10 +1,10 @@
 """The earliest arrival, for many plans at once; knows nothing of control.
 
 The first time at which a motion touches the terminal set is a discontinuous function of the
-parameters, and a population search gets stuck on its steps.  Where a motion comes closest to the
-target *within a window* [0, T] is smooth but for a change of the pass that is closest.  So: bring
-the closest states of a population to zero by Levenberg-Marquardt, all in one batch; where one
-arrives, shorten the window below its arrival, drop the worst, and go on until none follows.
+parameters, and a population search gets stuck on its steps.  The state at a *fixed* time T is
+smooth.  So: bring the states at T of a population to zero by Levenberg-Marquardt, all in one batch;
+where one arrives, at T or before, shorten T, drop those that are farthest, and go on until none
+follows.
 
 Plans that arrive without sliding in at a decaying rate are isolated, or lie on thin sets: that is
 why the population is wide at first and many of its members lead nowhere.
@@ -14,14 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-#: The window ends at this part of the last arrival.
+#: T after an arrival, as a part of the one before.
 SHORTER = 0.97
 
 #: Members that remain after an arrival, as a part; and how many remain at least.
@@ -37,90 +36,75 @@ PROBE, LONGEST = 1e-4, 0.5
 TRIALS, LEAST, MOST = np.array([1e-2, 1.0, 1e2]), 1e-8, 1e4
 
 
-class Approach(NamedTuple):
-    """The closest states of N motions, (N, k); how close they are, (N,); and when, (N,), s."""
-
-    state: FloatArray
-    distance: FloatArray
-    time: FloatArray
-
-    def part(self, rows: NDArray[np.intp]) -> Approach:
-        """Return some of them."""
-        return Approach(self.state[rows], self.distance[rows], self.time[rows])
-
-    def replaced(self, rows: NDArray[np.bool_], other: Approach) -> Approach:
-        """Return these with those of ``other`` in some rows."""
-        return Approach(
-            np.where(rows[:, None], other.state, self.state),
-            np.where(rows, other.distance, self.distance),
-            np.where(rows, other.time, self.time),
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class ArrivalSearch:
     """Looks for parameters whose motion arrives ever earlier.
 
     Parameters
     ----------
-    approach
-        Where motions come closest in a window: parameters (N, d) and T, s, to :class:`Approach`.
-        A motion that cannot be judged has an infinite distance.
+    states
+        States at T, s, for parameters (N, d): (N, k), infinite for a motion that broke off; and
+        when that is, (N,): a motion that arrives before T is told there and then.
     admits
         Whether parameters (N, d) whose motions arrive are admissible, (N,).
     radius
-        Distance that counts as arrived.
-    stop
-        Asked before each batch, with its size.
+        ‖state‖₂ that counts as arrived.
+    without
+        Whether so many evaluations cannot be had any more.
     """
 
-    approach: Callable[[FloatArray, float], Approach]
+    states: Callable[[FloatArray, float], tuple[FloatArray, FloatArray]]
     admits: Callable[[FloatArray], NDArray[np.bool_]]
     radius: float
-    stop: Callable[[int], bool] = lambda _: False
+    without: Callable[[int], bool] = lambda _: False
 
-    def run(self, z: FloatArray, T: float, members: int) -> float:
-        """Search from the nearest of some parameters (N, d), for arrivals before T, s.
-
-        Returns the end of the last window in which a motion arrived, ∞ for none.
-        """
-        found, quiet = np.inf, 0
-        if self.stop(len(z)):
-            return found
-        near = self.approach(z, T)
-        nearest = np.argsort(near.distance, kind="stable")[:members]
-        nearest = nearest[np.isfinite(near.distance[nearest])]
-        z, near, damping = z[nearest], near.part(nearest), np.full(len(nearest), 1e-2)
-        while quiet < PATIENCE and len(z) and not self.stop(len(z) * (z.shape[1] + len(TRIALS))):
-            arrived = near.distance <= self.radius
+    def run(self, z: FloatArray, T: float, members: int) -> None:
+        """Search from those of some parameters (N, d) that are nearest at T, s."""
+        if self.without(len(z)):
+            return
+        z, x, t = _nearest(z, *self.states(z, T), members)
+        damping, quiet = np.full(len(z), 1e-2), 0
+        while quiet < PATIENCE and len(z) and not self.without(len(z) * (z.shape[1] + len(TRIALS))):
+            arrived = np.linalg.norm(x, axis=1) <= self.radius
             if arrived.any():
-                good = np.flatnonzero(arrived)[self.admits(z[arrived])]
-                left = np.union1d(np.flatnonzero(~arrived), good)
-                if not len(good):
-                    z, near, damping = z[left], near.part(left), damping[left]
+                good = np.zeros(len(z), dtype=bool)
+                good[arrived] = self.admits(z[arrived])
+                left = good | ~arrived
+                if not good.any():
+                    z, x, t, damping = z[left], x[left], t[left], damping[left]
                     continue
-                found, quiet = T, 0
-                T = SHORTER * float(near.time[good].min())
-                z = z[left]
-                near = self.approach(z, T)
-                most = max(FEWEST, int(REMAIN * len(z)))
-                left = np.argsort(near.distance, kind="stable")[:most]
-                z, near, damping = z[left], near.part(left), np.full(len(left), 1e-2)
+                quiet, T, z = 0, SHORTER * float(t[good].min()), z[left]
+                z, x, t = _nearest(z, *self.states(z, T), max(FEWEST, int(REMAIN * len(z))))
+                damping = np.full(len(z), 1e-2)
             else:
                 quiet += 1
             count, d = z.shape
-            probes = self.approach((z[:, None] + PROBE * np.eye(d)).reshape(-1, d), T)
-            slopes = (probes.state.reshape(count, d, -1) - near.state[:, None]) / PROBE
+            probes, _ = self.states((z[:, None] + PROBE * np.eye(d)).reshape(-1, d), T)
+            slopes = (probes.reshape(count, d, -1) - x[:, None]) / PROBE
             dampings = damping[:, None] * TRIALS
-            trials = z[:, None] + _steps(slopes, near.state, dampings)
-            tried = self.approach(trials.reshape(-1, d), T)
-            rows, best = np.arange(count), tried.distance.reshape(count, -1).argmin(axis=1)
-            tried = tried.part(rows * len(TRIALS) + best)
-            better = tried.distance < near.distance
-            z, near = np.where(better[:, None], trials[rows, best], z), near.replaced(better, tried)
+            trials = z[:, None] + _steps(slopes, x, dampings)
+            tried, when = self.states(trials.reshape(-1, d), T)
+            misses = np.linalg.norm(tried, axis=1).reshape(count, -1)
+            rows, best = np.arange(count), misses.argmin(axis=1)
+            better = misses[rows, best] < np.linalg.norm(x, axis=1)
+            taken = (rows * len(TRIALS) + best)[better]
+            z[better], x[better], t[better] = (
+                trials[better, best[better]],
+                tried[taken],
+                when[taken],
+            )
             harder = np.where(better, dampings[rows, best], dampings[:, -1])
             damping = np.clip(harder, LEAST, MOST)
-        return found
+
+
+def _nearest(
+    z: FloatArray, x: FloatArray, t: FloatArray, most: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the parameters, so many at most, whose states are nearest to zero, with both."""
+    miss = np.linalg.norm(x, axis=1)
+    rows = np.argsort(miss, kind="stable")[:most]
+    rows = rows[np.isfinite(miss[rows])]
+    return z[rows], x[rows], t[rows]
 
 
 def _steps(slopes: FloatArray, states: FloatArray, dampings: FloatArray) -> FloatArray:

@@ -138,8 +138,7 @@ class Optimiser:
         if self.counts_time:
             return Budget(6144 * size)
         # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
-        n, m = self.loop.mechanism.n, self.loop.mechanism.m
-        return Budget(1024 * (2 * m * n - m * m) ** 2 // 3)
+        return Budget(1024 * size**2 // 3)
 
     @checked
     def propose(

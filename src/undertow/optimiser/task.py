@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from undertow.closed_loop import INADMISSIBLE, LANES, UNSTABLE, Event, RolloutBuffers
 from undertow.law import Margin, Plan, stability_margin
 from undertow.models import FloatArray
-from undertow.optimiser.arrival import SHORTER, Approach, ArrivalSearch
+from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
 from undertow.optimiser.trust_region import TrustRegion
@@ -66,8 +66,8 @@ FAR = 0.25
 POLISH = 512
 
 #: A search for arrivals far and wide: its members, draws for each of them, the spread of these, and
-#: the first window as a part of the best time: what arrives late may lead to what arrives early.
-CROWD, DRAWS, WIDE, WINDOW = 96, 16, 1.5, 2.0
+#: between which parts of the best time it begins: what arrives late may lead to what arrives early.
+CROWD, DRAWS, WIDE, BEGINS = 96, 16, 1.5, (0.5, 2.0)
 
 #: The same around the best plan: the spread is between two powers of ten; and how many of these
 #: searches in turn may lead nowhere before the next one far and wide.
@@ -232,18 +232,21 @@ class Optimisation:
 
     def global_search(self) -> Iterator[bool]:
         """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
-        self.cost(self.optimiser.firsts[: max(1, self.left)])
+        z = self.optimiser.firsts[: max(1, self.left)]
+        scores = self.cost(z)
         if self.optimiser.counts_time:
             yield self._earlier(min(POLISH, self.left))
-            yield self.arrive_earlier(wide=True)
+            self.arrive_earlier(wide=True, keep=POLISH)
+            yield self._earlier(self.left)
             return
         if self._centre().size <= MODEL_SIZE:
             self._model_search(self._centre())
             yield False
         optimiser, rng, total = self.optimiser, self.rng, self.budget.evaluations
         draws = max(optimiser.population, total // 6)
-        z = self.optimiser.firsts[0] + self.space.steps(rng, np.ones(draws))
-        scores = self.cost(z[: max(1, self.left)])
+        drawn = self.optimiser.firsts[0] + self.space.steps(rng, np.ones(draws))
+        drawn = drawn[: max(1, self.left)]
+        z, scores = np.vstack([z, drawn]), np.concatenate([scores, self.cost(drawn)])
         starts = z[np.argsort(scores, kind="stable")[:3]]
         share = (total - len(z)) // 4
         for start in starts:
@@ -379,23 +382,27 @@ class Optimisation:
             around = here + self.space.steps(self.rng, np.geomspace(0.1, 1.0, wide))
             self.cost(around, hopeless=1.0)
 
-    def arrive_earlier(self, wide: bool = False) -> bool:
+    def arrive_earlier(self, wide: bool = False, keep: int = 0) -> bool:
         """Search for earlier arrivals around the best plan, or first far and wide.
 
-        And far and wide again when that leads nowhere any more.
+        And far and wide again when that leads nowhere any more; so many evaluations are left over.
         """
         rng, space, spent = self.rng, self.space, -1
         search = ArrivalSearch(
-            self._approach, self._admits, 0.9 * self.loop.objective.terminal_radius, self._without
+            self._states,
+            self._admits,
+            0.9 * self.loop.objective.terminal_radius,
+            lambda evaluations: self.left < evaluations + keep or self.late(),
         )
         fruitless = FRUITLESS if wide else 0
-        while self.left > 0 and not self.late() and self.evaluations > spent:
+        while self.left > keep and not self.late() and self.evaluations > spent:
             before, spent = self.best_cost, self.evaluations
             if before <= self.loop.step:  # all but there
                 return True
             if not before < INADMISSIBLE or fruitless == FRUITLESS:
                 z = self.optimiser.firsts[0] + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
-                search.run(z, WINDOW * before if before < INADMISSIBLE else self._long(), CROWD)
+                known = before < INADMISSIBLE
+                search.run(z, rng.uniform(*BEGINS) * before if known else self._long(), CROWD)
                 fruitless = 0
                 continue
             spread = 10.0 ** rng.uniform(*NEAR_AND_FAR, FEW * AROUND)
@@ -404,7 +411,7 @@ class Optimisation:
             if self.best_cost < (1.0 - WORTHWHILE) * before:
                 fruitless = 0
             elif fruitless == 1:
-                self._earlier(min(POLISH, self.left))
+                self._earlier(min(POLISH, self.left - keep))
         return False
 
     def _long(self) -> float:
@@ -413,12 +420,11 @@ class Optimisation:
         rate = float(stability_margin(self.loop.mechanism, anchor.vector[None])[0])
         return min(self.horizon, LONG / max(rate, LONG / self.horizon))
 
-    def _without(self, evaluations: int) -> bool:
-        """Whether there are not so many evaluations left, or no time."""
-        return self.left < evaluations or self.late()
+    def _states(self, z: FloatArray, T: float) -> tuple[FloatArray, FloatArray]:
+        """States at T, (N, 2n), or where a motion came closest, if it arrived before; and when.
 
-    def _approach(self, z: FloatArray, T: float) -> Approach:
-        """Where motions come closest to the target before T; of an ensemble, its first member's."""
+        They are infinite where a motion broke off.  An ensemble's first member stands for all.
+        """
         loop, space = self.loop, self.space
         self.evaluations += len(z)
         buffers = RolloutBuffers(loop, len(z), space.segments, plants=loop.ensemble is not None)
@@ -426,11 +432,10 @@ class Optimisation:
             buffers.lanes[:, :, buffers.layout.size :] = loop.ensemble.values[0]
         buffers.fill(self.x, *space.decode(z))
         batch = loop.roll_out(buffers, self.optimiser.freedom.times, T, terminal=0.0, seek=True)
-        return Approach(
-            np.nan_to_num(batch.closest_x),
-            np.where(np.isfinite(batch.closest), batch.closest, np.inf),
-            batch.closest_time.copy(),
-        )
+        sound = (batch.event == Event.HORIZON) & np.isfinite(batch.x).all(axis=1)
+        early = sound & (batch.closest < loop.objective.terminal_radius)
+        x = np.where(early[:, None], batch.closest_x, batch.x)
+        return np.where(sound[:, None], x, np.inf), np.where(early, batch.closest_time, T)
 
     def _admits(self, z: FloatArray) -> NDArray[np.bool_]:
         """Score plans that arrive on the first plant."""
