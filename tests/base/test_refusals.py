@@ -14,6 +14,7 @@ from support import interpreted
 from undertow.base import InvalidInputError, UndertowError, UnstableSurfaceError
 from undertow.cascade import Update
 from undertow.models import TIME
+from undertow.optimiser.task import POLISH
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -63,10 +64,12 @@ def test_a_coordinate_may_be_called_x() -> None:
 
 @pytest.mark.parametrize("evaluations", [300, 6000])
 def test_a_budget_is_spent_and_not_exceeded(rig: ut.Mechanism, evaluations: int) -> None:
-    """A global search uses the evaluations that it is given, to within one generation."""
+    """A global search uses the evaluations it is given, to one generation, or has converged."""
     optimiser = ut.Optimiser(ut.ClosedLoop(rig, ut.MinimumTime()))
     proposal = optimiser.propose(rig.state(phi=0.3), budget=ut.Budget(evaluations))
-    assert evaluations - optimiser.population < proposal.evaluations <= evaluations
+    assert proposal.evaluations <= evaluations
+    spent = proposal.evaluations > evaluations - optimiser.population
+    assert spent or (proposal.status == "converged" and evaluations - proposal.evaluations < POLISH)
 
 
 def test_descent_is_undefined_where_a_prediction_is() -> None:

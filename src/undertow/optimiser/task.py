@@ -67,10 +67,11 @@ POLISH = 512
 
 #: A search for arrivals far and wide: its members, draws for each of them, the spread of these, and
 #: between which parts of the best time it begins: what arrives late may lead to what arrives early.
-CROWD, DRAWS, WIDE, BEGINS = 96, 16, 1.5, (0.5, 2.0)
+CROWD, DRAWS, WIDE, BEGINS = 96, 16, 1.5, (1.0, 2.0)
 
 #: The same around the best plan: the spread is between two powers of ten; and how many of these
-#: searches in turn may lead nowhere before the next one far and wide.
+#: searches in turn may lead nowhere before the next one far and wide.  With few parameters arrivals
+#: are isolated, and one is enough.
 FEW, AROUND, NEAR_AND_FAR, FRUITLESS = 24, 8, (-1.5, 0.3), 6
 
 #: Time constants of the first surface after which, without any plan, an arrival is looked for.
@@ -394,12 +395,13 @@ class Optimisation:
             0.9 * self.loop.objective.terminal_radius,
             lambda evaluations: self.left < evaluations + keep or self.late(),
         )
-        fruitless = FRUITLESS if wide else 0
+        most = FRUITLESS if self.optimiser.aims else 1
+        fruitless = most if wide else 0
         while self.left > keep and not self.late() and self.evaluations > spent:
             before, spent = self.best_cost, self.evaluations
             if before <= self.loop.step:  # all but there
                 return True
-            if not before < INADMISSIBLE or fruitless == FRUITLESS:
+            if not before < INADMISSIBLE or fruitless == most:
                 z = self.optimiser.firsts[0] + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
                 known = before < INADMISSIBLE
                 search.run(z, rng.uniform(*BEGINS) * before if known else self._long(), CROWD)
