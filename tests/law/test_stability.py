@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import undertow as ut
 from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
-from undertow.law import sliding_matrix, stability_margin
+from undertow.law import quadratic_designs, sliding_matrix, stability_margin
 from undertow.models import Linearisation, controllability, linearise
 from undertow.studies.paper import CASES
 
@@ -252,21 +252,34 @@ def test_quadratic_design_minimises_its_integral_on_the_surface(n: int, m: int) 
         assert abs(above - below) < 0.1 * (above + below)
 
 
-def test_a_design_is_kept_on_disk(
+def test_designs_are_kept_on_disk(
     rig: ut.Mechanism, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second time no Riccati equation is solved; another wish is another design."""
-    monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path / "designs"))
-    weights = [1.0, 7.0, 0.3, 0.2]
-    first = ut.first_surface(rig, weights, rate=0.25)
+    """The second time no Riccati equation is solved; many designs are one file, a wish is none."""
+    cache = tmp_path / "designs"
+    monkeypatch.setenv("UNDERTOW_CACHE", str(cache))
+    weights = 10.0 ** np.random.default_rng(0).uniform(-2, 2, (40, 4))
+    first, many = ut.first_surface(rig), quadratic_designs(rig, weights)
+    assert len(many) == 40
+    assert many[7] == ut.first_surface(rig, list(weights[7]))
+    assert len(list(cache.rglob("surfaces_*.txt"))) == 2
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("solved again")
 
     monkeypatch.setattr(scipy.linalg, "solve_continuous_are", refuse)
-    assert ut.first_surface(rig, weights, rate=0.25) == first
+    assert ut.first_surface(rig) == first
+    assert quadratic_designs(rig, weights) == many
     with pytest.raises(AssertionError, match="solved again"):
-        ut.first_surface(rig, weights, rate=0.26)
+        ut.first_surface(rig, rate=0.26)
+
+
+@pytest.mark.parametrize("weights", [[1.0, 2.0, 3.0, 4.0], [[1.0, 2.0]], [[1.0, 2.0, 0.0, 1.0]]])
+def test_weights_of_designs_are_rows_of_positive_numbers(
+    rig: ut.Mechanism, weights: list[object]
+) -> None:
+    with pytest.raises(InvalidInputError, match=r"\(N, 4\) numbers > 0"):
+        quadratic_designs(rig, weights)
 
 
 def test_poles_whose_placing_is_not_the_best_there_is_are_placed_without_a_word() -> None:

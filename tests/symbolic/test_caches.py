@@ -120,6 +120,24 @@ def test_equations_in_the_cache_are_read_and_not_run(
     assert not mark.exists()
 
 
+def test_of_many_texts_the_oldest_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A study of thousands of plants does not fill the disk; other kinds are left alone."""
+    monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(store, "KEPT", 10)
+    store.remember("other", "ff" * 32, "stays")
+    for k in range(1, 50):
+        store.remember("text", f"{k:02x}" * 32, f"{k}")
+        written = private_folder() / f"text_{f'{k:02x}' * 16}.txt"
+        os.utime(written, (k, k))
+    assert store.recall("text", "01" * 32) == "1"
+    store.remember("text", "00" * 32, "the one that clears")
+    assert len(list(private_folder().glob("text_*.txt"))) == 10
+    assert store.recall("text", "01" * 32) is None
+    assert store.recall("text", "31" * 32) == "49"
+    assert store.recall("text", "00" * 32) == "the one that clears"
+    assert store.recall("other", "ff" * 32) == "stays"
+
+
 def test_equations_come_back_from_the_cache_as_they_were() -> None:
     for make in (ut.mechanisms.rotary_pendulum, ut.mechanisms.tora, ut.mechanisms.gantry_crane):
         mechanism = make()

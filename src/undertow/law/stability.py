@@ -22,8 +22,10 @@ from undertow.base import (
     InvalidInputError,
     ModelError,
     SingularSurfaceError,
+    UndertowError,
     UnstableSurfaceError,
     checked,
+    floats,
 )
 from undertow.law.sliding import check_surface_shape, coupling, gamma_determinant, singularity
 from undertow.law.surface import LawLayout, Surface
@@ -246,11 +248,13 @@ def first_surface(
 
     Notes
     -----
-    A design is kept on disk beside the kernels, so that a second start need not repeat it.
+    The default design is kept on disk beside the kernels: a second start need not repeat it.
     """
     n, m = mechanism.n, mechanism.m
     if weights is None:
         weights = [1.0] * m + [10.0] * (n - m) + [0.1] * n
+        if rate == 0:
+            return _kept(mechanism, np.array([weights]), strict=True)[0]
     diagonal = np.asarray(weights, dtype=float)
     if diagonal.shape != (2 * n,) or not (np.isfinite(diagonal).all() and (diagonal > 0).all()):
         raise InvalidInputError(
@@ -258,15 +262,54 @@ def first_surface(
         )
     if not (np.isfinite(rate) and rate >= 0):
         raise InvalidInputError("convergence rate", value=rate, limit="finite and ≥ 0 1/s")
-    key = content_key(
-        mechanism.structure,
-        repr((mechanism.parameter_values.tolist(), diagonal.tolist(), float(rate))),
-    )
-    known = recall("surface", key)
+    return _quadratic(mechanism, diagonal, rate)
+
+
+@checked
+def quadratic_designs(mechanism: Mechanism, weights: ArrayLike) -> tuple[Surface, ...]:
+    """Return :func:`first_surface` for rows of weights, (N, 2n), but for those that have none.
+
+    They are kept on disk together.
+
+    Raises
+    ------
+    InvalidInputError
+        For weights of another shape, or that are not positive.
+    """
+    rows = floats("weights of quadratic designs", weights)
+    good = rows.ndim == 2 and rows.shape[1] == 2 * mechanism.n
+    if not (good and np.isfinite(rows).all() and (rows > 0).all()):
+        raise InvalidInputError(
+            "weights of quadratic designs",
+            value=f"shape {rows.shape}, least {rows.min(initial=np.inf):g}",
+            limit=f"(N, {2 * mechanism.n}) numbers > 0",
+        )
+    return _kept(mechanism, rows, strict=False)
+
+
+def _kept(mechanism: Mechanism, weights: FloatArray, *, strict: bool) -> tuple[Surface, ...]:
+    """Return quadratic designs from the disk, or design and keep them."""
+    numbers = repr((mechanism.parameter_values.tolist(), weights.tolist()))
+    key = content_key(mechanism.structure, numbers)
+    known = recall("surfaces", key)
     if known is not None:
-        return Surface.from_vector(np.array(json.loads(known)), n, m)
+        rows = json.loads(known)
+        return tuple(Surface.from_vector(np.array(r), mechanism.n, mechanism.m) for r in rows)
+    made = []
+    for row in weights:
+        try:
+            made.append(_quadratic(mechanism, row, 0.0))
+        except UndertowError:
+            if strict:
+                raise
+    remember("surfaces", key, json.dumps([surface.vector.tolist() for surface in made]))
+    return tuple(made)
+
+
+def _quadratic(mechanism: Mechanism, diagonal: FloatArray, rate: float) -> Surface:
     import scipy.linalg  # slow to import: a known design does without
 
+    n, m = mechanism.n, mechanism.m
     A, T = _regular_form(mechanism)
     free = 2 * n - m
     Q = T @ np.diag(diagonal) @ T.T
@@ -281,9 +324,7 @@ def first_surface(
     except np.linalg.LinAlgError as error:
         raise _uncontrollable(mechanism) from error
     K = np.linalg.solve(Q[free:, free:], A[:free, free:].T @ P + Q[:free, free:].T)
-    surface = _surface_of(mechanism, np.hstack([K, np.eye(m)]) @ T)
-    remember("surface", key, json.dumps(surface.vector.tolist()))
-    return surface
+    return _surface_of(mechanism, np.hstack([K, np.eye(m)]) @ T)
 
 
 @checked

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,9 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import UndertowError, at_least, check_fields, checked
+from undertow.base import at_least, check_fields, checked
 from undertow.closed_loop import ClosedLoop
-from undertow.law import Plan, Surface, check_surface, first_surface
+from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_designs
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
 from undertow.optimiser.search_space import DecisionVariables, SearchSpace
@@ -117,11 +116,8 @@ class Optimiser:
     def designs(self) -> tuple[Surface, ...]:
         """The first surface, and quadratic designs of random weights: all locally stable."""
         mechanism, rng = self.loop.mechanism, np.random.default_rng(self.seed)
-        found = [self.anchor]
-        for weights in 10 ** rng.uniform(-2, 2, (DESIGNS, 2 * mechanism.n)):
-            with contextlib.suppress(UndertowError):
-                found.append(first_surface(mechanism, list(weights)))
-        return tuple(found)
+        weights = 10 ** rng.uniform(-2, 2, (DESIGNS, 2 * mechanism.n))
+        return (self.anchor, *quadratic_designs(mechanism, weights))
 
     @cached_property
     def firsts(self) -> FloatArray:

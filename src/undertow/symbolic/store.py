@@ -26,6 +26,9 @@ import sympy as sp
 from undertow.symbolic.machine import numba
 from undertow.symbolic.private import private_folder
 
+#: Texts of a kind that are kept at most, but for as many again between two clearances.
+KEPT = 1024
+
 PACKAGE = Path(__file__).resolve().parent.parent
 
 
@@ -71,10 +74,18 @@ def recall(name: str, key: str) -> str | None:
 
 
 def remember(name: str, key: str, text: str) -> None:
-    """Keep a text under a key; a disk that refuses only costs time later."""
+    """Keep a text under a key; a disk that refuses only costs time later.
+
+    Now and then, by the key, the oldest of too many of its kind go: a study of many plants has
+    many texts.
+    """
     with contextlib.suppress(OSError, UnicodeEncodeError):
-        path = private_folder() / f"{name}_{key[:32]}.txt"
-        _write(path, f"{_seal(key, text)}\n{text}")
+        folder = private_folder()
+        _write(folder / f"{name}_{key[:32]}.txt", f"{_seal(key, text)}\n{text}")
+        if key.startswith("00"):
+            written = sorted(folder.glob(f"{name}_*.txt"), key=lambda path: path.stat().st_mtime)
+            for old in written[:-KEPT]:
+                old.unlink(missing_ok=True)
 
 
 def generated(kind: str, name: str, key: str, write: Callable[[], str]) -> ModuleType:
