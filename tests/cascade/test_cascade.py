@@ -101,10 +101,16 @@ def test_no_worse_than_the_one_time_optimum(run: ut.Run, cascade: ut.Cascade) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("objective", "at_most"), [(ut.MinimumEnergy(), 11.9), (ut.MinimumTime(), 1.42)]
+    ("objective", "at_most", "spread"),
+    [(ut.MinimumEnergy(), 11.9, 0.01), (ut.MinimumTime(), 1.05, 0.1)],
 )
-def test_cascades_at_41_degrees(rig: ut.Mechanism, objective: ut.Objective, at_most: float) -> None:
-    """Energy ≤ 11.9 V² s and time ≤ 1.42 s at 41°, d_e = 0.025; three seeds within 1 %."""
+def test_cascades_at_41_degrees(
+    rig: ut.Mechanism, objective: ut.Objective, at_most: float, spread: float
+) -> None:
+    """Energy ≤ 11.9 V² s and time ≤ 1.05 s at 41°, d_e = 0.025; first plans of three seeds alike.
+
+    So are the costs of energy; times of arrival part on the way.
+    """
     runs = [
         ut.Cascade(rig, objective, seed=seed, belief="exact").simulate(phi=ut.deg(41))
         for seed in range(3)
@@ -113,7 +119,7 @@ def test_cascades_at_41_degrees(rig: ut.Mechanism, objective: ut.Objective, at_m
     firsts = np.array([run.updates[0].predicted for run in runs])
     assert all(run.reached for run in runs)
     assert costs.max() <= at_most
-    assert np.ptp(costs) <= 0.01 * costs.min()
+    assert np.ptp(costs) <= spread * costs.min()
     assert np.ptp(firsts) <= 0.01 * firsts.min()
     assert min(float(run.lemma3_slack.min()) for run in runs) >= -1e-9 * at_most
 

@@ -19,7 +19,7 @@ JUMPS = ut.SetPoints([(0, {"x": 1.0}), (2, {"x": -1.0}), (4, {"x": 0.5})])
 def cascade() -> ut.Cascade:
     """Least energy within 8 s, with short searches."""
     objective = ut.MinimumEnergy(horizon=8.0, unit="N² s")
-    return ut.Cascade(CRANE, objective, cold=ut.Budget(600), warm=ut.Budget(96), belief="exact")
+    return ut.Cascade(CRANE, objective, cold=ut.Budget(6144), warm=ut.Budget(96), belief="exact")
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_the_state_machine_takes_the_target_off(cascade: ut.Cascade) -> None:
     """With and without a target: the same plan, the same input, counted from elsewhere."""
     rig = ut.mechanisms.rotary_pendulum(d_e=0.025)  # no travel: nothing is about absolute places
     plain = ut.Cascade(
-        rig, ut.MinimumTime(), cold=ut.Budget(600), warm=ut.Budget(96), belief="exact"
+        rig, ut.MinimumTime(), cold=ut.Budget(6144), warm=ut.Budget(96), belief="exact"
     )
     x, away = rig.state(phi=0.3), rig.state(theta=2.0)
     old, new = plain.start(x)[0], plain.start(x + away, {"theta": 2.0})[0]
@@ -146,7 +146,7 @@ def test_constraints_are_about_absolute_positions() -> None:
     """A formula of one's own, too: the way to x = 1 keeps |x| ≤ 1.05 m, the error does not."""
     wall = ut.Constraint("wall", lambda v: v.x**2 - 1.05**2)
     objective = ut.MinimumEnergy(horizon=4.0, constraints=(wall,))
-    short = ut.Cascade(CRANE, objective, cold=ut.Budget(600), warm=ut.Budget(96), belief="exact")
+    short = ut.Cascade(CRANE, objective, cold=ut.Budget(6144), warm=ut.Budget(96), belief="exact")
     run = short.simulate(CRANE.state(x=-1.0), target={"x": 1.0})
     assert run.reached
     assert np.abs(run.trajectory["x"]).max() <= 1.05 + 1e-4

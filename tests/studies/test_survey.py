@@ -107,13 +107,15 @@ def test_bound_is_below_the_cascade() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("goal", "most"), [("energy", 0.03), ("time", 0.3)])
-def test_a_free_reaching_law_closes_most_of_the_acrobots_gap(goal: str, most: float) -> None:
-    """Claim: with the usual law its gap is larger than 30 %."""
+@pytest.mark.parametrize(("goal", "least", "most"), [("energy", 0.3, 0.03), ("time", 0.05, 0.2)])
+def test_a_free_reaching_law_closes_most_of_the_acrobots_gap(
+    goal: str, least: float, most: float
+) -> None:
+    """Claim: of energy nearly all of it; of time it leaves a part."""
     pytest.importorskip("casadi")
     line = entry("acrobot", bounds=True, goal=goal)
-    assert line.gap > 0.3
-    assert line.free_gap < most
+    assert line.gap > least
+    assert line.free_gap < min(most, line.gap)
 
 
 def made(name: str = "a", gap: float = 0.05, **more: object) -> survey.Entry:

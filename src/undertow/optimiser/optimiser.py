@@ -133,8 +133,8 @@ class Optimiser:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
         if self.counts_time:
             return Budget(8192 * size)
-        # 3072 for the three of n = 2; a covariance takes as long to learn as it has entries.
-        return Budget(1024 * size**2 // 3)
+        # 6144 for the three of n = 2; a covariance takes as long to learn as it has entries.
+        return Budget(2048 * size**2 // 3)
 
     @checked
     def propose(
