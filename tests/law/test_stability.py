@@ -276,7 +276,7 @@ def test_designs_are_kept_on_disk(
 
 @pytest.mark.parametrize("weights", [[1.0, 2.0, 3.0, 4.0], [[1.0, 2.0]], [[1.0, 2.0, 0.0, 1.0]]])
 def test_weights_of_designs_are_rows_of_positive_numbers(
-    rig: ut.Mechanism, weights: list[object]
+    rig: ut.Mechanism, weights: list[Any]
 ) -> None:
     with pytest.raises(InvalidInputError, match=r"\(N, 4\) numbers > 0"):
         quadratic_designs(rig, weights)
