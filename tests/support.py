@@ -133,3 +133,19 @@ def interpreted(loop: ut.ClosedLoop) -> ut.ClosedLoop:
     """The loop with its generated kernel run by Python: no compilation, for short rollouts."""
     vars(loop)["_kernels"] = SimpleNamespace(rollout=loop._kernels.rollout.py_func)
     return loop
+
+
+def runge_kutta_step(
+    rate: Callable[[FloatArray, FloatArray], FloatArray],
+    x: FloatArray,
+    u: FloatArray,
+    later: FloatArray,
+    h: float,
+) -> FloatArray:
+    """One classical Runge-Kutta step of ẋ = rate(x, u), the input straight from u to ``later``."""
+    middle = 0.5 * (u + later)
+    first = rate(x, u)
+    second = rate(x + 0.5 * h * first, middle)
+    third = rate(x + 0.5 * h * second, middle)
+    last = rate(x + h * third, later)
+    return x + h / 6.0 * (first + 2.0 * second + 2.0 * third + last)

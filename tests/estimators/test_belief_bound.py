@@ -17,6 +17,7 @@ import pytest
 from scipy.optimize import linprog
 
 import undertow as ut
+from support import runge_kutta_step
 from undertow.base import InvalidInputError
 from undertow.estimators import Belief, KalmanFilter, ParameterEstimate
 from undertow.estimators.belief import AXES, LEAST, SLIPS, _contracted
@@ -64,12 +65,7 @@ def motions(
         return np.column_stack([y[:, n:], *qdd])
 
     for k in range(SAMPLES):
-        y, middle = x[k], 0.5 * (u[k] + u[k + 1])
-        first = rate(y, u[k])
-        second = rate(y + 0.5 * PERIOD * first, middle)
-        third = rate(y + 0.5 * PERIOD * second, middle)
-        last = rate(y + PERIOD * third, u[k + 1])
-        x[k + 1] = y + PERIOD / 6.0 * (first + 2.0 * second + 2.0 * third + last)
+        x[k + 1] = runge_kutta_step(rate, x[k], u[k], u[k + 1], PERIOD)
         part: FloatArray = np.zeros((runs, n))
         if kind == "even":
             part = rng.uniform(-1.0, 1.0, (runs, n))
@@ -78,7 +74,7 @@ def motions(
         elif kind == "one sign":
             part = constant
         elif kind == "outward":
-            part = np.sign(rate(y, u[k], farther) - first)[:, n:]
+            part = np.sign(rate(x[k], u[k], farther) - rate(x[k], u[k]))[:, n:]
         x[k + 1, :, n:] += most * part
     return t, np.asarray(x.swapaxes(0, 1)), np.asarray(u.swapaxes(0, 1))
 

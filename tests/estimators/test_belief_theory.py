@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from support import runge_kutta_step
 from undertow.closed_loop import Ensemble, Event
 from undertow.closed_loop.ensemble import TAIL, summarise
 from undertow.estimators import Belief
@@ -74,12 +75,7 @@ def motions(
         return np.column_stack([y[:, n:], *qdd])
 
     for k in range(SAMPLES):
-        y, middle = x[k], 0.5 * (u[k] + u[k + 1])
-        first = rate(y, u[k])
-        second = rate(y + 0.5 * PERIOD * first, middle)
-        third = rate(y + 0.5 * PERIOD * second, middle)
-        last = rate(y + PERIOD * third, u[k + 1])
-        x[k + 1] = y + PERIOD / 6.0 * (first + 2.0 * second + 2.0 * third + last)
+        x[k + 1] = runge_kutta_step(rate, x[k], u[k], u[k + 1], PERIOD)
         x[k + 1, :, n:] += belief.deviations * w[k]
     t = np.linspace(0.0, SAMPLES * PERIOD, SAMPLES + 1)
     return t, x.swapaxes(0, 1), u.swapaxes(0, 1), w.swapaxes(0, 1)

@@ -26,7 +26,7 @@ import sympy as sp
 from undertow.symbolic.machine import numba
 from undertow.symbolic.private import private_folder
 
-#: Texts of a kind that are kept at most, but for as many again between two clearances.
+#: Texts of a kind that a clearance leaves; one write in 256 clears.
 KEPT = 1024
 
 PACKAGE = Path(__file__).resolve().parent.parent
