@@ -219,6 +219,15 @@ class Cascade:
                 limit=f"multiples of the period, {self.period:g} s",
                 remedy="Then what is left of a plan is a plan again",
             )
+        parts = self.period / (self.freedom.schedule or self.period)
+        whole = max(parts, 1 / parts)
+        if abs(whole - round(whole)) > 1e-6:
+            raise InvalidInputError(
+                "schedule of the cascade",
+                value=f"{self.freedom.schedule:g} s",
+                limit=f"a multiple or a whole part of the period, {self.period:g} s",
+                remedy="Then what is left of a plan is a plan again",
+            )
         if self.first is not None:
             check_surface(self.mechanism, self.first)
         known = self.known

@@ -405,6 +405,21 @@ class Objective:
         return replace(self, constraints=constraints, travel=False)
 
     @checked
+    def range_of(self, mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
+        """Return the least and the largest value of each state, (2n,), that boxes among them allow.
+
+        Infinite where there is none; constraints that are no box are not in it.
+        """
+        names = list(mechanism.state_names)
+        low, high = np.full(len(names), -math.inf), np.full(len(names), math.inf)
+        for constraint in self.on(mechanism).constraints:
+            box: Any = constraint.formula
+            if isinstance(box, _Within) and not box.target:
+                index = box.state if isinstance(box.state, int) else names.index(box.state)
+                low[index], high[index] = max(low[index], box.low), min(high[index], box.high)
+        return low, high
+
+    @checked
     def meaning(self, mechanism: Mechanism) -> str:
         """Return in one line what is minimised, until when, and within which bounds.
 

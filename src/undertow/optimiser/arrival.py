@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,14 @@ PROBE, LONGEST = 1e-4, 0.5
 TRIALS, LEAST, MOST = np.array([1e-2, 1.0, 1e2]), 1e-8, 1e4
 
 
+class States(Protocol):
+    """See :class:`ArrivalSearch`."""
+
+    def __call__(self, z: FloatArray, T: float) -> tuple[FloatArray, FloatArray]:
+        """Return states at T, and when they are reached."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class ArrivalSearch:
     """Looks for parameters whose motion arrives ever earlier.
@@ -53,7 +63,7 @@ class ArrivalSearch:
         Whether so many evaluations cannot be had any more.
     """
 
-    states: Callable[[FloatArray, float], tuple[FloatArray, FloatArray]]
+    states: States
     admits: Callable[[FloatArray], NDArray[np.bool_]]
     radius: float
     without: Callable[[int], bool] = lambda _: False
@@ -62,7 +72,7 @@ class ArrivalSearch:
         """Search from those of some parameters (N, d) that are nearest at T, s."""
         if self.without(len(z)):
             return
-        z, x, t = _nearest(z, *self.states(z, T), members)
+        z, x, t = nearest(z, *self.states(z, T), members)
         damping, quiet = np.full(len(z), 1e-2), 0
         while quiet < PATIENCE and len(z) and not self.without(len(z) * (z.shape[1] + len(TRIALS))):
             arrived = np.linalg.norm(x, axis=1) <= self.radius
@@ -74,30 +84,42 @@ class ArrivalSearch:
                     z, x, t, damping = z[left], x[left], t[left], damping[left]
                     continue
                 quiet, T, z = 0, SHORTER * float(t[good].min()), z[left]
-                z, x, t = _nearest(z, *self.states(z, T), max(FEWEST, int(REMAIN * len(z))))
+                z, x, t = nearest(z, *self.states(z, T), max(FEWEST, int(REMAIN * len(z))))
                 damping = np.full(len(z), 1e-2)
             else:
                 quiet += 1
-            count, d = z.shape
-            probes, _ = self.states((z[:, None] + PROBE * np.eye(d)).reshape(-1, d), T)
-            slopes = (probes.reshape(count, d, -1) - x[:, None]) / PROBE
-            dampings = damping[:, None] * TRIALS
-            trials = z[:, None] + _steps(slopes, x, dampings)
-            tried, when = self.states(trials.reshape(-1, d), T)
-            misses = np.linalg.norm(tried, axis=1).reshape(count, -1)
-            rows, best = np.arange(count), misses.argmin(axis=1)
-            better = misses[rows, best] < np.linalg.norm(x, axis=1)
-            taken = (rows * len(TRIALS) + best)[better]
-            z[better], x[better], t[better] = (
-                trials[better, best[better]],
-                tried[taken],
-                when[taken],
-            )
-            harder = np.where(better, dampings[rows, best], dampings[:, -1])
-            damping = np.clip(harder, LEAST, MOST)
+            z, x, t, damping = closer(partial(self.states, T=T), z, x, t, damping)
 
 
-def _nearest(
+def closer(
+    states: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    z: FloatArray,
+    x: FloatArray,
+    t: FloatArray,
+    damping: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """One step of Levenberg and Marquardt for each of some parameters (N, d), all in one batch.
+
+    It brings their states x, (N, k), nearer to zero, or leaves them; ``states`` also tells when
+    they are reached, t (N,).  Returns parameters, states, times and dampings (N,) after the step.
+    """
+    count, d = z.shape
+    probes, _ = states((z[:, None] + PROBE * np.eye(d)).reshape(-1, d))
+    slopes = (probes.reshape(count, d, -1) - x[:, None]) / PROBE
+    dampings = damping[:, None] * TRIALS
+    trials = z[:, None] + _steps(slopes, x, dampings)
+    tried, when = states(trials.reshape(-1, d))
+    misses = np.linalg.norm(tried, axis=1).reshape(count, -1)
+    rows, best = np.arange(count), misses.argmin(axis=1)
+    better = misses[rows, best] < np.linalg.norm(x, axis=1)
+    taken = (rows * len(TRIALS) + best)[better]
+    z, x, t = z.copy(), x.copy(), t.copy()
+    z[better], x[better], t[better] = trials[better, best[better]], tried[taken], when[taken]
+    harder = np.where(better, dampings[rows, best], dampings[:, -1])
+    return z, x, t, np.clip(harder, LEAST, MOST)
+
+
+def nearest(
     z: FloatArray, x: FloatArray, t: FloatArray, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the parameters, so many at most, whose states are nearest to zero, with both."""

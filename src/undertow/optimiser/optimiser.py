@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import at_least, check_fields, checked
+from undertow.base import InvalidInputError, at_least, check_fields, checked
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_designs
 from undertow.models import FloatArray
@@ -132,7 +132,7 @@ class Optimiser:
         if warm:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
         if self.counts_time:
-            return Budget(8192 * size)
+            return Budget((2 if self.freedom.schedule else 1) * 8192 * size)
         # 6144 for the three of n = 2; a covariance takes as long to learn as it has entries.
         return Budget(2048 * size**2 // 3)
 
@@ -212,6 +212,13 @@ class Optimiser:
         self, x: ArrayLike, horizon: float, budget: Budget, resolution: float, sequence: int,
         warm: bool,
     ) -> Optimisation:  # fmt: skip
+        if self.freedom.schedule and not (self.counts_time and self.loop.ensemble is None):
+            raise InvalidInputError(
+                "schedule",
+                value=f"{self.freedom.schedule:g} s",
+                limit="least time, with a model that is taken for the plant",
+                remedy='Give the cascade MinimumTime() and belief="exact", or leave schedule out',
+            )
         early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
         return Optimisation(
             self, self.loop.mechanism.check_state(x), horizon * early, budget,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import InvalidInputError, check_fields
+from undertow.base import InvalidInputError, check_fields, positive
 from undertow.closed_loop import ClosedLoop
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray
@@ -32,15 +32,32 @@ class DecisionVariables:
         Times at which further surfaces take over, s; the first is 0: a schedule.
     alpha_a
         Also the off-diagonal entries of α_a (m > 1); its diagonal stays −1.
+    schedule
+        For least time alone: surfaces one after another, each for so long, s, as many as the
+        motion needs, with their reaching laws; 0: one plan of ``times``.
+
+    Raises
+    ------
+    InvalidInputError
+        For times that do not rise from 0, and a schedule without free reaching laws or with times.
     """
 
     reaching: bool = False
     times: tuple[float, ...] = (0.0,)
     alpha_a: bool = False
+    schedule: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse times that do not rise from 0."""
+        """Refuse times that do not rise from 0, and a schedule of fixed gains."""
         check_fields(self)
+        positive("schedule", self.schedule, "0.1 s, the cascade's period, is usual", zero=True)
+        if self.schedule and not (self.reaching and self.times == (0.0,)):
+            raise InvalidInputError(
+                "schedule",
+                value=f"{self.schedule:g} s, reaching={self.reaching}, times={self.times}",
+                limit="free reaching laws, no other times",
+                remedy="Write DecisionVariables(reaching=True, schedule=0.1)",
+            )
         if not rising_from_zero(self.times):
             raise InvalidInputError(
                 "times of a schedule", value=self.times, limit="rising times from 0 s"

@@ -23,6 +23,8 @@ from undertow.law import Margin, Plan, stability_margin
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
+from undertow.optimiser.following import Follower
+from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
 from undertow.optimiser.trust_region import TrustRegion
 from undertow.symbolic import numba
@@ -73,6 +75,12 @@ CROWD, DRAWS, WIDE, BEGINS = 96, 16, 1.5, (1.0, 2.0)
 #: searches in turn may lead nowhere before the next one far and wide.  With few parameters arrivals
 #: are isolated, and one is enough.
 FEW, AROUND, NEAR_AND_FAR, FRUITLESS = 24, 8, (-1.5, 0.3), 6
+
+#: A schedule as early as this many times the earliest arrival needs no other search.
+AS_EARLY = 1.02
+
+#: Draws of a schedule's surfaces: the largest factor of their gain, as its logarithm.
+STRONG = 5.0
 
 #: Time constants of the first surface after which, without any plan, an arrival is looked for.
 LONG = 10.0
@@ -237,8 +245,14 @@ class Optimisation:
         scores = self.cost(z)
         if self.optimiser.counts_time:
             yield self._earlier(min(POLISH, self.left))
-            self.arrive_earlier(wide=True, keep=POLISH)
-            yield self._earlier(self.left)
+            if self.optimiser.freedom.schedule and self.follow_earliest(self.left // 2):
+                yield True
+                return
+            again = self.optimiser.freedom.schedule > 0
+            self.arrive_earlier(wide=True, keep=POLISH + again * (self.left // 2))
+            yield self._earlier(POLISH if again else self.left)
+            if again:
+                yield self.follow_earliest()
             return
         if self._centre().size <= MODEL_SIZE:
             self._model_search(self._centre())
@@ -330,6 +344,10 @@ class Optimisation:
         here = self._begin(incumbent)
         if self._unscored is not None:
             self.cost(here[None])
+        # A schedule is kept while it does not need its last surface, the design.
+        kept = self.best_cost <= incumbent.times[-1]
+        if self.optimiser.freedom.schedule and (kept or self.follow_earliest()):
+            return True
         if not self.best_cost < INADMISSIBLE:
             self._look_around(here)
         if not self.optimiser.aims:
@@ -415,6 +433,84 @@ class Optimisation:
             elif fruitless == 1:
                 self._earlier(min(POLISH, self.left - keep))
         return False
+
+    # -- schedules that follow the earliest arrival ---------------------------------------------
+
+    def follow_earliest(self, keep: int = 0) -> bool:
+        """Look for the earliest arrival over all inputs, and for a schedule that follows it.
+
+        Starts from the motion of the best plan; returns whether the plan is as early by now.  So
+        many evaluations are left over.
+        """
+        loop, best = self.loop, self.best
+        if loop.ensemble is not None or best is None:
+            return False
+        limits = loop.mechanism.input_limits
+        long = self.best_cost
+        if not long < INADMISSIBLE:
+            long = float(loop.batch(self.x, best, duration=self.horizon, seek=True).closest_time[0])
+        if not np.isfinite(limits).all() or long <= loop.step:
+            return False
+        low, high = loop.objective.range_of(loop.mechanism)
+        arrival = EarliestArrival(
+            loop.mechanism,
+            loop.objective.terminal_radius,
+            low,
+            high,
+            lambda: self.left <= keep or self.late(),
+        )
+        recorded = loop.simulate(self.x, best, duration=long)
+        motion = arrival.improve(OpenLoopMotion.of(recorded, long))
+        if motion is None:
+            return False
+        if motion.time < (1.0 - WORTHWHILE) * self.best_cost - self.resolution:
+            plan = self._schedule(arrival, motion)
+            if plan is not None:
+                self._consider(plan)
+        return self.best_cost <= AS_EARLY * motion.time
+
+    def _schedule(self, arrival: EarliestArrival, motion: OpenLoopMotion) -> Plan | None:
+        """Return surfaces that follow a motion, the last but one of which arrives.
+
+        From the next multiple of the period on the first design takes over: that is stable, as the
+        last surface of a plan must be.
+        """
+        loop, space, period = self.loop, self.space, self.optimiser.freedom.schedule
+        m = loop.mechanism.m
+
+        def draw(count: int, before: FloatArray | None) -> FloatArray:
+            z = self.optimiser.firsts[0] + space.steps(self.rng, np.full(count, WIDE))
+            z[:, -2 * m : -m] += self.rng.uniform(0.0, STRONG, (count, m))
+            if before is not None:
+                near = np.geomspace(1e-3, 1.0, count // 8)
+                z[: len(near)] = before + space.steps(self.rng, near)
+            return np.asarray(z)
+
+        def states(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
+            self.evaluations += math.ceil(len(z) * time / motion.time)
+            buffers = RolloutBuffers(loop, len(z), 1).fill(x, *space.decode(z))
+            batch = loop.roll_out(buffers, (0.0,), time, terminal=0.0)
+            sound = (batch.event == Event.HORIZON) & np.isfinite(batch.x).all(axis=1)
+            return np.where(sound[:, None], batch.x, np.inf)
+
+        follower = Follower(draw, states, arrival, period, loop.step)
+        found = follower.follow(motion)
+        if found is None:
+            return None
+        z, times, end = found
+        vectors, gains = space.decode(np.vstack([z, self.optimiser.firsts[0]]))
+        assert gains is not None  # the reaching law of a schedule is free
+        plans = [space.plan(*each) for each in zip(vectors, gains, strict=True)]
+        laws = tuple(plan.reaching[0] for plan in plans if plan.reaching)
+        return Plan(tuple(plan.surfaces[0] for plan in plans), (*times, end), laws)
+
+    def _consider(self, plan: Plan) -> None:
+        """Score a plan that the coordinates cannot express, and keep it where it is the best."""
+        batch = self.loop.batch(self.x, plan, duration=self.horizon, stable_only=True)
+        self.evaluations += 1
+        score = float(batch.score(self.horizon)[0])
+        if score < self.best_cost and stability_margin(self.loop.mechanism, plan.surfaces[-1]) > 0:
+            self._best, self.best_z, self.best_cost = plan, self.space.encode(plan), score
 
     def _long(self) -> float:
         """A time, s, in which something should have arrived."""

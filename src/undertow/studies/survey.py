@@ -2,8 +2,9 @@
 
 Nothing is chosen by hand: designed surface, optimisation and cascade are those of
 ``undertow simulate NAME --belief exact``, from the mechanism's listed start; *free* is the cascade
-that may choose the reaching law, too.  The bound is a local optimum of the same task over *all*
-inputs, see :mod:`undertow.bounds`; a gap is what a cascade spends beyond it.
+that may choose the reaching law, too, and for least time a schedule of surfaces.  The bound is a
+local optimum of the same task over *all* inputs, see :mod:`undertow.bounds`; a gap is what a
+cascade spends beyond it.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ class Entry:
         The mechanism, its start in words, and the unit of cost.
     designed, one_time, cascade, free
         Cost of the designed surface, of the surface optimised once, of the cascade, and of the
-        cascade with a free reaching law; ``inf`` where the target was not reached.
+        cascade with free reaching laws, for least time in a schedule; ``inf`` where the target was
+        not reached.
     time
         When the cascade reached ‖x‖ ≤ ν, s; ``inf`` where it did not.
     radius
@@ -172,7 +174,9 @@ def survey_one(
     candidates: list[Surface | Plan] = [first, plan]
     costs = loop.batch(x0, candidates)
     run = cascade.simulate(x0)
-    free = replace(cascade, freedom=DecisionVariables(reaching=True)).simulate(x0)
+    schedule = cascade.period if cascade.optimiser.counts_time else 0.0
+    freedom = DecisionVariables(reaching=True, schedule=schedule)
+    free = replace(cascade, freedom=freedom).simulate(x0)
     longest = run.time if cascade.optimiser.counts_time else objective.horizon
     limit = _bound(mechanism, objective, x0, (run, free), longest) if bounds else math.nan
     bare = replace(objective, unit="", constraints=(), travel=False)

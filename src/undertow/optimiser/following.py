@@ -1,0 +1,171 @@
+"""Surfaces whose motion follows a given one, one after another; knows nothing of plans.
+
+A single surface can seldom do what the best input does.  For a short while it can: its parameters,
+with its reaching law, are more than the states.  So each surface is to bring the state, from where
+the one before it left it, to where the given motion is a while later, and the last one to the
+target.  What no surface does in a whole period is done by several.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from undertow.models import FloatArray
+from undertow.optimiser.arrival import TRIALS, closer, nearest
+from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
+
+#: Surfaces that are drawn for each piece, those of them that are improved, and the most steps; and
+#: how many times as much of all three where nothing else is left.
+DRAWN, IMPROVED, STEPS, MANY = 1024, 16, 15, 4
+
+#: Steps of the shortest piece.
+SHORTEST = 10
+
+#: What is near enough, in terminal radii: to the motion, so that the search for a piece ends; so
+#: that it is accepted; and to the target.
+FOLLOWS, ACCEPTED, CLOSE = 0.05, 0.5, 0.97
+
+#: The last piece is up to so many times as long as the others; when to look for its arrival, in
+#: parts of what is left of the motion, and how many of these while there may be shorter pieces.
+LAST, AFTER, BEFORE = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 3
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """Looks for surfaces that follow a motion to its end.
+
+    Parameters
+    ----------
+    draw
+        Draws search coordinates of so many surfaces, (N, d), some of them near the last one (d,).
+    states
+        States (N, 2n) so long, s, after a state x, for search coordinates (N, d); infinite for a
+        motion that broke off.
+    arrival
+        Whose motions are followed, and found anew from where the surfaces lead.
+    period
+        The longest piece, s: one ends at each of its multiples.
+    step
+        Of which pieces are multiples, s.
+    """
+
+    draw: Callable[[int, FloatArray | None], FloatArray]
+    states: Callable[[FloatArray, FloatArray, float], FloatArray]
+    arrival: EarliestArrival
+    period: float
+    step: float
+
+    def follow(self, motion: OpenLoopMotion) -> tuple[FloatArray, tuple[float, ...], float] | None:
+        """Return surfaces (S, d), when each takes over, s, and a multiple of the period, s.
+
+        By that the last one has arrived.  ``None`` where that was not found.
+        """
+        radius, shortest = self.arrival.radius, SHORTEST * self.step
+        scale = np.maximum(np.abs(motion.x).max(axis=0), radius)
+        x, left, passed, piece = motion.x[0], motion, 0.0, self.period
+        found: list[FloatArray] = []
+        times = [0.0]
+        while not self.arrival.late():
+            before = found[-1] if found else None
+            rest, divisible = left.time - passed, piece > shortest
+            if rest < LAST * piece:
+                last = self._arrive(x, left.x[-1], rest, scale, divisible, before)
+                if last is not None:
+                    return self._whole([*found, last[0]], times, times[-1] + last[1])
+                if not divisible:
+                    return None
+            multiple = self.period * math.floor(times[-1] / self.period + 1.0 + 1e-9)
+            time = min(piece, self._in_steps(multiple - times[-1]))
+            off = math.inf
+            if rest > time:
+                goal = self.arrival.state_at(left, passed + time)
+                z, ends, distance = self._lead(x, goal, time, scale, FOLLOWS * radius, before)
+                off = float(distance[0]) if len(z) else math.inf
+            if off > ACCEPTED * radius and divisible:
+                piece = max(shortest, self._in_steps(time / 2))
+                continue
+            if not math.isfinite(off):
+                return None
+            found.append(z[0])
+            times.append(round(times[-1] + time, 9))
+            x, passed, piece = ends[0], passed + time, self.period
+            if off > ACCEPTED * radius:
+                again = self.arrival.improve(left.after(passed, x))
+                if again is not None:
+                    left, passed = again, 0.0
+        return None
+
+    def _in_steps(self, time: float) -> float:
+        return self.step * round(time / self.step)
+
+    def _arrive(
+        self,
+        x: FloatArray,
+        end: FloatArray,
+        rest: float,
+        scale: FloatArray,
+        divisible: bool,
+        before: FloatArray | None,
+    ) -> tuple[FloatArray, float] | None:
+        """Return a surface, (d,), that leads from x to the target, and in what time, s."""
+        radius, target = self.arrival.radius, np.zeros_like(x)
+        parts = AFTER[:BEFORE] if divisible else AFTER
+        for part, measure in itertools.product(parts, (scale, np.full_like(x, radius))):
+            time = self.step * math.ceil(part * rest / self.step)
+            z, _, off = self._lead(
+                x, end / part, time, measure, CLOSE * radius, before, target,
+                1 if divisible else MANY,
+            )  # fmt: skip
+            if len(z) and off[0] < CLOSE * radius:
+                return z[0], time
+        return None
+
+    def _whole(
+        self, z: list[FloatArray], times: list[float], arrives: float
+    ) -> tuple[FloatArray, tuple[float, ...], float]:
+        """Let the last surface take over again at each multiple of the period until it arrives."""
+        end = math.ceil(arrives / self.period - 1e-9)
+        multiples = [round(k * self.period, 9) for k in range(1, end)]
+        more = [t for t in multiples if t > times[-1] + 1e-9]
+        z = [*z, *[z[-1]] * len(more)]
+        return np.array(z), (*times, *more), round(end * self.period, 9)
+
+    def _lead(
+        self,
+        x: FloatArray,
+        goal: FloatArray,
+        time: float,
+        scale: FloatArray,
+        near: float,
+        before: FloatArray | None,
+        target: FloatArray | None = None,
+        effort: int = 1,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return surfaces (N, d) that lead from x to a goal in so long, s, the nearest first.
+
+        With where they lead, (N, 2n), and how far that is from ``target``, (2n,), by default the
+        goal, in units of the states, (N,).  The search, in parts of ``scale``, (2n,), ends at the
+        first that is nearer than ``near``.  There may be none: all drawn motions may break off.
+        """
+        beside = np.zeros_like(goal) if target is None else goal - target
+        when = np.zeros(len(TRIALS) * effort * DRAWN)
+
+        def off(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+            return (self.states(x, z, time) - goal) / scale, when[: len(z)]
+
+        z = self.draw(effort * DRAWN, before)
+        z, miss, t = nearest(z, *off(z), effort * IMPROVED)
+        damping = np.full(len(z), 1e-2)
+        for _ in range(effort * STEPS):
+            close = len(z) and np.linalg.norm(miss * scale + beside, axis=1).min() < near
+            if close or not len(z) or self.arrival.late():
+                break
+            z, miss, t, damping = closer(off, z, miss, t, damping)
+        distance = np.linalg.norm(miss * scale + beside, axis=1)
+        order = np.argsort(distance, kind="stable")
+        return z[order], goal + miss[order] * scale, distance[order]
