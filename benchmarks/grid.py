@@ -167,9 +167,9 @@ def fill(
     return cells
 
 
-def percent(gap: float) -> str:
-    """Return a gap for people; what does not arrive, and where no motion was found, in signs."""
-    return "fails" if gap == math.inf else number(100 * gap, ".1f")
+def percent(gap: float, fails: str = "fails", nothing: str = "—") -> str:
+    """Return a gap for people, and what stands where none arrives or no motion was found."""
+    return fails if gap == math.inf else number(100 * gap, ".1f", nothing).replace("-0.0", "0.0")
 
 
 def tables(sheet: Sheet, cells: Cells) -> None:
@@ -241,7 +241,7 @@ def heat_map(sheet: Sheet, cells: Cells) -> Figure:
 def _cell(axes: Axes, row: int, column: int, gap: float, limit: float) -> None:
     """Draw one cell: its colour says how the gap compares with what is wanted."""
     box: dict[str, Any] = {"edgecolor": "white", "linewidth": 1.5}
-    text, ink = "×" if gap == math.inf else number(100 * gap, ".1f", ""), "black"
+    text, ink = percent(gap, "×", ""), "black"
     if math.isnan(gap):
         box |= {"facecolor": "white", "edgecolor": COLOURS["grey"], "hatch": "////", "linewidth": 0}
     else:
