@@ -49,7 +49,8 @@ def runs(
     angles: list[float],
     seeds: int,
     period: float,
-    budgets: dict[str, ut.Budget],
+    cold: ut.Budget | None,
+    warm: ut.Budget | None,
     now: Clock,
 ) -> Iterator[list[str]]:
     """Run every angle from every seed; yield a row of the table for each angle."""
@@ -69,7 +70,8 @@ def runs(
                 freedom=freedom,
                 seed=seed,
                 belief="exact",
-                **budgets,
+                cold=cold,
+                warm=warm,
             )
             began = now()
             run = cascade.simulate(x)
@@ -120,9 +122,8 @@ def main() -> int:
         warm = options.warm or (2000 if options.quick and "time-" in name else None)
         angles = options.angles or usual
         period = options.period or (options.schedule[0] if "schedule" in name else 0.1)
-        budgets = {"cold": options.cold, "warm": warm}
-        given = {when: ut.Budget(most) for when, most in budgets.items() if most}
-        rows += runs(rig, kind, angles, seeds, period, given, clock(options.clock))
+        first, later = (ut.Budget(most) if most else None for most in (options.cold, warm))
+        rows += runs(rig, kind, angles, seeds, period, first, later, clock(options.clock))
     friction = f", d_e = {options.damping:g}" if options.damping != 0.025 else ""
     table(
         f"cascades from {seeds} seeds, against the bound{friction}",

@@ -25,7 +25,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from numba.core import caching as numba_caching
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 
 from undertow.symbolic.private import is_private, private_folder
 
