@@ -2,7 +2,8 @@
 
 Energy: the cascade's total, ∫u² dt, against collocation over 60 s, from several angles.
 Minimum time: the cascade's time with the reaching law free, and with a schedule of surfaces,
-against the collocation bound.  All from several seeds.  The bound is the least cost of any
+against the collocation bound.  Other dampings, budgets and periods: what a gap of grid.py is due
+to.  All from several seeds.  The bound is the least cost of any
 input that keeps the pendulum above the horizontal, as every stable surface must (37).
 
 *Gap* is the median of the seeds over the bound, less one; *spread* is (worst − best)/best.
@@ -20,7 +21,6 @@ import numpy as np
 
 import undertow as ut
 
-RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 BOX = ut.state_box(phi=math.pi / 2)
 
 #: What is run: name, objective, freedom, and what is wanted: a gap for energy, a time in s.
@@ -32,22 +32,26 @@ def kinds(schedule: list[float]) -> dict[str, Kind]:
     times = (0.0, *schedule)
     free = ut.DecisionVariables(reaching=True)
     energy, time = ut.MinimumEnergy(), ut.MinimumTime()
+    several = ut.DecisionVariables(reaching=True, times=times)
     return {
         "energy": ("energy", energy, ut.DecisionVariables(), 0.01),
         "energy-reaching": ("energy, reaching free", energy, free, 0.01),
         "time": ("time", time, ut.DecisionVariables(), None),
         "time-reaching": ("time, reaching free", time, free, 0.70),
-        "time-schedule": (
-            "time, schedule",
-            time,
-            ut.DecisionVariables(reaching=True, times=times),
-            0.60,
-        ),
+        "energy-schedule": ("energy, schedule", energy, several, 0.01),
+        "time-schedule": ("time, schedule", time, several, 0.60),
     }
 
 
 def runs(
-    kind: Kind, angles: list[float], seeds: int, period: float, warm: int | None, now: Clock
+    rig: ut.Mechanism,
+    kind: Kind,
+    angles: list[float],
+    seeds: int,
+    period: float,
+    cold: ut.Budget | None,
+    warm: ut.Budget | None,
+    now: Clock,
 ) -> Iterator[list[str]]:
     """Run every angle from every seed; yield a row of the table for each angle."""
     from undertow.bounds import bound
@@ -55,19 +59,19 @@ def runs(
     name, objective, freedom, wanted = kind
     least = ut.MinimumTime if objective.name == "time" else ut.MinimumEnergy
     for degrees in angles:
-        x = RIG.state(phi=ut.deg(degrees))
-        floor = bound(RIG, least(constraints=BOX), x).cost
+        x = rig.state(phi=ut.deg(degrees))
+        floor = bound(rig, least(constraints=BOX), x).cost
         totals, seconds = [], []
         for seed in progress(range(seeds), f"{name}, {degrees:g}°: seeds"):
-            budget = None if warm is None else ut.Budget(warm)
             cascade = ut.Cascade(
-                RIG,
+                rig,
                 objective,
                 period=period,
                 freedom=freedom,
-                warm=budget,
                 seed=seed,
                 belief="exact",
+                cold=cold,
+                warm=warm,
             )
             began = now()
             run = cascade.simulate(x)
@@ -104,9 +108,12 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, help="number of seeds (5; --quick: 1)")
     parser.add_argument("--period", type=float,
                         help="re-optimisation period, s (0.1; a schedule: its first)")  # fmt: skip
+    parser.add_argument("--damping", type=float, default=0.025, help="d_e, N m s/rad (0.025)")
+    parser.add_argument("--cold", type=int, help="evaluations of the first optimisation")
     parser.add_argument("--warm", type=int, help="evaluations of a re-optimisation")
     options = parser.parse_args()
     need("casadi", "compare")
+    rig = ut.mechanisms.rotary_pendulum(d_e=options.damping)
     seeds = options.seeds or (1 if options.quick else 5)
     rows: list[list[str]] = []
     for name in options.kinds:
@@ -114,10 +121,12 @@ def main() -> int:
         usual = [41.0] if options.quick or kind[1].name == "time" else [40.0, 41.0, 42.5]
         warm = options.warm or (2000 if options.quick and "time-" in name else None)
         angles = options.angles or usual
-        period = options.period or (options.schedule[0] if name == "time-schedule" else 0.1)
-        rows += runs(kind, angles, seeds, period, warm, clock(options.clock))
+        period = options.period or (options.schedule[0] if "schedule" in name else 0.1)
+        first, later = (ut.Budget(most) if most else None for most in (options.cold, warm))
+        rows += runs(rig, kind, angles, seeds, period, first, later, clock(options.clock))
+    friction = f", d_e = {options.damping:g}" if options.damping != 0.025 else ""
     table(
-        f"cascades from {seeds} seeds, against the bound",
+        f"cascades from {seeds} seeds, against the bound{friction}",
         [
             "",
             "φ(0)",

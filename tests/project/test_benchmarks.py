@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from undertow.base import UndertowError
+from undertow.studies import survey
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))
@@ -209,12 +212,70 @@ def test_a_plant_that_leaves_its_box_is_lost(rivals: ModuleType, rig: ut.Mechani
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(SCRIPTS) - HELPERS))
 def test_quick_run(name: str) -> None:
-    if name in ("kernel", "reoptimise", "closed_loop", "gap", "searchers", "plants", "rig_peers"):
+    if name in (
+        "kernel", "reoptimise", "closed_loop", "gap", "grid", "searchers", "plants", "rig_peers",
+    ):  # fmt: skip
         pytest.importorskip("casadi")
     finished = run(str(FOLDER / f"{name}.py"), "--quick")
     assert finished.returncode == 0, finished.stderr
     assert "Traceback" not in finished.stderr
     assert len(finished.stdout.split()) > 5
+
+
+@pytest.fixture
+def grid(harness: ModuleType) -> ModuleType:
+    """The heat maps."""
+    import grid
+
+    return grid
+
+
+def test_cells_are_kept_as_they_are_finished(
+    grid: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Claim: a cell that was finished is not run again, nor is one of another seed taken for it."""
+    made: list[float] = []
+
+    def measured(
+        mechanism: ut.Mechanism, _objective: ut.Objective, x0: np.ndarray, **_more: object
+    ) -> survey.Entry:
+        made.append(float(x0[1]))
+        return survey.Entry(
+            "", mechanism.name, 2, 1, "", "", 3.0, 2.0, np.inf, 1.02, 4.0, 0.01, 1.0, 0.5
+        )
+
+    monkeypatch.setattr(grid, "survey_one", measured)
+    sheet, path = grid.rotary_sheet(), tmp_path / "grid.jsonl"
+    first = grid.fill("rotary", sheet, grid.ledger(path, 0), [(0, 0)], 0)
+    both = grid.fill("rotary", sheet, grid.ledger(path, 0), [(0, 0), (4, 6)], 0)
+    assert made == pytest.approx(np.radians([30, 30, 43.3, 43.3]))  # energy and time each
+    assert both[0, 0, "time"] == first[0, 0, "time"]
+    assert both[4, 6, "energy"].gap("cascade") == np.inf
+    assert both[4, 6, "energy"].gap("free") == pytest.approx(0.02)
+    with pytest.raises(UndertowError, match="other versions or settings"):
+        grid.ledger(path, 1)
+
+
+def test_a_grid_counts_what_fails_and_leaves_out_what_nothing_can(
+    grid: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Claim: a cascade that does not arrive misses the bound; where none was found nothing does."""
+    sheet = grid.rotary_sheet()
+    found = [(1.005, 1.0, 1.0), (np.inf, 1.5, 1.0), (np.inf, np.inf, np.nan)]
+    cells = {(0, c, "energy"): grid.Found(*costs, 1.0) for c, costs in enumerate(found)}
+    three, free = grid.verdicts(sheet, cells)
+    assert "three parameters: 1 of 2 cells within 1 %" in three
+    assert three.endswith("worst fails (wanted: all)")
+    assert free.endswith("1 of 2 cells within 1 %, median 25.0 %, worst 50.0 (wanted: all)")
+    grid.tables(sheet, cells)
+    assert re.search(r"d_e = 0 +three parameters +0\.5 +fails +—\n", capsys.readouterr().out)
+    drawn = grid.heat_map(sheet, cells).axes[0]
+    assert [text.get_text() for text in drawn.texts] == ["0.5", "×", ""]
+    within, missed, nothing = (bar.get_facecolor() for bar in drawn.patches)
+    assert within[2] > within[0] + 0.05  # blue
+    assert missed[0] > missed[2] + 0.5  # vermilion
+    assert nothing[:3] == (1.0, 1.0, 1.0)
+    assert drawn.patches[2].get_hatch()
 
 
 def test_swing_ups_meet_the_plant_that_a_seed_says(harness: ModuleType) -> None:

@@ -21,6 +21,8 @@ from typer.testing import CliRunner
 
 import undertow as ut
 from undertow.cli import app
+from undertow.mechanisms.named import named
+from undertow.models import linearise
 from undertow.plants import check_rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -207,3 +209,97 @@ def test_the_runtime_drives_the_example_from_the_command_line(tmp_path: Path) ->
     assert "BALANCE" in result.stdout
     assert "operator: stop" in result.stdout
     assert CliRunner().invoke(app, ["replay", str(log)]).exit_code == 0
+
+
+@pytest.fixture
+def written(example: Callable[[str], ModuleType]) -> ModuleType:
+    """The mechanisms that users would write."""
+    return example("mechanisms")
+
+
+OWN = (
+    "furuta", "qube", "long_short_pendubot", "ball_on_a_wheel", "pendulum_on_an_inclined_rail",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_users_mechanism_is_one(name: str, written: ModuleType) -> None:
+    """Claim: each is accepted, with its input reaching every mode, and falls when let go."""
+    mechanism = named(f"{EXAMPLES / 'mechanisms.py'}:{name}")
+    assert ut.check_mechanism(mechanism, compiled=False).passed
+    assert mechanism.fingerprint == getattr(written, name)().fingerprint
+    assert np.linalg.eigvals(linearise(mechanism).A).real.max() > 1  # it falls
+    assert np.linalg.norm(mechanism.usual_start) > 0
+
+
+STATES = np.random.default_rng(15).uniform(-1, 1, (5, 4))
+
+
+def test_the_users_rotary_pendulums_are_the_librarys(written: ModuleType) -> None:
+    """Claim: with its pivot's damping taken out each moves as the library's with those numbers.
+
+    The library turns the arm the other way, and its rod has the mass and half-length of the same
+    first and second moments.
+    """
+    flip = np.array([-1.0, 1.0, -1.0, 1.0])
+    qube = ut.mechanisms.rotary_pendulum("qube_servo_2")
+    numbers = {p.name: p.value for p in written.furuta().parameters}
+    half = 0.75 * numbers["pendulum"] / (numbers["m"] * numbers["l"])
+    mass = numbers["m"] * numbers["l"] / half
+    furuta = ut.mechanisms.rotary_pendulum(
+        l=half, m=mass, r_o=numbers["r"], d_e=numbers["d_1"], a_e=1.0,
+        I_e=numbers["arm"] + (numbers["m"] - mass) * numbers["r"] ** 2,
+    )  # fmt: skip
+    for mine, theirs in ((written.qube(), qube), (written.furuta(), furuta)):
+        mine = mine.with_parameters(d_2=1e-15)  # noqa: PLW2901
+        assert mine.input_limits == pytest.approx(0.45 if theirs is furuta else theirs.input_limits)
+        for x in STATES:
+            u = np.array([0.3])
+            np.testing.assert_allclose(
+                mine.accelerations(0.0, x, u),
+                flip[:2] * theirs.accelerations(0.0, flip * x, -u),
+                rtol=1e-9,
+            )
+
+
+def test_the_users_pendubot_is_the_librarys_of_other_numbers(written: ModuleType) -> None:
+    mine = written.long_short_pendubot()
+    theirs = ut.mechanisms.pendubot(
+        m_1=0.9, m_2=0.25, l_1=0.6, a_1=0.3, a_2=0.1, J_1=0.9 * 0.36 / 12, J_2=0.25 * 0.04 / 12,
+        b_1=0.02, b_2=1e-3, g=9.81,
+    )  # fmt: skip
+    for x in STATES:
+        u = np.array([0.7])
+        np.testing.assert_allclose(
+            mine.accelerations(0.0, x, u), theirs.accelerations(0.0, x, u), rtol=1e-9
+        )
+
+
+def test_a_ball_rolls_off_a_wheel_that_is_held(written: ModuleType) -> None:
+    """Claim: 5/7 g sin φ along the rim, as a solid ball rolls on any slope."""
+    mechanism = written.ball_on_a_wheel()
+    x = mechanism.state(lean=0.4)
+    M, f = mechanism.M(x[:2]), mechanism.f(x)
+    held = f[1] / M[1, 1]  # the wheel does not turn
+    assert 0.18 * held == pytest.approx(5 / 7 * 9.81 * np.sin(0.4))
+
+
+def test_a_counterweight_holds_the_cart_on_its_slope(written: ModuleType) -> None:
+    """Claim: nothing moves with the rod upright; M is that of its bodies' positions."""
+    mechanism = written.pendulum_on_an_inclined_rail()
+    assert mechanism.accelerations(0.0, mechanism.state(x=0.3), [0.0]) == pytest.approx([0, 0])
+    slope, a, step = np.pi / 12, 0.3, 1e-6
+
+    def centre(x: float, lean: float) -> np.ndarray:
+        return np.array([x * np.cos(slope) + 0.25 * np.sin(lean),
+                         x * np.sin(slope) + 0.25 * np.cos(lean)])  # fmt: skip
+
+    J = np.column_stack(
+        [
+            (centre(0.1 + step, a) - centre(0.1 - step, a)) / (2 * step),
+            (centre(0.1, a + step) - centre(0.1, a - step)) / (2 * step),
+        ]
+    )
+    cart = 0.6 + 0.8 * np.sin(slope)
+    wanted = 0.2 * J.T @ J + np.diag([cart, 0.2 * 0.5**2 / 12])
+    np.testing.assert_allclose(mechanism.M([0.1, a]), wanted, atol=1e-8)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
@@ -166,6 +167,15 @@ def test_survey_on_the_command_line(tmp_path: Path) -> None:
     listed = CliRunner().invoke(app, ["mechanisms"], env={"COLUMNS": "60"})
     assert listed.exit_code == 0
     assert all(name in listed.stdout for name in NAMES)
+
+
+def test_a_start_from_which_nothing_is_admissible_is_a_line_too() -> None:
+    """Claim: where no surface is, and no motion at all, the line says so and is no error."""
+    weak = ut.mechanisms.rotary_pendulum(d_e=0.025).with_input_limit(0.5)
+    x0 = weak.state(phi=ut.deg(30))
+    line = survey.survey_one(weak, ut.MinimumEnergy(), x0, bounds=False)
+    assert line.start == "phi = 30°"
+    assert line.designed == line.one_time == line.cascade == line.free == line.time == math.inf
 
 
 def test_unknown_names_are_refused_before_any_work() -> None:

@@ -291,3 +291,51 @@ def test_a_system_without_users_forks_and_posix_signals_simulates_and_replays(
     code = f"import os; os.chdir({str(tmp_path)!r})\n{OTHER_SYSTEM}"
     (said,) = run(code, UNDERTOW_CACHE=cache, HOME=str(tmp_path))
     assert "cannot fork" in said
+
+
+#: Compiled once and kept, and loaded by the next process; then something that is compiled afresh.
+PROBE = '''
+import sys
+import numpy as np
+from undertow.symbolic import numba
+from undertow.symbolic.store import load_module
+
+kept = load_module("probe", """
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)
+def doubled(x):
+    out = np.empty(len(x))
+    for i in range(len(x)):
+        out[i] = 2.0 * x[i]
+    return out
+""").doubled
+x = np.arange(3.0)
+print(kept(x).sum(), kept.stats.cache_hits.total(), "numba.np.arraymath" in sys.modules)
+
+
+@numba.njit
+def theirs(x):
+    return np.linalg.norm(x) + len([str(v) for v in range(3)]) + kept(x).sum()
+
+
+print(round(theirs(x), 6))
+'''
+
+
+def test_kept_machine_code_loads_without_what_compiling_needs(tmp_path: Path) -> None:
+    """Claim: a second process runs it without numba's own functions, and can still compile."""
+    paths = os.pathsep.join(sys.path)
+    environment = os.environ | {"UNDERTOW_CACHE": str(tmp_path), "PYTHONPATH": paths}
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", PROBE],
+            capture_output=True, text=True, env=environment, check=True,
+        ).stdout.splitlines()
+        for _ in range(2)
+    )  # fmt: skip
+    assert first[0] == "6.0 0 True"
+    assert second[0] == "6.0 1 False"
+    assert first[1] == second[1] == str(round(5**0.5 + 3 + 6, 6))

@@ -38,7 +38,7 @@ from undertow.law import Plan, Surface
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, linearise
-from undertow.objective import TRAVEL, Objective, objective_for
+from undertow.objective import TRAVEL, Constraint, Objective, objective_for
 from undertow.optimiser import DecisionVariables
 
 #: What is minimised where nothing else is asked for.
@@ -158,31 +158,60 @@ def survey(
 def survey_one(
     mechanism: Mechanism,
     objective: Objective,
+    x0: FloatArray | None = None,
     *,
     goal: str = "",
     seed: int = 0,
     bounds: bool = True,
+    within: Sequence[Constraint] = (),
 ) -> Entry:
-    """Bring one mechanism from its listed start to its target; the line of the survey."""
+    """Bring one mechanism from a start to its target; one line of the survey.
+
+    Parameters
+    ----------
+    mechanism, objective
+        The task.
+    x0
+        State to start from, (2n,); the mechanism's listed start by default.
+    goal
+        Word of the objective, for the line.
+    seed, bounds
+        As in :func:`survey`.
+    within
+        What the motion of the bound keeps besides the objective's own constraints: what every
+        surface must keep anyway.
+
+    Raises
+    ------
+    InvalidInputError
+        For a state that the task does not allow.
+    MissingExtraError
+        When a bound is asked for without CasADi.
+    """
     began = time.perf_counter()
-    x0 = mechanism.usual_start
+    x0 = mechanism.initial_state(x0, {})
     cascade = Cascade(mechanism, objective, seed=seed, belief="exact")
     loop = cascade.loop
-    proposal = cascade.start(x0)[1]
-    plan, first = proposal.plan, cascade.optimiser.anchor
-    assert plan is not None  # start() raises otherwise
-    candidates: list[Surface | Plan] = [first, plan]
-    costs = loop.batch(x0, candidates)
-    run = cascade.simulate(x0)
+    loop.objective.check_start(mechanism, x0)
+    run = _run(cascade, x0)
     schedule = cascade.period if cascade.optimiser.counts_time else 0.0
-    freedom = DecisionVariables(reaching=True, schedule=schedule)
-    free = replace(cascade, freedom=freedom).simulate(x0)
-    longest = run.time if cascade.optimiser.counts_time else objective.horizon
-    limit = _bound(mechanism, objective, x0, (run, free), longest) if bounds else math.nan
-    bare = replace(objective, unit="", constraints=(), travel=False)
+    free = replace(cascade, freedom=DecisionVariables(reaching=True, schedule=schedule))
+    freed = _run(free, x0)
+    candidates: list[Surface | Plan] = [cascade.optimiser.anchor]
+    if run is not None:
+        candidates.append(run.updates[0].plan)
+    costs = loop.batch(x0, candidates)
     reached = [
         float(cost) if ok else math.inf for cost, ok in zip(costs.cost, costs.reached, strict=True)
     ]
+    arrived = run is not None and run.reached
+    limit = math.nan
+    if bounds:
+        counted = cascade.optimiser.counts_time and run is not None
+        longest = run.time if run is not None and counted else objective.horizon
+        bounded = replace(objective, constraints=(*objective.constraints, *within))
+        limit = _bound(mechanism, bounded, x0, [r for r in (run, freed) if r is not None], longest)
+    bare = replace(objective, unit="", constraints=(), travel=False)
     return Entry(
         goal=goal,
         name=mechanism.name,
@@ -191,16 +220,29 @@ def survey_one(
         start=state_words(mechanism, x0),
         unit=objective.unit,
         designed=reached[0],
-        one_time=reached[1],
-        cascade=run.cost if run.reached else math.inf,
-        free=free.cost if free.reached else math.inf,
-        time=run.time if run.reached else math.inf,
-        radius=float(math.hypot(*run.trajectory.x[-1])),
+        one_time=reached[1] if len(reached) > 1 else math.inf,
+        cascade=_total(run),
+        free=_total(freed),
+        time=run.time if run is not None and arrived else math.inf,
+        radius=math.nan if run is None else float(math.hypot(*run.trajectory.x[-1])),
         bound=limit,
         seconds=time.perf_counter() - began,
         problem=f"{bare.meaning(mechanism)}; gate: {gate_words(cascade.gate)}",
         travel=", ".join(constraint.name for constraint in loop.objective.constraints),
     )
+
+
+def _run(cascade: Cascade, x0: FloatArray) -> Run | None:
+    """Simulate a cascade; ``None`` where no surface is admissible from here."""
+    try:
+        return cascade.simulate(x0)
+    except InfeasibleError:
+        return None
+
+
+def _total(run: Run | None) -> float:
+    """Cost of a run that reached the target, else ``inf``."""
+    return run.cost if run is not None and run.reached else math.inf
 
 
 def _bound(

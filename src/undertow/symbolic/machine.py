@@ -9,6 +9,9 @@ What numba keeps of compiled functions are pickles, and to load one is to run it
 keeps them beside the source, or in a folder that is named by the environment, whoever may write
 there, and refuses to decorate a function where it finds no place.  Those of this package and of
 its generated modules are kept where nobody else can write, see :mod:`undertow.symbolic.private`.
+
+Before numba loads what it keeps it imports all that it would need to compile, for a quarter of a
+second and 25 MB; machine code needs its runtime alone, and here gets no more.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from numba.core import caching as numba_caching
+from numba.core.runtime.nrt import rtsys
 
 from undertow.symbolic.private import is_private, private_folder
 
@@ -95,7 +99,21 @@ def _model() -> str:
     return next(named, "") or platform.processor() or platform.machine()
 
 
+def _loading(usual: Any) -> Any:
+    """Return how numba loads what it keeps, for our functions without what compiling needs."""
+
+    def load_overload(cache: Any, signature: Any, target: Any) -> Any:
+        if not isinstance(cache._impl.locator, _PrivateLocator):
+            return usual(cache, signature, target)
+        rtsys.initialize(target)
+        with cache._guard_against_spurious_io_errors():
+            return cache._load_overload(signature, target)
+
+    return load_overload
+
+
 _widen()
+caching.Cache.load_overload = _loading(caching.Cache.load_overload)
 # The list is searched from its beginning; other people's functions pass ours by.
 (getattr(caching, "CacheImpl", None) or caching._CacheImpl)._locator_classes.insert(
     0, _PrivateLocator
