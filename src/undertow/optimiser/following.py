@@ -89,7 +89,7 @@ class Follower:
             if off > ACCEPTED * radius and divisible:
                 piece = max(shortest, self._in_steps(time / 2))
                 continue
-            if not math.isfinite(off):
+            if not math.isfinite(off) or (off > ACCEPTED * radius and rest < LAST * self.period):
                 return None
             found.append(z[0])
             times.append(round(times[-1] + time, 9))

@@ -76,8 +76,9 @@ CROWD, DRAWS, WIDE, BEGINS = 96, 16, 1.5, (1.0, 2.0)
 #: are isolated, and one is enough.
 FEW, AROUND, NEAR_AND_FAR, FRUITLESS = 24, 8, (-1.5, 0.3), 6
 
-#: A schedule as early as this many times the earliest arrival needs no other search.
-AS_EARLY = 1.02
+#: A schedule as early as this many times the earliest arrival needs no other search; how often
+#: one is looked for that follows it.
+AS_EARLY, TRIES = 1.02, 3
 
 #: Draws of a schedule's surfaces: the largest factor of their gain, as its logarithm.
 STRONG = 5.0
@@ -464,9 +465,11 @@ class Optimisation:
         if motion is None:
             return False
         if motion.time < (1.0 - WORTHWHILE) * self.best_cost - self.resolution:
-            plan = self._schedule(arrival, motion)
-            if plan is not None:
-                self._consider(plan)
+            for _ in range(TRIES):
+                plan = self._schedule(arrival, motion)
+                if plan is not None:
+                    self._consider(plan)
+                    break
         return self.best_cost <= AS_EARLY * motion.time
 
     def _schedule(self, arrival: EarliestArrival, motion: OpenLoopMotion) -> Plan | None:
