@@ -139,7 +139,7 @@ class Scene:
         every = np.vstack(cloud)
         left, bottom = every.min(axis=0)
         right, top = every.max(axis=0)
-        margin = 0.08 * max(right - left, top - bottom, 0.1)
+        margin = 0.04 * max(right - left, top - bottom, 0.1)
         return left - margin, right + margin, bottom - margin, top + margin
 
 

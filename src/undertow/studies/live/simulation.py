@@ -117,7 +117,7 @@ class Simulation:
         self._worker = worker or background_worker(planner(mechanism, seed), processes=2)
         self.paused, self.speed, self.mode = False, 1.0, WAITING
         self._asked: tuple[int, Job, float] | None = None
-        self._sequence, self._lead, self._clock = 0, 0.05, 0.0
+        self._sequence, self._lead, self._clock = 0, self._settings.lead_time, 0.0
         self._firsts: dict[Task, Answer] = {}
         self._grips: dict[int, tuple[Grip, FloatArray, float]] = {}
         self._fresh: list[Message] = []
@@ -379,11 +379,11 @@ class Simulation:
                 self._task = job.task or self._task
                 self._apply(answer)
                 return
-            self._lead = min(1.5 * self._lead, 0.5)
+            self._lead = min(1.5 * self._lead, self._settings.max_lead_time)
             self._decide(answer, False, f"late by {1e3 * late:.0f} ms")
             return
-        if not answer.jump:
-            self._lead = min(max(1.3 * answer.seconds, 0.9 * self._lead, 0.01), 0.5)
+        if answer.seconds < 0.5 * self._lead:
+            self._lead = max(0.9 * self._lead, 0.01)
         self._task = job.task or self._task
         self._waiting = answer
 
@@ -417,7 +417,8 @@ class Simulation:
         self._spent = 0.0
         if self.mode == WAITING:
             self.mode = RUNNING
-        self._decide(answer, answer.admission.accepted, answer.admission.reason)
+        first = "first optimum of a task" if answer.jump else ""
+        self._decide(answer, answer.admission.accepted, first or answer.admission.reason)
 
     def _decide(self, answer: Answer, accepted: bool, why: str) -> None:
         """Say what has become of an answer."""
@@ -429,7 +430,8 @@ class Simulation:
             for place, name in places:
                 learnt[name] = float(values[place])
         reaching = self.law.reaching
-        message = plan_message(self.t, accepted, why, memory.surface, memory.predicted, reaching)
+        predicted = memory.predicted if answer.memory is memory else math.nan  # of another state
+        message = plan_message(self.t, accepted, why, memory.surface, predicted, reaching)
         ghost = self.scene.places(self._goal, self._parameters).tolist()
         message |= {
             "ms": 1e3 * answer.seconds, "first": answer.jump, "learnt": learnt, "ghost": ghost,
@@ -596,11 +598,12 @@ class Simulation:
             self._fresh.append({"kind": "controls", "controls": shown})
 
     def _warm_up(self) -> None:
-        """Have the fast loop compiled before anybody looks on."""
-        self.mode = RUNNING
-        self._step()
-        self._pull(self.rig.truth)
-        self.reset()
+        """Have the fast loop compiled before anybody looks on, while the first plan is sought."""
+        self._ask()
+        rig = self._rig(self._x0)
+        rig.knock(np.zeros(self.mechanism.n))
+        rig.write(self.law(self._x0))
+        self._limit(self._task.limits)
 
     def close(self) -> None:
         """End the slow loop."""

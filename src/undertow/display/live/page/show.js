@@ -35,9 +35,10 @@
     const k = before(frames, t), a = frames[k], b = frames[Math.min(k + 1, frames.length - 1)];
     const part = b.t > a.t ? clamp((t - a.t) / (b.t - a.t), 0, 1) : 0;
     const mix = (p, q) => p.map((v, i) => v + part * (q[i] - v));
-    const far = a.x.some((v, i) => Math.abs(b.x[i] - v) > 3 && i < a.x.length / 2);  // counted anew
+    const far = a.x.some((v, i) => i < a.x.length / 2 && Math.abs(b.x[i] - v) > 3);
     return part === 0 || far ? a : { ...a, t, x: mix(a.x, b.x), points: mix(a.points, b.points), held: b.held };
   }
+  const turned = (k, i) => k > 0 && Math.abs(frames[k].x[i] - frames[k - 1].x[i]) > 3;  // an angle is counted from the next upright
   function planAt(t) {
     let found = null;
     for (const plan of plans) if (plan.kind === "plan" && plan.t <= t + 1e-6 && (plan.rows || !found)) found = plan;
@@ -308,8 +309,8 @@
     c.strokeStyle = colour("--grid"); c.lineWidth = 1; c.setLineDash([]);
     c.beginPath(); c.moveTo(0, py(0)); c.lineTo(w, py(0)); c.moveTo(px(0), 0); c.lineTo(px(0), h); c.stroke();
     c.fillStyle = colour("--soft"); c.font = "12px system-ui, sans-serif";
-    c.textAlign = "right"; c.fillText(`${own.name}, ±${short(mx * f, 2)} ${own.unit}`, w - 6, h / 2 + 15);
-    c.textAlign = "left"; c.fillText(`rate, ±${short(my * f, 2)} ${own.unit}/s`, w / 2 + 6, 14);
+    c.textAlign = "right"; c.fillText(`→ ${own.name}, ±${short(mx * f, 2)} ${own.unit}`, w - 6, h - 7);
+    c.textAlign = "left"; c.fillText(`↑ its rate, ±${short(my * f, 2)} ${own.unit}/s`, 6, 15);
     const s0 = (p, alpha, dash) => {
       if (!p || !p.rows) return;
       const goal = p.goal || [];
@@ -336,15 +337,18 @@
       s0(plan, 1, []);
     }
     c.strokeStyle = colour("--blue"); c.lineWidth = 1.8; c.lineJoin = "round"; c.beginPath();
-    for (let k = from; k <= to; k++) { const x = px(frames[k].x[i]), y = py(frames[k].x[n + i]); k > from ? c.lineTo(x, y) : c.moveTo(x, y); }
+    for (let k = from; k <= to; k++) { const x = px(frames[k].x[i]), y = py(frames[k].x[n + i]); k > from && !turned(k, i) ? c.lineTo(x, y) : c.moveTo(x, y); }
     c.stroke();
     c.fillStyle = colour("--blue"); c.beginPath(); c.arc(px(frame.x[i]), py(frame.x[n + i]), 5, 0, 7); c.fill();
     c.fillStyle = colour("--red"); c.textAlign = "left"; c.fillText("s = 0", 6, h - 7);
   }
 
   // -- charts ----------------------------------------------------------------------------------
-  const axisOf = (scale, unit, side) => ({
-    scale, side, size: 46, gap: 3, font: "11px system-ui, sans-serif", stroke: () => colour("--soft"),
+  const nice = (v) => { const p = 10 ** Math.floor(Math.log10(v)); return (v >= 5 * p ? 5 : v >= 2 * p ? 2 : 1) * p; };
+  const threes = (u, k, low, high) => { const one = nice(0.85 * Math.max(high, 1e-9)); return [-one, 0, one]; };
+  const tens = (low, high) => { const all = []; for (let e = Math.ceil(Math.log10(low) - 1e-9); e <= Math.log10(high) + 1e-9; e++) all.push(10 ** e); return all; };
+  const axisOf = (scale, unit, side, splits = threes) => ({
+    scale, side, splits, filter: (u, all) => all, size: 46, gap: 3, font: "11px system-ui, sans-serif", stroke: () => colour("--soft"),
     grid: { stroke: () => colour("--grid"), width: 1, show: side === 3 }, ticks: { show: false }, space: 26,
     values: (u, splits) => splits.map((v) => (v == null ? "" : `${short(v)}${unit ? " " + unit : ""}`)),
   });
@@ -391,17 +395,16 @@
       } }])),
       { draw: hello.inputs.filter((one) => one.limit != null).map((one) => levels(one.unit || "u", () => [limitOf(one), -limitOf(one)], "--red")) });
     const layer = () => planAt(shown)?.layer ?? [];
-    chart("s", hello.inputs.map((_, k) => line(k, "s")), [axisOf("s", "", 3)],
+    chart("s", hello.inputs.map((_, k) => line(k, "s")), [axisOf("s", "", 3, (u, k, low, high) => { const up = high > 20 ? [1, 100] : high > 2 ? [1, 10] : [0.1, 1]; return [-up[1], -up[0], 0, ...up].filter((v) => v >= low && v <= high); })],
       { s: { distr: 4, asinh: 0.1, range: (u, low, high) => { const most = Math.max(0.4, Math.abs(low ?? 0), Math.abs(high ?? 0)); return [-1.3 * most, 1.3 * most]; } } },
       { draw: [levels("s", () => layer().flatMap((v) => [v, -v]), "--red")] });
-    const unit = "";
     chart("cost", [line(0, "J"), line(4, "J", { paths: () => null, dash: [], points: { show: true, size: 7, stroke: () => colour("--red"), fill: () => colour("--red") } })],
-      [axisOf("J", unit, 3)], { J: { distr: 3, range: (u, low, high) => {
+      [axisOf("J", "", 3, (u, k, low, high) => { const all = tens(low, high); return all.filter((_, i) => (all.length - 1 - i) % Math.ceil(all.length / 4) === 0); })], { J: { distr: 3, range: (u, low, high) => {
         if (low == null || !(high > 0)) return [0.1, 1];
         const top = 10 ** Math.ceil(Math.log10(1.001 * high));
         return [Math.max(10 ** Math.floor(Math.log10(Math.max(low, 1e-12))), top * 1e-6), top];
       } } });
-    chart("ms", [line(0, "ms", { paths: uPlot.paths.bars({ size: [0.6, 9], align: 0 }), fill: () => colour("--blue"), width: 0 })], [axisOf("ms", "", 3)],
+    chart("ms", [line(0, "ms", { paths: uPlot.paths.bars({ size: [0.6, 9], align: 0 }), fill: () => colour("--blue"), width: 0 })], [axisOf("ms", "", 3, (u, k, low, high) => [0, nice(0.9 * high)])],
       { ms: { range: (u, low, high) => [0, 1.15 * Math.max(high ?? 0, 5)] } });
   }
   const biggest = (one) => { const k = hello.inputs.indexOf(one); return Math.max(0.1, ...frames.slice(-480).map((f) => Math.abs(f.u[k]))); };
@@ -423,7 +426,7 @@
     const some = frames.slice(from, to + 1), t = some.map((f) => f.t), low = Math.max(shown - WINDOW, frames.length ? Math.min(frames[0].t, shown - 1) : 0);
     const x = { min: Math.min(low, shown - 0.5), max: Math.max(shown, low + 0.5) };
     const set = (id, data) => { charts[id].setData(data, false); charts[id].setScale("x", x); };
-    set("states", [t, ...hello.coordinates.map((c, k) => some.map((f) => f.x[k] * c.factor))]);
+    set("states", [t, ...hello.coordinates.map((c, k) => some.map((f, j) => (j && turned(from + j, k) ? null : f.x[k] * c.factor)))]);
     set("input", [t, ...hello.inputs.map((_, k) => some.map((f) => f.u[k]))]);
     set("s", [t, ...hello.inputs.map((_, k) => some.map((f) => f.s[k]))]);
     const decided = plans.filter((p) => p.kind === "plan" && p.t >= x.min && p.t <= shown);
@@ -468,19 +471,18 @@
     const speed = live ? state.speed : rate;
     $("clock").textContent = `${shown.toFixed(2)} s${speed < 1 ? `, ${short(1 / speed)}× slow motion` : ""}`;
     const banner = $("banner");
-    let text = "";
-    if (live && state.mode === "fallen") text = `<strong>It has fallen.</strong>${""}`;
-    if (live && state.mode === "waiting" && performance.now() - waitingSince > 2500) text = "wait";
-    const kind = text ? state.mode : performance.now() < noteUntil ? "note" : "";
+    const waits = live && state.mode === "waiting" && performance.now() - waitingSince > 2500;
+    const kind = waits || (live && state.mode === "fallen") ? state.mode : performance.now() < noteUntil ? "note" : "";
     if (banner.dataset.kind !== kind + state.why + note) {
       banner.dataset.kind = kind + state.why + note;
       banner.replaceChildren();
       banner.hidden = !kind;
+      banner.className = kind;
+      $("hint").hidden = !!kind;
       const add = (tag, words) => { const one = document.createElement(tag); one.textContent = words; banner.append(one); return one; };
       if (kind === "fallen") {
         add("strong", "It has fallen.");
-        add("span", `${state.why}. Lift it with the mouse until it is caught, or begin again: `);
-        banner.append(document.createElement("br"));
+        add("span", `${state.why[0]?.toUpperCase() ?? ""}${state.why.slice(1)}. Lift it with the mouse until it is caught, or begin again:`);
         add("button", "Reset (R)").onclick = reset;
       } else if (kind === "waiting") add("span", "The first search of a mechanism or objective compiles it: up to half a minute, once.");
       else if (kind === "note") add("span", note);
