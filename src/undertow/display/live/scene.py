@@ -20,8 +20,8 @@ from undertow.display.sketches import Box, Disc, Label, Line, Sketch
 from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import compile_expressions
 
-#: How far a coordinate without a declared travel is taken to go for the window, m.
-REACH = 0.6
+#: How far a travelling coordinate is shown at least, m, if it may go so far.
+REACH = 0.05
 
 #: Configurations of which the window shows all.
 SAMPLES = 400
@@ -127,19 +127,36 @@ class Scene:
         return bool(np.abs(self.slopes(q, parameters, grip)).max() > 1e-9)
 
     def _reach(self, mechanism: Mechanism) -> tuple[float, float, float, float]:
-        rng, parameters = np.random.default_rng(0), mechanism.parameter_values
-        low, high = [], []
-        for c in mechanism.coordinates:
-            usual = math.pi if c.unit == "rad" else REACH
-            low.append(c.low if math.isfinite(c.low) else -usual)
-            high.append(c.high if math.isfinite(c.high) else usual)
-        cloud = []
-        for q in rng.uniform(low, high, (SAMPLES, mechanism.n)):
-            cloud.append(self.places(q, parameters)[: 2 * self.count].reshape(-1, 2))
-        every = np.vstack(cloud)
-        left, bottom = every.min(axis=0)
-        right, top = every.max(axis=0)
-        margin = 0.04 * max(right - left, top - bottom, 0.1)
+        """All that it reaches by turning, and half as far again by travelling.
+
+        The page follows what travels farther.
+        """
+        turning = [math.pi if c.unit == "rad" else 0.0 for c in mechanism.coordinates]
+        left, right, bottom, top = self._extent(mechanism, turning)
+        travel = max(0.5 * max(right - left, top - bottom), REACH)
+        both = [
+            math.pi if c.unit == "rad" else min(travel, -c.low, c.high)
+            for c in mechanism.coordinates
+        ]
+        return self._extent(mechanism, both)
+
+    def _extent(
+        self, mechanism: Mechanism, reach: Sequence[float]
+    ) -> tuple[float, float, float, float]:
+        rng, values = np.random.default_rng(0), mechanism.parameter_values
+        q = rng.uniform(-1.0, 1.0, (SAMPLES, mechanism.n)) * reach
+        moved = [part["at"] + k for part in self.parts if part["kind"] not in ("frame", "ground")
+                 for k in range(part["count"])]  # fmt: skip
+        every = np.array([self.places(one, values) for one in q])
+        points = every[:, : 2 * self.count].reshape(SAMPLES, self.count, 2)
+        cloud = points[:, moved].reshape(-1, 2)
+        sizes = [max(p["width"], p["height"]) for p in self.parts if p["kind"] == "box"]
+        sizes += [
+            every[0, 2 * self.count + p["more"] + 1] for p in self.parts if p["kind"] == "disc"
+        ]
+        left, bottom = cloud.min(axis=0)
+        right, top = cloud.max(axis=0)
+        margin = 0.04 * max(right - left, top - bottom) + float(max(sizes, default=0.0))
         return left - margin, right + margin, bottom - margin, top + margin
 
 

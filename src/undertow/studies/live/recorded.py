@@ -144,7 +144,8 @@ def of_log(path: Path, mechanism: str | None = None) -> Message:
             plan |= {"ms": 1e3 * answer.seconds, "first": answer.jump, "goal": goal}
             plans.append(plan)
         for _, at, kind, text in recording.events:
-            plans.append({"kind": "event", "t": at, "why": f"{kind}: {text}"})
+            if kind != "answer":  # which is told above
+                plans.append({"kind": "event", "t": at, "why": f"{kind}: {text}"})
         plans.sort(key=lambda one: float(one["t"]))
         rows = _evenly(t)
         frames = steps[rows]

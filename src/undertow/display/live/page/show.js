@@ -228,7 +228,7 @@
       if (ghost && ["ground", "frame", "label"].includes(part.kind)) continue;
       const [x, y] = at(part.at);
       c.strokeStyle = colour("--soft"); c.lineWidth = 2; c.setLineDash([]);
-      if (part.kind === "ground") { c.beginPath(); c.moveTo(0, y); c.lineTo(w, y); c.stroke(); }
+      if (part.kind === "ground") { drawGround(c, m, y, w); }
       else if (part.kind === "label") { c.fillStyle = colour("--ink"); c.font = "15px system-ui, sans-serif"; c.textAlign = "center"; c.fillText(part.text, x, y + 14); }
       else if (part.kind === "box") {
         const bw = Math.max(part.width * m.scale, 4), bh = Math.max(part.height * m.scale, 3);
@@ -249,6 +249,15 @@
         if (link && !ghost) { c.fillStyle = colour("--ink"); c.beginPath(); c.arc(x, y, 0.55 * size, 0, 7); c.fill(); }
       }
     }
+  }
+  function drawGround(c, m, y, w) {  // with a tick for every step, so that what travels is seen to
+    const gap = nice(60 / m.scale), first = Math.ceil(m.back(0, 0)[0] / gap);
+    c.beginPath(); c.moveTo(0, y); c.lineTo(w, y); c.stroke();
+    c.lineWidth = 1; c.beginPath();
+    for (let k = first; m.x(k * gap) < w; k++) { const x = m.x(k * gap); c.moveTo(x, y); c.lineTo(x, y + (k === 0 ? 12 : 5)); }
+    c.stroke();
+    c.fillStyle = colour("--soft"); c.font = "11px system-ui, sans-serif"; c.textAlign = "center";
+    c.fillText("0", m.x(0), y + 24); c.fillText(`${short(gap)} m`, m.x(gap), y + 18);
   }
   function drawScene(frame, plan) {
     const [c, w, h] = fit($("scene"));
