@@ -85,13 +85,14 @@ class Control:
             one_of(self.label, str(value), self.choices)
             return replace(self, value=str(value))
         number = number_of(self.label, value)
-        if not self.low <= number <= self.high:
+        rounded = 1e-5 * max(abs(self.low), abs(self.high))  # viewers have six digits
+        if not self.low - rounded <= number <= self.high + rounded:
             raise InvalidInputError(
                 self.label,
                 value=f"{number:g} {self.unit}".rstrip(),
                 limit=f"{self.low:g} to {self.high:g}",
             )
-        return replace(self, value=number)
+        return replace(self, value=min(max(number, self.low), self.high))
 
     def shown(self) -> dict[str, Any]:
         """Return it as JSON values."""
