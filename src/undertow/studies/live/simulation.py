@@ -51,8 +51,12 @@ PAST, DECISIONS = 600, 60
 #: of; and the largest acceleration that it gives to it, m/s².
 GRIP, DAMPING, PULL = 18.0, 0.7, 120.0
 
-#: What a push of strength 1 changes the velocity of the last coordinate by, rad/s or m/s.
-PUSHED = {"rad": 0.7, "m": 0.2}
+#: What a push of strength 1 changes the velocity of the last coordinate by, rad/s or m/s, at most;
+#: and as a part of what would carry it, at the rate of its fastest mode, as far as the start is.
+PUSHED, PUSHED_PART = {"rad": 0.7, "m": 0.2}, 0.5
+
+#: An answer is looked for once a picture: so much later than its time it is not late, s.
+PICTURE = 1.0 / 60.0
 
 #: A mechanism that has fallen is caught when its free angles are so near again, rad, and as slow.
 CATCH, SLOW = 0.35, 4.0
@@ -109,6 +113,9 @@ class Simulation:
         cascade = cascade_for(mechanism, self.task, seed)  # refused here, not in another process
         cascade.objective.check_start(mechanism, self._x0)
         self._belief = Belief.usual(mechanism)
+        fastest = float(np.abs(np.linalg.eigvals(mechanism.linearise().A)).max())
+        carried = PUSHED_PART * fastest * float(np.abs(self._x0[: mechanism.n]).max())
+        self._usual_push = min(PUSHED[mechanism.coordinates[-1].unit], carried or math.inf)
         self._settings = Settings()
         surface = first_surface(mechanism)
         self.law = InnerLoop(mechanism, surface)
@@ -373,7 +380,7 @@ class Simulation:
             self._task = job.task or self._task
             self._apply(answer)
             return
-        if self.t > answer.use + 0.5 * STEP:
+        if self.t > answer.use + 1.5 * PICTURE * self.speed:
             late = self.t - answer.use
             if answer.jump:  # what is for another task may be late: the state is looked at
                 self._task = job.task or self._task
@@ -418,7 +425,9 @@ class Simulation:
         if self.mode == WAITING:
             self.mode = RUNNING
         first = "first optimum of a task" if answer.jump else ""
-        self._decide(answer, answer.admission.accepted, first or answer.admission.reason)
+        # That a state is off is told here, and a start again asked for.
+        why = first or answer.admission.reason.partition("; the state is")[0]
+        self._decide(answer, answer.admission.accepted, why)
 
     def _decide(self, answer: Answer, accepted: bool, why: str) -> None:
         """Say what has become of an answer."""
@@ -522,7 +531,7 @@ class Simulation:
         """One picture on: a sixtieth of a second, slower in slow motion."""
         self.paused = True
         if self.mode != WAITING:
-            for _ in range(max(1, round(self.speed / 60.0 / STEP))):
+            for _ in range(max(1, round(self.speed * PICTURE / STEP))):
                 self._step()
 
     def _go(self, speed: float) -> None:
@@ -535,7 +544,7 @@ class Simulation:
     def _push(self, side: float) -> None:
         n = self.mechanism.n
         inverse = np.linalg.inv(self.plant.M(self.rig.truth[:n]))
-        change = PUSHED[self.mechanism.coordinates[-1].unit] * self.controls[PUSH].si
+        change = self._usual_push * self.controls[PUSH].si
         impulse = np.zeros(n)
         impulse[-1] = side * change / inverse[-1, -1]
         self.rig.knock(impulse)
