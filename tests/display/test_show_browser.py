@@ -52,7 +52,7 @@ class Browser:
         page.on("console", lambda m: self.said.append(m.text))
         page.on("pageerror", lambda error: self.said.append(str(error)))
         root = address.rsplit("/", 1)[0]
-        page.on("request", lambda r: r.url.startswith(root) or self.asked.append(r.url))
+        page.on("request", lambda r: self.asked.extend([r.url] * (not r.url.startswith(root))))
         page.goto(address)
         return page
 

@@ -105,6 +105,7 @@ def test_the_page_is_for_those_who_have_its_address() -> None:
         for path in ("../server.py", "nothing.js", "%2e%2e/server.py"):
             assert (await fetched(server.address + path))[0] == 404
         assert (await fetched(server.address, Host="evil.example"))[0] == 403
+        assert (await fetched(server.address.rstrip("/")))[2] == content("index.html")
 
     serving(Counting(), look)
 
@@ -144,7 +145,7 @@ def test_two_viewers_see_the_same_and_leave() -> None:
             await two.send('{"do":"wrong"}')
             await two.send("{")
             await two.send("[]")
-            notes = []
+            notes: list[str] = []
             while len(notes) < 3:
                 said = json.loads(await two.recv())
                 notes += [said["text"]] if said["kind"] == "note" else []

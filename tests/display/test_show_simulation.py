@@ -47,7 +47,9 @@ COMPUTE = planner(RIG)
 
 def shown(**how: object) -> Simulation:
     worker = InlineWorker(COMPUTE, latency=0.0)
-    return Simulation(RIG, sketch(RIG), worker=worker, **how)  # type: ignore[arg-type]
+    made = Simulation(RIG, sketch(RIG), worker=worker, **how)  # type: ignore[arg-type]
+    made.ready.result(120)
+    return made
 
 
 def go(simulation: Simulation, seconds: float) -> list[Message]:
@@ -124,10 +126,13 @@ def test_a_hand_pulls_with_a_force_at_a_place(simulation: Simulation) -> None:
     at = tip + np.array([0.05, -0.02])
     simulation.hear({"do": "grab", "at": tip.tolist()}, 1)
     simulation.hear({"do": "drag", "at": at.tolist()}, 1)
-    grip, _, mass = simulation._grips[1]
+    hand = simulation.hands._hands[1]
+    grip, mass = hand.grip, hand.mass
     J = scene.slopes(x[:2], RIG.parameter_values, grip)
     force = mass * (18.0**2 * (at - tip) - 2 * 0.7 * 18.0 * (J @ x[2:]))
-    np.testing.assert_allclose(simulation._pull(x), J.T @ force, rtol=1e-9)
+    np.testing.assert_allclose(
+        simulation.hands.force(x, RIG.parameter_values), J.T @ force, rtol=1e-9
+    )
     frame = [m for m in go(simulation, 0.1) if m["kind"] == "frame"][-1]
     assert len(frame["held"]) == 1
     after = simulation.scene.held(simulation.rig.truth[:2], RIG.parameter_values, grip)
@@ -214,6 +219,7 @@ def test_late_and_surprised_answers_are_refused() -> None:
     """An answer for a state that is not there, or for a time that is over, changes no surface."""
     worker = Deferred(COMPUTE)
     simulation = Simulation(RIG, sketch(RIG), worker=worker)
+    simulation.ready.result(120)
     assert simulation.mode == "waiting"
     go(simulation, 0.3)
     assert simulation.t == 0.0  # held at the start until there is a plan

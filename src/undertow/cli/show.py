@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import webbrowser
 from pathlib import Path
 from typing import Annotated
@@ -15,8 +17,23 @@ from undertow.cli.parsing import mechanism_named, parse_start
 from undertow.cli.terminal import command, progress_bar
 from undertow.cli.terminal import show as say
 
-#: Ends of the names of logs.
-LOGS = (".db", ".sqlite")
+#: How a log begins: an SQLite database.
+SQLITE = b"SQLite format 3\0"
+
+
+def _is_log(name: str) -> bool:
+    """Whether a name is that of a log: by its ending, or by how the file begins."""
+    path = Path(name)
+    if not path.is_file():
+        return name.endswith(".db")
+    with path.open("rb") as file:
+        return file.read(len(SQLITE)) == SQLITE
+
+
+def _has_windows() -> bool:
+    """Whether a browser would open a window, not take over the terminal."""
+    shown = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    return shown or sys.platform in ("darwin", "win32")
 
 
 @command(
@@ -75,7 +92,7 @@ def show(
         require_extra("websockets", "show", "the live page needs websockets")
     else:
         check_folder(save.parent)
-    log = name.endswith(LOGS)
+    log = _is_log(name)
     if mechanism is not None and not log:
         raise InvalidInputError(
             "--mechanism", value=mechanism, limit="for a log, FILE.db", remedy="Leave it out"
@@ -100,7 +117,7 @@ def show(
 
     def ready(address: str) -> None:
         say(f"{name} at {address}", "On this machine alone. Ctrl-C ends it")
-        if browser:
+        if browser and _has_windows():
             webbrowser.open(address)
 
     try:

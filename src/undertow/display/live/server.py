@@ -41,12 +41,12 @@ MOST_BYTES, MOST_VIEWERS = 4096, 16
 #: How long a viewer may take to answer a ping, s: a suspended page is let go.
 PATIENCE = 20.0
 
-_HEADERS = (
-    ("Content-Security-Policy", "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'"),
-    ("Cache-Control", "no-store"),
-    ("Referrer-Policy", "no-referrer"),
-    ("X-Content-Type-Options", "nosniff"),
-)
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
 
 
 class Show(Protocol):
@@ -207,19 +207,19 @@ class Server:
             if len(self.viewers) >= MOST_VIEWERS:
                 return self._said(HTTPStatus.SERVICE_UNAVAILABLE, "Too many viewers.")
             return None
+        if not name and not path.endswith("/"):
+            return self._said(HTTPStatus.PERMANENT_REDIRECT, "", Location=f"/{self.token}/")
         name = name or "index.html"
         if name not in FILES:
             return self._said(HTTPStatus.NOT_FOUND, "There is no such file.")
-        return self._said(HTTPStatus.OK, content(name), FILES[name])
+        return self._said(HTTPStatus.OK, content(name), **{"Content-Type": FILES[name]})
 
-    def _said(
-        self, status: HTTPStatus, body: str | bytes, type_: str = "text/plain; charset=utf-8"
-    ) -> Any:
+    def _said(self, status: HTTPStatus, body: str | bytes, **more: str) -> Any:
         data = body.encode() if isinstance(body, str) else body
-        headers = self._headers([
-            ("Content-Type", type_), ("Content-Length", str(len(data))), ("Connection", "close"),
-            *_HEADERS,
-        ])  # fmt: skip
+        named = {"Content-Type": "text/plain; charset=utf-8", **_HEADERS, **more}
+        headers = self._headers(
+            {**named, "Content-Length": str(len(data)), "Connection": "close"}.items()
+        )
         return self._response(status.value, status.phrase, headers, data)
 
     async def _talk(self, socket: Any) -> None:

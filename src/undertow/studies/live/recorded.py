@@ -18,8 +18,8 @@ from undertow.models import FloatArray, Mechanism
 from undertow.runtime import Columns, Mode, read_log
 from undertow.runtime.encoding import answer_from, memory_from
 from undertow.runtime.replay import legible, recorded_recipe
+from undertow.studies.live.messages import described, frame_message, plan_message
 from undertow.studies.live.planner import Task, cascade_for
-from undertow.studies.live.simulation import described, frame_message, plan_message
 
 #: Pictures in a second, and most of them: a long recording has fewer a second.
 RATE, MOST = 60.0, 12_000

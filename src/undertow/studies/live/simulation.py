@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -20,18 +21,21 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, UndertowError, one_of
 from undertow.cascade import CascadeState
 from undertow.closed_loop.figures import display
-from undertow.display.live import Grip, Message, Scene
+from undertow.display.live import Message, Scene
 from undertow.display.sketches import Sketch
 from undertow.display.tree_sketch import sketch_named
 from undertow.estimators import Belief
-from undertow.law import Plan, ReachingLaw, ReferenceMotion, Surface, first_surface
+from undertow.law import Plan, ReferenceMotion, first_surface
 from undertow.law.inner_loop import InnerLoop
 from undertow.models import FloatArray, Mechanism, number_of
 from undertow.objective import Objective
 from undertow.plants import Bench, RealisticRig
 from undertow.plants.bench import Friction
 from undertow.runtime import Answer, Settings, Worker, background_worker
+from undertow.runtime.processes import Background
 from undertow.studies.live.controls import OBJECTIVE, PERIOD, PUSH, Control, controls_of
+from undertow.studies.live.hands import Hands
+from undertow.studies.live.messages import described, frame_message, plan_message
 from undertow.studies.live.planner import Job, Task, cascade_for, planner
 from undertow.symbolic import compile_expressions
 
@@ -46,10 +50,6 @@ SPEEDS = (1.0, 0.5, 0.2, 0.05)
 
 #: Pictures that a new viewer is shown of what was before, and decisions.
 PAST, DECISIONS = 600, 60
-
-#: Natural frequency, rad/s, and damping of the spring by which a hand holds what it has taken hold
-#: of; and the largest acceleration that it gives to it, m/s².
-GRIP, DAMPING, PULL = 18.0, 0.7, 120.0
 
 #: What a push of strength 1 changes the velocity of the last coordinate by, rad/s or m/s, at most;
 #: and as a part of what would carry it, at the rate of its fastest mode, as far as the start is.
@@ -94,7 +94,35 @@ class Simulation:
         Time of the motion, s.
     mode
         ``waiting`` for a first surface, ``running``, or ``fallen``.
+    rig
+        The plant.
+    law
+        The fast loop.
+    memory
+        That of the cascade; ``None`` before there is a plan.
+    hands
+        What viewers hold.
+    ready
+        Done once all that steps it is compiled; before, nothing moves.
     """
+
+    t: float
+    mode: str
+    rig: RealisticRig
+    memory: CascadeState | None
+    _why: str  # it has fallen
+    _u: FloatArray
+    _task: Task  # in force, and its target, (n,)
+    _goal: FloatArray
+    _spent: float  # since the decision in force
+    _debt: float  # time of the motion that the clock is ahead of it, s
+    _due: float  # when the next plan is asked for, s
+    _asked: tuple[int, Job, float] | None  # number, what, and when by the clock, s
+    _waiting: Answer | None  # for its time of use
+    _anew: bool  # a new task is to be begun: what was planned is for another state
+    _touched: bool  # by a hand, in the step before
+    _seen: list[tuple[float, FloatArray, FloatArray]]  # of the plant, since it was last asked
+    _said: Message
 
     def __init__(
         self,
@@ -123,20 +151,17 @@ class Simulation:
         self._costs: dict[str, tuple[Objective, Callable[..., Any]]] = {}
         self._worker = worker or background_worker(planner(mechanism, seed), processes=2)
         self.paused, self.speed, self.mode = False, 1.0, WAITING
-        self._asked: tuple[int, Job, float] | None = None
         self._sequence, self._lead, self._clock = 0, self._settings.lead_time, 0.0
         self._firsts: dict[Task, Answer] = {}
-        self._grips: dict[int, tuple[Grip, FloatArray, float]] = {}
+        self.hands = Hands(self.scene)
         self._fresh: list[Message] = []
         self._history: deque[Message] = deque(maxlen=PAST)
         self._decisions: deque[Message] = deque(maxlen=DECISIONS)
-        self.memory: CascadeState | None = None
-        self._waiting: Answer | None = None
-        self._seen: list[tuple[float, FloatArray, FloatArray]] = []
-        self._said: Message = {}
-        self._task, self._goal = self.task, np.zeros(mechanism.n)
+        self._seen, self._said = [], {}
+        self.ready: Future[None] = Future()
         self.reset()
-        self._warm_up()
+        self._ask()
+        Background(self._warm_up, "undertow warm-up")
 
     # -- what it is ---------------------------------------------------------------------------
 
@@ -217,8 +242,10 @@ class Simulation:
     def advance(self, seconds: float) -> list[Message]:
         """Go on by so much time on the clock, s; return what is new."""
         self._clock += seconds
-        self._take()
-        self._ask()
+        if self.ready.done():
+            self.ready.result()  # what went wrong is raised
+            self._take()
+            self._ask()
         if not self.paused and self.mode != WAITING:
             self._debt += seconds * self.speed
             while self._debt >= STEP:
@@ -245,9 +272,9 @@ class Simulation:
             self.law(error)
             if self._is_near(error):
                 self.mode, self._anew, self._why = RUNNING, True, ""
-        held = bool(self._grips)
+        held = bool(self.hands)
         if held:
-            self.rig.knock(STEP * self._pull(x))
+            self.rig.knock(STEP * self.hands.force(x, self._parameters))
         if held or self._touched:
             self._seen.clear()  # what a hand does is nothing to learn from
             self._touched = False
@@ -465,12 +492,8 @@ class Simulation:
         predicted = math.nan if self.memory is None else self.memory.predicted - self._spent
         frame = frame_message(self.t, x, self._u, demand, s, predicted)
         frame["points"] = self.scene.places(x[: self.mechanism.n], self._parameters).tolist()
-        if self._grips:
-            held = []
-            for grip, at, _ in self._grips.values():
-                place = self.scene.held(x[: self.mechanism.n], self._parameters, grip)
-                held.append([*place.tolist(), *at.tolist()])
-            frame["held"] = held
+        if self.hands:
+            frame["held"] = self.hands.shown(x[: self.mechanism.n], self._parameters)
         if not self._history or self._history[-1]["t"] < self.t:
             self._history.append(frame)
         self._fresh.append(frame)
@@ -488,15 +511,15 @@ class Simulation:
         InvalidInputError
             For what cannot be done.
         """
-        what = said.get("do")
+        what, here = said.get("do"), self.rig.truth[: self.mechanism.n]
         acts: dict[str, Callable[[], None]] = {
             "pause": lambda: self._pause(bool(said.get("on", not self.paused))),
             "step": self._single,
             "speed": lambda: self._go(number_of("speed", said.get("to"))),
             "reset": self.reset,
             "push": lambda: self._push(-1.0 if said.get("side") == -1 else 1.0),
-            "grab": lambda: self._grab(viewer, _place(said.get("at"))),
-            "drag": lambda: self._drag(viewer, _place(said.get("at"))),
+            "grab": lambda: self.hands.grab(viewer, self.plant, here, _place(said.get("at"))),
+            "drag": lambda: self.hands.move(viewer, _place(said.get("at"))),
             "release": lambda: self.gone(viewer),
             "set": lambda: self._set(str(said.get("name")), said.get("value")),
             "defaults": self._defaults,
@@ -506,7 +529,7 @@ class Simulation:
 
     def gone(self, viewer: int) -> None:
         """Let go of what a viewer holds."""
-        if self._grips.pop(viewer, None) is not None and not self._grips:
+        if self.hands.let_go(viewer) and not self.hands:
             self._touched, self._anew = True, self.memory is not None and self.mode == RUNNING
 
     def reset(self) -> None:
@@ -520,7 +543,7 @@ class Simulation:
         self._u = np.zeros(self.mechanism.m)
         self._limit(self._task.limits)
         self.law.parameters[:] = self.mechanism.parameter_values
-        for kept in (self._seen, self._grips, self._history, self._decisions, self._said):
+        for kept in (self._seen, self.hands, self._history, self._decisions, self._said):
             kept.clear()
         self._fresh.append({"kind": "reset"})
 
@@ -551,36 +574,6 @@ class Simulation:
         self._touched = True
         self._anew = self.memory is not None and self.mode == RUNNING
 
-    def _grab(self, viewer: int, at: FloatArray) -> None:
-        q = self.rig.truth[: self.mechanism.n]
-        left, right, bottom, top = self.scene.window
-        reach = 0.2 * max(right - left, top - bottom)
-        grip = self.scene.nearest(q, self._parameters, at, reach)
-        if grip is None:
-            raise InvalidInputError(
-                "what is taken hold of", value="nothing near there", limit="a part that moves"
-            )
-        J = self.scene.slopes(q, self._parameters, grip)
-        mobility = J @ np.linalg.solve(self.plant.M(q), J.T)
-        mass = 2.0 / max(float(np.trace(mobility)), 1e-9)
-        self._grips[viewer] = grip, at, mass
-
-    def _drag(self, viewer: int, at: FloatArray) -> None:
-        if viewer in self._grips:
-            grip, _, mass = self._grips[viewer]
-            self._grips[viewer] = grip, at, mass
-
-    def _pull(self, x: FloatArray) -> FloatArray:
-        """The generalised force of all hands: springs with damping, (n,)."""
-        n, total = self.mechanism.n, np.zeros(self.mechanism.n)
-        for grip, at, mass in self._grips.values():
-            J = self.scene.slopes(x[:n], self._parameters, grip)
-            place = self.scene.held(x[:n], self._parameters, grip)
-            force = mass * (GRIP**2 * (at - place) - 2 * DAMPING * GRIP * (J @ x[n:]))
-            size, most = float(np.linalg.norm(force)), mass * PULL
-            total += J.T @ (force * min(1.0, most / size) if size > 0 else force)
-        return total
-
     def _set(self, name: str, value: object) -> None:
         one_of("control", name, self.controls)
         before = self.controls[name]
@@ -607,12 +600,15 @@ class Simulation:
             self._fresh.append({"kind": "controls", "controls": shown})
 
     def _warm_up(self) -> None:
-        """Have the fast loop compiled before anybody looks on, while the first plan is sought."""
-        self._ask()
-        rig = self._rig(self._x0)
-        rig.knock(np.zeros(self.mechanism.n))
-        rig.write(self.law(self._x0))
-        self._limit(self._task.limits)
+        """Have the fast loop compiled, while the first plan is sought and viewers come."""
+        try:
+            rig, x = self._rig(self._x0), self._error(self._x0)
+            rig.knock(np.zeros(self.mechanism.n))
+            rig.write(InnerLoop(self.mechanism, self._idle.surface)(x))
+        except BaseException as error:
+            self.ready.set_exception(error)
+        else:
+            self.ready.set_result(None)
 
     def close(self) -> None:
         """End the slow loop."""
@@ -625,48 +621,6 @@ def simulation(
     """Return a simulation of a mechanism that was asked for by name, with the figure for that."""
     figure = sketch_named(name, mechanism)
     return Simulation(mechanism, figure, x0, objective=objective, period=period, seed=seed)
-
-
-def described(mechanism: Mechanism, scene: Scene) -> Message:
-    """Return what a page must know of a mechanism."""
-
-    def shown(unit: str) -> dict[str, Any]:
-        factor, word = display(unit)
-        return {"unit": word, "factor": factor}
-
-    return {
-        "kind": "hello",
-        "mechanism": mechanism.name.replace("_", " "),
-        "about": mechanism.description,
-        "coordinates": [
-            {"name": c.name, "about": c.description, **shown(c.unit)} for c in mechanism.coordinates
-        ],
-        "inputs": [{"name": i.name, "unit": i.unit, "limit": i.limit} for i in mechanism.inputs],
-        "parts": scene.parts,
-        "count": scene.count,
-        "window": [*map(float, scene.window)],
-    }
-
-
-def frame_message(
-    t: float, x: FloatArray, u: FloatArray, demand: FloatArray, s: FloatArray, predicted: float
-) -> Message:
-    """Return a picture: time, state, input, what the law asked for, s, and what is left to pay."""
-    return {
-        "kind": "frame", "t": float(t), "x": x.tolist(), "u": u.tolist(),
-        "demand": np.asarray(demand).tolist(), "s": s.tolist(), "left": float(predicted),
-    }  # fmt: skip
-
-
-def plan_message(
-    t: float, accepted: bool, why: str, surface: Surface, predicted: float, reaching: ReachingLaw
-) -> Message:
-    """Return a decision of the slow loop: the surface in use after it, and why it is that."""
-    return {
-        "kind": "plan", "t": float(t), "accepted": accepted, "why": why,
-        "predicted": float(predicted), "rows": surface.matrix.tolist(),
-        "layer": reaching.vector(surface.m)[surface.m :].tolist(),
-    }  # fmt: skip
 
 
 def _place(value: object) -> FloatArray:

@@ -13,7 +13,7 @@
   let hello = null, frames = [], plans = [], controls = new Map();
   let state = { mode: "waiting", paused: false, speed: 1, waits: "", why: "" };
   let live = true, shown = 0, playing = true, rate = 1;
-  let socket = null, retry = 0.4, ended = false, note = "", noteUntil = 0;
+  let socket = null, retry = 0.4, note = "", noteUntil = 0;
   let camera = { x: 0, y: 0 }, holding = null, drag = null;
   let colours = {}, charts = {}, drawn = 0, fps = 0, counted = performance.now(), listed = "";
 
@@ -493,7 +493,7 @@
         add("strong", "It has fallen.");
         add("span", `${state.why[0]?.toUpperCase() ?? ""}${state.why.slice(1)}. Lift it with the mouse until it is caught, or begin again:`);
         add("button", "Reset (R)").onclick = reset;
-      } else if (kind === "waiting") add("span", "The first search of a mechanism or objective compiles it: up to half a minute, once.");
+      } else if (kind === "waiting") add("span", "The first search of a mechanism or objective compiles it, once: that can take a minute.");
       else if (kind === "note") add("span", note);
     }
     if (state.mode !== "waiting") waitingSince = performance.now();
