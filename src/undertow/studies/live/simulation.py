@@ -59,7 +59,7 @@ PUSHED, PUSHED_PART = {"rad": 0.7, "m": 0.2}, 0.5
 PICTURE = 1.0 / 60.0
 
 #: A mechanism that has fallen is caught when its free angles are so near again, rad, and as slow.
-CATCH, SLOW = 0.35, 4.0
+CATCH, SLOW = 0.45, 5.0
 
 #: An answer that has not come after so long is given up, s: what is new has to be compiled first.
 GIVE_UP = 90.0
