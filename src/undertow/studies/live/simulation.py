@@ -62,7 +62,7 @@ PICTURE = 1.0 / 60.0
 CATCH, SLOW = 0.45, 5.0
 
 #: An answer that has not come after so long is given up, s: what is new has to be compiled first.
-GIVE_UP = 90.0
+GIVE_UP = 300.0
 
 #: The state of the show, in words.
 WAITING, RUNNING, FALLEN = "waiting", "running", "fallen"
@@ -452,9 +452,10 @@ class Simulation:
         if self.mode == WAITING:
             self.mode = RUNNING
         first = "first optimum of a task" if answer.jump else ""
-        # That a state is off is told here, and a start again asked for.
-        why = first or answer.admission.reason.partition("; the state is")[0]
-        self._decide(answer, answer.admission.accepted, why)
+        # After a jump the search near the plan in use is followed by one everywhere.
+        why, jumped, _ = answer.admission.reason.partition("; the state is")
+        self._anew = self._anew or bool(jumped)
+        self._decide(answer, answer.admission.accepted, first or why)
 
     def _decide(self, answer: Answer, accepted: bool, why: str) -> None:
         """Say what has become of an answer."""
@@ -530,7 +531,7 @@ class Simulation:
     def gone(self, viewer: int) -> None:
         """Let go of what a viewer holds."""
         if self.hands.let_go(viewer) and not self.hands:
-            self._touched, self._anew = True, self.memory is not None and self.mode == RUNNING
+            self._touched, self._due = True, self.t
 
     def reset(self) -> None:
         """Begin again at the start, with the controls as they stand."""
@@ -571,8 +572,7 @@ class Simulation:
         impulse = np.zeros(n)
         impulse[-1] = side * change / inverse[-1, -1]
         self.rig.knock(impulse)
-        self._touched = True
-        self._anew = self.memory is not None and self.mode == RUNNING
+        self._touched, self._due = True, self.t
 
     def _set(self, name: str, value: object) -> None:
         one_of("control", name, self.controls)

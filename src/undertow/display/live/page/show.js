@@ -138,7 +138,7 @@
   });
 
   // -- controls --------------------------------------------------------------------------------
-  const GROUPS = [["controller", "Controller"], ["plant", "True plant (the controller believes the usual one)"], ["hand", ""]];
+  const GROUPS = [["controller", "Controller"], ["plant", "True plant"], ["hand", ""]];
   function makeControls() {
     const box = $("controls");
     box.replaceChildren();
@@ -190,7 +190,9 @@
   function fill(label, one) {
     const input = label.querySelector("input, select"), out = label.querySelector("output");
     if (document.activeElement !== input || one.choices.length || !input.matches(":active")) input.value = one.value;
-    out.textContent = one.choices.length ? "" : `${short(one.value)} ${one.unit}`;
+    const believed = one.group === "plant" ? learnt[one.name.slice("plant ".length)] : null;
+    const more = believed != null ? `, believed ${short(believed)}` : "";
+    out.textContent = one.choices.length ? "" : `${short(one.value)} ${one.unit}${more}`;
     label.classList.toggle("changed", one.value !== one.usual);
   }
   function put(one) {
@@ -447,11 +449,17 @@
     const timed = decided.filter((p) => p.ms != null), times = new Map(timed.map((p) => [p.t, p.ms]));
     set("ms", [[...times.keys()], [...times.values()]]);
   }
+  let learnt = {};
+  function drawLearnt() {  // what the controller takes the plant's parameters to be by now
+    learnt = planAt(shown)?.learnt ?? {};
+    for (const name of Object.keys(learnt)) if (controls.has(`plant ${name}`)) put(controls.get(`plant ${name}`));
+  }
   function drawPlans() {
     const until = plans.filter((p) => p.t <= shown + 1e-6).slice(-14).reverse();
     const key = until.map((p) => `${p.t}${p.why}`).join();
     if (key === listed) return;
     listed = key;
+    drawLearnt();
     $("plans").replaceChildren(...until.map((p) => {
       const item = document.createElement("li"), head = document.createElement("b"), why = document.createElement("span");
       item.className = p.kind === "event" ? "" : p.accepted ? "yes" : "no";
