@@ -105,7 +105,8 @@ def page(browser: Browser, address: str) -> Iterator[Any]:
     if made.evaluate("undertow.state.paused"):
         made.click("#pause")
     made.click("#reset")
-    until(made, "undertow.state.mode === 'running' && undertow.frames.length > 20", 90)
+    until(made, "undertow.frames.length && undertow.frames.at(-1).t < 1", 20)
+    until(made, "undertow.state.mode === 'running' && undertow.plans.length > 0", 90)
     yield made
     made.close()
 
@@ -165,11 +166,9 @@ def test_every_control_does_what_it_says(page: Any) -> None:
     """All sliders arrive; target, objective and limit show in plans and inputs; then as usual."""
     until(page, "undertow.frame.t > 1.5")
     slide(page, "target theta", 40.0)
-    until(
-        page, "undertow.plans.at(-1).goal && Math.abs(undertow.plans.at(-1).goal[0] - 0.698) < 1e-3"
-    )
+    until(page, "Math.abs(undertow.plans.at(-1)?.goal[0] - 0.698) < 1e-3")
     page.select_option('.control[data-name="objective"] select', "energy")
-    until(page, "undertow.plans.at(-1).objective === 'energy'", 60)
+    until(page, "undertow.plans.at(-1)?.objective === 'energy'", 60)
     slide(page, "limit voltage", 5.0)
     slide(page, "push", 2.0)
     page.click("#left")

@@ -16,6 +16,7 @@ from undertow.cli.options import option
 from undertow.cli.parsing import mechanism_named, parse_start
 from undertow.cli.terminal import command, progress_bar
 from undertow.cli.terminal import show as say
+from undertow.models import Mechanism
 
 #: How a log begins: an SQLite database.
 SQLITE = b"SQLite format 3\0"
@@ -28,6 +29,14 @@ def _is_log(name: str) -> bool:
         return name.endswith(".db")
     with path.open("rb") as file:
         return file.read(len(SQLITE)) == SQLITE
+
+
+def _a_little_off(mechanism: Mechanism) -> list[str] | None:
+    """Return a start near the target for a mechanism that has no usual one."""
+    if mechanism.start:
+        return None
+    last = mechanism.coordinates[-1]
+    return [f"{last.name}={'3deg' if last.unit == 'rad' else '0.05m'}"]
 
 
 def _has_windows() -> bool:
@@ -103,7 +112,7 @@ def show(
             recording = live.of_log(Path(name), mechanism)
         else:
             model = mechanism_named(name, setting, limit)
-            x0 = parse_start(model, start)
+            x0 = parse_start(model, start or _a_little_off(model))
             if save is not None:
                 recording = live.recorded_run(name, model, x0, objective, period, seed, progress)
             else:

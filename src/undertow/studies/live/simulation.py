@@ -234,7 +234,7 @@ class Simulation:
         waits = "" if self._asked is None else ("surface" if self.memory is None else "plan")
         return {
             "kind": "state", "mode": self.mode, "paused": self.paused, "speed": self.speed,
-            "waits": waits, "why": self._why,
+            "waits": waits, "why": self._why, "there": self.mode == RUNNING and self._at_target,
         }  # fmt: skip
 
     # -- time ---------------------------------------------------------------------------------

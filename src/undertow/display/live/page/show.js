@@ -361,7 +361,7 @@
   const axisOf = (scale, unit, side, splits = threes) => ({
     scale, side, splits, filter: (u, all) => all, size: 46, gap: 3, font: "11px system-ui, sans-serif", stroke: () => colour("--soft"),
     grid: { stroke: () => colour("--grid"), width: 1, show: side === 3 }, ticks: { show: false }, space: 26,
-    values: (u, splits) => splits.map((v) => (v == null ? "" : `${short(v)}${unit ? " " + unit : ""}`)),
+    values: (u, splits) => splits.map((v) => (v == null ? "" : `${short(v)}${unit.length < 3 ? " " + unit : ""}`.trim())),
   });
   const line = (k, scale, more = {}) => ({
     scale, width: 2, stroke: () => colour(STYLES[k % STYLES.length][0]), dash: STYLES[k % STYLES.length][1], points: { show: false }, ...more,
@@ -427,8 +427,8 @@
       one.append(mark, text);
       return one;
     };
-    $("legend-states").replaceChildren(...hello.coordinates.map((c, k) => entry(k, c.name)));
-    $("legend-input").replaceChildren(...hello.inputs.map((one, k) => entry(k, one.name)), "- - limit");
+    $("legend-states").replaceChildren(...hello.coordinates.map((c, k) => entry(k, `${c.name}, ${c.unit}`)));
+    $("legend-input").replaceChildren(...hello.inputs.map((one, k) => entry(k, one.unit ? `${one.name}, ${one.unit}` : one.name)), hello.inputs.some((one) => one.limit != null) ? "- - limit" : "");
     $("legend-s").replaceChildren(...(hello.inputs.length > 1 ? hello.inputs.map((_, k) => entry(k, `s${k + 1}`)) : []), "- - layer ±ε");
     $("legend-cost").replaceChildren(entry(0, "predicted less spent"), "● predicted");
   }
@@ -474,7 +474,6 @@
 
   // -- words -----------------------------------------------------------------------------------
   function drawWords(frame) {
-    const off = frame ? Math.hypot(...frame.x.map((v, k) => v - ((planAt(shown)?.goal || [])[k] || 0))) : 0;
     const mode = $("mode");
     let words = "", style = "";
     if (!live) { words = frame?.mode ?? (playing ? "Recording" : "Recording, paused"); words = words[0].toUpperCase() + words.slice(1); }
@@ -482,7 +481,7 @@
     else if (state.mode === "fallen") [words, style] = ["Fallen", "bad"];
     else if (state.paused) words = "Paused";
     else if (frame?.held) words = "Held by hand";
-    else if (off < 0.06) [words, style] = ["At the target", "good"];
+    else if (state.there) [words, style] = ["At the target", "good"];
     else words = "On its way";
     mode.textContent = words; mode.className = style;
     const speed = live ? state.speed : rate;
