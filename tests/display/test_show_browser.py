@@ -14,10 +14,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from undertow.cli.show import show  # noqa: F401 - what is tested here
 from undertow.display.live import saved_page
@@ -25,6 +28,7 @@ from undertow.display.sketches import sketch
 from undertow.mechanisms import LIBRARY
 from undertow.studies.live import of_run
 from undertow.studies.live.planner import Task, cascade_for
+from undertow.studies.live.recorded import recording_of
 
 pytest.importorskip("websockets", reason="the extra 'show' is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
@@ -287,13 +291,34 @@ def test_a_saved_page_replays_anywhere(
     page.close()
 
 
+def test_every_mechanism_is_drawn(browser: Browser, tmp_path: Path) -> None:
+    """All thirteen at their usual starts: a figure within the picture, and labels of its own."""
+    for name, make in LIBRARY.items():
+        mechanism = make()
+        x = np.array([mechanism.usual_start, 0.5 * mechanism.usual_start])
+        none = np.zeros((2, mechanism.m))
+        message = recording_of(
+            mechanism, sketch(mechanism), np.array([0.0, 0.1]), x, none, none, none, np.ones(2), []
+        )
+        path = tmp_path / f"{name}.html"
+        path.write_bytes(saved_page(message))
+        page = browser.open(f"file://{path}")
+        until(page, "undertow.frame && document.getElementById('legend-states').children.length")
+        left, top = page.evaluate(TIP)
+        box = page.locator("#scene").bounding_box()
+        assert box["x"] < left < box["x"] + box["width"], name
+        assert box["y"] < top < box["y"] + box["height"], name
+        page.wait_for_timeout(150)
+        image = Image.open(BytesIO(page.locator("#scene").screenshot())).convert("RGB")
+        picture = np.asarray(image, dtype=int)
+        inked = np.abs(picture - picture[-1, 0]).max(axis=2) > 60
+        assert inked.sum() > 300, name
+        assert page.inner_text("#name").lower() == name.replace("_", " ")
+        page.close()
+
+
 def test_a_recording_looks_the_same_twice(browser: Browser, recorded: Path) -> None:
     """The same moment gives the same picture to 2 % of its points, and one with something in it."""
-    from io import BytesIO
-
-    import numpy as np
-    from PIL import Image
-
     pictures = []
     for _ in range(2):
         page = browser.open(f"file://{recorded}")

@@ -88,7 +88,7 @@ def of_run(run: Run, cascade: Cascade, figure: Sketch | None = None) -> Message:
     decided = np.clip(np.searchsorted(starts, motion.t[rows] + 1e-9, side="right") - 1, 0, None)
     paid = np.interp(starts, motion.t, motion.accumulated_cost)
     left = predicted[decided] - (motion.accumulated_cost[rows] - paid[decided])
-    return _recording(
+    return recording_of(
         mechanism, figure or sketch(mechanism), motion.t[rows], motion.x[rows], motion.u[rows],
         motion.u[rows], motion.s[rows], left, plans,
     )  # fmt: skip
@@ -152,7 +152,7 @@ def of_log(path: Path, mechanism: str | None = None) -> Message:
         name = recipe.mechanism if isinstance(recipe.mechanism, str) else ""
         figure = sketch_named(name, belief) if name else sketch(belief)
         left = np.full(len(rows), math.nan)
-        message = _recording(
+        message = recording_of(
             belief, figure, t[rows], frames[:, columns.x], frames[:, columns.u],
             frames[:, columns.demand], frames[:, columns.s], left, plans,
         )  # fmt: skip
@@ -168,10 +168,11 @@ def _evenly(t: FloatArray) -> Any:
     return np.unique(np.clip(np.searchsorted(t, wanted), 0, len(t) - 1))
 
 
-def _recording(
+def recording_of(
     mechanism: Mechanism, figure: Sketch, t: FloatArray, x: FloatArray, u: FloatArray,
     demand: FloatArray, s: FloatArray, left: FloatArray, plans: Sequence[Message],
 ) -> Message:  # fmt: skip
+    """Return instants of a motion, one a row, and its decisions as a recording."""
     scene, values = Scene(mechanism, figure), mechanism.parameter_values
     frames = []
     for row in zip(t, x, u, demand, s, left, strict=True):
