@@ -446,7 +446,7 @@
     for (const p of decided) at.set(p.t, [at.get(p.t)?.[0] ?? null, above(p.predicted)]);
     const all = [...at.keys()].sort((a, b) => a - b);
     set("cost", [all, all.map((v) => at.get(v)[0] ?? undefined), all.map((v) => at.get(v)[1])]);
-    const timed = decided.filter((p) => p.ms != null), times = new Map(timed.map((p) => [p.t, p.ms]));
+    const timed = decided.filter((p) => p.ms != null && !p.first), times = new Map(timed.map((p) => [p.t, p.ms]));
     set("ms", [[...times.keys()], [...times.values()]]);
   }
   let learnt = {};
