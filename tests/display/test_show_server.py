@@ -18,11 +18,12 @@ from typer.testing import CliRunner
 
 from runs import RECIPE
 from undertow.base import ArtefactError, InvalidInputError, MissingExtraError
+from undertow.cascade import CascadeState
 from undertow.cli import app
 from undertow.display.live import Message, saved_page
 from undertow.display.live.page import FILES, content, encoded
 from undertow.display.live.server import OTHERS, PICTURES, Server, Viewer
-from undertow.runtime import session
+from undertow.runtime import Columns, InlineWorker, Log, Runtime, SimulatedClock, about
 from undertow.studies.live import of_log
 
 websockets = pytest.importorskip("websockets")
@@ -260,11 +261,13 @@ def test_a_saved_page_is_one_file_that_asks_nobody() -> None:
     assert json.loads(data[1])["about"] == "</script><script>alert(1)</script>"
 
 
-def test_a_log_becomes_a_recording_and_one_file(tmp_path: Path) -> None:
+def test_a_log_becomes_a_recording_and_one_file(tmp_path: Path, memory: CascadeState) -> None:
     """Its frames and decisions, and the command that writes them into a page."""
-    log = tmp_path / "run.db"
-    with session(RECIPE, log=log, simulated=True) as runtime:
-        runtime.run(0.6)
+    log, controller = tmp_path / "run.db", RECIPE.make_controller(memory)
+    worker = InlineWorker(RECIPE.respond)
+    with Log(log, Columns.of(RECIPE.belief), about(controller, RECIPE), threaded=False) as book:
+        rig, clock = RECIPE.make_rig(), SimulatedClock()
+        Runtime(controller, rig, worker, clock=clock, log=book).run(0.6)
     message = of_log(log)
     assert message["live"] is False
     assert message["frames"][-1]["t"] == pytest.approx(0.6, abs=0.02)
