@@ -500,7 +500,7 @@
         add("strong", "It has fallen.");
         add("span", `${state.why[0]?.toUpperCase() ?? ""}${state.why.slice(1)}. Lift it with the mouse until it is caught, or begin again:`);
         add("button", "Reset (R)").onclick = reset;
-      } else if (kind === "waiting") add("span", "The first search of a mechanism or objective compiles it, once: that can take a minute.");
+      } else if (kind === "waiting") add("span", "The first search of a mechanism or objective compiles it, once: half a minute, or more for large ones.");
       else if (kind === "note") add("span", note);
     }
     if (state.mode !== "waiting") waitingSince = performance.now();
