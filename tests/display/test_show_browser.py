@@ -195,7 +195,7 @@ def test_the_pendulum_is_grabbed_thrown_and_caught_again(page: Any) -> None:
     page.mouse.down()
     page.mouse.move(x + 15, y, steps=4)
     until(page, "undertow.frame.held && undertow.frame.held.length === 1")
-    assert page.inner_text("#mode") == "Held by hand"
+    until(page, "document.getElementById('mode').textContent === 'Held by hand'", 5)
     page.mouse.up()
     until(page, "!undertow.frames.at(-1).held")
     page.wait_for_timeout(1500)
