@@ -54,5 +54,5 @@ $(STAMP): pyproject.toml constraints.txt
 	@"$(PYTHON)" -m venv --clear $(VENV) || { \
 	    echo "error: '$(PYTHON) -m venv' failed; some systems package it apart (python3-venv)."; \
 	    exit 1; } >&2
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bounds,certify,compare,interop,mujoco,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bounds,certify,compare,interop,mujoco,show,dev]'
 	@touch $@

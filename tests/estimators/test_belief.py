@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -216,3 +217,11 @@ def test_noise_has_the_scale_of_each_coordinate() -> None:
     np.testing.assert_allclose(Belief(rig, {}).deviations, 1e-5 * np.abs(full), rtol=1e-12)
     assert Belief(ut.mechanisms.ball_and_beam(), {}).deviations[1] == 0.004
     np.testing.assert_array_equal(Belief(rig, {}, noise=0.01).deviations, [0.01, 0.01])
+
+
+def test_an_input_without_a_limit_counts_as_one_unit() -> None:
+    """What the full inputs do is finite, and that of one unit; so is the noise that follows."""
+    cart = ut.mechanisms.cart_pendulum()
+    one, unlimited = (Belief.usual(cart.with_input_limit(v)) for v in (1.0, math.inf))
+    np.testing.assert_allclose(unlimited.full_accelerations, one.full_accelerations)
+    np.testing.assert_allclose(unlimited.deviations, one.deviations)

@@ -277,3 +277,18 @@ def test_numbers_carry_their_sources() -> None:
 def test_what_no_bench_has_is_refused(arm: ut.Mechanism, make: object, message: str) -> None:
     with pytest.raises(InvalidInputError, match=message):
         make(arm)  # type: ignore[operator]
+
+
+def test_a_knock_changes_momentum_once() -> None:
+    """q̇⁺ = q̇ + M⁻¹ p at the next period, and nothing in the one after."""
+    cart = ut.mechanisms.cart_pendulum()
+    rig, other = (IdealRig(cart, cart.state(phi=0.2)) for _ in range(2))
+    impulse = np.array([0.3, -0.02])
+    rig.knock(impulse)
+    for one in (rig, other):
+        one.write([0.0])
+    change = np.linalg.solve(cart.M([0.0, 0.2]), impulse)
+    np.testing.assert_allclose((rig.truth - other.truth)[2:], change, rtol=2e-3)
+    before = rig.truth
+    rig.write([0.0])
+    assert np.abs((rig.truth - before)[2:]).max() < 0.05 * np.abs(change).max()

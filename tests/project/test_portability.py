@@ -13,7 +13,8 @@ import pytest
 #: Takes away, once what others wrote is imported, what only POSIX systems have.
 WITHOUT_POSIX = """
 import importlib.abc, os, signal, socket, sys
-import concurrent.futures.process, ctypes, multiprocessing.connection, multiprocessing.reduction
+import asyncio, concurrent.futures.process, ctypes, multiprocessing.connection
+import multiprocessing.reduction
 import sqlite3, subprocess, tempfile
 import matplotlib.figure, numba, numpy, rich.console, scipy.linalg, sympy, typer
 

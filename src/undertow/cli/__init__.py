@@ -17,6 +17,7 @@ from undertow.cli import (  # noqa: F401 - each registers its commands
     library,
     paper,
     rig,
+    show,
     trials,
 )
 from undertow.cli.terminal import app, folded
@@ -25,8 +26,8 @@ __all__ = ["app", "main"]
 
 #: The order in which help shows the commands: look, steer, prove, run, repeat.
 _ORDER = (
-    "mechanisms", "derive", "animate", "survey", "optimise", "simulate", "certify", "verify",
-    "bench", "run", "target", "replay", "drill", "trials", "reproduce",
+    "mechanisms", "derive", "show", "animate", "survey", "optimise", "simulate", "certify",
+    "verify", "bench", "run", "target", "replay", "drill", "trials", "reproduce",
 )  # fmt: skip
 
 app.registered_commands.sort(

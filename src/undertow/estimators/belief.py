@@ -232,7 +232,7 @@ class Belief:
         """What the full inputs do to each acceleration at the target, (n,), rad/s² or m/s²."""
         limits, rest = self.mechanism.input_limits, np.zeros(2 * self.mechanism.n)
         full = np.diag(np.where(np.isfinite(limits), limits, 1.0))
-        still = self.mechanism.accelerations(0.0, rest, 0.0 * limits)
+        still = self.mechanism.accelerations(0.0, rest, np.zeros(len(limits)))
         driven = sum(np.abs(self.mechanism.accelerations(0.0, rest, u) - still) for u in full)
         return np.asarray(driven, dtype=float)
 

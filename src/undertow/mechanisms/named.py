@@ -7,9 +7,10 @@ from pathlib import Path
 from undertow.base import one_of
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
-from undertow.models.importers.mjcf import from_mjcf
+from undertow.models.importers.mjcf import from_mjcf, read_mjcf
 from undertow.models.importers.python_file import in_a_file, mechanism_from_file
-from undertow.models.importers.urdf import from_urdf
+from undertow.models.importers.tree import Tree
+from undertow.models.importers.urdf import from_urdf, read_urdf
 
 #: Ends of the names of files that are data.
 _FILES = {".urdf": from_urdf, ".xml": from_mjcf, ".mjcf": from_mjcf}
@@ -42,6 +43,20 @@ def named(name: str) -> Mechanism:
     own = "One of your own is FILE.py:NAME, FILE.urdf or FILE.xml"
     one_of("mechanism", name, LIBRARY, own)
     return LIBRARY[name]()
+
+
+def tree_named(name: str) -> Tree | None:
+    """Return the bodies and joints that a name means; ``None`` where it is not such a file.
+
+    Raises
+    ------
+    InvalidInputError, ModelError, ArtefactError
+        As for :func:`named`.
+    """
+    file, joints = _in_data(name)
+    if in_a_file(name) or file is None:
+        return None
+    return read_urdf(file)[0] if file.suffix == ".urdf" else read_mjcf(file, motors=not joints)
 
 
 def from_anywhere(name: str) -> str:

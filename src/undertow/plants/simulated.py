@@ -99,8 +99,9 @@ class RealisticRig:
         gaps = [bench.backlash.get(c.name, Backlash(0.0, 1.0)) for c in coordinates[: mechanism.m]]
         self._gap = np.array([[g.gap, g.inertia] for g in gaps])
         names = [c.name for c in coordinates]
-        self._pushes = np.zeros((len(bench.pushes), 1 + mechanism.n))
-        for row, push in zip(self._pushes, bench.pushes, strict=True):
+        self._pushes = np.zeros((1 + len(bench.pushes), 1 + mechanism.n))
+        self._pushes[0, 0] = math.inf  # a knock that is given while it runs
+        for row, push in zip(self._pushes[1:], bench.pushes, strict=True):
             row[0] = push.t if push.t >= 0.0 else math.inf
             row[1 + names.index(push.coordinate)] = push.impulse
         self._refuse_heavy_rotors()
@@ -191,6 +192,16 @@ class RealisticRig:
         self._samples += 1
         self._lateness = lateness
         self._t = self._samples * timing.period + lateness
+
+    def knock(self, impulse: ArrayLike) -> None:
+        """Give it a knock at the beginning of the next period.
+
+        Parameters
+        ----------
+        impulse
+            Generalised impulse on each coordinate, (n,), N m s or N s.
+        """
+        self._pushes[0, 0], self._pushes[0, 1:] = self._t, impulse
 
     def close(self) -> None:
         """Let go of the rig."""

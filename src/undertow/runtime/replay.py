@@ -139,11 +139,29 @@ def replay(
         When the file is no log, is damaged, has no recipe, or is of another mechanism; when it
         is of a mechanism in a file, and none is named.
     """
-    path = Path(path)
-    recording = read_log(path)
+    recording = read_log(Path(path))
+    recipe, remarks = recorded_recipe(recording, mechanism)
+    with legible(recording.path):
+        memory = memory_from(recording.meta["memory"], recipe.reference)
+        controller = recipe.make_controller(memory)
+    found = replay_controller(recording, controller, decisions=decisions)
+    return replace(found, remarks=(*remarks, *found.remarks))
+
+
+def recorded_recipe(
+    recording: Recording, mechanism: str | Mechanism | None = None
+) -> tuple[Recipe, tuple[str, ...]]:
+    """Return the recipe that a log carries, and what else is to be known of it, in sentences.
+
+    Raises
+    ------
+    ArtefactError
+        As for :func:`replay`.
+    """
+    path = recording.path
     if isinstance(mechanism, str):
         named(mechanism)  # what is wrong with it is not the log's
-    with _legible(path):
+    with legible(path):
         values = recording.meta.get("recipe")
         if values is None:
             raise ArtefactError(
@@ -160,14 +178,11 @@ def replay(
         if isinstance(mechanism, Mechanism):
             recipe = replace(recipe, mechanism=mechanism)
         _check_mechanism(recording, recipe.belief)  # before anything is designed for it
-        memory = memory_from(recording.meta["memory"], recipe.reference)
-        controller = recipe.make_controller(memory)
-    found = replay_controller(recording, controller, decisions=decisions)
-    return replace(found, remarks=(*remarks, *found.remarks))
+        return recipe, remarks
 
 
 @contextlib.contextmanager
-def _legible(path: Path) -> Iterator[None]:
+def legible(path: Path) -> Iterator[None]:
     """Say of what cannot be made of a log's content that it is the log's."""
     try:
         yield
@@ -240,7 +255,7 @@ def replay_controller(
         When the controller believes in another mechanism than the log, or the log is damaged.
     """
     _check_mechanism(recording, controller.cascade.mechanism)
-    with _legible(recording.path):
+    with legible(recording.path):
         return _replayed(recording, controller, decisions=decisions)
 
 

@@ -1,0 +1,136 @@
+"""A page that moves: a mechanism under its cascade, live, or what was recorded of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from undertow.base import InvalidInputError, check_folder, require_extra, write_file
+from undertow.cli import options
+from undertow.cli.options import option
+from undertow.cli.parsing import mechanism_named, parse_start
+from undertow.cli.terminal import command, progress_bar
+from undertow.cli.terminal import show as say
+from undertow.models import Mechanism
+
+#: How a log begins: an SQLite database.
+SQLITE = b"SQLite format 3\0"
+
+
+def _is_log(name: str) -> bool:
+    """Whether a name is that of a log: by its ending, or by how the file begins."""
+    path = Path(name)
+    if not path.is_file():
+        return name.endswith(".db")
+    with path.open("rb") as file:
+        return file.read(len(SQLITE)) == SQLITE
+
+
+def _a_little_off(mechanism: Mechanism) -> list[str] | None:
+    """Return a start near the target for a mechanism that has no usual one."""
+    if mechanism.start:
+        return None
+    last = mechanism.coordinates[-1]
+    return [f"{last.name}={'3deg' if last.unit == 'rad' else '0.05m'}"]
+
+
+def _has_windows() -> bool:
+    """Whether a browser would open a window, not take over the terminal."""
+    shown = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    return shown or sys.platform in ("darwin", "win32")
+
+
+@command(
+    "undertow show rotary_pendulum",
+    "undertow show overhead_crane --objective bench-time",
+    "undertow show robot.urdf:shoulder --start elbow=5deg",
+    "undertow show run.db",
+    "undertow show rotary_pendulum --save page.html",
+)
+def show(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="Mechanism of the library, or your own: FILE.py:NAME, FILE.urdf or FILE.xml, with "
+            ":JOINT,JOINT for the actuated joints where the file does not name them; or the log "
+            "of a run, FILE.db.",
+            metavar="NAME|LOG",
+        ),
+    ] = "rotary_pendulum",
+    start: options.Start = None,
+    objective: options.Goal = "bench-energy",
+    setting: options.Settings = None,
+    limit: options.Limits = None,
+    period: Annotated[float, option("Time between re-optimisations, s.")] = 0.1,
+    port: Annotated[
+        int | None,
+        option("Port of 127.0.0.1; 0: any free one. Default: 8417, or another if that is taken."),
+    ] = None,
+    browser: Annotated[bool, option("Open the page in the browser of this machine.")] = True,
+    mechanism: Annotated[
+        str | None,
+        option(
+            "Your own mechanism that a log is about, FILE.py:NAME. The file that a log names is "
+            "never run by itself.",
+            metavar="MECHANISM",
+        ),
+    ] = None,
+    save: Annotated[
+        Path | None,
+        option(
+            "Write one file that replays the log, or a simulated motion to the target, in any "
+            "browser, and end.",
+            metavar="FILE.html",
+        ),
+    ] = None,
+    seed: options.Seed = 0,
+) -> None:
+    """Show a mechanism and its controller on a live page, on this machine alone.
+
+    Poke it with the mouse, change its plant and its target, watch the surface jump. Ctrl-C ends it.
+    """
+    from undertow.display.live import saved_page, serve
+    from undertow.studies import live
+
+    if save is None:
+        require_extra("websockets", "show", "the live page needs websockets")
+    else:
+        check_folder(save.parent)
+    log = _is_log(name)
+    if mechanism is not None and not log:
+        raise InvalidInputError(
+            "--mechanism", value=mechanism, limit="for a log, FILE.db", remedy="Leave it out"
+        )
+    with progress_bar() as progress:
+        if log:
+            progress(f"reading {name}", 0.3)
+            recording = live.of_log(Path(name), mechanism)
+        else:
+            model = mechanism_named(name, setting, limit)
+            x0 = parse_start(model, start or _a_little_off(model))
+            if save is not None:
+                recording = live.recorded_run(name, model, x0, objective, period, seed, progress)
+            else:
+                progress("making ready", 0.3)
+                simulation = live.simulation(name, model, x0, objective, period, seed)
+    if save is not None:
+        written = write_file(save, saved_page(recording))
+        say(f"Written to {written}: open it in a browser; it needs no other file")
+        return
+    shown = live.Recorded(recording) if log else simulation
+
+    def ready(address: str) -> None:
+        say(f"{name} at {address}", "On this machine alone. Ctrl-C ends it")
+        if browser and _has_windows():
+            webbrowser.open(address)
+
+    try:
+        serve(shown, ready, port=port)
+    finally:
+        if not log:
+            simulation.close()

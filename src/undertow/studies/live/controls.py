@@ -1,0 +1,187 @@
+"""What a viewer can change: each control with its range, its unit as shown, and who it is for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from undertow.base import InvalidInputError, one_of
+from undertow.closed_loop.figures import display
+from undertow.models import Mechanism, Parameter, invariant_coordinates, number_of
+from undertow.objective import Goal
+from undertow.objective.named import finite_limits
+
+#: Whose a control is: the controller's, the true plant's, or the hand's that pokes it.
+Group = Literal["controller", "plant", "hand"]
+
+#: The words of the controls that belong to the task.
+OBJECTIVE, PERIOD, PUSH = "objective", "period", "push"
+
+#: Periods of re-optimisation that can be chosen, s: multiples of the predictions' step.
+SHORTEST, LONGEST = 0.05, 1.0
+
+#: How far masses and inertias, lengths, and damping of the plant go, as parts of their values; and
+#: dry friction, as a part of the full input, or of what a lean of 1 rad or m asks of a free joint.
+HEAVY, LONG, DAMPED = (0.5, 2.0), (0.8, 1.25), (0.0, 5.0)
+ROUGH, ROUGH_FREE = 0.3, 0.05
+
+
+@dataclass(frozen=True)
+class Control:
+    """A slider, or a choice of words.
+
+    Parameters
+    ----------
+    name
+        What it is called in messages.
+    label
+        What it is called on the page.
+    group
+        Whose it is.
+    value
+        As it is: in the unit shown, or a word.
+    low, high, usual
+        Of a slider.
+    unit
+        As shown.
+    factor
+        From SI to the unit shown.
+    choices
+        Words to choose from, in the place of a range.
+    main
+        Whether it is shown at once; the others are folded away.
+    """
+
+    name: str
+    label: str
+    group: Group
+    value: float | str
+    low: float = 0.0
+    high: float = 1.0
+    usual: float | str = 0.0
+    unit: str = ""
+    factor: float = 1.0
+    choices: tuple[str, ...] = field(default=())
+    main: bool = True
+
+    @property
+    def si(self) -> float:
+        """The value in SI units."""
+        return float(self.value) / self.factor
+
+    def put(self, value: object) -> Control:
+        """Return it with another value.
+
+        Raises
+        ------
+        InvalidInputError
+            For what is no such word, no number, or outside of the range.
+        """
+        if self.choices:
+            one_of(self.label, str(value), self.choices)
+            return replace(self, value=str(value))
+        number = number_of(self.label, value)
+        rounded = 1e-5 * max(abs(self.low), abs(self.high))  # viewers have six digits
+        if not self.low - rounded <= number <= self.high + rounded:
+            raise InvalidInputError(
+                self.label,
+                value=f"{number:g} {self.unit}".rstrip(),
+                limit=f"{self.low:g} to {self.high:g}",
+            )
+        return replace(self, value=min(max(number, self.low), self.high))
+
+    def shown(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return {name: value for name, value in asdict(self).items() if name != "factor"}
+
+
+def controls_of(mechanism: Mechanism, objective: str, period: float) -> dict[str, Control]:
+    """Return the controls of a mechanism, by name."""
+    made = [
+        *_targets(mechanism),
+        Control(
+            OBJECTIVE, "what is best", "controller", objective, choices=get_args(Goal),
+            usual=objective,
+        ),
+        Control(
+            PERIOD, "re-optimised every", "controller", period, SHORTEST, LONGEST, period, "s"
+        ),
+        *(
+            Control(
+                f"limit {channel.name}", f"limit of {channel.name}", "controller", channel.limit,
+                0.1 * channel.limit, 1.5 * channel.limit, channel.limit, channel.unit,
+            )
+            for channel in mechanism.inputs
+            if math.isfinite(channel.limit)
+        ),
+        *_frictions(mechanism),
+        *_parameters(mechanism.parameters),
+        Control(PUSH, "strength of a push", "hand", 1.0, 0.1, 5.0, 1.0, "×"),
+    ]  # fmt: skip
+    return {control.name: control for control in made}
+
+
+def _targets(mechanism: Mechanism) -> list[Control]:
+    """Where the target can be: along what the dynamics do not depend on, within the travel."""
+    made, free = [], invariant_coordinates(mechanism)
+    for c in mechanism.coordinates:
+        if c.name not in free:
+            continue
+        factor, unit = display(c.unit)
+        usual = math.pi / 2 if c.unit == "rad" else 1.0
+        # The travel counts 95 % of each side, and the terminal set has to lie inside.
+        low = max(0.85 * c.low, -usual)
+        high = min(0.85 * c.high, usual)
+        made.append(
+            Control(f"target {c.name}", f"target of {c.name}", "controller", 0.0, low * factor,
+                    high * factor, 0.0, unit, factor)
+        )  # fmt: skip
+    return made
+
+
+def _frictions(mechanism: Mechanism) -> list[Control]:
+    """Dry friction of each coordinate of the plant."""
+    lean = np.zeros(2 * mechanism.n)
+    made = []
+    for i, c in enumerate(mechanism.coordinates):
+        if i < mechanism.m:
+            gain = abs(float(mechanism.input_matrix[i, i].subs(mechanism.substitution)))
+            most = ROUGH * gain * float(finite_limits(mechanism)[i])
+        else:
+            lean[i] = 1.0
+            most = ROUGH_FREE * float(np.abs(mechanism.f(lean)).max())
+            lean[i] = 0.0
+        if most > 0:
+            most = float(f"{most:.2g}")
+            unit = "N m" if c.unit == "rad" else "N"
+            made.append(
+                Control(f"friction {c.name}", f"dry friction of {c.name}", "plant", 0.0, 0.0, most,
+                        0.0, unit, main=i == 0)
+            )  # fmt: skip
+    return made
+
+
+def _parameters(parameters: Sequence[Parameter]) -> list[Control]:
+    """What the plant weighs, and the rest of its parameters."""
+    made = []
+    masses = [p.name for p in parameters if p.unit == "kg" and p.value > 0]
+    for p in parameters:
+        low, high = LONG
+        if p.unit in ("kg", "kg m²"):
+            low, high = HEAVY
+        elif p.unit.startswith("N") and "s" in p.unit.split("/")[0].split():
+            low, high = DAMPED
+        if not p.value > 0:
+            continue
+        words = f"{p.name}, {p.description}" if p.description else p.name
+        made.append(
+            Control(
+                f"plant {p.name}", words, "plant", p.value, max(low * p.value, p.low),
+                min(high * p.value, p.high), p.value, p.unit, main=p.name in masses[-1:],
+            )
+        )  # fmt: skip
+    return made

@@ -1,0 +1,54 @@
+"""What a page is told of a mechanism, of an instant of its motion, and of a decision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from undertow.closed_loop.figures import display
+from undertow.display.live import Message, Scene
+from undertow.law import ReachingLaw, Surface
+from undertow.models import FloatArray, Mechanism
+
+
+def described(mechanism: Mechanism, scene: Scene) -> Message:
+    """Return what a page must know of a mechanism."""
+
+    def shown(unit: str) -> dict[str, Any]:
+        factor, word = display(unit)
+        return {"unit": word, "factor": factor}
+
+    return {
+        "kind": "hello",
+        "mechanism": mechanism.name.replace("_", " "),
+        "about": mechanism.description,
+        "coordinates": [
+            {"name": c.name, "about": c.description, **shown(c.unit)} for c in mechanism.coordinates
+        ],
+        "inputs": [{"name": i.name, "unit": i.unit, "limit": i.limit} for i in mechanism.inputs],
+        "parts": scene.parts,
+        "count": scene.count,
+        "window": [*map(float, scene.window)],
+    }
+
+
+def frame_message(
+    t: float, x: FloatArray, u: FloatArray, demand: FloatArray, s: FloatArray, predicted: float
+) -> Message:
+    """Return a picture: time, state, input, what the law asked for, s, and what is left to pay."""
+    return {
+        "kind": "frame", "t": float(t), "x": x.tolist(), "u": u.tolist(),
+        "demand": np.asarray(demand).tolist(), "s": s.tolist(), "left": float(predicted),
+    }  # fmt: skip
+
+
+def plan_message(
+    t: float, accepted: bool, why: str, surface: Surface, predicted: float, reaching: ReachingLaw
+) -> Message:
+    """Return a decision of the slow loop: the surface in use after it, and why it is that."""
+    return {
+        "kind": "plan", "t": float(t), "accepted": accepted, "why": why,
+        "predicted": float(predicted), "rows": surface.matrix.tolist(),
+        "layer": reaching.vector(surface.m)[surface.m :].tolist(),
+    }  # fmt: skip
