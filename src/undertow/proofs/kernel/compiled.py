@@ -1,0 +1,747 @@
+"""All compiled code of the kernel: interval arithmetic, the interpreter of graphs, Taylor steps.
+
+**One convention.**  An interval is two doubles, low ≤ high, that hold every value on the box;
+an end may be infinite, which means unbounded.  NaN, NaN: the expression may be undefined
+somewhere on the box.  NaN is handed on by every operation and no comparison with it is true, so
+it never proves anything.  IEEE 754 ``+ − × ÷ √`` err by half a unit in the last place (or 2⁻¹⁰⁷⁵
+where they underflow); every end is then moved outward by one to two.  sin, cos, exp and log of a
+double are Taylor sums *in this very arithmetic*, their remainders among the coefficients: nothing
+is assumed of a library's functions.
+
+All of it is in one file because numba's cache of a function sees a change of the file that the
+function is in, and not of what it calls: so no stale code is ever loaded.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numba
+import numpy as np
+
+__all__ = ["ABS", "ADD", "BINARY", "COS", "DIV", "EXP", "LOG", "MAX", "MIN", "MUL", "NEG", "PI",
+           "SIN", "SQR", "SQRT", "SUB", "apply", "dominance", "ellipsoid", "enclose", "inverse", "jets", "norm",
+           "over_boxes", "points", "product", "taylor_step"]  # fmt: skip
+
+#: Operations of code; those that take two operands; SIN and COS name each other as the second.
+ADD, SUB, MUL, DIV, MAX, MIN, NEG, SQR, SQRT, SIN, COS, EXP, LOG, ABS = range(14)
+BINARY = (ADD, SUB, MUL, DIV, MAX, MIN)
+
+_STEP, _TINY, _MOST = 2.0**-52, 2.3e-308, 1.7976931348623157e308
+_NAN, _INF = math.nan, math.inf
+
+_njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")  # no fast-math anywhere
+
+
+def enclose(value: Fraction) -> tuple[float, float]:
+    """Return the double that a rational is, twice, or its two neighbours."""
+    try:
+        near = value.numerator / value.denominator
+    except OverflowError:
+        return (_MOST, _INF) if value > 0 else (-_INF, -_MOST)
+    if Fraction(near) == value:
+        return near, near
+    below = near if Fraction(near) < value else math.nextafter(near, -_INF)
+    return below, math.nextafter(below, _INF)
+
+
+def _table(*values: Fraction | tuple[Fraction, Fraction]) -> Any:
+    ends = [v if isinstance(v, tuple) else (v, v) for v in values]
+    return np.array([(enclose(a)[0], enclose(b)[1]) for a, b in ends])
+
+
+_F = Fraction
+_FACTORIAL = [math.factorial(k) for k in range(20)]
+#: The last coefficient of each holds the remainder, for the ranges that arguments are reduced to.
+_SIN = _table(*(_F((-1) ** k, _FACTORIAL[2 * k + 1]) for k in range(9)),
+              (_F(-1, _FACTORIAL[19]), _F(1, _FACTORIAL[19])))  # fmt: skip
+_COS = _table(*(_F((-1) ** k, _FACTORIAL[2 * k]) for k in range(9)),
+              (_F(-1, _FACTORIAL[18]), _F(1, _FACTORIAL[18])))  # fmt: skip
+_EXP = _table(*(_F(1, _FACTORIAL[k]) for k in range(14)),
+              (_F(2, 3 * _FACTORIAL[14]), _F(3, 2 * _FACTORIAL[14])))  # fmt: skip
+_LOG = _table(*(_F(1, 2 * k + 1) for k in range(11)), (_F(0), _F(1, 22)))
+#: π/2, π and log 2 to 40 digits: the next digits are not all nines.
+_HALF_PI = _table(_F("1.5707963267948966192313216916397514420985"))[0]
+_PI = _table(_F("3.1415926535897932384626433832795028841971"))[0]
+PI = float(_PI[0]), float(_PI[1])
+_LN2 = _table(_F("0.6931471805599453094172321214581765680755"))[0]
+#: π/2 minus its lower double, so that arguments are reduced without losing digits.
+_HALF_PI_REST = _table(_F("1.5707963267948966192313216916397514420985") - _F(_HALF_PI[0]))[0]
+
+
+@_njit
+def down(v):  # type: ignore[no-untyped-def]
+    """Move a lower end outward; a sum that overflowed upward is at least the largest double."""
+    w = v - (abs(v) * _STEP + _TINY)
+    return w if w == w else (_MOST if v > 0.0 else v)
+
+
+@_njit
+def up(v):  # type: ignore[no-untyped-def]
+    """Move an upper end outward."""
+    w = v + (abs(v) * _STEP + _TINY)
+    return w if w == w else (-_MOST if v < 0.0 else v)
+
+
+@_njit
+def add(a, b, c, d):  # type: ignore[no-untyped-def]
+    """[a, b] + [c, d]."""
+    if a == 0.0 and b == 0.0:
+        return c, d
+    if c == 0.0 and d == 0.0:
+        return a, b
+    return down(a + c), up(b + d)
+
+
+@_njit
+def mul(a, b, c, d):  # type: ignore[no-untyped-def]
+    """[a, b] × [c, d]; 0 × unbounded is 0, for values are real, but 0 × undefined is not."""
+    if a != a or c != c:
+        return _NAN, _NAN
+    if (a == 0.0 and b == 0.0) or (c == 0.0 and d == 0.0):
+        return 0.0, 0.0
+    p, q, r, s = a * c, a * d, b * c, b * d
+    if p != p:
+        p = 0.0
+    if q != q:
+        q = 0.0
+    if r != r:
+        r = 0.0
+    if s != s:
+        s = 0.0
+    return down(min(min(p, q), min(r, s))), up(max(max(p, q), max(r, s)))
+
+
+@_njit
+def reciprocal(a, b):  # type: ignore[no-untyped-def]
+    """1/[a, b]; undefined where zero is inside."""
+    if not (a > 0.0 or b < 0.0):
+        return _NAN, _NAN
+    return down(1.0 / b), up(1.0 / a)
+
+
+@_njit
+def div(a, b, c, d):  # type: ignore[no-untyped-def]
+    """[a, b] / [c, d]."""
+    if not (c > 0.0 or d < 0.0) or a != a:
+        return _NAN, _NAN
+    if a == 0.0 and b == 0.0:
+        return 0.0, 0.0
+    if c == d and c - c == 0.0 and a - a == 0.0 and b - b == 0.0:
+        p, q = a / c, b / c
+        return down(min(p, q)), up(max(p, q))
+    p, q = reciprocal(c, d)
+    return mul(a, b, p, q)
+
+
+@_njit
+def sqr(a, b):  # type: ignore[no-untyped-def]
+    """[a, b]²."""
+    if a != a:
+        return _NAN, _NAN
+    small, big = min(abs(a), abs(b)), max(abs(a), abs(b))
+    if a <= 0.0 <= b:
+        return 0.0, up(big * big) if big > 0.0 else 0.0
+    return max(down(small * small), 0.0), up(big * big)
+
+
+@_njit
+def _horner(table, a, b):  # type: ignore[no-untyped-def]
+    """Σ c_k [a, b]ᵏ by Horner's scheme, in intervals."""
+    low, high = table[-1, 0], table[-1, 1]
+    for k in range(len(table) - 2, -1, -1):
+        low, high = mul(low, high, a, b)
+        low, high = add(low, high, table[k, 0], table[k, 1])
+    return low, high
+
+
+@_njit
+def _turn(x, quarter):  # type: ignore[no-untyped-def]
+    """Enclose sin(x + quarter·π/2) at a double.
+
+    x = k π/2 + r: any k will do, for r is enclosed; with |r| ≤ 0.9 the tables' remainders hold.
+    """
+    if not abs(x) <= 1e6:
+        return -1.0, 1.0
+    k = np.rint(x / _HALF_PI[0])
+    a, b = x, x
+    if k != 0.0:
+        p, q = mul(-k, -k, _HALF_PI[0], _HALF_PI[0])
+        a, b = add(a, b, p, q)
+        p, q = mul(-k, -k, _HALF_PI_REST[0], _HALF_PI_REST[1])
+        a, b = add(a, b, p, q)
+    if not (a >= -0.9 and b <= 0.9):
+        return -1.0, 1.0
+    t0, t1 = sqr(a, b)
+    turn = (int(k) + quarter) % 4
+    if turn % 2 == 0:
+        low, high = _horner(_SIN, t0, t1)
+        low, high = mul(low, high, a, b)
+    else:
+        low, high = _horner(_COS, t0, t1)
+    if turn >= 2:
+        low, high = -high, -low
+    return max(low, -1.0), min(high, 1.0)
+
+
+@_njit
+def _wave(a, b, quarter):  # type: ignore[no-untyped-def]
+    """Sin of [a, b] + quarter·π/2: its ends, and every crest (j even) and trough (j odd) inside.
+
+    They are at x = π/2 + jπ − quarter·π/2; the j that may be inside are counted outward.
+    """
+    if a != a:
+        return _NAN, _NAN
+    if not (a >= -1e6 and b <= 1e6 and b - a < 6.0):
+        return -1.0, 1.0
+    p, q = _turn(a, quarter)
+    r, s = _turn(b, quarter)
+    low, high = min(p, r), max(q, s)
+    shift = 0.5 * (quarter - 1)
+    p, q = div(a, b, _PI[0], _PI[1])
+    first, last = math.ceil(down(p + shift)), math.floor(up(q + shift))
+    for j in range(first, last + 1):
+        if j % 2 == 0:
+            high = 1.0
+        else:
+            low = -1.0
+    return low, high
+
+
+@_njit
+def _exp_end(x):  # type: ignore[no-untyped-def]
+    """Enclose e^x at a double: x = k log 2 + r, |r| ≤ 0.36."""
+    if x != x:
+        return _NAN, _NAN
+    if x > 709.0:
+        return 8.2e307, _INF
+    if x < -700.0:
+        return 0.0, 1e-300
+    k = np.rint(x / _LN2[0])
+    p, q = mul(-k, -k, _LN2[0], _LN2[1])
+    a, b = add(x, x, p, q)
+    low, high = _horner(_EXP, a, b)
+    scale = math.ldexp(1.0, int(k) // 2)
+    rest = math.ldexp(1.0, int(k) - int(k) // 2)
+    return low * scale * rest, high * scale * rest  # exact: neither under- nor overflows
+
+
+@_njit
+def _log_end(x):  # type: ignore[no-untyped-def]
+    """Enclose log x at a positive double: x = 2ᵉ m, log m = 2 Σ r^(2k+1)/(2k+1)."""
+    if x == _INF:
+        return 709.0, _INF
+    mantissa, e = math.frexp(x)
+    if mantissa < 0.7071:
+        mantissa, e = 2.0 * mantissa, e - 1
+    p, q = add(mantissa, mantissa, 1.0, 1.0)
+    a, b = add(mantissa, mantissa, -1.0, -1.0)
+    a, b = div(a, b, p, q)  # |r| ≤ 0.1716, r² ≤ 0.0295
+    t0, t1 = sqr(a, b)
+    low, high = _horner(_LOG, t0, t1)
+    low, high = mul(low, high, 2.0 * a, 2.0 * b)
+    p, q = mul(float(e), float(e), _LN2[0], _LN2[1])
+    return add(low, high, p, q)
+
+
+@_njit
+def apply(op, a, b, c, d):  # type: ignore[no-untyped-def]
+    """Apply an operation to [a, b], and to [c, d] where it takes two."""
+    if a != a or (op < NEG and c != c):
+        return _NAN, _NAN
+    if op == ADD:
+        return add(a, b, c, d)
+    if op == SUB:
+        return add(a, b, -d, -c)
+    if op == MUL:
+        return mul(a, b, c, d)
+    if op == DIV:
+        return div(a, b, c, d)
+    if op == MAX:
+        return max(a, c), max(b, d)
+    if op == MIN:
+        return min(a, c), min(b, d)
+    if op == NEG:
+        return -b, -a
+    if op == SQR:
+        return sqr(a, b)
+    if op == SQRT:
+        if not a > 0.0:
+            return _NAN, _NAN
+        return max(down(math.sqrt(a)), 0.0), up(math.sqrt(b))
+    if op == SIN:
+        return _wave(a, b, 0)
+    if op == COS:
+        return _wave(a, b, 1)
+    if op == EXP:
+        p, _ = _exp_end(a)
+        _, q = _exp_end(b)
+        return p, q
+    if op == LOG:
+        if not a > 0.0:
+            return _NAN, _NAN
+        p, _ = _log_end(a)
+        _, q = _log_end(b)
+        return p, q
+    if a >= 0.0:  # ABS
+        return a, b
+    if b <= 0.0:
+        return -b, -a
+    return 0.0, max(-a, b)
+
+
+# -- the interpreter -----------------------------------------------------------------------------
+
+# A jet of a register is (order + 1, 1 + V, 2): Taylor coefficients in time, each with its value and
+# its derivatives by the V variables.
+
+
+@_njit
+def _gain(out, x, y, scale):  # type: ignore[no-untyped-def]
+    """out += scale · x · y for coefficients (1 + V, 2) with their derivatives, scale exact."""
+    a, b = mul(x[0, 0], x[0, 1], y[0, 0], y[0, 1])
+    a, b = mul(a, b, scale, scale) if scale != 1.0 else (a, b)
+    out[0, 0], out[0, 1] = add(out[0, 0], out[0, 1], a, b)
+    for j in range(1, len(out)):
+        a, b = mul(x[0, 0], x[0, 1], y[j, 0], y[j, 1])
+        c, d = mul(x[j, 0], x[j, 1], y[0, 0], y[0, 1])
+        a, b = add(a, b, c, d)
+        a, b = mul(a, b, scale, scale) if scale != 1.0 else (a, b)
+        out[j, 0], out[j, 1] = add(out[j, 0], out[j, 1], a, b)
+
+
+@_njit
+def _over(out, y, scale):  # type: ignore[no-untyped-def]
+    """out ← out / (scale · y), derivatives too: (out' − w y')/y with w = out/y."""
+    c, d = mul(y[0, 0], y[0, 1], scale, scale)
+    out[0, 0], out[0, 1] = div(out[0, 0], out[0, 1], c, d)
+    for j in range(1, len(out)):
+        a, b = mul(y[j, 0], y[j, 1], scale, scale)
+        a, b = mul(a, b, out[0, 0], out[0, 1])
+        a, b = add(out[j, 0], out[j, 1], -b, -a)
+        out[j, 0], out[j, 1] = div(a, b, c, d)
+
+
+@_njit
+def _scaled(out, c, d):  # type: ignore[no-untyped-def]
+    """out ← out · [c, d]."""
+    for j in range(len(out)):
+        out[j, 0], out[j, 1] = mul(out[j, 0], out[j, 1], c, d)
+
+
+@_njit
+def _switch(op, x, y, u, v, out, k):  # type: ignore[no-untyped-def]
+    """|x|, max(x, y), min(x, y): the side that is sure on the whole box, by its values u and v.
+
+    Where neither is, value and derivatives hold both sides (Clarke), and so does the first
+    coefficient in time, which a motion through the corner has almost everywhere.
+    """
+    first, second = u[0] >= v[1], v[0] >= u[1]
+    if op == MIN:
+        first, second = second, first
+    if first or second:
+        out[:] = x if first else y
+        return
+    for j in range(len(out)):
+        if k > 1 or (k == 1 and j > 0) or x[j, 0] != x[j, 0] or y[j, 0] != y[j, 0]:
+            out[j] = _NAN
+        elif j == 0 and k == 0:
+            out[j, 0], out[j, 1] = apply(op, x[j, 0], x[j, 1], y[j, 0], y[j, 1])
+        else:
+            out[j, 0], out[j, 1] = min(x[j, 0], y[j, 0]), max(x[j, 1], y[j, 1])
+
+
+@_njit
+def _line(op, A, B, W, k):  # type: ignore[no-untyped-def]
+    """Coefficient k of op(A, B) into W[k], from A and B up to k and W up to k − 1.
+
+    The recurrences are Moore's: of w = u/v, w v = u; of w = √u, w² = u; of w = e^u, w' = u' w; of
+    w = log u, w' u = u'; and sin' = u' cos, cos' = −u' sin, where B is the partner.
+    """
+    w = W[k]
+    w[:] = 0.0
+    if op in (ADD, SUB):
+        for j in range(len(w)):
+            w[j, 0], w[j, 1] = apply(op, A[k, j, 0], A[k, j, 1], B[k, j, 0], B[k, j, 1])
+    elif op == NEG:
+        w[:, 0], w[:, 1] = -A[k, :, 1], -A[k, :, 0]
+    elif op == MUL:
+        for i in range(k + 1):
+            _gain(w, A[i], B[k - i], 1.0)
+    elif op == SQR:
+        for i in range((k + 1) // 2):
+            _gain(w, A[i], A[k - i], 2.0)
+        if k % 2 == 0:
+            _gain(w, A[k // 2], A[k // 2], 1.0)
+            if k == 0:
+                w[0, 0], w[0, 1] = sqr(A[0, 0, 0], A[0, 0, 1])
+    elif op in (MAX, MIN):
+        _switch(op, A[k], B[k], A[0, 0], B[0, 0], w, k)
+    elif op == ABS:
+        _switch(MAX, A[k], B[k], A[0, 0], B[0, 0], w, k)
+        if k == 0:
+            w[0, 0], w[0, 1] = apply(ABS, A[0, 0, 0], A[0, 0, 1], 0.0, 0.0)
+    elif op == DIV:
+        w[:] = A[k]
+        for i in range(k):
+            _gain(w, W[i], B[k - i], -1.0)
+        _over(w, B[0], 1.0)
+    elif k == 0:  # the rest: a function of one operand
+        w[0, 0], w[0, 1] = apply(op, A[0, 0, 0], A[0, 0, 1], 0.0, 0.0)
+        if len(w) > 1:
+            if op == SQRT:
+                c, d = reciprocal(2.0 * w[0, 0], 2.0 * w[0, 1])
+            elif op == EXP:
+                c, d = w[0, 0], w[0, 1]
+            elif op == LOG:
+                c, d = reciprocal(A[0, 0, 0], A[0, 0, 1])
+            else:
+                c, d = apply(COS if op == SIN else SIN, A[0, 0, 0], A[0, 0, 1], 0.0, 0.0)
+                if op == COS:
+                    c, d = -d, -c
+            w[1:] = A[0, 1:]
+            _scaled(w[1:], c, d)
+    elif op == SQRT:
+        w[:] = A[k]
+        for i in range(1, k):
+            _gain(w, W[i], W[k - i], -1.0)
+        _over(w, W[0], 2.0)
+    elif op == LOG:
+        for i in range(1, k):
+            _gain(w, W[i], A[k - i], -float(i))
+        c, d = reciprocal(float(k), float(k))
+        _scaled(w, c, d)
+        for j in range(len(w)):
+            w[j, 0], w[j, 1] = add(w[j, 0], w[j, 1], A[k, j, 0], A[k, j, 1])
+        _over(w, A[0], 1.0)
+    else:
+        other = W if op == EXP else B
+        for i in range(1, k + 1):
+            _gain(w, A[i], other[k - i], float(i) if op != COS else -float(i))
+        c, d = reciprocal(float(k), float(k))
+        _scaled(w, c, d)
+
+
+@_njit
+def jets(code, constants, low, high, rates, order, variables):  # type: ignore[no-untyped-def]
+    """Run code over one box: the jets of all registers, (R, order + 1, 1 + V, 2).
+
+    Registers are the inputs, the constants, then one for each line of code.  The first ``variables``
+    inputs are differentiated by.  ``rates`` are the registers of ẋ for the first inputs x: their
+    coefficients follow from x' = ẋ; other inputs are constant.
+    """
+    inputs, first = len(low), len(low) + len(constants)
+    total = first + len(code)
+    J = np.zeros((total, order + 1, 1 + variables, 2))
+    for i in range(inputs):
+        J[i, 0, 0, 0], J[i, 0, 0, 1] = low[i], high[i]
+        if i < variables:
+            J[i, 0, 1 + i] = 1.0
+    for i in range(len(constants)):
+        J[inputs + i, 0, 0] = constants[i]
+    negative = np.zeros((order + 1, 1 + variables, 2))
+    for k in range(order + 1):
+        for i in range(len(rates) if k else 0):
+            c, d = reciprocal(float(k), float(k))
+            J[i, k] = J[rates[i], k - 1]
+            _scaled(J[i, k], c, d)
+        for line in range(len(code)):
+            op, a, b = code[line, 0], code[line, 1], code[line, 2]
+            if op == ABS:
+                for i in range(k + 1):
+                    negative[i, :, 0], negative[i, :, 1] = -J[a, i, :, 1], -J[a, i, :, 0]
+                _line(op, J[a], negative, J[first + line], k)
+            else:
+                _line(op, J[a], J[b], J[first + line], k)
+    return J
+
+
+@_njit
+def over_boxes(code, constants, outputs, low, high, fixed):  # type: ignore[no-untyped-def]
+    """Outputs over many boxes (V, N) with fixed inputs (F, 2): by values, and by mean values too.
+
+    The mean value form f(m) + ∂f (x − m) holds too, and is met with the value.  Also returned: how
+    much of each output's variation is due to each variable, (O, V, N).
+    """
+    V, boxes = low.shape
+    out, spread = np.empty((len(outputs), 2, boxes)), np.zeros((len(outputs), V, boxes))
+    a, b = np.empty(V + len(fixed)), np.empty(V + len(fixed))
+    m = np.empty(V + len(fixed))
+    a[V:], b[V:] = fixed[:, 0], fixed[:, 1]
+    none = np.empty(0, dtype=np.int64)
+    top = np.empty(V + len(fixed))
+    for box in range(boxes):
+        a[:V], b[:V] = low[:, box], high[:, box]
+        m[:], top[:] = a, b
+        for i in range(V):
+            m[i] = top[i] = 0.5 * a[i] + 0.5 * b[i]
+        J = jets(code, constants, a, b, none, 0, V)
+        centre = jets(code, constants, m, top, none, 0, 0)
+        for o in range(len(outputs)):
+            p, q = J[outputs[o], 0, 0]
+            c, d = centre[outputs[o], 0, 0]
+            for i in range(V):
+                g0, g1 = J[outputs[o], 0, 1 + i]
+                e, f = mul(g0, g1, down(a[i] - m[i]), up(b[i] - m[i]))
+                c, d = add(c, d, e, f)
+                spread[o, i, box] = max(abs(g0), abs(g1)) * (b[i] - a[i])
+            if p == p and c == c:
+                p, q = max(p, c), min(q, d)
+            out[o, 0, box], out[o, 1, box] = p, q
+    return out, spread
+
+
+# -- interval matrices ---------------------------------------------------------------------------
+
+
+@_njit
+def product(A, B):  # type: ignore[no-untyped-def]
+    """Product of interval matrices (I, K, 2) and (K, J, 2)."""
+    out = np.zeros((A.shape[0], B.shape[1], 2))
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            for k in range(A.shape[1]):
+                a, b = mul(A[i, k, 0], A[i, k, 1], B[k, j, 0], B[k, j, 1])
+                out[i, j, 0], out[i, j, 1] = add(out[i, j, 0], out[i, j, 1], a, b)
+    return out
+
+
+@_njit
+def points(A):  # type: ignore[no-untyped-def]
+    """Doubles as intervals."""
+    out = np.empty((*A.shape, 2))
+    out[..., 0], out[..., 1] = A, A
+    return out
+
+
+@_njit
+def inverse(A):  # type: ignore[no-untyped-def]
+    """Enclose the inverse of every matrix in A (N, N, 2); NaN where that is not shown.
+
+    With a double R near the inverse of the middle and ‖I − R A‖ ≤ e < 1 (largest row sum),
+    A⁻¹ = (I − E)⁻¹ R, and (I − E)⁻¹ − I is at most e/(1 − e) in each entry.
+    """
+    n = len(A)
+    middle = 0.5 * (A[..., 0] + A[..., 1])
+    if not np.isfinite(middle).all() or np.linalg.det(middle) == 0.0:
+        return np.full((n, n, 2), _NAN)
+    R = points(np.linalg.inv(middle))
+    E = product(R, A)
+    worst = 0.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            c = 1.0 if i == j else 0.0
+            a, b = add(E[i, j, 0], E[i, j, 1], -c, -c)
+            total = up(total + max(abs(a), abs(b)))
+        worst = max(worst, total) if total == total else _INF
+    if not worst < 0.5:
+        return np.full((n, n, 2), _NAN)
+    e = up(worst / down(1.0 - worst))
+    near = np.empty((n, n, 2))
+    for i in range(n):
+        for j in range(n):
+            c = 1.0 if i == j else 0.0
+            near[i, j, 0], near[i, j, 1] = down(c - e), up(c + e)
+    return product(near, R)
+
+
+@_njit
+def norm(row):  # type: ignore[no-untyped-def]
+    """Upper bound of the Euclidean norm of an interval vector (K, 2)."""
+    total = 0.0
+    for k in range(len(row)):
+        big = max(abs(row[k, 0]), abs(row[k, 1]))
+        total = up(total + up(big * big))
+    return up(math.sqrt(total)) if total == total else _INF
+
+
+@_njit
+def dominance(S):  # type: ignore[no-untyped-def]
+    """A lower bound of the dominance of the diagonal of S (N, N, 2): > 0 proves S ≻ 0, S = Sᵀ."""
+    least = _INF
+    for i in range(len(S)):
+        off = 0.0
+        for j in range(len(S)):
+            if j != i:
+                off = up(off + max(abs(S[i, j, 0]), abs(S[i, j, 1])))
+        room = down(S[i, i, 0] - off)
+        least = min(least, room) if room == room else -_INF
+    return least
+
+
+# -- one validated Taylor step ---------------------------------------------------------------------
+
+
+@_njit
+def _picard(code, constants, rates, X, low, high, h):  # type: ignore[no-untyped-def]
+    """A box that motions from X (N, 2) do not leave within h, into low and high; whether shown."""
+    n = len(X)
+    none = np.empty(0, dtype=np.int64)
+    low[:n], high[:n] = X[:, 0], X[:, 1]
+    for attempt in range(12):
+        J = jets(code, constants, low, high, none, 0, 0)
+        inside = True
+        for i in range(n):
+            a, b = mul(J[rates[i], 0, 0, 0], J[rates[i], 0, 0, 1], 0.0, h)
+            a, b = add(X[i, 0], X[i, 1], a, b)
+            if not (a - a == 0.0 and b - b == 0.0):
+                return False
+            if not (low[i] <= a and b <= high[i]):
+                inside = False
+                room = (0.1 if attempt < 6 else 0.5) * (b - a) + 1e-300
+                low[i], high[i] = min(low[i], a - room), max(high[i], b + room)
+        if inside:
+            return True
+    return False
+
+
+@_njit
+def _orthogonal(A, widths):  # type: ignore[no-untyped-def]
+    """Orthonormal columns near those of A, the widest first (Lohner); nothing rests on them."""
+    n = len(A)
+    size = np.empty(n)
+    for j in range(n):
+        size[j] = np.sqrt((A[:, j] ** 2).sum()) * widths[j]
+    order, Q, filled = np.argsort(-size), np.zeros((n, n)), 0
+    for j in range(2 * n):  # the columns, then unit vectors where columns are dependent
+        v = np.zeros(n)
+        if j < n:
+            v[:] = A[:, order[j]]
+        else:
+            v[j - n] = 1.0
+        before = np.sqrt((v * v).sum())
+        for _ in range(2):
+            for k in range(filled):
+                v -= (v * Q[:, k]).sum() * Q[:, k]
+        length = np.sqrt((v * v).sum())
+        if length > 1e-10 * before and filled < n:
+            Q[:, filled] = v / length
+            filled += 1
+    return Q
+
+
+@_njit
+def _hulled(m, C, xi, Q, r):  # type: ignore[no-untyped-def]
+    """The box around m + C ξ + Q r, (N, 2)."""
+    first, second = product(points(C), xi), product(points(Q), r)
+    X = np.empty((len(m), 2))
+    for i in range(len(m)):
+        a, b = add(first[i, 0, 0], first[i, 0, 1], second[i, 0, 0], second[i, 0, 1])
+        X[i, 0], X[i, 1] = add(m[i], m[i], a, b)
+    return X
+
+
+@_njit
+def taylor_step(code, constants, rates, fixed, h, order, m, C, xi, Q, r):  # type: ignore[no-untyped-def]
+    """Motions from {m + C ξ + Q r : ξ, r in their boxes} after h: Lemma 6.
+
+    C (N, K) and Q (N, N) are doubles, ξ (K, 1, 2) and r (N, 1, 2) boxes.  New m, C, Q and r are
+    written into theirs.  Returned: whether it is shown, the box that motions stay in, (N, 2).
+    """
+    n = len(m)
+    low, high = np.empty(n + len(fixed)), np.empty(n + len(fixed))
+    low[n:], high[n:] = fixed[:, 0], fixed[:, 1]
+    X0 = _hulled(m, C, xi, Q, r)
+    stay = np.empty((n, 2))
+    if not _picard(code, constants, rates, X0, low, high, h):
+        return False, stay
+    stay[:, 0], stay[:, 1] = low[:n], high[:n]
+    whole = jets(code, constants, low, high, rates, order, 0)[:n, order, 0].copy()
+    if np.isnan(whole).any():  # a corner is inside: the short formula with Clarke's derivatives
+        order = 2
+        whole = jets(code, constants, low, high, rates, order, 0)[:n, order, 0].copy()
+    low[:n], high[:n] = m, m
+    centre = jets(code, constants, low, high, rates, order - 1, 0)
+    low[:n], high[:n] = X0[:, 0], X0[:, 1]
+    around = jets(code, constants, low, high, rates, order - 1, n)
+    end, S = whole, np.zeros((n, n, 2))
+    for k in range(order - 1, -1, -1):  # Horner in h; the remainder comes first
+        for i in range(n):
+            a, b = mul(end[i, 0], end[i, 1], h, h)
+            end[i, 0], end[i, 1] = add(a, b, centre[i, k, 0, 0], centre[i, k, 0, 1])
+            for j in range(n):
+                a, b = mul(S[i, j, 0], S[i, j, 1], h, h)
+                c, d = around[i, k, 1 + j]
+                S[i, j, 0], S[i, j, 1] = add(a, b, c, d)
+    if not (np.isfinite(end).all() and np.isfinite(S).all()):
+        return False, stay
+    carried, turned = product(S, points(C)), product(S, points(Q))
+    drift = np.zeros((n, 1, 2))
+    for i in range(n):
+        m[i] = 0.5 * (end[i, 0] + end[i, 1])
+        drift[i, 0, 0], drift[i, 0, 1] = add(end[i, 0], end[i, 1], -m[i], -m[i])
+        for j in range(C.shape[1]):
+            C[i, j] = 0.5 * (carried[i, j, 0] + carried[i, j, 1])
+            a, b = add(carried[i, j, 0], carried[i, j, 1], -C[i, j], -C[i, j])
+            a, b = mul(a, b, xi[j, 0, 0], xi[j, 0, 1])
+            drift[i, 0, 0], drift[i, 0, 1] = add(drift[i, 0, 0], drift[i, 0, 1], a, b)
+    Q[:] = _orthogonal(0.5 * (turned[..., 0] + turned[..., 1]), r[:, 0, 1] - r[:, 0, 0] + 1e-300)
+    back = inverse(points(Q))
+    moved, pushed = product(product(back, turned), r), product(back, drift)
+    for i in range(n):
+        a, b = add(moved[i, 0, 0], moved[i, 0, 1], pushed[i, 0, 0], pushed[i, 0, 1])
+        r[i, 0, 0], r[i, 0, 1] = a, b
+    return bool(np.isfinite(r).all()), stay
+
+
+# -- a terminal ellipsoid --------------------------------------------------------------------------
+
+
+@_njit
+def ellipsoid(code, constants, outputs, fixed, W, radius, C, layer, limits):  # type: ignore[no-untyped-def]
+    """Decide Lemma 5 for D = {|W x| ≤ radius}: what is not shown (0: all is), margin, half-sides of Q.
+
+    W (2n, 2n, 2) and C (m, 2n, 2) are intervals, radius, −layer and −limits rounded up.  Outputs:
+    q̈ (n), demand (m), then what has to keep its sign: pivots (n) > 0, det B, det Γ.
+    """
+    size, m = len(W), len(layer)
+    n, half = size // 2, np.zeros(len(W))
+    V = inverse(W)
+    if not np.isfinite(V).all():
+        return 1, -_INF, half
+    low, high = np.zeros(size + len(fixed)), np.zeros(size + len(fixed))
+    low[size:], high[size:] = fixed[:, 0], fixed[:, 1]
+    none = np.empty(0, dtype=np.int64)
+    centre = jets(code, constants, low, high, none, 0, 0)
+    for i in range(size):
+        half[i] = up(norm(V[i]) * radius)
+        low[i], high[i] = -half[i], half[i]
+    J = jets(code, constants, low, high, none, 0, size)
+    for i in range(n + m, len(outputs)):
+        a, b = J[outputs[i], 0, 0]
+        if not (a > 0.0 or (b < 0.0 and i >= n + m + n)):
+            return 2, -_INF, half
+    rows = product(C, V)
+    for i in range(m):
+        if not up(norm(rows[i]) * radius) <= layer[i]:
+            return 3, -_INF, half
+    slopes = np.zeros((m, size, 2))
+    for i in range(m):
+        slopes[i] = J[outputs[n + i], 0, 1:]
+    rows = product(slopes, V)
+    for i in range(m):
+        a, b = centre[outputs[n + i], 0, 0]
+        if not up(max(abs(a), abs(b)) + up(norm(rows[i]) * radius)) <= limits[i]:
+            return 4, -_INF, half
+    F = np.zeros((size, size, 2))
+    for i in range(n):
+        F[i, n + i] = 1.0
+        F[n + i] = J[outputs[i], 0, 1:]
+    A = product(product(W, F), V)
+    S, scale = np.empty((size, size, 2)), np.ones(size)
+    for i in range(size):
+        for j in range(size):
+            a, b = add(A[i, j, 0], A[i, j, 1], A[j, i, 0], A[j, i, 1])
+            S[i, j, 0], S[i, j, 1] = -b, -a
+        middle = 0.5 * (S[i, i, 0] + S[i, i, 1])
+        if middle > 1e-100:
+            scale[i] = 1.0 / math.sqrt(middle)
+    for i in range(size):  # a congruence with a positive diagonal: any will do
+        for j in range(size):
+            a, b = mul(S[i, j, 0], S[i, j, 1], scale[i], scale[i])
+            S[i, j, 0], S[i, j, 1] = mul(a, b, scale[j], scale[j])
+    margin = dominance(S)
+    return (0 if margin > 0.0 else 5), margin, half
