@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import FloatArray, Program, hull
 
-__all__ = ["Goal", "Settled", "settle"]
+__all__ = ["Goal", "Settled", "over_boxes", "settle"]
 
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
 CHUNK, TRIED = 512, 16
@@ -37,6 +37,29 @@ class Settled:
     why: str
     point: tuple[float, ...]
     boxes: int
+
+
+def over_boxes(
+    program: Program, low: FloatArray, high: FloatArray, fixed: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Enclose outputs over boxes (V, N) with fixed inputs (F, 2): (O, 2, N), (O, V, N).
+
+    The second is how much each output varies with each variable: a guess for splitting.
+    """
+    V, boxes = low.shape
+    values = np.empty((len(program.outputs), 2, boxes))
+    spreads = np.empty((len(program.outputs), V, boxes))
+    a, b = np.empty((2, V + len(fixed)))
+    a[V:], b[V:] = fixed.T
+    m, top = a.copy(), b.copy()
+    for k in range(boxes):
+        a[:V], b[:V] = low[:, k], high[:, k]
+        m[:V] = top[:V] = 0.5 * a[:V] + 0.5 * b[:V]
+        whole, centre = program(a, b, V), program(m, top)
+        values[:, :, k], spreads[:, :, k] = ops.mean_values(
+            whole, centre[:, 0], a[:V], b[:V], m[:V]
+        )
+    return values, spreads
 
 
 def settle(
@@ -65,9 +88,7 @@ def settle(
 
     def missed(a: FloatArray, b: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_], FloatArray]:
         """Goals that are not shown, and that are shown false, (O, N), with spreads."""
-        values, spread = ops.over_boxes(
-            program.code, program.constants, program.outputs, a, b, fixed
-        )
+        values, spread = over_boxes(program, a, b, fixed)
         below = np.where(signs[:, None] > 0, values[:, 0], -values[:, 1])
         above = np.where(signs[:, None] > 0, values[:, 1], -values[:, 0])
         shown, wrong = np.empty(below.shape, bool), np.empty(below.shape, bool)

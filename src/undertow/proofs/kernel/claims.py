@@ -378,11 +378,29 @@ class Reaching(Claim):
 
 # -- 5.4 -----------------------------------------------------------------------------------------------
 
-#: What is not shown, by the code of :func:`undertow.proofs.kernel.compiled.ellipsoid`.
+#: What is not shown, by number.
 REASONS = (
     "", "W is not shown to be invertible", "model and law are not shown to be regular",
     "the boundary layer is left", "an input limit is met", "V̇ < 0 is not shown",
 )  # fmt: skip
+
+
+def ellipsoid(
+    program: Program, fixed: FloatArray, W: FloatArray, radius: float, C: FloatArray,
+    layer: FloatArray, limits: FloatArray,
+) -> tuple[int, float, FloatArray]:  # fmt: skip
+    """Decide Lemma 5 as :func:`undertow.proofs.kernel.compiled.ellipsoid`: code, margin, sides of Q."""
+    size = len(W)
+    V = ops.inverse(W)
+    half = np.array([ops.up(ops.norm(row) * radius) for row in V])
+    if not (np.isfinite(V).all() and np.isfinite(half).all()):
+        return 1, -math.inf, np.zeros(size)
+    low, high = np.vstack([np.zeros((size, 2)), fixed]).T.copy()
+    centre = program(low, high)[:, 0]
+    low[:size], high[:size] = -half, half
+    whole = program(low, high, size)
+    code, margin = ops.ellipsoid(V, whole, centre, W, radius, C, layer, limits)
+    return int(code), float(margin), half
 
 
 def ellipsoid_program(own: System) -> Program:
@@ -437,13 +455,10 @@ class TerminalEllipsoid(Claim):
         own = system(model, law)
         if (why := no_equilibrium(own)) is not None:
             return "undecided", why, {}, {}
-        program = ellipsoid_program(own)
         W = np.array([[hull(v, v) for v in row] for row in self.W])
-        C = _rows(law)
-        code, margin, half = ops.ellipsoid(
-            program.code, program.constants, program.outputs, own.fixed(), W,
-            hull(self.radius, self.radius)[1], C,
-            np.array([hull(v, v)[0] for v in law.layer]), input_limits(model),
+        code, margin, half = ellipsoid(
+            ellipsoid_program(own), own.fixed(), W, hull(self.radius, self.radius)[1],
+            _rows(law), np.array([hull(v, v)[0] for v in law.layer]), input_limits(model),
         )  # fmt: skip
         details = {"margin": float(margin), "box": half.tolist(), "ball": self.ball}
         witness = dict(zip(model.states, half.tolist(), strict=True))

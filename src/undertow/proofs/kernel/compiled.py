@@ -22,8 +22,9 @@ import numba
 import numpy as np
 
 __all__ = ["ABS", "ADD", "BINARY", "COS", "DIV", "EXP", "LOG", "MAX", "MIN", "MUL", "NEG", "PI",
-           "SIN", "SQR", "SQRT", "SUB", "apply", "dominance", "ellipsoid", "enclose", "inverse", "jets", "norm",
-           "over_boxes", "points", "product", "taylor_step"]  # fmt: skip
+           "SIN", "SQR", "SQRT", "SUB", "add", "apply", "ellipsoid", "enclose", "hulled", "inverse",
+           "jets", "mean_values", "norm", "picard", "taylor_step", "up"]  # fmt: skip
+
 
 #: Operations of code; those that take two operands; SIN and COS name each other as the second.
 ADD, SUB, MUL, DIV, MAX, MIN, NEG, SQR, SQRT, SIN, COS, EXP, LOG, ABS = range(14)
@@ -176,11 +177,9 @@ def _turn(x, quarter):  # type: ignore[no-untyped-def]
         return -1.0, 1.0
     t0, t1 = sqr(a, b)
     turn = (int(k) + quarter) % 4
+    low, high = _horner(_SIN if turn % 2 == 0 else _COS, t0, t1)
     if turn % 2 == 0:
-        low, high = _horner(_SIN, t0, t1)
         low, high = mul(low, high, a, b)
-    else:
-        low, high = _horner(_COS, t0, t1)
     if turn >= 2:
         low, high = -high, -low
     return max(low, -1.0), min(high, 1.0)
@@ -196,9 +195,10 @@ def _wave(a, b, quarter):  # type: ignore[no-untyped-def]
         return _NAN, _NAN
     if not (a >= -1e6 and b <= 1e6 and b - a < 6.0):
         return -1.0, 1.0
-    p, q = _turn(a, quarter)
-    r, s = _turn(b, quarter)
-    low, high = min(p, r), max(q, s)
+    low, high = 1.0, -1.0
+    for end in (a, b):
+        p, q = _turn(end, quarter)
+        low, high = min(low, p), max(high, q)
     shift = 0.5 * (quarter - 1)
     p, q = div(a, b, _PI[0], _PI[1])
     first, last = math.ceil(down(p + shift)), math.floor(up(q + shift))
@@ -271,20 +271,16 @@ def apply(op, a, b, c, d):  # type: ignore[no-untyped-def]
         if not a > 0.0:
             return _NAN, _NAN
         return max(down(math.sqrt(a)), 0.0), up(math.sqrt(b))
-    if op == SIN:
-        return _wave(a, b, 0)
-    if op == COS:
-        return _wave(a, b, 1)
-    if op == EXP:
-        p, _ = _exp_end(a)
-        _, q = _exp_end(b)
-        return p, q
-    if op == LOG:
-        if not a > 0.0:
-            return _NAN, _NAN
-        p, _ = _log_end(a)
-        _, q = _log_end(b)
-        return p, q
+    if op in (SIN, COS):
+        return _wave(a, b, op - SIN)
+    if op == LOG and not a > 0.0:
+        return _NAN, _NAN
+    if op in (EXP, LOG):
+        low, high = _INF, -_INF
+        for end in (a, b):
+            p, q = _exp_end(end) if op == EXP else _log_end(end)
+            low, high = min(low, p), max(high, q)
+        return low, high
     if a >= 0.0:  # ABS
         return a, b
     if b <= 0.0:
@@ -354,74 +350,83 @@ def _switch(op, x, y, u, v, out, k):  # type: ignore[no-untyped-def]
 
 
 @_njit
+def _slope(op, a, b, w0, w1):  # type: ignore[no-untyped-def]
+    """The derivative of a function over [a, b], where it is [w0, w1]."""
+    if op == EXP:
+        return w0, w1
+    if op in (SQRT, LOG):
+        return reciprocal(2.0 * w0, 2.0 * w1) if op == SQRT else reciprocal(a, b)
+    c, d = _wave(a, b, COS - op)
+    return (-d, -c) if op == COS else (c, d)
+
+
+@_njit
 def _line(op, A, B, W, k):  # type: ignore[no-untyped-def]
     """Coefficient k of op(A, B) into W[k], from A and B up to k and W up to k − 1.
 
     The recurrences are Moore's: of w = u/v, w v = u; of w = √u, w² = u; of w = e^u, w' = u' w; of
-    w = log u, w' u = u'; and sin' = u' cos, cos' = −u' sin, where B is the partner.
+    w = log u, w' u = u'; and sin' = u' cos, cos' = −u' sin, where B is the partner.  Each is a sum of
+    products, times 1/k or plus u_k, over a first coefficient.
     """
     w = W[k]
     w[:] = 0.0
     if op in (ADD, SUB):
         for j in range(len(w)):
-            w[j, 0], w[j, 1] = apply(op, A[k, j, 0], A[k, j, 1], B[k, j, 0], B[k, j, 1])
-    elif op == NEG:
+            c, d = B[k, j]
+            if op == SUB:
+                c, d = -d, -c
+            w[j, 0], w[j, 1] = add(A[k, j, 0], A[k, j, 1], c, d)
+        return
+    if op == NEG:
         w[:, 0], w[:, 1] = -A[k, :, 1], -A[k, :, 0]
-    elif op == MUL:
-        for i in range(k + 1):
-            _gain(w, A[i], B[k - i], 1.0)
-    elif op == SQR:
-        for i in range((k + 1) // 2):
-            _gain(w, A[i], A[k - i], 2.0)
-        if k % 2 == 0:
-            _gain(w, A[k // 2], A[k // 2], 1.0)
-            if k == 0:
-                w[0, 0], w[0, 1] = sqr(A[0, 0, 0], A[0, 0, 1])
-    elif op in (MAX, MIN):
-        _switch(op, A[k], B[k], A[0, 0], B[0, 0], w, k)
-    elif op == ABS:
-        _switch(MAX, A[k], B[k], A[0, 0], B[0, 0], w, k)
-        if k == 0:
-            w[0, 0], w[0, 1] = apply(ABS, A[0, 0, 0], A[0, 0, 1], 0.0, 0.0)
-    elif op == DIV:
-        w[:] = A[k]
-        for i in range(k):
-            _gain(w, W[i], B[k - i], -1.0)
-        _over(w, B[0], 1.0)
-    elif k == 0:  # the rest: a function of one operand
+        return
+    if op in (MAX, MIN, ABS):
+        _switch(MAX if op == ABS else op, A[k], B[k], A[0, 0], B[0, 0], w, k)
+        if op == ABS and k == 0:
+            w[0, 0], w[0, 1] = max(w[0, 0], 0.0), w[0, 1]
+        return
+    if k == 0 and op in (SQRT, SIN, COS, EXP, LOG):
         w[0, 0], w[0, 1] = apply(op, A[0, 0, 0], A[0, 0, 1], 0.0, 0.0)
         if len(w) > 1:
-            if op == SQRT:
-                c, d = reciprocal(2.0 * w[0, 0], 2.0 * w[0, 1])
-            elif op == EXP:
-                c, d = w[0, 0], w[0, 1]
-            elif op == LOG:
-                c, d = reciprocal(A[0, 0, 0], A[0, 0, 1])
-            else:
-                c, d = apply(COS if op == SIN else SIN, A[0, 0, 0], A[0, 0, 1], 0.0, 0.0)
-                if op == COS:
-                    c, d = -d, -c
             w[1:] = A[0, 1:]
-            _scaled(w[1:], c, d)
-    elif op == SQRT:
-        w[:] = A[k]
-        for i in range(1, k):
-            _gain(w, W[i], W[k - i], -1.0)
-        _over(w, W[0], 2.0)
+            c, d = _slope(op, A[0, 0, 0], A[0, 0, 1], w[0, 0], w[0, 1])
+            for j in range(1, len(w)):
+                w[j, 0], w[j, 1] = mul(w[j, 0], w[j, 1], c, d)
+        return
+    # Σ weight · left_i · right_(k−i) for first ≤ i ≤ last
+    left, right, first, last = W, W, 1, k - 1
+    if op in (MUL, SQR):
+        left, right, first, last = A, B if op == MUL else A, 0, k
+    elif op == DIV:
+        left, right, first = W, B, 0
     elif op == LOG:
-        for i in range(1, k):
-            _gain(w, W[i], A[k - i], -float(i))
-        c, d = reciprocal(float(k), float(k))
-        _scaled(w, c, d)
+        left, right = W, A
+    elif op != SQRT:  # EXP, SIN, COS
+        left, right, last = A, W if op == EXP else B, k
+    if op in (DIV, SQRT):
+        w[:] = A[k]
+    for i in range(first, last + 1):
+        scale = 1.0
+        if op in (DIV, SQRT):
+            scale = -1.0
+        elif op == SQR:  # symmetric: half of it, twice
+            scale = 2.0 if 2 * i < k else 1.0
+            if 2 * i > k:
+                break
+        elif op in (LOG, COS):
+            scale = -float(i)
+        elif op in (SIN, EXP):
+            scale = float(i)
+        _gain(w, left[i], right[k - i], scale)
+    if op == SQR and k == 0:
+        w[0, 0], w[0, 1] = sqr(A[0, 0, 0], A[0, 0, 1])
+    if op in (LOG, SIN, COS, EXP):
+        _scaled(w, *reciprocal(float(k), float(k)))
+    if op == LOG:
         for j in range(len(w)):
             w[j, 0], w[j, 1] = add(w[j, 0], w[j, 1], A[k, j, 0], A[k, j, 1])
-        _over(w, A[0], 1.0)
-    else:
-        other = W if op == EXP else B
-        for i in range(1, k + 1):
-            _gain(w, A[i], other[k - i], float(i) if op != COS else -float(i))
-        c, d = reciprocal(float(k), float(k))
-        _scaled(w, c, d)
+    if op in (DIV, SQRT, LOG):
+        _over(w, B[0] if op == DIV else W[0] if op == SQRT else A[0], 2.0 if op == SQRT else 1.0)
 
 
 @_njit
@@ -459,37 +464,24 @@ def jets(code, constants, low, high, rates, order, variables):  # type: ignore[n
 
 
 @_njit
-def over_boxes(code, constants, outputs, low, high, fixed):  # type: ignore[no-untyped-def]
-    """Outputs over many boxes (V, N) with fixed inputs (F, 2): by values, and by mean values too.
+def mean_values(whole, centre, a, b, m):  # type: ignore[no-untyped-def]
+    """Values over a box, by their intervals and by f(m) + ∂f (x − m), both of which hold: (O, 2).
 
-    The mean value form f(m) + ∂f (x − m) holds too, and is met with the value.  Also returned: how
-    much of each output's variation is due to each variable, (O, V, N).
+    ``whole`` are values and derivatives over the box [a, b], (O, 1 + V, 2), ``centre`` values at
+    doubles m inside, (O, 2).  Also: how much of each output is due to each variable, (O, V).
     """
-    V, boxes = low.shape
-    out, spread = np.empty((len(outputs), 2, boxes)), np.zeros((len(outputs), V, boxes))
-    a, b = np.empty(V + len(fixed)), np.empty(V + len(fixed))
-    m = np.empty(V + len(fixed))
-    a[V:], b[V:] = fixed[:, 0], fixed[:, 1]
-    none = np.empty(0, dtype=np.int64)
-    top = np.empty(V + len(fixed))
-    for box in range(boxes):
-        a[:V], b[:V] = low[:, box], high[:, box]
-        m[:], top[:] = a, b
-        for i in range(V):
-            m[i] = top[i] = 0.5 * a[i] + 0.5 * b[i]
-        J = jets(code, constants, a, b, none, 0, V)
-        centre = jets(code, constants, m, top, none, 0, 0)
-        for o in range(len(outputs)):
-            p, q = J[outputs[o], 0, 0]
-            c, d = centre[outputs[o], 0, 0]
-            for i in range(V):
-                g0, g1 = J[outputs[o], 0, 1 + i]
-                e, f = mul(g0, g1, down(a[i] - m[i]), up(b[i] - m[i]))
-                c, d = add(c, d, e, f)
-                spread[o, i, box] = max(abs(g0), abs(g1)) * (b[i] - a[i])
-            if p == p and c == c:
-                p, q = max(p, c), min(q, d)
-            out[o, 0, box], out[o, 1, box] = p, q
+    out, spread = np.empty((len(whole), 2)), np.empty((len(whole), len(a)))
+    for o in range(len(whole)):
+        p, q = whole[o, 0]
+        c, d = centre[o]
+        for i in range(len(a)):
+            g0, g1 = whole[o, 1 + i]
+            e, f = mul(g0, g1, down(a[i] - m[i]), up(b[i] - m[i]))
+            c, d = add(c, d, e, f)
+            spread[o, i] = max(abs(g0), abs(g1)) * (b[i] - a[i])
+        if p == p and c == c:
+            p, q = max(p, c), min(q, d)
+        out[o, 0], out[o, 1] = p, q
     return out, spread
 
 
@@ -576,26 +568,21 @@ def dominance(S):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def _picard(code, constants, rates, X, low, high, h):  # type: ignore[no-untyped-def]
-    """A box that motions from X (N, 2) do not leave within h, into low and high; whether shown."""
-    n = len(X)
-    none = np.empty(0, dtype=np.int64)
-    low[:n], high[:n] = X[:, 0], X[:, 1]
-    for attempt in range(12):
-        J = jets(code, constants, low, high, none, 0, 0)
-        inside = True
-        for i in range(n):
-            a, b = mul(J[rates[i], 0, 0, 0], J[rates[i], 0, 0, 1], 0.0, h)
-            a, b = add(X[i, 0], X[i, 1], a, b)
-            if not (a - a == 0.0 and b - b == 0.0):
-                return False
-            if not (low[i] <= a and b <= high[i]):
-                inside = False
-                room = (0.1 if attempt < 6 else 0.5) * (b - a) + 1e-300
-                low[i], high[i] = min(low[i], a - room), max(high[i], b + room)
-        if inside:
-            return True
-    return False
+def picard(X, rates, low, high, h, part):  # type: ignore[no-untyped-def]
+    """Whether X + [0, h] F lies in [low, high], where F is in ``rates``; if not, widen that box.
+
+    1: it does; 0: the box was widened, by ``part`` of what it takes more; −1: F is not bounded.
+    """
+    inside = 1
+    for i in range(len(X)):
+        a, b = mul(rates[i, 0], rates[i, 1], 0.0, h)
+        a, b = add(X[i, 0], X[i, 1], a, b)
+        if not (a - a == 0.0 and b - b == 0.0):
+            return -1
+        if not (low[i] <= a and b <= high[i]):
+            inside, room = 0, part * (b - a) + 1e-300
+            low[i], high[i] = min(low[i], a - room), max(high[i], b + room)
+    return inside
 
 
 @_njit
@@ -624,7 +611,7 @@ def _orthogonal(A, widths):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def _hulled(m, C, xi, Q, r):  # type: ignore[no-untyped-def]
+def hulled(m, C, xi, Q, r):  # type: ignore[no-untyped-def]
     """The box around m + C ξ + Q r, (N, 2)."""
     first, second = product(points(C), xi), product(points(Q), r)
     X = np.empty((len(m), 2))
@@ -635,39 +622,25 @@ def _hulled(m, C, xi, Q, r):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def taylor_step(code, constants, rates, fixed, h, order, m, C, xi, Q, r):  # type: ignore[no-untyped-def]
-    """Motions from {m + C ξ + Q r : ξ, r in their boxes} after h: Lemma 6.
+def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-untyped-def]
+    """{m + C ξ + Q r} after h, Lemma 6: new m, C, Q and r into theirs; whether all is bounded.
 
-    C (N, K) and Q (N, N) are doubles, ξ (K, 1, 2) and r (N, 1, 2) boxes.  New m, C, Q and r are
-    written into theirs.  Returned: whether it is shown, the box that motions stay in, (N, 2).
+    ``rest`` (N, 2) is the last coefficient over a box that motions stay in, ``centre`` (N, K, 2) the
+    others at m, ``around`` (N, K, 1 + N, 2) the others over the set with their derivatives.
+    C (N, L) and Q (N, N) are doubles, ξ (L, 1, 2) and r (N, 1, 2) boxes.
     """
     n = len(m)
-    low, high = np.empty(n + len(fixed)), np.empty(n + len(fixed))
-    low[n:], high[n:] = fixed[:, 0], fixed[:, 1]
-    X0 = _hulled(m, C, xi, Q, r)
-    stay = np.empty((n, 2))
-    if not _picard(code, constants, rates, X0, low, high, h):
-        return False, stay
-    stay[:, 0], stay[:, 1] = low[:n], high[:n]
-    whole = jets(code, constants, low, high, rates, order, 0)[:n, order, 0].copy()
-    if np.isnan(whole).any():  # a corner is inside: the short formula with Clarke's derivatives
-        order = 2
-        whole = jets(code, constants, low, high, rates, order, 0)[:n, order, 0].copy()
-    low[:n], high[:n] = m, m
-    centre = jets(code, constants, low, high, rates, order - 1, 0)
-    low[:n], high[:n] = X0[:, 0], X0[:, 1]
-    around = jets(code, constants, low, high, rates, order - 1, n)
-    end, S = whole, np.zeros((n, n, 2))
-    for k in range(order - 1, -1, -1):  # Horner in h; the remainder comes first
+    end, S = rest.copy(), np.zeros((n, n, 2))
+    for k in range(centre.shape[1] - 1, -1, -1):  # Horner in h; the remainder comes first
         for i in range(n):
             a, b = mul(end[i, 0], end[i, 1], h, h)
-            end[i, 0], end[i, 1] = add(a, b, centre[i, k, 0, 0], centre[i, k, 0, 1])
+            end[i, 0], end[i, 1] = add(a, b, centre[i, k, 0], centre[i, k, 1])
             for j in range(n):
                 a, b = mul(S[i, j, 0], S[i, j, 1], h, h)
                 c, d = around[i, k, 1 + j]
                 S[i, j, 0], S[i, j, 1] = add(a, b, c, d)
     if not (np.isfinite(end).all() and np.isfinite(S).all()):
-        return False, stay
+        return False
     carried, turned = product(S, points(C)), product(S, points(Q))
     drift = np.zeros((n, 1, 2))
     for i in range(n):
@@ -684,52 +657,38 @@ def taylor_step(code, constants, rates, fixed, h, order, m, C, xi, Q, r):  # typ
     for i in range(n):
         a, b = add(moved[i, 0, 0], moved[i, 0, 1], pushed[i, 0, 0], pushed[i, 0, 1])
         r[i, 0, 0], r[i, 0, 1] = a, b
-    return bool(np.isfinite(r).all()), stay
+    return bool(np.isfinite(r).all())
 
 
 # -- a terminal ellipsoid --------------------------------------------------------------------------
 
 
 @_njit
-def ellipsoid(code, constants, outputs, fixed, W, radius, C, layer, limits):  # type: ignore[no-untyped-def]
-    """Decide Lemma 5 for D = {|W x| ≤ radius}: what is not shown (0: all is), margin, half-sides of Q.
+def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no-untyped-def]
+    """Decide Lemma 5 for {|W x| ≤ radius}: the number of what is not shown (0: all is), and a margin.
 
-    W (2n, 2n, 2) and C (m, 2n, 2) are intervals, radius, −layer and −limits rounded up.  Outputs:
-    q̈ (n), demand (m), then what has to keep its sign: pivots (n) > 0, det B, det Γ.
+    W (2n, 2n, 2), V around its inverse and C (m, 2n, 2) are intervals, radius is rounded up, layer and
+    limits down.  ``whole`` are values and derivatives over the box Q, (O, 1 + 2n, 2), ``centre`` values
+    at 0, (O, 2), of q̈ (n), the demand (m), pivots (n) > 0, and what keeps its sign: det B, det Γ.
     """
     size, m = len(W), len(layer)
-    n, half = size // 2, np.zeros(len(W))
-    V = inverse(W)
-    if not np.isfinite(V).all():
-        return 1, -_INF, half
-    low, high = np.zeros(size + len(fixed)), np.zeros(size + len(fixed))
-    low[size:], high[size:] = fixed[:, 0], fixed[:, 1]
-    none = np.empty(0, dtype=np.int64)
-    centre = jets(code, constants, low, high, none, 0, 0)
-    for i in range(size):
-        half[i] = up(norm(V[i]) * radius)
-        low[i], high[i] = -half[i], half[i]
-    J = jets(code, constants, low, high, none, 0, size)
-    for i in range(n + m, len(outputs)):
-        a, b = J[outputs[i], 0, 0]
+    n = size // 2
+    for i in range(n + m, len(whole)):
+        a, b = whole[i, 0]
         if not (a > 0.0 or (b < 0.0 and i >= n + m + n)):
-            return 2, -_INF, half
-    rows = product(C, V)
+            return 2, -_INF
+    rows = product(np.concatenate((C, whole[n : n + m, 1:])), V)
     for i in range(m):
         if not up(norm(rows[i]) * radius) <= layer[i]:
-            return 3, -_INF, half
-    slopes = np.zeros((m, size, 2))
+            return 3, -_INF
     for i in range(m):
-        slopes[i] = J[outputs[n + i], 0, 1:]
-    rows = product(slopes, V)
-    for i in range(m):
-        a, b = centre[outputs[n + i], 0, 0]
-        if not up(max(abs(a), abs(b)) + up(norm(rows[i]) * radius)) <= limits[i]:
-            return 4, -_INF, half
+        a, b = centre[n + i]
+        if not up(max(abs(a), abs(b)) + up(norm(rows[m + i]) * radius)) <= limits[i]:
+            return 4, -_INF
     F = np.zeros((size, size, 2))
     for i in range(n):
         F[i, n + i] = 1.0
-        F[n + i] = J[outputs[i], 0, 1:]
+        F[n + i] = whole[i, 1:]
     A = product(product(W, F), V)
     S, scale = np.empty((size, size, 2)), np.ones(size)
     for i in range(size):
@@ -744,4 +703,4 @@ def ellipsoid(code, constants, outputs, fixed, W, radius, C, layer, limits):  # 
             a, b = mul(S[i, j, 0], S[i, j, 1], scale[i], scale[i])
             S[i, j, 0], S[i, j, 1] = mul(a, b, scale[j], scale[j])
     margin = dominance(S)
-    return (0 if margin > 0.0 else 5), margin, half
+    return (0 if margin > 0.0 else 5), margin

@@ -122,14 +122,22 @@ class Program:
     constants: FloatArray
     outputs: NDArray[np.int64]
 
-    def __call__(
-        self, low: FloatArray, high: FloatArray, variables: int = 0
-    ) -> tuple[FloatArray, FloatArray]:
-        """Enclose over a box (inputs,): values (O, 2), derivatives by the first (O, V, 2)."""
-        none = np.empty(0, dtype=np.int64)
-        jets = ops.jets(self.code, self.constants, low, high, none, 0, variables)
-        found = jets[self.outputs, 0]
-        return found[:, 0], found[:, 1:]
+    def __call__(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
+        """Enclose over a box (inputs,): values and derivatives by the first, (O, 1 + V, 2)."""
+        jets = ops.jets(self.code, self.constants, low, high, _NONE, 0, variables)
+        return np.asarray(jets[self.outputs, 0])
+
+    def series(
+        self, low: FloatArray, high: FloatArray, order: int, variables: int = 0
+    ) -> FloatArray:
+        """Enclose Taylor coefficients of motions ẋ = outputs of the first N inputs.
+
+        Returns (N, order + 1, 1 + variables, 2): each with its derivatives by where the motion
+        passes at time 0.
+        """
+        rates = self.outputs
+        jets = ops.jets(self.code, self.constants, low, high, rates, order, variables)
+        return np.asarray(jets[: len(rates)])
 
 
 class Graph:
@@ -314,6 +322,7 @@ def _folded(kind: str, x: Fraction, y: Fraction | None) -> Fraction | None:
 
 
 Dual = tuple[Span, list[Span]]
+_NONE = np.empty(0, dtype=np.int64)
 
 
 def _dual(kind: str, operands: Sequence[Dual]) -> Dual:
