@@ -196,7 +196,9 @@ def model_of(mechanism: Mechanism) -> Model:
         return read_model(model_data(mechanism))
     except Refused as error:
         raise CertificateError(
-            f"model '{mechanism.name}' of a certificate", value=str(error), limit="what one can hold"
+            f"model '{mechanism.name}' of a certificate",
+            value=str(error),
+            limit="what one can hold",
         ) from error
 
 

@@ -82,11 +82,13 @@ def settle(
     """
     ends = np.array([hull(a, b) for a, b in box])
     low, high = ends[:, :1], ends[:, 1:]
-    corners = np.array(list(itertools.product(*ends[: 10]))).T if len(box) <= 10 else low
+    corners = np.array(list(itertools.product(*ends[:10]))).T if len(box) <= 10 else low
     count = 0
     signs = np.array([g.sign for g in goals])
 
-    def missed(a: FloatArray, b: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_], FloatArray]:
+    def missed(
+        a: FloatArray, b: FloatArray
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], FloatArray]:
         """Goals that are not shown, and that are shown false, (O, N), with spreads."""
         values, spread = over_boxes(program, a, b, fixed)
         below = np.where(signs[:, None] > 0, values[:, 0], -values[:, 1])

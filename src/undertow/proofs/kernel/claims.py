@@ -52,6 +52,10 @@ class Decision:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
+#: Kind of verdict, why, witness, details.
+Found = tuple[str, str, dict[str, float], dict[str, Any]]
+
+
 class Claim(ABC):
     """Numbers with a statement about a model and a law."""
 
@@ -72,8 +76,8 @@ class Claim(ABC):
         """Return the statement in words."""
 
     @abstractmethod
-    def decide(self, model: Model, law: Law, max_boxes: int) -> tuple[str, str, dict[str, float], dict[str, Any]]:
-        """Decide the statement: kind, why, witness, details."""
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
 
 
 def _texts(values: Any) -> Any:
@@ -160,20 +164,24 @@ class Stability(Claim):
 
     @classmethod
     def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
         rate = number(data["rate"])
         require(rate >= 0, "a rate ≥ 0")
         return cls(rate)
 
     def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
         return {"rate": number_text(self.rate)}
 
     def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
         return (
             "motions on the surface near the target converge to it exponentially, at a rate of at "
             f"least {inward(self.rate)} 1/s; how near is not said, and the input is not limited"
         )
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> tuple[str, str, dict[str, float], dict[str, Any]]:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
         matrix = sliding_matrix(model, law)
         if isinstance(matrix, tuple):
             return *matrix, {}, {}
@@ -206,7 +214,9 @@ def sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
     zero, one = Span(0), Span(1)
     try:
         # ∂(q_a, q_u, v_a, v_u)/∂z, of which v_a = −α_a⁻¹ [λ_a, λ_u, α_u] z.
-        slope = _solved(alpha_a, [[*a, *b, *c] for a, b, c in zip(lambda_a, lambda_u, alpha_u, strict=True)])
+        slope = _solved(
+            alpha_a, [[*a, *b, *c] for a, b, c in zip(lambda_a, lambda_u, alpha_u, strict=True)]
+        )
         G = [[-v for v in row] for row in slope]
         z = [[one if i == j else zero for j in range(2 * n - m)] for i in range(2 * n - m)]
         whole = [*z[:n], *G, *z[n:]]
@@ -264,7 +274,7 @@ def _regular(own: System) -> tuple[list[int], list[Goal], Span] | str:
 
 def _over_region(
     own: System, box: Region, nodes: Sequence[int], goals: Sequence[Goal], max_boxes: int
-) -> tuple[str, str, dict[str, float], dict[str, Any]]:
+) -> Found:
     n = own.model.n
     zero = (Fraction(0), Fraction(0))
     ends = [box.get(p.name, zero) for p in own.model.positions]
@@ -290,28 +300,34 @@ class Nonsingular(Claim):
 
     @classmethod
     def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
         ratio = number(data["ratio"])
         require(ratio > 0, "a ratio > 0")
         return cls(_read_region(data["region"], model), ratio)
 
     def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
         return {"region": _box_data(self.region), "ratio": number_text(self.ratio)}
 
     def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
         where = region(model.positions, self.region)
         return (
             f"the law exists {where}: M is positive definite, B and α_a − α_u M_uu⁻¹ M_auᵀ are "
             f"non-singular, whose determinant keeps {inward(self.ratio)} of that at the target"
         )
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> tuple[str, str, dict[str, float], dict[str, Any]]:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
         own = system(model, law)
         regular = _regular(own)
         if isinstance(regular, str):
             return "undecided", regular, {}, {}
         nodes, goals, gamma = regular
         least = gamma * Span(_sign(gamma) * self.ratio)
-        bound = Goal("det Γ/det Γ(0) is as stated", _sign(gamma), hull(least.low, least.high), False)
+        bound = Goal(
+            "det Γ/det Γ(0) is as stated", _sign(gamma), hull(least.low, least.high), False
+        )
         return _over_region(own, self.region, [*nodes, nodes[-1]], [*goals, bound], max_boxes)
 
 
@@ -327,28 +343,34 @@ class Reaching(Claim):
 
     @classmethod
     def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
         bounds, rate = numbers(data["disturbance"], model.n), numbers(data["rate"], model.m)
         require(min(*bounds, *rate) >= 0, "disturbances and rates ≥ 0")
         return cls(_read_region(data["region"], model), bounds, rate)
 
     def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
         numbers = {"disturbance": _texts(self.disturbance), "rate": _texts(self.rate)}
         return {"region": _box_data(self.region), **numbers}
 
     def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
         loads = ", ".join(
             f"{p.name}: {inward(v)} {'N m' if p.unit == 'rad' else 'N'}"
             for p, v in zip(model.positions, self.disturbance, strict=True)
             if v
         )
-        what = f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
+        what = (
+            f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
+        )
         rates = ", ".join(inward(v) for v in self.rate)
         return (
             f"the law {what} {region(model.positions, self.region)}: (16) with η = {rates}, wherever "
             "|s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are not covered"
         )
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> tuple[str, str, dict[str, float], dict[str, Any]]:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
         if law.switching == "tanh":
             return "undecided", "tanh is less than 1 everywhere: (16) is not stated of it", {}, {}
         own = system(model, law)
@@ -422,11 +444,13 @@ class TerminalEllipsoid(Claim):
 
     @classmethod
     def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
         radius = number(data["radius"])
         require(radius > 0, "a radius > 0")
         return cls(matrix(data["W"], 2 * model.n, 2 * model.n), radius)
 
     def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
         return {"W": _texts(self.W), "radius": number_text(self.radius)}
 
     @property
@@ -443,13 +467,15 @@ class TerminalEllipsoid(Claim):
         return 0.0
 
     def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
         return (
             "every motion of the full closed loop, its input renewed at every instant and the plant "
             f"the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inward(Fraction(self.ball), 3)}, "
             f"stays there and converges, inside the layer and {limits(model)}"
         )
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> tuple[str, str, dict[str, float], dict[str, Any]]:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
         if law.switching == "sign":
             return "undecided", "with sign(s) there is no layer to be inside of", {}, {}
         own = system(model, law)
@@ -505,7 +531,9 @@ def read_claim(data: Mapping[str, Any], model: Model) -> Claim:
         For a kind that is not known, or numbers that do not fit the model.
     """
     kind = data.get("kind")
-    require(isinstance(kind, str) and kind in KINDS, f"a claim of the unknown kind {str(kind)[:40]!r}")
+    require(
+        isinstance(kind, str) and kind in KINDS, f"a claim of the unknown kind {str(kind)[:40]!r}"
+    )
     known = KINDS[str(kind)]
     fields(data, f"claim '{known.kind}'", {"kind", *known.keys}, {"hint"})
     return known.read(data, model)
@@ -539,5 +567,3 @@ def check(
             progress(claim.kind, index / len(tasks))
         done.append((law, claim, decide(document.model, law, claim)))
     return done
-
-

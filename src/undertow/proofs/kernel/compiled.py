@@ -296,7 +296,7 @@ def apply(op, a, b, c, d):  # type: ignore[no-untyped-def]
 
 @_njit
 def _gain(out, x, y, scale):  # type: ignore[no-untyped-def]
-    """out += scale · x · y for coefficients (1 + V, 2) with their derivatives, scale exact."""
+    """Out += scale · x · y for coefficients (1 + V, 2) with their derivatives, scale exact."""
     a, b = mul(x[0, 0], x[0, 1], y[0, 0], y[0, 1])
     a, b = mul(a, b, scale, scale) if scale != 1.0 else (a, b)
     out[0, 0], out[0, 1] = add(out[0, 0], out[0, 1], a, b)
@@ -310,7 +310,7 @@ def _gain(out, x, y, scale):  # type: ignore[no-untyped-def]
 
 @_njit
 def _over(out, y, scale):  # type: ignore[no-untyped-def]
-    """out ← out / (scale · y), derivatives too: (out' − w y')/y with w = out/y."""
+    """Out ← out / (scale · y), derivatives too: (out' − w y')/y with w = out/y."""
     c, d = mul(y[0, 0], y[0, 1], scale, scale)
     out[0, 0], out[0, 1] = div(out[0, 0], out[0, 1], c, d)
     for j in range(1, len(out)):
@@ -322,7 +322,7 @@ def _over(out, y, scale):  # type: ignore[no-untyped-def]
 
 @_njit
 def _scaled(out, c, d):  # type: ignore[no-untyped-def]
-    """out ← out · [c, d]."""
+    """Out ← out · [c, d]."""
     for j in range(len(out)):
         out[j, 0], out[j, 1] = mul(out[j, 0], out[j, 1], c, d)
 

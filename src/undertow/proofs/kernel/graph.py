@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from undertow.proofs.kernel import compiled as ops
 __all__ = ["Graph", "Program", "Span", "hull"]
 
 FloatArray = NDArray[np.float64]
-Node = tuple[object, ...]
+Node = tuple[Any, ...]
 
 _OPS = {
     "add": ops.ADD, "sub": ops.SUB, "mul": ops.MUL, "div": ops.DIV, "max": ops.MAX, "min": ops.MIN,
@@ -163,14 +164,14 @@ class Graph:
     def value(self, k: int) -> Fraction | None:
         """Return the number that a node is, if it is one."""
         node = self.nodes[k]
-        return node[1] if node[0] == "number" else None  # type: ignore[return-value]
+        return node[1] if node[0] == "number" else None
 
     def make(self, kind: str, a: int = 0, b: int = 0) -> int:
         """Return the node of an operation, folded where that is exact."""
         if kind == "pi":
             return self._new(("pi",), True)
         if kind == "neg" and self.nodes[a][0] == "neg":
-            return int(self.nodes[a][1])  # type: ignore[call-overload]
+            return int(self.nodes[a][1])
         two = _OPS[kind] in ops.BINARY
         x, y = self.value(a), self.value(b) if two else None
         if x is not None and (y is not None or not two) and (kind != "div" or y):
@@ -182,7 +183,9 @@ class Graph:
         total = self.total[a] and (not two or self.total[b]) and safe
         return self._new((kind, a, b) if two else (kind, a), total)
 
-    def _simpler(self, kind: str, a: int, b: int, x: Fraction | None, y: Fraction | None) -> int | None:
+    def _simpler(
+        self, kind: str, a: int, b: int, x: Fraction | None, y: Fraction | None
+    ) -> int | None:
         if kind == "add" and (x == 0 or y == 0):
             return b if x == 0 else a
         if kind == "sub" and y == 0:
@@ -239,7 +242,7 @@ class Graph:
 
     def _operands(self, k: int) -> list[int]:
         node = self.nodes[k]
-        return [] if node[0] in ("input", "number", "pi") else [int(v) for v in node[1:]]  # type: ignore[call-overload]
+        return [] if node[0] in ("input", "number", "pi") else [int(v) for v in node[1:]]
 
     # -- its values ------------------------------------------------------------------------------
 
@@ -260,11 +263,11 @@ class Graph:
             node = self.nodes[k]
             kind, flat = str(node[0]), [none] * variables
             if kind == "input":
-                i = int(node[1])  # type: ignore[call-overload]
+                i = int(node[1])
                 slope = [Span(int(i == j)) for j in range(variables)]
                 found[k] = at[i], slope
             elif kind == "number":
-                found[k] = Span(node[1]), flat  # type: ignore[arg-type]
+                found[k] = Span(node[1]), flat
             elif kind == "pi":
                 found[k] = Span(*(Fraction(v) for v in ops.PI)), flat
             else:
@@ -278,7 +281,7 @@ class Graph:
         """Lower what some nodes depend on; every input stays one."""
         needed = self.depends(roots)
         count = len(self.inputs)
-        place = {k: int(self.nodes[k][1]) for k in self.inputs}  # type: ignore[call-overload]
+        place = {k: int(self.nodes[k][1]) for k in self.inputs}
         constants: list[tuple[float, float]] = []
         for k in needed:
             node = self.nodes[k]

@@ -136,9 +136,7 @@ class _Algebra:
         L = [[self.graph.number(int(i == j)) for j in range(n)] for i in range(n)]
         D: list[int] = []
         for j in range(n):
-            part = self.graph.sum(
-                make("mul", make("sqr", L[j][k]), D[k]) for k in range(j)
-            )
+            part = self.graph.sum(make("mul", make("sqr", L[j][k]), D[k]) for k in range(j))
             D.append(make("sub", A[j][j], part))
             for i in range(j + 1, n):
                 part = self.graph.sum(
@@ -165,7 +163,7 @@ class _Algebra:
         return out
 
     def adjugate(self, A: Nodes) -> tuple[Nodes, int]:
-        """adj A and det A, without a division by entries (Faddeev and LeVerrier)."""
+        """Adj A and det A, without a division by entries (Faddeev and LeVerrier)."""
         make, number, m = self.graph.make, self.graph.number, len(A)
         N: Nodes = [[number(int(i == j)) for j in range(m)] for i in range(m)]
         for k in range(1, m + 1):
@@ -200,9 +198,7 @@ class System:
         bounds = law.disturbance if law is not None else disturbance
         fixed = 2 * n + len(model.parameters)
         self.graph = graph = Graph(fixed + (2 * m * n + 2 * m if law is None else 0))
-        nodes = (
-            graph.inputs[fixed:] if law is None else [graph.number(v) for v in law.numbers]
-        )
+        nodes = graph.inputs[fixed:] if law is None else [graph.number(v) for v in law.numbers]
         given = iter(nodes)
 
         def block(rows: int, columns: int) -> Nodes:
@@ -230,6 +226,12 @@ class System:
         """Those of M with the unactuated block first: all > 0 iff M is positive definite."""
         return [*self.uu[1], *self.ss[1]]
 
+    def _absolute(self, A: Nodes) -> Nodes:
+        return self.algebra.each("abs", A)
+
+    def _one(self, k: int) -> Nodes:
+        return [[self.graph.number(int(i == j)) for j in range(k)] for i in range(k)]
+
     def _column(self, nodes: Sequence[int]) -> Nodes:
         return [[v] for v in nodes]
 
@@ -251,13 +253,11 @@ class System:
         graph, algebra, m, n = self.graph, self.algebra, self.model.m, self.model.n
         if not any(graph.value(b) != 0 for b in self.bounds):
             return self.eta
-        absolute = lambda A: algebra.each("abs", A)  # noqa: E731
-        one = lambda k: [[graph.number(int(i == j)) for j in range(k)] for i in range(k)]  # noqa: E731
         g_a, g_u = self._column(self.bounds[:m]), self._column(self.bounds[m:])
-        X = absolute(self.X)
+        X = self._absolute(self.X)
         transposed = [list(r) for r in zip(*X, strict=True)]
-        S_inverse = absolute(algebra.solve(self.ss, one(m)))
-        uu_inverse = absolute(algebra.solve(self.uu, one(n - m)))
+        S_inverse = self._absolute(algebra.solve(self.ss, self._one(m)))
+        uu_inverse = self._absolute(algebra.solve(self.uu, self._one(n - m)))
         a = algebra.times(S_inverse, algebra.each("add", g_a, algebra.times(transposed, g_u)))
         b = algebra.each("add", algebra.times(uu_inverse, g_u), algebra.times(X, a))
         largest = []

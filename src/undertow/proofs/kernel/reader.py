@@ -166,12 +166,9 @@ def read_model(data: Any) -> Model:
     n = len(positions)
     inputs = tuple(_quantity(v, "limit") for v in _list(data["inputs"], 1, n - 1))
     m = len(inputs)
-    parameters = tuple(
-        _quantity(v, "value") for v in _list(data["parameters"], 0, MOST_PARAMETERS)
-    )
+    parameters = tuple(_quantity(v, "value") for v in _list(data["parameters"], 0, MOST_PARAMETERS))
     nodes = tuple(
-        _node(v, k, n, len(parameters))
-        for k, v in enumerate(_list(data["nodes"], 1, MOST_NODES))
+        _node(v, k, n, len(parameters)) for k, v in enumerate(_list(data["nodes"], 1, MOST_NODES))
     )
     end = len(nodes)
 
@@ -200,11 +197,9 @@ def read_law(data: Any, model: Model) -> Law:
     keys = ("alpha_a", "lambda_a", "alpha_u", "lambda_u", "eta", "layer", "switching")
     fields(data, "law", {*keys, "disturbance"})
     n, m = model.n, model.m
-    blocks = (
-        matrix(data[k], m, m if k.endswith("_a") else n - m) for k in keys[:4]
-    )
+    a, b, c, d = (matrix(data[k], m, m if k.endswith("_a") else n - m) for k in keys[:4])
     law = Law(
-        *blocks, numbers(data["eta"], m), numbers(data["layer"], m), data["switching"],
+        a, b, c, d, numbers(data["eta"], m), numbers(data["layer"], m), data["switching"],
         numbers(data["disturbance"], n),
     )  # fmt: skip
     require(min(*law.eta, *law.layer) > 0, "η and the layer > 0")

@@ -24,7 +24,9 @@ def _digits(value: Fraction, digits: int, rounding: str) -> str:
         if len(short.normalize().as_tuple().digits) <= digits:
             return f"{near:.{digits}g}"
     context = Context(prec=digits, rounding=rounding)
-    return f"{float(context.divide(Decimal(value.numerator), Decimal(value.denominator))):.{digits}g}"
+    return (
+        f"{float(context.divide(Decimal(value.numerator), Decimal(value.denominator))):.{digits}g}"
+    )
 
 
 def inward(value: Fraction, digits: int = 6) -> str:
@@ -47,7 +49,7 @@ def region(positions: Sequence[Quantity], box: Region) -> str:
         f"|{k}| ≤ {inward(b)} {units[k]}".rstrip() if a == -b
         else f"{k} in {_within(a, b)} {units[k]}".rstrip()
         for k, (a, b) in box.items()
-        if (a, b) != (0, 0)
+        if a != 0 or b != 0
     ]  # fmt: skip
     if not parts:
         return "at the target"
