@@ -17,7 +17,7 @@ import sympy as sp
 from undertow.base.errors import CertificateError, ModelError
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import TIME, Mechanism
-from undertow.proofs.intervals.exact_model import exact_mechanism
+from undertow.proofs.intervals.exact_model import exact_mechanism, exact_number
 from undertow.proofs.intervals.require import require_autonomous
 from undertow.proofs.kernel.model import Law, Model
 from undertow.proofs.kernel.reader import Refused, number_text, read_law, read_model
@@ -40,7 +40,10 @@ _WRITTEN: dict[Any, Callable[[sp.Expr], sp.Expr]] = {
 class _Writer:
     """SymPy expressions to nodes, each distinct one once."""
 
-    def __init__(self, leaves: dict[sp.Symbol, list[Any]]) -> None:
+    def __init__(
+        self, leaves: dict[sp.Symbol, list[Any]], values: dict[sp.Symbol, sp.Rational]
+    ) -> None:
+        self._values = values
         self.nodes: list[list[Any]] = []
         self._known: dict[tuple[Any, ...], int] = {}
         self._done: dict[sp.Expr, int] = {}
@@ -79,6 +82,10 @@ class _Writer:
             return self.node(_PLAIN[e.func], self.of(e.args[0]))
         if e.func in _WRITTEN:
             return self.of(_WRITTEN[e.func](e.args[0]))
+        if e.free_symbols <= {*self._values}:  # a kink of parameters alone is none: a number
+            value = e.subs(self._values)
+            if value.is_Rational:
+                return self.number(value)
         raise ModelError(
             "model of a certificate",
             value=str(e)[:60],
@@ -131,14 +138,15 @@ class _Writer:
 
 @lru_cache(maxsize=64)
 def _graph(mechanism: Mechanism) -> tuple[Any, ...]:
-    """Nodes, M, f and B of an exact mechanism: of its equations alone."""
+    """Nodes, M, f and B of an exact mechanism."""
     n, m = mechanism.n, mechanism.m
     leaves: dict[sp.Symbol, list[Any]] = {}
     for i in range(n):
         leaves[mechanism.x[i]], leaves[mechanism.x[n + i]] = ["position", i], ["velocity", i]
     for k, symbol in enumerate(mechanism.parameter_symbols):
         leaves[symbol] = ["parameter", k]
-    writer = _Writer(leaves)
+    values = {p.symbol: exact_number(p.value) for p in mechanism.parameters}
+    writer = _Writer(leaves, values)
     M = [[writer.of(mechanism.mass_matrix[i, j]) for j in range(i + 1)] for i in range(n)]
     f = [writer.of(e) for e in mechanism.force]
     B = [[writer.of(mechanism.input_matrix[i, j]) for j in range(m)] for i in range(m)]

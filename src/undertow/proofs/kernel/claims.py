@@ -31,7 +31,7 @@ from undertow.proofs.kernel.reader import (
 from undertow.proofs.kernel.words import Region, inward, limits, region
 
 __all__ = ["KINDS", "Claim", "Decision", "Nonsingular", "Reaching", "Stability",
-           "TerminalEllipsoid", "check", "decide", "ellipsoid_program", "read_claim"]  # fmt: skip
+           "TerminalEllipsoid", "check", "decide", "ellipsoid", "ellipsoid_program", "no_equilibrium", "read_claim"]  # fmt: skip
 
 #: Boxes of a branch and bound before it gives up.
 MOST_BOXES = 200_000
@@ -494,10 +494,11 @@ class TerminalEllipsoid(Claim):
         return "undecided", f"{method}: {REASONS[code]}", witness, details
 
 
-def no_equilibrium(own: System) -> str | None:
-    """Why the target is not shown to be an equilibrium of the closed loop, or None: f_u(0, 0) = 0."""
+def no_equilibrium(own: System, origin: Sequence[Span] | None = None) -> str | None:
+    """Why the target is not shown to be at rest, or None: f_u(0, 0) = 0 and then q̈ = 0."""
     try:
-        free = own.graph.exact(own.f[own.model.m :], own.origin())
+        at = own.origin() if origin is None else origin
+        free = own.graph.exact(own.f[own.model.m :], at)
     except ArithmeticError as error:
         return f"at the target: {error}"
     return None if all(v.zero for v, _ in free) else "f_u(0, 0) = 0 is not shown exactly"

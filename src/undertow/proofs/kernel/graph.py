@@ -52,8 +52,8 @@ class Span:
         self.high = self.low if high is None else Fraction(high)
         if self.exact:
             return
-        if max(self.low.denominator.bit_length(), self.high.denominator.bit_length()) > 2000:
-            grid = 2**1000  # ends of many digits are rounded outward
+        if max(self.low.denominator.bit_length(), self.high.denominator.bit_length()) > 1200:
+            grid = 2**600  # ends of many digits are rounded outward
             self.low = Fraction(math.floor(self.low * grid), grid)
             self.high = Fraction(math.ceil(self.high * grid), grid)
 
@@ -92,14 +92,23 @@ def _function(kind: str, x: Span) -> Span:
     """Enclose a function: exactly where that is rational, else by the compiled arithmetic."""
     if x.exact and kind in _KNOWN and x.low == _KNOWN[kind][0]:
         return Span(_KNOWN[kind][1])
-    if kind == "sqrt" and x.exact and x.low > 0:
-        parts = [math.isqrt(v) for v in (x.low.numerator, x.low.denominator)]
-        if (parts[0] ** 2, parts[1] ** 2) == (x.low.numerator, x.low.denominator):
-            return Span(Fraction(*parts))
+    if kind == "sqrt" and x.low > 0:
+        low, high = (_root(v) for v in (x.low, x.high))
+        return Span(low[0], high[1])
     low, high = ops.apply(_OPS[kind], *hull(x.low, x.high), 0.0, 0.0)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ZeroDivisionError(f"{kind} of a number where it may be undefined")
     return Span(Fraction(low), Fraction(high))
+
+
+def _root(x: Fraction) -> tuple[Fraction, Fraction]:
+    """Return √x twice where it is rational, else two numbers around it, 2⁻⁴⁰⁰ apart."""
+    above, below = math.isqrt(x.numerator), math.isqrt(x.denominator)
+    if (above * above, below * below) == (x.numerator, x.denominator):
+        return Fraction(above, below), Fraction(above, below)
+    scaled = math.isqrt(x.numerator * x.denominator * 4**400)
+    step = x.denominator * 2**400
+    return Fraction(scaled, step), Fraction(scaled + 1, step)
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ def read_model(data: Any) -> Model:
         return tuple(_index(k, end) for k in _list(indices, count))
 
     model = Model(
-        _name(data["name"]), positions, inputs, parameters, nodes,
+        _short(data["name"], 64), positions, inputs, parameters, nodes,
         tuple(row(r, i + 1) for i, r in enumerate(_list(data["M"], n))),
         row(data["f"], n),
         tuple(row(r, m) for r in _list(data["B"], m)),

@@ -1,7 +1,7 @@
 """The search for terminal ellipsoids: modes of the linear closed loop, weighted.
 
 Nothing here proves anything: every set that is returned is one that the kernel of
-:mod:`undertow.proofs.claims.terminal_ellipsoid` has accepted.
+:mod:`undertow.proofs.kernel.claims` has accepted.
 """
 
 from __future__ import annotations
@@ -188,10 +188,10 @@ def search_for(
         loop = ClosedLoopProgram.of(mechanism, reaching.switching)
     except ModelError:  # not smooth: nothing is proved of it
         return None
-    if not loop.at_rest:
+    if not loop.at_rest(mechanism):
         return None
     numbers = loop.numbers(mechanism, surface, reaching)
-    _, gradients = loop.at_target(numbers)
+    gradients = loop.at_target(numbers)[:, 1:]
     n = loop.n
     A = np.vstack([np.eye(n, 2 * n, n), gradients[:n].mean(axis=-1)])
     if not np.isfinite(A).all():
@@ -216,7 +216,7 @@ def search_for(
         loop,
         numbers,
         *loop.rows(numbers),
-        loop.limits(mechanism, numbers),
+        mechanism.input_limits,
         T,
         np.asarray(np.linalg.inv(T), dtype=np.float64),
         np.array(rates),
