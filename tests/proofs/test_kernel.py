@@ -57,7 +57,7 @@ def claim_of(document: Document, kind: str) -> Document:
     return found
 
 
-# -- what stands in it -------------------------------------------------------------------------------
+# -- what stands in it ----------------------------------------------------------------------------
 
 
 def test_the_kept_file_is_proved_from_itself_alone() -> None:
@@ -94,7 +94,8 @@ def test_number_texts_are_exact(text: str, value: Fraction) -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "1.5", "1e3", "+1", "01", "1/0", "nan", "inf", "0x1p3", "0x1.8p+0", " 1", "1 ", "1/-2",
-     "0X1.0000000000000p+0", "0x1.0000000000000p+1024", "0x2.0000000000000p+0", "٣", "1" * 421, 3, None],
+     "0X1.0000000000000p+0", "0x1.0000000000000p+1024", "0x2.0000000000000p+0", "٣", "1" * 421, 3,
+     None],
 )  # fmt: skip
 def test_what_is_no_number_text_is_refused(text: Any) -> None:
     with pytest.raises(Refused):
@@ -194,7 +195,7 @@ def test_the_law_is_made_of_its_numbers() -> None:
     assert kinds["stability"] == "proved"  # it hangs on the surface alone
 
 
-# -- what is false -----------------------------------------------------------------------------------
+# -- what is false --------------------------------------------------------------------------------
 
 
 def inflated(kind: str, key: str, factor: float) -> Callable[[Document], None]:
@@ -253,7 +254,7 @@ def test_random_laws_are_judged_as_their_eigenvalues_say(seed: int) -> None:
             assert kind == ("proved" if rate < margin else "refuted"), (rig.name, factor)
 
 
-# -- the breaks that an outside look found -------------------------------------------------------------
+# -- the breaks that an outside look found --------------------------------------------------------
 
 
 def changed(extra: Any, name: str = "broken") -> ut.Mechanism:
@@ -345,7 +346,7 @@ def test_reaching_ends_at_the_singularity_and_names_its_region() -> None:
     assert decide(model, tanh, Reaching(region, load, (Fraction(0),))).kind == "undecided"
 
 
-# -- what it is ------------------------------------------------------------------------------------------
+# -- what it is -----------------------------------------------------------------------------------
 
 
 def code_lines(path: Path) -> int:

@@ -101,7 +101,7 @@ def law_objects(law: Law) -> tuple[Surface, ReachingLaw]:
 
 
 def match_document(document: Document, mechanism: Mechanism, own_parameters: bool) -> None:
-    """Refuse a file about another mechanism than this one: its equations are made again and compared.
+    """Refuse a file about another mechanism: the equations of this one are made again and compared.
 
     Parameters
     ----------
@@ -132,10 +132,7 @@ def match_document(document: Document, mechanism: Mechanism, own_parameters: boo
         what, limit = f"parameter '{key}' of '{name}'", f"{value:.17g}, the certificate's"
         again = "The proof is for that value: certify again with --set"
         require(mine[key] == value, what, f"{mine[key]:.17g}", limit, again)
-    try:
-        here = model_data(mechanism.with_parameters(**theirs))
-    except CertificateError:
-        raise
+    here = model_data(mechanism.with_parameters(**theirs))
     limits = tuple(i.limit for i in mechanism.inputs)
     wanted = tuple(float("inf") if i.value is None else float(i.value) for i in given.inputs)
     require(limits == wanted, f"input limits of '{name}'", limits, f"{wanted}, the certificate's")

@@ -31,7 +31,8 @@ from undertow.proofs.kernel.reader import (
 from undertow.proofs.kernel.words import Region, inward, limits, region
 
 __all__ = ["KINDS", "Claim", "Decision", "Nonsingular", "Reaching", "Stability",
-           "TerminalEllipsoid", "check", "decide", "ellipsoid", "ellipsoid_program", "no_equilibrium", "read_claim"]  # fmt: skip
+           "TerminalEllipsoid", "check", "decide", "ellipsoid", "ellipsoid_program",
+           "no_equilibrium", "read_claim"]  # fmt: skip
 
 #: Boxes of a branch and bound before it gives up.
 MOST_BOXES = 200_000
@@ -84,7 +85,7 @@ def _texts(values: Any) -> Any:
     return [_texts(v) for v in values] if isinstance(values, tuple) else number_text(values)
 
 
-# -- linear algebra on exact numbers -----------------------------------------------------------------
+# -- linear algebra on exact numbers --------------------------------------------------------------
 
 Spans = list[list[Span]]
 
@@ -98,6 +99,10 @@ def _times(A: Spans, B: Spans) -> Spans:
              for j in range(len(B[0]))] for r in A]  # fmt: skip
 
 
+def _plus(A: Spans, B: Spans) -> Spans:
+    return [[a + b for a, b in zip(r, s, strict=True)] for r, s in zip(A, B, strict=True)]
+
+
 def _solved(A: Spans, B: Spans) -> Spans:
     """A⁻¹ B by elimination with pivots that are not 0; ZeroDivisionError if that is not shown."""
     rows, n = [[*a, *b] for a, b in zip(A, B, strict=True)], len(A)
@@ -109,8 +114,8 @@ def _solved(A: Spans, B: Spans) -> Spans:
         for i in range(n):
             if i != j:
                 factor = rows[i][j]
-                rows[i] = [v - factor * w if k > j else v
-                           for k, (v, w) in enumerate(zip(rows[i], rows[j], strict=True))]  # fmt: skip
+                pairs = enumerate(zip(rows[i], rows[j], strict=True))
+                rows[i] = [v - factor * w if k > j else v for k, (v, w) in pairs]
     return [row[n:] for row in rows]
 
 
@@ -128,7 +133,7 @@ def _characteristic(A: Spans) -> list[Span]:
 
 
 def _routh(coefficients: list[Span]) -> bool | None:
-    """Lemma 3: whether a polynomial with a positive first coefficient is Hurwitz, if it is known."""
+    """Lemma 3: whether a polynomial, its first coefficient > 0, is Hurwitz, if it is known."""
     first, second = coefficients[::2], coefficients[1::2]
     while second:
         if not second[0].low > 0:
@@ -151,7 +156,7 @@ def _positive(A: list[list[Fraction]]) -> bool:
     return True
 
 
-# -- 5.1 -----------------------------------------------------------------------------------------------
+# -- 5.1 ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -222,11 +227,9 @@ def sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
         whole = [*z[:n], *G, *z[n:]]
         gradient = [d for _, d in values[n * n :]]
         M_ua, M_uu = [r[:m] for r in M[m:]], [r[m:] for r in M[m:]]
-        drift = [[a + b for a, b in zip(r, s, strict=True)]
-                 for r, s in zip(_times(lambda_a, G), _times(lambda_u, z[n:]), strict=True)]  # fmt: skip
+        drift = _plus(_times(lambda_a, G), _times(lambda_u, z[n:]))
         pull = _times(M_ua, _solved(alpha_a, drift))
-        right = [[a + b for a, b in zip(r, s, strict=True)]
-                 for r, s in zip(_times(gradient, whole), pull, strict=True)]  # fmt: skip
+        right = _plus(_times(gradient, whole), pull)
         thrown = _times(M_ua, _solved(alpha_a, alpha_u))
         E = [[a - b for a, b in zip(r, s, strict=True)] for r, s in zip(M_uu, thrown, strict=True)]
         return [*G, *z[n:], *_solved(E, right)]
@@ -236,7 +239,7 @@ def sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
         return ("refuted", why) if exact else ("undecided", f"not excluded: {why}")
 
 
-# -- 5.2, 5.3 ------------------------------------------------------------------------------------------
+# -- 5.2, 5.3 -------------------------------------------------------------------------------------
 
 
 def _read_region(data: Any, model: Model) -> dict[str, tuple[Fraction, Fraction]]:
@@ -365,8 +368,9 @@ class Reaching(Claim):
         )
         rates = ", ".join(inward(v) for v in self.rate)
         return (
-            f"the law {what} {region(model.positions, self.region)}: (16) with η = {rates}, wherever "
-            "|s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are not covered"
+            f"the law {what} {region(model.positions, self.region)}: (16) with η = {rates}, "
+            "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
+            "not covered"
         )
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
@@ -398,7 +402,7 @@ class Reaching(Claim):
         return _over_region(own, self.region, nodes, goals, max_boxes)
 
 
-# -- 5.4 -----------------------------------------------------------------------------------------------
+# -- 5.4 ------------------------------------------------------------------------------------------
 
 #: What is not shown, by number.
 REASONS = (
@@ -411,7 +415,7 @@ def ellipsoid(
     program: Program, fixed: FloatArray, W: FloatArray, radius: float, C: FloatArray,
     layer: FloatArray, limits: FloatArray,
 ) -> tuple[int, float, FloatArray]:  # fmt: skip
-    """Decide Lemma 5 as :func:`undertow.proofs.kernel.compiled.ellipsoid`: code, margin, sides of Q."""
+    """Decide Lemma 5, as ``compiled.ellipsoid`` says: code, margin, half-sides of Q."""
     size = len(W)
     V = ops.inverse(W)
     half = np.array([ops.up(ops.norm(row) * radius) for row in V])
@@ -435,7 +439,7 @@ def ellipsoid_program(own: System) -> Program:
 
 @dataclass(frozen=True)
 class TerminalEllipsoid(Claim):
-    """{|W x| ≤ radius} is a terminal set of the closed loop, inside the layer and the input limits."""
+    """{|W x| ≤ radius} is a terminal set of the closed loop, inside layer and input limits."""
 
     kind: ClassVar[str] = "terminal ellipsoid"
     keys: ClassVar[tuple[str, ...]] = ("W", "radius")
@@ -460,17 +464,21 @@ class TerminalEllipsoid(Claim):
         for slack in (1e-12, 1e-6, 1.0):
             c = Fraction(size * (1 + slack))
             columns = list(zip(*self.W, strict=True))
-            rest = [[Fraction(c * c if i == j else 0) - sum(a * b for a, b in zip(p, q, strict=True))
-                     for j, q in enumerate(columns)] for i, p in enumerate(columns)]  # fmt: skip
+            rest = [
+                [c * c * int(i == j) - sum(a * b for a, b in zip(p, q, strict=True))
+                 for j, q in enumerate(columns)]
+                for i, p in enumerate(columns)
+            ]  # fmt: skip
             if _positive(rest):
                 return float(self.radius / c) * (1 - 1e-15)
         return 0.0
 
     def sentence(self, model: Model) -> str:
         """Return the statement in words."""
+        ball = inward(Fraction(self.ball), 3)
         return (
-            "every motion of the full closed loop, its input renewed at every instant and the plant "
-            f"the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inward(Fraction(self.ball), 3)}, "
+            "every motion of the full closed loop, its input renewed at every instant and the "
+            f"plant the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {ball}, "
             f"stays there and converges, inside the layer and {limits(model)}"
         )
 
@@ -516,7 +524,7 @@ def input_limits(model: Model) -> FloatArray:
     return np.array(ends)
 
 
-# -- all of them ---------------------------------------------------------------------------------------
+# -- all of them ----------------------------------------------------------------------------------
 
 KINDS: Mapping[str, type[Claim]] = {
     claim.kind: claim for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid)

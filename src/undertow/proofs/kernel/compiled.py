@@ -112,7 +112,7 @@ def mul(a, b, c, d):  # type: ignore[no-untyped-def]
         r = 0.0
     if s != s:
         s = 0.0
-    return down(min(min(p, q), min(r, s))), up(max(max(p, q), max(r, s)))
+    return down(min(p, q, r, s)), up(max(p, q, r, s))
 
 
 @_njit
@@ -288,7 +288,7 @@ def apply(op, a, b, c, d):  # type: ignore[no-untyped-def]
     return 0.0, max(-a, b)
 
 
-# -- the interpreter -----------------------------------------------------------------------------
+# -- the interpreter ------------------------------------------------------------------------------
 
 # A jet of a register is (order + 1, 1 + V, 2): Taylor coefficients in time, each with its value and
 # its derivatives by the V variables.
@@ -365,8 +365,8 @@ def _line(op, A, B, W, k):  # type: ignore[no-untyped-def]
     """Coefficient k of op(A, B) into W[k], from A and B up to k and W up to k − 1.
 
     The recurrences are Moore's: of w = u/v, w v = u; of w = √u, w² = u; of w = e^u, w' = u' w; of
-    w = log u, w' u = u'; and sin' = u' cos, cos' = −u' sin, where B is the partner.  Each is a sum of
-    products, times 1/k or plus u_k, over a first coefficient.
+    w = log u, w' u = u'; and sin' = u' cos, cos' = −u' sin, where B is the partner.  Each is a sum
+    of products, times 1/k or plus u_k, over a first coefficient.
     """
     w = W[k]
     w[:] = 0.0
@@ -433,9 +433,9 @@ def _line(op, A, B, W, k):  # type: ignore[no-untyped-def]
 def jets(code, constants, low, high, rates, order, variables):  # type: ignore[no-untyped-def]
     """Run code over one box: the jets of all registers, (R, order + 1, 1 + V, 2).
 
-    Registers are the inputs, the constants, then one for each line of code.  The first ``variables``
-    inputs are differentiated by.  ``rates`` are the registers of ẋ for the first inputs x: their
-    coefficients follow from x' = ẋ; other inputs are constant.
+    Registers are the inputs, the constants, then one for each line of code.  The first
+    ``variables`` inputs are differentiated by.  ``rates`` are the registers of ẋ for the first
+    inputs x, whose coefficients follow from x' = ẋ; other inputs are constant.
     """
     inputs, first = len(low), len(low) + len(constants)
     total = first + len(code)
@@ -485,7 +485,7 @@ def mean_values(whole, centre, a, b, m):  # type: ignore[no-untyped-def]
     return out, spread
 
 
-# -- interval matrices ---------------------------------------------------------------------------
+# -- interval matrices ----------------------------------------------------------------------------
 
 
 @_njit
@@ -564,7 +564,7 @@ def dominance(S):  # type: ignore[no-untyped-def]
     return least
 
 
-# -- one validated Taylor step ---------------------------------------------------------------------
+# -- one validated Taylor step --------------------------------------------------------------------
 
 
 @_njit
@@ -625,8 +625,8 @@ def hulled(m, C, xi, Q, r):  # type: ignore[no-untyped-def]
 def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-untyped-def]
     """{m + C ξ + Q r} after h, Lemma 6: new m, C, Q and r into theirs; whether all is bounded.
 
-    ``rest`` (N, 2) is the last coefficient over a box that motions stay in, ``centre`` (N, K, 2) the
-    others at m, ``around`` (N, K, 1 + N, 2) the others over the set with their derivatives.
+    ``rest`` (N, 2) is the last coefficient over a box that motions stay in, ``centre`` (N, K, 2)
+    the others at m, ``around`` (N, K, 1 + N, 2) the others over the set with their derivatives.
     C (N, L) and Q (N, N) are doubles, ξ (L, 1, 2) and r (N, 1, 2) boxes.
     """
     n = len(m)
@@ -660,16 +660,17 @@ def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-unt
     return bool(np.isfinite(r).all())
 
 
-# -- a terminal ellipsoid --------------------------------------------------------------------------
+# -- a terminal ellipsoid -------------------------------------------------------------------------
 
 
 @_njit
 def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no-untyped-def]
-    """Decide Lemma 5 for {|W x| ≤ radius}: the number of what is not shown (0: all is), and a margin.
+    """Decide Lemma 5 for {|W x| ≤ radius}: what is not shown (0: all is), and a margin.
 
-    W (2n, 2n, 2), V around its inverse and C (m, 2n, 2) are intervals, radius is rounded up, layer and
-    limits down.  ``whole`` are values and derivatives over the box Q, (O, 1 + 2n, 2), ``centre`` values
-    at 0, (O, 2), of q̈ (n), the demand (m), pivots (n) > 0, and what keeps its sign: det B, det Γ.
+    W (2n, 2n, 2), V around its inverse and C (m, 2n, 2) are intervals, radius is rounded up, layer
+    and limits down.  ``whole`` are values and derivatives over the box Q, (O, 1 + 2n, 2),
+    ``centre`` values at 0, (O, 2), of q̈ (n), the demand (m), pivots (n) > 0, and what keeps its
+    sign: det B, det Γ.
     """
     size, m = len(W), len(layer)
     n = size // 2

@@ -1,8 +1,8 @@
 """Expressions as a graph with exact leaves: made, evaluated exactly, lowered to code.
 
-A node is a tuple: a leaf ``("input", i)`` or ``("number", Fraction)`` or ``("pi",)``, or an operation
-with the indices of earlier nodes.  Equal nodes are one.  Numbers are folded exactly, and x + 0, x · 1
-and the like fall away; 0 · x does only if x is defined everywhere.
+A node is a tuple: a leaf ``("input", i)`` or ``("number", Fraction)`` or ``("pi",)``, or an
+operation with the indices of earlier nodes.  Equal nodes are one.  Numbers are folded exactly, and
+x + 0, x · 1 and the like fall away; 0 · x does only if x is defined everywhere.
 """
 
 from __future__ import annotations
@@ -183,9 +183,9 @@ class Graph:
             return int(self.nodes[a][1])
         two = _OPS[kind] in ops.BINARY
         x, y = self.value(a), self.value(b) if two else None
-        if x is not None and (y is not None or not two) and (kind != "div" or y):
-            if (folded := _folded(kind, x, y)) is not None:
-                return self.number(folded)
+        known = x is not None and (y is not None or not two) and (kind != "div" or y != 0)
+        if known and x is not None and (folded := _folded(kind, x, y)) is not None:
+            return self.number(folded)
         if two and (simple := self._simpler(kind, a, b, x, y)) is not None:
             return simple
         safe = kind not in ("div", "sqrt", "log") or (kind == "div" and bool(y))

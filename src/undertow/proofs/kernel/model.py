@@ -23,7 +23,7 @@ Nodes = list[list[int]]
 
 @dataclass(frozen=True)
 class Quantity:
-    """A position, an input or a parameter: its name and unit, and a limit or value if it has one."""
+    """A position, an input or a parameter: name and unit, and its limit or value if it has one."""
 
     name: str
     unit: str
@@ -329,7 +329,7 @@ class System:
         return self.plant(u)
 
     def fixed(self, law: Law | None = None) -> FloatArray:
-        """Enclosures of all inputs but x: parameters, and the numbers of a law where they are inputs."""
+        """Enclosures of all inputs but x: parameters, and a law's numbers where they are inputs."""
         values = [p.value for p in self.model.parameters]
         numbers = [*values, *(law.numbers if law is not None else ())]
         return np.array([hull(v, v) for v in numbers if v is not None]).reshape(-1, 2)

@@ -30,7 +30,7 @@ _ONE = {"neg", "sqrt", "sin", "cos", "tanh", "exp", "log"}
 _TWO = {"add", "sub", "mul", "div"}
 
 
-class Refused(ValueError):
+class Refused(ValueError):  # noqa: N818
     """A file that is no certificate of this version, and what is wrong with it."""
 
 
@@ -50,7 +50,7 @@ def digest(value: Any) -> str:
     return hashlib.sha256(canonical(value)).hexdigest()
 
 
-# -- values ----------------------------------------------------------------------------------------
+# -- values ---------------------------------------------------------------------------------------
 
 
 def number(text: Any) -> Fraction:
@@ -124,7 +124,7 @@ def _index(value: Any, end: int) -> int:
     return int(value)
 
 
-# -- parts -----------------------------------------------------------------------------------------
+# -- parts ----------------------------------------------------------------------------------------
 
 
 def _quantity(data: Any, extra: str = "") -> Quantity:

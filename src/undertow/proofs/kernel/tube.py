@@ -1,9 +1,9 @@
 """Validated integration: boxes of states that move with ẋ = F(x), by Taylor steps (Lemma 6).
 
-A set is m + C ξ + Q r: ξ the box that it started as, C the derivative of the flow as far as doubles
-carry it, Q orthonormal (Lohner), r the box of what has been added since.  The right-hand side is code;
-a corner of the clip or of the layer shortens the formula of a step to the second order and, where
-that is too coarse, the step.
+A set is m + C ξ + Q r: ξ the box that it started as, C the derivative of the flow as far as
+doubles carry it, Q orthonormal (Lohner), r the box of what has been added since.  The right-hand
+side is code; a corner of the clip or of the layer shortens the formula of a step to the second
+order and, where no bounds are found, the step.
 """
 
 from __future__ import annotations
