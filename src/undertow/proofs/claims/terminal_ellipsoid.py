@@ -242,6 +242,7 @@ def prove(
     rows: tuple[FloatArray, FloatArray],
     limits: FloatArray,
     found: TerminalEllipsoid,
+    centre: FloatArray | None = None,
 ) -> tuple[int, float, FloatArray]:
     """Run the kernel's rule: the index of what is not shown, the margin, the box's half-sides."""
 
@@ -250,5 +251,6 @@ def prove(
 
     C, layer = rows
     return kernel.ellipsoid(
-        loop.program, points(numbers), points(found.W), found.radius, points(C), layer, limits
-    )
+        loop.program, points(numbers), points(found.W), found.radius, points(C), layer, limits,
+        centre,
+    )  # fmt: skip

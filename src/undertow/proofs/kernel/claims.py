@@ -413,18 +413,23 @@ REASONS = (
 
 def ellipsoid(
     program: Program, fixed: FloatArray, W: FloatArray, radius: float, C: FloatArray,
-    layer: FloatArray, limits: FloatArray,
+    layer: FloatArray, limits: FloatArray, centre: FloatArray | None = None,
 ) -> tuple[int, float, FloatArray]:  # fmt: skip
-    """Decide Lemma 5, as ``compiled.ellipsoid`` says: code, margin, half-sides of Q."""
+    """Decide Lemma 5, as ``compiled.ellipsoid`` says: code, margin, half-sides of Q.
+
+    ``centre`` are the program's values at x = 0, where they are known already.
+    """
     size = len(W)
     V = ops.inverse(W)
     half = np.array([ops.up(ops.norm(row) * radius) for row in V])
     if not (np.isfinite(V).all() and np.isfinite(half).all()):
         return 1, -math.inf, np.zeros(size)
     low, high = np.vstack([np.zeros((size, 2)), fixed]).T.copy()
-    centre = program(low, high)[:, 0]
+    centre = program(low, high)[:, 0] if centre is None else centre
     low[:size], high[:size] = -half, half
     whole = program(low, high, size)
+    if np.isnan(whole).any():  # something is undefined in Q
+        return 2, -math.inf, half
     code, margin = ops.ellipsoid(V, whole, centre, W, radius, C, layer, limits)
     return int(code), float(margin), half
 

@@ -38,7 +38,7 @@ class EllipsoidSearch:
 
     Parameters
     ----------
-    loop, numbers, C, layer, limits
+    loop, numbers, C, layer, limits, centre
         The interval program and what its proof takes.
     T, T_inverse
         Real modal matrix with columns of unit length, (2n, 2n), and its inverse.
@@ -53,6 +53,7 @@ class EllipsoidSearch:
     C: FloatArray
     layer: FloatArray
     limits: FloatArray
+    centre: FloatArray
     T: FloatArray
     T_inverse: FloatArray
     rates: FloatArray
@@ -67,7 +68,7 @@ class EllipsoidSearch:
 
     def _margin(self, candidate: TerminalEllipsoid) -> float:
         rows = self.C, self.layer
-        code, margin, _ = prove(self.loop, self.numbers, rows, self.limits, candidate)
+        code, margin, _ = prove(self.loop, self.numbers, rows, self.limits, candidate, self.centre)
         return margin if code == 0 else min(margin, 0.0)
 
     def around(self, x: ArrayLike, effort: int = 60) -> TerminalEllipsoid | None:
@@ -191,7 +192,8 @@ def search_for(
     if not loop.at_rest(mechanism):
         return None
     numbers = loop.numbers(mechanism, surface, reaching)
-    gradients = loop.at_target(numbers)[:, 1:]
+    at_target = loop.at_target(numbers)
+    gradients = at_target[:, 1:]
     n = loop.n
     A = np.vstack([np.eye(n, 2 * n, n), gradients[:n].mean(axis=-1)])
     if not np.isfinite(A).all():
@@ -217,6 +219,7 @@ def search_for(
         numbers,
         *loop.rows(numbers),
         mechanism.input_limits,
+        at_target[:, 0].copy(),
         T,
         np.asarray(np.linalg.inv(T), dtype=np.float64),
         np.array(rates),
