@@ -202,7 +202,10 @@ def inflated(kind: str, key: str, factor: float) -> Callable[[Document], None]:
     def edit(document: Document) -> None:
         claim = claim_of(document, kind)
         value = claim[key]
-        grown = lambda t: number_text(number(t) * Fraction(factor))  # noqa: E731
+
+        def grown(text: str) -> str:
+            return number_text(number(text) * Fraction(factor))
+
         if isinstance(value, str):
             claim[key] = grown(value)
         elif isinstance(value, list):
