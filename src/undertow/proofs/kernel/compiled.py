@@ -295,58 +295,72 @@ def apply(op, a, b, c, d):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def _gain(out, x, y, scale):  # type: ignore[no-untyped-def]
-    """Out += scale · x · y for coefficients (1 + V, 2) with their derivatives, scale exact."""
-    a, b = mul(x[0, 0], x[0, 1], y[0, 0], y[0, 1])
-    a, b = mul(a, b, scale, scale) if scale != 1.0 else (a, b)
-    out[0, 0], out[0, 1] = add(out[0, 0], out[0, 1], a, b)
-    for j in range(1, len(out)):
-        a, b = mul(x[0, 0], x[0, 1], y[j, 0], y[j, 1])
-        c, d = mul(x[j, 0], x[j, 1], y[0, 0], y[0, 1])
-        a, b = add(a, b, c, d)
-        a, b = mul(a, b, scale, scale) if scale != 1.0 else (a, b)
-        out[j, 0], out[j, 1] = add(out[j, 0], out[j, 1], a, b)
+def _gain(J, r, k, x, i, y, h, scale):  # type: ignore[no-untyped-def]
+    """J[r, k] += scale · J[x, i] · J[y, h], derivatives too; scale is exact."""
+    x0, x1 = J[x, i, 0, 0], J[x, i, 0, 1]
+    y0, y1 = J[y, h, 0, 0], J[y, h, 0, 1]
+    for j in range(J.shape[2]):
+        a, b = mul(x0, x1, J[y, h, j, 0], J[y, h, j, 1])
+        if j > 0:
+            c, d = mul(J[x, i, j, 0], J[x, i, j, 1], y0, y1)
+            a, b = add(a, b, c, d)
+        if scale != 1.0:
+            a, b = mul(a, b, scale, scale)
+        J[r, k, j, 0], J[r, k, j, 1] = add(J[r, k, j, 0], J[r, k, j, 1], a, b)
 
 
 @_njit
-def _over(out, y, scale):  # type: ignore[no-untyped-def]
-    """Out ← out / (scale · y), derivatives too: (out' − w y')/y with w = out/y."""
-    c, d = mul(y[0, 0], y[0, 1], scale, scale)
-    out[0, 0], out[0, 1] = div(out[0, 0], out[0, 1], c, d)
-    for j in range(1, len(out)):
-        a, b = mul(y[j, 0], y[j, 1], scale, scale)
-        a, b = mul(a, b, out[0, 0], out[0, 1])
-        a, b = add(out[j, 0], out[j, 1], -b, -a)
-        out[j, 0], out[j, 1] = div(a, b, c, d)
+def _over(J, r, k, y, scale):  # type: ignore[no-untyped-def]
+    """J[r, k] ← J[r, k] / (scale · J[y, 0]), derivatives too: (out' − w y')/y with w = out/y."""
+    c, d = mul(J[y, 0, 0, 0], J[y, 0, 0, 1], scale, scale)
+    for j in range(J.shape[2]):
+        a, b = J[r, k, j, 0], J[r, k, j, 1]
+        if j > 0:
+            e, f = mul(J[y, 0, j, 0], J[y, 0, j, 1], scale, scale)
+            e, f = mul(e, f, J[r, k, 0, 0], J[r, k, 0, 1])
+            a, b = add(a, b, -f, -e)
+        J[r, k, j, 0], J[r, k, j, 1] = div(a, b, c, d)
 
 
 @_njit
-def _scaled(out, c, d):  # type: ignore[no-untyped-def]
-    """Out ← out · [c, d]."""
-    for j in range(len(out)):
-        out[j, 0], out[j, 1] = mul(out[j, 0], out[j, 1], c, d)
+def _scaled(J, r, k, c, d):  # type: ignore[no-untyped-def]
+    """J[r, k] ← J[r, k] · [c, d]."""
+    for j in range(J.shape[2]):
+        J[r, k, j, 0], J[r, k, j, 1] = mul(J[r, k, j, 0], J[r, k, j, 1], c, d)
 
 
 @_njit
-def _switch(op, x, y, u, v, out, k):  # type: ignore[no-untyped-def]
-    """|x|, max(x, y), min(x, y): the side that is sure on the whole box, by its values u and v.
+def _switch(J, op, r, k, a, b):  # type: ignore[no-untyped-def]
+    """|x|, max(x, y), min(x, y): the side that is sure on the whole box, by its values.
 
-    Where neither is, value and derivatives hold both sides (Clarke), and so does the first
-    coefficient in time, which a motion through the corner has almost everywhere.
+    |x| is max(x, −x).  Where no side is sure, value and derivatives hold both (Clarke), and so
+    does the first coefficient in time, which a motion through the corner has almost everywhere.
     """
-    first, second = u[0] >= v[1], v[0] >= u[1]
+    u0, u1, v0, v1 = J[a, 0, 0, 0], J[a, 0, 0, 1], J[b, 0, 0, 0], J[b, 0, 0, 1]
+    if op == ABS:
+        v0, v1 = -u1, -u0
+    first, second = u0 >= v1, v0 >= u1
     if op == MIN:
         first, second = second, first
-    if first or second:
-        out[:] = x if first else y
-        return
-    for j in range(len(out)):
-        if k > 1 or (k == 1 and j > 0) or x[j, 0] != x[j, 0] or y[j, 0] != y[j, 0]:
-            out[j] = _NAN
+    for j in range(J.shape[2]):
+        x0, x1, y0, y1 = J[a, k, j, 0], J[a, k, j, 1], J[b, k, j, 0], J[b, k, j, 1]
+        if op == ABS:
+            y0, y1 = -x1, -x0
+        if first:
+            p, q = x0, x1
+        elif second:
+            p, q = y0, y1
+        elif k > 1 or (k == 1 and j > 0) or x0 != x0 or y0 != y0:
+            p, q = _NAN, _NAN
         elif j == 0 and k == 0:
-            out[j, 0], out[j, 1] = apply(op, x[j, 0], x[j, 1], y[j, 0], y[j, 1])
+            p, q = max(x0, y0), max(x1, y1)
+            if op == MIN:
+                p, q = min(x0, y0), min(x1, y1)
+            elif op == ABS:
+                p = max(p, 0.0)
         else:
-            out[j, 0], out[j, 1] = min(x[j, 0], y[j, 0]), max(x[j, 1], y[j, 1])
+            p, q = min(x0, y0), max(x1, y1)
+        J[r, k, j, 0], J[r, k, j, 1] = p, q
 
 
 @_njit
@@ -361,50 +375,50 @@ def _slope(op, a, b, w0, w1):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def _line(op, A, B, W, k):  # type: ignore[no-untyped-def]
-    """Coefficient k of op(A, B) into W[k], from A and B up to k and W up to k − 1.
+def _line(J, op, r, k, a, b):  # type: ignore[no-untyped-def]
+    """Coefficient k of register r = op(a, b), from those of a and b up to k, of r up to k − 1.
 
     The recurrences are Moore's: of w = u/v, w v = u; of w = √u, w² = u; of w = e^u, w' = u' w; of
-    w = log u, w' u = u'; and sin' = u' cos, cos' = −u' sin, where B is the partner.  Each is a sum
+    w = log u, w' u = u'; and sin' = u' cos, cos' = −u' sin, where b is the partner.  Each is a sum
     of products, times 1/k or plus u_k, over a first coefficient.
     """
-    w = W[k]
-    w[:] = 0.0
-    if op in (ADD, SUB):
-        for j in range(len(w)):
-            c, d = B[k, j]
-            if op == SUB:
-                c, d = -d, -c
-            w[j, 0], w[j, 1] = add(A[k, j, 0], A[k, j, 1], c, d)
-        return
-    if op == NEG:
-        w[:, 0], w[:, 1] = -A[k, :, 1], -A[k, :, 0]
+    V = J.shape[2]
+    if op in (ADD, SUB, NEG):
+        for j in range(V):
+            p, q = J[a, k, j, 0], J[a, k, j, 1]
+            if op == NEG:
+                p, q = -q, -p
+            elif op == ADD:
+                p, q = add(p, q, J[b, k, j, 0], J[b, k, j, 1])
+            else:
+                p, q = add(p, q, -J[b, k, j, 1], -J[b, k, j, 0])
+            J[r, k, j, 0], J[r, k, j, 1] = p, q
         return
     if op in (MAX, MIN, ABS):
-        _switch(MAX if op == ABS else op, A[k], B[k], A[0, 0], B[0, 0], w, k)
-        if op == ABS and k == 0:
-            w[0, 0], w[0, 1] = max(w[0, 0], 0.0), w[0, 1]
+        _switch(J, op, r, k, a, b)
         return
     if k == 0 and op in (SQRT, SIN, COS, EXP, LOG):
-        w[0, 0], w[0, 1] = apply(op, A[0, 0, 0], A[0, 0, 1], 0.0, 0.0)
-        if len(w) > 1:
-            w[1:] = A[0, 1:]
-            c, d = _slope(op, A[0, 0, 0], A[0, 0, 1], w[0, 0], w[0, 1])
-            for j in range(1, len(w)):
-                w[j, 0], w[j, 1] = mul(w[j, 0], w[j, 1], c, d)
+        u0, u1 = J[a, 0, 0, 0], J[a, 0, 0, 1]
+        w0, w1 = apply(op, u0, u1, 0.0, 0.0)
+        J[r, 0, 0, 0], J[r, 0, 0, 1] = w0, w1
+        if V > 1:
+            c, d = _slope(op, u0, u1, w0, w1)
+            for j in range(1, V):
+                J[r, 0, j, 0], J[r, 0, j, 1] = mul(J[a, 0, j, 0], J[a, 0, j, 1], c, d)
         return
     # Σ weight · left_i · right_(k−i) for first ≤ i ≤ last
-    left, right, first, last = W, W, 1, k - 1
+    left, right, first, last = r, r, 1, k - 1
     if op in (MUL, SQR):
-        left, right, first, last = A, B if op == MUL else A, 0, k
+        left, right, first, last = a, b if op == MUL else a, 0, k
     elif op == DIV:
-        left, right, first = W, B, 0
+        left, right, first = r, b, 0
     elif op == LOG:
-        left, right = W, A
+        left, right = r, a
     elif op != SQRT:  # EXP, SIN, COS
-        left, right, last = A, W if op == EXP else B, k
-    if op in (DIV, SQRT):
-        w[:] = A[k]
+        left, right, last = a, r if op == EXP else b, k
+    for j in range(V):
+        J[r, k, j, 0] = J[a, k, j, 0] if op in (DIV, SQRT) else 0.0
+        J[r, k, j, 1] = J[a, k, j, 1] if op in (DIV, SQRT) else 0.0
     for i in range(first, last + 1):
         scale = 1.0
         if op in (DIV, SQRT):
@@ -417,16 +431,18 @@ def _line(op, A, B, W, k):  # type: ignore[no-untyped-def]
             scale = -float(i)
         elif op in (SIN, EXP):
             scale = float(i)
-        _gain(w, left[i], right[k - i], scale)
+        _gain(J, r, k, left, i, right, k - i, scale)
     if op == SQR and k == 0:
-        w[0, 0], w[0, 1] = sqr(A[0, 0, 0], A[0, 0, 1])
+        J[r, k, 0, 0], J[r, k, 0, 1] = sqr(J[a, 0, 0, 0], J[a, 0, 0, 1])
     if op in (LOG, SIN, COS, EXP):
-        _scaled(w, *reciprocal(float(k), float(k)))
+        c, d = reciprocal(float(k), float(k))
+        _scaled(J, r, k, c, d)
     if op == LOG:
-        for j in range(len(w)):
-            w[j, 0], w[j, 1] = add(w[j, 0], w[j, 1], A[k, j, 0], A[k, j, 1])
+        for j in range(V):
+            p, q = add(J[r, k, j, 0], J[r, k, j, 1], J[a, k, j, 0], J[a, k, j, 1])
+            J[r, k, j, 0], J[r, k, j, 1] = p, q
     if op in (DIV, SQRT, LOG):
-        _over(w, B[0] if op == DIV else W[0] if op == SQRT else A[0], 2.0 if op == SQRT else 1.0)
+        _over(J, r, k, b if op == DIV else r if op == SQRT else a, 2.0 if op == SQRT else 1.0)
 
 
 @_njit
@@ -446,20 +462,13 @@ def jets(code, constants, low, high, rates, order, variables):  # type: ignore[n
             J[i, 0, 1 + i] = 1.0
     for i in range(len(constants)):
         J[inputs + i, 0, 0] = constants[i]
-    negative = np.zeros((order + 1, 1 + variables, 2))
     for k in range(order + 1):
         for i in range(len(rates) if k else 0):
             c, d = reciprocal(float(k), float(k))
             J[i, k] = J[rates[i], k - 1]
-            _scaled(J[i, k], c, d)
+            _scaled(J, i, k, c, d)
         for line in range(len(code)):
-            op, a, b = code[line, 0], code[line, 1], code[line, 2]
-            if op == ABS:
-                for i in range(k + 1):
-                    negative[i, :, 0], negative[i, :, 1] = -J[a, i, :, 1], -J[a, i, :, 0]
-                _line(op, J[a], negative, J[first + line], k)
-            else:
-                _line(op, J[a], J[b], J[first + line], k)
+            _line(J, code[line, 0], first + line, k, code[line, 1], code[line, 2])
     return J
 
 
