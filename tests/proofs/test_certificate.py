@@ -149,7 +149,7 @@ def test_a_damaged_or_edited_file_is_refused(written: bytes, name: str) -> None:
 
 FORGERIES: dict[str, tuple[Edit, str]] = {
     "another format": (lambda d: d.update(format="proof"), "format"),
-    "a later version": (lambda d: d.update(version=2), "version 2"),
+    "a later version": (lambda d: d.update(version=3), "version 3"),
     "an unknown claim": (lambda d: claims_of(d, "stability")[0].update(kind="magic"), "magic"),
     "no claim": (lambda d: d["subjects"][0].update(claims=[]), "no claim"),
     "a missing part": (lambda d: d["subjects"][0].pop("reaching"), "complete"),
