@@ -18,6 +18,7 @@ import undertow as ut
 from undertow.models import FloatArray
 
 BITS, ORDER = 220, 26
+flint.ctx.cap = ORDER  # of series; python-flint cuts them after ten terms by itself
 
 
 def exact(value: float) -> Any:

@@ -420,7 +420,7 @@ def proof_programme(subject: Subject) -> Iterator[Difference]:
     for x, state, law in zip(subject.states, subject.numbers, subject.laws, strict=True):
         if all(abs(float(s)) < e for s, e in zip(law.s, layer, strict=True)):
             point = np.concatenate([x, numbers])
-            (*found, _), _ = programme.program(point, point)
+            found = programme.over(point, point)[: len(names), 0]
             values = [*subject.model.accelerations(0.0, state, law.demand), *law.demand]
             rows.append((x, found, values))
     # Enclosures of sines are as wide near the target as anywhere.

@@ -215,6 +215,9 @@ def verify(
 ) -> None:
     """Check a certificate again, from the file and the mechanism alone.
 
+    A file of version 2 holds its model; where the library has none of that name, and none is given,
+    it is decided for the model of the file.
+
     Exit status 0 when every claim is proved again, else 1.
     """
     from undertow.proofs import check_settings, read_certificate
@@ -223,13 +226,14 @@ def verify(
 
     certificate = read_certificate(file)
     check_settings(certificate, parse_values(setting))
-    if mechanism is None and certificate.name not in LIBRARY:
+    known = mechanism is not None or certificate.name in LIBRARY
+    if not known and certificate.document is None:
         raise InvalidInputError(
             "certificate of a mechanism that the library does not have",
             value=certificate.name,
             remedy="Name its file: --mechanism FILE.py:NAME",
         )
-    model = mechanism_named(mechanism or certificate.name)
+    model = mechanism_named(mechanism or certificate.name) if known else None
     own = mechanism is not None and in_a_file(mechanism)
     with progress_bar() as progress:
         checked = decide(

@@ -38,6 +38,9 @@ from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Claim, floats_of
+from undertow.proofs.claims.document import law_objects, read_document
+from undertow.proofs.kernel.claims import read_claim
+from undertow.proofs.kernel.reader import Document
 
 __all__ = ["Certificate", "StatedClaim", "Subject", "read_certificate"]
 
@@ -120,6 +123,8 @@ class Certificate:
         What is certified.
     versions
         Of everything that made it.
+    document
+        What the kernel decides, for a file of version 2.
     """
 
     name: str
@@ -128,6 +133,7 @@ class Certificate:
     input_limits: tuple[float, ...]
     subjects: tuple[Subject, ...]
     versions: Mapping[str, str | None] = field(default_factory=dict)
+    document: Document | None = None
 
     def __repr__(self) -> str:
         """Show whose it is and how many claims are proved."""
@@ -215,6 +221,8 @@ class Certificate:
             With what is wrong.
         """
         document = _parse(content)
+        if document.get("version") == 2:
+            return cls._from_kernel(read_document(content))
         if document.get("format") != FORMAT:
             raise _error(f"format {document.get('format')!r}", repr(FORMAT))
         if document.get("version") != VERSION:
@@ -228,6 +236,27 @@ class Certificate:
         except (UndertowError, AttributeError, *_BROKEN) as error:
             value = f"{type(error).__name__}: {error}"
             raise _error(value, "complete, with numbers of the right shapes") from error
+
+    @classmethod
+    def _from_kernel(cls, document: Document) -> Self:
+        model = document.model
+        subjects = []
+        for subject in document.subjects:
+            known = [read_claim(data, model) for data in subject.claims]
+            stated = tuple(
+                StatedClaim(c.kind, c.data(), Verdict(c.sentence(model), "undecided"))
+                for c in known
+            )
+            subjects.append(Subject(*law_objects(subject.law), stated))
+        return cls(
+            model.name,
+            document.model_hash,
+            {p.name: float(p.value or 0) for p in model.parameters},
+            tuple(math.inf if i.value is None else float(i.value) for i in model.inputs),
+            tuple(subjects),
+            dict(document.made_with),
+            document,
+        )
 
     @classmethod
     def _from_document(cls, document: Mapping[str, Any]) -> Self:

@@ -17,6 +17,7 @@ from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.law.surface import ProvedSet
 from undertow.models.mechanism import FloatArray, Mechanism
+from undertow.proofs.kernel import claims as kernel
 
 __all__ = ["Box", "Claim", "Readers", "box_of", "floats_of", "matrix_of"]
 
@@ -57,6 +58,10 @@ class Claim(ABC):
 
         The verdict's sentence is made here, from the numbers that were decided on.
         """
+
+    def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim | None:
+        """Return what the kernel decides of it, for a certificate; None for kinds it does not."""
+        return None
 
     def proved_set(
         self, mechanism: Mechanism, surface: Surface, law: ReachingLaw

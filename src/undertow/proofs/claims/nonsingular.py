@@ -1,27 +1,37 @@
 """Whether the law exists all over a region of positions.
 
-α_a − α_u M_uu⁻¹ M_auᵀ must be invertible there; its determinant, relative to the target, is
-bounded from below by branch and bound in ball arithmetic.
+α_a − α_u M_uu⁻¹ M_auᵀ must be invertible there.  Branch and bound in ball arithmetic looks for the
+least determinant, relative to the target; the kernel decides that it is no less.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any, ClassVar
 
 from undertow.base.arguments import one_of
-from undertow.base.verdict import Verdict, inward, within
+from undertow.base.verdict import Kind, Verdict, inward, within
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim, Readers, box_of
+from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.intervals.branch import BallFunction, minimise_proved
 from undertow.proofs.intervals.exact_model import exact_matrix, exact_mechanism
 from undertow.proofs.intervals.interval import ball, compile_outward
 from undertow.proofs.intervals.require import require
+from undertow.proofs.kernel import claims as kernel
 from undertow.symbolic import Tape
 
-__all__ = ["NonsingularClaim", "nonsingular", "region_box", "region_words", "singular_distance"]
+__all__ = [
+    "NonsingularClaim",
+    "exact_box",
+    "nonsingular",
+    "region_box",
+    "region_words",
+    "singular_distance",
+]
 
 
 def region_box(mechanism: Mechanism, region: Box) -> list[tuple[float, float]]:
@@ -56,6 +66,15 @@ def region_words(mechanism: Mechanism, region: Box) -> str:
         return "at the target"
     rest = len(parts) < mechanism.n
     return f"for {', '.join(parts)}" + (", the other coordinates at the target" if rest else "")
+
+
+#: A ratio that is claimed of a region where none was found.
+TINY = 1e-9
+
+
+def exact_box(region: Box) -> dict[str, tuple[Fraction, Fraction]]:
+    """Return the rational numbers that the ends of a region are."""
+    return {k: (Fraction(float(a)), Fraction(float(b))) for k, (a, b) in region.items()}
 
 
 def _gamma(mechanism: Mechanism, surface: Surface) -> tuple[BallFunction, BallFunction]:
@@ -121,8 +140,23 @@ def nonsingular(
     found = minimise_proved(ratio, box, stop_below=0.0, max_boxes=max_boxes)
     held = True if found.lower > 0 else False if found.value <= 0 else None
     verdict = found.verdict(claim, names, "", method, held)
-    if not held:
-        return verdict
+    model, law = model_of(mechanism), law_of(mechanism, surface, ReachingLaw())
+    for slack in (1e-13, 1e-9, 1e-6):
+        least = found.lower * (1 - slack) if held else TINY
+        stated = kernel.Nonsingular(exact_box(region), Fraction(least))
+        decided = kernel.decide(model, law, stated, max_boxes)
+        if decided.kind == "proved" or not held:
+            break
+    method = decided.why
+    if decided.kind != verdict.kind or not held:
+        margin = min(verdict.margin, least) if held else verdict.margin
+        witness = decided.witness or verdict.witness
+        kind: Kind = "refuted" if decided.kind == "refuted" else "undecided"
+        return replace(
+            verdict, kind=kind, margin=margin, witness=witness, method=f"{method}, gave up"
+            if kind == "undecided" else method,
+        )  # fmt: skip
+    verdict = replace(verdict, margin=least, method=method)
     near = minimise_proved(distance, box, max_boxes=max_boxes)
     details = {**verdict.details, "smallest singular value": max(near.lower, 0.0)}
     return replace(verdict, details=details)
@@ -197,3 +231,7 @@ class NonsingularClaim(Claim):
     ) -> Verdict:
         """Decide it as :func:`nonsingular` does."""
         return nonsingular(mechanism, surface, self.region)
+
+    def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
+        """Return it with the ratio that was proved."""
+        return kernel.Nonsingular(exact_box(self.region), Fraction(verdict.margin))

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import reduce
 from operator import sub
 from typing import Any, ClassVar
@@ -37,10 +38,13 @@ from undertow.law import (
 )
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim, Readers, box_of, floats_of
-from undertow.proofs.claims.nonsingular import nonsingular, region_box, region_words
+from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.nonsingular import exact_box, nonsingular, region_box, region_words
 from undertow.proofs.intervals.branch import BallFunction, Minimum, minimise_proved
 from undertow.proofs.intervals.exact_model import exact_mechanism
 from undertow.proofs.intervals.interval import ball, compile_outward
+from undertow.proofs.kernel import claims as kernel
+from undertow.proofs.kernel.model import Law
 from undertow.symbolic import Tape
 
 #: Of one ball per coordinate.
@@ -163,8 +167,16 @@ def reaching(
     lower = min(r.lower for r in rows)
     worst = replace(min(rows, key=lambda r: r.value), lower=lower)
     claim = _claim(mechanism, bounds, rate, region_words(mechanism, region))
-    method = "(16) by ball arithmetic, branch and bound over positions"
-    held = True if lower >= 0 else False if worst.value < 0 else None
+    decided = kernel.decide(
+        model_of(mechanism),
+        _law(mechanism, surface, gains),
+        kernel.Reaching(
+            exact_box(region), tuple(map(Fraction, bounds)), tuple(map(Fraction, rate))
+        ),
+        max_boxes,
+    )
+    method, kinds = decided.why, {"proved": True, "refuted": False}
+    held = kinds.get(decided.kind)
     verdict = worst.verdict(claim, names, "1/s", method, held)
     exists = nonsingular(mechanism, surface, region, max_boxes=max_boxes)
     largest = tuple(balance.alone(j) for j in range(n))
@@ -178,6 +190,16 @@ def reaching(
         short = f"K falls short by {-verdict.margin:.4g} 1/s; alone it overcomes: {does}"
         verdict = replace(verdict, method=f"{method}; {short}")
     return ReachingCertificate(verdict, largest, balance.factor(bounds)[0] if held else 0.0)
+
+
+def _law(mechanism: Mechanism, surface: Surface, gains: ArrayLike | ReachingLaw | None) -> Law:
+    """Return the kernel's law with these gains: those of (13), or constants."""
+    own = gains if isinstance(gains, ReachingLaw) else ReachingLaw()
+    law = law_of(mechanism, surface, own)
+    if gains is None or isinstance(gains, ReachingLaw):
+        return law
+    constant = tuple(map(Fraction, _row("gains K", gains, mechanism.m)))
+    return replace(law, eta=constant, disturbance=(Fraction(0),) * mechanism.n)
 
 
 def _unit(coordinate: str) -> str:
@@ -337,3 +359,8 @@ class ReachingClaim(Claim):
         return reaching(
             mechanism, surface, self.region, law, eta=self.eta, disturbance=self.disturbance
         ).verdict
+
+    def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
+        """Return it as the kernel decides it."""
+        bounds, rate = (tuple(map(Fraction, v)) for v in (self.disturbance, self.eta))
+        return kernel.Reaching(exact_box(self.region), bounds, rate)

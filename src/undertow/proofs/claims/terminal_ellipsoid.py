@@ -1,47 +1,34 @@
 """Terminal sets of the full closed loop: ellipsoids inside the layer, proved in a millisecond.
 
-Inside the boundary layer and below the input limits the nominal closed loop is smooth,
-ẋ = f(x) with f(0) = 0, in the full state x = (q, q̇).  Over a box around 0 let [J] enclose the
-Jacobian of f; then f(x) ∈ [J] x, and with V(x) = |W x|², P = WᵀW,
-
-    V̇ = xᵀ (P J + Jᵀ P) x  for some J in [J].
-
-The claim: {V ≤ ρ²} is positively invariant, every motion from it converges to 0, and on it the
-law exists, |s_i| ≤ ε_i and |u_i| ≤ the limit.  The proof, in outward-rounded arithmetic: the
-ellipsoid lies in the box (its half-sides are those of the ellipsoid itself); on the box
-det Γ(q)/det Γ(0) > 0; the largest |s_i| and |u_i| on the ellipsoid are below their limits (u −
-u(0) ∈ [K] x with [K] its gradient); and −Uᵀ(P J + Jᵀ P)U has a positive, strictly dominant
-diagonal for all J in [J], with any U: such a matrix is positive definite, and U invertible.
+The rule is the kernel's (Lemma 5 of ``docs/certificate-format.md``); here it is prepared for many
+laws of one mechanism, whose numbers are inputs of one program, as a search and the gate need it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
-import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base.verdict import Verdict, inward
+from undertow.base.verdict import Kind, Verdict, inward
 from undertow.law import (
     LawLayout,
-    LawSymbols,
     ReachingLaw,
     Surface,
-    build_law_graph,
     check_surface_shape,
 )
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim, Readers, matrix_of
-from undertow.proofs.intervals.exact_model import exact_mechanism, vanishes
-from undertow.proofs.intervals.outward import add, down, magnitude, mul, up
-from undertow.proofs.intervals.program import Program, run
+from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.intervals.require import require, require_autonomous
-from undertow.symbolic import Tape
-from undertow.symbolic.machine import numba
+from undertow.proofs.kernel import claims as kernel
+from undertow.proofs.kernel.graph import Span
+from undertow.proofs.kernel.model import System
 
 __all__ = [
     "ClosedLoopProgram",
@@ -49,16 +36,6 @@ __all__ = [
     "TerminalEllipsoid",
     "limits_in_words",
 ]
-
-#: Why a set is not proved, by the kernel's code.
-REASONS = (
-    "proved",
-    "W and U are not close enough to inverses",
-    "the law's determinant reaches zero",
-    "the boundary layer is left",
-    "an input limit is met",
-    "V̇ < 0 is not shown",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,20 +108,19 @@ class TerminalEllipsoid(Claim):
             require(good, f"{name} of a terminal set", f"shape {shape}", limit)
         sound = math.isfinite(self.radius) and self.radius > 0
         require(sound, "radius of a terminal set", self.radius, "> 0")
-        program = ClosedLoopProgram.of(mechanism, law.switching)
-        claim = self.sentence(mechanism)
-        method = "interval Jacobian over the ellipsoid's box, diagonal dominance, float64 outward"
-        if not program.at_rest:
-            return Verdict(claim, "undecided", method="f_u(0, 0) = 0 cannot be shown symbolically")
-        numbers = program.numbers(mechanism, surface, law)
-        code, margin, point = prove(
-            program, numbers, program.rows(numbers), program.limits(mechanism, numbers), self
+        ClosedLoopProgram.of(mechanism, law.switching)
+        found = kernel.decide(
+            model_of(mechanism), law_of(mechanism, surface, law), self.stated(mechanism, None)
         )
-        witness = dict(zip(mechanism.state_names, point.tolist(), strict=True))
-        if code == 0:
-            details = {"ball": self.ball, "box": point.tolist()}
-            return Verdict(claim, "proved", margin, "", witness, method, details)
-        return Verdict(claim, "undecided", margin, "", witness, f"{method}: {REASONS[code]}")
+        margin = found.details.get("margin", math.nan)
+        details = {"ball": self.ball, "box": found.details.get("box")}
+        claim = self.sentence(mechanism)
+        return Verdict(claim, cast(Kind, found.kind), margin, "", found.witness, found.why, details)
+
+    def stated(self, mechanism: Mechanism, verdict: Verdict | None) -> kernel.Claim:
+        """Return it as the kernel decides it; U is a guess of the search, and not needed."""
+        W = tuple(tuple(Fraction(float(v)) for v in row) for row in self.W)
+        return kernel.TerminalEllipsoid(W, Fraction(self.radius))
 
     def proved_set(
         self, mechanism: Mechanism, surface: Surface, law: ReachingLaw
@@ -177,39 +153,19 @@ def limits_in_words(mechanism: Mechanism) -> str:
 
 
 class ClosedLoopProgram:
-    """Interval code of the unsaturated closed loop inside the layer, for any surface.
+    """The unsaturated closed loop inside the layer, for any surface and reaching law.
 
-    Inputs: x (2n), then the surface, η, ε and the mechanism's parameters.  Outputs: q̈ (n), the
-    input demand (m), det Γ(q).
+    Inputs: x (2n), then the mechanism's parameters, the surface, η and ε.  Outputs: q̈ (n), the
+    input demand (m), the pivots of M (n), det B, det Γ.
     """
 
     def __init__(self, mechanism: Mechanism, switching: str = "saturation") -> None:
-        mechanism = exact_mechanism(mechanism)
-        n, m = mechanism.n, mechanism.m
-        tape = Tape()
-        part = mechanism.partition(tape)
-        symbols = LawSymbols.of(n, m)
-        law = build_law_graph(part, mechanism.x, symbols, "sign", mechanism.disturbance_bounds)
-        alpha_a, lambda_a, alpha_u, lambda_u = symbols.blocks
-        ratio = [s / e for s, e in zip(law.s, symbols.layer, strict=True)]
-        if switching == "tanh":
-            ratio = [sp.tanh(r) for r in ratio]
-        push = sp.Matrix([k * r for k, r in zip(law.gains, ratio, strict=True)])
-        qd_a, qd_u = sp.Matrix(mechanism.x[n : n + m]), sp.Matrix(mechanism.x[n + m :])
-        gamma = tape.matrix(alpha_a - alpha_u * part.X)
-        adjugate, determinant = tape.adjugate(gamma)
-        drive = tape.matrix(alpha_u * part.y + lambda_a * qd_a + lambda_u * qd_u + push)
-        # (12); with it the linearised q̈_a is v, and q̈_u = y − X v.
-        v = tape.matrix(-(tape.matrix(adjugate * drive)) / determinant)
-        q_dd = [*v, *tape.matrix(part.y - part.X * v)]
-        force = tape.matrix(part.S * v - part.h)
-        b_adjugate, b_determinant = tape.adjugate(part.B)
-        demand = tape.matrix(b_adjugate * force / b_determinant)
-        others = [*symbols.surface, *symbols.eta, *symbols.layer, *mechanism.parameter_symbols]
-        self.n, self.m = n, m
-        self.program = Program.of(tape, mechanism.x, others, [*q_dd, *demand, determinant])
-        self.at_rest = vanishes(mechanism.force[m:, :], mechanism.x)
-        self.needs_no_input = self.at_rest and vanishes(mechanism.force[:m, :], mechanism.x)
+        model = model_of(mechanism)
+        bounds = tuple(Fraction(float(v)) for v in mechanism.disturbance_bounds)
+        own = System(model, None, switching, bounds)
+        self.n, self.m = model.n, model.m
+        self.program = kernel.ellipsoid_program(own)
+        self.own = own
 
     @classmethod
     def of(cls, mechanism: Mechanism, switching: str = "saturation") -> ClosedLoopProgram:
@@ -234,26 +190,30 @@ class ClosedLoopProgram:
 
     def numbers(self, mechanism: Mechanism, surface: Surface, reaching: ReachingLaw) -> FloatArray:
         """Return the inputs besides x."""
-        return np.concatenate([surface.vector, reaching.vector(self.m), mechanism.parameter_values])
+        return np.concatenate([mechanism.parameter_values, surface.vector, reaching.vector(self.m)])
 
     def rows(self, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return C with s = C x, (m, 2n), and the layer's half-widths, (m,)."""
         layout = LawLayout(self.n, self.m)
-        alpha_a, lambda_a, alpha_u, lambda_u = layout.blocks(numbers)
-        return np.hstack([lambda_a, lambda_u, alpha_a, alpha_u]), numbers[layout.layer]
+        law = numbers[len(self.own.model.parameters) :]
+        alpha_a, lambda_a, alpha_u, lambda_u = layout.blocks(law)
+        return np.hstack([lambda_a, lambda_u, alpha_a, alpha_u]), law[layout.layer]
 
-    def at_target(self, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return enclosures of the outputs and of their gradients at x = 0."""
+    def at_rest(self, mechanism: Mechanism) -> bool:
+        """Whether f_u(0, 0) = 0 is shown exactly for a mechanism of these equations."""
+        values = [Span(0)] * (2 * self.n) + [
+            Span(Fraction(float(v))) for v in mechanism.parameter_values
+        ]
+        return kernel.no_equilibrium(self.own, values) is None
+
+    def over(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
+        """Enclose the outputs over a box of inputs, (O, 1 + variables, 2)."""
+        return self.program(low, high, variables)
+
+    def at_target(self, numbers: FloatArray) -> FloatArray:
+        """Return enclosures of the outputs and of their gradients at x = 0, (O, 1 + 2n, 2)."""
         point = np.concatenate([np.zeros(2 * self.n), numbers])
-        return self.program(point, point)
-
-    def limits(self, mechanism: Mechanism, numbers: FloatArray) -> FloatArray:
-        """Return what the input limits leave besides the input that holds the target, (m,)."""
-        if self.needs_no_input:
-            return mechanism.input_limits
-        held, _ = self.at_target(numbers)
-        largest = np.abs(held[self.n : self.n + self.m]).max(axis=1)
-        return np.asarray((mechanism.input_limits - largest) * (1 - 1e-15))
+        return self.program(point, point, 2 * self.n)
 
 
 class _ByStructure:
@@ -261,15 +221,14 @@ class _ByStructure:
 
     def __init__(self, mechanism: Mechanism) -> None:
         self.mechanism = mechanism
+        model = model_of(mechanism)
+        self.key = (model.nodes, model.M, model.f, model.B, tuple(mechanism.disturbance_bounds))
 
     def __hash__(self) -> int:
-        return hash(self.mechanism.structure)
+        return hash(self.key)
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, _ByStructure)
-            and self.mechanism.structure == other.mechanism.structure
-        )
+        return isinstance(other, _ByStructure) and self.key == other.key
 
 
 @lru_cache(maxsize=64)
@@ -283,128 +242,15 @@ def prove(
     rows: tuple[FloatArray, FloatArray],
     limits: FloatArray,
     found: TerminalEllipsoid,
+    centre: FloatArray | None = None,
 ) -> tuple[int, float, FloatArray]:
-    """Run the kernel: the index into :data:`REASONS`, the margin, the box's half-sides."""
-    p = loop.program
-    code, margin, point = prove_kernel(
-        p.code, p.constants, p.outputs, numbers, *rows, limits,
-        found.W, found.U, found.radius, loop.n,
+    """Run the kernel's rule: the index of what is not shown, the margin, the box's half-sides."""
+
+    def points(values: FloatArray) -> FloatArray:
+        return np.stack([values, values], axis=-1)
+
+    C, layer = rows
+    return kernel.ellipsoid(
+        loop.program, points(numbers), points(found.W), found.radius, points(C), layer, limits,
+        centre,
     )  # fmt: skip
-    return int(code), float(margin), np.asarray(point)
-
-
-_njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@_njit
-def _dot(a, b):  # type: ignore[no-untyped-def]
-    """Interval inner product of intervals (K, 2) and floats (K,)."""
-    low, high = 0.0, 0.0
-    for k in range(len(b)):
-        c, d = mul(a[k, 0], a[k, 1], b[k], b[k])
-        low, high = add(low, high, c, d)
-    return low, high
-
-
-@_njit
-def _norm(row):  # type: ignore[no-untyped-def]
-    """Upper bound of the 2-norm of an interval vector (K, 2)."""
-    total = 0.0
-    for k in range(len(row)):
-        _, big = magnitude(row[k, 0], row[k, 1])
-        total = up(total + up(big * big))
-    return up(math.sqrt(total))
-
-
-@_njit
-def _product(A, B):  # type: ignore[no-untyped-def]
-    """Interval product of intervals (I, K, 2) and floats (K, J)."""
-    out = np.empty((A.shape[0], B.shape[1], 2))
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
-            out[i, j, 0], out[i, j, 1] = _dot(A[i], B[:, j])
-    return out
-
-
-@_njit
-def _points(A):  # type: ignore[no-untyped-def]
-    """Floats (I, K) as intervals."""
-    out = np.empty((A.shape[0], A.shape[1], 2))
-    out[:, :, 0], out[:, :, 1] = A, A
-    return out
-
-
-@_njit
-def prove_kernel(  # type: ignore[no-untyped-def]
-    code, constants, outputs, numbers, C, layer, limits, W, U, radius, n
-):
-    """The proof: index into REASONS, margin, half-sides of the ellipsoid's box."""
-    size, m = 2 * n, len(limits)
-    half = np.zeros(size)
-    # R = W U; x = U R⁻¹ (W x), and |R⁻¹ z| ≤ |z|/(1 − δ) with δ = ‖D‖ < 1, R = (I + D) Δ, Δ
-    # the diagonal scaling of U, which is divided out first.
-    point = _points(W)
-    pair = _product(point, U)
-    inverse = np.empty((size, size))
-    for j in range(size):
-        scale = 0.5 * (pair[j, j, 0] + pair[j, j, 1])
-        if not scale > 0.0:
-            return 1, -1e300, half
-        inverse[:, j] = U[:, j] / scale  # U Δ⁻¹, rounded: this is the matrix used below
-    pair = _product(point, inverse)
-    for i in range(size):
-        pair[i, i, 0], pair[i, i, 1] = add(pair[i, i, 0], pair[i, i, 1], -1.0, -1.0)
-    delta = _norm(pair.reshape(size * size, 2))
-    if not delta < 0.5:
-        return 1, -1e300, half
-    reach = up(radius / (1.0 - 1.0000001 * delta))
-    low, high = np.empty(size + len(numbers)), np.empty(size + len(numbers))
-    sides = _points(inverse)
-    for i in range(size):
-        half[i] = up(_norm(sides[i]) * reach)
-        low[i], high[i] = -half[i], half[i]
-    low[size:], high[size:] = numbers, numbers
-    values, gradients = run(code, constants, outputs, size, low, high)
-    # The law exists: det Γ keeps its sign, on a box around the target.
-    if not (values[n + m, 0] > 0.0 or values[n + m, 1] < 0.0):
-        return 2, -1e300, half
-    s, u = _product(_points(C), inverse), _product(gradients[n : n + m], inverse)
-    for i in range(m):
-        if not up(_norm(s[i]) * reach) <= layer[i]:
-            return 3, -1e300, half
-    for i in range(m):
-        if not up(_norm(u[i]) * reach) <= limits[i]:
-            return 4, -1e300, half
-    # G = W [J] U and F = W U, then −(FᵀG + GᵀF).
-    J = np.zeros((size, size, 2))
-    for i in range(n):
-        J[i, n + i, 0] = J[i, n + i, 1] = 1.0
-        J[n + i] = gradients[i]
-    right, F = _product(J, U), _product(point, U)
-    G = np.empty((size, size, 2))
-    for i in range(size):
-        for j in range(size):
-            G[i, j, 0], G[i, j, 1] = _dot(right[:, j], W[i])
-    margin = 1.0
-    S = np.empty((size, size, 2))
-    for i in range(size):
-        for j in range(size):
-            a, b = 0.0, 0.0
-            for k in range(size):
-                c, d = mul(F[k, i, 0], F[k, i, 1], G[k, j, 0], G[k, j, 1])
-                a, b = add(a, b, c, d)
-                c, d = mul(G[k, i, 0], G[k, i, 1], F[k, j, 0], F[k, j, 1])
-                a, b = add(a, b, c, d)
-            S[i, j, 0], S[i, j, 1] = -b, -a
-    for i in range(size):
-        off = 0.0
-        for j in range(size):
-            if j != i:
-                _, big = magnitude(S[i, j, 0], S[i, j, 1])
-                off = up(off + big)
-        # With U as the search scales it S is near 2 I: the margin is the part that is left.
-        row_margin = 0.5 * down(S[i, i, 0] - off)
-        if not row_margin > -1e300:
-            return 5, -1e300, half
-        margin = min(margin, row_margin)
-    return (0 if margin > 0.0 else 5), margin, half

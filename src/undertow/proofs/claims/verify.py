@@ -22,6 +22,7 @@ from undertow.proofs.claims.appendix import AppendixClaim
 from undertow.proofs.claims.certificate import Certificate, StatedClaim, Subject
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.closed_loop import LoopClaim
+from undertow.proofs.claims.document import decide_document, match_document
 from undertow.proofs.claims.nonsingular import NonsingularClaim
 from undertow.proofs.claims.reaching import ReachingClaim
 from undertow.proofs.claims.region import RegionClaim
@@ -153,7 +154,7 @@ def check_settings(certificate: Certificate, settings: Mapping[str, float]) -> N
 
 def verify(
     certificate: Certificate,
-    mechanism: Mechanism,
+    mechanism: Mechanism | None,
     *,
     own_parameters: bool = False,
     max_seconds: float = 600.0,
@@ -166,7 +167,8 @@ def verify(
     certificate
         From :func:`undertow.proofs.read_certificate`.
     mechanism, own_parameters
-        As for :func:`match`.
+        As for :func:`match`.  A file of version 2 says everything by itself: with None it is
+        decided for the model that is in it.
     max_seconds
         Effort for each claim.
     progress
@@ -186,6 +188,12 @@ def verify(
     MissingExtraError
         Without python-flint.
     """
+    if certificate.document is not None:
+        return _verify_document(certificate, mechanism, own_parameters, progress)
+    if mechanism is None:
+        raise CertificateError(
+            "certificate of version 1", value="no mechanism", limit="the one that it is about"
+        )
     matched = match(certificate, mechanism, own_parameters=own_parameters)
     model = exact_mechanism(matched)
     tasks = [(s, c) for s in certificate.subjects for c in s.claims]
@@ -203,6 +211,26 @@ def verify(
         verdict = _decide(model, subject, claim, max_seconds) if same is None else same.verdict
         done.append(Checked(subject, claim, verdict, matched.fingerprint))
     return tuple(done)
+
+
+def _verify_document(
+    certificate: Certificate,
+    mechanism: Mechanism | None,
+    own_parameters: bool,
+    progress: Callable[[str, float], None] | None,
+) -> tuple[Checked, ...]:
+    document, model = certificate.document, certificate.structure
+    assert document is not None
+    if mechanism is not None:
+        match_document(document, mechanism, own_parameters)
+        model = mechanism.with_parameters(**certificate.parameters).fingerprint
+    subjects = [s for s in certificate.subjects for _ in s.claims]
+    stated = [c for s in certificate.subjects for c in s.claims]
+    decided = decide_document(document, progress)
+    return tuple(
+        Checked(subject, claim, verdict, model)
+        for subject, claim, (_, _, verdict) in zip(subjects, stated, decided, strict=True)
+    )
 
 
 def _decide(mechanism: Mechanism, subject: Subject, stated: StatedClaim, seconds: float) -> Verdict:

@@ -1,7 +1,7 @@
 """The search for terminal ellipsoids: modes of the linear closed loop, weighted.
 
 Nothing here proves anything: every set that is returned is one that the kernel of
-:mod:`undertow.proofs.claims.terminal_ellipsoid` has accepted.
+:mod:`undertow.proofs.kernel.claims` has accepted.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class EllipsoidSearch:
 
     Parameters
     ----------
-    loop, numbers, C, layer, limits
+    loop, numbers, C, layer, limits, centre
         The interval program and what its proof takes.
     T, T_inverse
         Real modal matrix with columns of unit length, (2n, 2n), and its inverse.
@@ -53,6 +53,7 @@ class EllipsoidSearch:
     C: FloatArray
     layer: FloatArray
     limits: FloatArray
+    centre: FloatArray
     T: FloatArray
     T_inverse: FloatArray
     rates: FloatArray
@@ -67,7 +68,7 @@ class EllipsoidSearch:
 
     def _margin(self, candidate: TerminalEllipsoid) -> float:
         rows = self.C, self.layer
-        code, margin, _ = prove(self.loop, self.numbers, rows, self.limits, candidate)
+        code, margin, _ = prove(self.loop, self.numbers, rows, self.limits, candidate, self.centre)
         return margin if code == 0 else min(margin, 0.0)
 
     def around(self, x: ArrayLike, effort: int = 60) -> TerminalEllipsoid | None:
@@ -188,10 +189,11 @@ def search_for(
         loop = ClosedLoopProgram.of(mechanism, reaching.switching)
     except ModelError:  # not smooth: nothing is proved of it
         return None
-    if not loop.at_rest:
+    if not loop.at_rest(mechanism):
         return None
     numbers = loop.numbers(mechanism, surface, reaching)
-    _, gradients = loop.at_target(numbers)
+    at_target = loop.at_target(numbers)
+    gradients = at_target[:, 1:]
     n = loop.n
     A = np.vstack([np.eye(n, 2 * n, n), gradients[:n].mean(axis=-1)])
     if not np.isfinite(A).all():
@@ -216,7 +218,8 @@ def search_for(
         loop,
         numbers,
         *loop.rows(numbers),
-        loop.limits(mechanism, numbers),
+        mechanism.input_limits,
+        at_target[:, 0].copy(),
         T,
         np.asarray(np.linalg.inv(T), dtype=np.float64),
         np.array(rates),

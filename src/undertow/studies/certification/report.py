@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -14,7 +15,10 @@ from undertow.base import Verdict, inward
 from undertow.base import artefacts as results
 from undertow.cascade import Run
 from undertow.models import Mechanism
-from undertow.proofs import Certificate, Checked, Subject
+from undertow.proofs import Certificate, Checked, StatedClaim, Subject
+from undertow.proofs.claims.document import document_bytes
+from undertow.proofs.claims.verify import CLAIMS
+from undertow.proofs.kernel import claims as kernel
 from undertow.studies.certification.decide import Certified
 
 __all__ = [
@@ -174,6 +178,10 @@ def verification_report(certificate: Certificate, checked: Sequence[Checked]) ->
         Text(f"{certificate.name} with {values}", style="dim"),
         mark + Text(f"{held} of {len(checked)} claims proved again"),
     ]
+    if certificate.document is not None:
+        alone = all(item.model == certificate.structure for item in checked)
+        whose = "not compared with another" if alone else f"made again from {certificate.name}"
+        lines.append(Text(f"the model is the file's own, {whose}", style="dim"))
     if others:
         note = f"the file words {others} of them otherwise: what is said here was decided"
         lines.append(Text(note, style="yellow"))
@@ -187,6 +195,27 @@ def certificate_files(
     certified: Sequence[Certified],
     figures: Mapping[str, bytes] | None = None,
 ) -> dict[str, bytes]:
-    """Return ``certificate.json`` and the figures."""
-    certificate = Certificate.of(mechanism, [c.subject for c in certified], results.versions())
-    return {"certificate.json": certificate.to_bytes(), **(figures or {})}
+    """Return the files: ``certificate.json``, what the kernel decides; figures; ``drafts.json``.
+
+    ``drafts.json`` is of version 1: claims of kinds that the kernel does not decide yet, and the
+    remarks.  It is left out where there are none.
+    """
+    versions = results.versions()
+    proved, drafts = [], []
+    for item in certified:
+        subject, known = item.subject, list[kernel.Claim]()
+        rest = list[StatedClaim]()
+        for claim in subject.claims:
+            own = CLAIMS[claim.kind].from_dict(claim.data).stated(mechanism, claim.verdict)
+            known += [] if own is None else [own]
+            rest += [claim] if own is None else []
+        if known:
+            proved.append((subject.surface, subject.reaching, known))
+        if rest:
+            drafts.append(replace(subject, claims=tuple(rest)))
+    files = dict(figures or {})
+    if proved:
+        files["certificate.json"] = document_bytes(mechanism, proved, versions)
+    if drafts:
+        files["drafts.json"] = Certificate.of(mechanism, drafts, versions).to_bytes()
+    return files

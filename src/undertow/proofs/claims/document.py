@@ -1,0 +1,151 @@
+"""Certificates of version 2: written from claims that were proved, decided by the kernel.
+
+Kinds that the kernel does not decide yet stay in files of version 1, beside them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
+
+from undertow.base.errors import CertificateError
+from undertow.base.verdict import Kind, Verdict
+from undertow.law import ReachingLaw, Surface
+from undertow.models.mechanism import Mechanism
+from undertow.proofs.claims.model_data import law_data, model_data
+from undertow.proofs.kernel import claims as kernel
+from undertow.proofs.kernel.model import Law
+from undertow.proofs.kernel.reader import FORMAT, VERSION, Document, Refused, digest, read
+
+__all__ = ["decide_document", "document_bytes", "law_objects", "match_document", "read_document"]
+
+AGAIN = "The model has changed since: certify again"
+
+
+def document_bytes(
+    mechanism: Mechanism,
+    subjects: Sequence[tuple[Surface, ReachingLaw, Sequence[kernel.Claim]]],
+    versions: Mapping[str, str | None],
+) -> bytes:
+    """Return a file of version 2; every number in it is exact.
+
+    Raises
+    ------
+    CertificateError
+        For what a certificate cannot hold.
+    """
+    model = model_data(mechanism)
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "model": model,
+        "model_hash": digest(model),
+        "subjects": [
+            {
+                "law": law_data(mechanism, surface, law),
+                "claims": [{"kind": claim.kind, **claim.data()} for claim in claims],
+            }
+            for surface, law, claims in subjects
+        ],
+        "made_with": {k: v if v is None else v[:64] for k, v in versions.items()},
+    }
+    document["checksum"] = digest(document)
+    text = json.dumps(document, indent=1, ensure_ascii=False)
+    # A line for each innermost list; no text of a certificate has a bracket's line break inside.
+    text = re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", _on_one_line, text)
+    content = (text + "\n").encode()
+    read_document(content)
+    return content
+
+
+def _on_one_line(found: re.Match[str]) -> str:
+    return "[" + re.sub(r"\n\s+", " ", found[1]) + "]"
+
+
+def read_document(content: bytes) -> Document:
+    """Read a file of version 2, its claims too.
+
+    Raises
+    ------
+    CertificateError
+        For what is damaged or unknown.
+    """
+    try:
+        document = read(content)
+        for subject in document.subjects:
+            for data in subject.claims:
+                kernel.read_claim(data, document.model)
+    except Refused as error:
+        raise CertificateError(
+            "certificate",
+            value=str(error),
+            limit="as docs/certificate-format.md says",
+            remedy="It was edited or damaged; certify again",
+        ) from error
+    return document
+
+
+def law_objects(law: Law) -> tuple[Surface, ReachingLaw]:
+    """Return a law of a file as the objects that it was written from."""
+    surface = Surface(
+        *([[float(v) for v in row] for row in block]
+          for block in (law.alpha_a, law.lambda_a, law.alpha_u, law.lambda_u))
+    )  # fmt: skip
+    eta, layer = (tuple(map(float, v)) for v in (law.eta, law.layer))
+    one = len(eta) == 1
+    return surface, ReachingLaw(
+        eta[0] if one else eta, layer[0] if one else layer, cast(Any, law.switching)
+    )
+
+
+def match_document(document: Document, mechanism: Mechanism, own_parameters: bool) -> None:
+    """Refuse a file about another mechanism: the equations of this one are made again and compared.
+
+    Parameters
+    ----------
+    own_parameters
+        The mechanism's parameters count, and must be the file's.
+
+    Raises
+    ------
+    CertificateError
+        With what differs.
+    """
+    given = document.model
+    mine = {p.name: p.value for p in mechanism.parameters}
+    theirs = {p.name: float(p.value or 0) for p in given.parameters}
+
+    def require(good: bool, what: str, value: object, limit: object, remedy: str = AGAIN) -> None:
+        if not good:
+            raise CertificateError(what, value=value, limit=limit, remedy=remedy)
+
+    name = mechanism.name
+    about = "certificate of another mechanism"
+    require(
+        given.name == name, about, repr(given.name), f"'{name}'", "Name the one that it is about"
+    )
+    alike = f"parameters of '{name}'"
+    require(set(mine) == set(theirs), alike, ", ".join(sorted(mine)), ", ".join(sorted(theirs)))
+    for key, value in theirs.items() if own_parameters else ():
+        what, limit = f"parameter '{key}' of '{name}'", f"{value:.17g}, the certificate's"
+        again = "The proof is for that value: certify again with --set"
+        require(mine[key] == value, what, f"{mine[key]:.17g}", limit, again)
+    here = model_data(mechanism.with_parameters(**theirs))
+    limits = tuple(i.limit for i in mechanism.inputs)
+    wanted = tuple(float("inf") if i.value is None else float(i.value) for i in given.inputs)
+    require(limits == wanted, f"input limits of '{name}'", limits, f"{wanted}, the certificate's")
+    own = digest(here)
+    shown = f"{document.model_hash[:12]}…, those of the certificate"
+    require(own == document.model_hash, f"equations of '{name}'", f"hash {own[:12]}…", shown)
+
+
+def decide_document(
+    document: Document, progress: Callable[[str, float], None] | None = None
+) -> list[tuple[Law, kernel.Claim, Verdict]]:
+    """Decide all claims of a file: from the file alone."""
+    return [
+        (law, claim, Verdict(d.sentence, cast(Kind, d.kind), witness=d.witness, method=d.why))
+        for law, claim, d in kernel.check(document, progress)
+    ]

@@ -1,0 +1,583 @@
+"""The rules: each kind of claim with its statement, its decision and its sentence.
+
+Statements and lemmas are those of ``docs/certificate-format.md``, section 5, under the same names.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from undertow.proofs.kernel import compiled as ops
+from undertow.proofs.kernel.bound import Goal, settle
+from undertow.proofs.kernel.graph import FloatArray, Program, Span, hull
+from undertow.proofs.kernel.model import Law, Matrix, Model, System, system
+from undertow.proofs.kernel.reader import (
+    Document,
+    fields,
+    interval,
+    matrix,
+    number,
+    number_text,
+    numbers,
+    require,
+)
+from undertow.proofs.kernel.words import Region, inward, limits, region
+
+__all__ = ["KINDS", "Claim", "Decision", "Nonsingular", "Reaching", "Stability",
+           "TerminalEllipsoid", "check", "decide", "ellipsoid", "ellipsoid_program",
+           "no_equilibrium", "read_claim"]  # fmt: skip
+
+#: Boxes of a branch and bound before it gives up.
+MOST_BOXES = 200_000
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the checker says of one claim: ``proved``, ``refuted`` or ``undecided``, and why.
+
+    ``sentence`` is the statement, in words made of the claim's numbers; ``witness`` the point
+    where a refuted claim is false, or where the checker gave up.
+    """
+
+    kind: str
+    sentence: str
+    why: str
+    witness: Mapping[str, float] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+#: Kind of verdict, why, witness, details.
+Found = tuple[str, str, dict[str, float], dict[str, Any]]
+
+
+class Claim(ABC):
+    """Numbers with a statement about a model and a law."""
+
+    kind: ClassVar[str]
+    keys: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    @abstractmethod
+    def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
+
+    @abstractmethod
+    def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
+
+    @abstractmethod
+    def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
+
+    @abstractmethod
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
+
+
+def _texts(values: Any) -> Any:
+    return [_texts(v) for v in values] if isinstance(values, tuple) else number_text(values)
+
+
+# -- linear algebra on exact numbers --------------------------------------------------------------
+
+Spans = list[list[Span]]
+
+
+def _spans(block: Sequence[Sequence[Fraction]]) -> Spans:
+    return [[Span(v) for v in row] for row in block]
+
+
+def _times(A: Spans, B: Spans) -> Spans:
+    return [[sum((a * row[j] for a, row in zip(r, B, strict=True)), Span(0))
+             for j in range(len(B[0]))] for r in A]  # fmt: skip
+
+
+def _plus(A: Spans, B: Spans) -> Spans:
+    return [[a + b for a, b in zip(r, s, strict=True)] for r, s in zip(A, B, strict=True)]
+
+
+def _solved(A: Spans, B: Spans) -> Spans:
+    """A⁻¹ B by elimination with pivots that are not 0; ZeroDivisionError if that is not shown."""
+    rows, n = [[*a, *b] for a, b in zip(A, B, strict=True)], len(A)
+    for j in range(n):
+        size = [min(abs(r[j].low), abs(r[j].high)) * (r[j].low * r[j].high > 0) for r in rows[j:]]
+        best = j + size.index(max(size))
+        rows[j], rows[best] = rows[best], rows[j]
+        rows[j] = [v / rows[j][j] if k > j else v for k, v in enumerate(rows[j])]
+        for i in range(n):
+            if i != j:
+                factor = rows[i][j]
+                pairs = enumerate(zip(rows[i], rows[j], strict=True))
+                rows[i] = [v - factor * w if k > j else v for k, (v, w) in pairs]
+    return [row[n:] for row in rows]
+
+
+def _characteristic(A: Spans) -> list[Span]:
+    """Coefficients of det(x − A), highest power first (Faddeev and LeVerrier)."""
+    n, out = len(A), [Span(1)]
+    N = [[Span(int(i == j)) for j in range(n)] for i in range(n)]
+    for k in range(1, n + 1):
+        step = _times(A, N)
+        trace = sum((step[i][i] for i in range(n)), Span(0))
+        out.append(trace * Span(Fraction(-1, k)))
+        N = [[v + out[-1] if i == j else v for j, v in enumerate(row)]
+             for i, row in enumerate(step)]  # fmt: skip
+    return out
+
+
+def _routh(coefficients: list[Span]) -> bool | None:
+    """Lemma 3: whether a polynomial, its first coefficient > 0, is Hurwitz, if it is known."""
+    first, second = coefficients[::2], coefficients[1::2]
+    while second:
+        if not second[0].low > 0:
+            return False if second[0].high <= 0 else None
+        factor = first[0] / second[0]
+        padded = second + [Span(0)] * (len(first) - len(second))
+        third = [first[i + 1] - factor * padded[i + 1] for i in range(len(first) - 1)]
+        first, second = second, third
+    return True
+
+
+def _positive(A: list[list[Fraction]]) -> bool:
+    """Whether a symmetric rational matrix is positive definite, by its pivots."""
+    for j, row in enumerate(A):
+        if row[j] <= 0:
+            return False
+        for i in range(j + 1, len(A)):
+            factor = A[i][j] / row[j]
+            A[i] = [a - factor * b for a, b in zip(A[i], row, strict=True)]
+    return True
+
+
+# -- 5.1 ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stability(Claim):
+    """Every eigenvalue of the motion on the surface, at the target, is left of −rate, 1/s."""
+
+    kind: ClassVar[str] = "stability"
+    keys: ClassVar[tuple[str, ...]] = ("rate",)
+    rate: Fraction
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
+        rate = number(data["rate"])
+        require(rate >= 0, "a rate ≥ 0")
+        return cls(rate)
+
+    def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
+        return {"rate": number_text(self.rate)}
+
+    def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
+        return (
+            "motions on the surface near the target converge to it exponentially, at a rate of at "
+            f"least {inward(self.rate)} 1/s; how near is not said, and the input is not limited"
+        )
+
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
+        matrix = sliding_matrix(model, law)
+        if isinstance(matrix, tuple):
+            return *matrix, {}, {}
+        rate = Span(self.rate)
+        shifted = [[v + rate if i == j else v for j, v in enumerate(row)]
+                   for i, row in enumerate(matrix)]  # fmt: skip
+        exact = all(v.exact for row in matrix for v in row)
+        method = f"Routh array in {'exact rationals' if exact else 'rational intervals'}"
+        stable = _routh(_characteristic(shifted))
+        return {True: "proved", False: "refuted", None: "undecided"}[stable], method, {}, {}
+
+
+def sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
+    """Return A of ż = A z, z = (q_a, q_u, v_u), or a verdict and why there is none."""
+    n, m = model.n, model.m
+    own = system(model, law)
+    try:
+        nodes = [*(v for row in own.M for v in row), *own.f[m:]]
+        values = own.graph.exact(nodes, own.origin(), 2 * n)
+        pivots = own.graph.exact(own.pivots, own.origin())
+    except ArithmeticError as error:
+        return "undecided", f"at the target: {error}"
+    if not all(p.low > 0 for p, _ in pivots):
+        return "undecided", "M is not shown to be positive definite at the target"
+    if not all(v.zero for v, _ in values[n * n :]):
+        return "undecided", "f_u(0, 0) = 0 is not shown exactly"
+    M = [[values[n * i + j][0] for j in range(n)] for i in range(n)]
+    alpha_a, alpha_u = _spans(law.alpha_a), _spans(law.alpha_u)
+    lambda_a, lambda_u = _spans(law.lambda_a), _spans(law.lambda_u)
+    zero, one = Span(0), Span(1)
+    try:
+        # ∂(q_a, q_u, v_a, v_u)/∂z, of which v_a = −α_a⁻¹ [λ_a, λ_u, α_u] z.
+        slope = _solved(
+            alpha_a, [[*a, *b, *c] for a, b, c in zip(lambda_a, lambda_u, alpha_u, strict=True)]
+        )
+        G = [[-v for v in row] for row in slope]
+        z = [[one if i == j else zero for j in range(2 * n - m)] for i in range(2 * n - m)]
+        whole = [*z[:n], *G, *z[n:]]
+        gradient = [d for _, d in values[n * n :]]
+        M_ua, M_uu = [r[:m] for r in M[m:]], [r[m:] for r in M[m:]]
+        drift = _plus(_times(lambda_a, G), _times(lambda_u, z[n:]))
+        pull = _times(M_ua, _solved(alpha_a, drift))
+        right = _plus(_times(gradient, whole), pull)
+        thrown = _times(M_ua, _solved(alpha_a, alpha_u))
+        E = [[a - b for a, b in zip(r, s, strict=True)] for r, s in zip(M_uu, thrown, strict=True)]
+        return [*G, *z[n:], *_solved(E, right)]
+    except ZeroDivisionError:
+        exact = all(v.exact for row in M for v in row)
+        why = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
+        return ("refuted", why) if exact else ("undecided", f"not excluded: {why}")
+
+
+# -- 5.2, 5.3 -------------------------------------------------------------------------------------
+
+
+def _read_region(data: Any, model: Model) -> dict[str, tuple[Fraction, Fraction]]:
+    known = {p.name for p in model.positions}
+    require(isinstance(data, dict), "a region")
+    box = {}
+    for name, ends in data.items():
+        require(name in known, f"region of {name[:64]!r}: no position of the model")
+        box[name] = interval(ends)
+        require(box[name][0] <= 0 <= box[name][1], "a region with the target inside")
+    return box
+
+
+def _box_data(box: Region) -> dict[str, Any]:
+    return {k: [number_text(v) for v in ends] for k, ends in box.items()}
+
+
+def _sign(value: Span) -> int:
+    return 1 if value.low > 0 else -1 if value.high < 0 else 0
+
+
+def _regular(own: System) -> tuple[list[int], list[Goal], Span] | str:
+    """Nodes and goals of regularity, and det Γ(0); or why the target itself is not regular."""
+    try:
+        at = own.graph.exact([own.B_determinant, own.gamma_determinant], own.origin())
+    except ArithmeticError as error:
+        return f"at the target: {error}"
+    (drive, _), (gamma, _) = at
+    if not _sign(drive) or not _sign(gamma):
+        return "det B or det Γ may be 0 at the target"
+    goals = [Goal(f"pivot {k + 1} of M is > 0") for k in range(own.model.n)]
+    goals += [Goal("det B keeps its sign", _sign(drive)), Goal("Γ is non-singular", _sign(gamma))]
+    return [*own.pivots, own.B_determinant, own.gamma_determinant], goals, gamma
+
+
+def _over_region(
+    own: System, box: Region, nodes: Sequence[int], goals: Sequence[Goal], max_boxes: int
+) -> Found:
+    n = own.model.n
+    zero = (Fraction(0), Fraction(0))
+    ends = [box.get(p.name, zero) for p in own.model.positions]
+    fixed = np.vstack([np.zeros((n, 2)), own.fixed()])
+    found = settle(own.graph.program(nodes), ends, fixed, goals, max_boxes)
+    method = "intervals and mean values, branch and bound"
+    why = method if found.kind == "proved" else f"{method}: {found.why}, not shown"
+    names = [p.name for p in own.model.positions]
+    witness = dict(zip(names, found.point, strict=False))
+    if found.kind == "refuted":
+        why = f"{method}; false: {found.why}"
+    return found.kind, why, witness, {"boxes": found.boxes}
+
+
+@dataclass(frozen=True)
+class Nonsingular(Claim):
+    """The law exists all over a region, where det Γ(q)/det Γ(0) ≥ ratio."""
+
+    kind: ClassVar[str] = "nonsingular"
+    keys: ClassVar[tuple[str, ...]] = ("region", "ratio")
+    region: Region
+    ratio: Fraction
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
+        ratio = number(data["ratio"])
+        require(ratio > 0, "a ratio > 0")
+        return cls(_read_region(data["region"], model), ratio)
+
+    def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
+        return {"region": _box_data(self.region), "ratio": number_text(self.ratio)}
+
+    def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
+        where = region(model.positions, self.region)
+        return (
+            f"the law exists {where}: M is positive definite, B and α_a − α_u M_uu⁻¹ M_auᵀ are "
+            f"non-singular, whose determinant keeps {inward(self.ratio)} of that at the target"
+        )
+
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
+        own = system(model, law)
+        regular = _regular(own)
+        if isinstance(regular, str):
+            return "undecided", regular, {}, {}
+        nodes, goals, gamma = regular
+        least = gamma * Span(_sign(gamma) * self.ratio)
+        bound = Goal(
+            "det Γ/det Γ(0) is as stated", _sign(gamma), hull(least.low, least.high), False
+        )
+        return _over_region(own, self.region, [*nodes, nodes[-1]], [*goals, bound], max_boxes)
+
+
+@dataclass(frozen=True)
+class Reaching(Claim):
+    """The law overcomes disturbances over a region, and leaves a rate of reaching."""
+
+    kind: ClassVar[str] = "reaching"
+    keys: ClassVar[tuple[str, ...]] = ("region", "disturbance", "rate")
+    region: Region
+    disturbance: tuple[Fraction, ...]
+    rate: tuple[Fraction, ...]
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
+        bounds, rate = numbers(data["disturbance"], model.n), numbers(data["rate"], model.m)
+        require(min(*bounds, *rate) >= 0, "disturbances and rates ≥ 0")
+        return cls(_read_region(data["region"], model), bounds, rate)
+
+    def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
+        numbers = {"disturbance": _texts(self.disturbance), "rate": _texts(self.rate)}
+        return {"region": _box_data(self.region), **numbers}
+
+    def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
+        loads = ", ".join(
+            f"{p.name}: {inward(v)} {'N m' if p.unit == 'rad' else 'N'}"
+            for p, v in zip(model.positions, self.disturbance, strict=True)
+            if v
+        )
+        what = (
+            f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
+        )
+        rates = ", ".join(inward(v) for v in self.rate)
+        return (
+            f"the law {what} {region(model.positions, self.region)}: (16) with η = {rates}, "
+            "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
+            "not covered"
+        )
+
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
+        if law.switching == "tanh":
+            return "undecided", "tanh is less than 1 everywhere: (16) is not stated of it", {}, {}
+        own = system(model, law)
+        regular = _regular(own)
+        if isinstance(regular, str):
+            return "undecided", regular, {}, {}
+        nodes, goals, _ = regular
+        graph, algebra, n, m = own.graph, own.algebra, model.n, model.m
+        one = [[graph.number(int(i == j)) for j in range(n)] for i in range(n)]
+        identity = [row[:m] for row in one[:m]]
+        actuated = algebra.times(own.gamma, algebra.solve(own.ss, identity))
+        rest = algebra.each("sub", own.alpha_u, algebra.times(actuated, own.M_au))
+        free = algebra.times(rest, algebra.solve(own.uu, [row[m:] for row in one[m:]]))
+        for i in range(m):
+            left = graph.make("sub", own.gains[i], graph.number(self.rate[i]))
+            for weight, bound in zip([*actuated[i], *free[i]], self.disturbance, strict=True):
+                load = graph.make("mul", graph.make("abs", weight), graph.number(bound))
+                left = graph.make("sub", left, load)
+            if (known := graph.value(left)) is not None:
+                if known < 0:
+                    return "refuted", f"k_{i + 1} − η̃_{i + 1} = {float(known):.4g} < 0", {}, {}
+            else:
+                nodes = [*nodes, left]
+                goals = [*goals, Goal(f"row {i + 1} of (16)", strict=False)]
+        return _over_region(own, self.region, nodes, goals, max_boxes)
+
+
+# -- 5.4 ------------------------------------------------------------------------------------------
+
+#: What is not shown, by number.
+REASONS = (
+    "", "W is not shown to be invertible", "model and law are not shown to be regular",
+    "the boundary layer is left", "an input limit is met", "V̇ < 0 is not shown",
+)  # fmt: skip
+
+
+def ellipsoid(
+    program: Program, fixed: FloatArray, W: FloatArray, radius: float, C: FloatArray,
+    layer: FloatArray, limits: FloatArray, centre: FloatArray | None = None,
+) -> tuple[int, float, FloatArray]:  # fmt: skip
+    """Decide Lemma 5, as ``compiled.ellipsoid`` says: code, margin, half-sides of Q.
+
+    ``centre`` are the program's values at x = 0, where they are known already.
+    """
+    size = len(W)
+    V = ops.inverse(W)
+    half = np.array([ops.up(ops.norm(row) * radius) for row in V])
+    if not (np.isfinite(V).all() and np.isfinite(half).all()):
+        return 1, -math.inf, np.zeros(size)
+    low, high = np.vstack([np.zeros((size, 2)), fixed]).T.copy()
+    centre = program(low, high)[:, 0] if centre is None else centre
+    low[:size], high[:size] = -half, half
+    whole = program(low, high, size)
+    if np.isnan(whole).any():  # something is undefined in Q
+        return 2, -math.inf, half
+    code, margin = ops.ellipsoid(V, whole, centre, W, radius, C, layer, limits)
+    return int(code), float(margin), half
+
+
+def ellipsoid_program(own: System) -> Program:
+    """Return q̈, the demand, pivots, det B and det Γ of the loop inside the layer."""
+    q_dd, demand = own.loop(layer=True)
+    return own.graph.program(
+        [*q_dd, *demand, *own.pivots, own.B_determinant, own.gamma_determinant]
+    )
+
+
+@dataclass(frozen=True)
+class TerminalEllipsoid(Claim):
+    """{|W x| ≤ radius} is a terminal set of the closed loop, inside layer and input limits."""
+
+    kind: ClassVar[str] = "terminal ellipsoid"
+    keys: ClassVar[tuple[str, ...]] = ("W", "radius")
+    W: Matrix
+    radius: Fraction
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
+        radius = number(data["radius"])
+        require(radius > 0, "a radius > 0")
+        return cls(matrix(data["W"], 2 * model.n, 2 * model.n), radius)
+
+    def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
+        return {"W": _texts(self.W), "radius": number_text(self.radius)}
+
+    @property
+    def ball(self) -> float:
+        """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite."""
+        size = float(np.linalg.norm(np.array(self.W, dtype=float), 2))
+        for slack in (1e-12, 1e-6, 1.0):
+            c = Fraction(size * (1 + slack))
+            columns = list(zip(*self.W, strict=True))
+            rest = [
+                [c * c * int(i == j) - sum(a * b for a, b in zip(p, q, strict=True))
+                 for j, q in enumerate(columns)]
+                for i, p in enumerate(columns)
+            ]  # fmt: skip
+            if _positive(rest):
+                return float(self.radius / c) * (1 - 1e-15)
+        return 0.0
+
+    def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
+        ball = inward(Fraction(self.ball), 3)
+        return (
+            "every motion of the full closed loop, its input renewed at every instant and the "
+            f"plant the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {ball}, "
+            f"stays there and converges, inside the layer and {limits(model)}"
+        )
+
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
+        if law.switching == "sign":
+            return "undecided", "with sign(s) there is no layer to be inside of", {}, {}
+        own = system(model, law)
+        if (why := no_equilibrium(own)) is not None:
+            return "undecided", why, {}, {}
+        W = np.array([[hull(v, v) for v in row] for row in self.W])
+        code, margin, half = ellipsoid(
+            ellipsoid_program(own), own.fixed(), W, hull(self.radius, self.radius)[1],
+            _rows(law), np.array([hull(v, v)[0] for v in law.layer]), input_limits(model),
+        )  # fmt: skip
+        details = {"margin": float(margin), "box": half.tolist(), "ball": self.ball}
+        witness = dict(zip(model.states, half.tolist(), strict=True))
+        method = "interval Jacobian over the ellipsoid's box, diagonal dominance"
+        if code == 0:
+            return "proved", method, witness, details
+        return "undecided", f"{method}: {REASONS[code]}", witness, details
+
+
+def no_equilibrium(own: System, origin: Sequence[Span] | None = None) -> str | None:
+    """Why the target is not shown to be at rest, or None: f_u(0, 0) = 0 and then q̈ = 0."""
+    try:
+        at = own.origin() if origin is None else origin
+        free = own.graph.exact(own.f[own.model.m :], at)
+    except ArithmeticError as error:
+        return f"at the target: {error}"
+    return None if all(v.zero for v, _ in free) else "f_u(0, 0) = 0 is not shown exactly"
+
+
+def _rows(law: Law) -> FloatArray:
+    """C of s = C x, enclosed, (m, 2n, 2)."""
+    blocks = zip(law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u, strict=True)
+    return np.array([[hull(v, v) for part in row for v in part] for row in blocks])
+
+
+def input_limits(model: Model) -> FloatArray:
+    """Lower bounds of the input limits, (m,), ∞ for none."""
+    ends = [math.inf if i.value is None else hull(i.value, i.value)[0] for i in model.inputs]
+    return np.array(ends)
+
+
+# -- all of them ----------------------------------------------------------------------------------
+
+KINDS: Mapping[str, type[Claim]] = {
+    claim.kind: claim for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid)
+}
+
+
+def read_claim(data: Mapping[str, Any], model: Model) -> Claim:
+    """Read a claim of a file.
+
+    Raises
+    ------
+    Refused
+        For a kind that is not known, or numbers that do not fit the model.
+    """
+    kind = data.get("kind")
+    require(
+        isinstance(kind, str) and kind in KINDS, f"a claim of the unknown kind {str(kind)[:40]!r}"
+    )
+    known = KINDS[str(kind)]
+    fields(data, f"claim '{known.kind}'", {"kind", *known.keys}, {"hint"})
+    return known.read(data, model)
+
+
+def decide(model: Model, law: Law, claim: Claim, max_boxes: int = MOST_BOXES) -> Decision:
+    """Decide a claim about a model and a law."""
+    kind, why, witness, details = claim.decide(model, law, max_boxes)
+    return Decision(kind, claim.sentence(model), why, witness, details)
+
+
+def check(
+    document: Document,
+    progress: Callable[[str, float], None] | None = None,
+) -> list[tuple[Law, Claim, Decision]]:
+    """Decide all claims of a certificate, in its order.
+
+    Raises
+    ------
+    Refused
+        For a claim that cannot be read.
+    """
+    tasks = [
+        (subject.law, read_claim(data, document.model))
+        for subject in document.subjects
+        for data in subject.claims
+    ]
+    done = []
+    for index, (law, claim) in enumerate(tasks):
+        if progress is not None:
+            progress(claim.kind, index / len(tasks))
+        done.append((law, claim, decide(document.model, law, claim)))
+    return done

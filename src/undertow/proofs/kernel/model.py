@@ -1,0 +1,346 @@
+"""The mechanism and the law of a file, and the closed loop that the kernel makes of them itself.
+
+Formulas and Lemmas 1 and 2 of ``docs/certificate-format.md``, section 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from undertow.proofs.kernel.graph import FloatArray, Graph, Span, hull
+
+__all__ = ["Law", "Model", "Quantity", "System"]
+
+Matrix = tuple[tuple[Fraction, ...], ...]
+Nodes = list[list[int]]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A position, an input or a parameter: name and unit, and its limit or value if it has one."""
+
+    name: str
+    unit: str
+    value: Fraction | None = None
+
+
+@dataclass(frozen=True)
+class Model:
+    """M(q; p) q̈ = f(q, q̇; p) + [B(q; p); 0] u, as a graph.
+
+    Parameters
+    ----------
+    positions, inputs, parameters
+        n, m and P of them; the first m positions are actuated.  An input's value is its limit.
+    nodes
+        (kind, operands …), as in the file, numbers as rationals.
+    M, f, B
+        Indices of nodes: row i of M has i + 1.
+    """
+
+    name: str
+    positions: tuple[Quantity, ...]
+    inputs: tuple[Quantity, ...]
+    parameters: tuple[Quantity, ...]
+    nodes: tuple[tuple[Any, ...], ...]
+    M: tuple[tuple[int, ...], ...]
+    f: tuple[int, ...]
+    B: tuple[tuple[int, ...], ...]
+
+    @property
+    def n(self) -> int:
+        """Number of positions."""
+        return len(self.positions)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of x = (q, q̇)."""
+        names = [p.name for p in self.positions]
+        return (*names, *(f"{name}_dot" for name in names))
+
+    def lay(self, graph: Graph) -> tuple[Nodes, list[int], Nodes]:
+        """Lay M, f and B on a graph whose inputs are x, then p."""
+        n, at = self.n, list[int]()
+        first = {"position": 0, "velocity": n, "parameter": 2 * n}
+        for kind, *rest in self.nodes:
+            if kind == "number":
+                at.append(graph.number(rest[0]))
+            elif kind in first:
+                at.append(graph.inputs[first[kind] + rest[0]])
+            elif kind == "pow":
+                at.append(graph.power(at[rest[0]], rest[1]))
+            elif kind == "tanh":
+                at.append(graph.tanh(at[rest[0]]))
+            else:
+                at.append(graph.make(kind, *(at[k] for k in rest)))
+        mass = [[at[self.M[max(i, j)][min(i, j)]] for j in range(n)] for i in range(n)]
+        return mass, [at[k] for k in self.f], [[at[k] for k in row] for row in self.B]
+
+
+@dataclass(frozen=True)
+class Law:
+    """A surface, its reaching law, and the disturbance that its gains are for."""
+
+    alpha_a: Matrix
+    lambda_a: Matrix
+    alpha_u: Matrix
+    lambda_u: Matrix
+    eta: tuple[Fraction, ...]
+    layer: tuple[Fraction, ...]
+    switching: str
+    disturbance: tuple[Fraction, ...]
+
+    @property
+    def numbers(self) -> tuple[Fraction, ...]:
+        """α_a, λ_a, α_u, λ_u row by row, η, ε."""
+        blocks = (self.alpha_a, self.lambda_a, self.alpha_u, self.lambda_u)
+        return (*(v for b in blocks for row in b for v in row), *self.eta, *self.layer)
+
+
+class _Algebra:
+    """Matrices of nodes."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+
+    def times(self, A: Nodes, B: Nodes) -> Nodes:
+        make = self.graph.make
+        return [
+            [self.graph.sum(make("mul", a, row[j]) for a, row in zip(r, B, strict=True))
+             for j in range(len(B[0]))]
+            for r in A
+        ]  # fmt: skip
+
+    def each(self, kind: str, A: Nodes, B: Nodes | None = None) -> Nodes:
+        if B is None:
+            return [[self.graph.make(kind, a) for a in row] for row in A]
+        return [
+            [self.graph.make(kind, a, b) for a, b in zip(r, s, strict=True)]
+            for r, s in zip(A, B, strict=True)
+        ]
+
+    def factor(self, A: Nodes) -> tuple[Nodes, list[int]]:
+        """L and D of A = L D Lᵀ, symmetric."""
+        make, n = self.graph.make, len(A)
+        L = [[self.graph.number(int(i == j)) for j in range(n)] for i in range(n)]
+        D: list[int] = []
+        for j in range(n):
+            part = self.graph.sum(make("mul", make("sqr", L[j][k]), D[k]) for k in range(j))
+            D.append(make("sub", A[j][j], part))
+            for i in range(j + 1, n):
+                part = self.graph.sum(
+                    make("mul", make("mul", L[i][k], L[j][k]), D[k]) for k in range(j)
+                )
+                L[i][j] = make("div", make("sub", A[i][j], part), D[j])
+        return L, D
+
+    def solve(self, factor: tuple[Nodes, list[int]], B: Nodes) -> Nodes:
+        """A⁻¹ B from the factors of A."""
+        (L, D), make, n = factor, self.graph.make, len(B)
+        out: Nodes = [[0] * len(B[0]) for _ in range(n)]
+        for c in range(len(B[0])):
+            z: list[int] = []
+            for i in range(n):
+                part = self.graph.sum(make("mul", L[i][k], z[k]) for k in range(i))
+                z.append(make("sub", B[i][c], part))
+            z = [make("div", v, d) for v, d in zip(z, D, strict=True)]
+            for i in reversed(range(n)):
+                part = self.graph.sum(make("mul", L[k][i], z[k]) for k in range(i + 1, n))
+                z[i] = make("sub", z[i], part)
+            for i in range(n):
+                out[i][c] = z[i]
+        return out
+
+    def adjugate(self, A: Nodes) -> tuple[Nodes, int]:
+        """Adj A and det A, without a division by entries (Faddeev and LeVerrier)."""
+        make, number, m = self.graph.make, self.graph.number, len(A)
+        N: Nodes = [[number(int(i == j)) for j in range(m)] for i in range(m)]
+        for k in range(1, m + 1):
+            step = self.times(A, N)
+            trace = self.graph.sum(step[i][i] for i in range(m))
+            c = make("mul", number(Fraction(-1, k)), trace)
+            if k == m:
+                break
+            N = [[make("add", v, c) if i == j else v for j, v in enumerate(row)]
+                 for i, row in enumerate(step)]  # fmt: skip
+        sign = number((-1) ** (m - 1))
+        return [[make("mul", sign, v) for v in row] for row in N], make("mul", number((-1) ** m), c)
+
+
+class System:
+    """The plant and the law on one graph: everything that claims are about.
+
+    The inputs are x = (q, q̇), then the parameters, then, where ``law`` is None, the numbers of
+    a law as :attr:`Law.numbers` gives them; else they are exact in the graph.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        law: Law | None,
+        switching: str = "saturation",
+        disturbance: Sequence[Fraction] = (),
+    ) -> None:
+        n, m = model.n, model.m
+        self.model, self.law = model, law
+        self.switching = law.switching if law is not None else switching
+        bounds = law.disturbance if law is not None else disturbance
+        fixed = 2 * n + len(model.parameters)
+        self.graph = graph = Graph(fixed + (2 * m * n + 2 * m if law is None else 0))
+        nodes = graph.inputs[fixed:] if law is None else [graph.number(v) for v in law.numbers]
+        given = iter(nodes)
+
+        def block(rows: int, columns: int) -> Nodes:
+            return [[next(given) for _ in range(columns)] for _ in range(rows)]
+
+        self.alpha_a, self.lambda_a = block(m, m), block(m, m)
+        self.alpha_u, self.lambda_u = block(m, n - m), block(m, n - m)
+        self.eta, self.layer = block(1, m)[0], block(1, m)[0]
+        self.M, self.f, self.B = model.lay(graph)
+        self.algebra = algebra = _Algebra(graph)
+        M_aa, self.M_au = [r[:m] for r in self.M[:m]], [r[m:] for r in self.M[:m]]
+        self.M_ua, M_uu = [r[:m] for r in self.M[m:]], [r[m:] for r in self.M[m:]]
+        self.uu = algebra.factor(M_uu)
+        self.X = algebra.solve(self.uu, self.M_ua)
+        self.S = algebra.each("sub", M_aa, algebra.times(self.M_au, self.X))
+        self.S = [[self.S[max(i, j)][min(i, j)] for j in range(m)] for i in range(m)]
+        self.ss = algebra.factor(self.S)
+        self.gamma = algebra.each("sub", self.alpha_a, algebra.times(self.alpha_u, self.X))
+        self.gamma_adjugate, self.gamma_determinant = algebra.adjugate(self.gamma)
+        self.B_adjugate, self.B_determinant = algebra.adjugate(self.B)
+        self.bounds = [graph.number(v) for v in bounds]
+
+    @property
+    def pivots(self) -> list[int]:
+        """Those of M with the unactuated block first: all > 0 iff M is positive definite."""
+        return [*self.uu[1], *self.ss[1]]
+
+    def _absolute(self, A: Nodes) -> Nodes:
+        return self.algebra.each("abs", A)
+
+    def _one(self, k: int) -> Nodes:
+        return [[self.graph.number(int(i == j)) for j in range(k)] for i in range(k)]
+
+    def _column(self, nodes: Sequence[int]) -> Nodes:
+        return [[v] for v in nodes]
+
+    @cached_property
+    def s(self) -> list[int]:
+        """s, (m,)."""
+        graph, n, m = self.graph, self.model.n, self.model.m
+        x = graph.inputs
+        parts = (
+            (self.alpha_a, x[n : n + m]), (self.lambda_a, x[:m]),
+            (self.alpha_u, x[n + m : 2 * n]), (self.lambda_u, x[m:n]),
+        )  # fmt: skip
+        products = [self.algebra.times(A, self._column(v)) for A, v in parts]
+        return [graph.sum(p[i][0] for p in products) for i in range(m)]
+
+    @cached_property
+    def gains(self) -> list[int]:
+        """k, (m,)."""
+        graph, algebra, m, n = self.graph, self.algebra, self.model.m, self.model.n
+        if not any(graph.value(b) != 0 for b in self.bounds):
+            return self.eta
+        g_a, g_u = self._column(self.bounds[:m]), self._column(self.bounds[m:])
+        X = self._absolute(self.X)
+        transposed = [list(r) for r in zip(*X, strict=True)]
+        S_inverse = self._absolute(algebra.solve(self.ss, self._one(m)))
+        uu_inverse = self._absolute(algebra.solve(self.uu, self._one(n - m)))
+        a = algebra.times(S_inverse, algebra.each("add", g_a, algebra.times(transposed, g_u)))
+        b = algebra.each("add", algebra.times(uu_inverse, g_u), algebra.times(X, a))
+        largest = []
+        for column in (a, b):
+            top = column[0][0]
+            for row in column[1:]:
+                top = graph.make("max", top, row[0])
+            largest.append(top)
+        k = []
+        for i in range(m):
+            total = self.eta[i]
+            for rows, top in ((self.alpha_a, largest[0]), (self.alpha_u, largest[1])):
+                weight = graph.sum(graph.make("abs", v) for v in rows[i])
+                total = graph.make("add", total, graph.make("mul", weight, top))
+            k.append(total)
+        return k
+
+    def loop(self, *, layer: bool) -> tuple[list[int], list[int]]:
+        """Return q̈ (n,) and the demand d (m,) of the loop whose input is the demand.
+
+        ``layer``: with s_i/ε_i in place of its saturation, as inside the layer.
+        """
+        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
+        make = graph.make
+        push = []
+        for s, e, k in zip(self.s, self.layer, self.gains, strict=True):
+            ratio = make("div", s, e)
+            if self.switching == "tanh":
+                ratio = graph.tanh(ratio)
+            elif not layer:
+                ratio = graph.clip(ratio, graph.number(1))
+            push.append(make("mul", k, ratio))
+        y = algebra.solve(self.uu, self._column(self.f[m:]))
+        h = algebra.each("sub", self._column(self.f[:m]), algebra.times(self.M_au, y))
+        x = graph.inputs
+        drive = algebra.times(self.alpha_u, y)
+        for A, v in ((self.lambda_a, x[n : n + m]), (self.lambda_u, x[n + m : 2 * n])):
+            drive = algebra.each("add", drive, algebra.times(A, self._column(v)))
+        drive = algebra.each("add", drive, self._column(push))
+        w = [
+            [make("neg", make("div", row[0], self.gamma_determinant))]
+            for row in algebra.times(self.gamma_adjugate, drive)
+        ]
+        force = algebra.each("sub", algebra.times(self.S, w), h)
+        demand = [
+            make("div", row[0], self.B_determinant) for row in algebra.times(self.B_adjugate, force)
+        ]
+        free = algebra.each("sub", y, algebra.times(self.X, w))
+        return [row[0] for row in (*w, *free)], demand
+
+    def plant(self, u: Sequence[int]) -> list[int]:
+        """Return q̈ (n,) of the plant for inputs u: S q̈_a = h + B u, q̈_u = y − X q̈_a."""
+        algebra, m = self.algebra, self.model.m
+        y = algebra.solve(self.uu, self._column(self.f[m:]))
+        h = algebra.each("sub", self._column(self.f[:m]), algebra.times(self.M_au, y))
+        push = algebra.each("add", h, algebra.times(self.B, self._column(u)))
+        q_a = algebra.solve(self.ss, push)
+        q_u = algebra.each("sub", y, algebra.times(self.X, q_a))
+        return [row[0] for row in (*q_a, *q_u)]
+
+    def clipped(self) -> list[int]:
+        """Return q̈ (n,) of the closed loop with its layer and its clip, belief equal to plant."""
+        _, demand = self.loop(layer=False)
+        graph = self.graph
+        u = [
+            d if limit.value is None else graph.clip(d, graph.number(limit.value))
+            for d, limit in zip(demand, self.model.inputs, strict=True)
+        ]
+        return self.plant(u)
+
+    def fixed(self, law: Law | None = None) -> FloatArray:
+        """Enclosures of all inputs but x: parameters, and a law's numbers where they are inputs."""
+        values = [p.value for p in self.model.parameters]
+        numbers = [*values, *(law.numbers if law is not None else ())]
+        return np.array([hull(v, v) for v in numbers if v is not None]).reshape(-1, 2)
+
+    def origin(self) -> list[Span]:
+        """Exact inputs at x = 0."""
+        values = [Span(p.value) for p in self.model.parameters if p.value is not None]
+        return [*([Span(0)] * (2 * self.model.n)), *values]
+
+
+@lru_cache(maxsize=64)
+def system(model: Model, law: Law) -> System:
+    """Return the system of a model and a law; equal ones share it."""
+    return System(model, law)
