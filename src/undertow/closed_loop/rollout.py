@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base import InvalidInputError, at_least, check_fields, checked, floats, positive
+from undertow.closed_loop.adaptive_integrator import follow
 from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
 from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
 from undertow.closed_loop.exponential_integrator import GIVEN_BACK
-from undertow.closed_loop.kernel import compile_loop
+from undertow.closed_loop.kernel import compile_look, compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory
 from undertow.closed_loop.work_array import LANES
@@ -38,6 +39,9 @@ from undertow.law import (
 )
 from undertow.models import FloatArray, Mechanism, has_linear_model
 from undertow.objective import MinimumEnergy, Objective
+
+#: Relative tolerance of motions that are shown, and that decide.
+RTOL = 1e-9
 
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
@@ -83,12 +87,17 @@ class ClosedLoop:
     plant
         The truth.  The belief itself by default; must have as many coordinates and inputs.
     step
-        Runge-Kutta step, s.
+        Runge-Kutta step of batches, and between the rows of a recorded motion, s.
     zoh_steps
         Sampled inner loop: the law is evaluated every ``zoh_steps`` steps and held.
         0: continuous law, evaluated in every Runge-Kutta stage.
     escape
         ‖x‖₂ beyond which a motion counts as diverged.
+    rtol
+        Relative tolerance of motions that are integrated one by one, see
+        :mod:`undertow.closed_loop.adaptive_integrator`: those of :meth:`simulate`, and batches that
+        ask for it.  0: steps of ``step``, as batches take them; so with ``switching="sign"``, whose
+        chatter is that of the steps.
     tail_rtol
         Relative tolerance of the large steps that a batch takes once the law is in its boundary
         layer, see :mod:`undertow.closed_loop.exponential_integrator`; 0: small steps to the end.
@@ -119,6 +128,7 @@ class ClosedLoop:
     step: float = 0.002
     zoh_steps: int = 0
     escape: float = 200.0
+    rtol: float = RTOL
     tail_rtol: float = 0.0
     ensemble: Ensemble | None = None
     covariance: FloatArray | None = None
@@ -130,6 +140,7 @@ class ClosedLoop:
         for name, remedy in (
             ("escape", "Leave it out for the usual value"),
             ("tail_rtol", "Leave it out for the usual value"),
+            ("rtol", "0 is steps of one length; leave it out for the usual value"),
             ("zoh_steps", "0 is the continuous law"),
         ):
             at_least(f"{name} of a closed loop", getattr(self, name), 0, remedy)
@@ -192,6 +203,11 @@ class ClosedLoop:
             self.zoh_steps > 0,
             self.ensemble is not None,
         )
+
+    @cached_property
+    def _look(self) -> Any:
+        switching, sampled = self.reaching.switching, self.zoh_steps > 0
+        return compile_look(self.mechanism, self._given, self.objective, switching, sampled)
 
     @cached_property
     def numbers(self) -> LoopNumbers:
@@ -283,6 +299,7 @@ class ClosedLoop:
         cap: float = math.inf,
         stable_only: bool = False,
         seek: bool = False,
+        precise: bool = False,
         every: int = 0,
         record: FloatArray = NOTHING,
         noise: FloatArray | None = None,
@@ -297,7 +314,7 @@ class ClosedLoop:
             States, surfaces and laws; what is returned is a view of them.
         switch_times, duration
             When surfaces take over, and the length, s.
-        start, terminal, cap, stable_only, seek
+        start, terminal, cap, stable_only, seek, precise
             As for :meth:`batch` and :meth:`simulate`.
         every, record
             Where every so many steps leave a row, (N, rows, 2n + 2m + 2); 0: nowhere.
@@ -330,7 +347,7 @@ class ClosedLoop:
         numbers, end = self.numbers, self.linear_end
         radius = self.objective.terminal_radius if terminal is None else terminal
         # Large steps see no closest approach, and leave nothing to record.
-        large = self.takes_large_steps and not every and not seek
+        large = self.takes_large_steps and not (every or seek or precise)
         part, calm_from = buffers, 0 if large else steps
         noisy = self.covariance is not None and end is not None and end.counts_cost
         where: NDArray[np.intp] | slice = slice(buffers.count)
@@ -344,11 +361,9 @@ class ClosedLoop:
                 prepared = self._linearised(part)
             if prepared is not None and stable_only:
                 live *= prepared.stable
-            self._kernels.rollout(
-                part.states, live, part.lanes, switches, numbers.plant, numbers.belief,
-                numbers.limits, part.quiet if noise is None else noise, start, self.step, steps,
-                max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
-                every, record, out,
+            self._integrate(
+                part, switches, noise, start, steps, radius, cap, seek, calm_from, precise, every,
+                record,
             )  # fmt: skip
             if goes_on and prepared is not None and end is not None:
                 self._kernels.etd_integrate(
@@ -370,6 +385,30 @@ class ClosedLoop:
             failed = round((float(out[again, 1].max()) - start) / self.step)
             calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
             part, where = part.part(again), np.arange(buffers.count)[where][again]
+
+    def _integrate(
+        self, part: RolloutBuffers, switches: NDArray[np.int64], noise: FloatArray | None,
+        start: float, steps: int, radius: float, cap: float, seek: bool, calm_from: int,
+        precise: bool, every: int, record: FloatArray,
+    ) -> None:  # fmt: skip
+        """Integrate lanes: to the tolerance of the loop, or in its steps until ``calm_from``."""
+        x0, live, lanes, numbers = part.states, part.live, part.lanes, self.numbers
+        given = part.quiet if noise is None else noise
+        plant, belief, limits = numbers.plant, numbers.belief, numbers.limits
+        if precise:
+            look = self._look
+            follow()(
+                look.look, look.decide, part.count, x0, live, lanes, switches, plant, belief,
+                limits, given, start, self.step, steps, self.zoh_steps,
+                self.objective.terminal_radius, radius, self.escape, cap, self.rtol, every, record,
+                part.out,
+            )  # fmt: skip
+        else:
+            self._kernels.rollout(
+                x0, live, lanes, switches, plant, belief, limits, given, start, self.step, steps,
+                max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
+                every, record, part.out,
+            )  # fmt: skip
 
     def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
         """Add what noise costs near the target to the costs of motions, part of their time."""
@@ -423,6 +462,7 @@ class ClosedLoop:
         cap: float = math.inf,
         stable_only: bool = False,
         seek: bool = False,
+        precise: bool = False,
     ) -> Batch:
         """Roll out a batch: many surfaces or plans, many initial states, or both.
 
@@ -448,6 +488,8 @@ class ClosedLoop:
             loops with a linear model, see :attr:`linear_end`.
         seek
             Also find where the motion comes closest to the target.
+        precise
+            Integrate each to ``rtol``, as :meth:`simulate` does; of an ensemble none.
         """
         self._check_duration(duration)
         plans = _plans(surfaces)
@@ -502,7 +544,13 @@ class ClosedLoop:
             cap=cap,
             stable_only=stable_only,
             seek=seek,
+            precise=precise and self._adapts,
         )
+
+    @property
+    def _adapts(self) -> bool:
+        """Whether motions are integrated to a tolerance where that is asked for."""
+        return self.rtol > 0 and self.reaching.switching != "sign" and self.ensemble is None
 
     @checked
     def simulate(
@@ -575,6 +623,7 @@ class ClosedLoop:
             span,
             start=start,
             terminal=terminal,
+            precise=self._adapts,
             every=every,
             record=record,
             noise=noise,
