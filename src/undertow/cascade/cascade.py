@@ -458,7 +458,7 @@ class Cascade:
                 continue
             plan, horizon = proposal.required(here).plan, self.objective.horizon
             assert plan is not None  # required
-            cost = float(about.batch(x, plan, duration=horizon).score(horizon)[0])
+            cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
             if loop is not whole:  # every plausible plant lives to see the next decision
