@@ -662,6 +662,15 @@ class ClosedLoop:
         surface, law = plan.at(end)
         gains = (law or self.reaching).vector(self.mechanism.m)
         buffers = RolloutBuffers(self, 1, 1).fill(batch.x, surface.vector, gains)
+        if self._adapts:
+            n, m, numbers = self.mechanism.n, self.mechanism.m, self.numbers
+            u, seen, rates = np.zeros(m), np.ones(batch.path.shape[1] + 2 * m + 2), np.empty(2 * n + 1)
+            x = np.append(batch.x[0], batch.cost[0])
+            self._look.look(
+                start + end, x, buffers.lanes[0, 0], numbers.plant, numbers.belief, numbers.limits,
+                u, seen, rates,
+            )  # fmt: skip
+            return np.concatenate([x[:-1], u, seen[:m], x[-1:], seen[2 * m : 2 * m + 1]])
         record = self._record(buffers, 1)
         self.roll_out(
             buffers, (0.0,), self.step, start=start + end, terminal=0.0, every=1, record=record
@@ -681,9 +690,7 @@ class ClosedLoop:
             last = lines[0].copy()
         last[: 2 * n], last[2 * n + 2 * m] = batch.x[0], batch.cost[0]
         if len(rows) == 0:
-            rows = record[:1] if len(record) else last[None]
-            if end == 0.0:
-                rows[0, : 2 * n] = batch.x[0]
+            rows = last[None].copy()
         rows = np.vstack([rows, last])
         t = np.append(times[: len(rows) - 1], end)
         x, u, s, cost, margin = np.split(
