@@ -131,7 +131,7 @@ def observed_order(steps: FloatArray, errors: FloatArray) -> float:
 
 
 def interpreted(loop: ut.ClosedLoop) -> ut.ClosedLoop:
-    """The loop in fixed steps, its generated kernel run by Python: nothing compiled, for short ones."""
+    """The loop in fixed steps, its generated kernel run by Python: nothing is compiled."""
     loop = replace(loop, rtol=0.0)
     vars(loop)["_kernels"] = SimpleNamespace(rollout=loop._kernels.rollout.py_func)
     return loop

@@ -35,7 +35,7 @@ from undertow.cascade.simulation import (
     simulate_piece,
 )
 from undertow.cascade.targets import LoopsAbout, legs_of
-from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event, Trajectory, simulate_along
+from undertow.closed_loop import INADMISSIBLE, RTOL, ClosedLoop, Event, Trajectory, simulate_along
 from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import (
     Control,
@@ -123,7 +123,7 @@ class Cascade:
     first
         First surface, checked; designed by itself by default.
     step, zoh_steps
-        Runge-Kutta step of the predictions, s, and steps per sample of the inner loop
+        Runge-Kutta step of the search's rollouts, s, and steps per sample of the inner loop
         (0: continuous), as for :class:`undertow.ClosedLoop`.
     freedom
         What may be chosen besides the paper's surface parameters: reaching gains, a
@@ -153,6 +153,9 @@ class Cascade:
         Of the error of the estimated state at the target, (2n, 2n), SI units: predictions count the
         cost of the input that it becomes near the target, see :class:`undertow.ClosedLoop`.
         ``None``: states are exact.
+    rtol
+        Relative tolerance of simulated motions, and of what the gate predicts with a belief that is
+        exact; 0: steps of ``step``.
 
     Raises
     ------
@@ -186,6 +189,7 @@ class Cascade:
     planner: Planner | None = None
     belief: Belief | Literal["usual", "exact"] = "usual"
     covariance: FloatArray | None = None
+    rtol: float = RTOL
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
@@ -262,6 +266,7 @@ class Cascade:
             zoh_steps=self.zoh_steps,
             ensemble=None if belief is None else belief.ensemble(belief.prior),
             covariance=self.covariance,
+            rtol=self.rtol,
         )
 
     @checked

@@ -5,7 +5,9 @@ that moves) are separate arguments everywhere; by default they are the same.
 
 Rollouts are read from buffers and written there (:mod:`undertow.closed_loop.buffers`).  They go in
 small Runge-Kutta steps until the law is in its boundary layer and then, where the loop has a
-linear model, in large ones (:mod:`undertow.closed_loop.exponential_integrator`).
+linear model, in large ones (:mod:`undertow.closed_loop.exponential_integrator`).  Motions that
+are shown or that decide are integrated to a tolerance, see
+:mod:`undertow.closed_loop.adaptive_integrator`.
 """
 
 from __future__ import annotations
@@ -251,6 +253,8 @@ class ClosedLoop:
         The equations stay, and so do the kernels: nothing is compiled or looked up again.
         """
         end = None
+        if self._adapts:
+            assert self._look is not None  # found once, for all copies
         if self.plant is None and (self.ensemble is None) == (ensemble is None):
             end = self.linear_end and self.linear_end.believing(mechanism, ensemble)
         other = self._changed({"numbers", "linear_end"}, mechanism=mechanism, ensemble=ensemble)
@@ -299,7 +303,6 @@ class ClosedLoop:
         cap: float = math.inf,
         stable_only: bool = False,
         seek: bool = False,
-        precise: bool = False,
         every: int = 0,
         record: FloatArray = NOTHING,
         noise: FloatArray | None = None,
@@ -314,7 +317,7 @@ class ClosedLoop:
             States, surfaces and laws; what is returned is a view of them.
         switch_times, duration
             When surfaces take over, and the length, s.
-        start, terminal, cap, stable_only, seek, precise
+        start, terminal, cap, stable_only, seek
             As for :meth:`batch` and :meth:`simulate`.
         every, record
             Where every so many steps leave a row, (N, rows, 2n + 2m + 2); 0: nowhere.
@@ -347,7 +350,7 @@ class ClosedLoop:
         numbers, end = self.numbers, self.linear_end
         radius = self.objective.terminal_radius if terminal is None else terminal
         # Large steps see no closest approach, and leave nothing to record.
-        large = self.takes_large_steps and not (every or seek or precise)
+        large = self.takes_large_steps and not every and not seek
         part, calm_from = buffers, 0 if large else steps
         noisy = self.covariance is not None and end is not None and end.counts_cost
         where: NDArray[np.intp] | slice = slice(buffers.count)
@@ -361,9 +364,11 @@ class ClosedLoop:
                 prepared = self._linearised(part)
             if prepared is not None and stable_only:
                 live *= prepared.stable
-            self._integrate(
-                part, switches, noise, start, steps, radius, cap, seek, calm_from, precise, every,
-                record,
+            self._kernels.rollout(
+                part.states, live, part.lanes, switches, numbers.plant, numbers.belief,
+                numbers.limits, part.quiet if noise is None else noise, start, self.step, steps,
+                max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
+                every, record, out,
             )  # fmt: skip
             if goes_on and prepared is not None and end is not None:
                 self._kernels.etd_integrate(
@@ -386,29 +391,31 @@ class ClosedLoop:
             calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
             part, where = part.part(again), np.arange(buffers.count)[where][again]
 
-    def _integrate(
-        self, part: RolloutBuffers, switches: NDArray[np.int64], noise: FloatArray | None,
-        start: float, steps: int, radius: float, cap: float, seek: bool, calm_from: int,
-        precise: bool, every: int, record: FloatArray,
-    ) -> None:  # fmt: skip
-        """Integrate lanes: to the tolerance of the loop, or in its steps until ``calm_from``."""
-        x0, live, lanes, numbers = part.states, part.live, part.lanes, self.numbers
-        given = part.quiet if noise is None else noise
-        plant, belief, limits = numbers.plant, numbers.belief, numbers.limits
-        if precise:
-            look = self._look
-            follow()(
-                look.look, look.decide, part.count, x0, live, lanes, switches, plant, belief,
-                limits, given, start, self.step, steps, self.zoh_steps,
-                self.objective.terminal_radius, radius, self.escape, cap, self.rtol, every, record,
-                part.out,
-            )  # fmt: skip
-        else:
-            self._kernels.rollout(
-                x0, live, lanes, switches, plant, belief, limits, given, start, self.step, steps,
-                max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
-                every, record, part.out,
-            )  # fmt: skip
+    def _follow(
+        self, buffers: RolloutBuffers, switch_times: Sequence[float], duration: float, *,
+        start: float = 0.0, terminal: float | None = None, cap: float = math.inf,
+        stable_only: bool = False, every: int = 0, record: FloatArray = NOTHING,
+        noise: FloatArray | None = None,
+    ) -> Batch:  # fmt: skip
+        """Do what :meth:`roll_out` does to the tolerance of the loop, motion by motion."""
+        live, numbers, look = buffers.live, self.numbers, self._look
+        live.fill(1.0)
+        self._check_gains(buffers.lanes, live, stable_only)
+        noisy = self.covariance is not None and self.linear_end is not None
+        prepared = self._linearised(buffers) if stable_only or noisy else None
+        if prepared is not None and stable_only:
+            live *= prepared.stable
+        nu = self.objective.terminal_radius
+        follow()(
+            look.look, look.decide, buffers.count, buffers.states, live, buffers.lanes,
+            self._switch_steps(switch_times), numbers.plant, numbers.belief, numbers.limits,
+            buffers.quiet if noise is None else noise, start, self.step, self._steps(duration),
+            self.zoh_steps, nu, nu if terminal is None else terminal, self.escape, cap, self.rtol,
+            every, record, buffers.out,
+        )  # fmt: skip
+        if noisy and self.linear_end is not None and self.linear_end.counts_cost:
+            self._count_noise(buffers, start)
+        return buffers.batch(start)
 
     def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
         """Add what noise costs near the target to the costs of motions, part of their time."""
@@ -489,7 +496,8 @@ class ClosedLoop:
         seek
             Also find where the motion comes closest to the target.
         precise
-            Integrate each to ``rtol``, as :meth:`simulate` does; of an ensemble none.
+            Integrate each to ``rtol``, as :meth:`simulate` does; on an ensemble none is.  Not with
+            ``seek``.
         """
         self._check_duration(duration)
         plans = _plans(surfaces)
@@ -536,15 +544,21 @@ class ClosedLoop:
                 limit="equal numbers, or one of either",
                 remedy="Repeat the states or the surfaces",
             )
-        return self.roll_out(
+        if precise and seek:
+            raise InvalidInputError(
+                "batch of rollouts",
+                value="precise=True and seek=True",
+                limit="one of them",
+                remedy="Look for the closest approach in the steps of the loop",
+            )
+        precise = precise and self._adapts
+        return (self._follow if precise else partial(self.roll_out, seek=seek))(
             RolloutBuffers(self, count, len(switch_times)).fill(states, vectors, reaching),
             switch_times,
             self.objective.horizon if duration is None else duration,
             terminal=terminal,
             cap=cap,
             stable_only=stable_only,
-            seek=seek,
-            precise=precise and self._adapts,
         )
 
     @property
@@ -617,13 +631,12 @@ class ClosedLoop:
         span = self.objective.horizon if duration is None else duration
         buffers = RolloutBuffers(self, 1, len(plan.times))
         record = self._record(buffers, -(-self._steps(span) // every))
-        batch = self.roll_out(
+        batch = (self._follow if self._adapts else self.roll_out)(
             buffers.fill(x0, plan.vectors, plan.gains(self.reaching)),
             plan.times,
             span,
             start=start,
             terminal=terminal,
-            precise=self._adapts,
             every=every,
             record=record,
             noise=noise,
@@ -663,9 +676,8 @@ class ClosedLoop:
         gains = (law or self.reaching).vector(self.mechanism.m)
         buffers = RolloutBuffers(self, 1, 1).fill(batch.x, surface.vector, gains)
         if self._adapts:
-            n, m, numbers = self.mechanism.n, self.mechanism.m, self.numbers
-            u, seen, rates = np.zeros(m), np.ones(batch.path.shape[1] + 2 * m + 2), np.empty(2 * n + 1)
-            x = np.append(batch.x[0], batch.cost[0])
+            m, numbers, x = self.mechanism.m, self.numbers, np.append(batch.x[0], batch.cost[0])
+            u, seen, rates = np.zeros(m), np.ones(2 * m + 2 + batch.path.shape[1]), np.empty(len(x))
             self._look.look(
                 start + end, x, buffers.lanes[0, 0], numbers.plant, numbers.belief, numbers.limits,
                 u, seen, rates,
