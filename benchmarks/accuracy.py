@@ -94,26 +94,32 @@ class Reference:
         assert not any(rig.disturbance_bounds)  # the gains (13) are η
         self.case, self.n, self.m = case, rig.n, rig.m
         self.law = reaching or ut.ReachingLaw()
+        self._last: tuple[object, Point] | None = None
         self.limit, values = rig.input_limits, rig.substitution
         self.M, self.f, self.B = (
             sp.lambdify(rig.x, sp.Matrix(matrix).subs(values).tolist(), "math", cse=True)
             for matrix in (rig.mass_matrix, rig.force, rig.input_matrix)
         )
+        M = np.array(self.M(*np.zeros(2 * rig.n)))
+        self.coupling = np.linalg.solve(M[rig.m :, rig.m :], M[rig.m :, : rig.m])
         problem = case.objective.on(rig)
         self.stage, self.path = (
             sp.lambdify([*rig.x, *rig.u], sp.sympify(formula).subs(values), "math")
             for formula in (problem.stage_cost(rig), sp.Tuple(*problem.path_margins(rig)))
         )
 
-    def gamma(self, M: FloatArray, surface: ut.Surface) -> FloatArray:
-        """Return Γ = α_a − α_u M_uu⁻¹ M_auᵀ, (m, m)."""
-        m = self.m
-        return surface.alpha_a - surface.alpha_u @ np.linalg.solve(M[m:, m:], M[m:, :m])
-
     def evaluate(
         self, x: FloatArray, surface: ut.Surface, law: FloatArray, modes: tuple[int, ...]
     ) -> Point:
         """Evaluate plant and law at (x, cost); modes as of :meth:`modes`."""
+        key = x.tobytes(), surface, modes
+        if self._last is None or self._last[0] != key:  # every event asks for the same
+            self._last = key, self._evaluated(x, surface, law, modes)
+        return self._last[1]
+
+    def _evaluated(
+        self, x: FloatArray, surface: ut.Surface, law: FloatArray, modes: tuple[int, ...]
+    ) -> Point:
         n, m, state = self.n, self.m, x[:-1]
         M, f, B = (np.array(g(*state)) for g in (self.M, self.f, self.B))
         f, (eta, layer) = f[:, 0], np.split(law, 2)
@@ -122,17 +128,18 @@ class Reference:
         s = s + surface.alpha_u @ v_u + surface.lambda_u @ q_u
         into, beyond = s / layer, np.array(modes[:m], dtype=float)
         push = eta * np.where(beyond != 0, beyond, into)
-        gamma, drift = self.gamma(M, surface), np.linalg.solve(M[m:, m:], f[m:])
+        X, drift = np.split(np.linalg.solve(M[m:, m:], np.c_[M[m:, :m], f[m:]]), [m], axis=1)
+        gamma, drift = surface.alpha_a - surface.alpha_u @ X, drift[:, 0]
         drive = surface.alpha_u @ drift + surface.lambda_a @ v_a + surface.lambda_u @ v_u + push
         wanted = -np.linalg.solve(gamma, drive)
-        inertia = M[:m, :m] - M[:m, m:] @ np.linalg.solve(M[m:, m:], M[m:, :m])
+        inertia = M[:m, :m] - M[:m, m:] @ X
         demand = np.linalg.solve(B, inertia @ wanted - f[:m] + M[:m, m:] @ drift)
         at = np.array(modes[m:], dtype=float)
         u = np.where(at != 0, at * self.limit, demand)
         accelerations = np.linalg.solve(M, f + np.concatenate([B @ u, np.zeros(n - m)]))
         rates = np.array([*state[n:], *accelerations, self.stage(*state, *u)])
-        origin = np.array(self.M(*np.zeros(2 * n)))
-        singular = np.linalg.det(gamma) / np.linalg.det(self.gamma(origin, surface))
+        at_target = surface.alpha_a - surface.alpha_u @ self.coupling
+        singular = np.linalg.det(gamma) / np.linalg.det(at_target)
         return Point(rates, into, demand / self.limit, np.array([singular, *self.path(*state, *u)]))
 
     def modes(self, x: FloatArray, surface: ut.Surface, law: FloatArray) -> tuple[int, ...]:
