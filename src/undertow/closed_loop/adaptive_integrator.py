@@ -72,7 +72,7 @@ _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=T
 
 
 @_inlined
-def _marks(seen, radius, layers, limits, terminal, escape):  # type: ignore[no-untyped-def]
+def _marks(seen, least, radius, layers, limits, terminal, escape):  # type: ignore[no-untyped-def]
     """What holds at a state, a bit each: where it changes there is a corner, or the end."""
     held, bit, m = 0, 1, len(limits)
     for i in range(m):
@@ -80,19 +80,19 @@ def _marks(seen, radius, layers, limits, terminal, escape):  # type: ignore[no-u
         held += 2 * bit if seen[m + i] > limits[i] else 0
         held += 4 * bit if seen[m + i] < -limits[i] else 0
         bit *= 8
-    for i in range(2 * m, len(seen)):
-        held += 0 if seen[i] >= 0.0 else bit
+    for i in range(len(least)):
+        held += 0 if seen[2 * m + i] >= least[i] else bit
         bit *= 2
     return held + bit * ((1 if radius <= terminal else 0) + (0 if radius < escape else 2))
 
 
 @_inlined
-def _event(margins, cost, radius, terminal, escape, cap):  # type: ignore[no-untyped-def]
+def _event(margins, least, cost, radius, terminal, escape, cap):  # type: ignore[no-untyped-def]
     """The event that a state is; ``HORIZON`` while there is none."""
-    if not margins[0] >= 0.0:
+    if not margins[0] >= least[0]:
         return _SINGULAR
-    for margin in margins:
-        if not margin >= 0.0:
+    for i in range(1, len(margins)):
+        if not margins[i] >= least[i]:
             return _CONSTRAINT
     if not radius < escape:
         return _DIVERGED
@@ -170,7 +170,7 @@ def _dip(x, slopes, new, size, terminal, at):  # type: ignore[no-untyped-def]
 
 def _follow(  # type: ignore[no-untyped-def]
     look, decide, count, x0, live, lanes, switch, plant, belief, limits, noise, start, step, steps,
-    zoh_steps, nu, terminal, escape, cap, rtol, every, record, out,
+    zoh_steps, least, nu, terminal, escape, cap, rtol, every, record, out,
 ):  # fmt: skip
     """Integrate lanes one after the other; arguments and results are those of a rollout kernel."""
     size_x, m = x0.shape[1], len(limits)
@@ -221,8 +221,8 @@ def _follow(  # type: ignore[no-untyped-def]
                         clock = start + t + WHEN[i] * size
                         look(clock, new, lane, plant, belief, limits, u, seen, slopes[i])
                         if i == 0:
-                            held = _marks(seen, radius, layers, limits, terminal, escape)
-                            code = _event(margins, x[size_x], radius, terminal, escape, cap)
+                            held = _marks(seen, least, radius, layers, limits, terminal, escape)
+                            code = _event(margins, least, x[size_x], radius, terminal, escape, cap)
                             _keep_lowest(low, margins)
                     if fresh and code != _HORIZON:
                         break
@@ -233,7 +233,7 @@ def _follow(  # type: ignore[no-untyped-def]
                         usual = size
                         continue
                     outer = _distance(new)
-                    now = _marks(seen, outer, layers, limits, terminal, escape)
+                    now = _marks(seen, least, outer, layers, limits, terminal, escape)
                     if now != held:
                         beyond = size
                     elif beyond == math.inf:
@@ -246,7 +246,7 @@ def _follow(  # type: ignore[no-untyped-def]
                     if beyond < math.inf and size != beyond:
                         size = beyond
                         continue
-                    ends = _event(margins, new[size_x], outer, terminal, escape, cap)
+                    ends = _event(margins, least, new[size_x], outer, terminal, escape, cap)
                     _keep_lowest(low, margins)
                     broken, instant = math.inf, row
                     while instant * pace * step < t + size and broken == math.inf:
@@ -264,7 +264,7 @@ def _follow(  # type: ignore[no-untyped-def]
                         if into > 0.0:
                             _keep_lowest(low, margins)
                             for j in range(len(margins)):
-                                broken = broken if margins[j] >= 0.0 else into
+                                broken = broken if margins[j] >= least[j] else into
                         instant += 1
                     if beyond == math.inf and broken < math.inf:
                         beyond, size = broken, 0.5 * broken
@@ -295,14 +295,15 @@ def follow() -> Any:
     """Return the integrator, compiled for any mechanism: it calls what it is given.
 
     Its arguments are those of a rollout kernel, behind the mechanism's ``look`` and ``decide`` and
-    the number of lanes; ``zoh_steps`` is 0 for a continuous loop, and ``nu`` the objective's
+    the number of lanes; ``zoh_steps`` is 0 for a continuous loop, ``least`` the margins of (37), a
+    hard input limit and the path below which a motion has broken them, and ``nu`` the objective's
     terminal radius.
     """
     whole, real, look = numba.int64, numba.float64, numba.types.FunctionType(LOOK)
     table, block = numba.float64[:, ::1], numba.float64[:, :, ::1]
     signature = numba.void(
         look, look, whole, table, _ROW, block, numba.int64[::1], _ROW, _ROW, _ROW, block, real,
-        real, whole, whole, *[real] * 5, whole, block, table,
+        real, whole, whole, _ROW, *[real] * 5, whole, block, table,
     )  # fmt: skip
     return numba.njit(signature, cache=True, nogil=True, error_model="numpy")(_follow)
 

@@ -45,6 +45,10 @@ from undertow.objective import MinimumEnergy, Objective
 #: Relative tolerance of motions that are shown, and that decide.
 RTOL = 1e-9
 
+#: By how much of its margin at the target a constraint may be passed in such a motion: about what
+#: the steps of a search, which goes up to its bounds, place a motion wrongly by.
+ALLOWED = 1e-4
+
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
 
@@ -405,17 +409,30 @@ class ClosedLoop:
         prepared = self._linearised(buffers) if stable_only or noisy else None
         if prepared is not None and stable_only:
             live *= prepared.stable
-        nu = self.objective.terminal_radius
+        m, nu = self.mechanism.m, self.objective.terminal_radius
+        _, seen = self._looked(buffers.lanes[0, 0], np.zeros(2 * self.mechanism.n + 1), start)
+        least = -ALLOWED * np.maximum(np.nan_to_num(seen[2 * m :]), 0.0)
+        least[0] = 0.0  # beyond (37) there is no law
         follow()(
             look.look, look.decide, buffers.count, buffers.states, live, buffers.lanes,
             self._switch_steps(switch_times), numbers.plant, numbers.belief, numbers.limits,
             buffers.quiet if noise is None else noise, start, self.step, self._steps(duration),
-            self.zoh_steps, nu, nu if terminal is None else terminal, self.escape, cap, self.rtol,
-            every, record, buffers.out,
+            self.zoh_steps, least, nu, nu if terminal is None else terminal, self.escape, cap,
+            self.rtol, every, record, buffers.out,
         )  # fmt: skip
         if noisy and self.linear_end is not None and self.linear_end.counts_cost:
             self._count_noise(buffers, start)
         return buffers.batch(start)
+
+    def _looked(self, lane: FloatArray, x: FloatArray, t: float) -> tuple[FloatArray, FloatArray]:
+        """Return the inputs and what else is seen at a state with its cost, (2n + 1,)."""
+        m, numbers = self.mechanism.m, self.numbers
+        u, seen = np.zeros(m), np.ones(2 * m + 2 + len(self.objective.constraints))
+        for look in (self._look.decide, self._look.look):
+            look(
+                t, x, lane, numbers.plant, numbers.belief, numbers.limits, u, seen, np.empty(len(x))
+            )
+        return u, seen
 
     def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
         """Add what noise costs near the target to the costs of motions, part of their time."""
@@ -676,12 +693,8 @@ class ClosedLoop:
         gains = (law or self.reaching).vector(self.mechanism.m)
         buffers = RolloutBuffers(self, 1, 1).fill(batch.x, surface.vector, gains)
         if self._adapts:
-            m, numbers, x = self.mechanism.m, self.numbers, np.append(batch.x[0], batch.cost[0])
-            u, seen, rates = np.zeros(m), np.ones(2 * m + 2 + batch.path.shape[1]), np.empty(len(x))
-            self._look.look(
-                start + end, x, buffers.lanes[0, 0], numbers.plant, numbers.belief, numbers.limits,
-                u, seen, rates,
-            )  # fmt: skip
+            m, x = self.mechanism.m, np.append(batch.x[0], batch.cost[0])
+            u, seen = self._looked(buffers.lanes[0, 0], x, start + end)
             return np.concatenate([x[:-1], u, seen[:m], x[-1:], seen[2 * m : 2 * m + 1]])
         record = self._record(buffers, 1)
         self.roll_out(
