@@ -58,7 +58,7 @@ TAIL_RTOL = 2e-3
 RESOLVED = 1.0
 
 #: How much more a first plan may cost than the search found, as a factor, before it is searched for
-#: again in smaller steps; and how much smaller the last of them are.
+#: again in smaller steps; and how much smaller they are.
 AGREES, FINER = 1.01, 4
 
 #: How far positions may be off what the plan in use predicted for them before an admission says
@@ -501,9 +501,9 @@ class Cascade:
         """What the first plan is to be best on, one after the other; and in what steps, if fixed.
 
         Before anything has moved, what suits every plausible plant suits none of them well: the
-        estimate alone comes first, for a plan that the next decision replaces.  Where large steps
-        were too hopeful, small ones throughout follow; and smaller ones where the plan does not do
-        what it promised, integrated to the tolerance.
+        estimate alone comes first, for a plan that the next decision replaces.  Where its plan does
+        not do what it promised, small steps throughout follow: for one plant, which is integrated
+        to the tolerance, smaller ones than usual.
         """
         whole = self._loops(estimate)
         if self.planner is not None:
@@ -511,10 +511,12 @@ class Cascade:
         loops = [whole]
         if self.known is not None and estimate is not None:
             loops.insert(0, whole.believing(whole.mechanism, self.known.alone(estimate)))
-        tries = [(loop, fixed) for loop in loops for fixed in (None, loop)]
+        small = whole
         if whole.ensemble is None and not self.zoh_steps:
-            tries.append((whole, whole.with_steps(self.step / FINER, 0.0)))
-        return tries
+            small = whole.with_steps(self.step / FINER, 0.0)
+        return [
+            (loop, fixed) for loop in loops for fixed in (None, small if loop is whole else loop)
+        ]
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
