@@ -143,9 +143,9 @@ def _error(x, slopes, new, size, rtol, nu):  # type: ignore[no-untyped-def]
 
 @_inlined
 def _dip(x, slopes, new, size, terminal, at):  # type: ignore[no-untyped-def]
-    """After what part of a step the motion is nearest to the target; infinity for its ends.
+    """After what part of a step the motion is nearest to the target, where it is arrived then.
 
-    And where that is outside of the terminal set.
+    Infinity where it is nearest at an end of the step, or outside of the terminal set.
     """
     falling, rising = 0.0, 0.0
     for j in range(len(x) - 1):
