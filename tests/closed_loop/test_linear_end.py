@@ -337,7 +337,7 @@ def test_the_clock_at_the_start_does_not_matter_to_what_is_autonomous(rig: ut.Me
 
 def test_the_closest_approach_is_that_of_the_recorded_motion(rig: ut.Mechanism) -> None:
     """Smallest ‖x‖, when and where: no larger than any sample, and on the motion."""
-    loop = ClosedLoop(rig, ut.MinimumTime())
+    loop = ClosedLoop(rig, ut.MinimumTime(), rtol=0.0)
     surface = ut.Surface(-1, -3.6, 1.38, 9.07)
     x = rig.state(phi=ut.deg(35))
     batch = loop.batch(x, surface, terminal=0.0, duration=2.0, seek=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,7 +107,7 @@ def test_runge_kutta_converges_with_order_four(rig: ut.Mechanism, quick: ut.Surf
     reaching = ut.ReachingLaw(layer=1.0, switching="tanh")
 
     def end(step: float) -> FloatArray:
-        loop = ut.ClosedLoop(free, reaching=reaching, step=step)
+        loop = ut.ClosedLoop(free, reaching=reaching, step=step, rtol=0.0)
         x0 = free.state(phi=0.4, phi_dot=-0.5)
         return np.asarray(loop.simulate(x0, quick, duration=0.512, terminal=0.0).x[-1])
 
@@ -124,7 +125,8 @@ def test_uncontrolled_rollouts_conserve_energy_to_order_four(rig: ut.Mechanism) 
     x0 = free.state(phi=0.6, theta_dot=2.0, phi_dot=1.0)
     steps, drifts = np.array([0.008, 0.004, 0.002]), []
     for h in steps:
-        run = ut.ClosedLoop(free, step=h).simulate(x0, alone, duration=2.0, terminal=0.0)
+        loop = ut.ClosedLoop(free, step=h, rtol=0.0)
+        run = loop.simulate(x0, alone, duration=2.0, terminal=0.0)
         assert run.event == ut.Event.HORIZON
         assert np.abs(run["phi"]).max() > 3.0  # it swings right through
         energy = free.energy(run.x)
@@ -164,18 +166,21 @@ def test_a_batch_broadcasts_states_against_surfaces(
     assert_same(one_surface, loop.batch(starts, [surfaces[0]] * 37, duration=1.0))
 
 
+@pytest.mark.parametrize("rtol", [0.0, 1e-9])
 def test_simulate_and_batch_are_one_rollout(
-    loop: ut.ClosedLoop, starts: FloatArray, surfaces: list[ut.Surface]
+    loop: ut.ClosedLoop, starts: FloatArray, surfaces: list[ut.Surface], rtol: float
 ) -> None:
+    loop = replace(loop, rtol=rtol)
     for i in range(4):
         run = loop.simulate(starts[i], surfaces[i], duration=6.0)
-        batch = loop.batch(starts[i], [surfaces[i]], duration=6.0)
+        batch = loop.batch(starts[i], [surfaces[i]], duration=6.0, precise=True)
         assert run.cost == batch.cost[0]
         assert run.time == batch.time[0]
         assert run.event == batch.event[0]
         np.testing.assert_array_equal(run.x[-1], batch.x[0])
         np.testing.assert_array_equal(run.x[0], starts[i])
-        assert run.margin[:-1].min() == batch.singular[0]
+        # A margin is looked at where steps end, and rows lie elsewhere.
+        assert run.margin[:-1].min() == pytest.approx(batch.singular[0], rel=1e-3 if rtol else 0)
 
 
 def test_each_rollout_may_have_its_own_reaching_law(
@@ -195,7 +200,7 @@ def test_a_schedule_equals_its_pieces(
     loop: ut.ClosedLoop, starts: FloatArray, surfaces: list[ut.Surface]
 ) -> None:
     """Switching inside one rollout and starting anew at each switch give the same bits of x."""
-    times = (0.0, 0.1, 0.25, 0.3)
+    loop, times = replace(loop, rtol=0.0), (0.0, 0.1, 0.25, 0.3)
     whole = loop.simulate(starts[0], surfaces[:4], switch_times=times, duration=0.5, terminal=0.0)
     x, pieces = starts[0], []
     for surface, begin, end in zip(surfaces[:4], times, (*times[1:], 0.5), strict=True):
@@ -234,7 +239,7 @@ def test_sampled_loops_equal_a_plain_reference(
     rig: ut.Mechanism, wrong_belief: ut.Mechanism, quick: ut.Surface, truthful: bool
 ) -> None:
     """Law on the believed model and the measured state, held; plant on its own equations."""
-    loop = ut.ClosedLoop(rig, plant=None if truthful else wrong_belief, zoh_steps=4)
+    loop = ut.ClosedLoop(rig, plant=None if truthful else wrong_belief, zoh_steps=4, rtol=0.0)
     loop = loop if truthful else interpreted(loop)
     x0, samples = rig.state(phi=0.4, theta=0.1), 10
     noise = np.random.default_rng(6).normal(0, 2e-3, (samples, 4))
@@ -296,7 +301,7 @@ def test_a_plant_like_the_belief_changes_nothing_but_rounding(
 ) -> None:
     right = wrong_belief.with_parameters(m=0.125, d_e=0.025, push=0.0)
     x0 = rig.state(phi=0.4)
-    one = ut.ClosedLoop(rig, zoh_steps=4).simulate(x0, quick, duration=0.08)
+    one = ut.ClosedLoop(rig, zoh_steps=4, rtol=0.0).simulate(x0, quick, duration=0.08)
     twin = interpreted(ut.ClosedLoop(rig, plant=right, zoh_steps=4))
     two = twin.simulate(x0, quick, duration=0.08)
     np.testing.assert_allclose(one.x, two.x, atol=1e-12)
@@ -456,7 +461,7 @@ def test_constraints_end_a_motion_and_margins_are_the_smallest_met(
     rig: ut.Mechanism, watched: ut.Objective, quick: ut.Surface
 ) -> None:
     """(25) and (38): signed margins along the way, and the first break ends the rollout."""
-    loop = ut.ClosedLoop(rig, watched)
+    loop = ut.ClosedLoop(rig, watched, rtol=0.0)
     law = ut.SlidingModeLaw(rig, quick)
 
     def margins(run: ut.Trajectory) -> FloatArray:
@@ -618,7 +623,7 @@ def test_the_last_input_of_a_sampled_loop_is_the_one_held(
     """The last row is of the last state with the input, s and margin of the sample before."""
     loop, x0 = ut.ClosedLoop(rig, zoh_steps=4), rig.state(phi=0.3)
     run = loop.simulate(x0, quick, duration=0.05, terminal=0.0, every=every, start=2.0)
-    batch = loop.batch(x0, quick, duration=0.05, terminal=0.0)
+    batch = loop.batch(x0, quick, duration=0.05, terminal=0.0, precise=True)
     np.testing.assert_array_equal(run.x[-1], batch.x[0])
     assert run.cost == batch.cost[0]
     for column in (run.u, run.s, run.margin):
@@ -661,8 +666,8 @@ def test_pieces_of_a_motion_are_joined_at_their_ends(
         x = pieces[-1].x[-1]
     joined = ut.Trajectory.join(pieces)
     np.testing.assert_allclose(joined.t, whole.t, atol=1e-12)
-    np.testing.assert_array_equal(joined.x, whole.x)
-    np.testing.assert_allclose(joined.accumulated_cost, whole.accumulated_cost, rtol=1e-12)
+    np.testing.assert_allclose(joined.x, whole.x, atol=1e-7)  # steps begin anew with each piece
+    np.testing.assert_allclose(joined.accumulated_cost, whole.accumulated_cost, rtol=1e-7)
     assert (joined.event, joined.cost_unit) == (pieces[-1].event, whole.cost_unit)
     assert ut.Trajectory.join(pieces[:1]).time == pieces[0].time
     with pytest.raises(InvalidInputError, match="number of pieces"):

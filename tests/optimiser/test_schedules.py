@@ -90,7 +90,7 @@ def test_what_is_left_of_a_schedule_is_a_schedule() -> None:
         assert min(abs(t - 0.1 * k) for t in plan.times) < 1e-9
     assert run.reached
     assert np.min(run.lemma3_slack) > -1e-9
-    assert run.cost <= run.updates[0].proposal.cost + 1e-9
+    assert run.cost <= run.updates[0].predicted + 1e-9
 
 
 def test_a_push_is_followed_by_a_new_schedule() -> None:

@@ -53,7 +53,7 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
     horizon
         Longest prediction, s.
     """
-    pair = loop.batch(x, [old, new], duration=horizon)
+    pair = loop.batch(x, [old, new], duration=horizon, precise=True)
     old_score, new_cost = pair.score(horizon)
     old_cost = float(old_score) if old_score < INADMISSIBLE else math.inf
     stability = float(stability_margin(loop.mechanism, new.surfaces[-1]))

@@ -197,7 +197,7 @@ class DelayGate:
 
 def _refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: str) -> Admission:
     """Return a refusal with the cost of the plan that stays."""
-    score = float(loop.batch(x, old, duration=horizon).score(horizon)[0])
+    score = float(loop.batch(x, old, duration=horizon, precise=True).score(horizon)[0])
     return Admission(False, why, score if score < INADMISSIBLE else math.inf)
 
 

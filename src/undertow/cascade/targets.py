@@ -120,8 +120,8 @@ class LoopsAbout:
             ensemble = Ensemble(plant, values, ensemble.risk, ensemble.weights)
         moved = None if loop.plant is None else self._mechanism(loop.plant, positions)
         key = (
-            loop.reaching, loop.step, loop.zoh_steps, loop.tail_rtol, loop.escape, loop.plant,
-            loop.ensemble is None,
+            loop.reaching, loop.step, loop.zoh_steps, loop.rtol, loop.tail_rtol, loop.escape,
+            loop.plant, loop.ensemble is None,
         )  # fmt: skip
         if moved is not None or key not in self._prototypes:
             made = replace(

@@ -1,20 +1,22 @@
 """Mechanism and law integrated: the kernel, many runs at once, and what one run was.
 
 :mod:`.kernel` compiles what :mod:`.kernel_source` writes: small Runge-Kutta steps, and the large
-ones of :mod:`.exponential_integrator`, with the linear model of :mod:`.linear_model`.
+ones of :mod:`.exponential_integrator`, with the linear model of :mod:`.linear_model`.  Motions that
+are shown or that decide are integrated to a tolerance, by :mod:`.adaptive_integrator`.
 """
 
 from undertow.closed_loop.along_reference import simulate_along
 from undertow.closed_loop.buffers import RolloutBuffers
 from undertow.closed_loop.ensemble import Ensemble, Risk
 from undertow.closed_loop.kernel import compile_loop
-from undertow.closed_loop.rollout import ClosedLoop
+from undertow.closed_loop.rollout import RTOL, ClosedLoop
 from undertow.closed_loop.trajectory import INADMISSIBLE, UNSTABLE, Event, Trajectory
 from undertow.closed_loop.work_array import LANES
 
 __all__ = [
     "INADMISSIBLE",
     "LANES",
+    "RTOL",
     "UNSTABLE",
     "ClosedLoop",
     "Ensemble",

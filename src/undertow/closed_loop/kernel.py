@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import sympy as sp
 
+from undertow.closed_loop.adaptive_integrator import look_source
 from undertow.closed_loop.kernel_source import kernel_source
 from undertow.closed_loop.work_array import LANES, LoopGraph
 from undertow.law import LawSymbols, Switching, build_law_graph
@@ -88,6 +90,35 @@ def compile_loop(
     A module with the functions ``rollout`` and, for continuous loops, ``etd_integrate``; each is
     compiled when it is first called.
     """
+    given = belief, plant, objective, switching, sampled, many_plants
+    return _generated("loop", kernel_source, *given)
+
+
+@lru_cache(maxsize=64)
+def compile_look(
+    belief: Mechanism,
+    plant: Mechanism | None,
+    objective: Objective,
+    switching: Switching,
+    sampled: bool,
+) -> Any:
+    """Return a closed loop as :func:`undertow.closed_loop.adaptive_integrator.follow` wants it.
+
+    A module with the functions ``look`` and ``decide``, compiled.
+    """
+    return _generated("look", look_source, belief, plant, objective, switching, sampled, False)
+
+
+def _generated(
+    kind: str,
+    source: Callable[..., str],
+    belief: Mechanism,
+    plant: Mechanism | None,
+    objective: Objective,
+    switching: Switching,
+    sampled: bool,
+    many_plants: bool,
+) -> Any:
     truth = belief if plant is None else plant
     key = content_key(
         belief.structure,
@@ -101,6 +132,6 @@ def compile_loop(
     def write() -> str:
         program = build_loop_graph(belief, plant, objective, switching, many_plants=many_plants)
         header = f"Closed loop of {belief.name}, {objective.name}; generated, do not edit."
-        return kernel_source(program, sampled=sampled, header=header)
+        return source(program, sampled=sampled, header=header)
 
-    return generated("loop", belief.name, key, write)
+    return generated(kind, belief.name, key, write)

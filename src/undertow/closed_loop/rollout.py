@@ -5,7 +5,9 @@ that moves) are separate arguments everywhere; by default they are the same.
 
 Rollouts are read from buffers and written there (:mod:`undertow.closed_loop.buffers`).  They go in
 small Runge-Kutta steps until the law is in its boundary layer and then, where the loop has a
-linear model, in large ones (:mod:`undertow.closed_loop.exponential_integrator`).
+linear model, in large ones (:mod:`undertow.closed_loop.exponential_integrator`).  Motions that
+are shown or that decide are integrated to a tolerance, see
+:mod:`undertow.closed_loop.adaptive_integrator`.
 """
 
 from __future__ import annotations
@@ -20,10 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base import InvalidInputError, at_least, check_fields, checked, floats, positive
+from undertow.closed_loop.adaptive_integrator import follow
 from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
 from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
 from undertow.closed_loop.exponential_integrator import GIVEN_BACK
-from undertow.closed_loop.kernel import compile_loop
+from undertow.closed_loop.kernel import compile_look, compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory
 from undertow.closed_loop.work_array import LANES
@@ -38,6 +41,13 @@ from undertow.law import (
 )
 from undertow.models import FloatArray, Mechanism, has_linear_model
 from undertow.objective import MinimumEnergy, Objective
+
+#: Relative tolerance of motions that are shown, and that decide.
+RTOL = 1e-9
+
+#: By how much of its margin at the target a constraint may be passed in such a motion: about what
+#: the steps of a search, which goes up to its bounds, place a motion wrongly by.
+ALLOWED = 1e-4
 
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
@@ -83,12 +93,17 @@ class ClosedLoop:
     plant
         The truth.  The belief itself by default; must have as many coordinates and inputs.
     step
-        Runge-Kutta step, s.
+        Runge-Kutta step of batches, and between the rows of a recorded motion, s.
     zoh_steps
         Sampled inner loop: the law is evaluated every ``zoh_steps`` steps and held.
         0: continuous law, evaluated in every Runge-Kutta stage.
     escape
         ‖x‖₂ beyond which a motion counts as diverged.
+    rtol
+        Relative tolerance of motions that are integrated one by one, see
+        :mod:`undertow.closed_loop.adaptive_integrator`: those of :meth:`simulate`, and batches that
+        ask for it.  0: steps of ``step``, as batches take them; so with ``switching="sign"``, whose
+        chatter is that of the steps.
     tail_rtol
         Relative tolerance of the large steps that a batch takes once the law is in its boundary
         layer, see :mod:`undertow.closed_loop.exponential_integrator`; 0: small steps to the end.
@@ -119,6 +134,7 @@ class ClosedLoop:
     step: float = 0.002
     zoh_steps: int = 0
     escape: float = 200.0
+    rtol: float = RTOL
     tail_rtol: float = 0.0
     ensemble: Ensemble | None = None
     covariance: FloatArray | None = None
@@ -130,6 +146,7 @@ class ClosedLoop:
         for name, remedy in (
             ("escape", "Leave it out for the usual value"),
             ("tail_rtol", "Leave it out for the usual value"),
+            ("rtol", "0 is steps of one length; leave it out for the usual value"),
             ("zoh_steps", "0 is the continuous law"),
         ):
             at_least(f"{name} of a closed loop", getattr(self, name), 0, remedy)
@@ -194,6 +211,11 @@ class ClosedLoop:
         )
 
     @cached_property
+    def _look(self) -> Any:
+        switching, sampled = self.reaching.switching, self.zoh_steps > 0
+        return compile_look(self.mechanism, self._given, self.objective, switching, sampled)
+
+    @cached_property
     def numbers(self) -> LoopNumbers:
         """The numbers that the kernels read."""
         belief, truth = self.mechanism, self.truth
@@ -235,6 +257,8 @@ class ClosedLoop:
         The equations stay, and so do the kernels: nothing is compiled or looked up again.
         """
         end = None
+        if self._adapts:
+            assert self._look is not None  # found once, for all copies
         if self.plant is None and (self.ensemble is None) == (ensemble is None):
             end = self.linear_end and self.linear_end.believing(mechanism, ensemble)
         other = self._changed({"numbers", "linear_end"}, mechanism=mechanism, ensemble=ensemble)
@@ -371,6 +395,45 @@ class ClosedLoop:
             calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
             part, where = part.part(again), np.arange(buffers.count)[where][again]
 
+    def _follow(
+        self, buffers: RolloutBuffers, switch_times: Sequence[float], duration: float, *,
+        start: float = 0.0, terminal: float | None = None, cap: float = math.inf,
+        stable_only: bool = False, every: int = 0, record: FloatArray = NOTHING,
+        noise: FloatArray | None = None,
+    ) -> Batch:  # fmt: skip
+        """Do what :meth:`roll_out` does to the tolerance of the loop, motion by motion."""
+        live, numbers, look = buffers.live, self.numbers, self._look
+        live.fill(1.0)
+        self._check_gains(buffers.lanes, live, stable_only)
+        noisy = self.covariance is not None and self.linear_end is not None
+        prepared = self._linearised(buffers) if stable_only or noisy else None
+        if prepared is not None and stable_only:
+            live *= prepared.stable
+        m, nu = self.mechanism.m, self.objective.terminal_radius
+        _, seen = self._looked(buffers.lanes[0, 0], np.zeros(2 * self.mechanism.n + 1), start)
+        least = -ALLOWED * np.maximum(np.nan_to_num(seen[2 * m :]), 0.0)
+        least[0] = 0.0  # beyond (37) there is no law
+        follow()(
+            look.look, look.decide, buffers.count, buffers.states, live, buffers.lanes,
+            self._switch_steps(switch_times), numbers.plant, numbers.belief, numbers.limits,
+            buffers.quiet if noise is None else noise, start, self.step, self._steps(duration),
+            self.zoh_steps, least, nu, nu if terminal is None else terminal, self.escape, cap,
+            self.rtol, every, record, buffers.out,
+        )  # fmt: skip
+        if noisy and self.linear_end is not None and self.linear_end.counts_cost:
+            self._count_noise(buffers, start)
+        return buffers.batch(start)
+
+    def _looked(self, lane: FloatArray, x: FloatArray, t: float) -> tuple[FloatArray, FloatArray]:
+        """Return the inputs and what else is seen at a state with its cost, (2n + 1,)."""
+        m, numbers = self.mechanism.m, self.numbers
+        u, seen = np.zeros(m), np.ones(2 * m + 2 + len(self.objective.constraints))
+        for look in (self._look.decide, self._look.look):
+            look(
+                t, x, lane, numbers.plant, numbers.belief, numbers.limits, u, seen, np.empty(len(x))
+            )
+        return u, seen
+
     def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
         """Add what noise costs near the target to the costs of motions, part of their time."""
         assert self.linear_end is not None
@@ -423,6 +486,7 @@ class ClosedLoop:
         cap: float = math.inf,
         stable_only: bool = False,
         seek: bool = False,
+        precise: bool = False,
     ) -> Batch:
         """Roll out a batch: many surfaces or plans, many initial states, or both.
 
@@ -448,6 +512,9 @@ class ClosedLoop:
             loops with a linear model, see :attr:`linear_end`.
         seek
             Also find where the motion comes closest to the target.
+        precise
+            Integrate each to ``rtol``, as :meth:`simulate` does; on an ensemble none is.  Not with
+            ``seek``.
         """
         self._check_duration(duration)
         plans = _plans(surfaces)
@@ -494,15 +561,27 @@ class ClosedLoop:
                 limit="equal numbers, or one of either",
                 remedy="Repeat the states or the surfaces",
             )
-        return self.roll_out(
+        if precise and seek:
+            raise InvalidInputError(
+                "batch of rollouts",
+                value="precise=True and seek=True",
+                limit="one of them",
+                remedy="Look for the closest approach in the steps of the loop",
+            )
+        precise = precise and self._adapts
+        return (self._follow if precise else partial(self.roll_out, seek=seek))(
             RolloutBuffers(self, count, len(switch_times)).fill(states, vectors, reaching),
             switch_times,
             self.objective.horizon if duration is None else duration,
             terminal=terminal,
             cap=cap,
             stable_only=stable_only,
-            seek=seek,
         )
+
+    @property
+    def _adapts(self) -> bool:
+        """Whether motions are integrated to a tolerance where that is asked for."""
+        return self.rtol > 0 and self.reaching.switching != "sign" and self.ensemble is None
 
     @checked
     def simulate(
@@ -569,7 +648,7 @@ class ClosedLoop:
         span = self.objective.horizon if duration is None else duration
         buffers = RolloutBuffers(self, 1, len(plan.times))
         record = self._record(buffers, -(-self._steps(span) // every))
-        batch = self.roll_out(
+        batch = (self._follow if self._adapts else self.roll_out)(
             buffers.fill(x0, plan.vectors, plan.gains(self.reaching)),
             plan.times,
             span,
@@ -613,6 +692,10 @@ class ClosedLoop:
         surface, law = plan.at(end)
         gains = (law or self.reaching).vector(self.mechanism.m)
         buffers = RolloutBuffers(self, 1, 1).fill(batch.x, surface.vector, gains)
+        if self._adapts:
+            m, x = self.mechanism.m, np.append(batch.x[0], batch.cost[0])
+            u, seen = self._looked(buffers.lanes[0, 0], x, start + end)
+            return np.concatenate([x[:-1], u, seen[:m], x[-1:], seen[2 * m : 2 * m + 1]])
         record = self._record(buffers, 1)
         self.roll_out(
             buffers, (0.0,), self.step, start=start + end, terminal=0.0, every=1, record=record
@@ -632,9 +715,7 @@ class ClosedLoop:
             last = lines[0].copy()
         last[: 2 * n], last[2 * n + 2 * m] = batch.x[0], batch.cost[0]
         if len(rows) == 0:
-            rows = record[:1] if len(record) else last[None]
-            if end == 0.0:
-                rows[0, : 2 * n] = batch.x[0]
+            rows = last[None].copy()
         rows = np.vstack([rows, last])
         t = np.append(times[: len(rows) - 1], end)
         x, u, s, cost, margin = np.split(

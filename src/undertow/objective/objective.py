@@ -123,7 +123,10 @@ class Constraint:
     taken only where all constraints are bounds of states, :func:`state_box` or declared travel, and
     only where they cannot come near a bound, nor as near as the small steps before them.  A motion
     stops at the first test that fails.  The state at its end, where it enters the terminal set or
-    the horizon is over, is tested no more.
+    the horizon is over, is tested no more.  What is integrated to a tolerance, ``ClosedLoop.rtol``
+    (simulated motions, and what the gate predicts with an exact belief), is tested where its steps
+    end and at the instants that are recorded, or 4 ms apart, and stops where w becomes larger than
+    1e-4 of what it is below 0 at the target: a search goes up to its bounds, by other steps.
 
     *What may happen in between.*  Where ẇ is Lipschitz, w exceeds its larger value at two
     neighbouring tests, h apart, by at most (h²/8) max |ẅ| (the error of linear interpolation).

@@ -200,7 +200,7 @@ def survey_one(
     candidates: list[Surface | Plan] = [cascade.optimiser.anchor]
     if run is not None:
         candidates.append(run.updates[0].plan)
-    costs = loop.batch(x0, candidates)
+    costs = loop.batch(x0, candidates, precise=True)
     reached = [
         float(cost) if ok else math.inf for cost, ok in zip(costs.cost, costs.reached, strict=True)
     ]

@@ -1,0 +1,203 @@
+"""Motions to a tolerance: beside SciPy on the plain formulas, with corners and ends located."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import undertow as ut
+from support import derivative, interpreted
+from undertow.base import InvalidInputError
+from undertow.closed_loop import Event
+from undertow.law import Plan
+from undertow.mechanisms import LIBRARY
+from undertow.objective import objective_for
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+
+#: One that swings by the target once before it settles there.
+PASSING = ut.Surface(-1, -3.688, 1.361, 9.052)
+
+
+@pytest.fixture
+def accuracy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The benchmark with the reference."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    import accuracy
+
+    return accuracy
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", "pendubot", "two_motor_three_link"])
+def test_motions_agree_with_a_reference_that_shares_no_code(
+    accuracy: ModuleType, name: str
+) -> None:
+    """To 1e-7 where 1e-5 is wanted; steps of 2 ms are a hundred times as far off."""
+    rig = LIBRARY[name]()
+    goal = ut.MinimumEnergy(horizon=30.0, terminal_radius=0.05)
+    case = accuracy.Case(name, rig, goal, rig.usual_start, Plan.of(ut.first_surface(rig)))
+    exact = accuracy.Reference(case).motion(rtol=1e-11)
+    assert exact.reached
+    fine, coarse = (
+        accuracy.errors(accuracy.simulated(case, rtol=rtol)[0], exact) for rtol in (1e-9, 0.0)
+    )
+    assert max(fine.cost, fine.time) <= 1e-7
+    assert fine.state <= 1e-6
+    assert max(coarse.cost, coarse.time) >= 100 * max(fine.cost, fine.time)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("goal", ["energy", "time"])
+@pytest.mark.parametrize("name", LIBRARY)
+def test_every_mechanism_is_simulated_to_five_digits(
+    accuracy: ModuleType, name: str, goal: str
+) -> None:
+    """Cost and arrival of the cascade's first plan at default settings within 1e-5, relative."""
+    rig = LIBRARY[name]()
+    cascade = ut.Cascade(rig, objective_for(rig, goal), belief="exact")
+    plan = cascade.start(rig.usual_start)[0].plan
+    case = accuracy.Case(name, rig, cascade.objective, rig.usual_start, plan)
+    exact = accuracy.Reference(case).motion()
+    assert exact.reached
+    found = accuracy.errors(cascade.loop.simulate(rig.usual_start, plan), exact)
+    assert max(found.cost, found.time) <= 1e-5
+    assert found.state <= 1e-4
+
+
+def test_the_tolerance_is_a_dial(accuracy: ModuleType, rig: ut.Mechanism) -> None:
+    """A thousandth of the tolerance is at most a hundredth of the error."""
+    case = accuracy.Case("dial", rig, ut.MinimumTime(), rig.state(phi=0.7), Plan.of(PASSING))
+    exact = accuracy.Reference(case).motion(rtol=1e-11)
+    assert exact.reached
+    errors = [
+        accuracy.errors(accuracy.simulated(case, rtol=rtol)[0], exact).time
+        for rtol in (1e-4, 1e-7, 1e-10)
+    ]
+    assert errors[1] <= 0.01 * errors[0]
+    assert errors[2] <= max(0.01 * errors[1], 1e-9)
+
+
+def test_a_motion_that_dips_into_the_terminal_set_has_arrived(
+    accuracy: ModuleType, rig: ut.Mechanism
+) -> None:
+    """With a radius a millionth above the nearest pass at the pass; a millionth below, later."""
+    x0, plan = rig.state(phi=ut.deg(40)), Plan.of(PASSING)
+    loop = ut.ClosedLoop(rig, ut.MinimumTime())
+    whole = loop.simulate(x0, plan, terminal=1e-3)
+    radii = np.linalg.norm(whole.x, axis=1)
+    turns = (radii[1:-1] < radii[:-2]) & (radii[1:-1] < radii[2:]) & (radii[1:-1] < 0.02)
+    first = np.flatnonzero(turns)[0] + 1
+    assert whole.time > whole.t[first] + 0.1
+
+    def arrival(radius: float) -> tuple[float, float]:
+        goal = ut.MinimumTime(terminal_radius=radius)
+        exact = accuracy.Reference(accuracy.Case("dip", rig, goal, x0, plan)).motion(rtol=1e-10)
+        return loop.simulate(x0, plan, terminal=radius).time, exact.time
+
+    low, high = 0.9 * radii[first], 1.1 * radii[first]
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        passes = loop.simulate(x0, plan, terminal=middle).time < whole.t[first] + 0.01
+        low, high = (low, middle) if passes else (middle, high)
+    above, below = arrival(high * (1 + 1e-6)), arrival(low * (1 - 1e-6))
+    assert above[0] == pytest.approx(whole.t[first], abs=0.003)
+    assert above[0] == pytest.approx(above[1], rel=1e-5)
+    assert below[0] > above[0] + 0.01
+    assert below[0] == pytest.approx(below[1], rel=1e-5)
+
+
+def test_the_end_of_a_motion_is_located(rig: ut.Mechanism) -> None:
+    """Arrival on the sphere, the singular angle and the end of the travel, to nine digits."""
+    loop = ut.ClosedLoop(rig, ut.MinimumTime())
+    run = loop.simulate(rig.state(phi=0.5), PASSING)
+    assert run.event == Event.REACHED
+    assert np.linalg.norm(run.x[-1]) == pytest.approx(0.01, rel=1e-9)
+    base = ut.Surface(-1, -0.5, 5, 10)
+    lost = loop.simulate(rig.state(phi=math.radians(70), phi_dot=6.0), base, duration=2.0)
+    assert lost.event == Event.SINGULAR
+    M = rig.M([0, 0])
+    assert lost["phi"][-1] == pytest.approx(math.acos(-M[1, 1] / (M[0, 1] * 5.0)), abs=1e-9)
+    cart = LIBRARY["cart_pendulum"]()
+    x0 = cart.state(x=1.40, x_dot=1.0)
+    out = ut.ClosedLoop(cart).simulate(x0, ut.first_surface(cart))
+    assert out.event == Event.CONSTRAINT
+    assert out["x"][-1] == pytest.approx(1.425 * (1 + 1e-4), abs=1e-9)  # what is allowed
+    assert out["x"][-1] > out["x"][:-1].max()
+
+
+def test_a_bound_that_is_broken_between_two_steps_is_noticed() -> None:
+    """Recorded or not, by rows of 2 ms or of 50: no part of a motion lies 1 mm outside."""
+    cart = LIBRARY["cart_pendulum"]()
+    x0, surface = cart.state(phi=0.3), ut.first_surface(cart)
+    free = ut.ClosedLoop(cart, ut.MinimumEnergy(travel=False), rtol=1e-6).simulate(x0, surface)
+    most = float(np.abs(free["x"]).max())
+    bound = ut.state_box(x=most - 1e-3)
+    loop = ut.ClosedLoop(cart, ut.MinimumEnergy(constraints=bound), rtol=1e-6)
+    for every in (1, 25):
+        assert loop.simulate(x0, surface, every=every).event == Event.CONSTRAINT
+    assert loop.batch(x0, surface, precise=True).event[0] == Event.CONSTRAINT
+
+
+def test_held_inputs_move_a_plant_that_is_pushed_about(rig: ut.Mechanism) -> None:
+    """A sampled law on a belief that is wrong, beside SciPy from sample to sample."""
+    truth = rig.with_parameters(m=0.15, d_e=0.04)
+    loop = ut.ClosedLoop(rig, plant=truth, zoh_steps=4)
+    x = rig.state(phi=0.4, theta=0.1)
+    noise = np.random.default_rng(6).normal(0, 2e-3, (25, 4))
+    run = loop.simulate(x, PASSING, duration=0.2, terminal=0.0, noise=noise)
+    law = ut.SlidingModeLaw(rig, PASSING)
+    for k in range(25):
+        u = law(0.0, x + noise[k]).u
+        np.testing.assert_allclose(run.u[4 * k : 4 * k + 4], np.tile(u, (4, 1)), rtol=1e-6)
+        x = solve_ivp(
+            lambda t, x: derivative(truth, t, x, u),  # noqa: B023
+            (0, 0.008), x, method="DOP853", rtol=1e-12, atol=1e-13,
+        ).y[:, -1]  # fmt: skip
+    np.testing.assert_allclose(run.x[-1], x, atol=1e-7)
+
+
+def test_a_motion_to_a_tolerance_is_the_same_each_time(rig: ut.Mechanism) -> None:
+    """Whoever asks, with whom, and however often rows are recorded."""
+    x0 = rig.state(phi=0.6)
+    loops = [ut.ClosedLoop(rig, ut.MinimumEnergy()) for _ in range(2)]
+    runs = [loop.simulate(x0, PASSING) for loop in loops]
+    np.testing.assert_array_equal(runs[0].x, runs[1].x)
+    batch = loops[0].batch(x0, [PASSING, ut.first_surface(rig), PASSING], precise=True)
+    assert {runs[0].cost} == {batch.cost[0], batch.cost[2]}
+    assert loops[0].simulate(x0, PASSING, every=10).time == runs[0].time == batch.time[0]
+
+
+def test_fixed_steps_remain_for_those_who_want_them(rig: ut.Mechanism) -> None:
+    """``rtol=0`` simulates as batches do; what cannot be asked is refused."""
+    x0 = rig.state(phi=0.4)
+    loop = interpreted(ut.ClosedLoop(rig, rtol=0.0))
+    run, batch = loop.simulate(x0, PASSING, duration=0.05), loop.batch(x0, PASSING, duration=0.05)
+    assert run.cost == batch.cost[0]
+    np.testing.assert_array_equal(loop.batch(x0, PASSING, duration=0.05, precise=True).x, batch.x)
+    with pytest.raises(InvalidInputError, match="precise=True and seek=True"):
+        ut.ClosedLoop(rig).batch(x0, PASSING, precise=True, seek=True)
+    with pytest.raises(InvalidInputError, match=r"rtol of a closed loop.*-1"):
+        ut.ClosedLoop(rig, rtol=-1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pendubot", "cart_pendulum"])
+def test_a_first_plan_does_what_it_promises(accuracy: ModuleType, name: str) -> None:
+    """Where plans of least time are good by the errors of 2 ms alone, smaller steps find others."""
+    rig = LIBRARY[name]()
+    cascade = ut.Cascade(rig, objective_for(rig, "time"), belief="exact")
+    hasty = cascade.optimiser.require(rig.usual_start)
+    case = accuracy.Case(name, rig, cascade.objective, rig.usual_start, hasty.plan)
+    exact = accuracy.Reference(case).motion()
+    assert not exact.reached or exact.cost > 1.5 * hasty.cost
+    state, proposal = cascade.start(rig.usual_start)
+    found = accuracy.Reference(replace(case, plan=state.plan)).motion()
+    assert found.reached
+    assert found.cost == pytest.approx(state.predicted, rel=1e-5)
+    assert found.cost <= 1.01 * proposal.cost
