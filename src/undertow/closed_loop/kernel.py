@@ -54,15 +54,18 @@ def build_loop_graph(
     if objective.hard_input:
         margins = [limit - sp.Abs(d) for limit, d in zip(limits, law.u, strict=True)]
         input_margin = tape.let(sp.Min(*margins))
+    plant_parameters = () if many_plants else truth.parameter_symbols
+    lane_inputs = (*symbols.vector, *(truth.parameter_symbols if many_plants else ()))
+    fixed = [*plant_parameters, *belief_parameters, *limits, *lane_inputs]
     return LoopGraph(
-        tape=tape,
+        tape=tape.with_reciprocals(fixed),
         time=TIME,
         state=x,
         applied=applied,
         limits=limits,
-        plant_parameters=() if many_plants else truth.parameter_symbols,
+        plant_parameters=plant_parameters,
         belief_parameters=belief_parameters,
-        lane_inputs=(*symbols.vector, *(truth.parameter_symbols if many_plants else ())),
+        lane_inputs=lane_inputs,
         demand=tuple(law.u),
         s=tuple(law.s),
         singular=law.margin,

@@ -72,6 +72,30 @@ class Tape:
                 needed |= assignment.expression.free_symbols
         return kept[::-1]
 
+    def with_reciprocals(self, constants: Iterable[sp.Symbol]) -> Tape:
+        """Return this tape with products for quotients by ``constants`` and by what they determine.
+
+        Their reciprocals have lines of their own: a division takes a processor as long as a
+        dozen products.
+        """
+        tape, fixed = Tape(), {*constants}
+        for line in self.assignments:
+            if line.expression.free_symbols <= fixed:
+                fixed.add(line.symbol)
+                tape.assignments.append(line)
+                continue
+            powers = [p for p in line.expression.atoms(sp.Pow) if p.exp.is_negative]
+            inverse = {p: tape._reciprocal(p) for p in powers if p.base in fixed}
+            tape.assignments.append(Assignment(line.symbol, line.expression.xreplace(inverse)))
+        return tape
+
+    def _reciprocal(self, power: sp.Pow) -> sp.Symbol:
+        if power not in self._known:
+            symbol = sp.Symbol(f"_inverse{len(self._known)}", real=True)
+            self.assignments.append(Assignment(symbol, power))
+            self._known[power] = symbol
+        return self._known[power]
+
     # -- linear algebra on entries ------------------------------------------------------
 
     def product(self, a: sp.Matrix, b: sp.Matrix) -> sp.Matrix:
