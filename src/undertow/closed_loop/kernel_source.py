@@ -395,6 +395,9 @@ class _Writer:
 def kernel_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
     """Return the source of a module with one function ``rollout``.
 
+    It and ``etd_integrate`` do the lanes from one number to another, whole groups of them: threads
+    share a batch.
+
     Parameters
     ----------
     program
@@ -423,15 +426,15 @@ import numpy as np
     cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
 )
 def rollout(
-    x0, live, lanes, switch, plant, belief, limits, noise,
+    from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
     start, h, steps, zoh_steps, terminal, escape, cap, seek, calm_from, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
 {w.rows.allocate()}
     half, sixth = 0.5 * h, h / 6.0
     stride = max(1, round({WATCH} / h))
-    for b in range(0, x0.shape[0], {GROUPS * LANES}):
-        groups = min({GROUPS}, (x0.shape[0] - b) // {LANES})
+    for b in range(from_lane, to_lane, {GROUPS * LANES}):
+        groups = min({GROUPS}, (to_lane - b) // {LANES})
         segment, last, fewer = 0, start, True
 {_groups(w.reset(), 2)}
         for step in range(steps):
@@ -471,7 +474,7 @@ def rollout(
                 groups = (going + {LANES - 1}) // {LANES}
                 if groups == 0:
                     break
-        groups = min({GROUPS}, (x0.shape[0] - b) // {LANES})
+        groups = min({GROUPS}, (to_lane - b) // {LANES})
 {_groups(w.collect(), 2)}
 {"" if sampled else _etd_integrate(w)}"""
 
@@ -484,14 +487,14 @@ def _etd_integrate(w: _Writer) -> str:
     cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
 )
 def etd_integrate(
-    lanes, plant, belief, limits, until, terminal, escape, tail, counted,
+    from_lane, to_lane, lanes, plant, belief, limits, until, terminal, escape, tail, counted,
     linear, value, powers, forced, reach, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
 {w.rows.allocate()}
     {w.time} = 0.0
     segment = lanes.shape[1] - 1
-    for b in range(0, out.shape[0], {LANES}):
+    for b in range(from_lane, to_lane, {LANES}):
         block = b // {LANES}
 {_lanes(w.load_surface(), 2)}
 {_lanes(exponential_integrator.begin(w.rows), 2)}

@@ -11,7 +11,8 @@ linear model, in large ones (:mod:`undertow.closed_loop.exponential_integrator`)
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ from undertow.closed_loop.exponential_integrator import GIVEN_BACK
 from undertow.closed_loop.kernel import compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory
-from undertow.closed_loop.work_array import LANES
+from undertow.closed_loop.work_array import GROUPS, LANES
 from undertow.law import (
     LawLayout,
     Plan,
@@ -49,6 +50,10 @@ CALMER = 0.5
 #: make of it.  Twice or four times as much costs no less on a rig, and makes surfaces so soft that
 #: dry friction moves more than noise did.
 NEAR = 0.25
+
+#: Steps of single rollouts, about a millisecond, that a thread must find to be worth its beginning;
+#: parts of a batch for each thread, so that none waits long for another.
+WORTH, PARTS = 100_000, 4
 
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
@@ -97,6 +102,9 @@ class ClosedLoop:
     ensemble
         Plausible plants instead of one: every plan is rolled out on all of them, and a batch has
         one result for each plan, see :mod:`undertow.closed_loop.ensemble`.
+    threads
+        Threads that integrate a large batch, with the same results to the last bit however many:
+        one for each processor that is free.  1, for the real-time loops.
     covariance
         Of the error of the estimated state, (2n, 2n), that the law acts on.  Batches count the cost
         of what it makes of it near the target, tr(R K P Kᵀ) per second for a quarter of their time,
@@ -122,6 +130,7 @@ class ClosedLoop:
     tail_rtol: float = 0.0
     ensemble: Ensemble | None = None
     covariance: FloatArray | None = None
+    threads: int = 1
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
@@ -133,6 +142,7 @@ class ClosedLoop:
             ("zoh_steps", "0 is the continuous law"),
         ):
             at_least(f"{name} of a closed loop", getattr(self, name), 0, remedy)
+        at_least("threads of a closed loop", self.threads, 1, "1 is the calling thread alone")
         positive("rollout step, s", self.step)
         vector = self.reaching.vector(self.mechanism.m)
         if self.reaching.switching != "sign":
@@ -344,14 +354,16 @@ class ClosedLoop:
                 prepared = self._linearised(part)
             if prepared is not None and stable_only:
                 live *= prepared.stable
-            self._kernels.rollout(
+            self._in_threads(
+                self._kernels.rollout, part.padded, steps,
                 part.states, live, part.lanes, switches, numbers.plant, numbers.belief,
                 numbers.limits, part.quiet if noise is None else noise, start, self.step, steps,
                 max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
                 every, record, out,
             )  # fmt: skip
             if goes_on and prepared is not None and end is not None:
-                self._kernels.etd_integrate(
+                self._in_threads(
+                    self._kernels.etd_integrate, part.padded, steps,
                     part.lanes, numbers.plant, numbers.belief, numbers.limits,
                     start + steps * self.step, radius, self.escape, self.tail_rtol,
                     1.0 if end.counts_cost else 0.0, prepared.A, prepared.P, prepared.powers,
@@ -370,6 +382,27 @@ class ClosedLoop:
             failed = round((float(out[again, 1].max()) - start) / self.step)
             calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
             part, where = part.part(again), np.arange(buffers.count)[where][again]
+
+    def _in_threads(
+        self, kernel: Callable[..., None], lanes: int, steps: int, *arguments: object
+    ) -> None:
+        """Call a kernel for all lanes; where that pays, for parts of them in threads.
+
+        Threads are begun for this one batch and ended with it: none is there when a process forks.
+        """
+        blocks = -(-lanes // (GROUPS * LANES))
+        threads = min(self.threads, blocks, lanes * steps // WORTH)
+        if threads <= 1:
+            kernel(0, lanes, *arguments)
+            return
+        part = -(-blocks // (threads * PARTS)) * GROUPS * LANES
+        with ThreadPoolExecutor(threads) as pool:
+            calls = [
+                pool.submit(kernel, first, min(first + part, lanes), *arguments)
+                for first in range(0, lanes, part)
+            ]
+        for call in calls:
+            call.result()
 
     def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
         """Add what noise costs near the target to the costs of motions, part of their time."""
