@@ -13,7 +13,7 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
-from undertow.closed_loop import rollout
+from undertow.closed_loop import threads as sharing
 from undertow.models import FloatArray
 
 
@@ -30,7 +30,7 @@ def test_results_are_the_same_bits_whatever_the_number_of_threads(
     count: int, tail_rtol: float, rig: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each lane, in whichever thread and beside whichever others, has the bits it has alone."""
-    monkeypatch.setattr(rollout, "WORTH", 1)
+    monkeypatch.setattr(sharing, "WORTH", 1)
     loop = ut.ClosedLoop(rig, tail_rtol=tail_rtol)
     states, surfaces = fleet(rig, count)
     one, *others = (
@@ -55,7 +55,7 @@ def test_results_are_the_same_bits_whatever_the_number_of_threads(
 def test_sampled_loops_and_ensembles_are_shared_by_threads(
     rig: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rollout, "WORTH", 1)
+    monkeypatch.setattr(sharing, "WORTH", 1)
     states, surfaces = fleet(rig, 70)
     held = ut.ClosedLoop(rig, zoh_steps=2)
     belief = ut.Belief.usual(rig)
@@ -80,7 +80,7 @@ def test_threads_are_begun_where_they_pay_and_none_is_left(
             begun.append(workers)
             super().__init__(workers)
 
-    monkeypatch.setattr(rollout, "ThreadPoolExecutor", Watched)
+    monkeypatch.setattr(sharing, "ThreadPoolExecutor", Watched)
     states, surfaces = fleet(rig, 256)
     loop, before = ut.ClosedLoop(rig, threads=2), threading.active_count()
     loop.batch(states[:1], surfaces[:1], duration=10.0)

@@ -11,8 +11,7 @@ linear model, in large ones (:mod:`undertow.closed_loop.exponential_integrator`)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -26,8 +25,9 @@ from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
 from undertow.closed_loop.exponential_integrator import GIVEN_BACK
 from undertow.closed_loop.kernel import compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
+from undertow.closed_loop.threads import shared
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory
-from undertow.closed_loop.work_array import GROUPS, LANES
+from undertow.closed_loop.work_array import LANES
 from undertow.law import (
     LawLayout,
     Plan,
@@ -50,10 +50,6 @@ CALMER = 0.5
 #: make of it.  Twice or four times as much costs no less on a rig, and makes surfaces so soft that
 #: dry friction moves more than noise did.
 NEAR = 0.25
-
-#: Steps of single rollouts, about a millisecond, that a thread must find to be worth its beginning;
-#: parts of a batch for each thread, so that none waits long for another.
-WORTH, PARTS = 100_000, 4
 
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
@@ -354,17 +350,17 @@ class ClosedLoop:
                 prepared = self._linearised(part)
             if prepared is not None and stable_only:
                 live *= prepared.stable
-            self._in_threads(
-                self._kernels.rollout, part.padded, steps,
-                part.states, live, part.lanes, switches, numbers.plant, numbers.belief,
-                numbers.limits, part.quiet if noise is None else noise, start, self.step, steps,
-                max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
-                every, record, out,
+            integrate = shared(self._kernels.rollout, self.threads, part.padded, steps)
+            integrate(
+                0, part.padded, part.states, live, part.lanes, switches, numbers.plant,
+                numbers.belief, numbers.limits, part.quiet if noise is None else noise, start,
+                self.step, steps, max(1, self.zoh_steps), radius, self.escape, cap,
+                1.0 if seek else 0.0, calm_from, every, record, out,
             )  # fmt: skip
             if goes_on and prepared is not None and end is not None:
-                self._in_threads(
-                    self._kernels.etd_integrate, part.padded, steps,
-                    part.lanes, numbers.plant, numbers.belief, numbers.limits,
+                integrate = shared(self._kernels.etd_integrate, self.threads, part.padded, steps)
+                integrate(
+                    0, part.padded, part.lanes, numbers.plant, numbers.belief, numbers.limits,
                     start + steps * self.step, radius, self.escape, self.tail_rtol,
                     1.0 if end.counts_cost else 0.0, prepared.A, prepared.P, prepared.powers,
                     prepared.forced, prepared.reach, out,
@@ -382,27 +378,6 @@ class ClosedLoop:
             failed = round((float(out[again, 1].max()) - start) / self.step)
             calm_from = min(failed + max(round(CALMER / self.step), calm_from), steps)
             part, where = part.part(again), np.arange(buffers.count)[where][again]
-
-    def _in_threads(
-        self, kernel: Callable[..., None], lanes: int, steps: int, *arguments: object
-    ) -> None:
-        """Call a kernel for all lanes; where that pays, for parts of them in threads.
-
-        Threads are begun for this one batch and ended with it: none is there when a process forks.
-        """
-        blocks = -(-lanes // (GROUPS * LANES))
-        threads = min(self.threads, blocks, lanes * steps // WORTH)
-        if threads <= 1:
-            kernel(0, lanes, *arguments)
-            return
-        part = -(-blocks // (threads * PARTS)) * GROUPS * LANES
-        with ThreadPoolExecutor(threads) as pool:
-            calls = [
-                pool.submit(kernel, first, min(first + part, lanes), *arguments)
-                for first in range(0, lanes, part)
-            ]
-        for call in calls:
-            call.result()
 
     def _count_noise(self, buffers: RolloutBuffers, start: float) -> None:
         """Add what noise costs near the target to the costs of motions, part of their time."""
