@@ -8,7 +8,8 @@ Runge-Kutta steps instead; they run for a few surfaces and are scaled up.
 
 Last, eight times as many surfaces by one thread and by two, in turn, on the wall clock: by the
 generated kernel with ``threads=2``, and by the C, called by two threads for half of them each,
-which shows what the machine and its other users leave to a second thread.
+which shows what the machine and its other users leave to a second thread; and the processor time
+of both threads, which shows what sharing costs.
 """
 
 from __future__ import annotations
@@ -246,14 +247,18 @@ def two_threads(folder: Path, rounds: int) -> float:
         entrants[f"undertow, {threads}"] = ours(copies, threads)
     costs = {name: run() for name, run in entrants.items()}
     same = bool((costs["undertow, 1"] == costs["undertow, 2"]).all())
-    times = race(entrants, rounds, time.perf_counter, "threads")
+    wall = race(entrants, rounds, time.perf_counter, "threads")
+    busy = race(entrants, rounds, time.process_time, "threads, processor time")
     rows, ratios = [], []
     for name in ("C by hand", "undertow"):
-        one, two = (statistics.median(times[f"{name}, {threads}"]) for threads in (1, 2))
-        ratios.append(one / two)
-        rows.append([name, f"{1e3 * one:.1f}", f"{1e3 * two:.1f}", f"{one / two:.2f}"])
-    title = f"{copies * SURFACES} surfaces, one thread and two, wall clock"
-    table(title, ["", "one, ms", "two, ms", "times as fast"], rows)
+        waited, used = (
+            [1e3 * statistics.median(times[f"{name}, {threads}"]) for threads in (1, 2)]
+            for times in (wall, busy)
+        )
+        ratios.append(waited[0] / waited[1])
+        rows.append([name, *(f"{ms:.1f}" for ms in (*waited, *used)), f"{ratios[-1]:.2f}"])
+    title = f"{copies * SURFACES} surfaces, one thread and two: wall clock, processor time of both"
+    table(title, ["", "one, ms", "two", "processor, one", "two", "times as fast"], rows)
     print(f"\nload {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors")
     print(f"one thread and two: {'the same bits' if same else 'costs differ'}")
     return ratios[-1] if same else 0.0
