@@ -28,7 +28,6 @@ from support import (
 )
 from undertow.closed_loop.kernel import build_loop_graph
 from undertow.closed_loop.kernel_source import _hoist, kernel_source
-from undertow.closed_loop.work_array import LANES
 from undertow.law import Switching
 from undertow.models import TIME, FloatArray
 from undertow.symbolic import store
@@ -308,8 +307,8 @@ def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
         build_loop_graph(rig, None, ut.MinimumEnergy(), "saturation"), sampled=False, header=""
     )
     lines = source.splitlines()
-    heads = [i for i, line in enumerate(lines) if line.strip() == f"for i in range({LANES}):"]
-    assert len(heads) >= 6
+    heads = [i for i, line in enumerate(lines) if line.strip().startswith("for i in range(")]
+    assert len(heads) >= 18
     for head in heads:
         depth = len(lines[head]) - len(lines[head].lstrip())
         for line in lines[head + 1 :]:
@@ -335,7 +334,7 @@ def test_lane_loops_are_compiled_to_vectors() -> None:
 
     products = "(mul|fn?m(add|sub)[0-9]*)"
     assert count(products + "pd") > 150
-    assert count(products + "sd") <= 0.12 * count(products + "pd")
+    assert count(products + "sd") <= 0.15 * count(products + "pd")
 
 
 @pytest.mark.parametrize(

@@ -261,7 +261,7 @@ def kernel(subject: Subject, *, sampled: bool = False) -> Iterator[Difference]:
     record = np.zeros((buffers.padded, 1, 2 * n + 2 * m + 2))
     parameters, limits = mechanism.parameter_values, mechanism.input_limits
     kernels.rollout(
-        buffers.states, buffers.live, buffers.lanes, np.zeros(1, dtype=np.int64),
+        0, buffers.padded, buffers.states, buffers.live, buffers.lanes, np.zeros(1, dtype=np.int64),
         parameters, parameters, limits, buffers.quiet,
         0.0, STEP, 1, 1, 0.0, math.inf, math.inf, 0.0, 1, 1, record, buffers.out,
     )  # fmt: skip

@@ -30,7 +30,7 @@ from collections.abc import Sequence
 
 from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT
 from undertow.closed_loop.trajectory import Event
-from undertow.closed_loop.work_array import LANES, WorkArray, code, entrance, total
+from undertow.closed_loop.work_array import ENTERED, LANES, WorkArray, code, entrance, total
 
 #: Codes of a lane that waits for its large steps, and of one that cannot be done in this way.
 HANDED_OVER, GIVEN_BACK = -1.0, -2.0
@@ -209,9 +209,10 @@ def second_half(r: WorkArray) -> list[str]:
         f"sound = free & (outer < escape) & ((size > 0.0) | (level <= 16.0 * small){clear})",
         f"before = {r.radius}",
         *(f"m_{j} = a_{j} - x_{j}" for j in range(size)),
-        *entrance([f"x_{j}" for j in range(size)], "before"),
+        *entrance([f"x_{j}" for j in range(size)], "before * before"),
+        *ENTERED,
         "inside = (outer <= terminal) | passed",
-        "part = max(0.0, min(1.0, part)) if inside else 1.0",
+        "part = part if inside else 1.0",
         "far = before - terminal > span * speed",
         f"taken = going & sound & ((size <= 0.0) | ((level <= small) & far & (not inside){clear}))",
         *(f"x_{j} = x_{j} + part * m_{j} if taken else x_{j}" for j in range(size)),

@@ -31,7 +31,6 @@ def build_loop_graph(
     once; otherwise the belief keeps its own parameter symbols.  With ``many_plants`` each lane
     brings the parameters of its plant.
     """
-    tape = Tape()
     truth = belief if plant is None else plant
     x = truth.x
     rename: dict[sp.Symbol, sp.Expr] = dict(zip(belief.x, x, strict=True))
@@ -42,11 +41,14 @@ def build_loop_graph(
         )
         rename |= dict(zip(belief.parameter_symbols, belief_parameters, strict=True))
     symbols = LawSymbols.of(belief.n, belief.m)
+    applied = tuple(sp.Symbol(f"_applied_{i}", real=True) for i in range(truth.m))
+    limits = tuple(sp.Symbol(f"_limit_{i}", real=True) for i in range(truth.m))
+    plant_parameters = () if many_plants else truth.parameter_symbols
+    lane_inputs = (*symbols.vector, *(truth.parameter_symbols if many_plants else ()))
+    tape = Tape([*plant_parameters, *belief_parameters, *limits, *lane_inputs])
     law = build_law_graph(
         belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds
     )
-    applied = tuple(sp.Symbol(f"_applied_{i}", real=True) for i in range(truth.m))
-    limits = tuple(sp.Symbol(f"_limit_{i}", real=True) for i in range(truth.m))
     inputs = dict(zip(truth.u, applied, strict=True))
     qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
     stage, *path = tape.let_all(
@@ -62,9 +64,9 @@ def build_loop_graph(
         state=x,
         applied=applied,
         limits=limits,
-        plant_parameters=() if many_plants else truth.parameter_symbols,
+        plant_parameters=plant_parameters,
         belief_parameters=belief_parameters,
-        lane_inputs=(*symbols.vector, *(truth.parameter_symbols if many_plants else ())),
+        lane_inputs=lane_inputs,
         demand=tuple(law.u),
         s=tuple(law.s),
         singular=law.margin,

@@ -5,6 +5,9 @@ loops run over the lanes of a block, without branches, so that LLVM turns each o
 into vector instructions.  All lane data live in one flat work array ``W`` at constant
 offsets, which is what lets the vectoriser prove that loads and stores do not alias.
 
+What few steps need (where a motion enters the terminal set, why it broke off) is a loop of its own,
+for steps that end a motion; whether one does is counted in whole numbers, in any order the same.
+
 Lines of the tape are hoisted by what they depend on: parameters only (once a call),
 surface and gains (once a surface), state (every stage).
 """
@@ -18,7 +21,16 @@ import sympy as sp
 
 from undertow.closed_loop import exponential_integrator
 from undertow.closed_loop.trajectory import Event
-from undertow.closed_loop.work_array import LANES, LoopGraph, WorkArray, code, entrance, total
+from undertow.closed_loop.work_array import (
+    ENTERED,
+    GROUPS,
+    LANES,
+    LoopGraph,
+    WorkArray,
+    code,
+    entrance,
+    total,
+)
 from undertow.symbolic import Emitter, distinct, docstring
 
 #: Whether a lane may hand over is looked at in these intervals, s.
@@ -39,8 +51,14 @@ class _Writer:
         self.constant = {*self.of_call, *self.of_lane}
         self.rates = [*program.derivative, program.stage]
         self.monitored = [*program.s, program.singular]
+        now, least = [self.rows.singular, *self.rows.path], list(self.rows.smallest)
         if program.input_margin is not None:
             self.monitored.append(program.input_margin)
+            now.insert(1, self.rows.input)
+        else:
+            least.pop(1)
+        #: Margins of the present step, each with the smallest so far.
+        self.watched = list(zip(now, least, strict=True))
 
     # -- once a call, once a block, once a surface ---------------------------------------
 
@@ -62,20 +80,21 @@ class _Writer:
         r = self.rows
         return [
             *(f"{row} = x0[b + i, {j}]" for j, row in enumerate(r.x)),
-            "radius = math.sqrt(" + total(f"{row} * {row}" for row in r.x) + ")",
+            "square = " + total(f"{row} * {row}" for row in r.x),
+            "radius = math.sqrt(square)",
             f"{r.cost} = 0.0",
             f"{r.end} = start",
-            f"{r.radius} = radius",
+            f"{r.square} = square",
             f"{r.code} = {code(Event.REACHED)} if radius <= terminal else "
             f"({code(Event.HORIZON)} if live[b + i] > 0.0 else {code(Event.UNSTABLE)})",
             f"{r.active} = 1.0 if {r.code} == {code(Event.HORIZON)} else 0.0",
             f"{r.near} = radius",
             f"{r.near_time} = start",
             *(f"{near} = {x}" for near, x in zip(r.near_x, r.x, strict=True)),
-            *(f"{row} = math.inf" for row in r.smallest),
+            *(f"{row} = 1.0" for row in r.smallest),
+            *(f"{row} = math.inf" for _, row in self.watched),
             *(f"{row} = 0.0" for row in [*r.u, *r.s, *r.path]),
             f"{r.singular} = 1.0",
-            f"{r.input} = 1.0",
         ]
 
     def load_surface(self) -> list[str]:
@@ -121,13 +140,13 @@ class _Writer:
         return {line.symbol for line in self.program.tape.live(outputs)}
 
     def _store_law(self) -> list[str]:
-        r, program, text = self.rows, self.program, self.emit.text
-        margin = "1.0" if program.input_margin is None else text(program.input_margin)
+        r, text = self.rows, self.emit.text
         return [
             *(f"{row} = u_{j}" for j, row in enumerate(r.u)),
-            *(f"{row} = {text(e)}" for row, e in zip(r.s, program.s, strict=True)),
-            f"{r.singular} = {text(program.singular)}",
-            f"{r.input} = {margin}",
+            *(
+                f"{row} = {text(e)}"
+                for row, e in zip([*r.s, r.singular, r.input], self.monitored, strict=False)
+            ),
         ]
 
     def sample(self) -> list[str]:
@@ -199,31 +218,35 @@ class _Writer:
     # -- events ----------------------------------------------------------------------------
 
     def watch(self) -> list[str]:
-        """Keep the smallest margins; stop a lane whose margin is negative.
+        """Keep the smallest margins; count the lanes that have a negative one in ``broken``.
 
         Rows are read before they are chosen between: a choice between two elements of ``W``
         would be compiled as a choice between two addresses, and the loop not as vectors.
         """
-        r = self.rows
-        low = [f"low_{j}" for j in range(len(r.margins))]
-        now = [f"now_{j}" for j in range(len(r.margins))]
+        r, count = self.rows, range(len(self.watched))
         return [
-            *(f"{name} = {row}" for name, row in zip(now, r.margins, strict=True)),
-            *(f"{name} = {row}" for name, row in zip(low, r.smallest, strict=True)),
             f"active = {r.active} > 0.0",
-            f"end = {r.end}",
-            f"code = {r.code}",
+            *(f"now_{j}, low_{j} = {now}, {low}" for j, (now, low) in enumerate(self.watched)),
             # Written so that a margin that is not a number counts as broken, and is kept.
-            "sound = " + " & ".join(f"({name} >= 0.0)" for name in now),
             *(
-                f"{row} = {a} if ({b} >= {a}) | (not active) else {b}"
-                for row, a, b in zip(r.smallest, low, now, strict=True)
+                f"{low} = low_{j} if (now_{j} >= low_{j}) | (not active) else now_{j}"
+                for j, (_, low) in enumerate(self.watched)
             ),
-            "broken = active & (not sound)",
+            "sound = " + " & ".join(f"(now_{j} >= 0.0)" for j in count),
+            "broken += 0 if sound | (not active) else 1",
+        ]
+
+    def break_off(self) -> list[str]:
+        """Stop the lanes that have a negative margin."""
+        r, now = self.rows, [row for row, _ in self.watched]
+        return [
+            f"active, code, end = {r.active}, {r.code}, {r.end}",
+            "sound = " + " & ".join(f"({row} >= 0.0)" for row in now),
+            "stops = (active > 0.0) & (not sound)",
             f"kind = {code(Event.CONSTRAINT)} if {now[0]} >= 0.0 else {code(Event.SINGULAR)}",
-            f"{r.end} = {self.time} if broken else end",
-            f"{r.code} = kind if broken else code",
-            f"{r.active} = 1.0 if active & sound else 0.0",
+            f"{r.end} = {self.time} if stops else end",
+            f"{r.code} = kind if stops else code",
+            f"{r.active} = 0.0 if stops else active",
         ]
 
     def hand_over(self) -> list[str]:
@@ -245,7 +268,8 @@ class _Writer:
                 f"calm = calm & ({row} > max({spare!r}, {low}))"
                 for row, low, (_, spare) in zip(r.path, r.low, boxes, strict=bool(boxes))
             ),
-            f"code, active = {r.code}, {r.active}",
+            f"code, active, end = {r.code}, {r.active}, {r.end}",
+            f"{r.end} = {self.time} if calm else end",
             f"{r.code} = {exponential_integrator.HANDED_OVER} if calm else code",
             f"{r.active} = 0.0 if calm else active",
         ]
@@ -286,35 +310,61 @@ class _Writer:
         ]
 
     def advance(self) -> list[str]:
-        """Complete the step; stop lanes that reach the terminal set, are lost or too costly."""
+        """Complete the step; count the lanes that it ends in ``ended``.
+
+        Those are the ones that reach the terminal set, are lost or too costly.
+        """
         r = self.rows
-        nx = len(r.x)
+        new = [f"n_{j}" for j in range(len(r.x))]
+        old = [f"x_{j}" for j in range(len(r.x))]
         return [
-            f"active = {r.active}",
+            f"active, cost, before = {r.active} > 0.0, {r.cost}, {r.square}",
+            *(f"{name} = {x}" for name, x in zip(old, r.x, strict=True)),
+            *(f"{n} = {x} + sixth * {d}" for n, x, d in zip(new, old, r.slope, strict=True)),
+            f"c_new = cost + sixth * {r.cost_slope}",
+            *(f"m_{j} = {n} - {x}" for j, (n, x) in enumerate(zip(new, old, strict=True))),
+            "outer = " + total(f"{n} * {n}" for n in new),
+            *entrance(old, "before"),
+            "reached = (outer <= terminal * terminal) | passed",
+            "lost = not (outer < escape * escape)",
+            "ended += 1 if active & (reached | lost | (c_new > cap)) else 0",
+            f"{r.passed} = 1.0 if passed else 0.0",
+            *(f"{row} = {x}" for row, x in zip(r.past_x, old, strict=True)),
+            f"{r.past_cost} = cost",
+            f"{r.past_square} = before",
+            *(f"{row} = {n} if active else {x}" for row, n, x in zip(r.x, new, old, strict=True)),
+            f"{r.cost} = c_new if active else cost",
+            f"{r.square} = outer if active else before",
+        ]
+
+    def end(self) -> list[str]:
+        """Stop the lanes that a step ends, those that reach the terminal set at its edge."""
+        r = self.rows
+        old = [f"x_{j}" for j in range(len(r.x))]
+        return [
+            f"active, before, outer = {r.active}, {r.past_square}, {r.square}",
+            f"c_old, c_new, end = {r.past_cost}, {r.cost}, {r.end}",
+            f"there, lost, code = {r.passed} > 0.0, not (outer < escape * escape), {r.code}",
+            "there = (there | (outer <= terminal * terminal)) & (not lost)",
+            "ends = (active > 0.0) & (there | lost | (c_new > cap))",
+            "reached = ends & there",
+            f"kind = {code(Event.DIVERGED)} if lost else "
+            f"({code(Event.REACHED)} if there else {code(Event.COSTLY)})",
+            f"{r.code} = kind if ends else code",
+            *(f"{name} = {row}" for name, row in zip(old, r.past_x, strict=True)),
+            *(f"n_{j} = {row}" for j, row in enumerate(r.x)),
+            *(f"m_{j} = n_{j} - {x}" for j, x in enumerate(old)),
+            *entrance(old, "before"),
+            *ENTERED,
+            "part = part if reached else 1.0",
             *(
-                f"n_{j} = {x} + sixth * {d}"
-                for j, (x, d) in enumerate(zip(r.x, r.slope, strict=True))
+                f"{row} = {x} + part * m_{j} if reached else n_{j}"
+                for j, (row, x) in enumerate(zip(r.x, old, strict=True))
             ),
-            f"c_new = {r.cost} + sixth * {r.cost_slope}",
-            *(f"m_{j} = n_{j} - {x}" for j, x in enumerate(r.x)),
-            "outer = " + total(f"n_{j} * n_{j}" for j in range(nx)),
-            "radius = math.sqrt(outer)",
-            f"before = {r.radius}",
-            *entrance(r.x, "before"),
-            "reached = (radius <= terminal) | passed",
-            "part = max(0.0, min(1.0, part)) if reached else 1.0",
-            "lost = not (radius < escape)",
-            *(f"m_{j} = {x} + part * m_{j} if reached else n_{j}" for j, x in enumerate(r.x)),
-            *(f"{x} = m_{j} if active > 0.0 else {x}" for j, x in enumerate(r.x)),
-            f"{r.cost} = {r.cost} + part * (c_new - {r.cost}) if active > 0.0 else {r.cost}",
-            f"{r.end} = {self.time} + part * h if active > 0.0 else {r.end}",
-            f"costly = {r.cost} > cap",
-            f"code = {code(Event.DIVERGED)} if lost else ({code(Event.REACHED)} if reached else "
-            f"({code(Event.COSTLY)} if costly else {code(Event.HORIZON)}))",
-            f"{r.code} = code if active > 0.0 else {r.code}",
-            "radius = min(radius, terminal) if reached else radius",
-            f"{r.radius} = radius if active > 0.0 else before",
-            f"{r.active} = 0.0 if (lost or reached or costly) else active",
+            f"{r.cost} = c_old + part * (c_new - c_old) if reached else c_new",
+            f"{r.square} = min(outer, terminal * terminal) if reached else outer",
+            f"{r.end} = {self.time} + part * h if ends else end",
+            f"{r.active} = 0.0 if ends else active",
         ]
 
     def record(self) -> list[str]:
@@ -326,15 +376,27 @@ class _Writer:
     def collect(self) -> list[str]:
         """One line of results: cost, end, code, radius, closest, margins, final x, steps."""
         r = self.rows
-        steps = f"({r.end} - start) / h"
-        columns = [r.cost, r.end, r.code, r.radius, *r.smallest, r.near, r.near_time]
+        columns = [
+            r.cost,
+            "end",
+            r.code,
+            f"math.sqrt({r.square})",
+            *r.smallest,
+            r.near,
+            r.near_time,
+        ]
         return [
-            f"out[b + i, {j}] = {row}" for j, row in enumerate([*columns, *r.near_x, *r.x, steps])
+            f"end = last if {r.active} > 0.0 else {r.end}",
+            *(f"out[b + i, {j}] = {row}" for j, row in enumerate([*columns, *r.near_x, *r.x])),
+            f"out[b + i, {len(columns) + 2 * len(r.x)}] = (end - start) / h",
         ]
 
 
 def kernel_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
     """Return the source of a module with one function ``rollout``.
+
+    It and ``etd_integrate`` do the lanes from one number to another, whole groups of them: threads
+    share a batch.
 
     Parameters
     ----------
@@ -352,7 +414,7 @@ def kernel_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
         sampling = f"""\
             if step % zoh_steps == 0:
                 sample = min(step // zoh_steps, noise.shape[0] - 1)
-{_lanes(w.sample(), 4)}
+{_groups(w.sample(), 4)}
 """
     return f"""{docstring(header)}import math
 
@@ -364,43 +426,56 @@ import numpy as np
     cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
 )
 def rollout(
-    x0, live, lanes, switch, plant, belief, limits, noise,
+    from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
     start, h, steps, zoh_steps, terminal, escape, cap, seek, calm_from, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
-    W = np.empty({w.rows.count * LANES})
+{w.rows.allocate()}
     half, sixth = 0.5 * h, h / 6.0
     stride = max(1, round({WATCH} / h))
-    for b in range(0, x0.shape[0], {LANES}):
-        segment = 0
-{_lanes(w.reset(), 2)}
+    for b in range(from_lane, to_lane, {GROUPS * LANES}):
+        groups = min({GROUPS}, (to_lane - b) // {LANES})
+        segment, last, fewer = 0, start, True
+{_groups(w.reset(), 2)}
         for step in range(steps):
             {w.time} = start + step * h
             if segment < switch.shape[0] and step == switch[segment]:
-{_lanes(w.load_surface(), 4)}
+{_groups(w.load_surface(), 4)}
                 segment += 1
+            broken = 0
 {sampling}\
-{_lanes([*w.first_stage(sampled=sampled), *w.watch()], 3)}
+{_groups([*w.first_stage(sampled=sampled), *w.watch()], 3)}
+            if broken > 0:
+                fewer = True
+{_groups(w.break_off(), 4)}
             if every > 0 and step % every == 0:
-{_lanes(w.record(), 4)}
+{_groups(w.record(), 4)}
             if step >= calm_from and step % stride == 0 and segment == switch.shape[0]:
-{_lanes(w.hand_over(), 4)}
+                fewer = True
+{_groups(w.hand_over(), 4)}
             for rk in range(3):
                 weight = 1.0 if rk == 2 else 2.0
                 reach = half if rk == 0 else h
                 {w.time} = start + (step + (1.0 if rk == 2 else 0.5)) * h
-{_lanes(w.later_stage(sampled=sampled), 4)}
+{_groups(w.later_stage(sampled=sampled), 4)}
             {w.time} = start + step * h
+            last = {w.time} + h
             if seek > 0.0:
-{_lanes(w.approach(), 4)}
-{_lanes(w.advance(), 3)}
-            if step % 8 == 0:
-                alive = 0.0
-                for i in range({LANES}):
-                    alive += {w.rows.active}
-                if alive == 0.0:
+{_groups(w.approach(), 4)}
+            ended = 0
+{_groups(w.advance(), 3)}
+            if ended > 0:
+                fewer = True
+{_groups(w.end(), 4)}
+            if fewer:
+                going, fewer = 0, False
+                for i in range({LANES} * groups):
+                    going = i + 1 if {w.rows.active} > 0.0 else going
+                groups = (going + {LANES - 1}) // {LANES}
+                if groups == 0:
                     break
-{_lanes(w.collect(), 2)}
+        groups = min({GROUPS}, (to_lane - b) // {LANES})
+{_groups(w.collect(), 2)}
 {"" if sampled else _etd_integrate(w)}"""
 
 
@@ -412,14 +487,14 @@ def _etd_integrate(w: _Writer) -> str:
     cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
 )
 def etd_integrate(
-    lanes, plant, belief, limits, until, terminal, escape, tail, counted,
+    from_lane, to_lane, lanes, plant, belief, limits, until, terminal, escape, tail, counted,
     linear, value, powers, forced, reach, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
-    W = np.empty({w.rows.count * LANES})
+{w.rows.allocate()}
     {w.time} = 0.0
     segment = lanes.shape[1] - 1
-    for b in range(0, out.shape[0], {LANES}):
+    for b in range(from_lane, to_lane, {LANES}):
         block = b // {LANES}
 {_lanes(w.load_surface(), 2)}
 {_lanes(exponential_integrator.begin(w.rows), 2)}
@@ -439,9 +514,17 @@ def etd_integrate(
 """
 
 
-def _lanes(lines: Iterable[str], depth: int) -> str:
-    """Return a loop over the lanes of a block around ``lines``, indented."""
-    text = f"for i in range({LANES}):\n" + textwrap.indent("\n".join(lines), "    ")
+def _groups(lines: Iterable[str], depth: int) -> str:
+    """Return a loop over the lanes of the groups that go on around ``lines``, indented.
+
+    There is at least one group: a compiler that is told so leaves no scalars over.
+    """
+    return _lanes(lines, depth, f"max({LANES}, {LANES} * groups)")
+
+
+def _lanes(lines: Iterable[str], depth: int, count: str = str(LANES)) -> str:
+    """Return a loop over ``count`` lanes around ``lines``, indented."""
+    text = f"for i in range({count}):\n" + textwrap.indent("\n".join(lines), "    ")
     return textwrap.indent(text, "    " * depth)
 
 

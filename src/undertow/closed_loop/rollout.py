@@ -28,6 +28,7 @@ from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
 from undertow.closed_loop.exponential_integrator import GIVEN_BACK
 from undertow.closed_loop.kernel import compile_look, compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
+from undertow.closed_loop.threads import shared
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory
 from undertow.closed_loop.work_array import LANES
 from undertow.law import (
@@ -112,6 +113,9 @@ class ClosedLoop:
     ensemble
         Plausible plants instead of one: every plan is rolled out on all of them, and a batch has
         one result for each plan, see :mod:`undertow.closed_loop.ensemble`.
+    threads
+        Threads that integrate a large batch, with the same results to the last bit however many:
+        one for each processor that is free.  1, for the real-time loops.
     covariance
         Of the error of the estimated state, (2n, 2n), that the law acts on.  Batches count the cost
         of what it makes of it near the target, tr(R K P Kᵀ) per second for a quarter of their time,
@@ -138,6 +142,7 @@ class ClosedLoop:
     tail_rtol: float = 0.0
     ensemble: Ensemble | None = None
     covariance: FloatArray | None = None
+    threads: int = 1
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another shape."""
@@ -150,6 +155,7 @@ class ClosedLoop:
             ("zoh_steps", "0 is the continuous law"),
         ):
             at_least(f"{name} of a closed loop", getattr(self, name), 0, remedy)
+        at_least("threads of a closed loop", self.threads, 1, "1 is the calling thread alone")
         positive("rollout step, s", self.step)
         vector = self.reaching.vector(self.mechanism.m)
         if self.reaching.switching != "sign":
@@ -368,15 +374,17 @@ class ClosedLoop:
                 prepared = self._linearised(part)
             if prepared is not None and stable_only:
                 live *= prepared.stable
-            self._kernels.rollout(
-                part.states, live, part.lanes, switches, numbers.plant, numbers.belief,
-                numbers.limits, part.quiet if noise is None else noise, start, self.step, steps,
-                max(1, self.zoh_steps), radius, self.escape, cap, 1.0 if seek else 0.0, calm_from,
-                every, record, out,
+            integrate = shared(self._kernels.rollout, self.threads, part.padded, steps)
+            integrate(
+                0, part.padded, part.states, live, part.lanes, switches, numbers.plant,
+                numbers.belief, numbers.limits, part.quiet if noise is None else noise, start,
+                self.step, steps, max(1, self.zoh_steps), radius, self.escape, cap,
+                1.0 if seek else 0.0, calm_from, every, record, out,
             )  # fmt: skip
             if goes_on and prepared is not None and end is not None:
-                self._kernels.etd_integrate(
-                    part.lanes, numbers.plant, numbers.belief, numbers.limits,
+                integrate = shared(self._kernels.etd_integrate, self.threads, part.padded, steps)
+                integrate(
+                    0, part.padded, part.lanes, numbers.plant, numbers.belief, numbers.limits,
                     start + steps * self.step, radius, self.escape, self.tail_rtol,
                     1.0 if end.counts_cost else 0.0, prepared.A, prepared.P, prepared.powers,
                     prepared.forced, prepared.reach, out,

@@ -10,8 +10,12 @@ import sympy as sp
 from undertow.closed_loop.trajectory import Event
 from undertow.symbolic import Tape
 
-#: Closed loops in one block: two AVX-512 registers or four AVX2 registers of float64.
+#: Closed loops in one group: two AVX-512 registers or four AVX2 registers of float64.
 LANES = 16
+
+#: Groups that a rollout takes through each stage together: the operations on a lane wait for one
+#: another, and so long the processor works on other lanes.
+GROUPS = 2
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,9 @@ class WorkArray:
         self.count = 0
         nx, m, nw = len(program.state), len(program.applied), len(program.path)
         self.x, self.stage_x, self.slope = self._take(nx), self._take(nx), self._take(nx)
-        self.cost, self.cost_slope = self._take(2)
+        self.cost, self.cost_slope, self.square = self._take(3)
+        self.past_x = self._take(nx)
+        self.past_cost, self.past_square, self.passed = self._take(3)
         lane_inputs = program.lane_inputs
         self.lane = dict(zip(lane_inputs, self._take(len(lane_inputs)), strict=True))
         self.kept = dict(zip(kept, self._take(len(kept)), strict=True))
@@ -83,12 +89,15 @@ class WorkArray:
     def _take(self, rows: int) -> list[str]:
         start = self.count
         self.count += rows
-        return [f"W[{(start + j) * LANES} + i]" for j in range(rows)]
+        return [f"W[{(start + j) * GROUPS * LANES} + i]" for j in range(rows)]
 
-    @property
-    def margins(self) -> list[str]:
-        """Margins of the present step, in the order of ``smallest``."""
-        return [self.singular, self.input, *self.path]
+    def allocate(self) -> str:
+        """Return the lines that make the array, from the beginning of a cache line on."""
+        size = self.count * GROUPS * LANES
+        return f"""\
+    W = np.empty({size + 8})
+    skip = -(W.ctypes.data // 8) % 8
+    W = W[skip : skip + {size}]"""
 
 
 def code(event: Event) -> str:
@@ -101,15 +110,18 @@ def total(terms: Iterable[str]) -> str:
     return " + ".join(terms)
 
 
-def entrance(x: Sequence[str], radius: str) -> list[str]:
-    """Whether and where the chord m of a step from x, of this radius, enters the terminal ball.
-
-    ``part`` is the smaller root of |x + part m|² = terminal², if the chord has ``passed`` it.
-    """
+def entrance(x: Sequence[str], square: str) -> list[str]:
+    """Whether the chord m of a step from x, ‖x‖² = ``square``, ``passed`` the terminal ball."""
     return [
         "chord = " + total(f"m_{j} * m_{j}" for j in range(len(x))),
         "slant = -(" + total(f"{e} * m_{j}" for j, e in enumerate(x)) + ")",
-        f"depth = slant * slant - chord * ({radius} * {radius} - terminal * terminal)",
+        f"depth = slant * slant - chord * ({square} - terminal * terminal)",
         "passed = (slant > 0.0) & (depth >= 0.0) & (slant <= chord)",
-        "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
     ]
+
+
+#: The part of the chord up to the ball: the smaller root of ‖x + part m‖² = terminal², in [0, 1].
+ENTERED = [
+    "part = (slant - math.sqrt(max(depth, 0.0))) / chord if chord > 0.0 else 1.0",
+    "part = max(0.0, min(1.0, part))",
+]

@@ -57,7 +57,8 @@ def derived(
     coriolis = (mass * speeds).jacobian(rows) * speeds - sp.Matrix([kinetic]).jacobian(rows).T
     conservative = sp.Matrix([potential]).jacobian(rows).T
     damping = sp.Matrix([dissipation]).jacobian(speeds).T
-    force = (-coriolis - conservative - damping).applyfunc(_tidy)
+    # Expanded again, for terms that cancel only between single angles.
+    force = (-coriolis - conservative - damping).applyfunc(_tidy).applyfunc(sp.expand)
     mass, force = sp.ImmutableDenseMatrix(mass), sp.ImmutableDenseMatrix(force)
     remember("equations", key, f"{sp.srepr(mass)}\n{sp.srepr(force)}")
     return mass, force

@@ -2,8 +2,8 @@
 
 Sines and cosines are inlined as polynomials: numba's wheels bring no vector library, and a
 call would keep the lane loops from being vectorised.  After a two-part reduction to
-|r| ≤ π/4 the polynomials are fdlibm's kernels; the error stays below 2e-15 for |angle| up
-to 1e5 rad.
+|r| ≤ π/4 the polynomials are fdlibm's kernels, summed by pairs (Estrin's scheme) so that fewer
+operations wait for one another; the error stays below 2e-15 for |angle| up to 1e5 rad.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ SINCOS = """
 k_{i} = np.floor({arg} * 0.6366197723675814 + 0.5)
 r_{i} = ({arg} - k_{i} * 1.5707963267341256) - k_{i} * 6.077100506506192e-11
 z_{i} = r_{i} * r_{i}
-ps_{i} = r_{i} + r_{i} * z_{i} * (-0.16666666666666632 + z_{i} * (0.00833333333332249 + z_{i} * (-0.0001984126982985795 + z_{i} * (2.7557313707070068e-06 + z_{i} * (-2.5050760253406863e-08 + z_{i} * 1.58969099521155e-10)))))
-pc_{i} = 1.0 - 0.5 * z_{i} + z_{i} * z_{i} * (0.0416666666666666 + z_{i} * (-0.001388888888887411 + z_{i} * (2.480158728947673e-05 + z_{i} * (-2.7557314351390663e-07 + z_{i} * (2.087572321298175e-09 + z_{i} * -1.1359647557788195e-11)))))
+zz_{i} = z_{i} * z_{i}
+ps_{i} = r_{i} + r_{i} * z_{i} * ((-0.16666666666666632 + z_{i} * 0.00833333333332249) + zz_{i} * ((-0.0001984126982985795 + z_{i} * 2.7557313707070068e-06) + zz_{i} * (-2.5050760253406863e-08 + z_{i} * 1.58969099521155e-10)))
+pc_{i} = (1.0 - 0.5 * z_{i}) + zz_{i} * ((0.0416666666666666 + z_{i} * -0.001388888888887411) + zz_{i} * ((2.480158728947673e-05 + z_{i} * -2.7557314351390663e-07) + zz_{i} * (2.087572321298175e-09 + z_{i} * -1.1359647557788195e-11)))
 h_{i} = np.floor(k_{i} * 0.5)
 o_{i} = k_{i} - 2.0 * h_{i}
 g_{i} = 1.0 - 2.0 * (h_{i} - 2.0 * np.floor(h_{i} * 0.5))

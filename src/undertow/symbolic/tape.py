@@ -24,6 +24,13 @@ class Assignment(NamedTuple):
 class Tape:
     """Ordered assignments in which every distinct expression is computed once.
 
+    Parameters
+    ----------
+    constants
+        Symbols that change seldom.  What they alone determine gets lines of its own, to be computed
+        as seldom: coefficients and terms of sums, factors of products, divisors, whose
+        reciprocals become factors.
+
     Examples
     --------
     >>> import sympy as sp
@@ -33,9 +40,10 @@ class Tape:
     True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, constants: Iterable[sp.Symbol] = ()) -> None:
         self.assignments: list[Assignment] = []
         self._known: dict[sp.Expr, sp.Symbol] = {}
+        self._constants: set[sp.Basic] = {*constants}
 
     def let(self, expression: sp.Expr | float) -> sp.Expr:
         """Lay one expression on the tape and return the atom that holds its value."""
@@ -44,7 +52,7 @@ class Tape:
     def let_all(self, expressions: Iterable[sp.Expr | float]) -> list[sp.Expr]:
         """Lay several expressions at once, sharing their common subexpressions."""
         replacements, reduced = sp.cse(
-            [sp.sympify(e) for e in expressions],
+            [self._collect(sp.sympify(e)) for e in expressions],
             symbols=sp.numbered_symbols("_cse_", real=True),
             order="canonical",
         )
@@ -56,11 +64,47 @@ class Tape:
     def _assign(self, expression: sp.Expr) -> sp.Expr:
         if expression.is_Atom:
             return expression
+        fixed = self._is_constant(expression)
+        expression = expression if fixed else self._apart(expression)
         if expression not in self._known:
             symbol = sp.Symbol(f"_v{len(self.assignments)}", real=True)
             self.assignments.append(Assignment(symbol, expression))
             self._known[expression] = symbol
+            if fixed:
+                self._constants.add(symbol)
         return self._known[expression]
+
+    def _is_constant(self, expression: sp.Expr) -> bool:
+        return bool(self._constants) and expression.free_symbols <= self._constants
+
+    def _collect(self, expression: sp.Expr) -> sp.Expr:
+        """Add up the constant coefficients of equal terms of a sum, on lines of their own."""
+        if not self._constants:
+            return expression
+        coefficients: dict[sp.Expr, list[sp.Expr]] = {}
+        for term in sp.Add.make_args(expression):
+            factors = sp.Mul.make_args(term)
+            fixed = [factor for factor in factors if self._is_constant(factor)]
+            other = [factor for factor in factors if not self._is_constant(factor)]
+            coefficients.setdefault(sp.Mul(*other), []).append(sp.Mul(*fixed))
+        terms = []
+        for term, parts in coefficients.items():
+            total = sp.Add(*parts)
+            sign = -1 if total.could_extract_minus_sign() else 1
+            terms.append(sign * self._assign(sign * total) * term)
+        return sp.Add(*terms)
+
+    def _apart(self, expression: sp.Expr) -> sp.Expr:
+        """Give lines of their own to what constants alone determine of an expression."""
+        if expression.is_Atom or not expression.free_symbols:
+            return expression
+        if self._is_constant(expression):
+            return self._assign(expression)
+        known = [a for a in expression.args if self._is_constant(a) and a != -1]
+        if len(known) > 1 and isinstance(expression, sp.Add | sp.Mul):
+            rest = [a for a in expression.args if a not in known]
+            return expression.func(self._apart(expression.func(*known)), *map(self._apart, rest))
+        return expression.func(*map(self._apart, expression.args))
 
     def live(self, outputs: Iterable[sp.Expr]) -> list[Assignment]:
         """Return the assignments that ``outputs`` depend on, in order."""
