@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sympy as sp
 
 from undertow.base import InvalidInputError, ModelError, checked, floats, one_of
 from undertow.models.importers.equations import BALANCE, check_balanced, force_scale, shifted
+from undertow.models.linearisation import controllability
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.models.quantities import number_of
 from undertow.models.validity import by_names
@@ -75,6 +77,202 @@ def find_equilibrium(mechanism: Mechanism, /, **guess: float) -> dict[str, float
         )
     names = [c.name for c in mechanism.coordinates]
     return dict(zip(names, (float(v) for v in q), strict=True))
+
+
+#: Words for equilibria.
+WORDS = ("upright", "hanging", "nearest")
+
+#: Largest Hautus distance from a pair of no use, relative: below, no input reaches a joint.
+_UNREACHED = 1e-9
+
+#: A usual start, error of the first free coordinate from the target: rad, m.
+_OFF = {"rad": math.radians(5.0), "m": 0.05}
+
+
+@checked
+def at_equilibrium(mechanism: Mechanism, target: str | Mapping[str, float] = "") -> Mechanism:
+    """Return the mechanism in error coordinates from an equilibrium that is found and named.
+
+    Searched are the equilibria near poses with every hinge at 0 or 180° (the first one at ±90°
+    too), that lie inside the travel of all joints and that the inputs can hold within their
+    limits.
+
+    Parameters
+    ----------
+    mechanism
+        The model, its coordinates as a file has them.
+    target
+        ``"upright"``: the one with the highest potential energy that gravity and springs would
+        leave.  ``"hanging"``: the one with the lowest, to which they return.  ``"nearest"``: the
+        one nearest to zero.  A guess, coordinate name to rad or m: the one near it, actuated
+        coordinates kept.  By default the nearest that inputs can stabilise, zero itself where it
+        is one.
+
+    Returns
+    -------
+    Mechanism
+        Its coordinates read zero at the target; its description says where that was.  Where it
+        has no usual start, one 5° or 5 cm off in the first free coordinate.
+
+    Raises
+    ------
+    ModelError
+        Where there is no such equilibrium, or no input reaches some joint there.
+    InvalidInputError
+        For another word, and unknown coordinates.
+    """
+    if isinstance(target, Mapping):
+        words = "the equilibrium near " + _position(mechanism, _positions(mechanism, target))
+        return _placed(mechanism, find_equilibrium(mechanism, **target), words)
+    if target:
+        one_of("target equilibrium", target, WORDS, "Or say where: joint=ANGLE")
+    found = list(_equilibria(mechanism)) if target or not _rests(mechanism) else []
+    names = [c.name for c in mechanism.coordinates]
+    if not (found or _rests(mechanism)):
+        raise ModelError(
+            f"equilibria of '{mechanism.name}'",
+            value="none that was found",
+            limit="a pose inside the travel of the joints, which the inputs hold within limits",
+            remedy=_adrift(mechanism) or "Say where one is: JOINT=ANGLE for every joint",
+        )
+    if target in ("upright", "hanging"):
+        high = target == "upright"
+        stands = [e for e in found if e.stable is not high and e.stable is not None]
+        if not stands:
+            raise ModelError(
+                f"{target} equilibrium of '{mechanism.name}'",
+                value="none that was found",
+                limit="one of " + "; ".join(_position(mechanism, e.q) for e in found),
+                remedy="Take the nearest, or say where: JOINT=ANGLE",
+            )
+        chosen = (max if high else min)(stands, key=lambda e: e.energy)
+        return _placed(mechanism, dict(zip(names, chosen.q.tolist(), strict=True)), target)
+    here = [np.zeros(mechanism.n)] if _rests(mechanism) else []
+    places = here + [e.q for e in found if np.abs(e.q).max() > 0 or not here]
+    if target == "nearest":
+        places = places[:1]
+    for q in places:
+        at = dict(zip(names, q.tolist(), strict=True))
+        moved = _placed(mechanism, at, "the nearest equilibrium")
+        if target or controllability(moved) > _UNREACHED:
+            return moved
+    if here and not target:  # there may be others, farther away
+        for e in _equilibria(mechanism):
+            at = dict(zip(names, e.q.tolist(), strict=True))
+            moved = _placed(mechanism, at, "the nearest equilibrium that inputs stabilise")
+            if controllability(moved) > _UNREACHED:
+                return moved
+    raise ModelError(
+        f"linear models of '{mechanism.name}' at its equilibria",
+        value="motions that no input reaches",
+        limit="controllable",
+        remedy=_adrift(mechanism) or "Actuate another joint: FILE:JOINT,JOINT",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Equilibrium:
+    """Positions, (n,); potential energy, J; whether gravity and springs return to it, if known."""
+
+    q: FloatArray
+    energy: float
+    stable: bool | None
+
+
+def _rests(mechanism: Mechanism) -> bool:
+    """Whether zero is an equilibrium of the free coordinates."""
+    residual = np.abs(mechanism.f(np.zeros(2 * mechanism.n))[mechanism.m :]).max()
+    return bool(residual <= BALANCE * force_scale(mechanism))
+
+
+def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
+    """Find equilibria inside the travel that the inputs hold, the nearest to zero first."""
+    n, m = mechanism.n, mechanism.m
+    hinges = [i for i, c in enumerate(mechanism.coordinates) if c.unit == "rad"]
+    low = np.array([c.low for c in mechanism.coordinates])
+    high = np.array([c.high for c in mechanism.coordinates])
+    tries = [(0.0, math.pi)] * len(hinges)
+    if tries:
+        tries[0] = (0.0, math.pi, math.pi / 2, -math.pi / 2)
+    found: list[FloatArray] = []
+    for angles in itertools.product(*tries):
+        guess = np.zeros(n)
+        guess[hinges] = angles
+        guess = np.where(guess > high, guess - 2 * math.pi, guess)
+        q, left = _solved(mechanism, guess)
+        turned = np.where(
+            [c.unit == "rad" and math.isinf(c.high) for c in mechanism.coordinates],
+            np.remainder(q + math.pi - 1e-9, 2 * math.pi) - math.pi + 1e-9,
+            q,
+        )
+        if left <= BALANCE and _residual(mechanism, turned) <= BALANCE:
+            q = turned
+        inside = bool(np.all((q > low) & (q < high)))
+        if not (left <= BALANCE and inside):
+            continue
+        held = np.abs(holding_input(mechanism, q)) <= mechanism.input_limits
+        if held.all() and not any(np.abs(q - other).max() < 1e-6 for other in found):
+            found.append(q)
+    scale = force_scale(mechanism)
+    for q in sorted(found, key=lambda q: float(np.linalg.norm(q))):
+        x = np.append(q, np.zeros(n))
+        steps = 1e-5 * np.eye(2 * n)[m:n]
+        slopes = (mechanism.f(x + steps) - mechanism.f(x - steps))[:, m:].T / 2e-5
+        pull = np.linalg.eigvals(slopes).real / scale
+        stable = False if (pull > 1e-7).any() else True if (pull < -1e-7).all() else None
+        energy = 0.0 if mechanism.potential is None else float(mechanism.energy(x))
+        yield _Equilibrium(q, energy, stable)
+
+
+def _residual(mechanism: Mechanism, q: FloatArray) -> float:
+    """|f_u| at rest at q, relative."""
+    force = mechanism.f(np.append(q, np.zeros(mechanism.n)))[mechanism.m :]
+    return float(np.abs(force).max()) / force_scale(mechanism)
+
+
+def _placed(mechanism: Mechanism, equilibrium: Mapping[str, float], words: str) -> Mechanism:
+    """Return the mechanism about an equilibrium, with a usual start, and words about it."""
+    q = _positions(mechanism, equilibrium)
+    moved = move_target(mechanism, **equilibrium) if np.any(q) else mechanism
+    held = holding_input(moved)
+    force = ", ".join(f"{i.name} = {u:.3g}" for i, u in zip(moved.inputs, held, strict=True) if u)
+    text = f"target {words}: {_position(mechanism, q)} of the file"
+    text += f", held by {force}" * bool(force)
+    free = moved.coordinates[moved.m]
+    off = min(_OFF.get(free.unit, 0.05), 0.5 * free.high)
+    start = mechanism.start if mechanism.start and not np.any(q) else {free.name: off}
+    lines = [line for line in (mechanism.description, text) if line]
+    return replace(moved, start=dict(start), description="\n".join(lines))
+
+
+def _position(mechanism: Mechanism, q: FloatArray) -> str:
+    """Positions in words, hinges in degrees."""
+    return ", ".join(
+        f"{c.name} = {math.degrees(v):.4g}°" if c.unit == "rad" else f"{c.name} = {v:.4g} m"
+        for c, v in zip(mechanism.coordinates, q.tolist(), strict=True)
+    )
+
+
+def _adrift(mechanism: Mechanism) -> str:
+    """Say which coordinates nothing ties to those that inputs act on."""
+    n, m = mechanism.n, mechanism.m
+    tied = set(range(m))
+    rates = [c.velocity for c in mechanism.coordinates]
+    for _ in range(n):
+        for i in range(n):
+            for j in range(n):
+                force = mechanism.force[i].free_symbols | mechanism.mass_matrix[i, j].free_symbols
+                acts = {mechanism.q[j], rates[j]} & force or mechanism.mass_matrix[i, j] != 0
+                if i != j and acts and {i, j} & tied:
+                    tied |= {i, j}
+    loose = [c.name for i, c in enumerate(mechanism.coordinates) if i not in tied]
+    if not loose:
+        return ""
+    names = ",".join(f"-{name}" for name in loose)
+    return (
+        f"Nothing ties {', '.join(loose)} to what the inputs move: if they do not belong to the "
+        f"mechanism, freeze them, FILE:{names}"
+    )
 
 
 def _solved(mechanism: Mechanism, q: FloatArray) -> tuple[FloatArray, float]:

@@ -26,7 +26,13 @@ from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.coordinates import number, tidy
 from undertow.models.importers.equations import from_matrices, lagrange_force, unit_inputs
 from undertow.models.importers.tree import WORLD, Joint, Link, Tree
-from undertow.models.mechanism import Coordinate, Input, Mechanism, Parameter
+from undertow.models.mechanism import (
+    Coordinate,
+    Input,
+    Mechanism,
+    Parameter,
+    check_underactuated,
+)
 from undertow.models.quantities import code_points, normal_name
 
 #: Longest mass matrix, in operations of its upper half: deriving f from it takes some 10 s.
@@ -81,6 +87,13 @@ def mechanism_from_tree(
                 remedy="Write actuated=['shoulder']",
             )
     joints = tree.moving
+    if not joints:
+        raise ModelError(
+            f"'{tree.name}'",
+            value="no moving joint",
+            limit="at least two, and fewer motors than joints",
+            remedy="There is nothing to balance",
+        )
     names = _distinct([joint.name for joint in joints])
     coordinates = [
         Coordinate(
@@ -94,6 +107,7 @@ def mechanism_from_tree(
     ]
     index = {joint.name: i for i, joint in enumerate(joints)}
     inputs, B = _inputs(tree, joints, coordinates, index, actuated, effort or {})
+    check_underactuated(identifier(tree.name), len(joints), len(inputs))  # before long work
     book = _Book()
     mass, potential = _energies(tree, coordinates, index, book)
     dissipation = sp.Integer(0)
