@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,9 +12,10 @@ import sympy as sp
 
 from undertow.base import InvalidInputError, ModelError, checked, floats, one_of
 from undertow.models.importers.equations import BALANCE, check_balanced, force_scale, shifted
-from undertow.models.linearisation import controllability
+from undertow.models.linearisation import controllability, linearise
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.models.quantities import number_of
+from undertow.models.importers.tree import LARGEST
 from undertow.models.validity import by_names
 
 
@@ -205,6 +206,7 @@ def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
             np.remainder(q + math.pi - 1e-9, 2 * math.pi) - math.pi + 1e-9,
             q,
         )
+        turned[np.abs(turned) < 1e-12] = 0.0
         if left <= BALANCE and _residual(mechanism, turned) <= BALANCE:
             q = turned
         inside = bool(np.all((q > low) & (q < high)))
@@ -236,13 +238,69 @@ def _placed(mechanism: Mechanism, equilibrium: Mapping[str, float], words: str) 
     moved = move_target(mechanism, **equilibrium) if np.any(q) else mechanism
     held = holding_input(moved)
     force = ", ".join(f"{i.name} = {u:.3g}" for i, u in zip(moved.inputs, held, strict=True) if u)
+    words = words if np.any(q) else "zero" + f", {words}" * (words in WORDS)
     text = f"target {words}: {_position(mechanism, q)} of the file"
     text += f", held by {force}" * bool(force)
-    free = moved.coordinates[moved.m]
-    off = min(_OFF.get(free.unit, 0.05), 0.5 * free.high)
-    start = mechanism.start if mechanism.start and not np.any(q) else {free.name: off}
+    if not (mechanism.start and not np.any(q)):
+        start, needed = _usual_start(moved)
+        moved = replace(moved, start=start)
+        text += f"; 5° or 5 cm off needs {needed:.3g} times its inputs' limits" * (needed > 1)
     lines = [line for line in (mechanism.description, text) if line]
-    return replace(moved, start=dict(start), description="\n".join(lines))
+    return replace(moved, description="\n".join(lines))
+
+
+def _usual_start(mechanism: Mechanism) -> tuple[dict[str, float], float]:
+    """Return a start that the inputs can bring home: 5° or 5 cm off in the first free coordinate.
+
+    Where the linear model needs more than the limits for that, so much closer that it needs half.
+
+    Returns
+    -------
+    dict, float
+        The start, and what 5° or 5 cm need of the limits.
+    """
+    free = mechanism.coordinates[mechanism.m]
+    off = min(_OFF.get(free.unit, 0.05), 0.5 * free.high, -0.5 * free.low)
+    needed = _least_peak(mechanism, mechanism.state(**{free.name: off}))
+    return {free.name: off if needed <= 1 else 0.5 * off / needed}, needed
+
+
+def _least_peak(mechanism: Mechanism, x: FloatArray) -> float:
+    """Return the least peak of inputs, in parts of their limits, that stops all growing motions.
+
+    Of the linear model at the target, a motion z = wᵀx that grows as e^{λt} comes to rest under
+    u(t) where ∫ e^{−λt} wᵀB u dt = −z(0): a linear programme in u on 300 steps, until its slowest
+    has grown e⁶ times.
+    """
+    from scipy.optimize import linprog  # slow to import
+
+    try:
+        lin = linearise(mechanism)
+    except ModelError:
+        return 0.0
+    rates, modes = np.linalg.eig(lin.A.T)
+    grows = rates.real > 1e-6
+    limits = np.minimum(mechanism.input_limits, LARGEST)
+    if not grows.any():
+        return 0.0
+    rates, modes = rates[grows], modes[:, grows]
+    t = np.linspace(0.0, 6.0 / float(rates.real.min()), 301)
+    decay = np.exp(-np.outer(rates, t))
+    part = (decay[:, :-1] - decay[:, 1:]) / rates[:, None]
+    pushes = np.einsum("rk,ri->rki", part, modes.T @ lin.input * limits).reshape(len(rates), -1)
+    size = pushes.shape[1]
+    equal = np.hstack([np.vstack([pushes.real, pushes.imag]), np.zeros((2 * len(rates), 1))])
+    wanted = -np.hstack([(modes.T @ x).real, (modes.T @ x).imag])
+    peak = np.vstack([np.hstack([sign * np.eye(size), -np.ones((size, 1))]) for sign in (1, -1)])
+    found = linprog(
+        np.append(np.zeros(size), 1.0),
+        A_ub=peak,
+        b_ub=np.zeros(2 * size),
+        A_eq=equal,
+        b_eq=wanted,
+        bounds=[(None, None)] * size + [(0, None)],
+    )
+    return float(found.fun) if found.status == 0 else 0.0
 
 
 def _position(mechanism: Mechanism, q: FloatArray) -> str:
@@ -293,10 +351,26 @@ def _solved(mechanism: Mechanism, q: FloatArray) -> tuple[FloatArray, float]:
         return np.asarray(mechanism.f(x)[m:] / scale)
 
     try:
-        found = root(force, q[m:], tol=1e-14).x
+        found = _polished(force, root(force, q[m:], tol=1e-14).x)
         return np.concatenate([q[:m], found]), float(np.abs(force(found)).max())
     except InvalidInputError:  # the search left what can be computed
         return q, math.inf
+
+
+def _polished(force: Callable[[FloatArray], FloatArray], q: FloatArray) -> FloatArray:
+    """Newton's method to the last digits, where the slopes are regular."""
+    h, best = 1e-6, q
+    for _ in range(4):
+        left = force(best)
+        slopes = np.array([(force(best + d) - force(best - d)) / (2 * h) for d in h * np.eye(len(q))])
+        try:
+            better = best - np.linalg.solve(slopes.T, left)
+        except np.linalg.LinAlgError:
+            return best
+        if not np.abs(force(better)).max() < np.abs(left).max():
+            return best
+        best = better
+    return best
 
 
 @checked
