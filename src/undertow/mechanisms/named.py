@@ -49,8 +49,10 @@ def named(name: str) -> Mechanism:
     data = DataName.of(name)
     if data is not None:
         read = FILES[data.file.suffix]
-        mechanism = read(data.file, actuated=data.actuated or None, frozen=data.frozen)
-        return at_equilibrium(mechanism, data.equilibrium)
+        driven, target = data.actuated or None, data.equilibrium
+        if isinstance(target, str):
+            return read(data.file, actuated=driven, frozen=data.frozen, equilibrium=target)
+        return at_equilibrium(read(data.file, actuated=driven, frozen=data.frozen), target)
     own = "One of your own is FILE.py:NAME, FILE.urdf or FILE.xml"
     one_of("mechanism", name, LIBRARY, own)
     return LIBRARY[name]()

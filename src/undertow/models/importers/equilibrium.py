@@ -86,6 +86,9 @@ WORDS = ("upright", "hanging", "nearest")
 #: Largest Hautus distance from a pair of no use, relative: below, no input reaches a joint.
 _UNREACHED = 1e-9
 
+#: Hinges of which both 0 and 180° are tried.
+_TRIED = 5
+
 #: A usual start, error of the first free coordinate from the target: rad, m.
 _OFF = {"rad": math.radians(5.0), "m": 0.05}
 
@@ -192,7 +195,12 @@ def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
     hinges = [i for i, c in enumerate(mechanism.coordinates) if c.unit == "rad"]
     low = np.array([c.low for c in mechanism.coordinates])
     high = np.array([c.high for c in mechanism.coordinates])
-    tries = [(0.0, math.pi)] * len(hinges)
+    sample = np.random.default_rng(0).uniform(-2, 2, (64, n))
+    forces = mechanism.f(np.hstack([sample, np.zeros_like(sample)]))[:, m:]
+    falls = np.ptp(forces, axis=0) < 1e-9 * np.abs(forces).max(axis=0)
+    if falls.any():  # a force that is the same everywhere, and not zero
+        return
+    tries = [(0.0, math.pi)] * min(len(hinges), _TRIED) + [(0.0,)] * (len(hinges) - _TRIED)
     if tries:
         tries[0] = (0.0, math.pi, math.pi / 2, -math.pi / 2)
     found: list[FloatArray] = []

@@ -17,7 +17,7 @@ from undertow.models.importers.mjcf_bodies import Frame, link_of
 from undertow.models.importers.mjcf_document import Document, free_body, mjcf_document
 from undertow.models.importers.mujoco_compiler import compared, compiled, engine, tree_of
 from undertow.models.importers.reading import described, names_of
-from undertow.models.importers.rigid_body import mechanism_from_tree
+from undertow.models.importers.rigid_body import check_held, mechanism_from_tree
 from undertow.models.importers.tree import (
     WORLD,
     Actuator,
@@ -94,6 +94,8 @@ def from_mjcf(
     with computable("MJCF"):
         document = mjcf_document(source, names_of(frozen, "frozen"))
         tree, model, refusal = _read(document, motors=actuated is None)
+        if isinstance(equilibrium, str):
+            check_held(tree)
         place = equilibrium if isinstance(equilibrium, Mapping) else None
         mechanism = mechanism_from_tree(
             tree,

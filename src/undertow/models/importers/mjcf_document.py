@@ -256,6 +256,8 @@ def _strip(root: ET.Element) -> None:
         option.attrib = {k: v for k, v in option.attrib.items() if k in _OPTIONS}
         for flag in option.iterfind("flag"):
             flag.attrib = {k: v for k, v in flag.attrib.items() if k in _FLAGS}
+    for inertial in root.iter("inertial"):
+        inertial.attrib.setdefault("pos", "0 0 0")
     for element in list(root.iter()):
         element.attrib.pop("material", None)
         for child in list(element):

@@ -12,6 +12,7 @@ import importlib
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ AGREEMENT = 1e-8
 #: States at which they are compared.
 _STATES = 16
 
+_ALIKE = "accelerations as its own to"
 _EYE, _ORIGIN = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 
@@ -40,6 +42,17 @@ def engine() -> Any | None:
         return None
 
 
+@contextmanager
+def _quiet(mujoco: Any) -> Iterator[None]:
+    """Keep the compiler's warnings from the terminal, and from a log file in the user's folder."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
 def compiled(mujoco: Any, document: Document) -> Any:
     """Return MuJoCo's model of a document.
 
@@ -49,7 +62,8 @@ def compiled(mujoco: Any, document: Document) -> Any:
         In MuJoCo's own words, where its compiler refuses.
     """
     try:
-        return mujoco.MjModel.from_xml_string(document.text, document.files)
+        with _quiet(mujoco):
+            return mujoco.MjModel.from_xml_string(document.text, document.files)
     except (ValueError, mujoco.FatalError) as error:
         said = " ".join(str(error).split())
         raise InvalidInputError(
@@ -341,7 +355,8 @@ def urdf_compiled(mujoco: Any, robot: ET.Element, gravity: Vector) -> Any | None
         if element.tag not in ("link", "joint"):
             bare.remove(element)
     try:
-        model = mujoco.MjModel.from_xml_string(ET.tostring(bare, encoding="unicode"))
+        with _quiet(mujoco):
+            model = mujoco.MjModel.from_xml_string(ET.tostring(bare, encoding="unicode"))
     except (ValueError, mujoco.FatalError):
         return None
     model.opt.gravity[:] = gravity
@@ -364,7 +379,13 @@ def compared(
     version = f"MuJoCo {mujoco.__version__}"
     if math.isnan(worst):
         return f"{version}, not compared with it: joints have no names"
-    return f"{version}, accelerations as its own to {worst:.1g}"
+    return f"{version}, {_ALIKE} {worst:.1g}"
+
+
+def agreement(mechanism: Mechanism) -> str:
+    """To what the accelerations of a mechanism from a file are MuJoCo's; nothing where unknown."""
+    said = mechanism.description.partition(_ALIKE)[2]
+    return said.partition("\n")[0].strip()
 
 
 def compare(

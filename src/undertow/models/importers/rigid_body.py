@@ -142,6 +142,35 @@ def mechanism_from_tree(
     )
 
 
+def check_held(tree: Tree) -> None:
+    """Refuse a tree that falls whatever its joints do: no pose of it is an equilibrium.
+
+    (Joints that ``actuated`` names instead are not known here.)
+
+    Raises
+    ------
+    ModelError
+        For a slide that nothing but contact could hold against gravity.
+    """
+    driven = {name for a in (*tree.actuators, *tree.couplings) for name in a.coefficients}
+    turns: dict[str, np.ndarray | None] = {WORLD: np.eye(3)}  # None behind a hinge
+    for joint in tree.ordered():
+        before = turns[joint.parent]
+        turn = None if before is None else before @ np.asarray(joint.rotation)
+        turns[joint.child] = None if joint.kind == "hinge" else turn
+        if joint.kind != "slide" or joint.stiffness or joint.name in driven or turn is None:
+            continue
+        along = turn @ np.asarray(joint.axis, dtype=float) @ np.asarray(tree.gravity)
+        if abs(along) > 1e-3 * np.linalg.norm(tree.gravity) * np.linalg.norm(joint.axis):
+            raise ModelError(
+                f"joint '{joint.name}' of '{tree.name}'",
+                value="a slide along which the mechanism falls",
+                limit="held by a motor or a spring: contacts are left out",
+                remedy=f"What stands, walks or flies is not balanced here; freeze it, "
+                f"FILE:-{joint.name}, or drive it, FILE:{joint.name}",
+            )
+
+
 def identifier(name: str) -> str:
     """Return the name as a Python identifier: what is no letter or digit becomes ``_``.
 

@@ -15,7 +15,7 @@ from undertow.base import ModelError, checked, one_of
 from undertow.models.importers.equilibrium import at_equilibrium
 from undertow.models.importers.mujoco_compiler import compared, engine, urdf_compiled
 from undertow.models.importers.reading import described, names_of
-from undertow.models.importers.rigid_body import mechanism_from_tree
+from undertow.models.importers.rigid_body import check_held, mechanism_from_tree
 from undertow.models.importers.tree import FREE_BASE, WORLD, Joint, Link, Tree, Vector
 from undertow.models.importers.xml_files import (
     computable,
@@ -90,6 +90,8 @@ def from_urdf(
     with computable("URDF"):
         robot = _frozen(parse_xml(source, "robot"), names_of(frozen, "frozen"))
         tree, transmitted = _read(robot, gravity)
+        if isinstance(equilibrium, str):
+            check_held(tree)
         place = equilibrium if isinstance(equilibrium, Mapping) else None
         mechanism = mechanism_from_tree(
             tree,
@@ -156,6 +158,12 @@ def _read(robot: ET.Element, gravity: Vector) -> tuple[Tree, tuple[str, ...]]:
             limit="at least one",
             remedy="Give the bodies as <link>, the way they move as <joint>",
         )
+    # MuJoCo's way with what no body can be: a link without mass that moves with another.
+    welded = {joint.child for joint in joints if joint.kind == "fixed"}
+    links = [
+        replace(link, inertia=np.zeros((3, 3))) if link.name in welded and not link.mass else link
+        for link in links
+    ]
     children = {joint.child for joint in joints}
     roots = [link.name for link in links if link.name not in children]
     if len(roots) > 1:
@@ -169,8 +177,9 @@ def _read(robot: ET.Element, gravity: Vector) -> tuple[Tree, tuple[str, ...]]:
         joints.append(Joint(f"{roots[0]}_to_world", "fixed", WORLD, roots[0]))
     kept = tuple(link for link in links if link.name != WORLD)
     tree = Tree(name, kept, tuple(joints), gravity)
+    still = {joint.name for joint in joints if joint.kind == "fixed"}
     transmitted = [joint.get("name", "") for joint in robot.iterfind("transmission/joint")]
-    return tree, tuple(transmitted)
+    return tree, tuple(name for name in transmitted if name not in still)
 
 
 def _pose(element: ET.Element, of: str) -> tuple[FloatArray, Vector]:

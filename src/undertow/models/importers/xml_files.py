@@ -19,8 +19,8 @@ from undertow.models.mechanism import FloatArray
 LARGEST, DEEPEST, MOST = 1 << 24, 64, 20_000
 
 
-#: What tools leave in front of, or in, the XML of people's files: a declaration that does not
-#: come first, and the defaults of ROS' substitutions.
+#: What tools leave in the XML of people's files: a declaration that does not come first, the
+#: defaults of ROS' substitutions, and zeros at the end.
 _DECLARATION = re.compile(r"<\?xml\b[^>]*\?>")
 _DEFAULTED = re.compile(r"\$\(optenv\s+\S+\s+([^()]*)\)")
 #: A full stop behind a number that has one.
@@ -73,7 +73,7 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
             limit="plain XML",
             remedy="Expand the entities first",
         )
-    text = _DEFAULTED.sub(r"\1", _DECLARATION.sub("", text))
+    text = _DEFAULTED.sub(r"\1", _DECLARATION.sub("", text)).rstrip("\0 \t\r\n")
     try:
         _check_size(text, root)
         element = ET.fromstring(text)
