@@ -17,7 +17,6 @@ from undertow.models.partition import compiled
 from undertow.models.quantities import TIME, FloatArray, numbers
 from undertow.models.validity import kinks, require_smooth, shortened
 
-
 #: Largest |f_u| at a target, N m or N.
 AT_REST = 1e-9
 

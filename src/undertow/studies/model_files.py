@@ -154,7 +154,13 @@ def _one(file: Path, short: str, simulate: bool, seed: int) -> ModelFile:
             row = _motion(row, mechanism, seed)
     except UndertowError as error:
         none = error.what == "model file" and str(error.value).startswith("root")
-        about = "no model" if none else next((word for kind, word in _ABOUT.items() if isinstance(error, kind)), "a motion")
+        about = (
+            "no model"
+            if none
+            else next(
+                (word for kind, word in _ABOUT.items() if isinstance(error, kind)), "a motion"
+            )
+        )
         why = f"{error.what}: {error.value}" if error.value is not None else error.what
         row = replace(row, refused=about, why=" ".join(why.replace("|", "/").split()))
     return replace(row, seconds=time.perf_counter() - began)

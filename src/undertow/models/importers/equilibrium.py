@@ -12,10 +12,10 @@ import sympy as sp
 
 from undertow.base import InvalidInputError, ModelError, checked, floats, one_of
 from undertow.models.importers.equations import BALANCE, check_balanced, force_scale, shifted
+from undertow.models.importers.tree import LARGEST
 from undertow.models.linearisation import controllability, linearise
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.models.quantities import number_of
-from undertow.models.importers.tree import LARGEST
 from undertow.models.validity import by_names
 
 
@@ -200,7 +200,9 @@ def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
     falls = np.ptp(forces, axis=0) < 1e-9 * np.abs(forces).max(axis=0)
     if falls.any():  # a force that is the same everywhere, and not zero
         return
-    tries = [(0.0, math.pi)] * min(len(hinges), _TRIED) + [(0.0,)] * (len(hinges) - _TRIED)
+    tries: list[tuple[float, ...]] = [(0.0, math.pi)] * min(len(hinges), _TRIED) + [(0.0,)] * (
+        len(hinges) - _TRIED
+    )
     if tries:
         tries[0] = (0.0, math.pi, math.pi / 2, -math.pi / 2)
     found: list[FloatArray] = []
@@ -308,7 +310,7 @@ def _least_peak(mechanism: Mechanism, x: FloatArray) -> float:
         b_eq=wanted,
         bounds=[(None, None)] * size + [(0, None)],
     )
-    return float(found.fun) if found.status == 0 else 0.0
+    return float(found.fun or 0.0) if found.status == 0 else 0.0
 
 
 def _position(mechanism: Mechanism, q: FloatArray) -> str:
@@ -370,7 +372,9 @@ def _polished(force: Callable[[FloatArray], FloatArray], q: FloatArray) -> Float
     h, best = 1e-6, q
     for _ in range(4):
         left = force(best)
-        slopes = np.array([(force(best + d) - force(best - d)) / (2 * h) for d in h * np.eye(len(q))])
+        slopes = np.array(
+            [(force(best + d) - force(best - d)) / (2 * h) for d in h * np.eye(len(q))]
+        )
         try:
             better = best - np.linalg.solve(slopes.T, left)
         except np.linalg.LinAlgError:

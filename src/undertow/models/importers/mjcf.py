@@ -95,7 +95,7 @@ def from_mjcf(
         document = mjcf_document(source, names_of(frozen, "frozen"))
         tree, model, refusal = _read(document, motors=actuated is None)
         if isinstance(equilibrium, str):
-            check_held(tree)
+            check_held(tree, actuated or ())
         place = equilibrium if isinstance(equilibrium, Mapping) else None
         mechanism = mechanism_from_tree(
             tree,

@@ -21,7 +21,11 @@ from undertow.base import InvalidInputError, ModelError
 from undertow.models.importers.mjcf_document import Document, free_body
 from undertow.models.importers.rigid_body import identifier
 from undertow.models.importers.tree import WORLD, Actuator, Coupling, Joint, Link, Tree, Vector
-from undertow.models.importers.xml_files import rotation_from_quaternion, without_rounding
+from undertow.models.importers.xml_files import (
+    numbers_of,
+    rotation_from_quaternion,
+    without_rounding,
+)
 from undertow.models.mechanism import FloatArray, Mechanism
 
 #: Largest difference of accelerations from the engine's, relative to the largest of a state.
@@ -29,6 +33,9 @@ AGREEMENT = 1e-8
 
 #: States at which they are compared.
 _STATES = 16
+
+#: How many numbers attributes of a URDF have.
+_LENGTHS = {"xyz": 3, "rpy": 3, "lower": 1, "upper": 1}
 
 _ALIKE = "accelerations as its own to"
 _EYE, _ORIGIN = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -171,7 +178,7 @@ class _Compiled:
                 self.joints.append(Joint(f"{name}_fixed", "fixed", carrier, name, *pose))
             turn = rotation_from_quaternion(model.body_iquat[b].tolist())
             tensor = without_rounding(turn @ np.diag(model.body_inertia[b]) @ turn.T)
-            com = _vector(without_rounding(model.body_ipos[b]))
+            com = _vector(without_rounding(model.body_ipos[b]).tolist())
             self.links.append(Link(name, float(model.body_mass[b]), com, (tensor + tensor.T) / 2))
 
     def _joint(
@@ -354,6 +361,11 @@ def urdf_compiled(mujoco: Any, robot: ET.Element, gravity: Vector) -> Any | None
     for element in list(bare):
         if element.tag not in ("link", "joint"):
             bare.remove(element)
+    for element in bare.iter():  # as they were read, commas and all
+        for attribute, count in _LENGTHS.items():
+            if attribute in element.attrib:
+                values = numbers_of(element, attribute, None, count)
+                element.set(attribute, " ".join(map(repr, values)))
     try:
         with _quiet(mujoco):
             model = mujoco.MjModel.from_xml_string(ET.tostring(bare, encoding="unicode"))
@@ -460,9 +472,7 @@ def compare(
     return worst
 
 
-def _rows(
-    mechanism: Mechanism, tree: Tree, joints: Sequence[str], driven: bool
-) -> FloatArray:
+def _rows(mechanism: Mechanism, tree: Tree, joints: Sequence[str], driven: bool) -> FloatArray:
     """The mechanism's coordinates as combinations of joints, (n, n)."""
     places = {identifier(name): j for j, name in enumerate(joints)}
     strokes = [a.coefficients for a in tree.actuators] if driven else []

@@ -28,6 +28,7 @@ from undertow.models.importers.equations import from_matrices, lagrange_force, u
 from undertow.models.importers.tree import WORLD, Joint, Link, Tree
 from undertow.models.mechanism import (
     Coordinate,
+    FloatArray,
     Input,
     Mechanism,
     Parameter,
@@ -142,18 +143,24 @@ def mechanism_from_tree(
     )
 
 
-def check_held(tree: Tree) -> None:
+def check_held(tree: Tree, actuated: Sequence[str]) -> None:
     """Refuse a tree that falls whatever its joints do: no pose of it is an equilibrium.
 
-    (Joints that ``actuated`` names instead are not known here.)
+    Parameters
+    ----------
+    tree
+        With the file's own actuators.
+    actuated
+        Joints that are driven besides.
 
     Raises
     ------
     ModelError
         For a slide that nothing but contact could hold against gravity.
     """
-    driven = {name for a in (*tree.actuators, *tree.couplings) for name in a.coefficients}
-    turns: dict[str, np.ndarray | None] = {WORLD: np.eye(3)}  # None behind a hinge
+    driven = {name for a in tree.actuators for name in a.coefficients} | set(actuated)
+    driven |= {name for c in tree.couplings if c.stiffness for name in c.coefficients}
+    turns: dict[str, FloatArray | None] = {WORLD: np.eye(3)}  # None behind a hinge
     for joint in tree.ordered():
         before = turns[joint.parent]
         turn = None if before is None else before @ np.asarray(joint.rotation)

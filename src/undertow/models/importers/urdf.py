@@ -90,12 +90,13 @@ def from_urdf(
     with computable("URDF"):
         robot = _frozen(parse_xml(source, "robot"), names_of(frozen, "frozen"))
         tree, transmitted = _read(robot, gravity)
+        driven = actuated if actuated is not None else transmitted or _driven(tree) or None
         if isinstance(equilibrium, str):
-            check_held(tree)
+            check_held(tree, driven or ())
         place = equilibrium if isinstance(equilibrium, Mapping) else None
         mechanism = mechanism_from_tree(
             tree,
-            actuated=actuated if actuated is not None else transmitted or _driven(tree) or None,
+            actuated=driven,
             equilibrium=place,
             start=start,
             effort=effort,
