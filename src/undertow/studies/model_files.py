@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from textwrap import shorten
 
 from rich.console import RenderableType
 
@@ -43,6 +44,9 @@ _MOST_TRIED = 5
 
 #: What a refusal is about.
 _ABOUT = {ModelError: "mechanics", InvalidInputError: "the text", ArtefactError: "a missing file"}
+
+#: Most files of a group that are named.
+_SHOWN = 4
 
 #: Columns of the table of files that are read.
 HEADS = ("file", "n", "m", "target", "as MuJoCo to", "start", "arrives")
@@ -224,22 +228,29 @@ def _kept(rows: Sequence[ModelFile]) -> list[ModelFile]:
 
 
 def refused_groups(rows: Sequence[ModelFile]) -> Iterator[tuple[str, str, str, int]]:
-    """Gather files of a folder that are refused alike: files, about what, why, how many."""
+    """Gather the files below one folder that are refused alike.
+
+    Yields
+    ------
+    str, str, str, int
+        The first files, what their refusal is about, the first one's reason, how many there are.
+    """
 
     def alike(row: ModelFile) -> tuple[str, str, str]:
-        return str(Path(row.name).parent), row.refused, _without_names(row.why)
+        return Path(row.name).parts[0], row.refused, _kind(row.why)
 
     refused = sorted((row for row in rows if row.refused), key=lambda row: (*alike(row), row.name))
-    for (folder, about, _), group in groupby(refused, alike):
+    for (_, about, _), group in groupby(refused, alike):
         some = list(group)
-        names = [Path(row.name).name for row in some]
-        shown = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-        yield f"{folder}/{shown}".removeprefix("./"), about, some[0].why, len(some)
+        names = [row.name for row in some]
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        why = shorten(some[0].why, 110, placeholder=" …")
+        yield ", ".join(names[:_SHOWN]) + more, about, why, len(some)
 
 
-def _without_names(why: str) -> str:
-    """A reason without what is quoted in it, or counted."""
-    return re.sub(r"'[^']*'|[-\d.e]+", "", why)
+def _kind(why: str) -> str:
+    """A reason without what is quoted, named or counted in it."""
+    return re.sub(r"'[^']*'|joint \S+:|joints .*|moments .*|[-\d.e]+", "", why)
 
 
 def refused_table(rows: Sequence[ModelFile]) -> RenderableType:
