@@ -130,48 +130,53 @@ def at_equilibrium(mechanism: Mechanism, target: str | Mapping[str, float] = "")
         return _placed(mechanism, find_equilibrium(mechanism, **target), words)
     if target:
         one_of("target equilibrium", target, WORDS, "Or say where: joint=ANGLE")
-    found = list(_equilibria(mechanism)) if target or not _rests(mechanism) else []
-    names = [c.name for c in mechanism.coordinates]
-    if not (found or _rests(mechanism)):
+    if target in ("upright", "hanging"):
+        return _standing(mechanism, target)
+    q = None
+    for q in _nearest_first(mechanism):
+        moved = _placed(mechanism, _named(mechanism, q), "the nearest equilibrium")
+        if target or controllability(moved) > _UNREACHED:
+            return moved
+    if q is None:
         raise ModelError(
             f"equilibria of '{mechanism.name}'",
             value="none that was found",
             limit="a pose inside the travel of the joints, which the inputs hold within limits",
             remedy=_adrift(mechanism) or "Say where one is: JOINT=ANGLE for every joint",
         )
-    if target in ("upright", "hanging"):
-        high = target == "upright"
-        stands = [e for e in found if e.stable is not high and e.stable is not None]
-        if not stands:
-            raise ModelError(
-                f"{target} equilibrium of '{mechanism.name}'",
-                value="none that was found",
-                limit="one of " + "; ".join(_position(mechanism, e.q) for e in found),
-                remedy="Take the nearest, or say where: JOINT=ANGLE",
-            )
-        chosen = (max if high else min)(stands, key=lambda e: e.energy)
-        return _placed(mechanism, dict(zip(names, chosen.q.tolist(), strict=True)), target)
-    here = [np.zeros(mechanism.n)] if _rests(mechanism) else []
-    places = here + [e.q for e in found if np.abs(e.q).max() > 0 or not here]
-    if target == "nearest":
-        places = places[:1]
-    for q in places:
-        at = dict(zip(names, q.tolist(), strict=True))
-        moved = _placed(mechanism, at, "the nearest equilibrium")
-        if target or controllability(moved) > _UNREACHED:
-            return moved
-    if here and not target:  # there may be others, farther away
-        for e in _equilibria(mechanism):
-            at = dict(zip(names, e.q.tolist(), strict=True))
-            moved = _placed(mechanism, at, "the nearest equilibrium that inputs stabilise")
-            if controllability(moved) > _UNREACHED:
-                return moved
     raise ModelError(
         f"linear models of '{mechanism.name}' at its equilibria",
         value="motions that no input reaches",
         limit="controllable",
         remedy=_adrift(mechanism) or "Actuate another joint: FILE:JOINT,JOINT",
     )
+
+
+def _nearest_first(mechanism: Mechanism) -> Iterator[FloatArray]:
+    """Zero where it is an equilibrium, then those that are found, which takes longer."""
+    rests = _rests(mechanism)
+    if rests:
+        yield np.zeros(mechanism.n)
+    yield from (e.q for e in _equilibria(mechanism) if np.any(e.q) or not rests)
+
+
+def _standing(mechanism: Mechanism, target: str) -> Mechanism:
+    """Return the mechanism about its upright or hanging equilibrium."""
+    high, found = target == "upright", list(_equilibria(mechanism))
+    stands = [e for e in found if e.stable is (not high)]
+    if not stands:
+        raise ModelError(
+            f"{target} equilibrium of '{mechanism.name}'",
+            value="none that was found",
+            limit="one of " + ("; ".join(_position(mechanism, e.q) for e in found) or "none"),
+            remedy="Take the nearest, or say where: JOINT=ANGLE",
+        )
+    chosen = (max if high else min)(stands, key=lambda e: e.energy)
+    return _placed(mechanism, _named(mechanism, chosen.q), target)
+
+
+def _named(mechanism: Mechanism, q: FloatArray) -> dict[str, float]:
+    return dict(zip((c.name for c in mechanism.coordinates), q.tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
