@@ -454,7 +454,8 @@ def compare(
         data.qpos[:], data.qvel[:] = q[order], v[order]
         if driven:
             data.ctrl[:] = u
-        mujoco.mj_forward(model, data)
+        with _quiet(mujoco):
+            mujoco.mj_forward(model, data)
         theirs = np.zeros(n)
         theirs[order] = data.qacc
         theirs = rows @ theirs
