@@ -14,11 +14,13 @@ from runs import run
 from undertow.base import ArtefactError, InvalidInputError, ModelError, UndertowError
 from undertow.cli.parsing import aimed
 from undertow.estimators import Belief
-from undertow.mechanisms.named import DataName, from_anywhere, named
+from undertow.mechanisms.named import DataName, from_anywhere, named, origin
 from undertow.models import FloatArray, controllability
 from undertow.models import importers as modelling
 from undertow.models.importers import mjcf, mjcf_document, mujoco_compiler
 from undertow.models.importers.mujoco_compiler import AGREEMENT, agreement
+from undertow.runtime import Recipe
+from undertow.runtime.session import rig_named
 from undertow.studies.model_files import files_of, model_files, refused_groups, summary
 
 LOOK = """<mujoco>
@@ -274,6 +276,21 @@ def test_equilibria_by_name(pole: Path) -> None:
     pole.write_text(POLE.replace('range="-80 200"', 'range="-80 80"'))
     with pytest.raises(ModelError, match=r"hanging equilibrium.*one of slider = 0 m, hinge = -0"):
         named(f"{pole}@hanging")
+
+
+def test_a_rig_in_mujoco_stands_where_the_mechanism_does(pole: Path, mujoco: Any) -> None:
+    """Claim: on the scene of the same file zero is the equilibrium that is the target."""
+    for word in ("", "@hanging"):
+        name = f"{pole}{word}"
+        x = np.array([0.1, 0.2, 0.0, 0.0])
+        recipe = Recipe(mechanism=name, start=tuple(x.tolist()), rig="ideal")
+        plain = POLE.replace('<include file="./common/look.xml"/>', "")
+        scene = pole.with_name("scene.xml")
+        scene.write_text(plain.replace('<geom material="steel"/>', ""))
+        rig: Any = rig_named(str(scene), recipe, supervised=False)
+        at = origin(name)
+        assert rig._data.qpos.tolist() == pytest.approx([0.1, 0.2 + at["hinge"]])
+        assert at["hinge"] == pytest.approx(math.pi - LEAN if word else -LEAN)
 
 
 def test_an_equilibrium_that_the_inputs_cannot_hold_is_none(pole: Path) -> None:

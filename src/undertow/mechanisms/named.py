@@ -10,7 +10,7 @@ from pathlib import Path
 from undertow.base import InvalidInputError, one_of
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
-from undertow.models.importers.equilibrium import WORDS, at_equilibrium
+from undertow.models.importers.equilibrium import WORDS, at_equilibrium, where
 from undertow.models.importers.mjcf import from_mjcf, read_mjcf
 from undertow.models.importers.python_file import in_a_file, mechanism_from_file
 from undertow.models.importers.tree import Tree
@@ -72,6 +72,22 @@ def tree_named(name: str) -> Tree | None:
     if data.file.suffix == ".urdf":
         return read_urdf(data.file)[0]
     return read_mjcf(data.file, motors=not data.actuated)
+
+
+def origin(name: str) -> dict[str, float]:
+    """Where the target of a mechanism from a URDF or MJCF file is, in the file's coordinates.
+
+    Raises
+    ------
+    InvalidInputError, ModelError, ArtefactError
+        As for :func:`named`.
+    """
+    data = DataName.of(name)
+    if data is None:
+        return {}
+    read = FILES[data.file.suffix]
+    drawn = read(data.file, actuated=data.actuated or None, frozen=data.frozen)
+    return where(drawn, data.equilibrium)[0]
 
 
 def from_anywhere(name: str) -> str:

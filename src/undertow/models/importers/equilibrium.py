@@ -125,18 +125,30 @@ def at_equilibrium(mechanism: Mechanism, target: str | Mapping[str, float] = "")
     InvalidInputError
         For another word, and unknown coordinates.
     """
+    return _placed(mechanism, *where(mechanism, target))
+
+
+def where(mechanism: Mechanism, target: str | Mapping[str, float]) -> tuple[dict[str, float], str]:
+    """Return the equilibrium that :func:`at_equilibrium` takes, by coordinates, and its words.
+
+    Raises
+    ------
+    ModelError, InvalidInputError
+        As for that.
+    """
     if isinstance(target, Mapping):
         words = "the equilibrium near " + _position(mechanism, _positions(mechanism, target))
-        return _placed(mechanism, find_equilibrium(mechanism, **target), words)
+        return find_equilibrium(mechanism, **target), words
     if target:
         one_of("target equilibrium", target, WORDS, "Or say where: joint=ANGLE")
     if target in ("upright", "hanging"):
-        return _standing(mechanism, target)
+        return _named(mechanism, _standing(mechanism, target)), target
     q = None
     for q in _nearest_first(mechanism):
-        moved = _placed(mechanism, _named(mechanism, q), "the nearest equilibrium")
+        at = _named(mechanism, q)
+        moved = move_target(mechanism, **at) if np.any(q) else mechanism
         if target or controllability(moved) > _UNREACHED:
-            return moved
+            return at, "the nearest equilibrium"
     if q is None:
         raise ModelError(
             f"equilibria of '{mechanism.name}'",
@@ -160,8 +172,8 @@ def _nearest_first(mechanism: Mechanism) -> Iterator[FloatArray]:
     yield from (e.q for e in _equilibria(mechanism) if np.any(e.q) or not rests)
 
 
-def _standing(mechanism: Mechanism, target: str) -> Mechanism:
-    """Return the mechanism about its upright or hanging equilibrium."""
+def _standing(mechanism: Mechanism, target: str) -> FloatArray:
+    """Return the upright or hanging equilibrium, (n,)."""
     high, found = target == "upright", list(_equilibria(mechanism))
     stands = [e for e in found if e.stable is (not high)]
     if not stands:
@@ -172,7 +184,7 @@ def _standing(mechanism: Mechanism, target: str) -> Mechanism:
             remedy="Take the nearest, or say where: JOINT=ANGLE",
         )
     chosen = (max if high else min)(stands, key=lambda e: e.energy)
-    return _placed(mechanism, _named(mechanism, chosen.q), target)
+    return chosen.q
 
 
 def _named(mechanism: Mechanism, q: FloatArray) -> dict[str, float]:
