@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import copy
 import faulthandler
+import importlib
 import json
 import math
 import os
@@ -54,6 +55,10 @@ from undertow.runtime import (
 from undertow.studies.trials.robustness import run_ledger
 from undertow.symbolic import store
 from undertow.symbolic.private import private_folder
+
+# What MuJoCo starts and loads when it is imported is no file's doing.
+with suppress(ImportError):
+    importlib.import_module("mujoco")
 
 #: Longest time that a file may take, s; after the second the whole fuzzer is ended.
 LIMIT, HANG = 10.0, 60.0

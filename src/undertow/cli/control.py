@@ -9,7 +9,7 @@ from undertow.base import InvalidInputError
 from undertow.cascade import Cascade, Gate
 from undertow.cli import options
 from undertow.cli.options import folder, option
-from undertow.cli.parsing import parse_surface, parse_target, parse_task, parse_values
+from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task, parse_values
 from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
 from undertow.closed_loop import ClosedLoop
 from undertow.law import check_surface, first_surface
@@ -28,6 +28,7 @@ from undertow.runtime import default_gate
     "--limit voltage=8 --hard-input",
     "undertow simulate overhead_crane --target x=1m --target x=-1m@2s --objective bench-time",
     "undertow simulate model.py:bar",
+    "undertow simulate robot.urdf:shoulder --target upright",
 )
 def simulate(
     name: options.AnyName,
@@ -88,6 +89,7 @@ def simulate(
     from undertow.studies.motion import motion_files, motion_report
 
     options.check_control(control, ("cascade", "one-time", "designed"), surface)
+    name, target = aimed(name, target)
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
     goes_to = parse_target(belief, target)
     truth = belief.with_parameters(**parse_values(plant)) if plant else None

@@ -120,6 +120,42 @@ def survey(
         raise typer.Exit(INTERRUPTED)
 
 
+@command("undertow models robots", "undertow models robots --no-simulate --out tables")
+def models(
+    folder_of_files: Annotated[
+        Path, typer.Argument(help="Folder with URDF and MJCF files.", metavar="FOLDER")
+    ],
+    simulate: Annotated[
+        bool,
+        typer.Option(
+            "--simulate/--no-simulate", help="Also balance what can be, as simulate FILE does."
+        ),
+    ] = True,
+    seed: options.Seed = 0,
+    out: Annotated[Path | None, folder("models.csv and models.md")] = None,
+) -> None:
+    """Read every URDF and MJCF file of a folder: what is balanced, and what is not and why."""
+    from undertow.studies import model_files as study
+
+    check_out(out)
+    began, rows, interrupted = time.perf_counter(), list[study.ModelFile](), False
+    try:
+        with progress_bar() as progress:
+            study.model_files(
+                folder_of_files, simulate=simulate, seed=seed, progress=progress, done=rows.append
+            )
+    except KeyboardInterrupt:
+        if not rows:
+            raise
+        interrupted = True
+    written = write(out, lambda: study.files_of(rows))
+    show(study.read_table(rows), study.refused_table(rows), least=100)
+    show(study.summary(rows), *written, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
+    if interrupted:
+        show("interrupted: the files after these are not read", stderr=True)
+        raise typer.Exit(INTERRUPTED)
+
+
 @command(
     "undertow animate acrobot",
     "undertow animate rotary_pendulum --start phi=40deg --speed 0.5 --out film",

@@ -32,7 +32,8 @@ AnyName = Annotated[
     typer.Argument(
         help="Mechanism of the library, e.g. rotary_pendulum, or your own: FILE.py:NAME, FILE.urdf "
         "or FILE.xml. Append :JOINT,JOINT to name the actuated joints where a URDF or MJCF "
-        "file does not.",
+        "file does not, :-JOINT to freeze one, @upright, @hanging, @nearest or @JOINT=180deg to "
+        "choose its equilibrium.",
         metavar="NAME",
     ),
 ]
@@ -92,7 +93,8 @@ Target = Annotated[
         "Where to, with units. x=1m: a set-point; x=-1m@2s: another one from 2 s on; "
         "theta=45deg@0.5Hz: a sine; FILE.csv: a path through its points, 't (s), x (m)' in its "
         "first line. Repeatable. Default: x = 0. On a rig a set-point is gone to as soon as there "
-        "is a plan for it.",
+        "is a plan for it. For a URDF or MJCF file also upright, hanging, nearest or JOINT=180deg: "
+        "the equilibrium that is x = 0.",
         metavar="STATE=VALUE[@TIME]|FILE.csv",
     ),
 ]

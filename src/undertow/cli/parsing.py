@@ -13,10 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from undertow.base import InvalidInputError, one_of
+from undertow.base import InvalidInputError, ModelError, one_of
 from undertow.law import Reference, SetPoints, Surface, Target
-from undertow.mechanisms.named import named
-from undertow.models import FloatArray, Mechanism, normal_name
+from undertow.mechanisms.named import DataName, named
+from undertow.models import FloatArray, Mechanism, invariant_coordinates, normal_name
+from undertow.models.importers.equilibrium import WORDS
 from undertow.objective import Constraint, Objective, check_travel, objective_for, state_box
 
 #: Unit as typed to (SI unit of the coordinate, whether it is a rate, factor to SI).
@@ -63,6 +64,54 @@ def mechanism_named(
     for channel in new:
         one_of(f"input of '{mechanism.name}'", channel, known, example)
     return mechanism.with_input_limit(*(known | new).values())
+
+
+def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
+    """Move words that say at which equilibrium a file's mechanism rests into its name.
+
+    Parameters
+    ----------
+    name
+        Of a mechanism.
+    target
+        Words of ``--target``: ``upright`` and the like; ``JOINT=ANGLE`` along which the mechanism
+        cannot rest anywhere; and set-points.
+
+    Returns
+    -------
+    str, list of str
+        The name, and the words that are left.
+
+    Raises
+    ------
+    InvalidInputError
+        For equilibria of mechanisms that are in no URDF or MJCF file, and several of them.
+    """
+    words = [word for word in target or () if word in WORDS]
+    rest = [word for word in target or () if word not in WORDS]
+    data = DataName.of(name)
+    if data is None and words:
+        raise InvalidInputError(
+            "target",
+            value=repr(words[0]),
+            limit="a word about URDF and MJCF files; the target of others is x = 0",
+            remedy="A set-point is written --target x=1m",
+        )
+    if data is None or data.target:
+        if words:
+            raise InvalidInputError(
+                "target", value=f"{words[0]} beside {name}", limit="one of them"
+            )
+        return name, rest
+    places = [word for word in rest if "=" in word and "@" not in word]
+    if places and not words:
+        try:
+            fixed = invariant_coordinates(named(name))
+        except ModelError:  # without a target, that is: the places are one
+            fixed = ()
+        words = [word for word in places if word.partition("=")[0] not in fixed]
+        rest = [word for word in rest if word not in words]
+    return f"{name}@{','.join(words)}" if words else name, rest
 
 
 def objective_named(

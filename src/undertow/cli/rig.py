@@ -21,6 +21,7 @@ from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.options import folder, option
 from undertow.cli.parsing import (
+    aimed,
     mechanism_named,
     parse_new_target,
     parse_start,
@@ -130,6 +131,7 @@ def run(
     from undertow.runtime.session import closed_on_failure, rig_named
     from undertow.studies.rigs.runs import run_table
 
+    name, target = aimed(name, target)
     belief = mechanism_named(name, setting)
     hanging = swing_up and not start
     goal = parse_target(belief, target)

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, check_fields, checked, floats, one_of, positive
 from undertow.closed_loop import Ensemble, Risk
 from undertow.law import LawLayout
-from undertow.models import FloatArray, Mechanism, linear_accelerations, number_of
+from undertow.models import AT_REST, FloatArray, Mechanism, linear_accelerations, number_of
 
 #: Standard deviation of what is evenly spread over ± a tolerance, as a part of it.
 EVEN = 1.0 / math.sqrt(3.0)
@@ -108,6 +108,14 @@ class ParameterEstimate:
     def deviation(self) -> FloatArray:
         """Standard deviations of ``offset``, (p,): 0.58 where nothing is known."""
         return np.sqrt(np.diag(np.linalg.inv(self.information)))
+
+
+def _moves_target(mechanism: Mechanism, place: int, change: float) -> bool:
+    """Whether a change of one parameter leaves the target a force that no input balances."""
+    values = mechanism.parameter_values.copy()
+    values[place] += change
+    force = mechanism.function("force")(0.0, *np.zeros(2 * mechanism.n), *values)
+    return max(abs(float(f)) for f in force[mechanism.m :]) > AT_REST
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,16 +214,18 @@ class Belief:
         """Return the belief of a mechanism whose parameters carry tolerances, or the usual ones.
 
         Usual is ±20 % of masses and inertias, ±5 % of lengths, ±50 % of damping and ±10 % of all
-        else, gravity and numbers without a unit apart.
+        else, gravity and numbers without a unit apart; and parameters that would move the
+        target, which is then no equilibrium: an offset centre of mass, say.  Those are taken as
+        known.
         """
         found: dict[str, float] = {}
-        for p in mechanism.parameters:
+        for place, p in enumerate(mechanism.parameters):
             part = 0.0 if p.unit in EXACT else USUAL.get(p.unit, OTHERS)
             tolerance = abs(p.value) * part if p.tolerance is None else p.tolerance
             room = min(p.value - p.low, p.high - p.value)
             if p.tolerance is None and not tolerance < room:
                 tolerance = 0.5 * room
-            if tolerance > 0:
+            if tolerance > 0 and not _moves_target(mechanism, place, tolerance):
                 found[p.name] = tolerance
         return cls(mechanism, found)
 

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
-from undertow.base import one_of
+from undertow.base import InvalidInputError, one_of
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
+from undertow.models.importers.equilibrium import WORDS, at_equilibrium, where
 from undertow.models.importers.mjcf import from_mjcf, read_mjcf
 from undertow.models.importers.python_file import in_a_file, mechanism_from_file
 from undertow.models.importers.tree import Tree
 from undertow.models.importers.urdf import from_urdf, read_urdf
 
 #: Ends of the names of files that are data.
-_FILES = {".urdf": from_urdf, ".xml": from_mjcf, ".mjcf": from_mjcf}
+FILES = {".urdf": from_urdf, ".xml": from_mjcf, ".mjcf": from_mjcf}
+
+_DATA = re.compile(r"(?P<file>.+?\.(?:urdf|xml|mjcf))(?::(?P<joints>[^@]*))?(?:@(?P<target>.+))?")
+_PLACE = re.compile(r"([^=]+)=([-+]?[\d.]+(?:[eE][-+]?\d+)?)(deg|rad|m)")
 
 
 def named(name: str) -> Mechanism:
@@ -23,8 +30,10 @@ def named(name: str) -> Mechanism:
     ----------
     name
         A name of the library; ``FILE.py:NAME``, which runs the file; or ``FILE.urdf`` or
-        ``FILE.xml``, which are data, with ``:JOINT,JOINT`` behind for the actuated joints where
-        the file does not say which they are.  The target of a file is all joints at zero.
+        ``FILE.xml``, which are data.  Behind those ``:JOINT,JOINT`` names the actuated joints
+        where the file does not say which they are, ``:-JOINT`` freezes one; ``@upright``,
+        ``@hanging``, ``@nearest`` or ``@JOINT=180deg`` says which equilibrium is the target, see
+        :func:`~undertow.models.importers.at_equilibrium`.
 
     Raises
     ------
@@ -37,9 +46,13 @@ def named(name: str) -> Mechanism:
     """
     if in_a_file(name):
         return mechanism_from_file(name)
-    file, joints = _in_data(name)
-    if file is not None:
-        return _FILES[file.suffix](file, actuated=joints)
+    data = DataName.of(name)
+    if data is not None:
+        read = FILES[data.file.suffix]
+        driven, target = data.actuated or None, data.equilibrium
+        if isinstance(target, str):
+            return read(data.file, actuated=driven, frozen=data.frozen, equilibrium=target)
+        return at_equilibrium(read(data.file, actuated=driven, frozen=data.frozen), target)
     own = "One of your own is FILE.py:NAME, FILE.urdf or FILE.xml"
     one_of("mechanism", name, LIBRARY, own)
     return LIBRARY[name]()
@@ -53,10 +66,28 @@ def tree_named(name: str) -> Tree | None:
     InvalidInputError, ModelError, ArtefactError
         As for :func:`named`.
     """
-    file, joints = _in_data(name)
-    if in_a_file(name) or file is None:
+    data = DataName.of(name)
+    if in_a_file(name) or data is None:
         return None
-    return read_urdf(file)[0] if file.suffix == ".urdf" else read_mjcf(file, motors=not joints)
+    if data.file.suffix == ".urdf":
+        return read_urdf(data.file)[0]
+    return read_mjcf(data.file, motors=not data.actuated)
+
+
+def origin(name: str) -> dict[str, float]:
+    """Where the target of a mechanism from a URDF or MJCF file is, in the file's coordinates.
+
+    Raises
+    ------
+    InvalidInputError, ModelError, ArtefactError
+        As for :func:`named`.
+    """
+    data = DataName.of(name)
+    if data is None:
+        return {}
+    read = FILES[data.file.suffix]
+    drawn = read(data.file, actuated=data.actuated or None, frozen=data.frozen)
+    return where(drawn, data.equilibrium)[0]
 
 
 def from_anywhere(name: str) -> str:
@@ -64,17 +95,55 @@ def from_anywhere(name: str) -> str:
     if in_a_file(name) and not name.endswith(".py"):
         path, _, inside = name.rpartition(":")
         return f"{Path(path).resolve()}:{inside}"
-    file, joints = _in_data(name)
-    if file is None:
-        return name
-    return f"{file.resolve()}:{','.join(joints)}" if joints else str(file.resolve())
+    data = DataName.of(name)
+    return name if data is None else str(data.file.resolve()) + name[len(str(data.file)) :]
 
 
-def _in_data(name: str) -> tuple[Path | None, list[str] | None]:
-    """Return the file that holds a mechanism as data, and its actuated joints where given."""
-    if Path(name).suffix in _FILES:
-        return Path(name), None
-    path, _, joints = name.rpartition(":")
-    if Path(path).suffix in _FILES and joints:
-        return Path(path), joints.split(",")
-    return None, None
+@dataclass(frozen=True)
+class DataName:
+    """What the name of a mechanism in a URDF or MJCF file says.
+
+    Attributes
+    ----------
+    file
+        The file.
+    actuated, frozen
+        Names of joints.
+    target
+        The target's words; none for the nearest equilibrium that will do.
+    """
+
+    file: Path
+    actuated: tuple[str, ...] = ()
+    frozen: tuple[str, ...] = ()
+    target: str = ""
+
+    @classmethod
+    def of(cls, name: str) -> DataName | None:
+        """Take a name apart; None for one of another kind."""
+        match = _DATA.fullmatch(name)
+        if match is None:
+            return None
+        joints = [joint for joint in (match["joints"] or "").split(",") if joint]
+        actuated = tuple(joint for joint in joints if not joint.startswith("-"))
+        frozen = tuple(joint[1:] for joint in joints if joint.startswith("-"))
+        return cls(Path(match["file"]), actuated, frozen, match["target"] or "")
+
+    @property
+    def equilibrium(self) -> str | dict[str, float]:
+        """The target as :func:`~undertow.models.importers.at_equilibrium` takes it."""
+        if not self.target or self.target in WORDS:
+            return self.target
+        places = {}
+        for word in self.target.split(","):
+            match = _PLACE.fullmatch(word)
+            if match is None:
+                raise InvalidInputError(
+                    f"target of '{self.file.name}'",
+                    value=repr(word),
+                    limit=f"{', '.join(WORDS)}, or JOINT=VALUE with its unit, deg, rad or m",
+                    remedy=f"Write for instance {self.file.name}@upright",
+                )
+            value = float(match[2])
+            places[match[1]] = math.radians(value) if match[3] == "deg" else value
+        return places

@@ -7,6 +7,7 @@ from undertow.models.error_dynamics import (
     with_positions,
 )
 from undertow.models.linearisation import (
+    AT_REST,
     Linearisation,
     controllability,
     has_linear_model,
@@ -38,6 +39,7 @@ from undertow.models.validity import (
 )
 
 __all__ = [
+    "AT_REST",
     "TIME",
     "Coordinate",
     "FloatArray",

@@ -17,6 +17,9 @@ from undertow.models.partition import compiled
 from undertow.models.quantities import TIME, FloatArray, numbers
 from undertow.models.validity import kinks, require_smooth, shortened
 
+#: Largest |f_u| at a target, N m or N.
+AT_REST = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
@@ -96,7 +99,7 @@ def linearise(mechanism: Mechanism) -> Linearisation:
             limit="finite, with its slopes",
             remedy="Something is divided by zero there: rewrite the expression",
         )
-    if np.abs(rest[mechanism.m :]).max() > 1e-9:
+    if np.abs(rest[mechanism.m :]).max() > AT_REST:
         from undertow.models.importers.equations import nearest_equilibrium
 
         raise ModelError(

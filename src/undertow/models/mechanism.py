@@ -157,13 +157,7 @@ class Mechanism:
         for parts in ("coordinates", "inputs", "parameters"):
             object.__setattr__(self, parts, tuple(getattr(self, parts)))
         n, m = len(self.coordinates), len(self.inputs)
-        if not 0 < m < n:
-            raise ModelError(
-                f"'{self.name}' is not underactuated",
-                value=f"{n} coordinates and {m} inputs",
-                limit="at least one input and fewer inputs than coordinates",
-                remedy="Fully actuated mechanisms need no sliding surface of this kind",
-            )
+        check_underactuated(self.name, n, m)
         given = sp.eye(m) if self.input_matrix is None else self.input_matrix
         for attribute, value, shape in (
             ("mass_matrix", self.mass_matrix, (n, n)),
@@ -720,6 +714,23 @@ class Mechanism:
         )
         (value,) = potential(t, *np.moveaxis(q, -1, 0), *self.parameter_values)
         return np.asarray(kinetic + value)
+
+
+def check_underactuated(name: str, n: int, m: int) -> None:
+    """Refuse n coordinates under m inputs, unless 0 < m < n.
+
+    Raises
+    ------
+    ModelError
+        With both numbers.
+    """
+    if not 0 < m < n:
+        raise ModelError(
+            f"'{name}' is not underactuated",
+            value=f"{n} coordinates and {m} inputs",
+            limit="at least one input and fewer inputs than coordinates",
+            remedy="Fully actuated mechanisms need no sliding surface of this kind",
+        )
 
 
 def energies(

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
 from undertow.law import Reference, SetPoints, Target
+from undertow.mechanisms.named import origin
 from undertow.models.importers.python_file import in_a_file
 from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
 from undertow.runtime.clock import SimulatedClock, WallClock
@@ -75,9 +76,10 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
         return held(lambda: rig_from_file(word, recipe.belief))
     if word == "mujoco" or word.endswith(".xml"):
         scene = None if word == "mujoco" else Path(word)
+        at = origin(recipe.mechanism) if scene and isinstance(recipe.mechanism, str) else {}
 
         def engine() -> Rig:
-            return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, period=recipe.period)
+            return MuJoCoRig(recipe.belief, recipe.x0, scene=scene, target=at, period=recipe.period)
 
         return held(engine) if supervised else engine()
     raise InvalidInputError(

@@ -7,7 +7,12 @@ x = 0, physical parameters as data.
 from undertow.models.importers.coordinates import ActuatedForm, actuate
 from undertow.models.importers.drives import DCMotor, voltage_driven
 from undertow.models.importers.equations import from_energies, from_matrices
-from undertow.models.importers.equilibrium import find_equilibrium, holding_input, move_target
+from undertow.models.importers.equilibrium import (
+    at_equilibrium,
+    find_equilibrium,
+    holding_input,
+    move_target,
+)
 from undertow.models.importers.mjcf import from_mjcf, read_mjcf
 from undertow.models.importers.python_file import mechanism_from_file
 from undertow.models.importers.rigid_body import mechanism_from_tree
@@ -24,6 +29,7 @@ __all__ = [
     "Link",
     "Tree",
     "actuate",
+    "at_equilibrium",
     "find_equilibrium",
     "from_energies",
     "from_kane",

@@ -7,14 +7,18 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from undertow.base import InvalidInputError, ModelError, checked, one_of
+from undertow.models.importers.equilibrium import at_equilibrium
 from undertow.models.importers.mjcf_bodies import Frame, link_of
-from undertow.models.importers.rigid_body import mechanism_from_tree
+from undertow.models.importers.mjcf_document import Document, free_body, mjcf_document
+from undertow.models.importers.mujoco_compiler import compared, compiled, engine, tree_of
+from undertow.models.importers.reading import described, names_of
+from undertow.models.importers.rigid_body import check_held, mechanism_from_tree
 from undertow.models.importers.tree import (
-    FREE_BASE,
     WORLD,
     Actuator,
     Coupling,
@@ -23,16 +27,13 @@ from undertow.models.importers.tree import (
     Tree,
     Vector,
 )
-from undertow.models.importers.xml_files import computable, numbers_of, parse_xml
+from undertow.models.importers.xml_files import computable, is_text, numbers_of
 from undertow.models.mechanism import FloatArray, Mechanism
 
 #: Sections that do not touch the equations of motion of a tree of bodies.
-_HARMLESS = {
-    "asset", "compiler", "contact", "custom", "default", "extension", "keyframe", "option",
-    "sensor", "size", "statistic", "visual",
-}  # fmt: skip
+_HARMLESS = {"asset", "compiler", "default", "extension", "option"}
 _READ = {"worldbody", "actuator", "tendon", "equality"}
-_BODY_PARTS = {"body", "inertial", "joint", "freejoint", "geom", "site", "camera", "light"}
+_BODY_PARTS = {"body", "inertial", "joint", "freejoint", "geom", "site"}
 
 
 @checked
@@ -40,18 +41,22 @@ def from_mjcf(
     source: str | Path,
     *,
     actuated: Sequence[str] | None = None,
-    equilibrium: Mapping[str, float] | None = None,
+    frozen: Sequence[str] = (),
+    equilibrium: Mapping[str, float] | str | None = None,
     start: Mapping[str, float] | None = None,
     effort: Mapping[str, float] | None = None,
 ) -> Mechanism:
     """Build a mechanism from an MJCF file or text.
 
-    Read are bodies with ``<inertial>`` or with spheres, capsules, cylinders, boxes and
-    ellipsoids of given mass or density; hinge and slide joints with range, damping,
+    Where MuJoCo is installed its own compiler reads the file: includes, default classes, frames,
+    meshes, servos (their springs and dampers become the mechanism's) and gears as it has them; and
+    the mechanism's accelerations are compared with MuJoCo's at random states.  Elsewhere the
+    reader of this package does: bodies with ``<inertial>`` or with spheres, capsules, cylinders,
+    boxes and ellipsoids of given mass or density; hinge and slide joints with range, damping,
     stiffness, armature and ``frictionloss`` (a bound on the disturbance); default classes;
     ``motor`` actuators on joints and on ``fixed`` tendons, whose own damping, stiffness and
-    armature count too.  Contacts are left out.  An input without a limit is unlimited, and the
-    description of the mechanism says so.
+    armature count too.  Contacts are left out.  The description of the mechanism says what was
+    read, and which inputs the file gives no limit for.
 
     Parameters
     ----------
@@ -60,8 +65,11 @@ def from_mjcf(
     actuated
         Names of the actuated joints, in the order of the inputs: torques or forces on them,
         instead of the file's motors.
+    frozen
+        Names of joints that do not belong to the mechanism: their bodies stay as they are drawn.
     equilibrium
-        The target, joint name to rad or m; zero where left out.
+        The target, joint name to rad or m; zero where left out.  Or a word of
+        :func:`~undertow.models.importers.at_equilibrium`: upright, hanging, nearest.
     start
         A usual initial state, errors from the target, by state names.
     effort
@@ -74,35 +82,71 @@ def from_mjcf(
 
     Raises
     ------
+    ArtefactError
+        For a file that cannot be read.
     InvalidInputError
         For malformed XML, invalid numbers, unknown or repeated actuated joints.
     ModelError
         For ball and free joints, equality constraints, massless moving bodies, inertias that no
-        body has, elements that change the motion in ways that are not read here, and more joints
-        than equations can be derived for.
+        body has, elements that change the motion in ways that are not read here, more joints
+        than equations can be derived for, and accelerations that are not MuJoCo's.
     """
     with computable("MJCF"):
-        return mechanism_from_tree(
-            read_mjcf(source, motors=actuated is None),
+        document = mjcf_document(source, names_of(frozen, "frozen"))
+        tree, model, refusal = _read(document, motors=actuated is None)
+        if isinstance(equilibrium, str):
+            check_held(tree, actuated or ())
+        place = equilibrium if isinstance(equilibrium, Mapping) else None
+        mechanism = mechanism_from_tree(
+            tree,
             actuated=actuated,
-            equilibrium=equilibrium,
+            equilibrium=place,
             start=start,
             effort=effort,
-            source=str(source) if not str(source).lstrip().startswith("<") else "MJCF text",
+            source="MJCF text" if is_text(source) else str(source),
         )
+        how = "this package's own reader; MuJoCo, which would compare, is not installed"
+        if model is not None:
+            how = compared(mechanism, tree, model, place or {}, driven=actuated is None)
+        elif refusal:
+            how = f"this package's own reader; MuJoCo's would refuse: {refusal}"
+        mechanism = described(mechanism, tree, f"MJCF '{tree.name}' by {how}", document.frozen)
+        if isinstance(equilibrium, str):
+            return at_equilibrium(mechanism, equilibrium)
+        return mechanism
 
 
-@np.errstate(all="ignore")  # what overflows is refused with the tree
 @checked
 def read_mjcf(source: str | Path, *, motors: bool = True) -> Tree:
     """Read an MJCF file as a tree; ``motors=False`` leaves its actuators out.
 
     Raises
     ------
-    InvalidInputError, ModelError
+    ArtefactError, InvalidInputError, ModelError
         As for :func:`from_mjcf`.
     """
-    root = parse_xml(source, "mujoco")
+    return _read(mjcf_document(source), motors=motors)[0]
+
+
+@np.errstate(all="ignore")  # what overflows is refused with the tree
+def _read(document: Document, *, motors: bool) -> tuple[Tree, Any, str]:
+    """Return the tree; MuJoCo's compiled model where it has one; and why it has none."""
+    mujoco, name = engine(), document.root.get("model", "mujoco")
+    if mujoco is None:
+        return _own_tree(document.root, motors), None, ""
+    try:
+        model = compiled(mujoco, document)
+    except InvalidInputError as error:
+        # This reader may see a reason of mechanics, and how to mend it.  It grants files that
+        # they round moments of inertia, and rods that are thin.
+        tree, refusal = _own_tree(document.root, motors), str(error.value)
+        if "inertia" not in refusal:
+            raise
+        return tree, None, refusal
+    return tree_of(mujoco, model, name, motors=motors), model, ""
+
+
+def _own_tree(root: ET.Element, motors: bool) -> Tree:
     for section in root:
         if section.tag not in _HARMLESS | _READ:
             raise _unread(f"<{section.tag}>", "Write the model out without it")
@@ -237,11 +281,11 @@ class _Reader:
     ) -> Iterator[ET.Element]:
         for element in body:
             if element.tag == "freejoint":
-                raise _free(name, "freejoint")
+                raise free_body(f"of '{name}'", "freejoint")
             if element.tag == "joint":
                 joint = self._filled(element, childclass)
                 if joint.get("type", "hinge") not in ("hinge", "slide"):
-                    raise _free(name, joint.get("type", ""))
+                    raise free_body(f"of '{name}'", joint.get("type", ""))
                 yield joint
 
     def _joint(
@@ -370,12 +414,3 @@ class _Reader:
             yield Actuator(
                 name, coefficients, gear, min(limits), unit if gear == 1 else "", tendon or ""
             )
-
-
-def _free(body: str, kind: str) -> ModelError:
-    return ModelError(
-        f"body '{body}'",
-        value=f"a joint of type {kind!r}",
-        limit="hinge and slide joints",
-        remedy=FREE_BASE,
-    )

@@ -11,7 +11,11 @@ import numpy as np
 
 from undertow.base import InvalidInputError, ModelError
 from undertow.models.importers.tree import LARGEST, Link
-from undertow.models.importers.xml_files import numbers_of, rotation_from_quaternion
+from undertow.models.importers.xml_files import (
+    numbers_of,
+    rotation_from_quaternion,
+    without_rounding,
+)
 from undertow.models.mechanism import FloatArray
 
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
@@ -106,7 +110,7 @@ def _from_inertial(inertial: ET.Element, name: str, frame: Frame) -> Link:
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     else:
         tensor = np.diag(numbers_of(inertial, "diaginertia", None, 3))
-    return Link(name, mass, (x, y, z), _rounded(R @ tensor @ R.T))
+    return Link(name, mass, (x, y, z), _symmetric(R @ tensor @ R.T))
 
 
 def _from_geoms(geoms: Sequence[ET.Element], name: str, frame: Frame) -> Link:
@@ -133,7 +137,7 @@ def _from_geoms(geoms: Sequence[ET.Element], name: str, frame: Frame) -> Link:
         d = centre - com
         inertia += tensor + mass * (np.dot(d, d) * np.eye(3) - np.outer(d, d))
     x, y, z = (float(v) for v in com)
-    return Link(name, total, (x, y, z), _rounded(inertia))
+    return Link(name, total, (x, y, z), _symmetric(inertia))
 
 
 def _geom(geom: ET.Element, name: str, frame: Frame) -> tuple[float, FloatArray, FloatArray]:
@@ -255,8 +259,5 @@ def _to_z(direction: FloatArray) -> FloatArray:
     return _turn(list(axis), math.atan2(sine, float(direction[2])))
 
 
-def _rounded(tensor: FloatArray) -> FloatArray:
-    """Drop what rotations leave of entries that should be zero; make it symmetric."""
-    clean = (tensor + tensor.T) / 2
-    clean[np.abs(clean) < 1e-14 * max(float(np.abs(clean).max()), 1e-300)] = 0.0
-    return np.asarray(clean)
+def _symmetric(tensor: FloatArray) -> FloatArray:
+    return without_rounding((tensor + tensor.T) / 2)

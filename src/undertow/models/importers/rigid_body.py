@@ -26,7 +26,14 @@ from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.coordinates import number, tidy
 from undertow.models.importers.equations import from_matrices, lagrange_force, unit_inputs
 from undertow.models.importers.tree import WORLD, Joint, Link, Tree
-from undertow.models.mechanism import Coordinate, Input, Mechanism, Parameter
+from undertow.models.mechanism import (
+    Coordinate,
+    FloatArray,
+    Input,
+    Mechanism,
+    Parameter,
+    check_underactuated,
+)
 from undertow.models.quantities import code_points, normal_name
 
 #: Longest mass matrix, in operations of its upper half: deriving f from it takes some 10 s.
@@ -81,6 +88,13 @@ def mechanism_from_tree(
                 remedy="Write actuated=['shoulder']",
             )
     joints = tree.moving
+    if not joints:
+        raise ModelError(
+            f"'{tree.name}'",
+            value="no moving joint",
+            limit="at least two, and fewer motors than joints",
+            remedy="There is nothing to balance",
+        )
     names = _distinct([joint.name for joint in joints])
     coordinates = [
         Coordinate(
@@ -94,6 +108,7 @@ def mechanism_from_tree(
     ]
     index = {joint.name: i for i, joint in enumerate(joints)}
     inputs, B = _inputs(tree, joints, coordinates, index, actuated, effort or {})
+    check_underactuated(identifier(tree.name), len(joints), len(inputs))  # before long work
     book = _Book()
     mass, potential = _energies(tree, coordinates, index, book)
     dissipation = sp.Integer(0)
@@ -126,6 +141,41 @@ def mechanism_from_tree(
         description=description or f"rigid-body tree '{tree.name}'" + _unlimited(inputs),
         source=source,
     )
+
+
+def check_held(tree: Tree, actuated: Sequence[str]) -> None:
+    """Refuse a tree that falls whatever its joints do: no pose of it is an equilibrium.
+
+    Parameters
+    ----------
+    tree
+        With the file's own actuators.
+    actuated
+        Joints that are driven besides.
+
+    Raises
+    ------
+    ModelError
+        For a slide that nothing but contact could hold against gravity.
+    """
+    driven = {name for a in tree.actuators for name in a.coefficients} | set(actuated)
+    driven |= {name for c in tree.couplings if c.stiffness for name in c.coefficients}
+    turns: dict[str, FloatArray | None] = {WORLD: np.eye(3)}  # None behind a hinge
+    for joint in tree.ordered():
+        before = turns[joint.parent]
+        turn = None if before is None else before @ np.asarray(joint.rotation)
+        turns[joint.child] = None if joint.kind == "hinge" else turn
+        if joint.kind != "slide" or joint.stiffness or joint.name in driven or turn is None:
+            continue
+        along = turn @ np.asarray(joint.axis, dtype=float) @ np.asarray(tree.gravity)
+        if abs(along) > 1e-3 * np.linalg.norm(tree.gravity) * np.linalg.norm(joint.axis):
+            raise ModelError(
+                f"joint '{joint.name}' of '{tree.name}'",
+                value="a slide along which the mechanism falls",
+                limit="held by a motor or a spring: contacts are left out",
+                remedy=f"What stands, walks or flies is not balanced here; freeze it, "
+                f"FILE:-{joint.name}, or drive it, FILE:{joint.name}",
+            )
 
 
 def identifier(name: str) -> str:

@@ -12,9 +12,19 @@ from typing import Literal
 import numpy as np
 
 from undertow.base import ModelError, checked, one_of
-from undertow.models.importers.rigid_body import mechanism_from_tree
+from undertow.models.importers.equilibrium import at_equilibrium
+from undertow.models.importers.mujoco_compiler import compared, engine, urdf_compiled
+from undertow.models.importers.reading import described, names_of
+from undertow.models.importers.rigid_body import check_held, mechanism_from_tree
 from undertow.models.importers.tree import FREE_BASE, WORLD, Joint, Link, Tree, Vector
-from undertow.models.importers.xml_files import computable, numbers_of, parse_xml, rotation_from_rpy
+from undertow.models.importers.xml_files import (
+    computable,
+    is_text,
+    numbers_of,
+    parse_xml,
+    rotation_from_rpy,
+    without_rounding,
+)
 from undertow.models.mechanism import FloatArray, Mechanism
 
 _KINDS: dict[str, Literal["hinge", "slide", "fixed"]] = {
@@ -30,7 +40,8 @@ def from_urdf(
     source: str | Path,
     *,
     actuated: Sequence[str] | None = None,
-    equilibrium: Mapping[str, float] | None = None,
+    frozen: Sequence[str] = (),
+    equilibrium: Mapping[str, float] | str | None = None,
     gravity: Vector = (0.0, 0.0, -9.81),
     start: Mapping[str, float] | None = None,
     effort: Mapping[str, float] | None = None,
@@ -48,10 +59,14 @@ def from_urdf(
     source
         Path of the file, or the text itself.
     actuated
-        Names of the actuated joints, in the order of the inputs; those of the file's
-        ``<transmission>`` elements by default.
+        Names of the actuated joints, in the order of the inputs.  By default those of the file's
+        ``<transmission>`` elements, or, without any, those with an effort limit where others have
+        none.
+    frozen
+        Names of joints that do not belong to the mechanism: they become fixed as they are drawn.
     equilibrium
-        The target, joint name to rad or m; zero where left out.
+        The target, joint name to rad or m; zero where left out.  Or a word of
+        :func:`~undertow.models.importers.at_equilibrium`: upright, hanging, nearest.
     gravity
         m/s², in the frame of the root link.
     start
@@ -73,16 +88,48 @@ def from_urdf(
         mimic joints, repeated names, and more joints than equations can be derived for.
     """
     with computable("URDF"):
-        tree, transmitted = read_urdf(source, gravity)
-        chosen = actuated if actuated is not None else transmitted or None
-        return mechanism_from_tree(
+        robot = _frozen(parse_xml(source, "robot"), names_of(frozen, "frozen"))
+        tree, transmitted = _read(robot, gravity)
+        driven = actuated if actuated is not None else transmitted or _driven(tree) or None
+        if isinstance(equilibrium, str):
+            check_held(tree, driven or ())
+        place = equilibrium if isinstance(equilibrium, Mapping) else None
+        mechanism = mechanism_from_tree(
             tree,
-            actuated=chosen,
-            equilibrium=equilibrium,
+            actuated=driven,
+            equilibrium=place,
             start=start,
             effort=effort,
-            source=str(source) if not str(source).lstrip().startswith("<") else "URDF text",
+            source="URDF text" if is_text(source) else str(source),
         )
+        how = "this package's reader"
+        mujoco = engine()
+        model = None if mujoco is None else urdf_compiled(mujoco, robot, gravity)
+        if model is not None:
+            how += ", compared with " + compared(mechanism, tree, model, place or {}, driven=False)
+        mechanism = described(mechanism, tree, f"URDF '{tree.name}' by {how}", names_of(frozen, ""))
+        if isinstance(equilibrium, str):
+            return at_equilibrium(mechanism, equilibrium)
+        return mechanism
+
+
+def _driven(tree: Tree) -> list[str]:
+    """The joints with an effort limit, where there are others without."""
+    efforts = {joint.name: joint.effort for joint in tree.moving}
+    given = [name for name, effort in efforts.items() if math.isfinite(effort)]
+    return given if len(given) < len(efforts) else []
+
+
+def _frozen(robot: ET.Element, frozen: Sequence[str]) -> ET.Element:
+    """Make joints fixed."""
+    joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
+    for name in frozen:
+        one_of("frozen joint", name, joints, "Name joints as the file does")
+        joints[name].set("type", "fixed")
+    for transmission in robot.findall("transmission"):
+        if any(joint.get("name") in frozen for joint in transmission.iterfind("joint")):
+            robot.remove(transmission)
+    return robot
 
 
 @np.errstate(all="ignore")  # what overflows is refused with the tree
@@ -94,10 +141,14 @@ def read_urdf(
 
     Raises
     ------
-    InvalidInputError, ModelError
+    ArtefactError, InvalidInputError, ModelError
         As for :func:`from_urdf`.
     """
-    robot = parse_xml(source, "robot")
+    return _read(parse_xml(source, "robot"), gravity)
+
+
+@np.errstate(all="ignore")
+def _read(robot: ET.Element, gravity: Vector) -> tuple[Tree, tuple[str, ...]]:
     name = robot.get("name", "robot")
     links = [_link(element) for element in robot.findall("link")]
     joints = [_joint(element) for element in robot.findall("joint")]
@@ -108,6 +159,12 @@ def read_urdf(
             limit="at least one",
             remedy="Give the bodies as <link>, the way they move as <joint>",
         )
+    # MuJoCo's way with what no body can be: a link without mass that moves with another.
+    welded = {joint.child for joint in joints if joint.kind == "fixed"}
+    links = [
+        replace(link, inertia=np.zeros((3, 3))) if link.name in welded and not link.mass else link
+        for link in links
+    ]
     children = {joint.child for joint in joints}
     roots = [link.name for link in links if link.name not in children]
     if len(roots) > 1:
@@ -121,8 +178,9 @@ def read_urdf(
         joints.append(Joint(f"{roots[0]}_to_world", "fixed", WORLD, roots[0]))
     kept = tuple(link for link in links if link.name != WORLD)
     tree = Tree(name, kept, tuple(joints), gravity)
+    still = {joint.name for joint in joints if joint.kind == "fixed"}
     transmitted = [joint.get("name", "") for joint in robot.iterfind("transmission/joint")]
-    return tree, tuple(transmitted)
+    return tree, tuple(name for name in transmitted if name not in still)
 
 
 def _pose(element: ET.Element, of: str) -> tuple[FloatArray, Vector]:
@@ -172,8 +230,7 @@ def _link(element: ET.Element) -> Link:
             "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2),
         }.items():  # fmt: skip
             tensor[i, j] = tensor[j, i] = numbers_of(given, label, "0", 1, of=link.name)[0]
-    rotated = R @ tensor @ R.T
-    rotated[np.abs(rotated) < 1e-14 * max(np.abs(rotated).max(), 1e-300)] = 0.0
+    rotated = without_rounding(R @ tensor @ R.T)
     return replace(link, mass=mass, com=com, inertia=(rotated + rotated.T) / 2)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +19,24 @@ from undertow.models.mechanism import FloatArray
 LARGEST, DEEPEST, MOST = 1 << 24, 64, 20_000
 
 
-def parse_xml(source: str | Path, root: str) -> ET.Element:
+#: What tools leave in the XML of people's files: a declaration that does not come first, the
+#: defaults of ROS' substitutions, and zeros at the end.
+_DECLARATION = re.compile(r"<\?xml\b[^>]*\?>")
+_DEFAULTED = re.compile(r"\$\(optenv\s+\S+\s+([^()]*)\)")
+#: A full stop behind a number that has one.
+_STOP = re.compile(r"(\d\.\d+)\.(?=\s|$)")
+
+
+def is_text(source: str | Path) -> bool:
+    """Whether a source is XML itself, and no path."""
+    return isinstance(source, str) and source.lstrip().startswith("<")
+
+
+def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
     """Parse XML text (it starts with ``<``) or a file, and check the name of its root.
+
+    A declaration that does not come first is passed over, and ``$(optenv NAME DEFAULT)`` is its
+    default.
 
     Raises
     ------
@@ -37,10 +54,11 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
             limit="a path, or XML text",
             remedy="Give pathlib.Path('model.xml'), or the text itself",
         )
-    text = source if isinstance(source, str) and source.lstrip().startswith("<") else None
-    if text is None:
+    if is_text(source):
+        text = str(source)
+    else:
         try:
-            text = read_file(Path(source), "model file", most=LARGEST).decode("utf-8")
+            text = read_file(Path(source), "model file", most=LARGEST).decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise ArtefactError(
                 f"model file '{source}'",
@@ -55,6 +73,7 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
             limit="plain XML",
             remedy="Expand the entities first",
         )
+    text = _DEFAULTED.sub(r"\1", _DECLARATION.sub("", text)).rstrip("\0 \t\r\n")
     try:
         _check_size(text, root)
         element = ET.fromstring(text)
@@ -66,7 +85,7 @@ def parse_xml(source: str | Path, root: str) -> ET.Element:
             limit="every tag closed and every attribute quoted",
             remedy="Correct the file there",
         ) from error
-    if element.tag != root:
+    if element.tag not in (root, *more):
         raise ModelError(
             "model file",
             value=f"root <{element.tag}>",
@@ -137,6 +156,9 @@ def numbers_of(
 ) -> list[float]:
     """Return the numbers of an attribute; ``of`` names what the element belongs to.
 
+    Commas do as well as spaces; surplus zeros and the stop of ``1.57.`` are passed over: people's
+    files have them.
+
     Raises
     ------
     InvalidInputError
@@ -154,11 +176,13 @@ def numbers_of(
     try:
         if not text.isascii() or "_" in text:  # of which Python, but no XML reader, makes numbers
             raise ValueError(text)
-        values = [float(word) for word in text.split()]
+        values = [float(word) for word in _STOP.sub(r"\1", text.replace(",", " ")).split()]
     except ValueError as error:
         raise InvalidInputError(label, value=shown, limit="numbers", remedy=wanted) from error
     if not all(math.isfinite(v) for v in values):
         raise InvalidInputError(label, value=shown, limit="finite numbers", remedy=wanted)
+    if count is not None and not any(values[count:]):  # zeros too many mean nothing
+        values = values[:count]
     if count is not None and len(values) != count:
         raise InvalidInputError(label, value=shown, limit=f"{count} numbers", remedy=wanted)
     return values
@@ -191,3 +215,10 @@ def rotation_from_quaternion(quaternion: list[float]) -> FloatArray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def without_rounding(values: FloatArray) -> FloatArray:
+    """Drop what rotations leave of entries that should be zero."""
+    clean = np.array(values, dtype=np.float64)
+    clean[np.abs(clean) < 1e-14 * max(float(np.abs(clean).max()), 1e-300)] = 0.0
+    return clean

@@ -1,0 +1,475 @@
+"""URDF and MJCF as people have them: what is in the files of others, in small ones of our own."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import undertow as ut
+from runs import run
+from undertow.base import ArtefactError, InvalidInputError, ModelError, UndertowError
+from undertow.cli.parsing import aimed
+from undertow.estimators import Belief
+from undertow.mechanisms.named import DataName, from_anywhere, named, origin
+from undertow.models import FloatArray, controllability
+from undertow.models import importers as modelling
+from undertow.models.importers import mjcf, mjcf_document, mujoco_compiler
+from undertow.models.importers.mujoco_compiler import AGREEMENT, agreement
+from undertow.runtime import Recipe
+from undertow.runtime.session import rig_named
+from undertow.studies.model_files import files_of, model_files, refused_groups, summary
+
+LOOK = """<mujoco>
+  <asset><texture name="grid" type="2d" builtin="checker" width="9" height="9"/>
+    <material name="steel" texture="grid"/></asset>
+  <visual><map znear="0.1"/></visual>
+</mujoco>"""
+
+POLE = """<!-- a pole that leans: its upright is 0.2 deg off zero -->
+<mujoco model="leaning pole">
+  <include file="./common/look.xml"/>
+  <compiler inertiafromgeom="true"/>
+  <size nstack="3000"/>
+  <default><joint damping="0.2"/><geom material="steel"/>
+    <default class="pole"><joint axis="0 1 0" damping="0.001"/></default></default>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <geom type="plane" size="4 4 .1"/>
+    <body name="cart">
+      <joint name="slider" type="slide" axis="1 0 0" range="-1 1"/>
+      <geom type="box" size="0.1 0.1 0.05" mass="1"/>
+      <body name="pole" childclass="pole">
+        <joint name="hinge" range="-80 200"/>
+        <geom type="capsule" fromto="0 0 0 0.002 0 0.6" size="0.03" mass="0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="slide" joint="slider" gear="50" ctrlrange="-3 3"/></actuator>
+  <sensor><jointpos joint="hinge"/></sensor>
+</mujoco>"""
+
+LEAN = math.atan2(0.001, 0.3)
+
+
+@pytest.fixture
+def pole(tmp_path: Path) -> Path:
+    (tmp_path / "common").mkdir()
+    (tmp_path / "common" / "look.xml").write_text(LOOK)
+    path = tmp_path / "pole.xml"
+    path.write_text(POLE)
+    return path
+
+
+@pytest.fixture
+def mujoco() -> Any:
+    return pytest.importorskip("mujoco")
+
+
+def states(n: int) -> FloatArray:
+    return np.random.default_rng(0).uniform(-2, 2, (20, 2 * n))
+
+
+def same(one: ut.Mechanism, other: ut.Mechanism, tight: float = 1e-12) -> None:
+    x = states(one.n)
+    scale = np.abs(one.f(x)).max()
+    assert np.abs(one.M(x[:, : one.n]) - other.M(x[:, : one.n])).max() < tight
+    assert np.abs(one.f(x) - other.f(x)).max() < tight * scale
+    assert one.input_matrix == other.input_matrix
+    assert one.input_limits.tolist() == other.input_limits.tolist()
+
+
+# -- two readers ---------------------------------------------------------------------------------
+
+
+def test_both_readers_make_the_same_of_a_file(
+    pole: Path, mujoco: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Claim: includes, default classes and materials are read with and without MuJoCo, alike; a
+    mechanism that MuJoCo read agrees with it to 1e-8 and says so."""
+    by_mujoco = modelling.from_mjcf(pole)
+    assert 0 < float(agreement(by_mujoco)) < AGREEMENT
+    monkeypatch.setattr(mjcf, "engine", lambda: None)
+    own = modelling.from_mjcf(pole)
+    assert agreement(own) == ""
+    assert "MuJoCo, which would compare, is not installed" in own.description
+    same(by_mujoco, own)
+    assert [p.name for p in own.parameters] == [p.name for p in by_mujoco.parameters]
+
+
+def test_what_was_read_is_said_in_five_lines(pole: Path) -> None:
+    lines = named(str(pole)).description.splitlines()
+    assert [line.split()[0] for line in lines] == ["MJCF", "joints", "inputs", "left", "target"]
+    assert lines[1] == "joints slider (-1 to 1 m), hinge (-80 to 200°)"
+    assert lines[2] == "inputs slide × 50 on slider, |slide| ≤ 3"
+
+
+def test_a_difference_from_mujoco_is_refused(
+    pole: Path, mujoco: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Claim: what moves the bodies and is not read does not go unnoticed: here, half a damping."""
+    true = mujoco_compiler._Compiled._joint
+
+    def halved(self: Any, *given: Any) -> Any:
+        joint = true(self, *given)
+        object.__setattr__(joint, "damping", 0.5 * joint.damping)
+        return joint
+
+    monkeypatch.setattr(mujoco_compiler._Compiled, "_joint", halved)
+    with pytest.raises(ModelError, match=r"from MuJoCo's, relative.*at most 1e-08"):
+        modelling.from_mjcf(pole)
+
+
+SERVO = """<mujoco model="servo">
+  <compiler angle="radian"/>
+  <worldbody><body name="a"><joint name="slider" type="slide" axis="1 0 0" damping="0.1"/>
+    <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+    <frame euler="0 0.3 0"><body name="b" pos="0 0 0.1"><joint name="hinge" axis="0 1 0"/>
+      <geom type="mesh" mesh="tip"/></body></frame></body></worldbody>
+  <asset><mesh name="tip" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .4"/></asset>
+  <tendon><fixed name="belt"><joint joint="slider" coef="2"/></fixed></tendon>
+  <actuator>
+    <position name="drive" tendon="belt" gear="3" kp="7" kv="0.5" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>"""
+
+
+def test_servos_tendons_of_one_joint_frames_and_meshes(mujoco: Any) -> None:
+    """Claim: the spring and damper of a servo become the mechanism's, gears and coefficients
+    multiply, and a mesh gives its inertia; the comparison with MuJoCo is made at once."""
+    read = modelling.from_mjcf(SERVO)
+    assert float(agreement(read)) < AGREEMENT
+    assert [c.name for c in read.coordinates] == ["slider", "hinge"]
+    assert float(read.input_matrix[0, 0]) == pytest.approx(7 * 3 * 2)
+    push = read.f([0.1, 0.0, 0.0, 0.0])[0] - read.f([0.0, 0.0, 0.0, 0.0])[0]
+    assert push == pytest.approx(-7 * (3 * 2) ** 2 * 0.1)
+    brake = read.f([0.0, 0.0, 1.0, 0.0])[0] - read.f([0.0, 0.0, 0.0, 0.0])[0]
+    assert brake == pytest.approx(-0.1 - 0.5 * (3 * 2) ** 2)
+
+
+def test_what_mujoco_has_and_no_mechanism_can_have_is_refused(mujoco: Any) -> None:
+    limited = POLE.replace('<include file="./common/look.xml"/>', "").replace(
+        ' material="steel"', ""
+    )
+    for old, new, match in (
+        ("<actuator>", '<actuator><intvelocity joint="hinge" kp="1" actrange="-1 1"/>', "states"),
+        ("<actuator>", '<actuator><muscle joint="hinge"/>', "states of its own"),
+        ('ctrlrange="-3 3"', 'ctrlrange="0 3"', "one way only"),
+        ("<worldbody>", '<option density="1"/><worldbody>', "density"),
+        ("<actuator>", '<tendon><fixed name="t" range="0 1"><joint joint="slider" coef="1"/>'
+         "</fixed></tendon><actuator>", "limits on tendon"),
+        ('<body name="pole"', '<body name="pole" gravcomp="1"', "gravcomp"),
+        ('joint="slider" gear="50"', 'joint="slider" gear="0"', "gear of actuator"),
+        ('name="hinge" range', 'name="hinge" strength="1" range', "unrecognized attribute"),
+    ):  # fmt: skip
+        assert old in limited
+        with pytest.raises(UndertowError, match=match):
+            modelling.from_mjcf(limited.replace(old, new))
+
+
+def test_frames_of_the_world_are_read(mujoco: Any) -> None:
+    """Claim: ``coordinate="global"``, which MuJoCo reads no more, gives the same equations."""
+    head = '<mujoco><compiler {}/><worldbody><body name="a" pos="0.1 0 0.2">'
+    ends = '<actuator><motor joint="p"/></actuator></mujoco>'
+    local = head.format('angle="radian"') + (
+        '<joint name="p" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 1" size=".05"/>'
+        '<body name="b" pos="0 0 1"><joint name="q" axis="0 1 0" pos="0 0 0.05"/>'
+        '<geom type="capsule" fromto="0 0 0 0.3 0 0.5" size=".05"/></body></body></worldbody>'
+    )
+    world = head.format('angle="radian" coordinate="global"') + (
+        '<joint name="p" axis="0 1 0"/>'
+        '<geom type="capsule" fromto="0.1 0 0.2 0.1 0 1.2" size=".05"/>'
+        '<body name="b"><joint name="q" axis="0 1 0" pos="0.1 0 1.25"/>'
+        '<geom type="capsule" fromto="0.1 0 1.2 0.4 0 1.7" size=".05"/></body></body></worldbody>'
+    )
+    same(modelling.from_mjcf(local + ends), modelling.from_mjcf(world + ends), 1e-11)
+
+
+def test_a_compilers_warnings_stay_away(
+    tmp_path: Path, mujoco: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Claim: MuJoCo leaves no log file in the folder where somebody works."""
+    monkeypatch.chdir(tmp_path)
+    text = SERVO.replace('angle="radian"', 'angle="radian" settotalmass="3"')
+    assert modelling.from_mjcf(text).n == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- files are data --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("element", "match"),
+    [
+        ('<include file="/etc/passwd"/>', "relative to the model's own file"),
+        ('<include file="C:\\\\look.xml"/>', "relative to the model's own file"),
+        ('<include file="pole.xml"/>', "include itself"),
+        ('<include file=""/>', "relative"),
+        ('<include file="nowhere.xml"/>', r"nowhere\.xml"),
+        ('<include file="common"/>', "plain file"),
+    ],
+)
+def test_includes_are_relative_and_end(pole: Path, element: str, match: str) -> None:
+    pole.write_text(POLE.replace('<include file="./common/look.xml"/>', element))
+    with pytest.raises(UndertowError, match=match):
+        modelling.from_mjcf(pole)
+
+
+def test_a_text_has_no_folder_to_include_from() -> None:
+    with pytest.raises(InvalidInputError, match="Give the model as a file"):
+        modelling.from_mjcf(POLE)
+
+
+def test_what_is_included_counts(pole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim: the limits of size are those of the whole document."""
+    pole.with_name("common").joinpath("look.xml").write_text(f"<mujoco>{'<asset/>' * 40}</mujoco>")
+    assert modelling.from_mjcf(pole).n == 2
+    monkeypatch.setattr(mjcf_document, "MOST", 50)
+    with pytest.raises(InvalidInputError, match="with what it includes"):
+        modelling.from_mjcf(pole)
+
+
+@pytest.mark.parametrize("file", ["/tip.stl", "tip.stl"])
+def test_a_mesh_that_an_inertia_needs_is_relative_and_there(pole: Path, file: str) -> None:
+    mesh = f'<asset><mesh name="tip" file="{file}"/></asset><worldbody>'
+    text = POLE.replace("<worldbody>", mesh)
+    pole.write_text(text)
+    assert modelling.from_mjcf(pole).n == 2  # nothing needs it
+    pole.write_text(text.replace('type="capsule" fromto="0 0 0 0.002 0 0.6" size="0.03"',
+                                 'type="mesh" mesh="tip"'))  # fmt: skip
+    with pytest.raises(UndertowError, match="relative" if file[0] == "/" else "an <inertial>"):
+        modelling.from_mjcf(pole)
+
+
+# -- equilibria ------------------------------------------------------------------------------------
+
+
+def test_the_nearest_equilibrium_is_found_and_taken(pole: Path) -> None:
+    """Claim: an upright that leans needs no word; it is the target, and named."""
+    rig = named(str(pole))
+    assert f"target the nearest equilibrium: slider = 0 m, hinge = {math.degrees(-LEAN):.4g}°" in (
+        rig.description
+    )
+    assert np.abs(rig.f(np.zeros(4))[1]) < 1e-12
+    assert rig.coordinates[1].low == pytest.approx(math.radians(-80) + LEAN)
+    assert dict(rig.start) == {"hinge": math.radians(5)}
+    assert controllability(rig) > 1e-4
+    known = modelling.from_mjcf(pole, equilibrium={"hinge": -LEAN}) if LEAN else rig
+    same(rig, known, 1e-9)
+
+
+def test_equilibria_by_name(pole: Path) -> None:
+    up, down = named(f"{pole}@upright"), named(f"{pole}@hanging")
+    turned = [0.0, math.pi]
+    same(up, named(f"{pole}@nearest"))
+    assert np.abs(up.M(turned) - down.M([0, 0])).max() < 1e-9
+    same(down, named(f"{pole}@hinge=170deg"), 1e-9)
+    same(down, modelling.from_mjcf(pole, equilibrium="hanging"))
+    assert "hanging" in down.description
+    with pytest.raises(InvalidInputError, match="one of upright, hanging, nearest"):
+        modelling.from_mjcf(pole, equilibrium="sideways")
+    with pytest.raises(InvalidInputError, match="JOINT=VALUE with its unit"):
+        named(f"{pole}@hinge=170")
+    pole.write_text(POLE.replace('range="-80 200"', 'range="-80 80"'))
+    with pytest.raises(ModelError, match=r"hanging equilibrium.*one of slider = 0 m, hinge = -0"):
+        named(f"{pole}@hanging")
+
+
+def test_a_rig_in_mujoco_stands_where_the_mechanism_does(pole: Path, mujoco: Any) -> None:
+    """Claim: on the scene of the same file zero is the equilibrium that is the target."""
+    for word in ("", "@hanging"):
+        name = f"{pole}{word}"
+        x = np.array([0.1, 0.2, 0.0, 0.0])
+        recipe = Recipe(mechanism=name, start=tuple(x.tolist()), rig="ideal")
+        plain = POLE.replace('<include file="./common/look.xml"/>', "")
+        scene = pole.with_name("scene.xml")
+        scene.write_text(plain.replace('<geom material="steel"/>', ""))
+        rig: Any = rig_named(str(scene), recipe, supervised=False)
+        at = origin(name)
+        assert rig._data.qpos.tolist() == pytest.approx([0.1, 0.2 + at["hinge"]])
+        assert at["hinge"] == pytest.approx(math.pi - LEAN if word else -LEAN)
+
+
+def test_an_equilibrium_that_the_inputs_cannot_hold_is_none(pole: Path) -> None:
+    """Claim: on a slope of 30 degrees a force of m g sin(30 deg) holds the cart, or nothing."""
+    text = POLE.replace("<worldbody>", '<option gravity="4.905 0 -8.496"/><worldbody>')
+    pole.write_text(text)
+    assert "held by slide = -0.12" in named(str(pole)).description
+    pole.write_text(text.replace('ctrlrange="-3 3"', 'ctrlrange="-.1 .1"'))
+    with pytest.raises(ModelError, match="which the inputs hold within limits"):
+        named(str(pole))
+
+
+def test_a_start_is_within_what_the_inputs_reach(pole: Path) -> None:
+    """Claim: a motor too weak for 5 degrees says by how much, and its start is closer: so much
+    that the linear model needs half of it."""
+    strong = named(str(pole))
+    pole.write_text(POLE.replace('ctrlrange="-3 3"', 'ctrlrange="-.001 .001"'))
+    weak = named(str(pole))
+    needed = float(weak.description.rpartition("needs ")[2].split()[0])
+    lin = strong.linearise()
+    rates, modes = np.linalg.eig(lin.A.T)
+    k = int(np.argmax(rates.real))  # alone: z = wᵀx is held by |wᵀb| u ≥ λ |z|
+    push = abs(modes[:, k] @ lin.input[:, 0]) * 0.001
+    assert needed == pytest.approx(
+        rates[k].real * abs(modes[1, k]) * math.radians(5) / push, rel=0.02
+    )
+    assert weak.start["hinge"] == pytest.approx(0.5 * math.radians(5) / needed, rel=1e-2)
+
+
+def test_parameters_that_would_move_the_target_are_known(pole: Path) -> None:
+    """Claim: where a centre of mass is off the axis, learning it would move the equilibrium."""
+    names = set(Belief.usual(named(str(pole))).tolerances)
+    assert "pole_mass" in names
+    assert not names & {"pole_com_x", "pole_com_z"}
+    straight = POLE.replace("0.002 0 0.6", "0 0 0.6")
+    pole.write_text(straight)
+    assert "pole_com_z" in Belief.usual(named(str(pole))).tolerances
+
+
+# -- joints that do not belong ---------------------------------------------------------------------
+
+REACHER = """<body name="target"><joint name="target-x" type="slide" axis="1 0 0"/>
+  <joint name="target-y" type="slide" axis="0 1 0"/><geom type="sphere" size="0.02"/></body>
+</worldbody>"""
+
+
+def test_joints_that_nothing_ties_to_the_motors_are_frozen_by_name(pole: Path) -> None:
+    pole.write_text(POLE.replace("</worldbody>", REACHER))
+    with pytest.raises(ModelError, match="freeze them, FILE:-target_x,-target_y"):
+        named(str(pole))
+    frozen = named(f"{pole}:-target-x,-target-y")
+    assert "frozen target-x, target-y" in frozen.description
+    pole.write_text(POLE)
+    same(frozen, named(str(pole)))
+    with pytest.raises(InvalidInputError, match="frozen joint"):
+        named(f"{pole}:-elbow")
+
+
+def test_what_falls_is_refused_before_equations_are_derived(pole: Path) -> None:
+    pole.write_text(POLE.replace('type="slide" axis="1 0 0"', 'type="slide" axis="0 0 1"')
+                    .replace('joint="slider"', 'joint="hinge"'))  # fmt: skip
+    with pytest.raises(ModelError, match=r"'slider'.*a slide along which the mechanism falls"):
+        named(str(pole))
+    assert modelling.from_mjcf(pole).n == 2  # to look at, it may
+
+
+# -- URDF ----------------------------------------------------------------------------------------
+
+URDF = """
+<!-- generated -->
+<?xml version="1.0"?>
+<robot name="cart">
+  <link name="rail"/>
+  <link name="box"><visual><geometry><mesh filename="package://none/box.dae"/></geometry></visual>
+    <inertial><origin xyz="0, 0, 0 0" rpy="$(optenv TILT 0 0 0)"/><mass value="1"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <link name="pole"><inertial><origin xyz="0 0 0.5"/><mass value="0.1"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+  <link name="tip"><inertial><mass value="0"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <joint name="slide" type="prismatic"><parent link="rail"/><child link="box"/>
+    <axis xyz="1 0 0"/><limit effort="30" lower="-2.0." upper="2" velocity="5"/></joint>
+  <joint name="turn" type="continuous"><parent link="box"/><child link="pole"/>
+    <axis xyz="0 1 0"/></joint>
+  <joint name="end" type="fixed"><parent link="pole"/><child link="tip"/></joint>
+</robot>
+\0"""
+
+
+def test_a_urdf_as_people_have_it(tmp_path: Path) -> None:
+    """Claim: commas, surplus zeros, a late declaration, ROS' defaults, a stop too many, meshes that
+    are nowhere and a zero at the end hinder nobody; the joint with an effort is the driven one;
+    a link without mass that is fixed to another turns with no inertia."""
+    path = tmp_path / "cart.urdf"
+    path.write_text(URDF)
+    rig = named(str(path))
+    assert [c.name for c in rig.coordinates] == ["slide", "turn"]
+    assert [i.name for i in rig.inputs] == ["slide_force"]
+    assert (rig.coordinates[0].low, rig.input_limits.tolist()) == (-2.0, [30.0])
+    assert rig.M([0.0, 0.0])[1, 1] == pytest.approx(0.01 + 0.1 * 0.25)
+    if mujoco_compiler.engine():
+        assert float(agreement(rig)) < AGREEMENT
+    path.write_text(URDF.replace('effort="30"', 'effort="0"'))
+    with pytest.raises(ModelError, match="names no actuator"):
+        named(str(path))
+    assert named(f"{path}:slide@hanging").n == 2
+    frozen = modelling.from_urdf(URDF.replace("</robot>", LIMB), frozen=["wrist"])
+    same(frozen, modelling.from_urdf(URDF))
+    assert frozen.n == 2
+
+
+LIMB = """<link name="stick"/><joint name="wrist" type="continuous"><parent link="rail"/>
+  <child link="stick"/><axis xyz="0 1 0"/></joint></robot>"""
+
+
+# -- names and commands ----------------------------------------------------------------------------
+
+
+def test_names_of_mechanisms_in_files(tmp_path: Path) -> None:
+    name = DataName.of("a b/robot.urdf:one,-two@one=90deg,two=0.5m")
+    assert name is not None
+    assert (name.file, name.actuated, name.frozen) == (Path("a b/robot.urdf"), ("one",), ("two",))
+    assert name.equilibrium == {"one": pytest.approx(math.pi / 2), "two": 0.5}
+    assert DataName.of("rotary_pendulum") is None
+    assert DataName.of("file.py:name") is None
+    assert from_anywhere("robot.urdf:one@upright").endswith("/robot.urdf:one@upright")
+    assert from_anywhere("robot.urdf:one@upright").startswith("/")
+
+
+def test_words_of_the_option_target(pole: Path) -> None:
+    """Claim: words about equilibria go into the name; where the cart may rest anywhere, a place is
+    a set-point, and elsewhere it is an equilibrium."""
+    assert aimed(str(pole), ["upright"]) == (f"{pole}@upright", [])
+    assert aimed(str(pole), ["hanging", "slider=0.2m"]) == (f"{pole}@hanging", ["slider=0.2m"])
+    assert aimed(str(pole), ["slider=0.2m"]) == (str(pole), ["slider=0.2m"])
+    assert aimed(str(pole), ["hinge=180deg"]) == (f"{pole}@hinge=180deg", [])
+    assert aimed("tora", ["x=1m"]) == ("tora", ["x=1m"])
+    assert aimed("tora", None) == ("tora", [])
+    for name, words in (("tora", ["upright"]), (f"{pole}@hanging", ["upright"])):
+        with pytest.raises(InvalidInputError, match="target"):
+            aimed(name, words)
+
+
+def test_a_folder_of_files(pole: Path, tmp_path: Path) -> None:
+    """Claim: one command says of every file what was read, or what it was refused for."""
+    (tmp_path / "note.xml").write_text("<note/>")
+    (tmp_path / "free.xml").write_text(
+        '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "broken.urdf").write_text("<robot>")
+    (tmp_path / "two.urdf").write_text(URDF.replace('effort="30"', 'effort="0"'))
+    rows = {row.name: row for row in model_files(tmp_path, simulate=False)}
+    assert set(rows) == {"broken.urdf", "common/look.xml", "free.xml", "note.xml", "pole.xml",
+                         "two.urdf:slide"}  # fmt: skip
+    refused = {name: row.refused for name, row in rows.items()}
+    assert refused == {
+        "broken.urdf": "the text",
+        "common/look.xml": "mechanics",
+        "free.xml": "mechanics",
+        "note.xml": "no model",
+        "pole.xml": "",
+        "two.urdf:slide": "",
+    }
+    assert (rows["pole.xml"].n, rows["pole.xml"].m, rows["pole.xml"].balanced) == (2, 1, None)
+    assert summary(tuple(rows.values())).startswith("6 files: 2 read; refused 2 for mechanics")
+    assert sum(count for *_, count in refused_groups(tuple(rows.values()))) == 4
+    assert b"| two.urdf:slide | 2 | 1 |" in files_of(tuple(rows.values()))["models.md"]
+    code, out, _ = run("models", str(tmp_path), "--no-simulate")
+    assert code == 0
+    assert "6 files: 2 read" in out
+    with pytest.raises(ArtefactError, match="0 files"):
+        model_files(tmp_path / "nowhere")
+
+
+@pytest.mark.slow  # kernels of its own
+def test_a_file_is_simulated_without_another_word(pole: Path) -> None:
+    """Claim: from 5 degrees off the nearest equilibrium to it, within the travel of the cart."""
+    code, out, _ = run("simulate", str(pole), "--control", "one-time", "--objective", "effort")
+    assert code == 0, out
+    assert "start          hinge = 5°" in out
+    assert "reached the target" in out
+    assert "95 % of the travel" in out.replace("\n", " ")
