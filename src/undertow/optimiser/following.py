@@ -46,6 +46,8 @@ class Follower:
     states
         States (N, 2n) so long, s, after a state x, for search coordinates (N, d); infinite for a
         motion that broke off.
+    exact
+        The same for one surface (d,), integrated without the errors of a search: (2n,).
     arrival
         Whose motions are followed, and found anew from where the surfaces lead.
     period
@@ -56,6 +58,7 @@ class Follower:
 
     draw: Callable[[int, FloatArray | None], FloatArray]
     states: Callable[[FloatArray, FloatArray, float], FloatArray]
+    exact: Callable[[FloatArray, FloatArray, float], FloatArray]
     arrival: EarliestArrival
     period: float
     step: float
@@ -84,8 +87,10 @@ class Follower:
             off = math.inf
             if rest > time:
                 goal = self.arrival.state_at(left, passed + time)
-                z, ends, distance = self._lead(x, goal, time, scale, FOLLOWS * radius, before)
-                off = float(distance[0]) if len(z) else math.inf
+                z, _ = self._lead(x, goal, time, scale, FOLLOWS * radius, before)
+                if len(z):
+                    end = self.exact(x, z[0], time)
+                    off = float(np.linalg.norm(end - goal))
             if off > ACCEPTED * radius and divisible:
                 piece = max(shortest, self._in_steps(time / 2))
                 continue
@@ -93,7 +98,7 @@ class Follower:
                 return None
             found.append(z[0])
             times.append(round(times[-1] + time, 9))
-            x, passed, piece = ends[0], passed + time, self.period
+            x, passed, piece = end, passed + time, self.period
             if off > ACCEPTED * radius:
                 again = self.arrival.improve(left.after(passed, x))
                 if again is not None:
@@ -117,12 +122,13 @@ class Follower:
         parts = AFTER[:BEFORE] if divisible else AFTER
         for part, measure in itertools.product(parts, (scale, np.full_like(x, radius))):
             time = self.step * math.ceil(part * rest / self.step)
-            z, _, off = self._lead(
+            z, off = self._lead(
                 x, end / part, time, measure, CLOSE * radius, before, target,
                 1 if divisible else MANY,
             )  # fmt: skip
-            if len(z) and off[0] < CLOSE * radius:
-                return z[0], time
+            for last in z[off < CLOSE * radius]:
+                if np.linalg.norm(self.exact(x, last, time)) < radius:
+                    return last, time
         return None
 
     def _whole(
@@ -145,11 +151,11 @@ class Follower:
         before: FloatArray | None,
         target: FloatArray | None = None,
         effort: int = 1,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Return surfaces (N, d) that lead from x to a goal in so long, s, the nearest first.
 
-        With where they lead, (N, 2n), and how far that is from ``target``, (2n,), by default the
-        goal, in units of the states, (N,).  The search, in parts of ``scale``, (2n,), ends at the
+        With how far from ``target``, (2n,), by default the goal, in units of the states, (N,).  The
+        search, in parts of ``scale``, (2n,), ends at the
         first that is nearer than ``near``.  There may be none: all drawn motions may break off.
         """
         beside = np.zeros_like(goal) if target is None else goal - target
@@ -168,4 +174,4 @@ class Follower:
             z, miss, t, damping = closer(off, z, miss, t, damping)
         distance = np.linalg.norm(miss * scale + beside, axis=1)
         order = np.argsort(distance, kind="stable")
-        return z[order], goal + miss[order] * scale, distance[order]
+        return z[order], distance[order]

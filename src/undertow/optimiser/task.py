@@ -311,9 +311,11 @@ class Optimisation:
         if plain and incumbent.times == freedom.times:
             self._unscored = incumbent
             return here
+        schedule = freedom.schedule > 0
         batch = loop.batch(
-            self.x, incumbent, duration=self.horizon, stable_only=True, seek=self._seeks()
-        )
+            self.x, incumbent, duration=self.horizon, stable_only=True,
+            seek=self._seeks() and not schedule, precise=schedule,
+        )  # fmt: skip
         stable = loop.linear_end or stability_margin(loop.mechanism, incumbent.surfaces[-1]) > 0
         self.evaluations += 1
         self._adopt(incumbent, here, float(batch.score(self.horizon)[0]) if stable else UNSTABLE)
@@ -496,7 +498,15 @@ class Optimisation:
             sound = (batch.event == Event.HORIZON) & np.isfinite(batch.x).all(axis=1)
             return np.where(sound[:, None], batch.x, np.inf)
 
-        follower = Follower(draw, states, arrival, period, loop.step)
+        def exact(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
+            vectors, gains = space.decode(z[None])
+            batch = loop.batch(
+                x, vectors, reaching=gains, duration=time, terminal=0.0, precise=True
+            )
+            sound = int(batch.event[0]) == Event.HORIZON
+            return np.asarray(batch.x[0]) if sound else np.full_like(x, np.inf)
+
+        follower = Follower(draw, states, exact, arrival, period, loop.step)
         found = follower.follow(motion)
         if found is None:
             return None
@@ -509,7 +519,7 @@ class Optimisation:
 
     def _consider(self, plan: Plan) -> None:
         """Score a plan that the coordinates cannot express, and keep it where it is the best."""
-        batch = self.loop.batch(self.x, plan, duration=self.horizon, stable_only=True)
+        batch = self.loop.batch(self.x, plan, duration=self.horizon, stable_only=True, precise=True)
         self.evaluations += 1
         score = float(batch.score(self.horizon)[0])
         if score < self.best_cost and stability_margin(self.loop.mechanism, plan.surfaces[-1]) > 0:
