@@ -72,9 +72,13 @@ class Follower:
         scale = np.maximum(np.abs(motion.x).max(axis=0), radius)
         x, left, passed, piece = motion.x[0], motion, 0.0, self.period
         found: list[FloatArray] = []
-        times = [0.0]
+        times, off = [0.0], 0.0
         while not self.arrival.late():
             before = found[-1] if found else None
+            last_leg = left.time - passed < LAST * piece
+            if off > ACCEPTED * radius or (last_leg and off > FOLLOWS * radius):
+                again = self.arrival.improve(left.after(passed, x))
+                left, passed, off = (left, passed, 0.0) if again is None else (again, 0.0, 0.0)
             rest, divisible = left.time - passed, piece > shortest
             if rest < LAST * piece:
                 last = self._arrive(x, left.x[-1], rest, scale, divisible, before)
@@ -84,25 +88,22 @@ class Follower:
                     return None
             multiple = self.period * math.floor(times[-1] / self.period + 1.0 + 1e-9)
             time = min(piece, self._in_steps(multiple - times[-1]))
-            off = math.inf
+            beside = math.inf
             if rest > time:
                 goal = self.arrival.state_at(left, passed + time)
                 z, _ = self._lead(x, goal, time, scale, FOLLOWS * radius, before)
                 if len(z):
                     end = self.exact(x, z[0], time)
-                    off = float(np.linalg.norm(end - goal))
-            if off > ACCEPTED * radius and divisible:
+                    beside = float(np.linalg.norm(end - goal))
+            if beside > ACCEPTED * radius and divisible:
                 piece = max(shortest, self._in_steps(time / 2))
                 continue
-            if not math.isfinite(off) or (off > ACCEPTED * radius and rest < LAST * self.period):
+            lost = beside > ACCEPTED * radius and rest < LAST * self.period
+            if lost or not math.isfinite(beside):
                 return None
             found.append(z[0])
             times.append(round(times[-1] + time, 9))
-            x, passed, piece = end, passed + time, self.period
-            if off > ACCEPTED * radius:
-                again = self.arrival.improve(left.after(passed, x))
-                if again is not None:
-                    left, passed = again, 0.0
+            x, passed, piece, off = end, passed + time, self.period, beside
         return None
 
     def _in_steps(self, time: float) -> float:

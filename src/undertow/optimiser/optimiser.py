@@ -129,6 +129,8 @@ class Optimiser:
         if given is not None:
             return given
         size = self.space.size
+        if warm and self.freedom.schedule:
+            return Budget(4096 * size)
         if warm:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
         if self.counts_time:
