@@ -3,9 +3,9 @@
 Two sheets.  *rotary*: the rotary pendulum from seven angles with five dampings.  *own*: the five
 mechanisms of examples/mechanisms.py from 0.6, 1 and 1.4 times their starts.  In each cell, for
 least energy and for least time: the cascade with three plain parameters and the one that may
-choose the reaching law, too, both with the exact model, over the optimal-control bound of
-undertow.bounds from several guesses, the cascades' own motions among them.  The bound keeps every
-pendulum above the horizontal, as each stable surface must (37).
+choose the reaching laws, too, for least time in a schedule of surfaces, both with the exact model,
+over the optimal-control bound of undertow.bounds from several guesses, the cascades' own motions
+among them.  The bound keeps every pendulum above the horizontal, as each stable surface must (37).
 
 A cell is kept in the ledger as soon as it is finished: the same command goes on where it was
 interrupted.  A ledger is of one seed and one version of the package: remove it after a change.
@@ -52,7 +52,7 @@ SCALES = (0.6, 1.0, 1.4)
 
 #: Largest gap wanted.
 WANTED = {"energy": 0.01, "time": 0.05}
-KINDS = {"cascade": "three parameters", "free": "reaching law free"}
+KINDS = {"cascade": "three parameters", "free": "reaching laws free"}
 
 #: Gaps over what is wanted: blue below, orange above, a factor of ten to either end.
 SHADES = LinearSegmentedColormap.from_list(

