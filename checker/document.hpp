@@ -149,7 +149,6 @@ template <class T> struct Plant {
 };
 
 struct Model {
-    std::string model_name;
     size_t n = 0, m = 0;
     std::vector<std::string> positions, inputs, parameter_names;
     std::vector<bool> limited;
@@ -161,7 +160,7 @@ struct Model {
 
     explicit Model(const Json& j) {
         only_keys(j, {"name", "positions", "inputs", "parameters", "nodes", "M", "f", "B"}, "model");
-        model_name = label(j.keys.at("name"), 64, "name of the model");
+        label(j.keys.at("name"), 64, "name of the model");
         std::set<std::string> names;
         const auto fresh = [&](const std::string& s) {
             if (!names.insert(s).second) refuse("a name occurs twice");
