@@ -402,7 +402,8 @@ static Matrix<Interval> enclosed(const Matrix<Fraction>& a) {
 }
 
 // Symmetric G: a congruence with the inverse of a Cholesky factor of the middle makes it nearly the
-// identity; dominance of the diagonal then decides (the factor itself need not be right).
+// identity, and one with a diagonal of weights, found by Gauss and Seidel, gives the dominance of the
+// diagonal, if any weights do. Neither the factor nor the weights need be right: they are only tried.
 static bool positive_definite(const Matrix<Interval>& G) {
     const size_t n = G.size();
     Matrix<double> L(n, std::vector<double>(n, 0.0)), R = L;
@@ -425,11 +426,19 @@ static bool positive_definite(const Matrix<Interval>& G) {
     for (size_t i = 0; i < n; ++i)
         if (!positive(C[i][i])) return false;
     const auto D = product(product(C, G), transposed(C));
+    std::vector<double> weight(n, 1.0);
+    for (int round = 0; round < 200; ++round)
+        for (size_t i = 0; i < n; ++i) {
+            double others = 1.0;
+            for (size_t j = 0; j < n; ++j)
+                if (j != i) others += D[i][j].size() * weight[j];
+            weight[i] = others / D[i][i].low();
+        }
     for (size_t i = 0; i < n; ++i) {
-        Interval others(0.0);
+        Interval rest = D[i][i] * Interval(weight[i]);
         for (size_t j = 0; j < n; ++j)
-            if (j != i) others = others + Interval(std::max(D[i][j].size(), D[j][i].size()));
-        if (!positive(D[i][i] - others)) return false;
+            if (j != i) rest = rest - Interval(std::max(D[i][j].size(), D[j][i].size())) * Interval(weight[j]);
+        if (!(weight[i] > 0) || !positive(rest)) return false;
     }
     return true;
 }

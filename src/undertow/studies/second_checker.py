@@ -32,7 +32,9 @@ def second_checker() -> Path:
     if found is None:
         remedy = "Build it in a checkout of the repository: make checker"
         if not any(map(shutil.which, COMPILERS)):
-            remedy = f"No compiler is found ({' or '.join(COMPILERS)}): install one, then make checker"
+            remedy = (
+                f"No compiler is found ({' or '.join(COMPILERS)}): install one, then make checker"
+            )
         raise MissingExtraError(
             f"second checker '{NAME}'", value="not built", limit="verify --both", remedy=remedy
         )
