@@ -1,6 +1,6 @@
-"""The second checker of certificates, a program of its own (``checker/``, built by ``make checker``).
+"""The second checker of certificates, a program of its own (``make checker`` builds it).
 
-It shares no code with the library: here it is only found, run, and read.
+Its code in ``checker/`` shares none with the library: here it is only found, run, and read.
 """
 
 from __future__ import annotations
