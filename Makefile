@@ -8,9 +8,11 @@ VENV  := .venv
 BIN   := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
+CHECKER := build/undertow-checker
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow check bench clean
+.PHONY: help setup demo test slow check bench checker clean
 
 help: ## list the targets
 	@echo "Undertow: make <target>    (PYTHON=$(PYTHON), WORKERS=$(WORKERS))"
@@ -35,6 +37,17 @@ check: $(STAMP) ## formatting, lint, types, direction of imports
 
 bench: $(STAMP) ## all benchmarks, with a summary (docs/benchmarks.md says what they mean)
 	$(BIN)/python benchmarks
+
+checker: $(CHECKER) ## build the second checker of certificates (needs a C++17 compiler)
+
+# One rounding mode for the whole run: -frounding-math, and no fused operations.
+$(CHECKER): checker/checker.cpp $(wildcard checker/*.hpp)
+	@command -v $(firstword $(CXX)) >/dev/null || { \
+	    echo "error: no C++ compiler found under the name '$(CXX)'."; \
+	    echo "Install g++ or clang++ (12 or newer), or name one: make checker CXX=/path/to/c++"; \
+	    exit 1; } >&2
+	@mkdir -p $(@D)
+	$(CXX) -std=c++17 -O2 -frounding-math -ffp-contract=off -Wall -Wextra -o $@ checker/checker.cpp
 
 clean: ## remove .venv, caches and results/
 	rm -rf $(VENV) results dist build

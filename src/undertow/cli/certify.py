@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -212,6 +213,9 @@ def verify(
         ),
     ] = None,
     seconds: Annotated[float, option("Time limit for each claim, s.")] = 600.0,
+    both: Annotated[
+        bool, option("Ask the second checker too (make checker), and fail where they differ.")
+    ] = False,
 ) -> None:
     """Check a certificate again, from the file and the mechanism alone.
 
@@ -223,6 +227,7 @@ def verify(
     from undertow.proofs import check_settings, read_certificate
     from undertow.proofs import verify as decide
     from undertow.studies import certification
+    from undertow.studies.second_checker import agreement_table, decide_again
 
     certificate = read_certificate(file)
     check_settings(certificate, parse_values(setting))
@@ -235,9 +240,27 @@ def verify(
         )
     model = mechanism_named(mechanism or certificate.name) if known else None
     own = mechanism is not None and in_a_file(mechanism)
+    again: list[tuple[str, float]] = []
+    if both:
+        again = decide_again(file, seconds=seconds)
+    started: list[float] = []
     with progress_bar() as progress:
+
+        def timed(what: str, fraction: float) -> None:
+            started.append(perf_counter())
+            progress(what, fraction)
+
         checked = decide(
-            certificate, model, own_parameters=own, max_seconds=seconds, progress=progress
+            certificate, model, own_parameters=own, max_seconds=seconds, progress=timed
         )
     show(certification.verification_report(certificate, checked), least=80)
-    exit_unless(all(item.verdict for item in checked))
+    alike = True
+    if both:
+        ends = [*started[1 : len(checked)], perf_counter()]
+        ours = [
+            (item.verdict.kind, end - start)
+            for item, start, end in zip(checked, started, ends, strict=False)
+        ]
+        table, alike = agreement_table([item.claim.kind for item in checked], ours, again)
+        show(table)
+    exit_unless(alike and all(item.verdict for item in checked))

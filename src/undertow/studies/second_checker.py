@@ -1,0 +1,98 @@
+"""The second checker of certificates, a program of its own (``make checker`` builds it).
+
+Its code in ``checker/`` shares none with the library: here it is only found, run, and read.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from undertow.base.errors import CertificateError, MissingExtraError
+
+__all__ = ["agree", "agreement_table", "decide_again", "second_checker"]
+
+NAME = "undertow-checker"
+BUILT = Path(__file__).parents[3] / "build" / NAME
+COMPILERS = ("g++", "clang++")
+
+
+def second_checker() -> Path:
+    """Return the program: in this checkout's ``build/``, else on the PATH.
+
+    Raises
+    ------
+    MissingExtraError
+        Where it is not built; the remedy names the compiler if that is missing too.
+    """
+    found = str(BUILT) if BUILT.is_file() else shutil.which(NAME)
+    if found is None:
+        remedy = "Build it in a checkout of the repository: make checker"
+        if not any(map(shutil.which, COMPILERS)):
+            remedy = (
+                f"No compiler is found ({' or '.join(COMPILERS)}): install one, then make checker"
+            )
+        raise MissingExtraError(
+            f"second checker '{NAME}'", value="not built", limit="verify --both", remedy=remedy
+        )
+    return Path(found)
+
+
+def decide_again(file: Path, *, seconds: float = 600.0) -> list[tuple[str, float]]:
+    """Return verdict and time in s of every claim of a file, in its order, by the second checker.
+
+    Parameters
+    ----------
+    file
+        Certificate of version 2.
+    seconds
+        Limit for each claim, s.
+
+    Raises
+    ------
+    CertificateError
+        Where it refuses the file.
+    MissingExtraError
+        Where it is not built.
+    """
+    command = [str(second_checker()), str(file), "--seconds", repr(float(seconds))]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    if run.returncode not in (0, 1) or run.stderr:
+        raise CertificateError(
+            "certificate before the second checker",
+            value=run.stderr.strip() or f"exit status {run.returncode}",
+            limit="a file of version 2",
+        )
+    lines = re.findall(r"^claim \d+: (\w+), ([\d.]+) s$", run.stdout, re.MULTILINE)
+    return [(kind, float(time)) for kind, time in lines]
+
+
+def agree(first: str, second: str) -> bool:
+    """Return whether both or neither call a claim proved."""
+    return (first == "proved") == (second == "proved")
+
+
+def agreement_table(
+    kinds: Sequence[str],
+    first: Sequence[tuple[str, float]],
+    second: Sequence[tuple[str, float]],
+) -> tuple[str, bool]:
+    """Return a table of text, claim by claim, and whether both checkers agree on all.
+
+    Parameters
+    ----------
+    kinds
+        Kind of each claim.
+    first, second
+        Verdict and time in s of each claim, by the kernel and by the second checker.
+    """
+    lines = [f"{'claim':<20} {'kernel':<20} {'second checker':<20}"]
+    fine = len(kinds) == len(first) == len(second)
+    for kind, (a, s), (b, t) in zip(kinds, first, second, strict=False):
+        word = "agree" if agree(a, b) else "DISAGREE"
+        lines.append(f"{kind:<20} {f'{a}, {s:.3f} s':<20} {f'{b}, {t:.3f} s':<20} {word}")
+        fine = fine and agree(a, b)
+    return "\n".join(lines), fine
