@@ -445,14 +445,12 @@ class Optimisation:
         Starts from the motion of the best plan; returns whether the plan is as early by now.  So
         many evaluations are left over.
         """
-        loop, best = self.loop, self.best
-        if loop.ensemble is not None or best is None:
+        loop, best, long = self.loop, self.best, self.best_cost
+        if best is None or not np.isfinite(loop.mechanism.input_limits).all():
             return False
-        limits = loop.mechanism.input_limits
-        long = self.best_cost
         if not long < INADMISSIBLE:
             long = float(loop.batch(self.x, best, duration=self.horizon, seek=True).closest_time[0])
-        if not np.isfinite(limits).all() or long <= loop.step:
+        if long <= loop.step:
             return False
         low, high = loop.objective.range_of(loop.mechanism)
         arrival = EarliestArrival(

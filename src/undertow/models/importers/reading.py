@@ -11,8 +11,8 @@ from undertow.models.importers.tree import Tree
 from undertow.models.mechanism import Coordinate, Mechanism
 
 
-def names_of(given: Sequence[str], what: str) -> list[str]:
-    """Return names of joints as a list; one alone may be a plain text.
+def names_of(given: Sequence[str], what: str, of: str = "") -> list[str]:
+    """Return names of joints, those of a tree ``of``, as a list; one alone may be a plain text.
 
     Raises
     ------
@@ -23,7 +23,7 @@ def names_of(given: Sequence[str], what: str) -> list[str]:
     odd = [name for name in names if not isinstance(name, str)]
     if odd:
         raise InvalidInputError(
-            f"{what} joints",
+            f"{what} joints" + (f" of '{of}'" if of else ""),
             value=repr(odd[0]),
             limit="names of joints",
             remedy=f"Write {what}=['shoulder']",

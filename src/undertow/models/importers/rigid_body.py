@@ -22,9 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, checked, one_of
+from undertow.base import ModelError, checked, one_of
 from undertow.models.importers.coordinates import number, tidy
 from undertow.models.importers.equations import from_matrices, lagrange_force, unit_inputs
+from undertow.models.importers.reading import names_of
 from undertow.models.importers.tree import WORLD, Joint, Link, Tree
 from undertow.models.mechanism import (
     Coordinate,
@@ -78,15 +79,7 @@ def mechanism_from_tree(
         For an actuated joint that does not exist or is named twice.
     """
     if actuated is not None:
-        actuated = [actuated] if isinstance(actuated, str) else list(actuated)
-        odd = [joint for joint in actuated if not isinstance(joint, str)]
-        if odd:
-            raise InvalidInputError(
-                f"actuated joints of '{tree.name}'",
-                value=repr(odd[0]),
-                limit="names of joints",
-                remedy="Write actuated=['shoulder']",
-            )
+        actuated = names_of(actuated, "actuated", tree.name)
     joints = tree.moving
     if not joints:
         raise ModelError(
