@@ -173,6 +173,15 @@ def test_a_motion_to_a_tolerance_is_the_same_each_time(rig: ut.Mechanism) -> Non
     assert loops[0].simulate(x0, PASSING, every=10).time == runs[0].time == batch.time[0]
 
 
+def test_a_motion_ends_before_a_surface_that_takes_over_later(rig: ut.Mechanism) -> None:
+    """A plan's first piece alone is the same with the rest of the plan and without it."""
+    x0, loop = rig.state(phi=0.3), ut.ClosedLoop(rig, ut.MinimumEnergy())
+    plan = Plan((PASSING, ut.first_surface(rig)), (0.0, 30.0))
+    piece, alone = (loop.simulate(x0, what, duration=0.1) for what in (plan, PASSING))
+    assert piece.time == alone.time == pytest.approx(0.1)
+    np.testing.assert_array_equal(piece.x, alone.x)
+
+
 def test_fixed_steps_remain_for_those_who_want_them(rig: ut.Mechanism) -> None:
     """``rtol=0`` simulates as batches do; what cannot be asked is refused."""
     x0 = rig.state(phi=0.4)

@@ -1,7 +1,8 @@
-"""Schedules of surfaces that follow the earliest arrival over all inputs."""
+"""Schedules of surfaces: they follow the earliest arrival over all inputs, or save energy."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
+from undertow.bounds import bound
 from undertow.law import stability_margin
 from undertow.optimiser.open_loop import NODES, EarliestArrival, OpenLoopMotion
 
@@ -105,6 +107,29 @@ def test_a_push_is_followed_by_a_new_schedule() -> None:
     assert second.cost < 2 * first.cost
 
 
+@pytest.mark.parametrize(("d_e", "degrees"), [(0.073, 41.0), (0.04, 33.0)])
+def test_several_surfaces_are_nearer_to_the_bound_of_energy(d_e: float, degrees: float) -> None:
+    """A part of what one surface wastes remains, and each later decision keeps it or gains."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=d_e)
+    x0, goal = rig.state(phi=ut.deg(degrees)), ut.MinimumEnergy(horizon=20.0)
+    single, several = (
+        ut.Cascade(rig, goal, belief="exact", freedom=freedom)
+        for freedom in (ut.DecisionVariables(reaching=True), FREE)
+    )
+    least = bound(rig, goal, x0, intervals=200).cost
+    one, _ = single.start(x0)
+    run = several.simulate(x0)
+    plan = run.updates[0].plan
+    assert len(plan.surfaces) == 5
+    assert plan.times[1] in (0.1, 0.2)
+    wasted = several.loop.simulate(x0, plan).cost / least - 1.0
+    assert wasted < min(0.5 * (one.predicted / least - 1.0), 0.01)
+    assert run.reached
+    assert run.cost / least - 1.0 < wasted + 1e-3
+    later = [update.plan.times for update in run.updates if update.t < plan.times[-1]]
+    assert all(len(a) >= len(b) for a, b in itertools.pairwise(later))
+
+
 def test_refusals() -> None:
     """Each names the value and what to write."""
     with pytest.raises(InvalidInputError, match="reaching=True, schedule="):
@@ -117,9 +142,5 @@ def test_refusals() -> None:
     with pytest.raises(InvalidInputError, match="whole part of the period"):
         ut.Cascade(rig, ut.MinimumTime(), belief="exact",
                    freedom=ut.DecisionVariables(reaching=True, schedule=0.07))  # fmt: skip
-    for made in (
-        ut.Cascade(rig, ut.MinimumEnergy(), belief="exact", freedom=FREE),
-        ut.Cascade(rig, ut.MinimumTime(), freedom=FREE),
-    ):
-        with pytest.raises(InvalidInputError, match="least time"):
-            made.optimiser.propose(rig.usual_start)
+    with pytest.raises(InvalidInputError, match="least time"):
+        ut.Cascade(rig, ut.MinimumTime(), freedom=FREE).optimiser.propose(rig.usual_start)

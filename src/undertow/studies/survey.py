@@ -194,8 +194,7 @@ def survey_one(
     loop = cascade.loop
     loop.objective.check_start(mechanism, x0)
     run = _run(cascade, x0)
-    schedule = cascade.period if cascade.optimiser.counts_time else 0.0
-    free = replace(cascade, freedom=DecisionVariables(reaching=True, schedule=schedule))
+    free = replace(cascade, freedom=DecisionVariables(reaching=True, schedule=cascade.period))
     freed = _run(free, x0)
     candidates: list[Surface | Plan] = [cascade.optimiser.anchor]
     if run is not None:
