@@ -19,8 +19,6 @@ from undertow.models import TIME, FloatArray, Mechanism, require_smooth
 from undertow.objective import Objective
 from undertow.symbolic import Tape
 
-__all__ = ["Programme", "Solution"]
-
 #: Largest defect (see ``Bound.defect``) that a result may have: coarse meshes let a
 #: programme "move" in ways that the mechanism cannot.
 DEFECT = 1e-3

@@ -17,17 +17,12 @@ import numpy as np
 import sympy as sp
 
 from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
-from undertow.checks.exact import ExactLaw, ExactModel, Number, evaluate, runge_kutta
+from undertow.checks.exact import ExactLaw, ExactModel, Matrix, Number, evaluate, runge_kutta
 from undertow.closed_loop import ClosedLoop, RolloutBuffers, compile_loop
 from undertow.law import InnerLoop, ReachingLaw, SlidingModeLaw, Surface, coupling, first_surface
 from undertow.models import TIME, FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Objective
 from undertow.proofs import ClosedLoopProgram
-
-__all__ = [
-    "LIMIT", "SETTLED", "Difference", "Subject", "inner_loop", "kernel", "numpy_functions",
-    "proof_programme", "settling", "worst",
-]  # fmt: skip
 
 #: Largest difference, relative to what the rounding of each value scales with.
 LIMIT = 1e-13
@@ -183,7 +178,7 @@ class Subject:
 
     def compared(
         self, what: str, x: FloatArray, computed: Sequence[float] | FloatArray,
-        exact: Sequence[Number], names: Sequence[str] = (),
+        exact: Sequence[Number] | Matrix, names: Sequence[str] = (),
     ) -> Iterator[Difference]:  # fmt: skip
         """Compare numbers at a state, one by one."""
         entries = names or [str(i + 1) for i in range(len(exact))]

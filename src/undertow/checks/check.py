@@ -19,8 +19,6 @@ from undertow.models import FloatArray, Mechanism, controllability, has_linear_m
 from undertow.models.importers.equations import nearest_equilibrium
 from undertow.symbolic import Tape, compile_numpy
 
-__all__ = ["Check", "MechanismReport", "check_mechanism"]
-
 #: Largest relative residual of an identity at float64.
 _ROUNDING = 1e-9
 

@@ -27,8 +27,6 @@ from undertow.base import ModelError
 from undertow.law import ReachingLaw, Surface
 from undertow.models import TIME, Mechanism
 
-__all__ = ["ExactLaw", "ExactModel", "Number", "evaluate", "product", "runge_kutta", "solve"]
-
 _MP: Any = MPContext()
 _MP.dps = 50
 
@@ -257,9 +255,10 @@ def _holds(condition: sp.Basic, known: dict[sp.Basic, Number]) -> bool:
 
 Matrix = np.ndarray[Any, np.dtype[np.object_]]
 _Matrices = tuple[Matrix, Matrix, Matrix]
+_Rows = Sequence[Any] | Matrix
 
 
-def solve(A: ArrayLike, b: ArrayLike) -> Matrix:
+def solve(A: _Rows, b: _Rows) -> Matrix:
     """Return A⁻¹ b by elimination with row exchanges, (n, n) and (n, k) to (n, k)."""
     rows = np.hstack([np.array(A, dtype=object), np.array(b, dtype=object)])
     n = len(rows)
@@ -283,7 +282,7 @@ def determinant(A: Matrix) -> Number:
     return total
 
 
-def product(A: ArrayLike, b: ArrayLike) -> Matrix:
+def product(A: _Rows, b: _Rows) -> Matrix:
     """Return A b."""
     return np.asarray(np.array(A, dtype=object) @ np.array(b, dtype=object))
 

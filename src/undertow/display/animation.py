@@ -22,12 +22,10 @@ from PIL import Image
 
 from undertow.base import manifest, positive
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, figure_bytes, style
+from undertow.closed_loop.figures import COLOURS, figure_bytes, style
 from undertow.display.sketches import Box, Disc, Label, Line, Sketch, sketch
 from undertow.models import FloatArray, Mechanism, check_symbols, vocabulary
 from undertow.symbolic import compile_expressions
-
-__all__ = ["Film", "film_files", "gif", "still"]
 
 #: A motion is shown until all of it stays within this part of where it has been.
 SETTLED = 0.03

@@ -23,8 +23,6 @@ from undertow.law import first_surface, sliding_matrix
 from undertow.models import Mechanism, linearise
 from undertow.symbolic.formulas import plain, readable, rounded, tex, tex_words
 
-__all__ = ["Derivation", "Equation", "Section", "derivation"]
-
 #: Longest line of words.
 WIDTH = 79
 

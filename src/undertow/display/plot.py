@@ -1,4 +1,4 @@
-"""Phase planes and sliding surfaces drawn; the rest is :mod:`undertow.closed_loop.figures`'."""
+"""Phase planes and sliding surfaces drawn."""
 
 from __future__ import annotations
 
@@ -10,33 +10,8 @@ from matplotlib.axes import Axes
 
 from undertow.base import InvalidInputError
 from undertow.closed_loop import Trajectory
-from undertow.closed_loop.figures import (
-    COLOURS,
-    axis,
-    display,
-    figure_bytes,
-    figure_files,
-    input_series,
-    motion_figure,
-    state_series,
-    state_words,
-    style,
-)
+from undertow.closed_loop.figures import axis, display
 from undertow.law import Surface
-
-__all__ = [
-    "COLOURS",
-    "display",
-    "figure_bytes",
-    "figure_files",
-    "input_series",
-    "motion_figure",
-    "phase",
-    "state_series",
-    "state_words",
-    "style",
-    "surface_trace",
-]
 
 
 def phase(axes: Axes, trajectory: Trajectory, name: str, **line: Any) -> None:

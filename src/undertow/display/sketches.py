@@ -14,8 +14,6 @@ import sympy as sp
 
 from undertow.models import Mechanism
 
-__all__ = ["Box", "Disc", "Label", "Line", "Sketch", "sketch"]
-
 #: x, y, z as numbers or expressions, m.
 Point = tuple[Any, Any, Any]
 

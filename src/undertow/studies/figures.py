@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, input_series, state_series, style
+from undertow.closed_loop.figures import COLOURS, input_series, state_series, style
 
 #: How the motions of the paper's tables are drawn, by row.
 ROW_LINES: Mapping[str, dict[str, Any]] = {

@@ -7,8 +7,8 @@ from rich.table import Table
 
 from undertow.base import Progress, no_progress, table
 from undertow.closed_loop import ClosedLoop
+from undertow.closed_loop.figures import figure_bytes, state_words, style
 from undertow.display.animation import Film, still
-from undertow.display.plot import figure_bytes, state_words, style
 from undertow.mechanisms import LIBRARY
 from undertow.objective import MinimumEnergy
 from undertow.optimiser import Optimiser

@@ -10,8 +10,6 @@ from typing import Any, Generic, TypeVar
 
 from undertow.base import ArtefactError, parse_json, read_file
 
-__all__ = ["Ledger"]
-
 #: Largest ledger that is read, bytes.
 LARGEST = 1 << 28
 

@@ -28,7 +28,7 @@ from undertow.base import (
 )
 from undertow.cascade import Cascade
 from undertow.closed_loop import Event
-from undertow.display.plot import state_words
+from undertow.closed_loop.figures import state_words
 from undertow.mechanisms.named import FILES, named
 from undertow.models import Mechanism
 from undertow.models.importers.mujoco_compiler import agreement

@@ -11,7 +11,7 @@ from rich.text import Text
 from undertow.base import facts, finite, manifest, table, to_csv
 from undertow.cascade import Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
-from undertow.display.plot import display, figure_bytes, motion_figure, state_words
+from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
 from undertow.law import Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective

@@ -13,8 +13,6 @@ from pathlib import Path
 
 from undertow.base.errors import CertificateError, MissingExtraError
 
-__all__ = ["agree", "agreement_table", "decide_again", "second_checker"]
-
 NAME = "undertow-checker"
 BUILT = Path(__file__).parents[3] / "build" / NAME
 COMPILERS = ("g++", "clang++")

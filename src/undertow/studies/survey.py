@@ -33,7 +33,7 @@ from undertow.base import (
 )
 from undertow.bounds import bound
 from undertow.cascade import Cascade, Run, gate_words
-from undertow.display.plot import state_words
+from undertow.closed_loop.figures import state_words
 from undertow.law import Plan, Surface
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named

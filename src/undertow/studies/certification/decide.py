@@ -45,13 +45,6 @@ from undertow.proofs.claims.region import reaches
 from undertow.proofs.region.lyapunov import extent
 from undertow.studies.paper.appendix_search import search_rate
 
-__all__ = [
-    "Certified",
-    "certify_appendix",
-    "certify_run",
-    "certify_surface",
-]
-
 #: Called with (what is being done, part done).
 Progress = Callable[[str, float], None]
 

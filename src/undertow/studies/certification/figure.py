@@ -9,14 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.display.plot import COLOURS, display, style
+from undertow.closed_loop.figures import COLOURS, display, style
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs import ProvedRegion, SurfaceMotion
 from undertow.proofs.region.lyapunov import extent
 from undertow.proofs.region.motion import AutonomousSystem
-
-__all__ = ["held", "region_figure", "simulated"]
 
 #: Points a side of the picture of the simulated region.
 GRID = 101

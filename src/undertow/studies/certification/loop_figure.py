@@ -9,14 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.display.plot import COLOURS, display, style
+from undertow.closed_loop.figures import COLOURS, display, style
 from undertow.law import ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.proofs import LoopClaim
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.search.closed_loop import follow
-
-__all__ = ["loop_figure"]
 
 #: Starts on one side, up to this many times the proved ones.
 STARTS, BEYOND = 100, 4.0

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from undertow.base import Verdict, inward, markdown_table
-from undertow.display.plot import figure_files, style
+from undertow.closed_loop.figures import figure_files, style
 from undertow.mechanisms import rotary_pendulum
 from undertow.proofs.claims.appendix import (
     CASES,

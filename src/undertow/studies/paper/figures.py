@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, phase, style, surface_trace
+from undertow.closed_loop.figures import COLOURS, style
+from undertow.display.plot import phase, surface_trace
 from undertow.models import FloatArray
 from undertow.studies.figures import REPEATS, ROW_LINES, beginning, draw_rows, rows_figure
 from undertow.studies.paper.data import CONDITIONS, ROWS

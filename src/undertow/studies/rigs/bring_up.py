@@ -15,7 +15,7 @@ from rich.text import Text
 
 from undertow.base import Progress, manifest, no_progress, number, table, to_csv, versions
 from undertow.bring_up import BringUp, Identification, doublets, identify, perform, rest_state
-from undertow.display.plot import figure_bytes, style
+from undertow.closed_loop.figures import figure_bytes, style
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Encoder, Friction, RealisticRig, Timing
