@@ -40,16 +40,8 @@ def rows_figure(
 ) -> Figure:
     """Return a figure of motions of the rotary pendulum: φ, θ and voltage over time.
 
-    Parameters
-    ----------
-    motions
-        Each with the properties of its lines, the label among them.
-    until
-        Right end of the time axis, s.
-    title
-        Above the first row.
-    columns
-        Of the legend.
+    Each motion comes with the properties of its lines, the label among them; the time axis ends at
+    ``until``, s; the legend has so many columns.
     """
     with style():
         figure = Figure(figsize=(6.4, 5.2), layout="constrained")

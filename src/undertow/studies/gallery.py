@@ -20,10 +20,7 @@ COLUMNS = 5
 def mechanism_table(width: int = 120) -> Table:
     """Return the mechanisms of the library with their inputs, starts and descriptions.
 
-    Parameters
-    ----------
-    width
-        Of the terminal; from 100 columns on there is room for the listed starts too.
+    From a ``width`` of 100 columns on there is room for the listed starts too.
     """
     heads = ["mechanism", "n, m", "inputs", "start", "what it is"]
     if width < 100:

@@ -90,13 +90,6 @@ def region_figure(region: ProvedRegion, title: str) -> Figure:
 
     The motion on the surface knows no input limit.  Where what is drawn has states that the
     actuators cannot hold there, the title says so and a line shows where they end.
-
-    Parameters
-    ----------
-    region
-        Proved, on the surface of a mechanism.
-    title
-        Of the figure.
     """
     motion = region.motion
     assert isinstance(motion, SurfaceMotion)

@@ -28,13 +28,6 @@ def loop_figure(
     Left: the coordinate over time.  Right: the same coordinate and its p, with the shadow of the
     terminal set.  The motions are those of the law that acts at every instant on the plant that
     it knows; a held input or another plant of the claim's box moves a little differently.
-
-    Parameters
-    ----------
-    claim
-        Proved.
-    title
-        Of the figure.
     """
     motion = LoopMotion(mechanism, surface, reaching)
     index = [c.name for c in mechanism.coordinates].index(claim.coordinate)

@@ -71,14 +71,8 @@ def comparison(
 ) -> Figure:
     """Return Figure 4 or 6: base, one-time and cascade; φ, θ and voltage.
 
-    Parameters
-    ----------
-    columns
-        Title of each column to its motions by row name.
-    until
-        Right ends of the time axes, s: of φ and the voltage, and of θ, which is slower.
-    title
-        Above the figure.
+    ``columns``: title of each column to its motions by row name. ``until``: right ends of the time
+    axes, s: of φ and the voltage, and of θ, which is slower.
     """
     short, long = until
     with style():

@@ -46,16 +46,8 @@ class Limits:
 class BalanceResult:
     """Everything that the experiment gave.
 
-    Attributes
-    ----------
-    bench, x0, seconds, seeds
-        What was run.
-    outcomes
-        (objective, row) to the runs, one for each seed.
-    ideal
-        (objective, row) to the run on the ideal rig.
-    limits
-        Row to catch limits; empty when they were not asked for.
+    ``outcomes`` and ``ideal`` are by (objective, row): the runs, one for each seed, and the run on
+    the ideal rig; ``limits`` by row, empty when they were not asked for. ``x0`` is (2n,).
     """
 
     bench: Bench
@@ -145,25 +137,10 @@ def balance(
 ) -> BalanceResult:
     """Run the three controllers for both objectives on every rig.
 
-    Parameters
-    ----------
-    bench
-        A bench of the rotary pendulum; the SRV02's by default.
-    angle
-        φ(0), rad, at rest.
-    seconds
-        Length of a run, s.
-    seeds
-        Rigs.
-    budget
-        Rollouts that one re-optimisation may spend.
-    limits
-        Whether to search for the catch limits.
-    progress
-        Called with what is being done and the part done.
-    begun
-        Called once, with the result that fills as the runs are made: what is left of it where
-        they are interrupted.
+    A run begins at φ(0) = ``angle``, rad, at rest, and takes ``seconds``, s; ``seeds`` rigs are
+    made of a bench of the rotary pendulum, the SRV02's by default; a re-optimisation may spend
+    ``budget`` rollouts; ``limits`` also searches for the catch limits. ``begun`` is called once,
+    with the result that fills as the runs are made: what is left of it where they are interrupted.
     """
     bench = srv02_rig() if bench is None else bench
     belief = bench.mechanism

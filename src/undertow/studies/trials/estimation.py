@@ -34,18 +34,9 @@ def estimators_for(belief: Mechanism, bench: Bench) -> dict[str, Callable[[], Es
 class EstimatorRow:
     """One estimator: its errors, its processor time and the runs with it.
 
-    Attributes
-    ----------
-    name
-        Which.
-    balanced, seeds
-        Runs that ended balanced, of how many.
-    errors
-        Root mean square of q̇̂ − q̇ while balancing, (n,), rad/s or m/s.
-    effort, chatter
-        ∫u² dt, and the total variation of u per second, means over the balanced runs.
-    microseconds
-        Processor time of one estimate.
+    ``errors``: root mean square of q̇̂ − q̇ while balancing, (n,), rad/s or m/s. ``effort``,
+    ``chatter``: ∫u² dt, and the total variation of u per second, means over the balanced runs.
+    ``microseconds``: processor time of one estimate.
     """
 
     name: str

@@ -17,22 +17,10 @@ from undertow.runtime import Recipe, session
 class LibraryRow:
     """Runs of one mechanism.
 
-    Attributes
-    ----------
-    name
-        Of the mechanism.
-    inputs
-        How many it has.
-    layer
-        Boundary layer ε that its rig's sensors need.
-    held, runs
-        Runs in which the law held it to the end, of how many.
-    ends
-        Why the others were stopped, and how often.
-    applied
-        Answers of the optimiser that were put to use, per run that was held.
-    chatter
-        Total variation per second of the input that varies most, in parts of its limit.
+    ``layer``: boundary layer ε that its rig's sensors need. ``held``: runs in which the law held it
+    to the end; ``ends``: why the others were stopped, and how often. ``applied``: answers of the
+    optimiser that were put to use, per run that was held. ``chatter``: total variation per second
+    of the input that varies most, in parts of its limit.
     """
 
     name: str
@@ -56,20 +44,8 @@ def through_the_runtime(
 ) -> list[LibraryRow]:
     """Run mechanisms from their usual starts, each on its realistic rigs.
 
-    Parameters
-    ----------
-    names
-        Of the mechanisms.
-    seeds
-        Rigs of each.
-    seconds
-        Length of a run, s.
-    evaluations
-        Rollouts that one re-optimisation may spend.
-    progress
-        Called with what is being done and the part done.
-    done
-        Called with each row as it is finished.
+    On ``seeds`` rigs of each, for ``seconds``, s; a re-optimisation may spend ``evaluations``
+    rollouts. ``done`` is called with each row as it is finished.
     """
     rows = []
     for number, name in enumerate(names):

@@ -108,16 +108,8 @@ def breaking_point(
 ) -> Breaking:
     """Find the largest change survived on all seeds, by bisection from nothing.
 
-    Parameters
-    ----------
-    run
-        (change, seed) to whether it balanced.
-    largest
-        Where to start from.
-    seeds
-        Rigs.
-    bisections
-        The interval is halved so often.
+    ``run`` takes (change, seed) and says whether it balanced; the interval is halved ``bisections``
+    times.
     """
 
     def first_failure(value: float) -> int | None:
@@ -198,22 +190,10 @@ def robustness(
 ) -> RobustnessResult:
     """Run every controller on the same random rigs, then look for what breaks each.
 
-    Parameters
-    ----------
-    rigs
-        Random rigs.
-    seeds
-        Rigs on which a single change must be survived; 0 looks for no breaking points.
-    angle
-        φ(0), rad, at rest.
-    seconds
-        Length of a run on a random rig, s.
-    budget
-        Rollouts that one re-optimisation may spend.
-    ledger
-        A file that keeps every run as it is made: what it holds already is not run again.
-    progress
-        Called with what is being done and the part done.
+    There are ``rigs`` random ones, and ``seeds`` on which a single change must be survived (0 looks
+    for no breaking points). A run on a random rig begins at φ(0) = ``angle``, rad, at rest, and
+    takes ``seconds``, s; a re-optimisation may spend ``budget`` rollouts. ``ledger`` is a file that
+    keeps every run as it is made: what it holds already is not run again.
 
     Raises
     ------

@@ -106,18 +106,9 @@ class CascadeSteering:
 class NMPC:
     """The optimal-control problem of one mechanism, warm-started from solution to solution.
 
-    Parameters
-    ----------
-    belief
-        The model.
-    objective
-        Gives the stage cost; the terminal cost is that of its quadratic part.
-    period
-        Time between solutions, s.
-    step, horizon
-        Time that an input is held, and length of the prediction, s.
-    iterations
-        Most iterations of the interior-point method per solution.
+    The objective gives the stage cost, its quadratic part the terminal cost. A solution is made
+    every ``period``, s, by at most ``iterations`` of the interior-point method, for a ``horizon``,
+    s, in which an input is held for ``step``, s, at a time.
     """
 
     def __init__(
