@@ -256,8 +256,9 @@ class Programme:
         largest = np.abs(np.array(slope + found["lam_x"])).max()
         return float(largest / max(1.0, np.abs(np.array(steepness)).max()))
 
-    def spent(self, guess: Guess, samples: int = 400) -> float:
+    def spent(self, guess: Guess) -> float:
         """Return the cost of a guess as it stands, by the trapezoidal rule."""
+        samples = 400
         t = np.linspace(0.0, guess.time, samples)
         rows = (t[None], guess.x(t).T, guess.u(t).T)
         return float(np.trapezoid(np.array(self.cost.map(samples)(*rows)[1]).ravel(), t))

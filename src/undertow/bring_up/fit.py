@@ -21,7 +21,6 @@ from functools import partial
 import numpy as np
 import scipy.optimize
 import scipy.signal
-import scipy.stats
 
 from undertow.base import InvalidInputError
 from undertow.bring_up.motion import MotionRecord, Predictor

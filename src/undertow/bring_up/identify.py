@@ -12,8 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
-import scipy.signal
 import scipy.stats
 
 from undertow.base import Progress, no_progress
@@ -90,7 +88,6 @@ def identify(
     x0: FloatArray,
     record: MotionRecord,
     *,
-    confidence: float = 0.95,
     progress: Progress = no_progress,
 ) -> Identification:
     """Identify parameters of a mechanism from a motion that begins at rest.
@@ -103,8 +100,6 @@ def identify(
         Where it rests, (2n,).
     record
         Inputs and measured positions; wired as the model.
-    confidence
-        Of the intervals.
     progress
         Told what is under way.
 
@@ -112,7 +107,7 @@ def identify(
     -------
     Identification
         Estimates by least squares in which every reading counts for what it is worth
-        (:func:`undertow.bring_up.fit.readings`), with confidence intervals from the
+        (:func:`undertow.bring_up.fit.readings`), with 95 % confidence intervals from the
         Jacobian, corrected for residuals that are correlated in time (Newey and West,
         *Econometrica* 55(3), 1987), and no narrower than what the counting of the encoders
         alone would make them.
@@ -130,7 +125,7 @@ def identify(
     variances = np.maximum(
         correlated(J, r, mechanism.n), counted(predicted, fit.noise, fit.sigma, fit.variance, J)
     )
-    quantile = float(scipy.stats.norm.ppf(0.5 + confidence / 2))
+    quantile = float(scipy.stats.norm.ppf(0.975))
     estimates = {}
     alone = 1.0 / np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))  # of each column, the rest fitted
     motion = float(np.linalg.norm((fit.moved - fit.moved.mean(axis=0)) / np.sqrt(fit.variance)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -176,6 +176,18 @@ def progress_bar() -> Iterator[Progress]:
     with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
+
+
+def completed(work: Callable[[Progress], object], kept: Sized = (1,)) -> bool:
+    """Work under a progress bar; false where Ctrl-C ended it and something is kept to be shown."""
+    try:
+        with progress_bar() as progress:
+            work(progress)
+    except KeyboardInterrupt:
+        if not kept:
+            raise
+        return False
+    return True
 
 
 def show(*parts: RenderableType, stderr: bool = False, least: int = 0, **how: Any) -> None:

@@ -209,8 +209,7 @@ class Film:
             axes.set_title(f"{self.mechanism.name.replace('_', ' ')}\n{self.span}")
 
 
-#: Positions (F, n) to points of each part (F, k, 3), angle and radius (F, 2), tip (F, 3).
-#: Points of the parts, angles and radii of the discs, and the tip, over time.
+#: Points of the parts, (F, k, 3), angles and radii of the discs, (F, 2), and the tip, (F, 3).
 Places = tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray]
 
 
@@ -266,17 +265,10 @@ def _settled(trajectory: Trajectory) -> float:
     return min(float(last) + 0.5, float(trajectory.t[-1]))
 
 
-def gif(film: Film, *, width: float = 4.2) -> bytes:
-    """Return a film as an endless GIF: the figure, the time, and the inputs as bars.
-
-    Parameters
-    ----------
-    film
-        What to show.
-    width
-        Width, inches.
-    """
+def gif(film: Film) -> bytes:
+    """Return a film as an endless GIF: the figure, the time, and the inputs as bars."""
     left, right, bottom, top = film.window
+    width = 4.2  # inches
     height = float(np.clip(width * (top - bottom) / (right - left), 0.5 * width, 1.3 * width))
     limits = film.mechanism.input_limits
     bar = np.where(np.isfinite(limits), limits, np.abs(film.u).max(axis=0) + 1e-12)

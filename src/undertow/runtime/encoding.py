@@ -149,13 +149,11 @@ class Columns:
 
     def agrees(self, row: FloatArray, controller: Controller) -> bool:
         """Whether a controller is, bit for bit, where the step of a row had left it."""
-        pairs = (
-            (controller.u, self.u),
-            (controller.x, self.x),
-            (controller.s, self.s),
-            (controller.demand, self.demand),
+        names = ("u", "x", "s", "demand")
+        same = all(
+            np.array_equal(getattr(controller, k), row[getattr(self, k)], equal_nan=True)
+            for k in names
         )
-        same = all(np.array_equal(values, row[at], equal_nan=True) for values, at in pairs)
         same = same and controller.mode == row[self.mode]
         return same and controller.memory.sequence == row[self.surface]
 

@@ -186,10 +186,7 @@ def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None
         return _retarget(cascade, request, x, began)
     proposal: object = cascade.propose(memory, memory.absolute(request.use, x), request.use)
     if not isinstance(proposal, Proposal):
-        what = f"not a proposal but a {type(proposal).__name__}"
-        proposal = Proposal(
-            None, "failed", math.inf, math.inf, (), 0, 0.0, request.sequence, request.use, what
-        )
+        proposal = _failed(request, f"not a proposal but a {type(proposal).__name__}")
     judged = judge(cascade, memory, proposal, x, request.use)
     return _answer(request, x, proposal, *judged, began)
 
@@ -208,11 +205,13 @@ def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -
         )  # fmt: skip
         return replace(answer, jump=True)
     except Exception as error:
-        message = f"{type(error).__name__}: {error}"
-        proposal = Proposal(
-            None, "failed", math.inf, math.inf, (), 0, 0.0, request.sequence, use, message
-        )
+        proposal = _failed(request, f"{type(error).__name__}: {error}")
         return _answer(request, x, proposal, *judge(cascade, memory, proposal, x, use), began)
+
+
+def _failed(request: Request, why: str) -> Proposal:
+    number, use = request.sequence, request.use
+    return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, number, use, why)
 
 
 def _answer(

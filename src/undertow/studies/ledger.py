@@ -58,7 +58,7 @@ class Ledger(Generic[K, V]):
             LookupError,
             TypeError,
             AttributeError,
-            OverflowError,
+            ArithmeticError,
         ) as error:
             cause, value = error, f"{type(error).__name__}: {error}"
             limit = "a ledger that can be read and written"

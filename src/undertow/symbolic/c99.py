@@ -132,11 +132,11 @@ class C99Emitter(Emitter):
                 remedy="Write the model with elementary functions",
             ) from error
 
-    def statements(self, results: Mapping[str, sp.Expr], indent: str = "    ") -> str:
+    def statements(self, results: Mapping[str, sp.Expr]) -> str:
         """Return the code that computes expressions and stores each at a C place.
 
         Stores come last, so that a result may lie where an input lay.
         """
         code, _ = self.lines(results.values(), set())
         stores = [f"{place} = {self.text(value)};" for place, value in results.items()]
-        return "\n".join(indent + line for line in [*code, *stores])
+        return "\n".join(f"    {line}" for line in [*code, *stores])

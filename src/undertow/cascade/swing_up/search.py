@@ -384,16 +384,9 @@ def designs_for(
     return found
 
 
-def designed(
-    mechanism: Mechanism,
-    *,
-    seed: int = 0,
-    fresh: bool = False,
-    progress: Callable[[float], None] = lambda _: None,
-) -> SwingUp:
+def designed(mechanism: Mechanism, *, seed: int = 0) -> SwingUp:
     """Return the swing-up with the gains that :func:`designs_for` returns: see there."""
-    found = designs_for(mechanism, seed=seed, fresh=fresh, progress=progress)
-    return SwingUp(mechanism, tuple(one.gains for one in found))
+    return SwingUp(mechanism, tuple(one.gains for one in designs_for(mechanism, seed=seed)))
 
 
 def kept_text(found: Mapping[Mechanism, Sequence[RatedGains]]) -> str:

@@ -94,11 +94,10 @@ def catch_limit(
     *,
     seeds: int,
     seconds: float = 5.0,
-    resolution: float = math.radians(0.5),
 ) -> float:
     """Return the largest φ(0) from which at least 19 of 20 of the seeds are caught, rad.
 
-    Found by bisection between 20° and 60°, to ``resolution``; 0 where even 20° is too much.
+    Found by bisection between 20° and 60°, to 0.5°; 0 where even 20° is too much.
     """
 
     def holds(angle: float) -> bool:
@@ -114,7 +113,7 @@ def catch_limit(
                 return False
         return True
 
-    low, high = math.radians(20), math.radians(60)
+    low, high, resolution = math.radians(20), math.radians(60), math.radians(0.5)
     if not holds(low):
         return 0.0
     while high - low > resolution * 1.001:
@@ -126,7 +125,6 @@ def catch_limit(
 
 def balance(
     *,
-    bench: Bench | None = None,
     angle: float = math.radians(35),
     seconds: float = 10.0,
     seeds: int = 20,
@@ -142,7 +140,7 @@ def balance(
     ``budget`` rollouts; ``limits`` also searches for the catch limits. ``begun`` is called once,
     with the result that fills as the runs are made: what is left of it where they are interrupted.
     """
-    bench = srv02_rig() if bench is None else bench
+    bench = srv02_rig()
     belief = bench.mechanism
     x0 = belief.state(phi=angle)
     ideal_bench = undisturbed(belief, bench.timing.period)

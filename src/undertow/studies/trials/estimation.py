@@ -63,7 +63,6 @@ def _cost(estimator: Estimator, belief: Mechanism, calls: int = 5000) -> float:
 def compared(
     *,
     seeds: int = 5,
-    angle: float = math.radians(20),
     seconds: float = 8.0,
     done: Callable[[EstimatorRow], None] = lambda _row: None,
 ) -> list[EstimatorRow]:
@@ -74,7 +73,7 @@ def compared(
     """
     bench = srv02_rig()
     belief = bench.mechanism
-    x0 = belief.state(phi=angle)
+    x0 = belief.state(phi=math.radians(20))
     surface = first_surface(belief)
     law = lambda _: steady(InnerLoop(belief, surface))  # noqa: E731
     ideal = Bench(belief, tachometers={}, timing=undisturbed(belief).timing)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,6 @@ class LibraryRow:
 
 def through_the_runtime(
     *,
-    names: Sequence[str] = tuple(LIBRARY),
     seeds: int = 5,
     seconds: float = 10.0,
     evaluations: int = 256,
@@ -48,11 +47,11 @@ def through_the_runtime(
     rollouts. ``done`` is called with each row as it is finished.
     """
     rows = []
-    for number, name in enumerate(names):
+    for number, name in enumerate(LIBRARY):
         ends: Counter[str] = Counter()
         applied, chatter = [], []
         for seed in range(seeds):
-            progress(name, (number + seed / seeds) / len(names))
+            progress(name, (number + seed / seeds) / len(LIBRARY))
             recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=evaluations)
             with session(recipe, simulated=True) as runtime:
                 report = runtime.run(seconds)

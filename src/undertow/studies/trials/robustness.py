@@ -38,6 +38,9 @@ MASSES, FRICTION, DELAY, IMPULSE = 0.20, 2.0, 0.005, 0.004
 #: surface the time to bring the arm home afterwards.
 KNOCK, SINGLE = 5.0, 20.0
 
+#: φ(0), rad, at rest; and rollouts that one re-optimisation may spend.
+ANGLE, BUDGET = math.radians(35), 256
+
 #: Names in the tables.
 NAMES = ("cascade", "fixed surface", "clipped LQR", "NMPC, 10 Hz")
 
@@ -164,12 +167,10 @@ def _read(
     return (name, what, float(value), result.seed), result
 
 
-def _makers(
-    belief: Mechanism, bench: Bench, x0: FloatArray, budget: int
-) -> dict[str, MakeController]:
+def _makers(belief: Mechanism, bench: Bench, x0: FloatArray) -> dict[str, MakeController]:
     """Return the controllers by name; NMPC where CasADi is there."""
     objective = objective_for(belief, "bench-energy")
-    made = controllers(belief, bench, objective, x0, budget=budget)
+    made = controllers(belief, bench, objective, x0, budget=BUDGET)
     makers = dict(
         zip(NAMES, (made["cascade"], made["one-time"], clipped_regulator(belief)), strict=False)
     )
@@ -182,9 +183,7 @@ def robustness(
     *,
     rigs: int = 200,
     seeds: int = 3,
-    angle: float = math.radians(35),
     seconds: float = 10.0,
-    budget: int = 256,
     ledger: Path | None = None,
     progress: Progress = no_progress,
 ) -> RobustnessResult:
@@ -202,10 +201,10 @@ def robustness(
     """
     bench = srv02_rig()
     belief = bench.mechanism
-    x0: FloatArray = belief.state(phi=angle)
+    x0: FloatArray = belief.state(phi=ANGLE)
     objective = objective_for(belief, "bench-energy")
-    makers = _makers(belief, bench, x0, budget)
-    settings = {"angle": angle, "seconds": [seconds, SINGLE], "budget": budget}
+    makers = _makers(belief, bench, x0)
+    settings = {"angle": ANGLE, "seconds": [seconds, SINGLE], "budget": BUDGET}
     book = run_ledger(ledger, settings | {"fingerprint": belief.fingerprint})
 
     def once(name: str, what: str, value: float, seed: int, truth: Bench) -> Result:

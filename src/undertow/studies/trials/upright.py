@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -124,22 +124,18 @@ def swing_trials(
     mechanism: Mechanism,
     *,
     swing: SwingUp | None = None,
-    bench: Bench | None = None,
     seeds: int = 20,
     seconds: float = SWING_SECONDS,
-    progress: Callable[[float], None] = lambda _: None,
 ) -> SwingResult:
     """Swing a mechanism up on realistic rigs, from hanging at rest, one for each seed.
 
     The energy law has the gains that are kept by default, the bench is :func:`bench_of` the
     mechanism's; a run takes ``seconds``, s.
     """
-    bench = bench_of(mechanism) if bench is None else bench
+    bench = bench_of(mechanism)
     swing = designed(mechanism) if swing is None else swing
-    region, runs = CatchRegion(mechanism), []
-    for seed in range(seeds):
-        progress(seed / seeds)
-        runs.append(swing_trial(bench, swing, region, seed=seed, seconds=seconds))
+    region = CatchRegion(mechanism)
+    runs = [swing_trial(bench, swing, region, seed=seed, seconds=seconds) for seed in range(seeds)]
     return SwingResult(
         mechanism,
         [run.outcome for run in runs],
