@@ -38,17 +38,9 @@ STEP = 1e-3
 class Difference:
     """One number of compiled code beside its exact value.
 
-    Attributes
-    ----------
-    what
-        Which number of what.
-    where
-        At which state, in words.
-    computed, exact
-        Both values, the exact one rounded.
-    relative
-        Their difference relative to the exact value's :class:`size <undertow.checks.exact.Number>`;
-        infinite where what was computed is no number, or a proved enclosure misses.
+    ``what``, ``where``: which number of what, at which state, in words. ``relative``: the
+    difference relative to the exact value's :class:`size <undertow.checks.exact.Number>`; infinite
+    where what was computed is no number, or a proved enclosure misses.
     """
 
     what: str
@@ -73,18 +65,8 @@ def worst(differences: Iterable[Difference]) -> Difference | None:
 class Subject:
     """A mechanism, a law for it and states: what compiled code is tried at.
 
-    Parameters
-    ----------
-    mechanism
-        The model.
-    surface
-        By default one with random entries, all different, so that none can stand in for another.
-    reaching
-        The reaching law.
-    count
-        How many states of each kind.
-    seed
-        Of surface and states.
+    By default the surface has random entries, all different, so that none can stand in for another.
+    There are ``count`` states of each kind.
     """
 
     def __init__(

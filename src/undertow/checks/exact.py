@@ -308,11 +308,6 @@ class ExactLaw(NamedTuple):
 class ExactModel:
     """A mechanism's own expressions, with its parameters, in 50 digits.
 
-    Parameters
-    ----------
-    mechanism
-        Whose equations.
-
     Raises
     ------
     ModelError

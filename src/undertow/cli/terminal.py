@@ -91,14 +91,8 @@ def command(
 ) -> Callable[[Callable[P, None]], Callable[P, None]]:
     """Register a command: its errors are one line, its help ends with the examples.
 
-    Parameters
-    ----------
-    *examples
-        Lines as they are typed.
-    name
-        Of the command; the function's by default.
-    of
-        The group that it belongs to.
+    The examples are lines as they are typed; the name is the function's by default; it belongs to
+    the group ``of``.
     """
 
     def register(function: Callable[P, None]) -> Callable[P, None]:

@@ -45,24 +45,11 @@ _KINDS: dict[str, dict[str, Any]] = {
 class Film:
     """A motion ready for drawing.
 
-    Attributes
-    ----------
-    mechanism
-        What moves.
-    sketch
-        What is drawn of it.
-    t
-        Times of the frames, (F,), s.
-    q, u
-        Positions, (F, n), and inputs, (F, m), at these times.
-    points
-        Points of each part in the plane of the view, (F, k, 2), m.
-    angles
-        Angle and radius of each disc, (F, 2); empty for other parts.
-    tip
-        The tip in the plane of the view, (F, 2), m.
-    whole
-        How long the motion takes until it has settled, s: longer than the film where that is cut.
+    ``t``: times of the frames, (F,), s. ``q``, ``u``: positions, (F, n), and inputs, (F, m), at
+    these times. ``points``: of each part in the plane of the view, (F, k, 2), m; ``angles``: angle
+    and radius of each disc, (F, 2), empty for other parts; ``tip``: in the plane of the view, (F,
+    2), m. ``whole``: how long the motion takes until it has settled, s: longer than the film where
+    that is cut.
     """
 
     mechanism: Mechanism
@@ -319,14 +306,7 @@ def _gauge(axes: Axes, film: Film, k: int, bar: FloatArray) -> None:
 def still(axes: Axes, film: Film, ghosts: int = 6) -> None:
     """Draw a motion in one picture: faint poses from the start, the last one in full.
 
-    Parameters
-    ----------
-    axes
-        Where to draw.
-    film
-        The motion.
-    ghosts
-        How many poses besides the last, evenly spaced along the tip's path.
+    There are so many ghosts besides the last pose, evenly spaced along the tip's path.
     """
     steps = np.linalg.norm(np.diff(film.tip, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])

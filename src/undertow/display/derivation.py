@@ -57,15 +57,7 @@ def _folded(line: str) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Derivation:
-    """The formulas of one mechanism, section by section.
-
-    Attributes
-    ----------
-    mechanism
-        Whose formulas they are.
-    sections
-        In the order of the theory.
-    """
+    """The formulas of one mechanism, section by section."""
 
     mechanism: Mechanism
     sections: tuple[Section, ...]

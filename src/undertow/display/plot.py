@@ -36,20 +36,8 @@ def surface_trace(
     With all other states as they are, s = 0 asks for the velocity q̇_i − s/α_i.  The trace
     breaks where another surface takes over; a dotted line joins the two ends.
 
-    Parameters
-    ----------
-    axes
-        Where to draw.
-    trajectory
-        A motion with one input.
-    surfaces
-        The surfaces in use, one for each of ``switch_times``, (S,).
-    switch_times
-        When each takes over, s; the first is the start.
-    name
-        The coordinate.
-    **line
-        Properties of the trace.
+    The motion has one input; each of the surfaces, (S,), takes over at its time, s, the first at
+    the start; ``line`` has properties of the trace.
 
     Raises
     ------

@@ -26,18 +26,8 @@ SHORT = 1e-3
 def sketch_named(name: str, mechanism: Mechanism) -> Sketch:
     """Return the figure of a mechanism that was asked for by name.
 
-    Parameters
-    ----------
-    name
-        As for :func:`undertow.mechanisms.named.named`.
-    mechanism
-        What was found under it.
-
-    Returns
-    -------
-    Sketch
-        The library's own; for a file of bodies one from its kinematics; labelled dials where
-        neither can be had.
+    The library's own; for a file of bodies one from its kinematics; labelled dials where neither
+    can be had. Names are those of :func:`undertow.mechanisms.named.named`.
     """
     tree = tree_named(name)
     found = None if tree is None else tree_sketch(tree, mechanism)

@@ -17,13 +17,7 @@ from undertow.symbolic import literal
 
 
 class Twin:
-    """The exported controller, in double precision, by the library's own law and estimator.
-
-    Parameters
-    ----------
-    controller
-        What was exported.
-    """
+    """The exported controller, in double precision, by the library's own law and estimator."""
 
     def __init__(self, controller: EmbeddedController) -> None:
         self.controller = controller
@@ -148,17 +142,7 @@ SHORT, LONG = slice(80, 83), slice(150, 165)
 def random_states(mechanism: Mechanism, count: int, seed: int = 0) -> FloatArray:
     """Return states drawn evenly: a whole turn or the range of travel, rates to ±10.
 
-    Parameters
-    ----------
-    count
-        How many.
-    seed
-        Of the draw.
-
-    Returns
-    -------
-    numpy.ndarray
-        (count, 2n), SI units.
+    They are (count, 2n), SI units.
     """
     ends = [
         (max(c.low, -np.pi), min(c.high, np.pi)) if c.unit == "rad" else

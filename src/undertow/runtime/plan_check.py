@@ -26,12 +26,7 @@ _LAYOUT = {
 class PlanCheck:
     """Packs the plans of a mechanism for the fast loop, and tests their stability.
 
-    Parameters
-    ----------
-    mechanism
-        The controller's belief.
-    reaching
-        The reaching law of plans that have none of their own.
+    ``reaching`` is the law of plans that have none of their own.
     """
 
     def __init__(self, mechanism: Mechanism, reaching: ReachingLaw) -> None:

@@ -136,9 +136,9 @@ def balance(
     """Run the three controllers for both objectives on every rig.
 
     A run begins at φ(0) = ``angle``, rad, at rest, and takes ``seconds``, s; ``seeds`` rigs are
-    made of a bench of the rotary pendulum, the SRV02's by default; a re-optimisation may spend
-    ``budget`` rollouts; ``limits`` also searches for the catch limits. ``begun`` is called once,
-    with the result that fills as the runs are made: what is left of it where they are interrupted.
+    made of the SRV02 bench; a re-optimisation may spend ``budget`` rollouts; ``limits`` also
+    searches for the catch limits. ``begun`` is called once, with the result that fills as the runs
+    are made: what is left of it where they are interrupted.
     """
     bench = srv02_rig()
     belief = bench.mechanism

@@ -190,9 +190,9 @@ def robustness(
     """Run every controller on the same random rigs, then look for what breaks each.
 
     There are ``rigs`` random ones, and ``seeds`` on which a single change must be survived (0 looks
-    for no breaking points). A run on a random rig begins at φ(0) = ``angle``, rad, at rest, and
-    takes ``seconds``, s; a re-optimisation may spend ``budget`` rollouts. ``ledger`` is a file that
-    keeps every run as it is made: what it holds already is not run again.
+    for no breaking points). A run on a random rig begins at rest at ``ANGLE`` and takes
+    ``seconds``, s. ``ledger`` is a file that keeps every run as it is made: what it holds already
+    is not run again.
 
     Raises
     ------

@@ -129,8 +129,7 @@ def swing_trials(
 ) -> SwingResult:
     """Swing a mechanism up on realistic rigs, from hanging at rest, one for each seed.
 
-    The energy law has the gains that are kept by default, the bench is :func:`bench_of` the
-    mechanism's; a run takes ``seconds``, s.
+    The energy law has the gains that are kept by default; a run takes ``seconds``, s.
     """
     bench = bench_of(mechanism)
     swing = designed(mechanism) if swing is None else swing
