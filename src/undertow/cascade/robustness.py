@@ -89,22 +89,8 @@ def delay_margin(
 ) -> float:
     """Return the longest delay, s, in whole periods, that the loop at the target bears.
 
-    Parameters
-    ----------
-    mechanism
-        The model.
-    surface, reaching
-        The law; the paper's gains by default.
-    period
-        Sampling period, s.
-    longest
-        Where to stop looking, s.
-
-    Returns
-    -------
-    float
-        Stable up to and including this delay; −period where the sampled loop is unstable
-        without any.
+    The margin is −period where the sampled loop is unstable without any delay; the search stops at
+    ``longest``, s. The law has the paper's gains by default.
 
     Examples
     --------
@@ -138,14 +124,8 @@ def noise_share(
     With u = k x̂ near the target and an error of the estimate with covariance P it is
     √(k P kᵀ)_ii, as a part of the input's limit; of several inputs the largest part.
 
-    Parameters
-    ----------
-    mechanism
-        The model; an input without a limit does not count.
-    surface, reaching
-        The law; the paper's gains by default.
-    covariance
-        P of the estimated state, (2n, 2n).
+    The covariance of the estimated state is P, (2n, 2n); the law has the paper's gains by default,
+    and an input without a limit does not count.
 
     Examples
     --------

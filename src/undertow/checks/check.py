@@ -27,18 +27,7 @@ _ROUNDING = 1e-9
 class Check:
     """One condition: its name, whether it holds, the number found and the limit.
 
-    Attributes
-    ----------
-    name
-        The condition.
-    passed
-        Whether it holds.
-    value
-        What was found; NaN where it could not be computed.
-    limit
-        What it should have been, in words.
-    remedy
-        What could help where it fails.
+    ``value`` is NaN where it could not be computed; ``remedy`` says what could help where it fails.
     """
 
     name: str

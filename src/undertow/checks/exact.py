@@ -37,12 +37,7 @@ _NEAR = 1e-11
 class Number:
     """A value to 50 digits, and its size, to which its rounding error in float64 is relative.
 
-    Parameters
-    ----------
-    value
-        A float (taken as the binary number that it is) or one of 50 digits.
-    size
-        |value| by default.
+    A float is taken as the binary number that it is; the size is |value| by default.
 
     Examples
     --------

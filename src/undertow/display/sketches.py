@@ -62,14 +62,8 @@ class Label:
 class Sketch:
     """What to draw of a mechanism.
 
-    Parameters
-    ----------
-    parts
-        From back to front.
-    tip
-        The point whose path is shown.
-    view
-        From where it is seen.
+    The parts come from back to front; ``tip`` is the point whose path is shown, ``view`` from where
+    it is seen.
     """
 
     parts: tuple[Line | Disc | Box | Label, ...]

@@ -27,17 +27,8 @@ Layout = Mapping[str, str]
 class Workspace:
     """One block of numbers, and named views of its parts.
 
-    Parameters
-    ----------
-    layout
-        Names and dimensions.
-    **sizes
-        What the dimensions are written in.
-
-    Attributes
-    ----------
-    block
-        All of it, one-dimensional.
+    The layout has names and dimensions, written in ``sizes``; ``block`` is all of it,
+    one-dimensional.
 
     Examples
     --------

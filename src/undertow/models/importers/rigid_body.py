@@ -139,12 +139,7 @@ def mechanism_from_tree(
 def check_held(tree: Tree, actuated: Sequence[str]) -> None:
     """Refuse a tree that falls whatever its joints do: no pose of it is an equilibrium.
 
-    Parameters
-    ----------
-    tree
-        With the file's own actuators.
-    actuated
-        Joints that are driven besides.
+    The tree has the file's own actuators; joints that are driven besides are ``actuated``.
 
     Raises
     ------
