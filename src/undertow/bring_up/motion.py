@@ -67,14 +67,8 @@ class GuardError(UndertowError):
 class MotionRecord:
     """What was written to a rig and what it measured.
 
-    Attributes
-    ----------
-    t
-        Times of the samples, (N,), s.
-    q
-        Measured positions, (N, n); ``q[k]`` was read before ``u[k]`` was written.
-    u
-        Inputs written, (N, m).
+    Samples were taken at t, (N,), s; ``q[k]`` of the positions, (N, n), was read before ``u[k]`` of
+    the inputs, (N, m), was written.
     """
 
     t: FloatArray

@@ -89,8 +89,22 @@ def delay_margin(
 ) -> float:
     """Return the longest delay, s, in whole periods, that the loop at the target bears.
 
-    The margin is −period where the sampled loop is unstable without any delay; the search stops at
-    ``longest``, s. The law has the paper's gains by default.
+    Parameters
+    ----------
+    mechanism
+        The model.
+    surface, reaching
+        The law; the paper's gains by default.
+    period
+        Sampling period, s.
+    longest
+        Where to stop looking, s.
+
+    Returns
+    -------
+    float
+        Stable up to and including this delay; −period where the sampled loop is unstable
+        without any.
 
     Examples
     --------
@@ -124,8 +138,14 @@ def noise_share(
     With u = k x̂ near the target and an error of the estimate with covariance P it is
     √(k P kᵀ)_ii, as a part of the input's limit; of several inputs the largest part.
 
-    The covariance of the estimated state is P, (2n, 2n); the law has the paper's gains by default,
-    and an input without a limit does not count.
+    Parameters
+    ----------
+    mechanism
+        The model; an input without a limit does not count.
+    surface, reaching
+        The law; the paper's gains by default.
+    covariance
+        P of the estimated state, (2n, 2n).
 
     Examples
     --------

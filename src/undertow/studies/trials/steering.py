@@ -40,18 +40,8 @@ class CascadeSteering:
     present state, then the next one is asked for: for the state predicted one period ahead.  Where
     it has a belief, its estimator learns what that leaves open, see :meth:`listen`.
 
-    Parameters
-    ----------
-    cascade
-        The two-rate controller.
-    start
-        What :meth:`Cascade.start` returned: the first optimisation is made before the run, as
-        on a bench.
-
-    Attributes
-    ----------
-    admitted, refused
-        How many answers passed the gate, and how many did not.
+    The first optimisation, ``start``, was made before the run by :meth:`Cascade.start`, as on a
+    bench. ``admitted`` answers passed the gate, ``refused`` did not.
     """
 
     def __init__(self, cascade: Cascade, start: tuple[CascadeState, Proposal]) -> None:
