@@ -471,13 +471,14 @@ def evaluated(program: Path, cases: list[Document], file: Path) -> list[list[str
 
 
 @needs_compiler
-def test_2000_expressions_are_enclosed_with_their_derivatives(
-    program: Path, tmp_path: Path
+@pytest.mark.parametrize("count", [400, pytest.param(2000, marks=pytest.mark.slow)])
+def test_expressions_are_enclosed_with_their_derivatives(
+    program: Path, tmp_path: Path, count: int
 ) -> None:
     """At points and on thin and wider boxes, against 60 digits; fractions to 40 of them."""
-    source = random.Random(2000)
+    source = random.Random(count)
     cases, points = [], []
-    for index in range(2000):
+    for index in range(count):
         width = (Fraction(0), Fraction(0), Fraction(1, 2**40), Fraction(1, 50))[index % 4]
         size = Fraction(source.choice([1e-9, 1.0, 1.0, 20.0, 1e6]))
         low = [size * Fraction(source.randint(-(10**6), 10**6), 10**6) for _ in range(4)]
@@ -508,8 +509,8 @@ def test_2000_expressions_are_enclosed_with_their_derivatives(
                     assert abs(high - value) <= scale_**2 * mp.mpf(10) ** -40, case
                     sharp += ends[1] - ends[0] <= 1e-9 * max(1, abs(ends[1]))
             defined += not math.isnan(ends[0])
-    assert defined > 1950
-    assert sharp > 700
+    assert defined > 0.975 * count
+    assert sharp > 0.35 * count
 
 
 @needs_compiler
