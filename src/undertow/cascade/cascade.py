@@ -455,8 +455,10 @@ class Cascade:
         whole = self._loops(known)
         here = self.about(whole, target, t)
         here.objective.check_start(here.mechanism, x)
-        best: tuple[float, Plan, Proposal] | None = None
+        found: list[tuple[int, float, Plan, Proposal]] = []
         for loop, fixed in self._first_tries(known):
+            if found and loop.ensemble is not None and len(loop.ensemble) == 1:
+                break  # what follows is for want of any plan
             about = self.about(loop, target, t)
             planner = self._planner(loop, target, t)
             if fixed is not None:
@@ -464,10 +466,9 @@ class Cascade:
             proposal = planner.propose(
                 x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
             )
-            if proposal.plan is None and (loop is not whole or best is not None):
+            if proposal.plan is None:
                 continue
-            plan, horizon = proposal.required(here).plan, self.objective.horizon
-            assert plan is not None  # required
+            plan, horizon = proposal.plan, self.objective.horizon
             cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
@@ -475,12 +476,12 @@ class Cascade:
                 good &= self._survives(here, x, plan)
             if loop.ensemble is None and self.planner is None:
                 good &= cost <= AGREES * proposal.cost
-            if good or (loop is whole and (best is None or cost <= best[0])):
-                best = cost, plan, proposal
+            found.append((0 if good else 1 if loop is whole else 2, cost, plan, proposal))
             if good:
                 break
-        assert best is not None  # the last try is of the whole, and raised where it found nothing
-        cost, plan, proposal = best
+        if not found:
+            proposal.required(here)
+        _, cost, plan, proposal = min(found, key=lambda each: each[:2])
         if target is not None and target.moves:
             plan, cost = self._first_along(whole, plan, x, target, t)
         begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
@@ -504,6 +505,10 @@ class Cascade:
         estimate alone comes first, for a plan that the next decision replaces.  Where its plan does
         not do what it promised, small steps throughout follow: for one plant, which is integrated
         to the tolerance, smaller ones than usual.
+
+        Where nothing suits every plausible plant, what brings home the estimate itself comes last,
+        without room for any error: to learn which of the plants it is takes less time than to fall,
+        and from the next decision on the plan is kept that all of them survive longest.
         """
         whole = self._loops(estimate)
         if self.planner is not None:
@@ -514,9 +519,13 @@ class Cascade:
         small = whole
         if whole.ensemble is None and not self.zoh_steps:
             small = whole.with_steps(self.step / FINER, 0.0)
-        return [
+        tries = [
             (loop, fixed) for loop in loops for fixed in (None, small if loop is whole else loop)
         ]
+        if self.known is not None and estimate is not None:
+            mere = self.known.alone(estimate, slips=False)
+            tries.append((whole.believing(whole.mechanism, mere), None))
+        return tries
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:

@@ -324,8 +324,13 @@ class Belief:
         return self._slipping(self.values(offsets), weights)
 
     @checked
-    def alone(self, estimate: ParameterEstimate) -> Ensemble:
-        """Return an ensemble of the estimate alone, with small errors of state and surface."""
+    def alone(self, estimate: ParameterEstimate, *, slips: bool = True) -> Ensemble:
+        """Return an ensemble of the estimate alone; with ``slips`` some members have small errors.
+
+        Those are of state and surface, and each member has the same parameters.
+        """
+        if not slips:
+            return Ensemble(self.mechanism, self.values(estimate.offset[None]), self.risk)
         values = self.values(np.tile(estimate.offset, (1 + SLIPS, 1)))
         return self._slipping(values, np.ones(len(values)))
 
