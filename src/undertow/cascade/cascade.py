@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -103,6 +103,18 @@ class CascadeState:
     def absolute(self, t: float, error: FloatArray) -> FloatArray:
         """Return the state that is so far off the target at time t, s: the inverse."""
         return error if self.target is None else error + self.target.state(t)
+
+
+class FirstTry(NamedTuple):
+    """An answer to the search for a first plan, and the cost of its plan where it was judged.
+
+    ``rank`` is 0 where it is good, 1 if it is for every plausible plant, 2 if it is for the
+    estimate, 3 where there is none.
+    """
+
+    rank: int
+    cost: float
+    proposal: Proposal
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,37 +467,53 @@ class Cascade:
         whole = self._loops(known)
         here = self.about(whole, target, t)
         here.objective.check_start(here.mechanism, x)
-        found: list[tuple[int, float, Plan, Proposal]] = []
+        tries = []
         for loop, fixed in self._first_tries(known):
-            if found and loop.ensemble is not None and len(loop.ensemble) == 1:
-                break  # what follows is for want of any plan
-            about = self.about(loop, target, t)
-            planner = self._planner(loop, target, t)
-            if fixed is not None:
-                planner = self.optimiser.on(self.about(fixed, target, t))
-            proposal = planner.propose(
-                x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
-            )
-            if proposal.plan is None:
-                continue
-            plan, horizon = proposal.plan, self.objective.horizon
-            cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
-            cost = cost if cost < INADMISSIBLE else math.inf
-            good = math.isfinite(cost)
-            if loop is not whole:  # every plausible plant lives to see the next decision
-                good &= self._survives(here, x, plan)
-            if loop.ensemble is None and self.planner is None:
-                good &= cost <= AGREES * proposal.cost
-            found.append((0 if good else 1 if loop is whole else 2, cost, plan, proposal))
-            if good:
+            tries.append(self._first_try(x, loop, fixed, whole, target, t))
+            if tries[-1].rank == 0:
                 break
-        if not found:
-            proposal.required(here)
-        _, cost, plan, proposal = min(found, key=lambda each: each[:2])
+        # Where nothing suits every plausible plant, what brings home the estimate, without room for
+        # any error: to learn which of the plants it is takes less time than to fall.
+        if self.known is not None and known is not None and tries[-1].proposal.plan is None:
+            single = whole.believing(whole.mechanism, self.known.single(known))
+            tries.append(self._first_try(x, single, None, whole, target, t))
+        best = min(tries, key=lambda one: (one.rank, one.cost))
+        cost, proposal = best.cost, best.proposal
+        plan = proposal.required(here).plan
+        assert plan is not None  # required
         if target is not None and target.moves:
             plan, cost = self._first_along(whole, plan, x, target, t)
         begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
         return begun, replace(proposal, sequence=number)
+
+    def _first_try(
+        self,
+        x: FloatArray,
+        loop: ClosedLoop,
+        fixed: ClosedLoop | None,
+        whole: ClosedLoop,
+        target: ReferenceMotion | None,
+        t: float,
+    ) -> FirstTry:
+        """Search for a first plan that is best on a loop, in fixed steps or as usual; judge it."""
+        about = self.about(loop, target, t)
+        planner = self._planner(loop, target, t)
+        if fixed is not None:
+            planner = self.optimiser.on(self.about(fixed, target, t))
+        proposal = planner.propose(
+            x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
+        )
+        plan, horizon = proposal.plan, self.objective.horizon
+        if plan is None:
+            return FirstTry(3, math.inf, proposal)
+        cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
+        cost = cost if cost < INADMISSIBLE else math.inf
+        good = math.isfinite(cost)
+        if loop is not whole:  # every plausible plant lives to see the next decision
+            good &= self._survives(self.about(whole, target, t), x, plan)
+        if loop.ensemble is None and self.planner is None:
+            good &= cost <= AGREES * proposal.cost
+        return FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal)
 
     def _first_along(
         self, loop: ClosedLoop, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float
@@ -505,10 +533,6 @@ class Cascade:
         estimate alone comes first, for a plan that the next decision replaces.  Where its plan does
         not do what it promised, small steps throughout follow: for one plant, which is integrated
         to the tolerance, smaller ones than usual.
-
-        Where nothing suits every plausible plant, what brings home the estimate itself comes last,
-        without room for any error: to learn which of the plants it is takes less time than to fall,
-        and from the next decision on the plan is kept that all of them survive longest.
         """
         whole = self._loops(estimate)
         if self.planner is not None:
@@ -519,13 +543,9 @@ class Cascade:
         small = whole
         if whole.ensemble is None and not self.zoh_steps:
             small = whole.with_steps(self.step / FINER, 0.0)
-        tries = [
+        return [
             (loop, fixed) for loop in loops for fixed in (None, small if loop is whole else loop)
         ]
-        if self.known is not None and estimate is not None:
-            mere = self.known.alone(estimate, slips=False)
-            tries.append((whole.believing(whole.mechanism, mere), None))
-        return tries
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:

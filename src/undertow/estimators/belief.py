@@ -324,15 +324,15 @@ class Belief:
         return self._slipping(self.values(offsets), weights)
 
     @checked
-    def alone(self, estimate: ParameterEstimate, *, slips: bool = True) -> Ensemble:
-        """Return an ensemble of the estimate alone; with ``slips`` some members have small errors.
-
-        Those are of state and surface, and each member has the same parameters.
-        """
-        if not slips:
-            return Ensemble(self.mechanism, self.values(estimate.offset[None]), self.risk)
+    def alone(self, estimate: ParameterEstimate) -> Ensemble:
+        """Return an ensemble of the estimate alone, with small errors of state and surface."""
         values = self.values(np.tile(estimate.offset, (1 + SLIPS, 1)))
         return self._slipping(values, np.ones(len(values)))
+
+    @checked
+    def single(self, estimate: ParameterEstimate) -> Ensemble:
+        """Return an ensemble of one member, the estimate, without any error."""
+        return Ensemble(self.mechanism, self.values(estimate.offset[None]), self.risk)
 
     def _slipping(self, values: FloatArray, weights: FloatArray) -> Ensemble:
         """Return an ensemble whose members 1 to ``SLIPS`` have small errors of state and surface.
