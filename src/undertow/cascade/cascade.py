@@ -467,16 +467,36 @@ class Cascade:
         whole = self._loops(known)
         here = self.about(whole, target, t)
         here.objective.check_start(here.mechanism, x)
-        tries = []
-        for loop, fixed in self._first_tries(known):
-            tries.append(self._first_try(x, loop, fixed, whole, target, t))
-            if tries[-1].rank == 0:
-                break
         # Where nothing suits every plausible plant, what brings home the estimate, without room for
         # any error: to learn which of the plants it is takes less time than to fall.
-        if self.known is not None and known is not None and tries[-1].proposal.plan is None:
+        single = None
+        if self.known is not None and known is not None:
             single = whole.believing(whole.mechanism, self.known.single(known))
-            tries.append(self._first_try(x, single, None, whole, target, t))
+        last = [] if single is None else [(single, None)]
+        tries: list[FirstTry] = []
+        for loop, fixed in [*self._first_tries(known), *last]:
+            if loop is single and tries[-1].proposal.plan is not None:
+                break
+            about, planner = self.about(loop, target, t), self._planner(loop, target, t)
+            if fixed is not None:
+                planner = self.optimiser.on(self.about(fixed, target, t))
+            proposal = planner.propose(
+                x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
+            )
+            plan, horizon = proposal.plan, self.objective.horizon
+            if plan is None:
+                tries.append(FirstTry(3, math.inf, proposal))
+                continue
+            cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
+            cost = cost if cost < INADMISSIBLE else math.inf
+            good = math.isfinite(cost)
+            if loop is not whole:  # every plausible plant lives to see the next decision
+                good &= self._survives(here, x, plan)
+            if loop.ensemble is None and self.planner is None:
+                good &= cost <= AGREES * proposal.cost
+            tries.append(FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal))
+            if good:
+                break
         best = min(tries, key=lambda one: (one.rank, one.cost))
         cost, proposal = best.cost, best.proposal
         plan = proposal.required(here).plan
@@ -485,35 +505,6 @@ class Cascade:
             plan, cost = self._first_along(whole, plan, x, target, t)
         begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
         return begun, replace(proposal, sequence=number)
-
-    def _first_try(
-        self,
-        x: FloatArray,
-        loop: ClosedLoop,
-        fixed: ClosedLoop | None,
-        whole: ClosedLoop,
-        target: ReferenceMotion | None,
-        t: float,
-    ) -> FirstTry:
-        """Search for a first plan that is best on a loop, in fixed steps or as usual; judge it."""
-        about = self.about(loop, target, t)
-        planner = self._planner(loop, target, t)
-        if fixed is not None:
-            planner = self.optimiser.on(self.about(fixed, target, t))
-        proposal = planner.propose(
-            x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
-        )
-        plan, horizon = proposal.plan, self.objective.horizon
-        if plan is None:
-            return FirstTry(3, math.inf, proposal)
-        cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
-        cost = cost if cost < INADMISSIBLE else math.inf
-        good = math.isfinite(cost)
-        if loop is not whole:  # every plausible plant lives to see the next decision
-            good &= self._survives(self.about(whole, target, t), x, plan)
-        if loop.ensemble is None and self.planner is None:
-            good &= cost <= AGREES * proposal.cost
-        return FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal)
 
     def _first_along(
         self, loop: ClosedLoop, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float
