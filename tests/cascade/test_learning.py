@@ -11,7 +11,7 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from undertow.base import InvalidInputError
+from undertow.base import InfeasibleError, InvalidInputError
 from undertow.cascade import CascadeState, cost_gate
 from undertow.estimators import ParameterEstimate
 
@@ -157,6 +157,30 @@ def test_where_no_plan_suits_all_the_one_that_lives_longest_is_kept(
     kept, admission = cascade.apply_gate(state, proposal, x)
     assert admission.accepted
     assert cascade.loop.batch(x, kept.plan).time[0] > pair.time.min()
+
+
+@pytest.mark.slow
+def test_where_no_first_plan_suits_all_the_estimate_has_one() -> None:
+    """A wheel that leans as far as its voltage bears: some plausible plants are late at best.
+
+    What brings home the estimate is a start; what is learnt meanwhile brings home the plant.
+    """
+    rig = ut.mechanisms.reaction_wheel_pendulum()
+    parts = {"m_p": 0.1, "m_r": 0.1, "J_p": 0.1, "J_r": 0.1, "l_p": 0.03, "l_r": 0.03}
+    belief = ut.Belief.relative(rig, **parts, b_p=0.5, b_r=0.5)
+    aim, x = ut.MinimumTime(horizon=6.0), rig.state(phi=ut.deg(2.5))
+    cascade = ut.Cascade(rig, aim, belief=belief, cold=ut.Budget(2000))
+    for ensemble in (cascade.loop.ensemble, belief.alone(belief.prior)):
+        loop = cascade.loop.believing(rig, ensemble)
+        assert ut.Optimiser(loop, cold=cascade.cold).propose(x).plan is None
+    state, _ = cascade.start(x)
+    assert 4.0 < state.predicted < 6.0
+    assert "although not feasible" in cascade.first_admission(state, x, aim.horizon).reason
+    run = cascade.simulate(x, plant=changed(rig, {"m_p": -0.05}))
+    assert run.reached
+    assert run.cost < state.predicted
+    with pytest.raises(InfeasibleError, match="reaction_wheel"):
+        cascade.start(rig.state(phi=ut.deg(10)))
 
 
 @pytest.mark.slow

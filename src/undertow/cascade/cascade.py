@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -103,6 +103,18 @@ class CascadeState:
     def absolute(self, t: float, error: FloatArray) -> FloatArray:
         """Return the state that is so far off the target at time t, s: the inverse."""
         return error if self.target is None else error + self.target.state(t)
+
+
+class FirstTry(NamedTuple):
+    """An answer to the search for a first plan, and the cost of its plan where it was judged.
+
+    ``rank`` is 0 where it is good, 1 if it is for every plausible plant, 2 if it is for the
+    estimate, 3 where there is none.
+    """
+
+    rank: int
+    cost: float
+    proposal: Proposal
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,19 +467,26 @@ class Cascade:
         whole = self._loops(known)
         here = self.about(whole, target, t)
         here.objective.check_start(here.mechanism, x)
-        best: tuple[float, Plan, Proposal] | None = None
-        for loop, fixed in self._first_tries(known):
-            about = self.about(loop, target, t)
-            planner = self._planner(loop, target, t)
+        # Where nothing suits every plausible plant, what brings home the estimate, without room for
+        # any error: to learn which of the plants it is takes less time than to fall.
+        single = None
+        if self.known is not None and known is not None:
+            single = whole.believing(whole.mechanism, self.known.single(known))
+        last = [] if single is None else [(single, None)]
+        tries: list[FirstTry] = []
+        for loop, fixed in [*self._first_tries(known), *last]:
+            if loop is single and tries[-1].proposal.plan is not None:
+                break
+            about, planner = self.about(loop, target, t), self._planner(loop, target, t)
             if fixed is not None:
                 planner = self.optimiser.on(self.about(fixed, target, t))
             proposal = planner.propose(
                 x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
             )
-            if proposal.plan is None and (loop is not whole or best is not None):
+            plan, horizon = proposal.plan, self.objective.horizon
+            if plan is None:
+                tries.append(FirstTry(3, math.inf, proposal))
                 continue
-            plan, horizon = proposal.required(here).plan, self.objective.horizon
-            assert plan is not None  # required
             cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
@@ -475,12 +494,13 @@ class Cascade:
                 good &= self._survives(here, x, plan)
             if loop.ensemble is None and self.planner is None:
                 good &= cost <= AGREES * proposal.cost
-            if good or (loop is whole and (best is None or cost <= best[0])):
-                best = cost, plan, proposal
+            tries.append(FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal))
             if good:
                 break
-        assert best is not None  # the last try is of the whole, and raised where it found nothing
-        cost, plan, proposal = best
+        best = min(tries, key=lambda one: (one.rank, one.cost))
+        cost, proposal = best.cost, best.proposal
+        plan = proposal.required(here).plan
+        assert plan is not None  # required
         if target is not None and target.moves:
             plan, cost = self._first_along(whole, plan, x, target, t)
         begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)

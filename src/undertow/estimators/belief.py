@@ -329,6 +329,11 @@ class Belief:
         values = self.values(np.tile(estimate.offset, (1 + SLIPS, 1)))
         return self._slipping(values, np.ones(len(values)))
 
+    @checked
+    def single(self, estimate: ParameterEstimate) -> Ensemble:
+        """Return an ensemble of one member, the estimate, without any error."""
+        return Ensemble(self.mechanism, self.values(estimate.offset[None]), self.risk)
+
     def _slipping(self, values: FloatArray, weights: FloatArray) -> Ensemble:
         """Return an ensemble whose members 1 to ``SLIPS`` have small errors of state and surface.
 
