@@ -265,47 +265,24 @@ class Optimisation:
 
     def global_search(self) -> Iterator[bool]:
         """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
-        if not self.optimiser.counts_time:
-            yield from self._coarse_to_fine()
-            return
-        self.cost(self.firsts[: max(1, self.left)])
-        yield self._earlier(min(POLISH, self.left))
-        if self.optimiser.freedom.schedule and self.follow_earliest(self.left // 2):
-            yield True
-            return
-        again = self.optimiser.freedom.schedule > 0
-        self.arrive_earlier(wide=True, keep=POLISH + again * (self.left // 2))
-        yield self._earlier(POLISH if again else self.left)
-        if again:
-            yield self.follow_earliest()
-
-    def _coarse_to_fine(self) -> Iterator[bool]:
-        """Look for the best single surface, then improve several copies of it, if there may be."""
-        freedom, size = self.optimiser.freedom, self.space.size // self.space.segments
-        if len(freedom.times) == 1 and not freedom.schedule:
-            yield from self._search_everywhere()
-            return
-        self._switch_at((0.0,))
-        self._kept = min(FINE * size, 3 * self.left // 4)
-        yield from self._search_everywhere()
-        self._kept = 0
-        self._switch_at(self._division() if freedom.schedule else freedom.times)
-        yield self._descend(self._centre(), 0.1, self.left, 1e-4)
-
-    def _division(self) -> tuple[float, ...]:
-        """When each of several surfaces is to take over from the best single one, s."""
-        period, best = self.optimiser.freedom.schedule, self.best
-        assert best is not None  # cost() has run before
-        motion = self.loop.simulate(self.x, best, duration=self.horizon)
-        spent = np.searchsorted(motion.accumulated_cost, NEARLY_ALL * motion.cost)
-        first = period * max(1, round(SOON * float(motion.t[spent]) / period))
-        times = (round(first * 2**k, 9) for k in range(DIVIDED - 1))
-        return (0.0, *(t for t in times if t < self.horizon))
-
-    def _search_everywhere(self) -> Iterator[bool]:
-        """Improve the best of the designs, then descend from the best of many draws."""
+        several = len(self.space.freedom.times) > 1 or self.optimiser.freedom.schedule > 0
+        several &= not self.optimiser.counts_time
+        if several:
+            self._switch_at((0.0,))
+            self._kept = min(FINE * self.space.size, 3 * self.left // 4)
         z = self.firsts[: max(1, self.left)]
         scores = self.cost(z)
+        if self.optimiser.counts_time:
+            yield self._earlier(min(POLISH, self.left))
+            if self.optimiser.freedom.schedule and self.follow_earliest(self.left // 2):
+                yield True
+                return
+            again = self.optimiser.freedom.schedule > 0
+            self.arrive_earlier(wide=True, keep=POLISH + again * (self.left // 2))
+            yield self._earlier(POLISH if again else self.left)
+            if again:
+                yield self.follow_earliest()
+            return
         if self._centre().size <= MODEL_SIZE:
             self._model_search(self._centre())
             yield False
@@ -323,6 +300,22 @@ class Optimisation:
             start = self._centre() + self.space.steps(rng, np.ones(1))[0]
             self._descend(start, 0.3, self.left, 3e-3)
         yield converged
+        if several:
+            self._kept = 0
+            self._switch_at(self._division())
+            yield self._descend(self._centre(), 0.1, self.left, 1e-4)
+
+    def _division(self) -> tuple[float, ...]:
+        """When each of several surfaces is to take over from the best single one, s."""
+        period, best = self.optimiser.freedom.schedule, self.best
+        if not period:
+            return self.optimiser.freedom.times
+        assert best is not None  # cost() has run before
+        motion = self.loop.simulate(self.x, best, duration=self.horizon)
+        spent = np.searchsorted(motion.accumulated_cost, NEARLY_ALL * motion.cost)
+        first = period * max(1, round(SOON * float(motion.t[spent]) / period))
+        times = (round(first * 2**k, 9) for k in range(DIVIDED - 1))
+        return (0.0, *(t for t in times if t < self.horizon))
 
     def local_search(self, incumbent: Plan) -> bool:
         """Start from the incumbent; look further away where that gains nothing."""
