@@ -64,7 +64,7 @@ myst_heading_anchors = 4
 highlight_language = "text"
 
 # The reference: what the packages export, in the order of __all__.
-autodoc_default_options = {"members": True, "imported-members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True, "imported-members": True}
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
@@ -75,6 +75,7 @@ autosummary_context = {"elsewhere": _shown_before()}
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False
 maximum_signature_line_length = 80
 
 # The gallery: each script is run, and the figures among its variables are its pictures.
@@ -105,9 +106,11 @@ html_theme_options = {"navigation_with_keys": True}
 
 
 def _mathml(tex: str, display: str = "inline") -> str:
-    """Return a formula as MathML, which browsers draw by themselves."""
-    tree = tex2mathml(tex, as_block=display == "block")
-    return tree.toxml() if hasattr(tree, "toxml") else str(tree)
+    r"""Return a formula as MathML, which browsers draw by themselves.
+
+    The index of an accented letter is written ``\dot q{}_a``: beside it, and not underneath.
+    """
+    return tex2mathml(tex, as_block=display == "block")
 
 
 def _inline_formula(writer: Any, node: nodes.math) -> None:
@@ -117,7 +120,7 @@ def _inline_formula(writer: Any, node: nodes.math) -> None:
 
 def _formula(writer: Any, node: nodes.math_block) -> None:
     """Write a formula on lines of its own; its label is its number in the paper."""
-    label = node["label"]
+    label = node.get("label")
     number = f'<span class="eqno">({label})</span>' if label else ""
     here = f' id="{node["ids"][0]}"' if node["ids"] else ""
     formula = _mathml(node.astext(), "block")

@@ -2,8 +2,8 @@
 From a URDF file
 ================
 
-Masses, inertias, damping and limits are read, and the equations derived. On the command line the same
-is ``undertow simulate robot.urdf:x``.
+Masses, inertias, damping and limits are read, and the equations derived; on the command line
+``undertow simulate robot.urdf:x`` does it.
 """
 
 import undertow as ut
