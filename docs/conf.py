@@ -85,6 +85,7 @@ sphinx_gallery_conf = {
     "filename_pattern": r"\.py$",
     "within_subsection_order": "FileNameSortKey",
     "image_scrapers": ["gallery_pictures.figures"],
+    "capture_repr": (),
     "reset_modules": ["gallery_pictures.look"],
     "abort_on_example_error": True,
     "download_all_examples": False,
@@ -110,7 +111,9 @@ def _mathml(tex: str, display: str = "inline") -> str:
 
     The index of an accented letter is written ``\dot q{}_a``: beside it, and not underneath.
     """
-    return tex2mathml(tex, as_block=display == "block")
+    formula = tex2mathml(tex, as_block=display == "block")
+    # As an accent a dot sits too low where the font is not made for mathematics.
+    return formula.replace('accent="true"', 'accent="false"')
 
 
 def _inline_formula(writer: Any, node: nodes.math) -> None:
