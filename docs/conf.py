@@ -23,7 +23,8 @@ def _shown_before() -> dict[str, dict[str, str]]:
     text = (DOCS / "api.md").read_text(encoding="utf-8")
     for name in re.findall(r"^   (undertow[\w.]*)$", text, re.MULTILINE):
         package = import_module(name)
-        found = {public: getattr(package, public) for public in package.__all__}
+        own = [n for n, thing in vars(package).items() if getattr(thing, "__module__", "") == name]
+        found = {public: getattr(package, public) for public in getattr(package, "__all__", own)}
         elsewhere[name] = {p: shown[id(thing)] for p, thing in found.items() if id(thing) in shown}
         shown |= {id(thing): f"{name}.{p}" for p, thing in found.items() if id(thing) not in shown}
     return elsewhere
@@ -64,14 +65,17 @@ myst_heading_anchors = 4
 highlight_language = "text"
 
 # The reference: what the packages export, in the order of __all__.
-autodoc_default_options = {"members": True, "imported-members": True}
+autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autosummary_generate = True
 autosummary_imported_members = True
 autosummary_ignore_module_all = False
-autosummary_context = {"elsewhere": _shown_before()}
+autosummary_context = {
+    "elsewhere": _shown_before(),
+    "exports": {name for name in _shown_before() if hasattr(import_module(name), "__all__")},
+}
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True

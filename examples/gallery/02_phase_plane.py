@@ -9,7 +9,8 @@ replaces the surface, the motion reaches the new one, and slides on.
 import matplotlib.pyplot as plt
 
 import undertow as ut
-from undertow.display.plot import COLOURS, phase, surface_trace
+from undertow.closed_loop.figures import COLOURS
+from undertow.display.plot import phase, surface_trace
 
 pendulum = ut.mechanisms.rotary_pendulum(d_e=0.025)
 run = ut.Cascade(pendulum, ut.MinimumEnergy(horizon=3.0), belief="exact").simulate(phi=ut.deg(40))

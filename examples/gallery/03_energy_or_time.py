@@ -7,7 +7,7 @@ long as its horizon allows to bring the arm home, and two thirds of a second for
 """
 
 import undertow as ut
-from undertow.display.plot import motion_figure
+from undertow.closed_loop.figures import motion_figure
 
 pendulum = ut.mechanisms.rotary_pendulum(d_e=0.025)
 runs = {

@@ -72,18 +72,12 @@ def test_every_public_name_has_its_place_in_the_reference() -> None:
     pages = _reference()
     assert len(pages) == len(set(pages))
     public = {package.__name__ for package in _packages() if getattr(package, "__all__", ())}
-    inside = {name for name in public if not _has_page(name, pages)}
-    assert not inside, "packages that export names and have no page in docs/api.md"
+    assert public <= set(pages), "packages that export names and have no page in docs/api.md"
     for name in pages:
         module = importlib.import_module(name)
         assert module.__doc__, name
-        for one in module.__all__:
+        for one in getattr(module, "__all__", ()):
             assert hasattr(module, one), (name, one)
-
-
-def _has_page(name: str, pages: list[str]) -> bool:
-    """Whether a package, or the one above it that exports the same names, has a page."""
-    return name in pages
 
 
 def test_the_example_of_the_first_page_runs(
