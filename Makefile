@@ -40,6 +40,7 @@ bench: $(STAMP) ## all benchmarks, with a summary (docs/benchmarks.md says what 
 	$(BIN)/python benchmarks
 
 docs: $(DOCS) ## build the documentation site, build/docs/index.html, running its gallery
+	rm -rf docs/api build/docs
 	MPLBACKEND=agg $(BIN)/python -m sphinx -b html -W --keep-going -q -d build/doctrees docs build/docs
 	$(BIN)/undertow show rotary_pendulum --start phi=35deg --objective bench-time --save build/docs/replay.html
 	$(BIN)/python docs/check_links.py build/docs
