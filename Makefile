@@ -7,12 +7,13 @@ WORKERS ?= 2
 VENV  := .venv
 BIN   := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DOCS  := $(VENV)/.installed-docs
 
 CHECKER := build/undertow-checker
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow check bench checker clean
+.PHONY: help setup demo test slow check bench docs checker clean
 
 help: ## list the targets
 	@echo "Undertow: make <target>    (PYTHON=$(PYTHON), WORKERS=$(WORKERS))"
@@ -38,6 +39,12 @@ check: $(STAMP) ## formatting, lint, types, direction of imports
 bench: $(STAMP) ## all benchmarks, with a summary (docs/benchmarks.md says what they mean)
 	$(BIN)/python benchmarks
 
+docs: $(DOCS) ## build the documentation site, build/docs/index.html, running its gallery
+	rm -rf docs/api build/docs
+	MPLBACKEND=agg $(BIN)/python -m sphinx -b html -W --keep-going -q -d build/doctrees docs build/docs
+	$(BIN)/undertow show rotary_pendulum --start phi=35deg --objective bench-time --save build/docs/replay.html
+	$(BIN)/python docs/check_links.py build/docs
+
 checker: $(CHECKER) ## build the second checker of certificates (needs a C++17 compiler)
 
 # One rounding mode for the whole run: -frounding-math, and no fused operations.
@@ -50,7 +57,7 @@ $(CHECKER): checker/checker.cpp $(wildcard checker/*.hpp)
 	$(CXX) -std=c++17 -O2 -frounding-math -ffp-contract=off -Wall -Wextra -o $@ checker/checker.cpp
 
 clean: ## remove .venv, caches and results/
-	rm -rf $(VENV) results dist build
+	rm -rf $(VENV) results dist build docs/api docs/gallery
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -68,4 +75,9 @@ $(STAMP): pyproject.toml constraints.txt
 	    echo "error: '$(PYTHON) -m venv' failed; some systems package it apart (python3-venv)."; \
 	    exit 1; } >&2
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bounds,certify,compare,interop,mujoco,show,dev]'
+	@touch $@
+
+# What builds the site comes on top, for those who build it.
+$(DOCS): $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	@touch $@
