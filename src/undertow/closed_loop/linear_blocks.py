@@ -10,6 +10,7 @@ matrices is written out for the given N, so that its innermost loop runs over th
 from __future__ import annotations
 
 from undertow.closed_loop.work_array import LANES
+from undertow.symbolic import SELECT, single_assignment
 
 #: Time of the first stored power e^{At}, s; level k stands for 2ᵏ units.
 UNIT = 0.005
@@ -51,13 +52,13 @@ def linear_source(size: int) -> str:
         *read_turned,
         *(f"o[{e}] = add[{e}] + {v}" for e, v in zip(places, entries, strict=True)),
     ]
-    return f'''"""Linear systems of order {N}; generated, do not edit."""
+    source = f'''"""Linear systems of order {N}; generated, do not edit."""
 
 import math
 
 import numba
 import numpy as np
-
+{SELECT}
 FAST = {{"contract", "nsz", "arcp"}}
 
 
@@ -161,6 +162,7 @@ def double(A, Q, P, stable, powers, forced):
                 for c in range({N}):
                     P[first + i, r, c] = X[(r * {N} + c) * {LANES} + i]
 '''
+    return single_assignment(source)
 
 
 def _indented(lines: list[str]) -> str:

@@ -6,6 +6,7 @@ from undertow.symbolic.function import COMPILED, PREAMBLE, function_source
 from undertow.symbolic.machine import numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
+from undertow.symbolic.single_assignment import SELECT, single_assignment
 from undertow.symbolic.store import (
     content_key,
     generated,
@@ -22,6 +23,7 @@ __all__ = [
     "BRIEF",
     "COMPILED",
     "PREAMBLE",
+    "SELECT",
     "C99Emitter",
     "Emitter",
     "Real",
@@ -41,6 +43,7 @@ __all__ = [
     "processor",
     "recall",
     "remember",
+    "single_assignment",
     "sources_digest",
     "unpacked",
 ]
