@@ -423,7 +423,8 @@ import numpy as np
 {SELECT}
 
 @numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
+    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
+    fastmath={{"contract", "nsz", "arcp"}},
 )
 def rollout(
     from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
@@ -485,7 +486,8 @@ def _etd_integrate(w: _Writer) -> str:
     return f"""
 
 @numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
+    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
+    fastmath={{"contract", "nsz", "arcp"}},
 )
 def etd_integrate(
     from_lane, to_lane, lanes, plant, belief, limits, until, terminal, escape, tail, counted,

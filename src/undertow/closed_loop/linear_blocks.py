@@ -62,21 +62,21 @@ import numpy as np
 FAST = {{"contract", "nsz", "arcp"}}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST, no_cfunc_wrapper=True, no_cpython_wrapper=True)
 def _product(a, b, add, factor, o):
     for r in range({N}):
         for i in range({LANES}):
 {_indented(product)}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST, no_cfunc_wrapper=True, no_cpython_wrapper=True)
 def _turned(a, b, add, o):
     for r in range({N}):
         for i in range({LANES}):
 {_indented(turned)}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 def double(A, Q, P, stable, powers, forced):
     half = {N // 2}
     W = np.zeros((12, {area}))
@@ -137,9 +137,10 @@ def double(A, Q, P, stable, powers, forced):
             G[e] *= 0.5 * t
         for level in range(-halvings, {LEVELS}):
             if 0 <= level < {STEP_SIZES}:
-                powers[block, level] = E
-                forced[block, level, 0] = F
-                forced[block, level, 1] = G
+                for e in range({area}):
+                    powers[block, level, e] = E[e]
+                    forced[block, level, 0, e] = F[e]
+                    forced[block, level, 1, e] = G[e]
             if level + 1 < {STEP_SIZES}:
                 _product(E, G, F, 1.0, T)
                 for e in range({area}):

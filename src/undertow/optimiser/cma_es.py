@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from undertow.base import InvalidInputError, at_least, positive
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -143,7 +143,7 @@ class CMAES:
         self._factor()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _adapt(  # type: ignore[no-untyped-def]
     x, weights, rates, generation, scale, sigma, mean, path_sigma, path_c, C, basis, root
 ):

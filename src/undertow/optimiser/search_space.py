@@ -17,7 +17,7 @@ from undertow.base import InvalidInputError, check_fields, positive
 from undertow.closed_loop import ClosedLoop
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class SearchSpace:
         return Plan(surfaces, self.freedom.times, laws)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _decode(rows, base, places, width, fastest, vectors, gains):  # type: ignore[no-untyped-def]
     m, free = gains.shape[2] // 2, len(places)
     for k in range(rows.shape[0]):

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from undertow.optimiser.cma_es import FloatArray, check_start
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 #: Lengths tried along a step of the model.
 STRETCHES = np.array([0.35, 0.7, 1.0, 1.4, 2.0, 3.0])
@@ -103,7 +103,7 @@ class TrustRegion:
         self.radius = min(max(0.5 * length, 0.01), 0.3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _spread_out(centre, step, lengths, radius, drawn, x):  # type: ignore[no-untyped-def]
     """Write candidates: lengths along the step, then a design around its end."""
     d, first = len(centre), len(lengths)
@@ -128,7 +128,7 @@ def _spread_out(centre, step, lengths, radius, drawn, x):  # type: ignore[no-unt
             x[k, j] = centre[j] + step[j] + radius * way
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _learn(x, f, known_x, known_f, count):  # type: ignore[no-untyped-def]
     """Keep what is no penalty; return how many are known now, and the best of the new ones."""
     best = -1
@@ -175,7 +175,7 @@ def _model_step(
     return np.asarray((basis * y * reach).sum(axis=1))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _normal_equations(x, distance, f, reach, best_f, normal, right):  # type: ignore[no-untyped-def]
     """Add up the normal equations, a little regularised, of a quadratic around the best one.
 

@@ -3,7 +3,7 @@
 from undertow.symbolic.c99 import C99Emitter, Real, literal
 from undertow.symbolic.expressions import parse_expression
 from undertow.symbolic.function import COMPILED, PREAMBLE, function_source
-from undertow.symbolic.machine import numba, processor
+from undertow.symbolic.machine import compiled, numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
 from undertow.symbolic.single_assignment import SELECT, single_assignment
@@ -31,6 +31,7 @@ __all__ = [
     "Workspace",
     "compile_expressions",
     "compile_numpy",
+    "compiled",
     "content_key",
     "distinct",
     "docstring",
