@@ -59,17 +59,20 @@ import math
 import numba
 import numpy as np
 {SELECT}
-FAST = {{"contract", "nsz", "arcp"}}
+inlined = numba.njit(
+    cache=True, nogil=True, error_model="numpy", forceinline=True, no_cfunc_wrapper=True,
+    no_cpython_wrapper=True, fastmath={{"contract", "nsz", "arcp"}},
+)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST, no_cfunc_wrapper=True, no_cpython_wrapper=True)
+@inlined
 def _product(a, b, add, factor, o):
     for r in range({N}):
         for i in range({LANES}):
 {_indented(product)}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST, no_cfunc_wrapper=True, no_cpython_wrapper=True)
+@inlined
 def _turned(a, b, add, o):
     for r in range({N}):
         for i in range({LANES}):

@@ -154,7 +154,9 @@ def _model_step(
     near = np.argsort(away, kind="stable")[: 3 * terms]
     reach = max(float(away[near[min(len(near) - 1, terms + 3)]]), 1e-6)
     normal, right = np.zeros((terms, terms)), np.zeros(terms)
-    _normal_equations(beside[near], away[near], known_f[near] - best_f, reach, best_f, normal, right)
+    _normal_equations(
+        beside[near], away[near], known_f[near] - best_f, reach, best_f, normal, right
+    )
     _, _, c, singular = lapack.dgesv(normal, right)
     H = np.zeros((d, d))
     H[_upper(d)] = c[d + 1 :]

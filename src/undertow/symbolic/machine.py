@@ -30,7 +30,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from numba.core import caching as numba_caching
-from numba.core import event
+from numba.core import event as numba_event
 from numba.core.runtime.nrt import rtsys
 from numba.core.types import functions as numba_functions
 
@@ -43,6 +43,7 @@ PACKAGE = Path(__file__).resolve().parent.parent
 #: numba's own modules have no types.
 caching: Any = numba_caching
 functions: Any = numba_functions
+event: Any = numba_event
 
 #: Decorator of the functions of this package that are compiled: no lock of the interpreter, no
 #: exceptions.

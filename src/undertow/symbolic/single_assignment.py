@@ -1,8 +1,9 @@
 """Straight-line loops in the form that numba compiles soonest: each name is assigned once.
 
 For a name that is assigned twice, anywhere in a function, numba goes through the whole function
-again, and so it does for each ``a if c else b``, which it takes for a branch.  Here every assignment
-makes a name of its own, and a choice is a call of :func:`select`.  The values stay the same.
+again, and so it does for each ``a if c else b``, which it takes for a branch.  Here every
+assignment makes a name of its own, and a choice is a call of :func:`select`.  The values stay the
+same.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from itertools import count
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, cast
 
 from undertow.symbolic.machine import numba
 
@@ -94,7 +95,7 @@ class _Loop(ast.NodeTransformer):
         return ast.Call(ast.Name("select", ast.Load()), parts, [])
 
     def visit_BoolOp(self, node: ast.BoolOp) -> ast.expr:
-        first, *rest = [self.visit(value) for value in node.values]
+        first, *rest = (cast(ast.expr, self.visit(value)) for value in node.values)
         operator = ast.BitAnd() if isinstance(node.op, ast.And) else ast.BitOr()
         for value in rest:
             first = ast.BinOp(first, operator, value)
