@@ -27,7 +27,7 @@ import sympy as sp
 
 from undertow.closed_loop.trajectory import Event
 from undertow.closed_loop.work_array import LoopGraph
-from undertow.symbolic import PREAMBLE, Emitter, docstring, numba
+from undertow.symbolic import PREAMBLE, Emitter, compiled, docstring, numba
 
 #: Dormand and Prince: stages, the last of which is the step; its error; when each stage is.
 STAGES = np.array([
@@ -68,7 +68,7 @@ _ROW = numba.float64[::1]
 LOOK = numba.void(numba.float64, *[_ROW] * 8)
 _LOOK = f"numba.void(numba.float64, {', '.join(['numba.float64[::1]'] * 8)})"
 
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+_inlined = compiled(forceinline=True, no_cpython_wrapper=True)
 
 
 @_inlined
@@ -178,8 +178,8 @@ def _follow(  # type: ignore[no-untyped-def]
     x, new, at, rates = (
         np.empty(size_x + 1), np.empty(size_x + 1), np.empty(size_x + 1), np.empty(size_x + 1)
     )  # fmt: skip
-    slopes, u = np.zeros((7, size_x + 1)), np.zeros(m)
-    seen, low = np.ones(2 * m + 2 + paths), np.empty(2 + paths)
+    slopes, u = np.empty((7, size_x + 1)), np.empty(m)
+    seen, low = np.empty(2 * m + 2 + paths), np.empty(2 + paths)
     margins = seen[2 * m :]
     pace = every if every > 0 else (PACE if paths > 0 else steps + 1)
     for b in range(count):
@@ -305,7 +305,7 @@ def follow() -> Any:
         look, look, whole, table, _ROW, block, numba.int64[::1], _ROW, _ROW, _ROW, block, real,
         real, whole, whole, _ROW, *[real] * 5, whole, block, table,
     )  # fmt: skip
-    return numba.njit(signature, cache=True, nogil=True, error_model="numpy")(_follow)
+    return compiled(signature)(_follow)
 
 
 def look_source(program: LoopGraph, *, sampled: bool, header: str) -> str:

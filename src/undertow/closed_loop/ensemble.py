@@ -16,7 +16,7 @@ import numpy as np
 from undertow.base import InvalidInputError, check_fields, floats, one_of
 from undertow.closed_loop.trajectory import Event
 from undertow.models import FloatArray, Mechanism
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 #: How the costs of a plan on the members count: their mean, the mean of the dearest third
 #: (conditional value at risk), or the dearest.
@@ -113,7 +113,7 @@ class Ensemble:
         return len(self.values)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def summarise(member_out, weights, tail, margins, out):  # type: ignore[no-untyped-def]
     """Write one result for each plan from those of its members, row after row.
 
@@ -160,7 +160,7 @@ def summarise(member_out, weights, tail, margins, out):  # type: ignore[no-untyp
         out[plan, columns - 1] = steps
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _precedes(a, b):  # type: ignore[no-untyped-def]
     """Whether a member's result a stands for the plan rather than b.
 
@@ -175,7 +175,7 @@ def _precedes(a, b):  # type: ignore[no-untyped-def]
     return a[3] > b[3]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _grade(event):  # type: ignore[no-untyped-def]
     if event == Event.REACHED:
         return 0
@@ -183,7 +183,7 @@ def _grade(event):  # type: ignore[no-untyped-def]
     return 1 if late or event == Event.COSTLY else 2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _dearest(costs, weights, tail):  # type: ignore[no-untyped-def]
     """Return the mean of the dearest members, those that weigh ``tail`` together."""
     if tail <= 0.0:

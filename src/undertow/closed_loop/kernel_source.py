@@ -31,7 +31,7 @@ from undertow.closed_loop.work_array import (
     entrance,
     total,
 )
-from undertow.symbolic import Emitter, distinct, docstring
+from undertow.symbolic import SELECT, Emitter, distinct, docstring, single_assignment
 
 #: Whether a lane may hand over is looked at in these intervals, s.
 WATCH = 0.032
@@ -416,14 +416,15 @@ def kernel_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
                 sample = min(step // zoh_steps, noise.shape[0] - 1)
 {_groups(w.sample(), 4)}
 """
-    return f"""{docstring(header)}import math
+    source = f"""{docstring(header)}import math
 
 import numba
 import numpy as np
-
+{SELECT}
 
 @numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
+    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
+    fastmath={{"contract", "nsz", "arcp"}},
 )
 def rollout(
     from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
@@ -477,6 +478,7 @@ def rollout(
         groups = min({GROUPS}, (to_lane - b) // {LANES})
 {_groups(w.collect(), 2)}
 {"" if sampled else _etd_integrate(w)}"""
+    return single_assignment(source)
 
 
 def _etd_integrate(w: _Writer) -> str:
@@ -484,7 +486,8 @@ def _etd_integrate(w: _Writer) -> str:
     return f"""
 
 @numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={{"contract", "nsz", "arcp"}}
+    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
+    fastmath={{"contract", "nsz", "arcp"}},
 )
 def etd_integrate(
     from_lane, to_lane, lanes, plant, belief, limits, until, terminal, escape, tail, counted,

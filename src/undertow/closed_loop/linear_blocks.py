@@ -10,6 +10,7 @@ matrices is written out for the given N, so that its innermost loop runs over th
 from __future__ import annotations
 
 from undertow.closed_loop.work_array import LANES
+from undertow.symbolic import SELECT, single_assignment
 
 #: Time of the first stored power e^{At}, s; level k stands for 2ᵏ units.
 UNIT = 0.005
@@ -51,31 +52,34 @@ def linear_source(size: int) -> str:
         *read_turned,
         *(f"o[{e}] = add[{e}] + {v}" for e, v in zip(places, entries, strict=True)),
     ]
-    return f'''"""Linear systems of order {N}; generated, do not edit."""
+    source = f'''"""Linear systems of order {N}; generated, do not edit."""
 
 import math
 
 import numba
 import numpy as np
+{SELECT}
+inlined = numba.njit(
+    cache=True, nogil=True, error_model="numpy", forceinline=True, no_cfunc_wrapper=True,
+    no_cpython_wrapper=True, fastmath={{"contract", "nsz", "arcp"}},
+)
 
-FAST = {{"contract", "nsz", "arcp"}}
 
-
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST)
+@inlined
 def _product(a, b, add, factor, o):
     for r in range({N}):
         for i in range({LANES}):
 {_indented(product)}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=FAST)
+@inlined
 def _turned(a, b, add, o):
     for r in range({N}):
         for i in range({LANES}):
 {_indented(turned)}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 def double(A, Q, P, stable, powers, forced):
     half = {N // 2}
     W = np.zeros((12, {area}))
@@ -136,9 +140,10 @@ def double(A, Q, P, stable, powers, forced):
             G[e] *= 0.5 * t
         for level in range(-halvings, {LEVELS}):
             if 0 <= level < {STEP_SIZES}:
-                powers[block, level] = E
-                forced[block, level, 0] = F
-                forced[block, level, 1] = G
+                for e in range({area}):
+                    powers[block, level, e] = E[e]
+                    forced[block, level, 0, e] = F[e]
+                    forced[block, level, 1, e] = G[e]
             if level + 1 < {STEP_SIZES}:
                 _product(E, G, F, 1.0, T)
                 for e in range({area}):
@@ -161,6 +166,7 @@ def double(A, Q, P, stable, powers, forced):
                 for c in range({N}):
                     P[first + i, r, c] = X[(r * {N} + c) * {LANES} + i]
 '''
+    return single_assignment(source)
 
 
 def _indented(lines: list[str]) -> str:

@@ -35,7 +35,7 @@ from undertow.models import (
     numbers,
 )
 from undertow.objective import Objective
-from undertow.symbolic import load_module, numba
+from undertow.symbolic import compiled, load_module
 
 #: Terms of the series of e^{|A|t} before a loop is too fast to bound.
 TERMS = 60
@@ -226,7 +226,7 @@ class TerminalLinearModel:
             _reach(into.A, into.powers, into.forced, self._bounded, into.reach)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _close(  # type: ignore[no-untyped-def]
     lanes,
     starts,
@@ -323,7 +323,7 @@ def _close(  # type: ignore[no-untyped-def]
                 Q[lane, i, j] = value
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _solve(a, b):  # type: ignore[no-untyped-def]
     """Overwrite b with a⁻¹ b: Gaussian elimination with partial pivoting; a is spoilt."""
     size, columns = b.shape
@@ -353,7 +353,7 @@ def _solve(a, b):  # type: ignore[no-untyped-def]
             b[k, j] = value / a[k, k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _reach(A, powers, forced, bounded, reach):  # type: ignore[no-untyped-def]
     """Write bounds of |F_ij(s)| for all 0 ≤ s ≤ t, for the times t of the ``powers``.
 

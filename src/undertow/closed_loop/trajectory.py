@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from undertow.base import at_least, checked, one_of, require_extra
 from undertow.models import FloatArray, Mechanism
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 if TYPE_CHECKING:
     from undertow.closed_loop.figures import MotionFigure
@@ -90,7 +90,7 @@ class Batch:
         return scores
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _score(cost, time, event, radius, horizon, scores):  # type: ignore[no-untyped-def]
     for i in range(len(scores)):
         if event[i] == Event.REACHED:

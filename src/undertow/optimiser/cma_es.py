@@ -14,9 +14,10 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from undertow.base import InvalidInputError, at_least, positive
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -109,7 +110,7 @@ class CMAES:
         self._factor()
 
     def _factor(self) -> None:
-        eigenvalues, basis = np.linalg.eigh(self.C)
+        eigenvalues, basis, _ = lapack.dsyevd(self.C, lower=1)
         self._basis = np.ascontiguousarray(basis)
         self._root = np.sqrt(np.maximum(eigenvalues, 1e-20))
 
@@ -139,33 +140,38 @@ class CMAES:
             x[order[: self.weights.size]], self.weights, rates, self.generation, self.scale,
             self.sigma, self.mean, self.path_sigma, self.path_c, self.C, self._basis, self._root,
         )  # fmt: skip
+        self._factor()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _adapt(  # type: ignore[no-untyped-def]
     x, weights, rates, generation, scale, sigma, mean, path_sigma, path_c, C, basis, root
 ):
-    """Update everything but sigma in place from the best candidates; return the new sigma."""
+    """Update mean, paths and C in place from the best candidates; return the new sigma."""
     c_sigma, d_sigma, c_c, c_1, c_mu, mu_eff, chi = rates
     mu, d = x.shape
-    y = (x - mean) / (sigma * scale)
-    step = np.zeros(d)
-    for k in range(mu):
-        step += weights[k] * y[k]  # (41)
-    mean += sigma * scale * step  # (42)
-    whitened = np.zeros(d)
+    y, step, whitened = np.empty((mu, d)), np.zeros(d), np.zeros(d)
+    for i in range(d):
+        for k in range(mu):
+            y[k, i] = (x[k, i] - mean[i]) / (sigma * scale[i])
+            step[i] += weights[k] * y[k, i]  # (41)
+        mean[i] += sigma * scale[i] * step[i]  # (42)
     for k in range(d):
         along = 0.0
         for i in range(d):
             along += basis[i, k] * step[i]
-        whitened += basis[:, k] * (along / root[k])
-    path_sigma *= 1 - c_sigma
-    path_sigma += math.sqrt(c_sigma * (2 - c_sigma) * mu_eff) * whitened  # (43)
-    norm = math.sqrt(np.sum(path_sigma * path_sigma))
+        for i in range(d):
+            whitened[i] += basis[i, k] * (along / root[k])
+    square, pace = 0.0, math.sqrt(c_sigma * (2 - c_sigma) * mu_eff)
+    for i in range(d):
+        path_sigma[i] = path_sigma[i] * (1 - c_sigma) + pace * whitened[i]  # (43)
+        square += path_sigma[i] * path_sigma[i]
+    norm = math.sqrt(square)
     expected = math.sqrt(1 - (1 - c_sigma) ** (2 * generation)) * chi
     stalled = 1.0 if norm / expected < 1.4 + 2 / (d + 1) else 0.0
-    path_c *= 1 - c_c
-    path_c += stalled * math.sqrt(c_c * (2 - c_c) * mu_eff) * step  # (45)
+    pace = stalled * math.sqrt(c_c * (2 - c_c) * mu_eff)
+    for i in range(d):
+        path_c[i] = path_c[i] * (1 - c_c) + pace * step[i]  # (45)
     forget = (1 - stalled) * c_c * (2 - c_c)
     for i in range(d):
         for j in range(d):
@@ -173,10 +179,6 @@ def _adapt(  # type: ignore[no-untyped-def]
             for k in range(mu):
                 value += c_mu * weights[k] * y[k, i] * y[k, j]
             C[i, j] = value  # (47)
-    eigenvalues, vectors = np.linalg.eigh(C)
-    basis[:] = vectors
-    for k in range(d):
-        root[k] = math.sqrt(max(eigenvalues[k], 1e-20))
     return sigma * math.exp(min(1.0, c_sigma / d_sigma * (norm / chi - 1)))  # (44)
 
 

@@ -17,7 +17,7 @@ from undertow.base import InvalidInputError, check_fields, positive
 from undertow.closed_loop import ClosedLoop
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 
 @dataclass(frozen=True)
@@ -150,19 +150,19 @@ class SearchSpace:
         return Plan(surfaces, self.freedom.times, laws)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _decode(rows, base, places, width, fastest, vectors, gains):  # type: ignore[no-untyped-def]
-    m = gains.shape[2] // 2
+    m, free = gains.shape[2] // 2, len(places)
     for k in range(rows.shape[0]):
         for segment in range(rows.shape[1]):
-            row, vector = rows[k, segment], vectors[k, segment]
-            vector[:] = 0.0
-            vector[: len(base)] = base
-            for j in range(len(places)):
-                vector[places[j]] = width[j] * math.sinh(max(-15.0, min(15.0, row[j])))
+            for j in range(vectors.shape[2]):
+                vectors[k, segment, j] = base[j] if j < len(base) else 0.0
+            for j in range(free):
+                z = max(-15.0, min(15.0, rows[k, segment, j]))
+                vectors[k, segment, places[j]] = width[j] * math.sinh(z)
             for j in range(m):
-                eta = math.exp(max(-5.0, min(10.0, row[len(places) + j])))
-                logit = max(-14.0, min(14.0, row[len(places) + m + j]))
+                eta = math.exp(max(-5.0, min(10.0, rows[k, segment, free + j])))
+                logit = max(-14.0, min(14.0, rows[k, segment, free + m + j]))
                 rate = 1.0 + (fastest - 1.0) / (1.0 + math.exp(-logit))
                 gains[k, segment, j] = eta
                 gains[k, segment, m + j] = eta / rate

@@ -30,7 +30,7 @@ from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
 from undertow.optimiser.search_space import SearchSpace
 from undertow.optimiser.trust_region import TrustRegion
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 if TYPE_CHECKING:
     from undertow.optimiser import Optimiser
@@ -637,7 +637,7 @@ def _among(count: int, stable: NDArray[np.intp], scores: FloatArray) -> FloatArr
     return every
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _guide(  # type: ignore[no-untyped-def]
     event, cost, radius, closest, closest_time, terminal, best, seek, guide
 ):

@@ -10,17 +10,21 @@ fewer generations than a covariance takes to adapt; a rough one is better left t
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import lapack
 
 from undertow.optimiser.cma_es import FloatArray, check_start
-from undertow.symbolic import numba
+from undertow.symbolic import compiled
 
 #: Lengths tried along a step of the model.
 STRETCHES = np.array([0.35, 0.7, 1.0, 1.4, 2.0, 3.0])
 
 #: Costs from here on are penalties and stay out of the model.
 PENALTY = 1e8
+
+_upper = lru_cache(maxsize=16)(np.triu_indices)
 
 
 class TrustRegion:
@@ -93,20 +97,24 @@ class TrustRegion:
             self.step[:] = 0.0
             self.radius *= 0.5
             return
-        length = _model_step(self._x[: self._count], self._f, self.best_x, self.best_f, self.step)
+        known = self._x[: self._count], self._f[: self._count]
+        self.step[:] = _model_step(*known, self.best_x, self.best_f)
+        length = math.sqrt(float((self.step * self.step).sum()))
         self.radius = min(max(0.5 * length, 0.01), 0.3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _spread_out(centre, step, lengths, radius, drawn, x):  # type: ignore[no-untyped-def]
     """Write candidates: lengths along the step, then a design around its end."""
     d, first = len(centre), len(lengths)
     for k in range(first):
         for j in range(d):
             x[k, j] = centre[j] + lengths[k] * step[j]
-    norm = np.empty(len(drawn))
+    norm = np.zeros(len(drawn))
     for k in range(len(drawn)):
-        norm[k] = math.sqrt(np.sum(drawn[k] * drawn[k]))
+        for j in range(d):
+            norm[k] += drawn[k, j] * drawn[k, j]
+        norm[k] = math.sqrt(norm[k])
     for k in range(first, len(x)):
         axis = k - first
         for j in range(d):
@@ -120,7 +128,7 @@ def _spread_out(centre, step, lengths, radius, drawn, x):  # type: ignore[no-unt
             x[k, j] = centre[j] + step[j] + radius * way
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _learn(x, f, known_x, known_f, count):  # type: ignore[no-untyped-def]
     """Keep what is no penalty; return how many are known now, and the best of the new ones."""
     best = -1
@@ -128,34 +136,57 @@ def _learn(x, f, known_x, known_f, count):  # type: ignore[no-untyped-def]
         if f[k] < np.inf and (best < 0 or f[k] < f[best]):
             best = k
         if f[k] < PENALTY:
-            known_x[count] = x[k]
+            for j in range(x.shape[1]):
+                known_x[count, j] = x[k, j]
             known_f[count] = f[k]
             count += 1
     return count, best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _model_step(known_x, known_f, best_x, best_f, step):  # type: ignore[no-untyped-def]
-    """Fit a quadratic to the costs near the best one; write its trust-region step.
-
-    Returns the length of the step.
-    """
-    known, d = known_x.shape
+def _model_step(
+    known_x: FloatArray, known_f: FloatArray, best_x: FloatArray, best_f: float
+) -> FloatArray:
+    """Fit a quadratic to the costs near the best one; return its trust-region step."""
+    d = best_x.size
     terms = (d + 1) * (d + 2) // 2
-    count, scale = min(known, 3 * terms), abs(best_f)
-    away = np.empty(known)
-    for i in range(known):
-        away[i] = math.sqrt(np.sum((known_x[i] - best_x) ** 2))
-    near = np.argsort(away, kind="mergesort")[:count]
-    distance, f, x = away[near], known_f[near] - best_f, np.empty((count, d))
-    for i in range(count):
-        x[i] = known_x[near[i]] - best_x
-    reach = max(distance[min(count - 1, terms + 3)], 1e-6)
-    normal = np.zeros((terms, terms))
-    right = np.zeros(terms)
+    beside = known_x - best_x
+    away = np.sqrt((beside * beside).sum(axis=1))
+    near = np.argsort(away, kind="stable")[: 3 * terms]
+    reach = max(float(away[near[min(len(near) - 1, terms + 3)]]), 1e-6)
+    normal, right = np.zeros((terms, terms)), np.zeros(terms)
+    _normal_equations(
+        beside[near], away[near], known_f[near] - best_f, reach, best_f, normal, right
+    )
+    _, _, c, singular = lapack.dgesv(normal, right)
+    H = np.zeros((d, d))
+    H[_upper(d)] = c[d + 1 :]
+    curvature, basis, unsolved = lapack.dsyevd(H + H.T, lower=1)
+    if singular or unsolved:
+        return np.zeros(d)
+    slope = basis.T @ c[1 : d + 1]
+    top = max(abs(curvature[0]), abs(curvature[-1]), 1e-300)
+    bent, push = np.maximum(curvature, 1e-3 * top), 0.0
+    for _ in range(60):
+        y = -slope / (bent + push)
+        size = math.sqrt((y * y).sum())
+        if size <= 1.5:
+            break
+        push = max(1.5 * push, 1e-3 * top)
+    if not size < 1e3:
+        return np.zeros(d)
+    return np.asarray((basis * y * reach).sum(axis=1))
+
+
+@compiled()
+def _normal_equations(x, distance, f, reach, best_f, normal, right):  # type: ignore[no-untyped-def]
+    """Add up the normal equations, a little regularised, of a quadratic around the best one.
+
+    Its coefficients: the constant, the slopes, and the second-order terms row by row.
+    """
+    d, terms = x.shape[1], len(right)
     row = np.empty(terms)
-    for i in range(count):
-        far, high = distance[i] / reach, f[i] / (0.5 * scale + 1e-9)
+    for i in range(len(f)):
+        far, high = distance[i] / reach, f[i] / (0.5 * abs(best_f) + 1e-9)
         weight = (1.0 / (1.0 + far**4) + 1e-3) / (1.0 + high * high)
         row[0] = 1.0
         k = d + 1
@@ -174,34 +205,3 @@ def _model_step(known_x, known_f, best_x, best_f, step):  # type: ignore[no-unty
         trace += normal[a, a]
     for a in range(terms):
         normal[a, a] += 1e-9 * trace / terms
-    c = np.linalg.solve(normal, right)
-    H = np.zeros((d, d))
-    k = d + 1
-    for a in range(d):
-        for b in range(a, d):
-            H[a, b] += c[k]
-            H[b, a] += c[k]
-            k += 1
-    curvature, basis = np.linalg.eigh(H)
-    slope = basis.T @ c[1 : d + 1]
-    top = max(abs(curvature[0]), abs(curvature[-1]), 1e-300)
-    push, size = 0.0, 0.0
-    y = np.empty(d)
-    for _ in range(60):
-        size = 0.0
-        for a in range(d):
-            y[a] = -slope[a] / (max(curvature[a], 1e-3 * top) + push)
-            size += y[a] * y[a]
-        size = math.sqrt(size)
-        if size <= 1.5:
-            break
-        push = max(1.5 * push, 1e-3 * top)
-    if not size < 1e3:
-        y[:] = 0.0
-    length = 0.0
-    for a in range(d):
-        step[a] = 0.0
-        for b in range(d):
-            step[a] += basis[a, b] * y[b] * reach
-        length += step[a] * step[a]
-    return math.sqrt(length)

@@ -3,9 +3,10 @@
 from undertow.symbolic.c99 import C99Emitter, Real, literal
 from undertow.symbolic.expressions import parse_expression
 from undertow.symbolic.function import COMPILED, PREAMBLE, function_source
-from undertow.symbolic.machine import numba, processor
+from undertow.symbolic.machine import compiled, numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
+from undertow.symbolic.single_assignment import SELECT, single_assignment
 from undertow.symbolic.store import (
     content_key,
     generated,
@@ -22,6 +23,7 @@ __all__ = [
     "BRIEF",
     "COMPILED",
     "PREAMBLE",
+    "SELECT",
     "C99Emitter",
     "Emitter",
     "Real",
@@ -29,6 +31,7 @@ __all__ = [
     "Workspace",
     "compile_expressions",
     "compile_numpy",
+    "compiled",
     "content_key",
     "distinct",
     "docstring",
@@ -41,6 +44,7 @@ __all__ = [
     "processor",
     "recall",
     "remember",
+    "single_assignment",
     "sources_digest",
     "unpacked",
 ]

@@ -12,29 +12,44 @@ its generated modules are kept where nobody else can write, see :mod:`undertow.s
 
 Before numba loads what it keeps it imports all that it would need to compile, for a quarter of a
 second and 25 MB; machine code needs its runtime alone, and here gets no more.
+
+What numba builds while it compiles is there until the end: looking for garbage in it would take a
+tenth of the time.  So would functions for callers in C, which :data:`compiled` leaves out, and
+finding again and again what type a sum of two numbers has would take more.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import platform
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
 from numba.core import caching as numba_caching
+from numba.core import event as numba_event
 from numba.core.runtime.nrt import rtsys
+from numba.core.types import functions as numba_functions
 
 from undertow.symbolic.private import is_private, private_folder
 
-__all__ = ["numba", "processor"]
+__all__ = ["compiled", "numba", "processor"]
 
 PACKAGE = Path(__file__).resolve().parent.parent
 
 #: numba's own modules have no types.
 caching: Any = numba_caching
+functions: Any = numba_functions
+event: Any = numba_event
+
+#: Decorator of the functions of this package that are compiled: no lock of the interpreter, no
+#: exceptions.
+compiled: Any = partial(
+    numba.njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True
+)
 
 
 def _widen() -> None:
@@ -112,7 +127,45 @@ def _loading(usual: Any) -> Any:
     return load_overload
 
 
+class _NoCollection(event.Listener):  # type: ignore[misc]
+    """Switches the collection of garbage off while something is compiled."""
+
+    def __init__(self) -> None:
+        self._depth, self._collects = 0, False
+
+    def on_start(self, event: object) -> None:
+        if self._depth == 0:
+            self._collects = gc.isenabled()
+            gc.disable()
+        self._depth += 1
+
+    def on_end(self, event: object) -> None:
+        self._depth -= 1
+        if self._depth == 0 and self._collects:
+            gc.enable()
+
+
+def _remembering(usual: Any) -> Any:
+    """Return how numba types a call, for operators with what it found the last time.
+
+    It types all that a function holds until nothing changes any more, three times or more.
+    A function type never changes: where overloads are added, there is a new one.
+    """
+
+    def get_call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws or getattr(function.typing_key, "__module__", "") != "_operator":
+            return usual(function, context, args, kws)
+        known = vars(function).setdefault("_known", {})
+        if args not in known:
+            known[args] = usual(function, context, args, kws)
+        return known[args]
+
+    return get_call_type
+
+
 _widen()
+event.register("numba:compile", _NoCollection())
+functions.BaseFunction.get_call_type = _remembering(functions.BaseFunction.get_call_type)
 caching.Cache.load_overload = _loading(caching.Cache.load_overload)
 # The list is searched from its beginning; other people's functions pass ours by.
 (getattr(caching, "CacheImpl", None) or caching._CacheImpl)._locator_classes.insert(
