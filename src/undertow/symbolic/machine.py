@@ -15,7 +15,8 @@ second and 25 MB; machine code needs its runtime alone, and here gets no more.
 
 What numba builds while it compiles is there until the end: looking for garbage in it would take a
 tenth of the time.  So would functions for callers in C, which :data:`compiled` leaves out, and
-finding again and again what type a sum of two numbers has would take more.
+finding again and again what type a sum of two numbers has would take more.  All of this is for
+functions of this package alone; other people's are compiled as ever.
 """
 
 from __future__ import annotations
@@ -70,9 +71,13 @@ class _PrivateLocator(caching._SourceFileBackedLocatorMixin, caching._CacheLocat
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> Any:
-        path = Path(file).resolve()
-        ours = path.is_relative_to(PACKAGE) or path.parent == private_folder()
-        return super().from_function(function, file) if ours else None
+        return super().from_function(function, file) if _is_ours(file) else None
+
+
+def _is_ours(file: str) -> bool:
+    """Whether a source is of this package or one of its generated modules."""
+    path = Path(file).resolve()
+    return path.is_relative_to(PACKAGE) or path.parent == private_folder()
 
 
 @lru_cache(maxsize=64)
@@ -127,22 +132,26 @@ def _loading(usual: Any) -> Any:
     return load_overload
 
 
-class _NoCollection(event.Listener):  # type: ignore[misc]
-    """Switches the collection of garbage off while something is compiled."""
+class _Sooner(event.Listener):  # type: ignore[misc]
+    """While a function of ours is compiled: no collection of garbage, and types are remembered."""
 
     def __init__(self) -> None:
-        self._depth, self._collects = 0, False
+        self._inside: list[bool] = []
+        self._collects = False
 
-    def on_start(self, event: object) -> None:
-        if self._depth == 0:
+    def on_start(self, event: Any) -> None:
+        ours = any(self._inside) or _is_ours(event.data["dispatcher"].py_func.__code__.co_filename)
+        if ours and not any(self._inside):
             self._collects = gc.isenabled()
             gc.disable()
-        self._depth += 1
+            functions.BaseFunction.get_call_type = _remembering(_USUAL)
+        self._inside.append(ours)
 
-    def on_end(self, event: object) -> None:
-        self._depth -= 1
-        if self._depth == 0 and self._collects:
-            gc.enable()
+    def on_end(self, event: Any) -> None:
+        if self._inside.pop() and not any(self._inside):
+            functions.BaseFunction.get_call_type = _USUAL
+            if self._collects:
+                gc.enable()
 
 
 def _remembering(usual: Any) -> Any:
@@ -164,8 +173,8 @@ def _remembering(usual: Any) -> Any:
 
 
 _widen()
-event.register("numba:compile", _NoCollection())
-functions.BaseFunction.get_call_type = _remembering(functions.BaseFunction.get_call_type)
+_USUAL = functions.BaseFunction.get_call_type
+event.register("numba:compile", _Sooner())
 caching.Cache.load_overload = _loading(caching.Cache.load_overload)
 # The list is searched from its beginning; other people's functions pass ours by.
 (getattr(caching, "CacheImpl", None) or caching._CacheImpl)._locator_classes.insert(
