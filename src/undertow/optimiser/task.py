@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,7 @@ from undertow.law import Margin, Plan, stability_margin
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
+from undertow.optimiser.fitting import fits
 from undertow.optimiser.following import Follower
 from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
@@ -497,14 +499,16 @@ class Optimisation:
             return np.where(sound[:, None], batch.x, np.inf)
 
         def exact(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
-            vectors, gains = space.decode(z[None])
+            self.evaluations += math.ceil(len(z) * time / motion.time)
+            vectors, gains = space.decode(z)
             batch = loop.batch(
                 x, vectors, reaching=gains, duration=time, terminal=0.0, precise=True
             )
-            sound = int(batch.event[0]) == Event.HORIZON
-            return np.asarray(batch.x[0]) if sound else np.full_like(x, np.inf)
+            sound = (batch.event == Event.HORIZON) & np.isfinite(batch.x).all(axis=1)
+            return np.where(sound[:, None], batch.x, np.inf)
 
-        follower = Follower(draw, states, exact, arrival, period, loop.step)
+        fit = partial(fits, space, self.optimiser.anchor)
+        follower = Follower(draw, fit, states, exact, arrival, period, loop.step)
         found = follower.follow(motion)
         if found is None:
             return None
