@@ -61,12 +61,16 @@ class ArrivalSearch:
         ‖state‖₂ that counts as arrived.
     without
         Whether so many evaluations cannot be had any more.
+    shorter, fewest
+        T after an arrival, as a part of the one before; how many members remain at least.
     """
 
     states: States
     admits: Callable[[FloatArray], NDArray[np.bool_]]
     radius: float
     without: Callable[[int], bool] = lambda _: False
+    shorter: float = SHORTER
+    fewest: int = FEWEST
 
     def run(self, z: FloatArray, T: float, members: int) -> None:
         """Search from those of some parameters (N, d) that are nearest at T, s."""
@@ -83,8 +87,8 @@ class ArrivalSearch:
                 if not good.any():
                     z, x, t, damping = z[left], x[left], t[left], damping[left]
                     continue
-                quiet, T, z = 0, SHORTER * float(t[good].min()), z[left]
-                z, x, t = nearest(z, *self.states(z, T), max(FEWEST, int(REMAIN * len(z))))
+                quiet, T, z = 0, self.shorter * float(t[good].min()), z[left]
+                z, x, t = nearest(z, *self.states(z, T), max(self.fewest, int(REMAIN * len(z))))
                 damping = np.full(len(z), 1e-2)
             else:
                 quiet += 1

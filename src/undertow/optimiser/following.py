@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,26 @@ FOLLOWS, ACCEPTED, CLOSE = 0.05, 0.5, 0.97
 #: The last piece is up to so many times as long as the others; when to look for its arrival, in
 #: parts of what is left of the motion, and how many of these while there may be shorter pieces.
 LAST, AFTER, BEFORE = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 3
+
+
+#: Pieces of a motion at least, where the steps allow.
+PIECES = 6
+
+
+def refined(times: Sequence[float], period: float, end: float, step: float) -> tuple[float, ...]:
+    """Return times before an end, s, with all multiples of a period, and the longest pieces halved.
+
+    Until there are ``PIECES``, or none is longer than ``SHORTEST`` steps.
+    """
+    multiples = [round(k * period, 9) for k in range(math.ceil(end / period - 1e-9))]
+    edges = sorted({*times, *multiples, end})
+    while len(edges) <= PIECES:
+        k = int(np.argmax(np.diff(edges)))
+        middle = step * round((edges[k] + edges[k + 1]) / 2 / step)
+        if edges[k + 1] - edges[k] <= SHORTEST * step:
+            break
+        edges.insert(k + 1, round(middle, 9))
+    return tuple(edges[:-1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,8 +40,14 @@ PROGRAMS = 200
 #: time shrinks, and in the end.
 FUNNEL, CLOSED = 0.1, 1e-4
 
+#: How much narrower a funnel wider than that gets with each step.
+NARROWS = 0.9
+
 #: Part of the terminal radius that is aimed for, and what missing it by itself counts as a gap.
 INSIDE, MISS = 0.8, 0.05
+
+#: How long a faster motion takes, in parts of what it is guessed from.
+SOONER = 0.85
 
 #: Step of the differences of the derivatives, in parts of the scales.
 PROBE = 1e-6
@@ -81,6 +87,17 @@ class OpenLoopMotion:
         states[0] = x
         pieces = ((nodes[1:] + nodes[:-1]) / 2 / self.time * NODES).astype(int)
         return OpenLoopMotion(self.time - t, states, self.u[np.minimum(pieces, NODES - 1)])
+
+    def faster(self) -> OpenLoopMotion:
+        """Return the same path in less time, a guess: there may be an earlier arrival nearby."""
+        x, n = self.x.copy(), self.x.shape[1] // 2
+        x[1:, n:] /= SOONER
+        return OpenLoopMotion(SOONER * self.time, x, self.u)
+
+    def mirrored(self) -> OpenLoopMotion:
+        """Return it reflected in the straight line to its end, a guess: the other way round."""
+        straight = np.linspace(self.x[0], np.zeros_like(self.x[0]), NODES + 1)
+        return OpenLoopMotion(self.time, 2 * straight - self.x, -self.u)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +224,7 @@ class EarliestArrival:
                 retries, trust, funnel = retries + 1, TRUST, 0.3 * total
                 continue
             gain = 1.0 - nT / T
+            funnel = max(min(FUNNEL, funnel), NARROWS * funnel)
             x, u, T = nx, nu, nT
             scale = sized(x)
             gap, total = gaps(x, u, T)
