@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.models import FloatArray
-from undertow.optimiser.arrival import TRIALS, closer, nearest
+from undertow.optimiser.arrival import closer, nearest
 from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 
 #: Surfaces that are drawn for each piece, those of them that are improved, and the most steps; and

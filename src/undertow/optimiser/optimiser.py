@@ -130,7 +130,7 @@ class Optimiser:
             return given
         size = self.space.size
         if warm and self.freedom.schedule:
-            return Budget(8192)
+            return Budget(16384 // self.loop.mechanism.n)
         if warm:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
         if self.counts_time:

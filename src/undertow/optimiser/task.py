@@ -90,9 +90,10 @@ SOONER = ((0.6, True), (0.75, True), (0.88, False), (0.97, False))
 LATER = ((1.0, False), (1.1, False), (1.25, False), (1.6, True), (2.5, True), (4.0, True))
 
 #: T after an arrival, as a part of the one before, at first and in the end; members that remain;
-#: ways to sway a schedule, and how far they go; evaluations for a single surface where all fails.
+#: ways to sway a schedule, and how far they go; evaluations for a single surface where all fails,
+#: and twice as many without any plan.
 HURRY, UNHURRIED = 0.9, 0.98
-FEWEST, WAYS, SWAY, ALONE = 4, 3, (0.02, 0.5), 2048
+FEWEST, WAYS, SWAY, ALONE = 4, 3, (0.02, 0.5), 1024
 
 #: Draws of a schedule's surfaces: the largest factor of their gain, as its logarithm.
 STRONG = 5.0
@@ -364,11 +365,11 @@ class Optimisation:
         if self._unscored is not None:
             self.cost(here[None])
         if self.optimiser.freedom.schedule:
-            if not self.lead_back(incumbent):
-                self._earlier(min(POLISH, self.left))
-                self.arrive_earlier(keep=max(0, self.left - ALONE))
-                return self.best is not None and self.lead_back(self.best)
-            return True
+            if self.lead_back(incumbent):
+                return True
+            alone = ALONE if self.best_cost < INADMISSIBLE else 2 * ALONE
+            self.arrive_earlier(keep=max(0, self.left - alone))
+            return self.best is not None and self.lead_back(self.best)
         if not self.best_cost < INADMISSIBLE:
             self._look_around(here)
         if not self.optimiser.aims:
@@ -471,33 +472,39 @@ class Optimisation:
             long = float(loop.batch(self.x, best, duration=self.horizon, seek=True).closest_time[0])
         if long <= loop.step:
             return
-        low, high = loop.objective.range_of(loop.mechanism)
-        arrival = EarliestArrival(
-            loop.mechanism,
-            loop.objective.terminal_radius,
-            low,
-            high,
-            lambda: self.left <= keep or self.late(),
-        )
         recorded = loop.simulate(self.x, best, duration=long)
+        arrival = self._arrival(keep)
         motion = arrival.improve(OpenLoopMotion.of(recorded, long))
         if motion is None:
             return
         earliest = motion.time
-        self._follow(arrival, motion)
+        self._follow(motion, keep)
         yield self.best_cost <= AS_EARLY * earliest
         for guess in (motion.faster(), motion.mirrored()):
             other = arrival.improve(guess)
             if other is not None and other.time < earliest / AS_EARLY:
                 earliest = other.time
-                self._follow(arrival, other)
+                self._follow(other, keep)
                 yield self.best_cost <= AS_EARLY * earliest
 
-    def _follow(self, arrival: EarliestArrival, motion: OpenLoopMotion) -> None:
-        """Look for a schedule that follows a motion, where that is earlier than the best plan."""
+    def _arrival(self, keep: int) -> EarliestArrival:
+        """The task over all inputs, as long as more evaluations than these are left."""
+        loop = self.loop
+        low, high = loop.objective.range_of(loop.mechanism)
+        radius = loop.objective.terminal_radius
+        return EarliestArrival(
+            loop.mechanism, radius, low, high, lambda: self.left <= keep or self.late()
+        )
+
+    def _follow(self, motion: OpenLoopMotion, keep: int) -> None:
+        """Look for a schedule that follows a motion, where that is earlier than the best plan.
+
+        So many evaluations are left over, and others for further motions.
+        """
         if motion.time < (1.0 - WORTHWHILE) * self.best_cost - self.resolution:
             for _ in range(TRIES):
-                plan = self._schedule(arrival, motion)
+                share = (self.left - keep) // TRIES
+                plan = self._schedule(self._arrival(self.left - share), motion)
                 if plan is not None:
                     self._consider(plan)
                     self.lead_back(plan)
@@ -524,9 +531,7 @@ class Optimisation:
             self._lead_back(self.best, UNHURRIED * before, UNHURRIED)
         return kept or self.best_cost <= T
 
-    def _lead_back(
-        self, incumbent: Plan, T: float, shorter: float, designs: bool = False
-    ) -> None:
+    def _lead_back(self, incumbent: Plan, T: float, shorter: float, designs: bool = False) -> None:
         """Search for arrivals until T, s, around a plan and the same plan, stretched.
 
         Or around the designs.
@@ -573,13 +578,12 @@ class Optimisation:
     def _ended(self, plan: Plan, arrives: float) -> Plan:
         """Return a plan with the first design taking over at the next multiple of the period."""
         period = self.optimiser.freedom.schedule
-        end = round(period * math.ceil(arrives / period + 1e-9), 9)
+        end = round(period * math.ceil(arrives / period - 1e-9), 9)
         count = sum(t < end - 1e-9 for t in plan.times)
-        anchor = self.space.plan(*(part[0] for part in self.space.decode(self.optimiser.firsts[:1])))
+        vectors, gains = self.space.decode(self.optimiser.firsts[:1])
+        anchor = self.space.plan(vectors[0], None if gains is None else gains[0])
         laws = plan.laws(self.loop.reaching)[:count] + anchor.laws(self.loop.reaching)
-        return Plan(
-            plan.surfaces[:count] + anchor.surfaces, (*plan.times[:count], end), laws
-        )
+        return Plan(plan.surfaces[:count] + anchor.surfaces, (*plan.times[:count], end), laws)
 
     def _schedule(self, arrival: EarliestArrival, motion: OpenLoopMotion) -> Plan | None:
         """Return surfaces that follow a motion, the last but one of which arrives.
