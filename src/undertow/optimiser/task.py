@@ -369,7 +369,8 @@ class Optimisation:
                 return True
             alone = ALONE if self.best_cost < INADMISSIBLE else 2 * ALONE
             self.arrive_earlier(keep=max(0, self.left - alone))
-            return self.best is not None and self.lead_back(self.best)
+            found = self.best
+            return found is not None and found is not incumbent and self.lead_back(found)
         if not self.best_cost < INADMISSIBLE:
             self._look_around(here)
         if not self.optimiser.aims:
@@ -517,12 +518,12 @@ class Optimisation:
         come first.  Returns whether it was kept or there is an arrival now.
         """
         promised, before = incumbent.times[-1], self.best_cost
-        kept = before <= promised or not promised
-        if kept and before <= self.loop.step:
-            return True
+        kept = before <= promised or (not promised and before < INADMISSIBLE)
+        if not (kept or promised) or before <= self.loop.step:
+            return kept
         first, tries = (before, SOONER) if kept else (promised, LATER)
         for part, designs in tries:
-            T = part * first
+            T = min(part * first, self.horizon)
             self._lead_back(incumbent, T, HURRY, designs)
             if self.best_cost < before:
                 break
