@@ -77,7 +77,7 @@ class ArrivalSearch:
         if self.without(len(z)):
             return
         z, x, t = nearest(z, *self.states(z, T), members)
-        damping, quiet = np.full(len(z), 1e-2), 0
+        damping, quiet, earliest = np.full(len(z), 1e-2), 0, np.inf
         while quiet < PATIENCE and len(z) and not self.without(len(z) * (z.shape[1] + len(TRIALS))):
             arrived = np.linalg.norm(x, axis=1) <= self.radius
             if arrived.any():
@@ -87,7 +87,10 @@ class ArrivalSearch:
                 if not good.any():
                     z, x, t, damping = z[left], x[left], t[left], damping[left]
                     continue
-                quiet, T, z = 0, self.shorter * float(t[good].min()), z[left]
+                now = float(t[good].min())
+                # In whole steps a short T may stay as it is: then an arrival is no news.
+                quiet, earliest = 0 if now < earliest else quiet + 1, min(now, earliest)
+                T, z = self.shorter * now, z[left]
                 z, x, t = nearest(z, *self.states(z, T), max(self.fewest, int(REMAIN * len(z))))
                 damping = np.full(len(z), 1e-2)
             else:

@@ -26,7 +26,7 @@ from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
 from undertow.optimiser.fitting import fits
-from undertow.optimiser.following import Follower, refined
+from undertow.optimiser.following import SHORTEST, Follower, refined
 from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
 from undertow.optimiser.search_space import DecisionVariables, SearchSpace
@@ -94,6 +94,9 @@ LATER = ((1.0, False), (1.1, False), (1.25, False), (1.6, True), (2.5, True), (4
 #: and twice as many without any plan.
 HURRY, UNHURRIED = 0.9, 0.98
 FEWEST, WAYS, SWAY, ALONE = 4, 3, (0.02, 0.5), 1024
+
+#: What a motion integrated to the tolerance counts as, in evaluations: it takes as long.
+EXACT = 16
 
 #: Draws of a schedule's surfaces: the largest factor of their gain, as its logarithm.
 STRONG = 5.0
@@ -519,7 +522,7 @@ class Optimisation:
         """
         promised, before = incumbent.times[-1], self.best_cost
         kept = before <= promised or (not promised and before < INADMISSIBLE)
-        if not (kept or promised) or before <= self.loop.step:
+        if not (kept or promised) or before <= SHORTEST * self.loop.step:  # nothing, all but there
             return kept
         first, tries = (before, SOONER) if kept else (promised, LATER)
         for part, designs in tries:
@@ -553,7 +556,7 @@ class Optimisation:
             z = np.tile(self.optimiser.firsts, space.segments)
 
         def admits(z: FloatArray) -> NDArray[np.bool_]:
-            self.evaluations += len(z)
+            self.evaluations += EXACT * len(z)
             vectors, gains = space.decode(z)
             batch = loop.batch(
                 self.x, vectors, reaching=gains, switch_times=times, duration=T, precise=True
@@ -634,7 +637,7 @@ class Optimisation:
     def _consider(self, plan: Plan) -> None:
         """Score a plan that the coordinates cannot express, and keep it where it is the best."""
         batch = self.loop.batch(self.x, plan, duration=self.horizon, stable_only=True, precise=True)
-        self.evaluations += 1
+        self.evaluations += EXACT
         score = float(batch.score(self.horizon)[0])
         if score < self.best_cost and stability_margin(self.loop.mechanism, plan.surfaces[-1]) > 0:
             self._best, self.best_z, self.best_cost = plan, self.space.encode(plan), score
