@@ -503,12 +503,11 @@ class Optimisation:
     def _follow(self, motion: OpenLoopMotion, keep: int) -> None:
         """Look for a schedule that follows a motion, where that is earlier than the best plan.
 
-        So many evaluations are left over, and others for further motions.
+        So many evaluations are left over.
         """
         if motion.time < (1.0 - WORTHWHILE) * self.best_cost - self.resolution:
             for _ in range(TRIES):
-                share = (self.left - keep) // TRIES
-                plan = self._schedule(self._arrival(self.left - share), motion)
+                plan = self._schedule(self._arrival(keep), motion)
                 if plan is not None:
                     self._consider(plan)
                     self.lead_back(plan)
