@@ -24,10 +24,10 @@ demo: $(STAMP) ## repeat the paper's experiment, tables and figures into results
 	$(BIN)/undertow reproduce --out results
 
 test: $(STAMP) ## run the tests, but for the slow ones
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 slow: $(STAMP) ## run the slow tests; having none is fine (pytest then exits with 5)
-	$(BIN)/python -m pytest -n $(WORKERS) -m slow || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow || [ $$? -eq 5 ]
 
 check: $(STAMP) ## formatting, lint, types, direction of imports
 	$(BIN)/ruff format --check .

@@ -53,7 +53,7 @@ from plants import (
 )
 from undertow.base import UndertowError
 from undertow.cascade.simulation import LEARNING, is_news
-from undertow.display.plot import state_words
+from undertow.closed_loop.figures import state_words
 from undertow.estimators import KalmanFilter
 from undertow.estimators.recorded_run import compensated
 from undertow.law import InnerLoop

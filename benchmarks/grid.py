@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 
 import undertow as ut
 from undertow.base import number, versions, write_files
-from undertow.display.plot import COLOURS, figure_files, state_words, style
+from undertow.closed_loop.figures import COLOURS, figure_files, state_words, style
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray
 from undertow.objective import objective_for

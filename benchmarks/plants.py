@@ -52,7 +52,7 @@ import undertow as ut
 from predictive import PERIOD, Acados, RealTimeIteration, Sampled
 from rivals import Box, DoMPC, Plant, ShootingMPC, tuned
 from undertow.base import UndertowError
-from undertow.display.plot import state_words
+from undertow.closed_loop.figures import state_words
 from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray
 from undertow.objective.objective import TRAVEL

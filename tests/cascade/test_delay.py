@@ -13,6 +13,7 @@ from undertow.base import InvalidInputError
 from undertow.cascade import noise_share, robustness_gate
 from undertow.cascade.robustness import DelayGate, _exponential, delay_margin, feedback
 from undertow.law import InnerLoop, Plan
+from undertow.objective import objective_for
 from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
 from undertow.runtime.controller_defaults import NOISE, estimator_for, reaching_for
 
@@ -99,9 +100,9 @@ def test_a_weaker_motor_must_do(arm: ut.Mechanism) -> None:
     """Where the whole input is needed, a gate that wants a reserve refuses the plan."""
     edge = arm.state(phi=ut.deg(44))
     first = ut.first_surface(arm)
-    better = ut.Optimiser(ut.ClosedLoop(arm)).require(edge).plan
+    loop = ut.ClosedLoop(arm, objective_for(arm, "bench-energy"))  # others have its kernels
+    better = ut.Optimiser(loop).require(edge).plan
     assert better is not None
-    loop = ut.ClosedLoop(arm)
     old = Plan.of(first)
     assert robustness_gate(0.001, 0.0)(loop, old, better, edge, 60.0).accepted
     refused = robustness_gate(0.001, 0.2)(loop, old, better, edge, 60.0)

@@ -214,6 +214,7 @@ def test_the_next_gains_meet_what_those_before_have_left() -> None:
     assert 0.09 < off < 0.12
 
 
+@pytest.mark.slow  # a rig and a law of its own are compiled
 def test_a_pendubot_that_is_heavier_and_rubs_more_than_its_model_is_swung_up() -> None:
     """Without the pump its second link stayed hanging, whatever the gains: see law.py."""
     mechanism = ut.mechanisms.pendubot()

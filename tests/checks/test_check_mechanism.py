@@ -28,7 +28,7 @@ def test_every_mechanism_of_the_library_passes(name: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=() if name == "cart_pendulum" else pytest.mark.slow)
+        pytest.param(name, marks=() if name == "rotary_pendulum" else pytest.mark.slow)
         for name in sorted(LIBRARY)
     ],
 )
@@ -252,4 +252,6 @@ def test_the_report_prints_one_line_a_condition() -> None:
     failing = [line for line in text.splitlines() if "FAIL" in line]
     assert len(failing) == 2  # the equilibrium, and the potential it now disagrees with
     assert all(line.rstrip().endswith(("it out", "move_target")) for line in failing)
-    assert np.isfinite([c.value for c in check_mechanism(cart()).checks]).all()
+    assert np.isfinite(
+        [c.value for c in check_mechanism(ut.mechanisms.rotary_pendulum()).checks]
+    ).all()

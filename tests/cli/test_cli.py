@@ -142,12 +142,13 @@ def test_bad_input_is_refused_with_value_and_limit(
     assert limit in err
 
 
-def test_a_target_on_the_command_line(tmp_path: Path) -> None:
+def test_a_target_on_the_command_line() -> None:
     """Set-points one after another; the report says which, and what was reached."""
-    short = ("--objective", "bench-time", "--horizon", "6", "--start", "x=0m")
-    code, out, _ = run("simulate", CRANE, *short, "--target", "x=0.3m", "--target", "x=0m@1s")
+    short = ("--objective", "time", "--start", "phi=0deg", "--belief", "exact")
+    targets = ("--target", "theta=20deg", "--target", "theta=0deg@0.5s")
+    code, out, _ = run("simulate", RIG, *short, *targets)
     assert code == 0
-    assert "x=0.3m, x=0m@1s" in out
+    assert "theta=20deg, theta=0deg@0.5s" in out
     assert "begin another task" in " ".join(out.split())
 
 

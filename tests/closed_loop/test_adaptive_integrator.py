@@ -34,7 +34,16 @@ def accuracy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return accuracy
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", "pendubot", "two_motor_three_link"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rotary_pendulum",
+        *(  # kernels of their own
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("pendubot", "two_motor_three_link")
+        ),
+    ],
+)
 def test_motions_agree_with_a_reference_that_shares_no_code(
     accuracy: ModuleType, name: str
 ) -> None:
@@ -171,6 +180,15 @@ def test_a_motion_to_a_tolerance_is_the_same_each_time(rig: ut.Mechanism) -> Non
     batch = loops[0].batch(x0, [PASSING, ut.first_surface(rig), PASSING], precise=True)
     assert {runs[0].cost} == {batch.cost[0], batch.cost[2]}
     assert loops[0].simulate(x0, PASSING, every=10).time == runs[0].time == batch.time[0]
+
+
+def test_a_motion_ends_before_a_surface_that_takes_over_later(rig: ut.Mechanism) -> None:
+    """A plan's first piece alone is the same with the rest of the plan and without it."""
+    x0, loop = rig.state(phi=0.3), ut.ClosedLoop(rig, ut.MinimumEnergy())
+    plan = Plan((PASSING, ut.first_surface(rig)), (0.0, 30.0))
+    piece, alone = (loop.simulate(x0, what, duration=0.1) for what in (plan, PASSING))
+    assert piece.time == alone.time == pytest.approx(0.1)
+    np.testing.assert_array_equal(piece.x, alone.x)
 
 
 def test_fixed_steps_remain_for_those_who_want_them(rig: ut.Mechanism) -> None:

@@ -16,6 +16,7 @@ from undertow.closed_loop.ensemble import Risk, summarise
 from undertow.closed_loop.work_array import LANES
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
+from undertow.objective import objective_for
 
 HORIZON = 20.0
 
@@ -36,7 +37,8 @@ def plants(rig: ut.Mechanism) -> list[ut.Mechanism]:
 def loop(rig: ut.Mechanism, plants: list[ut.Mechanism]) -> ut.ClosedLoop:
     """The law of the nominal plant on all of them."""
     values = np.array([plant.parameter_values for plant in plants])
-    return ut.ClosedLoop(rig, ut.MinimumEnergy(horizon=HORIZON), ensemble=Ensemble(rig, values))
+    goal = objective_for(rig, "bench-energy", horizon=HORIZON)
+    return ut.ClosedLoop(rig, goal, ensemble=Ensemble(rig, values))
 
 
 @pytest.fixture(scope="module")

@@ -317,6 +317,7 @@ def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
             assert not line.strip().startswith(("if ", "for ", "while ", "break", "continue"))
 
 
+@pytest.mark.slow  # what is read from the cache shows no assembly: compiled for this alone
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="reads x86-64 instructions")
 def test_lane_loops_are_compiled_to_vectors() -> None:
     """The arithmetic of a step is packed: what is left as scalars runs once a block or a call."""

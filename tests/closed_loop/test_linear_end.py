@@ -76,8 +76,17 @@ def test_linear_ends_agree_with_scipy(build: Callable[[], ut.Mechanism]) -> None
     assert stable >= LANES // 2
 
 
-@pytest.mark.parametrize(("n", "m"), SHAPES)
-@pytest.mark.parametrize("members", [0, 2])
+@pytest.mark.parametrize(
+    ("n", "m", "members"),
+    [
+        *((2, 1, 0), (3, 2, 0), (2, 1, 2), (3, 2, 2)),
+        *(
+            pytest.param(n, m, members, marks=pytest.mark.slow)
+            for n, m in SHAPES if (n, m) not in ((2, 1), (3, 2))
+            for members in (0, 2)
+        ),
+    ],
+)  # fmt: skip
 def test_linear_models_are_those_of_the_law_and_the_plant(n: int, m: int, members: int) -> None:
     """A by central differences of plant and law, xᵀQx by the stage cost along the law, any n, m.
 

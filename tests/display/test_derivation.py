@@ -25,7 +25,12 @@ from undertow.law.sliding import singularity
 from undertow.mechanisms import LIBRARY
 from undertow.symbolic.formulas import plain, readable, tex
 
-NAMES = sorted(LIBRARY)
+#: A pendulum, three coordinates and two motors; the others are tried by the slow suite.
+QUICK = {"rotary_pendulum", "double_pendulum_on_a_cart", "two_motor_three_link"}
+NAMES = [
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+    for name in sorted(LIBRARY)
+]
 SIGMA = sp.Symbol("sigma", real=True)
 
 

@@ -188,6 +188,7 @@ def test_hard_input_limit_is_a_constraint_on_the_unclipped_law(rig: ut.Mechanism
     assert np.abs(demand).max() <= 4.0
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_hard_input_limit_that_no_surface_meets_is_refused(rig: ut.Mechanism) -> None:
     """The refusal carries what the best candidate broke, the limit and the remedy."""
     weak = rig.with_input_limit(0.3)

@@ -119,7 +119,7 @@ def test_a_plan_of_least_time_arrives_when_it_says(rivals: ModuleType, rig: ut.M
     assert abs(outcome.time - promised) < 0.02
 
 
-@pytest.mark.parametrize("goal", ["energy", "time"])
+@pytest.mark.parametrize("goal", ["energy", pytest.param("time", marks=pytest.mark.slow)])
 def test_fatrop_finds_the_plan_of_ipopt(rivals: ModuleType, rig: ut.Mechanism, goal: str) -> None:
     if shutil.which("gcc") is None:
         pytest.skip("needs gcc")

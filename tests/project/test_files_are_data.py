@@ -251,10 +251,10 @@ BAD: dict[str, tuple[Change, ...]] = {
 def test_a_log_that_is_damaged_or_of_later_times_is_refused_at_once(log: Path, what: str) -> None:
     """A condition with what was met and what to do; at 09076aa a TypeError, or none for ever."""
     change(log, *BAD[what])
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(ArtefactError) as refused:
         replay(log)
-    assert time.perf_counter() - began < 10.0
+    assert time.process_time() - began < 10.0
     assert refused.value.value or refused.value.limit
 
 
@@ -367,10 +367,10 @@ MODELS: dict[str, tuple[str, type[UndertowError]]] = {
 def test_a_model_that_is_none_is_refused_at_once(what: str) -> None:
     """The first was a RecursionError at 09076aa, the third had no end."""
     text, kind = MODELS[what]
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(kind):
         modelling.from_mjcf(text)
-    assert time.perf_counter() - began < 10.0
+    assert time.process_time() - began < 10.0
 
 
 # -- ledgers ---------------------------------------------------------------------------------------

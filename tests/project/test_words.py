@@ -563,7 +563,7 @@ def test_the_command_line_takes_urdf_and_mjcf(tmp_path: Path) -> None:
     code, out, err = run("derive", f"{file}:x")
     assert code == 0, err
     assert "pendulum_on_a_cart" in out
-    code, out, err = run("simulate", f"{file}:x", "--horizon", "10")
+    code, out, err = run("simulate", f"{file}:x", "--control", "designed", "--horizon", "10")
     assert code == 0, err
     assert "phi = 5°" in out
     assert from_anywhere(f"{file}:x") == f"{file.resolve()}:x"

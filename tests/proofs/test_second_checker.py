@@ -471,13 +471,14 @@ def evaluated(program: Path, cases: list[Document], file: Path) -> list[list[str
 
 
 @needs_compiler
-def test_2000_expressions_are_enclosed_with_their_derivatives(
-    program: Path, tmp_path: Path
+@pytest.mark.parametrize("count", [400, pytest.param(2000, marks=pytest.mark.slow)])
+def test_expressions_are_enclosed_with_their_derivatives(
+    program: Path, tmp_path: Path, count: int
 ) -> None:
     """At points and on thin and wider boxes, against 60 digits; fractions to 40 of them."""
-    source = random.Random(2000)
+    source = random.Random(count)
     cases, points = [], []
-    for index in range(2000):
+    for index in range(count):
         width = (Fraction(0), Fraction(0), Fraction(1, 2**40), Fraction(1, 50))[index % 4]
         size = Fraction(source.choice([1e-9, 1.0, 1.0, 20.0, 1e6]))
         low = [size * Fraction(source.randint(-(10**6), 10**6), 10**6) for _ in range(4)]
@@ -508,8 +509,8 @@ def test_2000_expressions_are_enclosed_with_their_derivatives(
                     assert abs(high - value) <= scale_**2 * mp.mpf(10) ** -40, case
                     sharp += ends[1] - ends[0] <= 1e-9 * max(1, abs(ends[1]))
             defined += not math.isnan(ends[0])
-    assert defined > 1950
-    assert sharp > 700
+    assert defined > 0.975 * count
+    assert sharp > 0.35 * count
 
 
 @needs_compiler
@@ -532,11 +533,21 @@ def test_what_is_not_defined_is_said(program: Path, tmp_path: Path) -> None:
 
 
 @needs_compiler
-def test_all_mechanisms_are_decided_alike(program: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("rotary_pendulum", "double_pendulum_on_a_cart", "two_motor_three_link"),
+        pytest.param(tuple(ut.mechanisms.LIBRARY), marks=pytest.mark.slow),
+    ],
+    ids=["three", "all"],
+)
+def test_mechanisms_are_decided_alike(
+    program: Path, tmp_path: Path, names: tuple[str, ...]
+) -> None:
     """Up to four coordinates, two inputs, gains for a disturbance; half of the claims too bold."""
     decided = {"proved": 0, "not": 0}
-    for name, make in ut.mechanisms.LIBRARY.items():
-        rig = make()
+    for name in names:
+        rig = ut.mechanisms.LIBRARY[name]()
         n, m = rig.n, rig.m
         claims = [kernel.Stability(Fraction(0))]
         surface, law = ut.first_surface(rig), ut.ReachingLaw(eta=5.0)
@@ -572,4 +583,4 @@ def test_all_mechanisms_are_decided_alike(program: Path, tmp_path: Path) -> None
         assert theirs[-2] == "proved", name
         for kind in theirs:
             decided["proved" if kind == "proved" else "not"] += 1
-    assert min(decided.values()) >= 2 * len(ut.mechanisms.LIBRARY), decided
+    assert min(decided.values()) >= 2 * len(names), decided

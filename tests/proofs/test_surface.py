@@ -135,7 +135,13 @@ def test_floats_count_as_the_binary_numbers_that_they_are() -> None:
 
 
 @pytest.mark.parametrize("symbolic", [False, True])
-@pytest.mark.parametrize(("n", "m"), [(2, 1), (3, 1), (3, 2), (4, 2), (5, 2), (5, 3)])
+@pytest.mark.parametrize(
+    ("n", "m"),
+    [
+        *((2, 1), (3, 1), (3, 2), (4, 2)),
+        *(pytest.param(5, m, marks=pytest.mark.slow) for m in (2, 3)),
+    ],
+)
 def test_hurwitz_agrees_with_the_pencil(n: int, m: int, symbolic: bool) -> None:
     """Exact verdict and margin equal those of the pencil's finite eigenvalues."""
     mechanism = linear_mechanism(n, m, seed=10 * n + m, symbolic=symbolic)

@@ -201,13 +201,13 @@ def test_an_old_answer_is_refused_under_a_new_number(controller: Controller) -> 
 
 
 def test_the_test_of_a_plan_takes_microseconds() -> None:
-    """It comes after the output; ten times what it takes, for a busy machine."""
+    """It comes after the output; of processor time, ten times what it takes."""
     for name in ("rotary_pendulum", "two_motor_three_link", "triple_pendulum_on_a_cart"):
         mechanism = getattr(ut.mechanisms, name)()
         test, plan = PlanCheck(mechanism, ReachingLaw()), Plan.of(first_surface(mechanism))
         times = []
         for _ in range(300):
-            began = time.perf_counter()
+            began = time.thread_time()
             assert test.fault(test.pack(plan)) == ""
-            times.append(time.perf_counter() - began)
+            times.append(time.thread_time() - began)
         assert np.median(times) < 300e-6

@@ -67,12 +67,12 @@ def test_simulate_every_other_with_no_further_choice(name: str) -> None:
 @pytest.mark.parametrize("name", [PROMPT, pytest.param("acrobot", marks=pytest.mark.slow)])
 def test_costs_fall_from_first_surface_to_cascade(name: str) -> None:
     """Claim: optimising once never costs more than the first surface, the cascade not more yet."""
-    line = entry(name)
+    pytest.importorskip("casadi")
+    line = entry(name, bounds=True)
     assert line.cascade <= line.one_time * (1 + 1e-3)
     assert line.one_time <= line.designed
     assert math.isfinite(line.time)
     assert line.radius <= 0.01 + 1e-9
-    assert math.isnan(line.bound)
 
 
 @pytest.mark.parametrize("goal", survey.GOALS)
@@ -99,12 +99,12 @@ def test_documented_gaps_are_those_of_the_rows(goal: str) -> None:
 
 
 def test_bound_is_below_the_cascade() -> None:
-    """Claim: the pendubot's bound is below its cascades, by what the page says."""
+    """Claim: the bound of the quick mechanism is below its cascades, by what the page says."""
     pytest.importorskip("casadi")
-    line = entry("pendubot", bounds=True)
+    line = entry(PROMPT, bounds=True)
     assert 0 < line.bound < line.cascade
     assert line.free > 0.998 * line.bound  # itself exact to its mesh alone
-    assert 100 * line.gap == pytest.approx(float(documented()["pendubot"][8].split()[0]), abs=1)
+    assert 100 * line.gap == pytest.approx(float(documented()[PROMPT][8].split()[0]), abs=0.2)
 
 
 @pytest.mark.slow
@@ -154,8 +154,11 @@ def test_table_and_files_say_what_was_found() -> None:
     assert not re.search(r"nan|inf\b", "".join(f.decode() for f in files.values()))
 
 
-def test_survey_on_the_command_line(tmp_path: Path) -> None:
-    """Claim: one command prints the table and leaves it as files."""
+def test_survey_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim: one command prints the table, here of a line found above, and leaves it as files."""
+    pytest.importorskip("casadi")
+    line = entry(PROMPT, bounds=True)
+    monkeypatch.setattr(survey, "survey_one", lambda *_, **__: line)
     words = ["survey", "--only", PROMPT, "--no-bounds", "--objective", "energy"]
     words += ["--out", str(tmp_path)]
     result = CliRunner().invoke(app, words, env={"COLUMNS": "60"})

@@ -388,7 +388,7 @@ def test_a_thread_that_does_not_begin_is_an_error_in_bounded_time(
     began = time.monotonic()
     with pytest.raises(ResourceError, match=r"has not begun after 0\.1 s"):
         Background(lambda: None, "undertow test")
-    assert time.monotonic() - began < 2.0
+    assert time.monotonic() - began < 10.0
 
 
 def test_a_thread_of_ours_begins_works_and_ends() -> None:

@@ -318,7 +318,7 @@ print(kept(x).sum(), kept.stats.cache_hits.total(), "numba.np.arraymath" in sys.
 
 @numba.njit
 def theirs(x):
-    return np.linalg.norm(x) + len([str(v) for v in range(3)]) + kept(x).sum()
+    return x.max() + kept(x).sum()
 
 
 print(round(theirs(x), 6))
@@ -338,4 +338,4 @@ def test_kept_machine_code_loads_without_what_compiling_needs(tmp_path: Path) ->
     )  # fmt: skip
     assert first[0] == "6.0 0 True"
     assert second[0] == "6.0 1 False"
-    assert first[1] == second[1] == str(round(5**0.5 + 3 + 6, 6))
+    assert first[1] == second[1] == str(2.0 + 6.0)

@@ -1,7 +1,8 @@
 """Results as tables, text and files: one look, written whole, never overwritten.
 
 Files of an earlier run under the same names are moved into ``earlier-1``, ``earlier-2``, …
-inside the folder, so no result is lost.  Figures are saved by :mod:`undertow.display.plot`.
+inside the folder, so no result is lost.  Figures are saved by
+:mod:`undertow.closed_loop.figures`.
 """
 
 from __future__ import annotations

@@ -11,8 +11,6 @@ import sympy as sp
 
 from undertow.base import InvalidInputError
 
-__all__ = ["smooth", "translate"]
-
 _SAME = "acos asin atan atan2 cos cosh exp log sign sin sinh tan tanh"
 FUNCTIONS = {
     **{getattr(sp, name): name for name in _SAME.split()},

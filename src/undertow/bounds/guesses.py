@@ -14,8 +14,6 @@ from undertow.base import InvalidInputError
 from undertow.closed_loop import Trajectory
 from undertow.models import FloatArray, Mechanism, linearise
 
-__all__ = ["Guess", "built_in", "recorded", "rests", "time_scale"]
-
 
 class Guess(NamedTuple):
     """A motion to start from: states and inputs at given times, arrays (N,) to (N, …)."""

@@ -10,8 +10,6 @@ import scipy.optimize
 
 from undertow.models import FloatArray, Mechanism
 
-__all__ = ["adapted_mesh", "defects", "first_mesh", "hermite"]
-
 
 def first_mesh(count: int, dense: float) -> FloatArray:
     """Nodes in [0, 1]: six tenths of them even on [0, dense], then in geometric progression."""

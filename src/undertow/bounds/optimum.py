@@ -20,8 +20,6 @@ from undertow.closed_loop import Trajectory
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 
-__all__ = ["Bound", "bound"]
-
 
 @dataclass(frozen=True, eq=False)
 class Bound:

@@ -19,8 +19,6 @@ from undertow.models import TIME, FloatArray, Mechanism, require_smooth
 from undertow.objective import Objective
 from undertow.symbolic import Tape
 
-__all__ = ["Programme", "Solution"]
-
 #: Largest defect (see ``Bound.defect``) that a result may have: coarse meshes let a
 #: programme "move" in ways that the mechanism cannot.
 DEFECT = 1e-3
@@ -258,8 +256,9 @@ class Programme:
         largest = np.abs(np.array(slope + found["lam_x"])).max()
         return float(largest / max(1.0, np.abs(np.array(steepness)).max()))
 
-    def spent(self, guess: Guess, samples: int = 400) -> float:
+    def spent(self, guess: Guess) -> float:
         """Return the cost of a guess as it stands, by the trapezoidal rule."""
+        samples = 400
         t = np.linspace(0.0, guess.time, samples)
         rows = (t[None], guess.x(t).T, guess.u(t).T)
         return float(np.trapezoid(np.array(self.cost.map(samples)(*rows)[1]).ravel(), t))

@@ -26,16 +26,9 @@ from undertow.plants.bench import Bench, bench_for
 class Miswired(RigWrapper):
     """A rig with factors on its inputs and encoders, in another order, and late.
 
-    Parameters
-    ----------
-    rig
-        The rig.
-    inputs, encoders
-        Factors, (m,) and (n,): −1 is a swapped sign, 0 a cable that is off.
-    delay
-        Further delay of the inputs, s; whole periods.
-    order
-        Which encoder is plugged in where each coordinate is read; empty: as it should be.
+    ``inputs``, ``encoders``: factors, (m,) and (n,): −1 is a swapped sign, 0 a cable that is off.
+    ``delay``: further one of the inputs, s; whole periods. ``order``: which encoder is plugged in
+    where each coordinate is read; empty: as it should be.
     """
 
     def __init__(
@@ -68,12 +61,9 @@ class Miswired(RigWrapper):
 def miswired(rig: Rig, mechanism: Mechanism, faults: Sequence[str]) -> Rig:
     """Return a rig with faults given in words, ``part=value``.
 
-    Parameters
-    ----------
-    faults
-        ``voltage=-1`` (factor of an input), ``theta=2`` (factor of an encoder; 0: cable off),
-        ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.0015`` (s, besides the rig's
-        own).  Friction is the bench's: see :func:`rubbing`.
+    They are ``voltage=-1`` (factor of an input), ``theta=2`` (factor of an encoder; 0: cable off),
+    ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.0015`` (s, besides the rig's own).
+    Friction is the bench's: see :func:`rubbing`.
 
     Raises
     ------
@@ -143,18 +133,9 @@ def rig_named(
 ) -> Rig:
     """Return a simulated rig, or the driver of one's own, to be closed by who asks.
 
-    Parameters
-    ----------
-    word
-        ``realistic``, ``ideal`` or ``FILE.py:NAME``.
-    belief, truth
-        What is believed of the mechanism, and how a simulated one moves.
-    rest
-        State at rest, (2n,), in which a simulated one begins.
-    faults
-        Friction among them is put into a simulated bench, see :func:`.faults.rubbing`.
-    seed
-        Of a realistic rig.
+    The word is ``realistic``, ``ideal`` or ``FILE.py:NAME``; a simulated one moves as ``truth``
+    says and begins at rest, (2n,), and friction among the faults is put into its bench, see
+    :func:`.faults.rubbing`; the seed is a realistic one's.
 
     Raises
     ------

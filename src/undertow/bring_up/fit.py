@@ -21,7 +21,6 @@ from functools import partial
 import numpy as np
 import scipy.optimize
 import scipy.signal
-import scipy.stats
 
 from undertow.base import InvalidInputError
 from undertow.bring_up.motion import MotionRecord, Predictor
@@ -59,14 +58,8 @@ def readings(
     *Quantization Noise*, Cambridge 2008, ch. 4 and 17).  Readings that share an error count as
     one: its variance is taken times their number.
 
-    Parameters
-    ----------
-    predicted
-        Motion, (N, n), rad or m.
-    away
-        Measured less predicted, (N, n).
-    sigma
-        Standard deviation of a count, (n,): its size by √12.
+    ``predicted`` is the motion, (N, n), rad or m, ``away`` measured less predicted, (N, n), and
+    ``sigma`` the standard deviation of a count, (n,): its size by √12.
     """
     step = sigma * math.sqrt(12)
     shared = np.column_stack(
@@ -112,16 +105,8 @@ def counted(
     The predicted motion is counted from many zeros, with the noise that there is, and each
     time the least squares are followed to first order.
 
-    Parameters
-    ----------
-    predicted
-        Motion, (N, n), rad or m.
-    noise, variance
-        See :func:`readings`.
-    sigma
-        Standard deviation of a count, (n,): its size by √12.
-    J
-        See above.
+    ``predicted`` is the motion, (N, n), rad or m; ``noise`` and ``variance`` are those of
+    :func:`readings`, ``sigma`` is the standard deviation of a count, (n,), and J see above.
     """
     rng = np.random.default_rng(0)
     step, solve, draws = sigma * math.sqrt(12), np.linalg.pinv(J), []

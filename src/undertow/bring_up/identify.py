@@ -12,8 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
-import scipy.signal
 import scipy.stats
 
 from undertow.base import Progress, no_progress
@@ -26,21 +24,10 @@ from undertow.models import FloatArray, Mechanism
 class Estimate:
     """One identified quantity.
 
-    Attributes
-    ----------
-    name, unit, description
-        What it is.
-    value
-        The estimate.
-    error
-        Its standard error.
-    low, high
-        Its 95 % confidence interval.
-    nominal
-        What the model says; NaN where it says nothing.
-    matters
-        How much the motion would differ if this were as the model says and all else were fitted
-        again, to first order, as a share of the motion.
+    ``error``: its standard error; ``low``, ``high``: its 95 % confidence interval. ``nominal``:
+    what the model says; NaN where it says nothing. ``matters``: how much the motion would differ if
+    this were as the model says and all else were fitted again, to first order, as a share of the
+    motion.
     """
 
     name: str
@@ -58,22 +45,11 @@ class Estimate:
 class Identification:
     """What a motion says of its mechanism.
 
-    Attributes
-    ----------
-    estimates
-        The identified quantities, by name.
-    held
-        Parameters kept at their nominal values: the motion does not tell them apart.
-    residual
-        RMS of measured less predicted, (n,), rad or m.
-    before
-        The same with the nominal model.
-    explained
-        Share of the motion that is explained, (n,), 1 for all of it.
-    predicted
-        What the identified model says of the motion, (N, n), about the same zero as measured.
-    mechanism
-        The mechanism with the identified parameters.
+    ``held``: parameters kept at their nominal values: the motion does not tell them apart.
+    ``residual``: RMS of measured less predicted, (n,), rad or m; ``before``: the same with the
+    nominal model. ``explained``: share of the motion that is explained, (n,), 1 for all of it.
+    ``predicted``: what the identified model says of the motion, (N, n), about the same zero as
+    measured. ``mechanism``: with the identified parameters.
     """
 
     estimates: Mapping[str, Estimate]
@@ -90,29 +66,18 @@ def identify(
     x0: FloatArray,
     record: MotionRecord,
     *,
-    confidence: float = 0.95,
     progress: Progress = no_progress,
 ) -> Identification:
     """Identify parameters of a mechanism from a motion that begins at rest.
 
-    Parameters
-    ----------
-    mechanism
-        The model, whose parameter values are the first guess.
-    x0
-        Where it rests, (2n,).
-    record
-        Inputs and measured positions; wired as the model.
-    confidence
-        Of the intervals.
-    progress
-        Told what is under way.
+    The model's parameter values are the first guess; it rests at ``x0``, (2n,); the record is wired
+    as the model.
 
     Returns
     -------
     Identification
         Estimates by least squares in which every reading counts for what it is worth
-        (:func:`undertow.bring_up.fit.readings`), with confidence intervals from the
+        (:func:`undertow.bring_up.fit.readings`), with 95 % confidence intervals from the
         Jacobian, corrected for residuals that are correlated in time (Newey and West,
         *Econometrica* 55(3), 1987), and no narrower than what the counting of the encoders
         alone would make them.
@@ -130,7 +95,7 @@ def identify(
     variances = np.maximum(
         correlated(J, r, mechanism.n), counted(predicted, fit.noise, fit.sigma, fit.variance, J)
     )
-    quantile = float(scipy.stats.norm.ppf(0.5 + confidence / 2))
+    quantile = float(scipy.stats.norm.ppf(0.975))
     estimates = {}
     alone = 1.0 / np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))  # of each column, the rest fitted
     motion = float(np.linalg.norm((fit.moved - fit.moved.mean(axis=0)) / np.sqrt(fit.variance)))

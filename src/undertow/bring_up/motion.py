@@ -67,14 +67,8 @@ class GuardError(UndertowError):
 class MotionRecord:
     """What was written to a rig and what it measured.
 
-    Attributes
-    ----------
-    t
-        Times of the samples, (N,), s.
-    q
-        Measured positions, (N, n); ``q[k]`` was read before ``u[k]`` was written.
-    u
-        Inputs written, (N, m).
+    Samples were taken at t, (N,), s; ``q[k]`` of the positions, (N, n), was read before ``u[k]`` of
+    the inputs, (N, m), was written.
     """
 
     t: FloatArray
@@ -98,12 +92,8 @@ def perform(
 ) -> MotionRecord:
     """Write a sequence of inputs, (N, m), and record what is measured.
 
-    Parameters
-    ----------
-    guard
-        How far each coordinate may go from where it is now, (n,).
-    until
-        Stop once a coordinate has gone so far, (n,).
+    ``guard``: how far each coordinate may go from where it is now, (n,); ``until``: stop once one
+    has gone so far, (n,).
 
     Raises
     ------
@@ -167,12 +157,7 @@ STRIBECK = 0.05
 class Predictor:
     """Plays recorded inputs on a mechanism with joint friction, from rest.
 
-    Parameters
-    ----------
-    mechanism
-        The model; parameters and frictions are given to each call.
-    x0
-        Where it rests, (2n,).
+    Parameters and frictions are given to each call; it rests at ``x0``, (2n,).
     """
 
     def __init__(self, mechanism: Mechanism, x0: FloatArray) -> None:
@@ -197,20 +182,9 @@ class Predictor:
     ) -> FloatArray:
         """Return the states at the times of the record, (N, 2n).
 
-        Parameters
-        ----------
-        record
-            Whose times and inputs are played.
-        parameters
-            Of the mechanism, in its order.
-        coulomb
-            Dry friction of the joints, (2, n): when sliding and when breaking away.
-        viscous
-            Damping of the joints besides the mechanism's own, (n,).
-        gain
-            Factor of each input, (m,).
-        start
-            State at the first sample, (2n,); at rest by default.
+        ``coulomb``: dry friction of the joints, (2, n): when sliding and when breaking away;
+        ``viscous``: damping besides the mechanism's own, (n,); ``gain``: factor of each input,
+        (m,); ``start``: state at the first sample, (2n,), at rest by default.
         """
         n, m = self.mechanism.n, self.mechanism.m
         friction = np.column_stack([*coulomb, np.full(n, STRIBECK), viscous])

@@ -47,14 +47,9 @@ KNOWN = {
 class Wiring:
     """What lies between a rig and the model: factors of 1, in order, where all is well.
 
-    Attributes
-    ----------
-    inputs
-        Factor of each input, (m,); 0: it does nothing.
-    encoders
-        Factor of each coordinate's encoder, (n,); 0: it never moves.
-    order
-        Which of the rig's readings is that of each coordinate; empty: as they come.
+    ``inputs``: factor of each input, (m,); 0: it does nothing. ``encoders``: factor of each
+    coordinate's encoder, (n,); 0: it never moves. ``order``: which of the rig's readings is that of
+    each coordinate; empty: as they come.
     """
 
     inputs: FloatArray
@@ -114,19 +109,10 @@ def explain(gain: FloatArray, known: FloatArray) -> tuple[float, Wiring]:
 
     It is the wiring with the fewest faults that explains measured gains.
 
-    Parameters
-    ----------
-    gain
-        g, (m, n): response of coordinate j to input i, measured over predicted; near 0 where
-        nothing moved that should have.
-    known
-        Whether the prediction is large enough to compare with, (m, n).
-
-    Returns
-    -------
-    float, Wiring
-        Factors within a ratio of 1.45 of ±1 are ±1; scales of encoders near a known one are
-        that.
+    g, (m, n), is the response of coordinate j to input i, measured over predicted, near 0 where
+    nothing moved that should have; ``known``, (m, n), whether the prediction is large enough to
+    compare with. Factors within a ratio of 1.45 of ±1 are ±1; scales of encoders near a known one
+    are that.
     """
     m, n = gain.shape
     dead = np.array([not (np.abs(gain[i][known[i]]) > DEAD).any() for i in range(m)])
@@ -198,12 +184,8 @@ SHAPE = 5.0
 class Response:
     """The motion that a push makes.
 
-    Attributes
-    ----------
-    moved
-        Measured, (N, n), about its start.
-    predicted
-        The model's, by level of dry friction, (L, N, n), about its start.
+    ``moved``: measured, (N, n), and ``predicted``: the model's, by level of dry friction, (L, N,
+    n), each about its start.
     """
 
     moved: FloatArray
@@ -255,14 +237,8 @@ def push_response(predictor: Predictor, record: MotionRecord, i: int, calm: Floa
 class WiringEstimate:
     """What the pushes say of the wiring.
 
-    Attributes
-    ----------
-    wiring
-        Order, signs and scales.
-    ratio
-        Measured over predicted motion with this wiring undone, (m, n).
-    known
-        Whether the prediction is large enough to compare with, (m, n).
+    ``ratio``: measured over predicted motion with this wiring undone, (m, n); ``known``: whether
+    the prediction is large enough to compare with, (m, n).
     """
 
     wiring: Wiring

@@ -58,16 +58,8 @@ Assessment = Literal["right", "wrong", "unclear"]
 class RigFinding:
     """What one check found.
 
-    Attributes
-    ----------
-    check, part
-        What was checked, of which part.
-    measured, expected
-        In words, with units.
-    verdict
-        ``"right"``, ``"wrong"``, or ``"unclear"`` where the motion does not tell.
-    remedy
-        What to do about it.
+    ``measured`` and ``expected`` are words, with units; the verdict is ``"unclear"`` where the
+    motion does not tell; the remedy says what to do about it.
     """
 
     check: str
@@ -82,16 +74,8 @@ class RigFinding:
 class BringUp:
     """All that a bring-up found.
 
-    Attributes
-    ----------
-    findings
-        In the order of the checks.
-    wiring
-        Factors between rig and model.
-    identification
-        Parameters, where the wiring allowed it.
-    record
-        The motion that they were identified from, in the model's signs and scales.
+    Findings are in the order of the checks; the parameters were identified, where the wiring
+    allowed it, from the record, in the model's signs and scales.
     """
 
     findings: tuple[RigFinding, ...]
@@ -116,20 +100,10 @@ def bring_up(
 ) -> BringUp:
     """Check a rig against its model by small safe motions from rest.
 
-    Parameters
-    ----------
-    rig
-        At rest, nothing else moving it.
-    belief
-        The model.
-    delay
-        From a write to its effect in a reading, s, as it should be; ``None``: not compared.
-    rest
-        The state it rests in, (2n,); found from the model by default.
-    learn
-        Also a longer motion, from which delay, friction and parameters are identified.
-    progress
-        Told what is under way, and the fraction done.
+    The rig is at rest, nothing else moving it; it rests at ``rest``, (2n,), found from the model by
+    default. ``delay``: from a write to its effect in a reading, s, as it should be; ``None``: not
+    compared. ``learn``: also a longer motion, from which delay, friction and parameters are
+    identified.
 
     Raises
     ------

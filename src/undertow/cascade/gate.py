@@ -42,16 +42,8 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
     says of them is believed.  This is the step of Lemma 3, J̃_{k+1} ≤ Ĵ_{k+1}.  On an ensemble,
     where neither suits every plausible plant, the one that all survive longer stays in use.
 
-    Parameters
-    ----------
-    loop
-        The predicted closed loop.
-    old, new
-        The plan in use, shifted to now, and the proposed one.
-    x
-        Present state, (2n,).
-    horizon
-        Longest prediction, s.
+    ``old`` is the plan in use, shifted to now, ``new`` the proposed one; x is the present state,
+    (2n,), ``horizon`` the longest prediction, s.
     """
     pair = loop.batch(x, [old, new], duration=horizon, precise=True)
     old_score, new_cost = pair.score(horizon)

@@ -76,15 +76,8 @@ def _compiled(mechanism: Mechanism, margin: sp.Expr):  # type: ignore[no-untyped
 class LoopsAbout:
     """The closed loops of a cascade as they are about targets elsewhere.
 
-    Parameters
-    ----------
-    mechanism, objective
-        The cascade's.
-
-    Attributes
-    ----------
-    names
-        The invariant coordinates that constraints know of: those whose target is a parameter.
+    ``names`` are the invariant coordinates that constraints know of: those whose target is a
+    parameter.
     """
 
     def __init__(self, mechanism: Mechanism, objective: Objective) -> None:

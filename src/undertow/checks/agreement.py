@@ -17,17 +17,12 @@ import numpy as np
 import sympy as sp
 
 from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
-from undertow.checks.exact import ExactLaw, ExactModel, Number, evaluate, runge_kutta
+from undertow.checks.exact import ExactLaw, ExactModel, Matrix, Number, evaluate, runge_kutta
 from undertow.closed_loop import ClosedLoop, RolloutBuffers, compile_loop
 from undertow.law import InnerLoop, ReachingLaw, SlidingModeLaw, Surface, coupling, first_surface
 from undertow.models import TIME, FloatArray, Mechanism
 from undertow.objective import MinimumEnergy, Objective
 from undertow.proofs import ClosedLoopProgram
-
-__all__ = [
-    "LIMIT", "SETTLED", "Difference", "Subject", "inner_loop", "kernel", "numpy_functions",
-    "proof_programme", "settling", "worst",
-]  # fmt: skip
 
 #: Largest difference, relative to what the rounding of each value scales with.
 LIMIT = 1e-13
@@ -43,17 +38,9 @@ STEP = 1e-3
 class Difference:
     """One number of compiled code beside its exact value.
 
-    Attributes
-    ----------
-    what
-        Which number of what.
-    where
-        At which state, in words.
-    computed, exact
-        Both values, the exact one rounded.
-    relative
-        Their difference relative to the exact value's :class:`size <undertow.checks.exact.Number>`;
-        infinite where what was computed is no number, or a proved enclosure misses.
+    ``what``, ``where``: which number of what, at which state, in words. ``relative``: the
+    difference relative to the exact value's :class:`size <undertow.checks.exact.Number>`; infinite
+    where what was computed is no number, or a proved enclosure misses.
     """
 
     what: str
@@ -78,18 +65,8 @@ def worst(differences: Iterable[Difference]) -> Difference | None:
 class Subject:
     """A mechanism, a law for it and states: what compiled code is tried at.
 
-    Parameters
-    ----------
-    mechanism
-        The model.
-    surface
-        By default one with random entries, all different, so that none can stand in for another.
-    reaching
-        The reaching law.
-    count
-        How many states of each kind.
-    seed
-        Of surface and states.
+    By default the surface has random entries, all different, so that none can stand in for another.
+    There are ``count`` states of each kind.
     """
 
     def __init__(
@@ -183,7 +160,7 @@ class Subject:
 
     def compared(
         self, what: str, x: FloatArray, computed: Sequence[float] | FloatArray,
-        exact: Sequence[Number], names: Sequence[str] = (),
+        exact: Sequence[Number] | Matrix, names: Sequence[str] = (),
     ) -> Iterator[Difference]:  # fmt: skip
         """Compare numbers at a state, one by one."""
         entries = names or [str(i + 1) for i in range(len(exact))]

@@ -19,8 +19,6 @@ from undertow.models import FloatArray, Mechanism, controllability, has_linear_m
 from undertow.models.importers.equations import nearest_equilibrium
 from undertow.symbolic import Tape, compile_numpy
 
-__all__ = ["Check", "MechanismReport", "check_mechanism"]
-
 #: Largest relative residual of an identity at float64.
 _ROUNDING = 1e-9
 
@@ -29,18 +27,7 @@ _ROUNDING = 1e-9
 class Check:
     """One condition: its name, whether it holds, the number found and the limit.
 
-    Attributes
-    ----------
-    name
-        The condition.
-    passed
-        Whether it holds.
-    value
-        What was found; NaN where it could not be computed.
-    limit
-        What it should have been, in words.
-    remedy
-        What could help where it fails.
+    ``value`` is NaN where it could not be computed; ``remedy`` says what could help where it fails.
     """
 
     name: str

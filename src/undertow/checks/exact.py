@@ -16,16 +16,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import numpy as np
 import sympy as sp
 from mpmath import MPContext
+from numpy.typing import ArrayLike
 
 from undertow.base import ModelError
 from undertow.law import ReachingLaw, Surface
 from undertow.models import TIME, Mechanism
-
-__all__ = ["ExactLaw", "ExactModel", "Number", "evaluate", "product", "runge_kutta", "solve"]
 
 _MP: Any = MPContext()
 _MP.dps = 50
@@ -37,12 +37,7 @@ _NEAR = 1e-11
 class Number:
     """A value to 50 digits, and its size, to which its rounding error in float64 is relative.
 
-    Parameters
-    ----------
-    value
-        A float (taken as the binary number that it is) or one of 50 digits.
-    size
-        |value| by default.
+    A float is taken as the binary number that it is; the size is |value| by default.
 
     Examples
     --------
@@ -251,56 +246,45 @@ def _holds(condition: sp.Basic, known: dict[sp.Basic, Number]) -> bool:
     return bool(condition.func(sp.Integer(int(_MP.sign(left - right))), 0))
 
 
-# -- linear algebra ------------------------------------------------------------------------------
+# -- linear algebra: NumPy adds and multiplies what stands in its arrays, exact numbers too ------
 
-Matrix = list[list[Number]]
-_Matrices = tuple[Matrix, list[Number], Matrix]
+Matrix = np.ndarray[Any, np.dtype[np.object_]]
+_Matrices = tuple[Matrix, Matrix, Matrix]
+_Rows = Sequence[Any] | Matrix
 
 
-def solve(A: Sequence[Sequence[Number]], b: Sequence[Sequence[Number]]) -> Matrix:
+def solve(A: _Rows, b: _Rows) -> Matrix:
     """Return A⁻¹ b by elimination with row exchanges, (n, n) and (n, k) to (n, k)."""
-    rows = [[*left, *right] for left, right in zip(A, b, strict=True)]
+    rows = np.hstack([np.array(A, dtype=object), np.array(b, dtype=object)])
     n = len(rows)
     for j in range(n):
-        best = max(range(j, n), key=lambda i: abs(rows[i][j].value))
-        rows[j], rows[best] = rows[best], rows[j]
+        best = max(range(j, n), key=lambda i: abs(rows[i, j].value))
+        rows[[j, best]] = rows[[best, j]]
         for i in range(n):
-            if i != j and rows[i][j].value != 0:
-                factor = rows[i][j] / rows[j][j]
-                rows[i] = [
-                    *rows[i][: j + 1],
-                    *(a - factor * p for a, p in zip(rows[i][j + 1 :], rows[j][j + 1 :],
-                                                     strict=True)),
-                ]  # fmt: skip
-    return [[entry / rows[i][i] for entry in rows[i][n:]] for i in range(n)]
+            if i != j and rows[i, j].value != 0:
+                rows[i, j + 1 :] -= rows[j, j + 1 :] * (rows[i, j] / rows[j, j])
+    return np.asarray(rows[:, n:] / rows.diagonal()[:, None])
 
 
-def determinant(A: Sequence[Sequence[Number]]) -> Number:
+def determinant(A: Matrix) -> Number:
     """Return the determinant by expansion along the first row."""
     if len(A) == 1:
-        return A[0][0]
+        return cast(Number, A[0, 0])
     total = Number(0)
     for j, entry in enumerate(A[0]):
-        minor = determinant([[*row[:j], *row[j + 1 :]] for row in A[1:]])
+        minor = determinant(np.delete(A[1:], j, axis=1))
         total = total - entry * minor if j % 2 else total + entry * minor
     return total
 
 
-def product(A: Sequence[Sequence[Number]], b: Sequence[Sequence[Number]]) -> Matrix:
+def product(A: _Rows, b: _Rows) -> Matrix:
     """Return A b."""
-    columns = list(zip(*b, strict=True))
-    return [[_dot(row, column) for column in columns] for row in A]
+    return np.asarray(np.array(A, dtype=object) @ np.array(b, dtype=object))
 
 
-def _dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
-    total = Number(0)
-    for left, right in zip(a, b, strict=True):
-        total = total + left * right
-    return total
-
-
-def _numbers(block: Any) -> Matrix:
-    return [[Number(float(v)) for v in row] for row in block]
+def _numbers(block: ArrayLike) -> Matrix:
+    """Return floats as exact numbers."""
+    return np.asarray(np.vectorize(lambda v: Number(float(v)), otypes=[object])(block))
 
 
 # -- the model -----------------------------------------------------------------------------------
@@ -318,11 +302,6 @@ class ExactLaw(NamedTuple):
 
 class ExactModel:
     """A mechanism's own expressions, with its parameters, in 50 digits.
-
-    Parameters
-    ----------
-    mechanism
-        Whose equations.
 
     Raises
     ------
@@ -353,17 +332,13 @@ class ExactModel:
         """Return M (n, n), f (n,) and B (m, m)."""
         key = (t, *((v.value, v.size) for v in x))
         if self._last is None or self._last[0] != key:
-            self._last = (key, self._evaluated(self.known(t, x)))
+            known, model = self.known(t, x), self.mechanism
+            mass, force, push = (
+                np.array([evaluate(e, known) for e in matrix], dtype=object).reshape(matrix.shape)
+                for matrix in (model.mass_matrix, model.force, model.input_matrix)
+            )
+            self._last = key, (mass, force.ravel(), push)
         return self._last[1]
-
-    def _evaluated(self, known: dict[sp.Basic, Number]) -> _Matrices:
-        def entries(matrix: sp.Matrix) -> Matrix:
-            rows, columns = range(matrix.rows), range(matrix.cols)
-            return [[evaluate(matrix[i, j], known) for j in columns] for i in rows]
-
-        model = self.mechanism
-        mass, force = entries(model.mass_matrix), entries(model.force)
-        return mass, [row[0] for row in force], entries(model.input_matrix)
 
     def accelerations(
         self,
@@ -375,37 +350,28 @@ class ExactModel:
         """Return q̈ (n,) under the input u; ``damping`` acts on each joint besides."""
         n, m = self.mechanism.n, self.mechanism.m
         M, f, B = self.matrices(t, x)
-        push = [*product(B, [[v] for v in u]), *[[Number(0)]] * (n - m)]
-        total = [[a + b[0]] for a, b in zip(f, push, strict=True)]
+        total = f + np.append(product(B, u), [Number(0)] * (n - m))
         if damping is not None:
-            total = [[a[0] - d * v] for a, d, v in zip(total, damping, x[n:], strict=True)]
-        return [row[0] for row in solve(M, total)]
+            total = total - np.array(damping, dtype=object) * np.array(x[n:], dtype=object)
+        return list(solve(M, total[:, None])[:, 0])
 
     def law(self, surface: Surface, reaching: ReachingLaw, x: Sequence[Number]) -> ExactLaw:
         """Return the sliding-mode law at x: the u for which ṡ = −K sw(s/ε), (5) with (12)."""
         n, m = self.mechanism.n, self.mechanism.m
         M, f, B = self.matrices(0.0, x)
         position, velocity = _numbers(surface.position_row), _numbers(surface.velocity_row)
-        q, qd = [[v] for v in x[:n]], [[v] for v in x[n:]]
-        s = [a[0] + b[0] for a, b in zip(product(position, q), product(velocity, qd), strict=True)]
-        vector = [Number(float(v)) for v in reaching.vector(m)]
-        eta, layer = vector[:m], vector[m:]
+        s = product(position, x[:n]) + product(velocity, x[n:])
+        eta, layer = np.split(_numbers(reaching.vector(m)), 2)
         gains = self._gains(surface, M, eta)
-        pushes = [*B, *[[Number(0)] * m for _ in range(n - m)]]
-        moves = solve(M, [[a, *row] for a, row in zip(f, pushes, strict=True)])
-        drift = product(velocity, [[row[0]] for row in moves])
-        turn = product(position, qd)
+        pushes = np.vstack([B, _numbers(np.zeros((n - m, m)))])
+        moves = solve(M, np.column_stack([f, pushes]))
         switch = [_switch(a, e, reaching.switching) for a, e in zip(s, layer, strict=True)]
-        wanted = [
-            [-(k * w) - a[0] - b[0]]
-            for k, w, a, b in zip(gains, switch, drift, turn, strict=True)
-        ]  # fmt: skip
-        grip = product(velocity, [row[1:] for row in moves])
-        demand = [row[0] for row in solve(grip, wanted)]
+        wanted = -(gains * switch) - velocity @ moves[:, 0] - product(position, x[n:])
+        demand = solve(velocity @ moves[:, 1:], wanted[:, None])[:, 0]
         limits = self.mechanism.input_limits.tolist()
         here, target = (determinant(self._gamma(surface, mass)) for mass in (M, self._at_target))
         clipped = [a.clip(b) for a, b in zip(demand, limits, strict=True)]
-        return ExactLaw(clipped, demand, s, gains, here / target)
+        return ExactLaw(clipped, list(demand), list(s), list(gains), here / target)
 
     @cached_property
     def _at_target(self) -> Matrix:
@@ -413,47 +379,31 @@ class ExactModel:
 
     def _coupling(self, M: Matrix) -> Matrix:
         m = self.mechanism.m
-        return solve([row[m:] for row in M[m:]], [row[:m] for row in M[m:]])
+        return solve(M[m:, m:], M[m:, :m])
 
     def _gamma(self, surface: Surface, M: Matrix) -> Matrix:
         """Γ = α_a − α_u M_uu⁻¹ M_auᵀ."""
-        through = product(_numbers(surface.alpha_u), self._coupling(M))
-        return [
-            [a - b for a, b in zip(left, right, strict=True)]
-            for left, right in zip(_numbers(surface.alpha_a), through, strict=True)
-        ]
+        through = _numbers(surface.alpha_u) @ self._coupling(M)
+        return np.asarray(_numbers(surface.alpha_a) - through)
 
-    def _gains(self, surface: Surface, M: Matrix, eta: list[Number]) -> list[Number]:
+    def _gains(self, surface: Surface, M: Matrix, eta: Matrix) -> Matrix:
         """K of (13): η, and what the declared disturbances ask for."""
-        bounds = [[Number(b)] for b in self.mechanism.disturbance_bounds]
-        if not any(b[0].value for b in bounds):
+        bounds, m = _numbers(self.mechanism.disturbance_bounds), self.mechanism.m
+        if not any(b.value for b in bounds):
             return eta
-        n, m = self.mechanism.n, self.mechanism.m
-        X = self._coupling(M)
-        lost = product([row[m:] for row in M[:m]], X)
-        S = [
-            [a - b for a, b in zip(row[:m], gone, strict=True)]
-            for row, gone in zip(M[:m], lost, strict=True)
-        ]
 
         def inverse(A: Matrix) -> Matrix:
-            one = [[Number(int(i == j)) for j in range(len(A))] for i in range(len(A))]
-            return [[abs(v) for v in row] for row in solve(A, one)]
+            return np.abs(solve(A, _numbers(np.eye(len(A)))))
 
-        X = [[abs(v) for v in row] for row in X]
-        through = product(list(zip(*X, strict=True)), bounds[m:])
-        total = [[a[0] + b[0]] for a, b in zip(bounds[:m], through, strict=True)]
-        driven = product(inverse(S), total)
-        alone = product(inverse([row[m:] for row in M[m:]]), bounds[m:])
-        free = [[a[0] + b[0]] for a, b in zip(alone, product(X, driven), strict=True)]
-        worst = [max((row[0] for row in part), key=lambda v: v.value) for part in (driven, free)]
-        weights = _numbers(surface.velocity_row)
-        return [
-            k
-            + sum((abs(v) for v in row[:m]), Number(0)) * worst[0]
-            + sum((abs(v) for v in row[m:n]), Number(0)) * worst[1]
-            for k, row in zip(eta, weights, strict=True)
-        ]
+        X = self._coupling(M)
+        S, X = M[:m, :m] - M[:m, m:] @ X, np.abs(X)
+        driven = inverse(S) @ (bounds[:m] + X.T @ bounds[m:])
+        free = inverse(M[m:, m:]) @ bounds[m:] + X @ driven
+        own, other = (max(part, key=lambda v: v.value) for part in (driven, free))
+        weights = np.abs(_numbers(surface.velocity_row))
+        return np.asarray(
+            eta + weights[:, :m].sum(axis=1) * own + weights[:, m:].sum(axis=1) * other
+        )
 
 
 def runge_kutta(

@@ -165,7 +165,7 @@ def _files(
     mechanism: Mechanism, certified: Sequence[Certified], progress: Progress
 ) -> dict[str, bytes]:
     """Return the certificate, and figures of what has one: regions, and the closed loop."""
-    from undertow.display.plot import figure_files
+    from undertow.closed_loop.figures import figure_files
     from undertow.proofs import LoopClaim
     from undertow.studies import certification
 

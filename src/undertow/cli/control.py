@@ -81,9 +81,9 @@ def simulate(
     schedule: Annotated[
         float,
         option(
-            "Least time alone: surfaces one after another, each for so long at most, s, with free "
-            "reaching laws, that follow the earliest motion over all inputs; the model is taken "
-            "for the plant. 0.1, the period, is usual. 0: one surface at a time.",
+            "Surfaces one after another with free reaching laws; for least time each for so long "
+            "at most, s, following the earliest motion over all inputs. The model is taken for "
+            "the plant. 0.1, the period, is usual. 0: one surface at a time.",
         ),
     ] = 0.0,
     seed: options.Seed = 0,
@@ -113,12 +113,12 @@ def simulate(
             limit="cascade, which follows targets",
             remedy="Leave one of them out",
         )
-    if schedule and (steering != "cascade" or objective != "time" or known == "usual"):
+    if schedule and (steering != "cascade" or known == "usual"):
         raise InvalidInputError(
             "--schedule",
-            value=f"{schedule:g} s, --control {steering}, --objective {objective}",
-            limit="the cascade, least time, a model that is taken for the plant",
-            remedy="Add --objective time, and leave --control, --surface and --belief out",
+            value=f"{schedule:g} s, --control {steering}",
+            limit="the cascade, with a model that is taken for the plant",
+            remedy="Leave --control, --surface and --belief out",
         )
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)

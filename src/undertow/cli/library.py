@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.options import folder, option
 from undertow.cli.parsing import mechanism_named, parse_task
-from undertow.cli.terminal import check_out, command, progress_bar, show, terminal, write
+from undertow.cli.terminal import check_out, command, completed, progress_bar, show, terminal, write
 from undertow.closed_loop import ClosedLoop
 from undertow.mechanisms import LIBRARY
 from undertow.optimiser import Optimiser
@@ -86,32 +87,19 @@ def survey(
     from undertow.studies import survey as study
 
     check_out(out)
-    began, entries, interrupted = time.perf_counter(), list[study.Entry](), False
+    began, entries = time.perf_counter(), list[study.Entry]()
     names, goals = only or list(LIBRARY), objective or list(study.GOALS)
-    try:
-        with progress_bar() as progress:
-            study.survey(
-                names,
-                goals=goals,
-                horizon=horizon,
-                seed=seed,
-                bounds=bounds,
-                progress=progress,
-                done=entries.append,
-            )
-    except KeyboardInterrupt:
-        if not entries:
-            raise
-        interrupted = True
+    work = partial(study.survey, names, goals=goals, horizon=horizon, seed=seed, bounds=bounds)
+    whole = completed(lambda told: work(progress=told, done=entries.append), entries)
     written = write(out, lambda: study.files(request, entries))
     for some in study.by_goal(entries):
         show("", some[0].goal, study.survey_table(some), least=80, crop=False, soft_wrap=True)
         show(*study.summary(some))
     show(*written, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
-    if interrupted:
-        whole, part = divmod(len(entries), len(names))
-        left = dict.fromkeys(goals[whole:], names)
-        left[goals[whole]] = names[part:]
+    if not whole:
+        ended, part = divmod(len(entries), len(names))
+        left = dict.fromkeys(goals[ended:], names)
+        left[goals[ended]] = names[part:]
         show(f"interrupted: {len(entries)} of {len(goals) * len(names)} are done. The others, with "
              "the options as before:", stderr=True)  # fmt: skip
         for goal, others in left.items():
@@ -138,20 +126,13 @@ def models(
     from undertow.studies import model_files as study
 
     check_out(out)
-    began, rows, interrupted = time.perf_counter(), list[study.ModelFile](), False
-    try:
-        with progress_bar() as progress:
-            study.model_files(
-                folder_of_files, simulate=simulate, seed=seed, progress=progress, done=rows.append
-            )
-    except KeyboardInterrupt:
-        if not rows:
-            raise
-        interrupted = True
+    began, rows = time.perf_counter(), list[study.ModelFile]()
+    work = partial(study.model_files, folder_of_files, simulate=simulate, seed=seed)
+    whole = completed(lambda told: work(progress=told, done=rows.append), rows)
     written = write(out, lambda: study.files_of(rows))
     show(study.read_table(rows), study.refused_table(rows), least=100)
     show(study.summary(rows), *written, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
-    if interrupted:
+    if not whole:
         show("interrupted: the files after these are not read", stderr=True)
         raise typer.Exit(INTERRUPTED)
 

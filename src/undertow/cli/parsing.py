@@ -38,22 +38,8 @@ def mechanism_named(
 ) -> Mechanism:
     """Return a mechanism of the library or of a file, its parameters and input limits replaced.
 
-    Parameters
-    ----------
-    name
-        Its name in the library, or ``FILE.py:NAME`` for one's own, see
-        :func:`undertow.models.importers.mechanism_from_file`.
-    settings
-        Parameters as ``name=value``, SI units.
-    limits
-        Largest magnitudes of inputs as ``name=value``, each in the input's unit.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown mechanism, parameter or input, or a value outside its bounds.
-    ArtefactError
-        When the file cannot be read or fails.
+    A name is as for :func:`undertow.mechanisms.named.named`; parameters are words ``name=value`` in
+    SI units, largest magnitudes of inputs in the input's unit.
     """
     mechanism = named(name).with_parameters(**parse_values(settings))
     if not limits:
@@ -69,23 +55,9 @@ def mechanism_named(
 def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
     """Move words that say at which equilibrium a file's mechanism rests into its name.
 
-    Parameters
-    ----------
-    name
-        Of a mechanism.
-    target
-        Words of ``--target``: ``upright`` and the like; ``JOINT=ANGLE`` along which the mechanism
-        cannot rest anywhere; and set-points.
-
-    Returns
-    -------
-    str, list of str
-        The name, and the words that are left.
-
-    Raises
-    ------
-    InvalidInputError
-        For equilibria of mechanisms that are in no URDF or MJCF file, and several of them.
+    The words are those of ``--target``: ``upright`` and the like; ``JOINT=ANGLE`` along which the
+    mechanism cannot rest anywhere; and set-points. Returns the name, and the words that are left;
+    equilibria of mechanisms that are in no URDF or MJCF file, and several of them, are refused.
     """
     words = [word for word in target or () if word in WORDS]
     rest = [word for word in target or () if word not in WORDS]
@@ -124,23 +96,7 @@ def objective_named(
 ) -> Objective:
     """Return the objective that a word means, within bounds that are words too.
 
-    Parameters
-    ----------
-    name
-        A word of :func:`undertow.objective_for`.
-    mechanism
-        Whose inputs and states are meant.
-    horizon
-        Longest motion, s.
-    box
-        Bounds on states, see :func:`parse_box`.
-    hard_input
-        Whether a motion whose law asks for more than the actuator gives is refused.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown name, a bound that cannot be, or a horizon that is not positive.
+    See :func:`undertow.objective_for` and :func:`parse_box`; the horizon is in s.
     """
     constraints = parse_box(mechanism, box)
     return objective_for(
@@ -161,11 +117,6 @@ def parse_task(
     """Return what is to be steered, from where, and what is minimised on the way.
 
     See :func:`mechanism_named`, :func:`parse_start` and :func:`objective_named`.
-
-    Raises
-    ------
-    InvalidInputError
-        For a word that means nothing, and a start that the objective does not admit.
     """
     mechanism = mechanism_named(name, settings, limits)
     x0 = parse_start(mechanism, start)
@@ -253,19 +204,8 @@ def _quantity(text: str, units: Sequence[str], what: str, example: str) -> tuple
 def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray:
     """Read an initial state from ``name=value`` words with units; the rest is zero.
 
-    Parameters
-    ----------
-    mechanism
-        Whose states they are.
-    words
-        Like ``phi=40deg``, ``theta_dot=10deg/s`` or ``x=0.2m``.  Without any word, the
-        mechanism's usual start.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown state, a missing or wrong unit, or what is no number; and for no word at
-        all where the mechanism has no usual start.
+    Words are like ``phi=40deg``, ``theta_dot=10deg/s`` or ``x=0.2m``; without any, the mechanism's
+    usual start.
 
     Examples
     --------
@@ -288,22 +228,9 @@ def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray
 def parse_target(mechanism: Mechanism, words: Sequence[str] | None) -> Target | None:
     """Read a target from words with units; ``None`` without any: x = 0.
 
-    Parameters
-    ----------
-    mechanism
-        Whose coordinates they are.
-    words
-        Set-points, ``x=2m`` from the start or ``x=-1m@2s`` from a time on; sines of the same
-        frequency about 0, ``theta=45deg@0.5Hz``; or one CSV file with a path, see
-        :meth:`undertow.Reference.read`.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown state, a missing or wrong unit, what is no number, words of several kinds,
-        and a file that is no path.
-    ArtefactError
-        For a file that cannot be read.
+    Words are set-points, ``x=2m`` from the start or ``x=-1m@2s`` from a time on; sines of the same
+    frequency about 0, ``theta=45deg@0.5Hz``; or one CSV file with a path, see
+    :meth:`undertow.Reference.read`.
 
     Examples
     --------
@@ -327,17 +254,8 @@ unit, m. Write for instance --target x=1m
 def parse_new_target(units: Mapping[str, str], words: Sequence[str]) -> SetPoints:
     """Read set-points for a run that goes on; their times count from now.
 
-    Parameters
-    ----------
-    units
-        Of the coordinates along which they may be, SI: ``m`` or ``rad``.
-    words
-        Like ``x=2m``, or ``x=-1m@5s``.
-
-    Raises
-    ------
-    InvalidInputError
-        For another coordinate, a missing or wrong unit, and what is no number.
+    ``units`` are of the coordinates along which they may be, SI: ``m`` or ``rad``; words are like
+    ``x=2m``, or ``x=-1m@5s``.
 
     Examples
     --------
@@ -396,19 +314,8 @@ def _target_of_words(
 def parse_box(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[Constraint, ...]:
     """Read bounds on states from words with units.
 
-    Parameters
-    ----------
-    mechanism
-        Whose states they are.
-    words
-        Like ``theta=60deg``, which is |theta| ≤ 60°, or ``x=-0.2m:0.5m``.  What they bound, the
-        mechanism's declared travel bounds no more; they cannot reach beyond it.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown state, a missing or wrong unit, bounds that exclude the target or reach
-        beyond the declared travel, or two pairs of bounds on one state.
+    Words are like ``theta=60deg``, which is |theta| ≤ 60°, or ``x=-0.2m:0.5m``. What they bound,
+    the mechanism's declared travel bounds no more; they cannot reach beyond it.
 
     Examples
     --------
@@ -443,18 +350,8 @@ def parse_box(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[Constr
 def parse_surface(mechanism: Mechanism, text: str) -> Surface:
     """Read a surface from its blocks; α_a is −I where it is not given.
 
-    Parameters
-    ----------
-    mechanism
-        For the shapes.
-    text
-        ``"lambda_a=-0.5 alpha_u=5 lambda_u=10"``; entries of a row are joined by commas,
-        rows by semicolons.
-
-    Raises
-    ------
-    InvalidInputError
-        For a missing, unknown or ill-shaped block.
+    ``"lambda_a=-0.5 alpha_u=5 lambda_u=10"``; entries of a row are joined by commas, rows by
+    semicolons.
     """
     blocks: dict[str, FloatArray] = {"alpha_a": -np.eye(mechanism.m)}
     names = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -91,14 +91,8 @@ def command(
 ) -> Callable[[Callable[P, None]], Callable[P, None]]:
     """Register a command: its errors are one line, its help ends with the examples.
 
-    Parameters
-    ----------
-    *examples
-        Lines as they are typed.
-    name
-        Of the command; the function's by default.
-    of
-        The group that it belongs to.
+    The examples are lines as they are typed; the name is the function's by default; it belongs to
+    the group ``of``.
     """
 
     def register(function: Callable[P, None]) -> Callable[P, None]:
@@ -176,6 +170,18 @@ def progress_bar() -> Iterator[Progress]:
     with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
+
+
+def completed(work: Callable[[Progress], object], kept: Sized = (1,)) -> bool:
+    """Work under a progress bar; false where Ctrl-C ended it and something is kept to be shown."""
+    try:
+        with progress_bar() as progress:
+            work(progress)
+    except KeyboardInterrupt:
+        if not kept:
+            raise
+        return False
+    return True
 
 
 def show(*parts: RenderableType, stderr: bool = False, least: int = 0, **how: Any) -> None:

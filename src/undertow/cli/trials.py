@@ -10,7 +10,7 @@ import typer
 
 from undertow.base import INTERRUPTED
 from undertow.cli.options import option
-from undertow.cli.terminal import check_out, command, progress_bar, show, write
+from undertow.cli.terminal import check_out, command, completed, show, write
 
 
 @command(
@@ -82,16 +82,11 @@ def trials(
         fresh=fresh,
         folder=out,
     )
-    interrupted = False
-    try:
-        with progress_bar() as progress:
-            campaign.run(what, progress)
-    except KeyboardInterrupt:
-        interrupted = True
+    whole = completed(lambda progress: campaign.run(what, progress))
     report, files = campaign.finished()
     written = write(out, lambda: files) if files else ()
     show(*([] if report is None else [report]), *written)
-    if interrupted:
+    if not whole:
         show(_how_to_go_on(what, out), stderr=True)
         raise typer.Exit(INTERRUPTED)
 

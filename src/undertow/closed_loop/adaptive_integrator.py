@@ -197,7 +197,7 @@ def _follow(  # type: ignore[no-untyped-def]
             if segment < len(switch) and tick == switch[segment]:
                 lane = lanes[b, segment]
                 segment += 1
-            until = switch[segment] if segment < len(switch) else steps
+            until = min(switch[segment], steps) if segment < len(switch) else steps
             if zoh_steps > 0:
                 if tick % zoh_steps == 0:
                     sample = min(tick // zoh_steps, noise.shape[0] - 1)

@@ -22,12 +22,10 @@ from PIL import Image
 
 from undertow.base import manifest, positive
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, figure_bytes, style
+from undertow.closed_loop.figures import COLOURS, figure_bytes, style
 from undertow.display.sketches import Box, Disc, Label, Line, Sketch, sketch
 from undertow.models import FloatArray, Mechanism, check_symbols, vocabulary
 from undertow.symbolic import compile_expressions
-
-__all__ = ["Film", "film_files", "gif", "still"]
 
 #: A motion is shown until all of it stays within this part of where it has been.
 SETTLED = 0.03
@@ -47,24 +45,11 @@ _KINDS: dict[str, dict[str, Any]] = {
 class Film:
     """A motion ready for drawing.
 
-    Attributes
-    ----------
-    mechanism
-        What moves.
-    sketch
-        What is drawn of it.
-    t
-        Times of the frames, (F,), s.
-    q, u
-        Positions, (F, n), and inputs, (F, m), at these times.
-    points
-        Points of each part in the plane of the view, (F, k, 2), m.
-    angles
-        Angle and radius of each disc, (F, 2); empty for other parts.
-    tip
-        The tip in the plane of the view, (F, 2), m.
-    whole
-        How long the motion takes until it has settled, s: longer than the film where that is cut.
+    ``t``: times of the frames, (F,), s. ``q``, ``u``: positions, (F, n), and inputs, (F, m), at
+    these times. ``points``: of each part in the plane of the view, (F, k, 2), m; ``angles``: angle
+    and radius of each disc, (F, 2), empty for other parts; ``tip``: in the plane of the view, (F,
+    2), m. ``whole``: how long the motion takes until it has settled, s: longer than the film where
+    that is cut.
     """
 
     mechanism: Mechanism
@@ -211,8 +196,7 @@ class Film:
             axes.set_title(f"{self.mechanism.name.replace('_', ' ')}\n{self.span}")
 
 
-#: Positions (F, n) to points of each part (F, k, 3), angle and radius (F, 2), tip (F, 3).
-#: Points of the parts, angles and radii of the discs, and the tip, over time.
+#: Points of the parts, (F, k, 3), angles and radii of the discs, (F, 2), and the tip, (F, 3).
 Places = tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray]
 
 
@@ -268,17 +252,10 @@ def _settled(trajectory: Trajectory) -> float:
     return min(float(last) + 0.5, float(trajectory.t[-1]))
 
 
-def gif(film: Film, *, width: float = 4.2) -> bytes:
-    """Return a film as an endless GIF: the figure, the time, and the inputs as bars.
-
-    Parameters
-    ----------
-    film
-        What to show.
-    width
-        Width, inches.
-    """
+def gif(film: Film) -> bytes:
+    """Return a film as an endless GIF: the figure, the time, and the inputs as bars."""
     left, right, bottom, top = film.window
+    width = 4.2  # inches
     height = float(np.clip(width * (top - bottom) / (right - left), 0.5 * width, 1.3 * width))
     limits = film.mechanism.input_limits
     bar = np.where(np.isfinite(limits), limits, np.abs(film.u).max(axis=0) + 1e-12)
@@ -329,14 +306,7 @@ def _gauge(axes: Axes, film: Film, k: int, bar: FloatArray) -> None:
 def still(axes: Axes, film: Film, ghosts: int = 6) -> None:
     """Draw a motion in one picture: faint poses from the start, the last one in full.
 
-    Parameters
-    ----------
-    axes
-        Where to draw.
-    film
-        The motion.
-    ghosts
-        How many poses besides the last, evenly spaced along the tip's path.
+    There are so many ghosts besides the last pose, evenly spaced along the tip's path.
     """
     steps = np.linalg.norm(np.diff(film.tip, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])

@@ -23,8 +23,6 @@ from undertow.law import first_surface, sliding_matrix
 from undertow.models import Mechanism, linearise
 from undertow.symbolic.formulas import plain, readable, rounded, tex, tex_words
 
-__all__ = ["Derivation", "Equation", "Section", "derivation"]
-
 #: Longest line of words.
 WIDTH = 79
 
@@ -59,15 +57,7 @@ def _folded(line: str) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Derivation:
-    """The formulas of one mechanism, section by section.
-
-    Attributes
-    ----------
-    mechanism
-        Whose formulas they are.
-    sections
-        In the order of the theory.
-    """
+    """The formulas of one mechanism, section by section."""
 
     mechanism: Mechanism
     sections: tuple[Section, ...]

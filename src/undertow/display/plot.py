@@ -1,4 +1,4 @@
-"""Phase planes and sliding surfaces drawn; the rest is :mod:`undertow.closed_loop.figures`'."""
+"""Phase planes and sliding surfaces drawn."""
 
 from __future__ import annotations
 
@@ -10,33 +10,8 @@ from matplotlib.axes import Axes
 
 from undertow.base import InvalidInputError
 from undertow.closed_loop import Trajectory
-from undertow.closed_loop.figures import (
-    COLOURS,
-    axis,
-    display,
-    figure_bytes,
-    figure_files,
-    input_series,
-    motion_figure,
-    state_series,
-    state_words,
-    style,
-)
+from undertow.closed_loop.figures import axis, display
 from undertow.law import Surface
-
-__all__ = [
-    "COLOURS",
-    "display",
-    "figure_bytes",
-    "figure_files",
-    "input_series",
-    "motion_figure",
-    "phase",
-    "state_series",
-    "state_words",
-    "style",
-    "surface_trace",
-]
 
 
 def phase(axes: Axes, trajectory: Trajectory, name: str, **line: Any) -> None:
@@ -61,20 +36,8 @@ def surface_trace(
     With all other states as they are, s = 0 asks for the velocity q̇_i − s/α_i.  The trace
     breaks where another surface takes over; a dotted line joins the two ends.
 
-    Parameters
-    ----------
-    axes
-        Where to draw.
-    trajectory
-        A motion with one input.
-    surfaces
-        The surfaces in use, one for each of ``switch_times``, (S,).
-    switch_times
-        When each takes over, s; the first is the start.
-    name
-        The coordinate.
-    **line
-        Properties of the trace.
+    The motion has one input; each of the surfaces, (S,), takes over at its time, s, the first at
+    the start; ``line`` has properties of the trace.
 
     Raises
     ------

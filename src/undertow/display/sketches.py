@@ -14,8 +14,6 @@ import sympy as sp
 
 from undertow.models import Mechanism
 
-__all__ = ["Box", "Disc", "Label", "Line", "Sketch", "sketch"]
-
 #: x, y, z as numbers or expressions, m.
 Point = tuple[Any, Any, Any]
 
@@ -64,14 +62,8 @@ class Label:
 class Sketch:
     """What to draw of a mechanism.
 
-    Parameters
-    ----------
-    parts
-        From back to front.
-    tip
-        The point whose path is shown.
-    view
-        From where it is seen.
+    The parts come from back to front; ``tip`` is the point whose path is shown, ``view`` from where
+    it is seen.
     """
 
     parts: tuple[Line | Disc | Box | Label, ...]

@@ -16,7 +16,7 @@ from undertow.display.sketches import Box, Disc, Line, Point, Sketch, View, sket
 from undertow.mechanisms.named import tree_named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers import Joint, Link, Tree
-from undertow.models.importers.rigid_body import identifier
+from undertow.models.importers.rigid_body import identifier, rotation_about
 from undertow.models.importers.tree import WORLD
 
 #: Shorter than this part of the whole, a way between two points is none.
@@ -26,18 +26,8 @@ SHORT = 1e-3
 def sketch_named(name: str, mechanism: Mechanism) -> Sketch:
     """Return the figure of a mechanism that was asked for by name.
 
-    Parameters
-    ----------
-    name
-        As for :func:`undertow.mechanisms.named.named`.
-    mechanism
-        What was found under it.
-
-    Returns
-    -------
-    Sketch
-        The library's own; for a file of bodies one from its kinematics; labelled dials where
-        neither can be had.
+    The library's own; for a file of bodies one from its kinematics; labelled dials where neither
+    can be had. Names are those of :func:`undertow.mechanisms.named.named`.
     """
     tree = tree_named(name)
     found = None if tree is None else tree_sketch(tree, mechanism)
@@ -116,17 +106,10 @@ def _poses(tree: Tree, angles: dict[str, sp.Symbol]) -> dict[str, tuple[sp.Matri
             else:
                 anchor = _vector(joint.anchor)
                 about = here + turn * anchor
-                turn = turn * _rotation(axis, q)
+                turn = turn * rotation_about(axis, q)
                 here = about - turn * anchor
         poses[joint.child] = turn, here
     return poses
-
-
-def _rotation(axis: sp.Matrix, q: sp.Expr) -> sp.Matrix:
-    """Rodrigues' formula."""
-    x, y, z = axis
-    K = sp.Matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return sp.eye(3) + sp.sin(q) * K + (1 - sp.cos(q)) * K * K
 
 
 def _turned(tree: Tree, poses: dict[str, tuple[sp.Matrix, sp.Matrix]]) -> tuple[sp.Matrix, View]:

@@ -28,18 +28,9 @@ StateFeedback = Callable[[float, FloatArray], FloatArray]
 class Record:
     """What happened on a rig, sample by sample.
 
-    Attributes
-    ----------
-    t
-        Times on the rig's clock, (N,), s.
-    q
-        Measured positions, (N, n).
-    x
-        Estimated states, (N, 2n).
-    u
-        Inputs written, (N, m).
-    truth
-        True states, (N, 2n), of simulated rigs; else NaN.
+    ``t``: times on the rig's clock, (N,), s; ``q``: measured positions, (N, n); ``x``: estimated
+    states, (N, 2n); ``u``: inputs written, (N, m); ``truth``: true states, (N, 2n), of simulated
+    rigs, else NaN.
     """
 
     t: FloatArray
@@ -69,21 +60,8 @@ def run_recorded(
 ) -> Record:
     """Run a controller on a rig for some time, as fast as it goes.
 
-    Parameters
-    ----------
-    rig
-        A plant; of hardware the loop keeps no pace: the rig's own ``read`` must.
-    estimator
-        Gives the states; :class:`undertow.estimators.Measured` where velocities are measured.
-    controller
-        (t, x̂) to the inputs.
-    seconds
-        How long, on the rig's clock.
-
-    Returns
-    -------
-    Record
-        One line per sample.
+    With hardware the loop keeps no pace: the rig's own ``read`` must. It takes ``seconds`` on the
+    rig's clock; the record has one line per sample.
     """
     count = round(seconds / rig.period)
     if not 1 <= count <= 10_000_000:
@@ -134,16 +112,8 @@ def compensated(
 ) -> StateFeedback:
     """Return a controller whose output lacks what the estimator knows of the disturbance.
 
-    Parameters
-    ----------
-    controller
-        (t, x̂) to the inputs.
-    estimator
-        Whose ``disturbance`` is taken off.
-    limits
-        Largest |u_i|, (m,).
-    when
-        Asked after each step of the controller: whether its output shall lack it.
+    ``limits`` are the largest |u_i|, (m,); ``when`` is asked after each step of the controller:
+    whether its output shall lack it.
     """
     out = np.zeros_like(limits)
 

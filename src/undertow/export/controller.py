@@ -212,16 +212,8 @@ def checksums(
 ) -> list[int]:
     """Return the checksum of each row.
 
-    Parameters
-    ----------
-    number
-        Of the plan.
-    starts
-        Periods at which the rows take over, ascending from 0.
-    rows
-        Numbers of each row, as ``as_held`` gives them: surface (2mn,), η (m,) and ε (m,).
-    real
-        Floating-point type of the C.
+    ``starts``: periods at which the rows take over, ascending from 0; ``rows``: numbers of each, as
+    ``as_held`` gives them: surface (2mn,), η (m,) and ε (m,).
     """
     width = WIDTH[real]
     mask = (1 << width) - 1

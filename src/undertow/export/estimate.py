@@ -233,16 +233,7 @@ def estimate_code(
 ) -> dict[str, str]:
     """Return the parts of the templates that make the state from positions.
 
-    Parameters
-    ----------
-    step
-        Differentiator or observer.
-    mechanism, period
-        Of the controller, s.
-    parameters
-        C text of the parameters' symbols.
-    real
-        Floating-point type.
+    ``period`` is the controller's, s; ``parameters`` have the C text of the parameters' symbols.
     """
 
     def row(values: list[float]) -> str:

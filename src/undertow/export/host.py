@@ -87,19 +87,10 @@ class Agreement:
 class Footprint:
     """What a controller costs on this machine.
 
-    Attributes
-    ----------
-    instructions
-        Of one step from positions, math.h included: the mean over a run.
-    code, constants
-        Bytes of machine code and of constant data.
-    memory
-        Bytes of one controller's state.
-    stack
-        Bytes: all frames of the controller's functions together, so a bound on its depth but
-        for math.h's.
-    calls
-        Names that the object file asks of the standard library.
+    ``instructions``: of one step from positions, math.h included: the mean over a run. ``code``,
+    ``constants``, ``memory``: bytes of machine code, of constant data, and of one controller's
+    state. ``stack``: bytes: all frames of the controller's functions together, so a bound on its
+    depth but for math.h's. ``calls``: names that the object file asks of the standard library.
     """
 
     instructions: float
@@ -113,14 +104,7 @@ class Footprint:
 class Build:
     """A controller's C in a folder, compiled there.
 
-    Parameters
-    ----------
-    controller
-        What is exported.
-    folder
-        Where its files are, or are written to if they are not there.
-    compiler
-        A C compiler that takes GCC's options.
+    The folder has its files, or they are written there; the compiler takes GCC's options.
 
     Raises
     ------
@@ -256,12 +240,7 @@ class Build:
 class HostProcess:
     """The exported controller as a process of its own, spoken to over a pipe.
 
-    Parameters
-    ----------
-    controller
-        What was exported.
-    program
-        The built ``<name>_pipe``.
+    ``program`` is the built ``<name>_pipe``.
     """
 
     def __init__(self, controller: EmbeddedController, program: Path) -> None:
@@ -350,16 +329,9 @@ HELD = 0.1
 class RigRun:
     """One run on a rig, period by period.
 
-    Attributes
-    ----------
-    q
-        Measured positions, (N, n).
-    u
-        Outputs, (N, m).
-    status
-        What the controller said of each period.
-    held
-        Whether the unactuated coordinates stayed within :data:`HELD` in the last second.
+    ``q``, ``u``: measured positions, (N, n), and outputs, (N, m); ``status``: what the controller
+    said of each period; ``held``: whether the unactuated coordinates stayed within :data:`HELD` in
+    the last second.
     """
 
     q: FloatArray
@@ -371,14 +343,7 @@ class RigRun:
 def run_on_rig(process: HostProcess, rig: Rig, seconds: float) -> RigRun:
     """Let an exported controller steer a rig, from measured positions alone.
 
-    Parameters
-    ----------
-    process
-        The controller's process.
-    rig
-        Whose period is the controller's.
-    seconds
-        How long, on the rig's clock.
+    The rig's period is the controller's; ``seconds`` are of the rig's clock.
     """
     m = process.controller.mechanism.m
     positions, outputs, status = [], [], []

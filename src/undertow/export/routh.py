@@ -21,12 +21,8 @@ _Polynomial = list[sp.Expr]
 def characteristic_polynomial(mechanism: Mechanism, surface: Sequence[sp.Symbol]) -> list[sp.Expr]:
     """Return the coefficients, the highest power first, (2n − m + 1,), scaled to at most 1.
 
-    Parameters
-    ----------
-    mechanism
-        The belief, linearised at its target with its parameters' values.
-    surface
-        Symbols of the numbers of a surface, (2mn,), as they lie in its vector.
+    The belief is linearised at its target with its parameters' values; ``surface`` are the symbols
+    of its numbers, (2mn,), as they lie in its vector.
     """
     n, m, lin = mechanism.n, mechanism.m, linearise(mechanism)
     vector = np.array(surface, dtype=object)

@@ -17,13 +17,7 @@ from undertow.symbolic import literal
 
 
 class Twin:
-    """The exported controller, in double precision, by the library's own law and estimator.
-
-    Parameters
-    ----------
-    controller
-        What was exported.
-    """
+    """The exported controller, in double precision, by the library's own law and estimator."""
 
     def __init__(self, controller: EmbeddedController) -> None:
         self.controller = controller
@@ -148,17 +142,7 @@ SHORT, LONG = slice(80, 83), slice(150, 165)
 def random_states(mechanism: Mechanism, count: int, seed: int = 0) -> FloatArray:
     """Return states drawn evenly: a whole turn or the range of travel, rates to ±10.
 
-    Parameters
-    ----------
-    count
-        How many.
-    seed
-        Of the draw.
-
-    Returns
-    -------
-    numpy.ndarray
-        (count, 2n), SI units.
+    They are (count, 2n), SI units.
     """
     ends = [
         (max(c.low, -np.pi), min(c.high, np.pi)) if c.unit == "rad" else
@@ -171,8 +155,8 @@ def random_states(mechanism: Mechanism, count: int, seed: int = 0) -> FloatArray
     return np.hstack([q, rng.uniform(-10, 10, (count, mechanism.n))])
 
 
-def run_positions(controller: EmbeddedController, periods: int = PERIODS) -> FloatArray:
-    """Return the positions of a run as encoders give them, some of them lost, (periods, n).
+def run_positions(controller: EmbeddedController) -> FloatArray:
+    """Return the positions of a run as encoders give them, some of them lost, (PERIODS, n).
 
     The model moves under the twin's own outputs, by the midpoint rule, from a tenth of its
     usual start.
@@ -182,8 +166,8 @@ def run_positions(controller: EmbeddedController, periods: int = PERIODS) -> Flo
     twin = Twin(controller)
     x = 0.1 * mechanism.state(**mechanism.start)
     resolution = 2 * np.pi / 2**16
-    rows = np.empty((periods, n))
-    for k in range(periods):
+    rows = np.empty((PERIODS, n))
+    for k in range(PERIODS):
         rows[k] = np.round(x[:n] / resolution) * resolution
         u, _ = twin.step(rows[k])
         slope = np.concatenate([x[n:], mechanism.accelerations(0.0, x, u)])

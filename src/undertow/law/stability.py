@@ -36,17 +36,7 @@ from undertow.symbolic import content_key, recall, remember
 def sliding_matrix(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> FloatArray:
     """Return the matrix of the sliding dynamics at the target, (…, 2n−m, 2n−m).
 
-    Parameters
-    ----------
-    mechanism
-        The model.
-    surfaces
-        A surface or surface vectors, (…, 2mn).
-
-    Returns
-    -------
-    numpy.ndarray
-        A_s with ż = A_s z, z = (q_a, q_u, q̇_u).
+    Surface vectors are (…, 2mn); ż = A_s z with z = (q_a, q_u, q̇_u).
     """
     lin = linearise(mechanism)
     n, m = mechanism.n, mechanism.m

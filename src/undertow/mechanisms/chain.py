@@ -26,15 +26,10 @@ def chain_energies(
         T = ½ Σ_i [m_i (ẋ² + 2ẋ Σ_j a_ij cos φ_j φ̇_j + Σ_jk a_ij a_ik cos(φ_j − φ_k) φ̇_j φ̇_k)
             + J_i φ̇_i²],        V = g Σ_i m_i Σ_j a_ij cos φ_j.
 
-    Parameters
-    ----------
-    p
-        ``m_1`` …, kg; ``J_1`` … about the centres of mass, kg m²; ``a_1`` … from a link's joint to
-        its centre of mass and ``l_1`` … to the next joint where there is one, m; ``g``, m/s².
-    angles, rates
-        φ_i and φ̇_i as expressions in the coordinates and their velocities, rad, rad/s.
-    base_rate
-        ẋ of the first joint, m/s.
+    p has ``m_1`` …, kg; ``J_1`` … about the centres of mass, kg m²; ``a_1`` … from a link's joint
+    to its centre of mass and ``l_1`` … to the next joint where there is one, m; ``g``, m/s². Angles
+    and rates are φ_i and φ̇_i as expressions in the coordinates and their velocities, rad, rad/s;
+    ``base_rate`` is ẋ of the first joint, m/s.
     """
     kinetic, potential = sp.Integer(0), sp.Integer(0)
     for i, rate in enumerate(rates, 1):
@@ -63,18 +58,10 @@ def standing_links(
 
     Link 1 leans by q_1 from the upright, link i by q_i against the one before.
 
-    Parameters
-    ----------
-    name
-        Of the mechanism.
-    motors
-        The number of each joint that is turned, whose angle is an actuated coordinate, to the
-        torque that turns it.
-    parameters
-        ``m_i, l_i, a_i, J_i`` of each link as for :func:`chain_energies`, damping of its joint
-        ``b_i``; gravity ``g``.
-    **rest
-        Further fields of :class:`undertow.Mechanism`.
+    ``motors``: the number of each joint that is turned, whose angle is an actuated coordinate, to
+    the torque that turns it. ``parameters``: ``m_i, l_i, a_i, J_i`` of each link as for
+    :func:`chain_energies`, damping of its joint ``b_i``; gravity ``g``. ``rest``: further fields of
+    :class:`undertow.Mechanism`.
     """
     p = {one.name: one.symbol for one in parameters}
     links = {
@@ -109,16 +96,9 @@ def links_on_a_cart(
 ) -> Mechanism:
     """Return links that stand on a cart, upright at the target, moved by a force on the cart.
 
-    Parameters
-    ----------
-    name
-        Of the mechanism.
-    limit
-        Of the force, N.
-    parameters
-        Of the cart ``m_c, b_c``, mass and damping; of the links as for :func:`standing_links`.
-    **rest
-        Further fields of :class:`undertow.Mechanism`.
+    ``limit`` is that of the force, N; ``parameters`` are those of the cart ``m_c, b_c``, mass and
+    damping, and of the links as for :func:`standing_links`; ``rest`` are further fields of
+    :class:`undertow.Mechanism`.
     """
     p = {one.name: one.symbol for one in parameters}
     numbers = _links(p)

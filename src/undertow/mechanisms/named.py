@@ -103,14 +103,8 @@ def from_anywhere(name: str) -> str:
 class DataName:
     """What the name of a mechanism in a URDF or MJCF file says.
 
-    Attributes
-    ----------
-    file
-        The file.
-    actuated, frozen
-        Names of joints.
-    target
-        The target's words; none for the nearest equilibrium that will do.
+    ``actuated``, ``frozen``: names of joints; ``target``: its words, none for the nearest
+    equilibrium that will do.
     """
 
     file: Path

@@ -86,13 +86,8 @@ _DERIVED: dict[object, Mechanism] = {}
 def error_dynamics(mechanism: Mechanism, reference: FloatArray | None = None) -> Mechanism:
     """Return the mechanism of the error q̃ = q − q_r.
 
-    Parameters
-    ----------
-    mechanism
-        What moves.
-    reference
-        q_r, q̇_r and q̈_r, (3n,): the last parameters of what is returned, named by
-        :func:`reference_names`; zero by default.
+    ``reference`` holds q_r, q̇_r and q̈_r, (3n,): the last parameters of what is returned, named by
+    :func:`reference_names`; zero by default.
     """
     key = mechanism.structure, mechanism.name, mechanism.input_limits.tobytes()
     if key not in _DERIVED:

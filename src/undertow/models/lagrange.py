@@ -29,16 +29,7 @@ def derived(
     coordinates, the versions of Python and SymPy and this file's own text: a change of any of
     them derives afresh.
 
-    Parameters
-    ----------
-    name
-        Of the mechanism, for messages.
-    q, qd
-        Symbols of coordinates and velocities, n each.
-    kinetic, potential
-        T(q, q̇) and V(q), J.
-    dissipation
-        Rayleigh's function D(q, q̇), W.
+    T and V are in J, Rayleigh's function D(q, q̇) in W; ``name`` is for messages.
 
     Raises
     ------

@@ -216,14 +216,8 @@ def check_symbols(
     To SymPy ``Symbol("a")`` and ``Symbol("a", real=True)`` are different variables: the derivative
     of one by the other is zero, and terms with the wrong one would drop out of the equations.
 
-    Parameters
-    ----------
-    what
-        Whose expressions, for the message.
-    expressions
-        Expressions, or a matrix of them.
-    known
-        What they may hold, see :func:`vocabulary`.
+    ``what`` says whose expressions these are, for the message; ``known`` is what they may hold, see
+    :func:`vocabulary`.
 
     Raises
     ------
@@ -348,19 +342,10 @@ def require_smooth(
     SymPy also differentiates expressions with kinks, and returns a slope that does not exist:
     0 for |x| at 0.
 
-    Parameters
-    ----------
-    what
-        What is differentiated, for the message.
-    expressions
-        Expressions, or a matrix of them.
-    variables
-        By which they are differentiated.
-    at
-        The point where, all symbols to numbers: a kink elsewhere, as that of |x − 1| at 0, does
-        no harm.  Without it the derivative is wanted everywhere.
-    orders
-        How many derivatives are taken one after the other: x |x| has one, and no second.
+    The point ``at``, all symbols to numbers, is where the derivative is wanted: a kink elsewhere,
+    as that of |x − 1| at 0, does no harm. Without it the derivative is wanted everywhere.
+    ``orders`` derivatives are taken one after the other: x |x| has one, and no second. ``what`` is
+    for the message.
 
     Raises
     ------

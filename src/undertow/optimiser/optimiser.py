@@ -16,7 +16,7 @@ from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
 from undertow.optimiser.search_space import DecisionVariables, SearchSpace
-from undertow.optimiser.task import Optimisation
+from undertow.optimiser.task import FINE, Optimisation
 
 #: Quadratic designs that a global search begins with.
 DESIGNS = 31
@@ -128,15 +128,17 @@ class Optimiser:
         given = self.warm if warm else self.cold
         if given is not None:
             return given
-        size = self.space.size
-        if warm and self.freedom.schedule:
+        size, schedule = self.space.size, self.freedom.schedule > 0
+        if warm and schedule and self.counts_time:
             return Budget(16384 // self.loop.mechanism.n)
         if warm:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
         if self.counts_time:
-            return Budget((2 if self.freedom.schedule else 1) * 8192 * size)
+            return Budget((2 if schedule else 1) * 8192 * size)
+        size //= self.space.segments
+        divided = FINE * size if schedule or self.space.segments > 1 else 0
         # 6144 for the three of n = 2; a covariance takes as long to learn as it has entries.
-        return Budget(2048 * size**2 // 3)
+        return Budget(2048 * size**2 // 3 + divided)
 
     @checked
     def propose(
@@ -214,12 +216,12 @@ class Optimiser:
         self, x: ArrayLike, horizon: float, budget: Budget, resolution: float, sequence: int,
         warm: bool,
     ) -> Optimisation:  # fmt: skip
-        if self.freedom.schedule and not (self.counts_time and self.loop.ensemble is None):
+        if self.freedom.schedule and self.counts_time and self.loop.ensemble is not None:
             raise InvalidInputError(
                 "schedule",
                 value=f"{self.freedom.schedule:g} s",
-                limit="least time, with a model that is taken for the plant",
-                remedy='Give the cascade MinimumTime() and belief="exact", or leave schedule out',
+                limit="for least time, a model that is taken for the plant",
+                remedy='Give the cascade belief="exact", or leave schedule out',
             )
         early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
         return Optimisation(

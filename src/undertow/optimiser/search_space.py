@@ -33,8 +33,9 @@ class DecisionVariables:
     alpha_a
         Also the off-diagonal entries of α_a (m > 1); its diagonal stays −1.
     schedule
-        For least time alone: surfaces one after another, each for so long, s, as many as the
-        motion needs, with their reaching laws; 0: one plan of ``times``.
+        Surfaces one after another, with their reaching laws.  For least time each for so long, s,
+        and as many as the motion needs; for another cost five, the first for so long or longer,
+        the others for twice the time each, the last one for good.  0: those of ``times``.
 
     Raises
     ------

@@ -5,7 +5,8 @@ surfaces are not rolled out; inadmissible motions get a graded penalty, see
 :meth:`undertow.closed_loop.trajectory.Batch.score`.  A global search first improves the best of
 some quadratic designs, which is an answer already, and then looks elsewhere: for a smooth cost by
 descents from the best of many draws, for the time of arrival by
-:mod:`undertow.optimiser.arrival`.
+:mod:`undertow.optimiser.arrival`.  Of a smooth cost the best single surface comes first, where
+there may be several one after another: its copies are what they are improved from.
 """
 
 from __future__ import annotations
@@ -97,6 +98,10 @@ FEWEST, WAYS, SWAY, ALONE = 4, 3, (0.02, 0.5), 1024
 
 #: What a motion integrated to the tolerance counts as, in evaluations: it takes as long.
 EXACT = 16
+#: A single surface is divided into so many, the first but one of which takes over after this part
+#: of the time in which nearly all of the cost, this part, is spent, each later one after twice the
+#: time; and the evaluations that improving them may take, per coordinate of a single one.
+DIVIDED, SOON, NEARLY_ALL, FINE = 5, 1 / 8, 0.95, 10240
 
 #: Draws of a schedule's surfaces: the largest factor of their gain, as its logarithm.
 STRONG = 5.0
@@ -149,6 +154,7 @@ class Optimisation:
         self.incumbent_cost = math.inf
         self._unscored: Plan | None = None
         self._pace = 0.0
+        self._kept = 0
         self._buffers: dict[int, RolloutBuffers] = {}
 
     # -- budget ----------------------------------------------------------------------------
@@ -161,8 +167,22 @@ class Optimisation:
 
     @property
     def left(self) -> int:
-        """Evaluations that are left."""
-        return self.budget.evaluations - self.evaluations
+        """Evaluations that are left, but for those that are kept for later."""
+        return self.budget.evaluations - self.evaluations - self._kept
+
+    @property
+    def firsts(self) -> FloatArray:
+        """Search coordinates of the designs, (N, d)."""
+        size = self.space.size // self.space.segments
+        return np.tile(self.optimiser.firsts[:, :size], self.space.segments)
+
+    def _switch_at(self, times: tuple[float, ...]) -> None:
+        """Search from now on for surfaces that take over at these times, s."""
+        best, freedom = self.best, replace(self.optimiser.freedom, times=times, schedule=0.0)
+        self.space = SearchSpace(self.loop, self.optimiser.anchor, freedom)
+        self._buffers.clear()
+        if best is not None:
+            self._best, self.best_z = best, self.space.encode(best)
 
     # -- evaluation ------------------------------------------------------------------------
 
@@ -177,7 +197,7 @@ class Optimisation:
         or the deadline a little above what they would cost without the miss, which keeps the
         score continuous where the best plans lie.
         """
-        optimiser, loop, known = self.optimiser, self.loop, self.best_cost < INADMISSIBLE
+        loop, known = self.loop, self.best_cost < INADMISSIBLE
         vectors, gains = self.space.decode(z)
         incumbent, self._unscored = self._unscored, None
         if incumbent is not None:
@@ -197,7 +217,7 @@ class Optimisation:
         scores = guide = np.empty(0)
         if len(vectors):
             batch = loop.roll_out(
-                self._filled(vectors, gains), optimiser.freedom.times, self.horizon,
+                self._filled(vectors, gains), self.space.freedom.times, self.horizon,
                 cap=cap, stable_only=True, seek=seek,
             )  # fmt: skip
             scores = batch.score(self.horizon)
@@ -260,27 +280,55 @@ class Optimisation:
 
     def global_search(self) -> Iterator[bool]:
         """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
-        z = self.optimiser.firsts[: max(1, self.left)]
-        scores = self.cost(z)
-        if self.optimiser.counts_time:
-            yield self._earlier(min(POLISH, self.left))
-            again, done = self.optimiser.freedom.schedule > 0, False
-            if again:
-                for done in self.follow_earliest(self.left // 2):
-                    yield done
-            if done:
-                return
-            self.arrive_earlier(wide=True, keep=POLISH + again * (self.left // 2))
-            yield self._earlier(POLISH if again else self.left)
-            if again:
-                yield from self.follow_earliest()
+        if not self.optimiser.counts_time:
+            yield from self._coarse_to_fine()
             return
+        self.cost(self.firsts[: max(1, self.left)])
+        yield self._earlier(min(POLISH, self.left))
+        again, done = self.optimiser.freedom.schedule > 0, False
+        if again:
+            for done in self.follow_earliest(self.left // 2):
+                yield done
+        if done:
+            return
+        self.arrive_earlier(wide=True, keep=POLISH + again * (self.left // 2))
+        yield self._earlier(POLISH if again else self.left)
+        if again:
+            yield from self.follow_earliest()
+
+    def _coarse_to_fine(self) -> Iterator[bool]:
+        """Look for the best single surface, then improve several copies of it, if there may be."""
+        freedom, size = self.optimiser.freedom, self.space.size // self.space.segments
+        if len(freedom.times) == 1 and not freedom.schedule:
+            yield from self._search_everywhere()
+            return
+        self._switch_at((0.0,))
+        self._kept = min(FINE * size, 3 * self.left // 4)
+        yield from self._search_everywhere()
+        self._kept = 0
+        self._switch_at(self._division() if freedom.schedule else freedom.times)
+        yield self._descend(self._centre(), 0.1, self.left, 1e-4)
+
+    def _division(self) -> tuple[float, ...]:
+        """When each of several surfaces is to take over from the best single one, s."""
+        period, best = self.optimiser.freedom.schedule, self.best
+        assert best is not None  # cost() has run before
+        motion = self.loop.simulate(self.x, best, duration=self.horizon)
+        spent = np.searchsorted(motion.accumulated_cost, NEARLY_ALL * motion.cost)
+        first = period * max(1, round(SOON * float(motion.t[spent]) / period))
+        times = (round(first * 2**k, 9) for k in range(DIVIDED - 1))
+        return (0.0, *(t for t in times if t < self.horizon))
+
+    def _search_everywhere(self) -> Iterator[bool]:
+        """Improve the best of the designs, then descend from the best of many draws."""
+        z = self.firsts[: max(1, self.left)]
+        scores = self.cost(z)
         if self._centre().size <= MODEL_SIZE:
             self._model_search(self._centre())
             yield False
-        optimiser, rng, total = self.optimiser, self.rng, self.budget.evaluations
+        optimiser, rng, total = self.optimiser, self.rng, self.evaluations + self.left
         draws = max(optimiser.population, total // 6)
-        drawn = self.optimiser.firsts[0] + self.space.steps(rng, np.ones(draws))
+        drawn = self.firsts[0] + self.space.steps(rng, np.ones(draws))
         drawn = drawn[: max(1, self.left)]
         z, scores = np.vstack([z, drawn]), np.concatenate([scores, self.cost(drawn)])
         starts = z[np.argsort(scores, kind="stable")[:3]]
@@ -295,6 +343,8 @@ class Optimisation:
 
     def local_search(self, incumbent: Plan) -> bool:
         """Start from the incumbent; look further away where that gains nothing."""
+        if self.optimiser.freedom.schedule:
+            self._switch_at(incumbent.times)
         here = self._begin(incumbent)
         if self._unscored is not None and (self.left < 2 * LANES or self.late()):
             self.cost(here[None])
@@ -326,12 +376,12 @@ class Optimisation:
     def _begin(self, incumbent: Plan) -> FloatArray:
         """Return the coordinates of the incumbent; where they cannot express it, score it."""
         here = self.space.encode(incumbent)
-        loop, freedom = self.loop, self.optimiser.freedom
+        loop, freedom = self.loop, self.space.freedom
         plain = freedom.reaching or incumbent.reaching is None
         if plain and incumbent.times == freedom.times:
             self._unscored = incumbent
             return here
-        schedule = freedom.schedule > 0
+        schedule = self.optimiser.freedom.schedule > 0
         batch = loop.batch(
             self.x, incumbent, duration=self.horizon, stable_only=True,
             seek=self._seeks() and not schedule, precise=schedule,
@@ -397,7 +447,7 @@ class Optimisation:
             self.x,
             vectors,
             reaching=gains,
-            switch_times=self.optimiser.freedom.times,
+            switch_times=self.space.freedom.times,
             duration=1.05 * self.best_cost,
             terminal=0.0,
             seek=True,
@@ -446,7 +496,7 @@ class Optimisation:
             if before <= self.loop.step:  # all but there
                 return True
             if not before < INADMISSIBLE or fruitless == most:
-                z = self.optimiser.firsts[0] + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
+                z = self.firsts[0] + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
                 known = before < INADMISSIBLE
                 search.run(z, rng.uniform(*BEGINS) * before if known else self._long(), CROWD)
                 fruitless = 0
@@ -598,7 +648,7 @@ class Optimisation:
         m = loop.mechanism.m
 
         def draw(count: int, before: FloatArray | None) -> FloatArray:
-            z = self.optimiser.firsts[0] + space.steps(self.rng, np.full(count, WIDE))
+            z = self.firsts[0] + space.steps(self.rng, np.full(count, WIDE))
             z[:, -2 * m : -m] += self.rng.uniform(0.0, STRONG, (count, m))
             if before is not None:
                 near = np.geomspace(1e-3, 1.0, count // 8)
@@ -677,7 +727,7 @@ class Optimisation:
         The best plan is then the one that all plants survive longest, and it is answered.
         """
         if not self.best_cost < INADMISSIBLE:
-            self.cost(self.optimiser.firsts)
+            self.cost(self.firsts)
 
     def answer(self, converged: bool, computed_for: float, *, judged: bool = True) -> Proposal:
         """Pack the best admissible plan; a first one that is to be judged, with its margins."""

@@ -189,15 +189,6 @@ def rig_from_file(text: str, mechanism: Mechanism) -> Rig:
 def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") -> None:
     """Refuse what is no rig of a mechanism, before it moves; it is read once.
 
-    Parameters
-    ----------
-    rig
-        What is to be one.
-    mechanism
-        Whose positions it must read.
-    name
-        For messages.
-
     Raises
     ------
     ArtefactError

@@ -23,13 +23,9 @@ _THIN = 1e-14
 class Scene:
     """An MJCF document and how its joints read the coordinates.
 
-    Attributes
-    ----------
-    xml
-        The document; its actuators take the mechanism's inputs, in order.
-    joints
-        Matrix P, (n, n), with ``qpos = P q`` and ``qvel = P q̇``: MuJoCo's joints are relative
-        and in the order of the bodies.
+    The actuators of the document take the mechanism's inputs, in order. ``joints`` is the matrix P,
+    (n, n), with ``qpos = P q`` and ``qvel = P q̇``: MuJoCo's joints are relative and in the order
+    of the bodies.
     """
 
     xml: str

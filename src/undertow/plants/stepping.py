@@ -348,15 +348,8 @@ def compiled_module(
 ) -> Any:
     """Return a compiled module of a mechanism's :func:`dynamics_source` and a body that uses it.
 
-    Parameters
-    ----------
-    mechanism
-        Whose n, m and p are known in the body.
-    kind, title
-        Of the file, and in its first line.
-    body, imports
-        Source; imports of compiled functions, whose changes numba's cache does not notice: the
-        key in the first line does.
+    Its n, m and p are known in the body. ``imports`` are of compiled functions, whose changes
+    numba's cache does not notice: the key in the first line does.
     """
     key = content_key(mechanism.structure, mechanism.name)
 

@@ -132,13 +132,7 @@ def locked_memory() -> Iterator[str]:
 
 
 class Histogram:
-    """Durations counted in bins of 1 µs up to 20 ms; nothing is allocated by a count.
-
-    Attributes
-    ----------
-    longest
-        Longest duration, s.
-    """
+    """Durations counted in bins of 1 µs up to 20 ms; nothing is allocated by a count."""
 
     BINS = 20_000
 
@@ -174,17 +168,8 @@ SECOND = 1.0
 class FailureRatio:
     """The part of the last periods that failed, each weighing less the longer ago it was.
 
-    Parameters
-    ----------
-    window
-        Time constant of the weights, s: what failed one window ago weighs e⁻¹.
-    period
-        Of the fast loop, s.
-
-    Attributes
-    ----------
-    value
-        From 0 to 1; 0 at first, so that it takes some time until a share is found high.
+    What failed one ``window``, s, ago weighs e⁻¹; ``period`` is that of the fast loop, s. ``value``
+    is from 0 to 1; 0 at first, so that it takes some time until a share is found high.
 
     Examples
     --------
@@ -214,12 +199,8 @@ class RigClock:
     it.  One that stands still, of a sensor slower than the loop or of a rig that took no output,
     may have let that time pass or not.
 
-    Parameters
-    ----------
-    settings
-        Largest drift in a second, s, and longest stall, s.
-    period
-        Of the fast loop, s.
+    The settings give the largest drift in a second and the longest stall, s; ``period`` is that of
+    the fast loop, s.
     """
 
     def __init__(self, settings: Settings, period: float) -> None:
@@ -231,12 +212,7 @@ class RigClock:
     def check(self, stamp: float, now: float, step: int) -> str:
         """Return what is wrong with the rig's clock; empty where nothing is.
 
-        Parameters
-        ----------
-        stamp
-            Time of a reading on the rig's clock, s.
-        now, step
-            Time on the host's clock, s, and number of the step in which it was read.
+        ``stamp`` is the time of a reading on the rig's clock, ``now`` that on the host's, s.
         """
         last, self._last = self._last, (stamp, now, step)
         if last is None or not 0.0 <= stamp - last[0] <= self._stall:

@@ -57,22 +57,11 @@ UNSOUND = "unsound: "
 class Inputs:
     """Everything that a step depends on besides the memory of the controller.
 
-    Attributes
-    ----------
-    t
-        Time of the step, s.
-    measurement
-        What the rig said, ``None`` when it failed.
-    answer
-        An answer of the slow loop that has arrived.
-    command
-        The operator's wish.
-    alarm
-        What the runtime itself found wrong (a stall, failed writes, deadlines missed, a clock
-        that runs wrong); stops the run.
-    target
-        Another target that was asked for meanwhile: when it jumps, s after this step, and where
-        to.  It takes the place of what was asked for before and has not been reached.
+    ``t``: time of the step, s. ``measurement``: ``None`` when the rig failed. ``answer``: of the
+    slow loop, one that has arrived. ``alarm``: what the runtime itself found wrong (a stall, failed
+    writes, deadlines missed, a clock that runs wrong); stops the run. ``target``: another one that
+    was asked for meanwhile: when it jumps, s after this step, and where to. It takes the place of
+    what was asked for before and has not been reached.
     """
 
     t: float

@@ -39,17 +39,9 @@ def estimator_for(
 ) -> KalmanFilter:
     """Return the Kalman filter that knows a bench's encoders, period and delays, nothing else.
 
-    Parameters
-    ----------
-    belief
-        The controller's model.
-    bench
-        The bench.
-    drift
-        Density of the matched disturbance's drift, input units per √s; ``DRIFT`` of the
-        smallest limit by default.  0 estimates none.
-    known
-        What is not known of the model's parameters, which are then learnt.
+    ``drift``: density of the matched disturbance's drift, input units per √s; ``DRIFT`` of the
+    smallest limit by default, 0 estimates none. ``known``: what is not known of the model's
+    parameters, which are then learnt.
     """
     sigmas = []
     for c in belief.coordinates:
@@ -74,11 +66,8 @@ def default_gate(estimator: KalmanFilter | None = None) -> Gate:
     periods of delay, do with ``RESERVE`` = 15 % less input, and spend no more than ``NOISE`` = 20 %
     of the input on noise.
 
-    Parameters
-    ----------
-    estimator
-        That of the rig: its period, and what it does not know of the state at the target.
-        ``None``: states are exact, as in a simulation.
+    The estimator is that of the rig: its period, and what it does not know of the state at the
+    target; ``None``: states are exact, as in a simulation.
     """
     if estimator is None:
         return cost_gate

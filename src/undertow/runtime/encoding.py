@@ -48,22 +48,13 @@ class Columns:
 
     Every name of a coordinate, state or input of the mechanism gives a column.
 
-    Attributes
-    ----------
-    names
-        Of all columns, in their order.
-    k, t, clock
-        Number of the step, its time since the start of the run, s, and on the clock, s.
-    mode, surface
-        State of the run, and sequence number of the plan in use.
-    rig_t, q, v
-        The measurement: time on the rig's clock, s, positions (n,) and velocities (n,).
-    x, s, demand, u
-        Estimate (2n,), surface values (m,), unlimited output of the law (m,), output (m,).
-    margin
-        det Γ(q)/det Γ(0).
-    late_us, read_us, step_us, write_us
-        How late the step began, and how long reading, computing and writing took, µs.
+    ``k``, ``t``, ``clock``: number of the step, its time since the start of the run, s, and on the
+    clock, s. ``mode``, ``surface``: state of the run, and sequence number of the plan in use.
+    ``rig_t``, ``q``, ``v``: the measurement: time on the rig's clock, s, positions (n,) and
+    velocities (n,). ``x``, ``s``, ``demand``, ``u``: estimate (2n,), surface values (m,), unlimited
+    output of the law (m,), output (m,). ``margin``: det Γ(q)/det Γ(0). ``late_us``, ``read_us``,
+    ``step_us``, ``write_us``: how late the step began, and how long reading, computing and writing
+    took, µs.
     """
 
     names: tuple[str, ...]
@@ -113,16 +104,8 @@ class Columns:
     def fill(self, row: FloatArray, k: int, at: Stamps, inputs: Inputs, after: Controller) -> None:
         """Write a step into a row.
 
-        Parameters
-        ----------
-        row
-            Numbers of all columns; written over.
-        k
-            Number of the step.
-        at
-            When its parts were due or done.
-        inputs, after
-            What it was given, and the controller after it.
+        Number ``k``; when its parts were due or done; what it was given, and the controller
+        ``after`` it.
         """
         row[self.k], row[self.t], row[self.clock] = k, inputs.t, at.began
         row[self.mode], row[self.surface] = after.mode, after.memory.sequence
@@ -149,13 +132,11 @@ class Columns:
 
     def agrees(self, row: FloatArray, controller: Controller) -> bool:
         """Whether a controller is, bit for bit, where the step of a row had left it."""
-        pairs = (
-            (controller.u, self.u),
-            (controller.x, self.x),
-            (controller.s, self.s),
-            (controller.demand, self.demand),
+        names = ("u", "x", "s", "demand")
+        same = all(
+            np.array_equal(getattr(controller, k), row[getattr(self, k)], equal_nan=True)
+            for k in names
         )
-        same = all(np.array_equal(values, row[at], equal_nan=True) for values, at in pairs)
         same = same and controller.mode == row[self.mode]
         return same and controller.memory.sequence == row[self.surface]
 

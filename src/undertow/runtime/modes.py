@@ -82,22 +82,10 @@ def transition(
 
     Faults come before everything, and nothing but the operator leads out of a safe stop.
 
-    Parameters
-    ----------
-    mode, command
-        The present state, a :class:`Mode`, and the operator's wish, a :class:`Command`.
-    fault
-        The run cannot go on.
-    ready
-        The sensors have been sound for long enough.
-    inside
-        The state is where the law may take over.
-    lost
-        The state is where the law cannot hold it.
-    settled
-        The state is close to the target.
-    swings
-        There is a swing-up.
+    ``mode`` and ``command`` are the present :class:`Mode` and the operator's :class:`Command`.
+    ``fault``: the run cannot go on; ``ready``: the sensors have been sound for long enough;
+    ``inside``, ``lost``: the state is where the law may take over, and where it cannot hold it;
+    ``settled``: it is close to the target; ``swings``: there is a swing-up.
 
     Examples
     --------

@@ -26,12 +26,7 @@ _LAYOUT = {
 class PlanCheck:
     """Packs the plans of a mechanism for the fast loop, and tests their stability.
 
-    Parameters
-    ----------
-    mechanism
-        The controller's belief.
-    reaching
-        The reaching law of plans that have none of their own.
+    ``reaching`` is the law of plans that have none of their own.
     """
 
     def __init__(self, mechanism: Mechanism, reaching: ReachingLaw) -> None:
@@ -210,19 +205,11 @@ def _judge(
 def is_hurwitz(A: FloatArray, polynomials: FloatArray, routh: FloatArray) -> bool:
     """Whether all eigenvalues of A, (N, N), have negative real parts, by Routh and Hurwitz.
 
-    Parameters
-    ----------
-    A
-        Overwritten: balanced, scaled, and brought to Hessenberg form by eliminations (Wilkinson,
-        *The Algebraic Eigenvalue Problem*, ch. 6), which gives the characteristic polynomial by
-        a recurrence over its leading minors.
-    polynomials, routh
-        Room, (N + 1, N + 1) and (2, N + 1).
-
-    Returns
-    -------
-    bool
-        False also where a number is not finite, or an entry of Routh's first column is zero.
+    A is overwritten: balanced, scaled, and brought to Hessenberg form by eliminations (Wilkinson,
+    *The Algebraic Eigenvalue Problem*, ch. 6), which gives the characteristic polynomial by a
+    recurrence over its leading minors. ``polynomials`` and ``routh`` are room, (N + 1, N + 1) and
+    (2, N + 1). The answer is also no where a number is not finite, or an entry of Routh's first
+    column is zero.
     """
     size = A.shape[0]
     total = 0.0

@@ -88,17 +88,11 @@ def fork(
     waits for.  Ours are begun after the forks; those of a linear algebra library take care
     of themselves.
 
-    Parameters
-    ----------
-    target, args, name
-        What it runs, and its name in messages.
-    daemon
-        Whether it is ended with this process, by SIGTERM; otherwise this one waits for it.
-    ignores
-        Which of :data:`STOPPING` it ignores from the beginning, in a session of its own: Ctrl-C,
-        Ctrl-Z and a lost connection reach every process of a terminal, and a supervisor that is
-        stopped or ended with its controller keeps nothing.  The others end it.  A stop that is
-        asked for meanwhile reaches this process once the other has begun.
+    ``daemon``: whether it is ended with this process, by SIGTERM; otherwise this one waits for it.
+    ``ignores``: which of :data:`STOPPING` it ignores from the beginning, in a session of its own:
+    Ctrl-C, Ctrl-Z and a lost connection reach every process of a terminal, and a supervisor that is
+    stopped or ended with its controller keeps nothing. The others end it. A stop that is asked for
+    meanwhile reaches this process once the other has begun.
 
     Raises
     ------
@@ -208,12 +202,7 @@ class Background(threading.Thread):
     :meth:`threading.Thread.start` waits without end for a thread that the system made but had
     no memory to begin with.
 
-    Parameters
-    ----------
-    target
-        What it does; the process does not wait for it when it ends.
-    name
-        Of the thread, for messages.
+    The process does not wait for ``target`` when it ends.
 
     Raises
     ------
@@ -257,12 +246,8 @@ class _BoundedEvent(threading.Event):
 def check_resources(*, processes: int, log: bool = False) -> None:
     """See that the system has what a run needs, before anything of a rig is touched.
 
-    Parameters
-    ----------
-    processes
-        That the run will fork.
-    log
-        Whether it writes a log; what its disk has free is :func:`undertow.runtime.log.check_log`'s.
+    It will fork so many processes; what the disk of a log has free is
+    :func:`undertow.runtime.log.check_log`'s.
 
     Raises
     ------

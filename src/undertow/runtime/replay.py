@@ -41,28 +41,12 @@ from undertow.symbolic import processor, sources_digest
 class Replay:
     """What came of a replay.
 
-    Attributes
-    ----------
-    recording
-        The log.
-    steps
-        Steps that were made again.
-    differing
-        Steps whose output, estimate, surface value or state differs in any bit.
-    first
-        The first of them; ``None`` where there is none.
-    judged
-        Answers of the slow loop that were judged again.
-    misjudged
-        Answers that the gate decided otherwise on.
-    gap
-        Number of a step that the log lost; the replay ends before it.
-    u
-        Outputs, (steps, m).
-    build
-        What has changed since the log was written: name to (then, now).
-    remarks
-        What else is to be known of it, in sentences.
+    ``differing``: of the ``steps`` that were made again, those whose output, estimate, surface
+    value or state differs in any bit; ``first``: the first of them. ``judged``, ``misjudged``:
+    answers of the slow loop that were judged again, and those that the gate decided otherwise on.
+    ``gap``: number of a step that the log lost; the replay ends before it. ``u``: outputs, (steps,
+    m). ``build``: what has changed since the log was written, name to (then, now). ``remarks``:
+    what else is to be known of it, in sentences.
     """
 
     recording: Recording
@@ -85,15 +69,9 @@ class Replay:
 def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> dict[str, Any]:
     """Return what a log must tell of a run, so that it can be replayed.
 
-    Parameters
-    ----------
-    controller
-        Idle, as the run will start with it.
-    recipe
-        From which it was built; without one, or with one whose mechanism or objective has no
-        name, a replay needs the controller from its caller.
-    **more
-        Further JSON values.
+    The controller is idle, as the run will start with it. Without a recipe, or with one whose
+    mechanism or objective has no name, a replay needs the controller from its caller. ``more`` are
+    further JSON values.
     """
     mechanism = controller.cascade.mechanism
     recipe = None if recipe is None else recipe.in_names()

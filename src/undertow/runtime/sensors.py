@@ -167,23 +167,9 @@ def _module(mechanism: Mechanism) -> Any:
 class SensorMonitor:
     """Compares readings with what the model expects; short gaps are left to the estimator.
 
-    Parameters
-    ----------
-    mechanism
-        The controller's belief.
-    settings
-        Limits of innovations and of gaps.
-    period
-        Of the fast loop, s.
-
-    Attributes
-    ----------
-    missing
-        Readings of the last step that are missing or not accepted.
-    first
-        Whether the last step was the first with a sound reading.
-    probe
-        −1, 0 or 1: what to add to the inputs, in units of twice their dead band.
+    Of the last step ``missing`` says which readings are missing or not accepted, and ``first``
+    whether it was the first with a sound reading; ``probe`` is −1, 0 or 1: what to add to the
+    inputs, in units of twice their dead band. ``period`` is that of the fast loop, s.
     """
 
     def __init__(self, mechanism: Mechanism, settings: Settings, period: float) -> None:
@@ -216,23 +202,11 @@ class SensorMonitor:
     ) -> tuple[Measurement | None, int, int]:
         """Return what can be accepted of a measurement, and what is wrong for too long.
 
-        Parameters
-        ----------
-        measurement
-            Of this step; ``None`` when the rig failed.
-        x
-            Estimate of the last step, (2n,).
-        u
-            Input since then, (m,).
-
-        Returns
-        -------
-        Measurement or None
-            With NaN for what is missing; ``None`` before the first sound reading.  The next
-            call writes it over.
-        int, int
-            What was found, a fault if it is above ``LAST_HARMLESS``, and at which sensor:
-            :meth:`describe` says it in words.
+        The measurement is ``None`` when the rig failed; x, (2n,), is the estimate of the last step
+        and u, (m,), the input since then. What comes back has NaN for what is missing, is ``None``
+        before the first sound reading, and is written over by the next call. Two numbers say what
+        was found, a fault if above ``LAST_HARMLESS``, and at which sensor: :meth:`describe` says it
+        in words.
 
         Raises
         ------

@@ -40,14 +40,8 @@ from undertow.runtime.verdict import Report
 def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
     """Return the rig that is asked for, or nothing for one that the recipe itself makes.
 
-    Parameters
-    ----------
-    word
-        ``ideal``, ``realistic``, ``mujoco``, ``FILE.xml`` or ``FILE.py:NAME``.
-    recipe
-        Of the run.
-    supervised
-        Whether a process of its own holds the rig.
+    The word is ``ideal``, ``realistic``, ``mujoco``, ``FILE.xml`` or ``FILE.py:NAME``;
+    ``supervised``: a process of its own holds the rig.
 
     Raises
     ------

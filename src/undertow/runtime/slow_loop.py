@@ -41,10 +41,7 @@ BEGUN = "begun"
 class Packer:
     """Writes what goes between two processes; motions that both of them have go by number.
 
-    Parameters
-    ----------
-    shared
-        What the other process has, too, for it was forked from this one.
+    ``shared`` is what the other process has, too, for it was forked from this one.
     """
 
     def __init__(self, shared: Sequence[object] = ()) -> None:
@@ -105,24 +102,12 @@ class Request:
 class Answer:
     """What the slow loop says.
 
-    Attributes
-    ----------
-    sequence, use
-        Number and time of use, s, of the request.
-    x
-        State predicted for the time of use, (2n,).
-    proposal, admission
-        The optimiser's answer and the gate's decision.
-    before, memory
-        The cascade's memory as it was asked, and from the time of use on.
-    law_vectors
-        Numbers of the law for each surface of the plan, (S, 2mn + 2m + 1).
-    seconds
-        Time from request to answer, s.
-    swing
-        That of the request.
-    jump
-        Whether the target jumps at the time of use: ``x`` is counted from the new one.
+    ``sequence``, ``use``, ``swing``: number, time of use, s, and swing of the request. ``x``: state
+    predicted for the time of use, (2n,). ``proposal``, ``admission``: the optimiser's answer and
+    the gate's decision. ``before``, ``memory``: the cascade's memory as it was asked, and from the
+    time of use on. ``law_vectors``: numbers of the law for each surface of the plan, (S, 2mn + 2m +
+    1). ``seconds``: from request to answer, s. ``jump``: whether the target jumps at the time of
+    use: ``x`` is counted from the new one.
     """
 
     sequence: int
@@ -186,10 +171,7 @@ def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None
         return _retarget(cascade, request, x, began)
     proposal: object = cascade.propose(memory, memory.absolute(request.use, x), request.use)
     if not isinstance(proposal, Proposal):
-        what = f"not a proposal but a {type(proposal).__name__}"
-        proposal = Proposal(
-            None, "failed", math.inf, math.inf, (), 0, 0.0, request.sequence, request.use, what
-        )
+        proposal = _failed(request, f"not a proposal but a {type(proposal).__name__}")
     judged = judge(cascade, memory, proposal, x, request.use)
     return _answer(request, x, proposal, *judged, began)
 
@@ -208,11 +190,13 @@ def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -
         )  # fmt: skip
         return replace(answer, jump=True)
     except Exception as error:
-        message = f"{type(error).__name__}: {error}"
-        proposal = Proposal(
-            None, "failed", math.inf, math.inf, (), 0, 0.0, request.sequence, use, message
-        )
+        proposal = _failed(request, f"{type(error).__name__}: {error}")
         return _answer(request, x, proposal, *judge(cascade, memory, proposal, x, use), began)
+
+
+def _failed(request: Request, why: str) -> Proposal:
+    number, use = request.sequence, request.use
+    return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, number, use, why)
 
 
 def _answer(
@@ -312,12 +296,7 @@ class Worker(Protocol):
 class InlineWorker:
     """Computes at once, and answers after a latency of simulated time.
 
-    Parameters
-    ----------
-    compute
-        Request to answer.
-    latency
-        Simulated time from request to answer, s.
+    ``latency`` is the simulated time from request to answer, s.
     """
 
     def __init__(self, compute: Compute, latency: float = 0.05) -> None:
@@ -471,15 +450,10 @@ def background_worker(
 ) -> BackgroundWorker:
     """Return a worker on another core: one process computes, the others stand by.
 
-    Parameters
-    ----------
-    compute
-        Request to answer; call it once before, so that everything is compiled.
-    processes
-        Processes to fork now, while the fast loop does not run yet: one to compute, the
-        rest to take over from one that hangs or dies.  0: a thread of this process.
-    shared
-        What requests and answers hold that both sides have: a long reference.
+    ``compute`` has been called once before, so that everything is compiled. ``processes`` are
+    forked now, while the fast loop does not run yet: one to compute, the rest to take over from one
+    that hangs or dies; 0: a thread of this process. ``shared`` is what requests and answers hold
+    that both sides have: a long reference.
 
     Raises
     ------

@@ -108,16 +108,8 @@ def step_memory(
 ) -> Workspace:
     """Return what a step of the fast loop works on, its settings filled in.
 
-    Parameters
-    ----------
-    mechanism
-        The controller's belief.
-    settings
-        Limits and patience.
-    period
-        Of the fast loop, s.
-    fall_angle
-        A free angle further than this from the target has been thrown out, rad.
+    ``period`` is that of the fast loop, s; a free angle further than ``fall_angle``, rad, from the
+    target has been thrown out.
     """
     n, m = mechanism.n, mechanism.m
     memory = Workspace(_LAYOUT, n=n, m=m, p=len(mechanism.parameters))
@@ -212,14 +204,8 @@ def reference_row(
 ) -> None:
     """Write q_r, q̇_r and q̈_r at the time t into a row, (3n,), as :class:`ReferenceMotion` has them.
 
-    Parameters
-    ----------
-    t
-        Time, s.
-    times, q, v, a
-        Of the motion: (N,), and (N, n) each; one row is a set-point.
-    row
-        Written over.
+    Of the motion there are ``times``, (N,), s, and ``q``, ``v``, ``a``, (N, n) each; one row is a
+    set-point.
     """
     n, last = q.shape[1], times.shape[0] - 1
     row[n:] = 0.0
@@ -251,12 +237,7 @@ def reference_row(
 def stage_module(mechanism: Mechanism, objective: Objective) -> Any:
     """Return the compiled module of Φ(x, u), (21): ``stage(x, u, parameters, cost)``.
 
-    Parameters
-    ----------
-    mechanism
-        The controller's belief.
-    objective
-        Whose stage cost it is; ``cost``, (1,), is filled with it.
+    ``cost``, (1,), is filled.
     """
     stage = objective.stage_cost(mechanism)
     key = content_key(mechanism.structure, mechanism.name, sp.srepr(stage))

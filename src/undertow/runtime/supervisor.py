@@ -84,16 +84,10 @@ class _Farewell(NamedTuple):
 class SupervisedRig:
     """A rig that is kept by another process.
 
-    Parameters
-    ----------
-    make
-        Makes the rig, in the supervisor.  What it needs should be compiled already.
-    limits, slew
-        Largest |u|, and largest change in one period, (m,).
-    controller_timeout
-        Time without an output after which the supervisor takes over, s.
-    record
-        File for what the supervisor did, as JSON, once it has let go.
+    It calls ``make`` in the supervisor, so what that needs should be compiled already. ``limits``
+    are the largest |u| and ``slew`` the largest change in one period, (m,). After
+    ``controller_timeout``, s, without an output the supervisor takes over; once it has let go it
+    writes what it did to the file ``record``, as JSON.
 
     Raises
     ------

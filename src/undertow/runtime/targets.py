@@ -57,21 +57,11 @@ MOST_POINTS, MOST_TEXT = 1000, 500
 class RunTarget:
     """Where a run that goes on is steered.
 
-    Attributes
-    ----------
-    mechanism
-        Its name.
-    units
-        Of the coordinates along which the target may be, by name: ``m`` or ``rad``.
-    t
-        Time of the run, s.
-    now
-        Where the target is, coordinate to position; empty at x = 0.
-    ahead
-        What was asked for and is not reached yet: from which time of the run on, s, and where.
-        The target jumps as soon as there is a plan for it.
-    said
-        What was last said of the target in the run.
+    ``units``: of the coordinates along which the target may be, by name: ``m`` or ``rad``. ``t``:
+    time of the run, s. ``now``: where the target is, coordinate to position; empty at x = 0.
+    ``ahead``: what was asked for and is not reached yet: from which time of the run on, s, and
+    where; the target jumps as soon as there is a plan for it. ``said``: what was last said of the
+    target in the run.
     """
 
     mechanism: str
@@ -161,17 +151,7 @@ def address_path(log: Path) -> Path:
 class Listener:
     """Takes targets for a run from other processes, until it is closed.
 
-    Parameters
-    ----------
-    run
-        Who is asked for them.
-    log
-        The log of the run: the address is written beside it.
-
-    Attributes
-    ----------
-    failure
-        Why it does not listen; empty while it does.
+    The address is written beside the log. ``failure``: why it does not listen; empty while it does.
 
     Raises
     ------

@@ -146,26 +146,15 @@ class Report:
 class RunVerdict:
     """How a run ended.
 
-    Attributes
-    ----------
-    ending
-        ``balanced``: the law held the mechanism to the end, settled at the target.  ``caught``:
-        the law held it to the end, but it was not settled, or not at the target.  ``degraded``:
-        one of both, but something was wrong on the way.  ``lost``: thrown out, past its travel, or
-        never caught.  ``stopped``: by the operator before its time, or by a fault.
-    reasons
-        Why, in words.
-    final_error
-        ‖x‖₂ of the last estimate, whole turns of free joints taken off.
-    cost
-        ∫ Φ dt of the estimates and outputs over the run, in the objective's unit.
-    output_problem
-        What is not known to be off: empty when the device took an output of zero at the end,
-        and could be closed.
-    output_zero
-        Whether the device took an output of zero at the end.
-    unit
-        Of the cost.
+    ``ending``: ``balanced``: the law held the mechanism to the end, settled at the target.
+    ``caught``: the law held it to the end, but it was not settled, or not at the target.
+    ``degraded``: one of both, but something was wrong on the way. ``lost``: thrown out, past its
+    travel, or never caught. ``stopped``: by the operator before its time, or by a fault.
+
+    ``final_error``: ‖x‖₂ of the last estimate, whole turns of free joints taken off; ``cost``: ∫ Φ
+    dt of the estimates and outputs over the run, in the objective's unit. ``output_zero``: whether
+    the device took an output of zero at the end; ``output_problem``: what is not known to be off,
+    empty when it did and could be closed.
     """
 
     ending: Ending

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, input_series, state_series, style
+from undertow.closed_loop.figures import COLOURS, input_series, state_series, style
 
 #: How the motions of the paper's tables are drawn, by row.
 ROW_LINES: Mapping[str, dict[str, Any]] = {
@@ -40,16 +40,8 @@ def rows_figure(
 ) -> Figure:
     """Return a figure of motions of the rotary pendulum: φ, θ and voltage over time.
 
-    Parameters
-    ----------
-    motions
-        Each with the properties of its lines, the label among them.
-    until
-        Right end of the time axis, s.
-    title
-        Above the first row.
-    columns
-        Of the legend.
+    Each motion comes with the properties of its lines, the label among them; the time axis ends at
+    ``until``, s; the legend has so many columns.
     """
     with style():
         figure = Figure(figsize=(6.4, 5.2), layout="constrained")

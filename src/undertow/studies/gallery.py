@@ -7,8 +7,8 @@ from rich.table import Table
 
 from undertow.base import Progress, no_progress, table
 from undertow.closed_loop import ClosedLoop
+from undertow.closed_loop.figures import figure_bytes, state_words, style
 from undertow.display.animation import Film, still
-from undertow.display.plot import figure_bytes, state_words, style
 from undertow.mechanisms import LIBRARY
 from undertow.objective import MinimumEnergy
 from undertow.optimiser import Optimiser
@@ -20,10 +20,7 @@ COLUMNS = 5
 def mechanism_table(width: int = 120) -> Table:
     """Return the mechanisms of the library with their inputs, starts and descriptions.
 
-    Parameters
-    ----------
-    width
-        Of the terminal; from 100 columns on there is room for the listed starts too.
+    From a ``width`` of 100 columns on there is room for the listed starts too.
     """
     heads = ["mechanism", "n, m", "inputs", "start", "what it is"]
     if width < 100:

@@ -10,8 +10,6 @@ from typing import Any, Generic, TypeVar
 
 from undertow.base import ArtefactError, parse_json, read_file
 
-__all__ = ["Ledger"]
-
 #: Largest ledger that is read, bytes.
 LARGEST = 1 << 28
 
@@ -22,19 +20,9 @@ V = TypeVar("V")
 class Ledger(Generic[K, V]):
     """Results by what was run; in memory, or in a file of JSON lines.
 
-    Parameters
-    ----------
-    path
-        The file, continued where there is one; ``None`` keeps nothing.
-    head
-        What the runs have in common, versions and settings: the first line.
-    read
-        What a further line says: which run, and its result.  It raises for a line that is none.
-
-    Attributes
-    ----------
-    known
-        The results.
+    ``path`` is the file, continued where there is one, ``None`` keeps nothing; ``head`` what the
+    runs have in common, versions and settings: its first line. ``read`` says of a further line
+    which run it is, and its result; it raises for a line that is none. ``known`` has the results.
 
     Raises
     ------
@@ -70,7 +58,7 @@ class Ledger(Generic[K, V]):
             LookupError,
             TypeError,
             AttributeError,
-            OverflowError,
+            ArithmeticError,
         ) as error:
             cause, value = error, f"{type(error).__name__}: {error}"
             limit = "a ledger that can be read and written"

@@ -28,7 +28,7 @@ from undertow.base import (
 )
 from undertow.cascade import Cascade
 from undertow.closed_loop import Event
-from undertow.display.plot import state_words
+from undertow.closed_loop.figures import state_words
 from undertow.mechanisms.named import FILES, named
 from undertow.models import Mechanism
 from undertow.models.importers.mujoco_compiler import agreement
@@ -59,29 +59,13 @@ REFUSED = ("files", "number", "refused for", "why")
 class ModelFile:
     """What became of one file.
 
-    Attributes
-    ----------
-    name
-        Its path in the folder, with the joints that were named as actuated where it names none.
-    n, m
-        Coordinates and inputs; 0 where it was refused.
-    target
-        Where the target is, in the file's own coordinates.
-    agreement
-        Largest difference of accelerations from MuJoCo's, relative; empty where not compared.
-    start
-        Where the motion began.
-    end
-        How the motion ended; empty where none was asked for.
-    balanced
-        Whether it arrived within its travel; None where none was asked for.
-    refused
-        What a refusal is about: ``mechanics``, ``no model``, ``the text``, ``a missing file``;
-        else empty.
-    why
-        What was refused and what it should have been, or where a motion ended.
-    seconds
-        Wall time, s.
+    ``name``: its path in the folder, with the joints that were named as actuated where it names
+    none. ``n``, ``m``: 0 where it was refused. ``target``: in the file's own coordinates.
+    ``agreement``: largest difference of accelerations from MuJoCo's, relative; empty where not
+    compared. ``end``, ``balanced``: how the motion ended, and whether it arrived within its travel;
+    empty and None where none was asked for. ``refused``: what a refusal is about: ``mechanics``,
+    ``no model``, ``the text``, ``a missing file``; else empty. ``why``: what was refused and what
+    it should have been, or where a motion ended. ``seconds``: wall time, s.
     """
 
     name: str
@@ -107,18 +91,9 @@ def model_files(
 ) -> tuple[ModelFile, ...]:
     """Read every URDF and MJCF file below a folder, and balance what can be.
 
-    Parameters
-    ----------
-    folder
-        Where they are; links are not followed.
-    simulate
-        Balance them as ``undertow simulate FILE`` does: least energy from the usual start.
-    seed
-        Seed of the optimisers.
-    progress
-        Called with the file and the part that is done.
-    done
-        Called with each as it is finished.
+    Links are not followed. ``simulate`` balances them as ``undertow simulate FILE`` does: least
+    energy from the usual start; ``seed`` is the optimisers'. ``done`` is called with each as it is
+    finished.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from rich.text import Text
 from undertow.base import facts, finite, manifest, table, to_csv
 from undertow.cascade import Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
-from undertow.display.plot import display, figure_bytes, motion_figure, state_words
+from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
 from undertow.law import Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
@@ -81,20 +81,8 @@ def motion_report(
 ) -> RenderableType:
     """Return a simulated motion for the terminal.
 
-    Parameters
-    ----------
-    mechanism, objective, start
-        What was asked for.
-    motion
-        What the plant did.
-    surface
-        The (first) surface.
-    run
-        The cascade's record, where a cascade was run.
-    gate
-        Who admitted its surfaces.
-    target
-        Where to, in words, where that is not x = 0.
+    ``surface`` is the (first) one, ``run`` the cascade's record where a cascade was run, ``gate``
+    who admitted its surfaces, ``target`` where to, in words, where that is not x = 0.
     """
     rows = _head(mechanism, objective, start, gate)
     if target:
@@ -191,18 +179,7 @@ def motion_files(
 ) -> dict[str, bytes]:
     """Return a motion's files: ``motion.csv`` (SI units), ``motion.png``, ``manifest.json``.
 
-    Parameters
-    ----------
-    request
-        What was asked for, to be kept in the manifest.
-    motion
-        The motion.
-    cost
-        Its total.
-    surfaces
-        The surfaces in use, in order.
-    run
-        The cascade's record: every decision with its verdict goes into the manifest.
+    The manifest keeps the request, and of a cascade's ``run`` every decision with its verdict.
     """
     *names, _ = motion.columns
     columns = (motion.t, *(values for values, _ in motion.columns.values()))

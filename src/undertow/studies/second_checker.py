@@ -13,8 +13,6 @@ from pathlib import Path
 
 from undertow.base.errors import CertificateError, MissingExtraError
 
-__all__ = ["agree", "agreement_table", "decide_again", "second_checker"]
-
 NAME = "undertow-checker"
 BUILT = Path(__file__).parents[3] / "build" / NAME
 COMPILERS = ("g++", "clang++")
@@ -44,12 +42,7 @@ def second_checker() -> Path:
 def decide_again(file: Path, *, seconds: float = 600.0) -> list[tuple[str, float]]:
     """Return verdict and time in s of every claim of a file, in its order, by the second checker.
 
-    Parameters
-    ----------
-    file
-        Certificate of version 2.
-    seconds
-        Limit for each claim, s.
+    The file is a certificate of version 2; each claim may take ``seconds``, s.
 
     Raises
     ------
@@ -82,12 +75,8 @@ def agreement_table(
 ) -> tuple[str, bool]:
     """Return a table of text, claim by claim, and whether both checkers agree on all.
 
-    Parameters
-    ----------
-    kinds
-        Kind of each claim.
-    first, second
-        Verdict and time in s of each claim, by the kernel and by the second checker.
+    ``first`` and ``second`` are verdict and time, s, of each claim, by the kernel and by the second
+    checker.
     """
     lines = [f"{'claim':<20} {'kernel':<20} {'second checker':<20}"]
     fine = len(kinds) == len(first) == len(second)

@@ -33,7 +33,7 @@ from undertow.base import (
 )
 from undertow.bounds import bound
 from undertow.cascade import Cascade, Run, gate_words
-from undertow.display.plot import state_words
+from undertow.closed_loop.figures import state_words
 from undertow.law import Plan, Surface
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
@@ -52,26 +52,13 @@ PER_CYCLE = 12
 class Entry:
     """One line of the survey.
 
-    Attributes
-    ----------
-    goal
-        The word of what was minimised.
-    name, n, m, start, unit
-        The mechanism, its start in words, and the unit of cost.
-    designed, one_time, cascade, free
-        Cost of the designed surface, of the surface optimised once, of the cascade, and of the
-        cascade with free reaching laws, for least time in a schedule; ``inf`` where the target was
-        not reached.
-    time
-        When the cascade reached ‖x‖ ≤ ν, s; ``inf`` where it did not.
-    radius
-        ‖x‖ at the end of the cascade's motion.
-    bound
-        Optimal-control bound, NaN where none was asked for or found.
-    seconds
-        Wall time of all of it, s.
-    problem, travel
-        What was minimised and who admitted surfaces, and the bounds of travel, in words.
+    ``goal``: the word of what was minimised. ``designed``, ``one_time``, ``cascade``, ``free``:
+    cost of the designed surface, of the surface optimised once, of the cascade, and of the cascade
+    with free reaching laws, for least time in a schedule; ``inf`` where the target was not reached.
+    ``time``: when the cascade reached ‖x‖ ≤ ν, s; ``inf`` where it did not. ``radius``: ‖x‖ at the
+    end of the cascade's motion. ``bound``: optimal-control bound, NaN where none was asked for or
+    found. ``seconds``: wall time of all of it, s. ``problem``, ``travel``: what was minimised and
+    who admitted surfaces, and the bounds of travel, in words.
     """
 
     goal: str
@@ -114,22 +101,10 @@ def survey(
 ) -> tuple[Entry, ...]:
     """Bring every mechanism from its listed start to its target.
 
-    Parameters
-    ----------
-    names
-        Which; all of the library by default.
-    goals
-        Words of :func:`undertow.objective_for`, one after the other.
-    horizon
-        Longest motion, s.
-    seed
-        Seed of the optimisers.
-    bounds
-        Also the optimal-control bound (extra ``bounds``).
-    progress
-        Called with what is being done and the part that is done.
-    done
-        Called with each line as it is finished: what an interrupted survey leaves.
+    All of the library by default, for each of the ``goals``, words of
+    :func:`undertow.objective_for`, within ``horizon``, s; ``bounds`` also computes the
+    optimal-control bound (extra ``bounds``). ``done`` is called with each line as it is finished:
+    what an interrupted survey leaves.
 
     Raises
     ------
@@ -167,19 +142,9 @@ def survey_one(
 ) -> Entry:
     """Bring one mechanism from a start to its target; one line of the survey.
 
-    Parameters
-    ----------
-    mechanism, objective
-        The task.
-    x0
-        State to start from, (2n,); the mechanism's listed start by default.
-    goal
-        Word of the objective, for the line.
-    seed, bounds
-        As in :func:`survey`.
-    within
-        What the motion of the bound keeps besides the objective's own constraints: what every
-        surface must keep anyway.
+    From ``x0``, (2n,), the mechanism's listed start by default; ``goal`` is the objective's word,
+    for the line. The motion of the bound keeps what is ``within`` besides the objective's own
+    constraints: what every surface must keep anyway.
 
     Raises
     ------
@@ -194,8 +159,7 @@ def survey_one(
     loop = cascade.loop
     loop.objective.check_start(mechanism, x0)
     run = _run(cascade, x0)
-    schedule = cascade.period if cascade.optimiser.counts_time else 0.0
-    free = replace(cascade, freedom=DecisionVariables(reaching=True, schedule=schedule))
+    free = replace(cascade, freedom=DecisionVariables(reaching=True, schedule=cascade.period))
     freed = _run(free, x0)
     candidates: list[Surface | Plan] = [cascade.optimiser.anchor]
     if run is not None:

@@ -86,14 +86,8 @@ class _Printer(ScalarCode, C99CodePrinter):  # type: ignore[misc]  # SymPy is un
 class C99Emitter(Emitter):
     """Prints tape lines as C declarations of ``const ut_real``.
 
-    Parameters
-    ----------
-    tape
-        Where the expressions were laid.
-    names
-        C text of the symbols that come from outside: an element of an array, a macro.
-    kind
-        ``"double"`` or ``"float"``: of literals and of math.h's functions.
+    Symbols from outside have C text in ``names``: an element of an array, a macro. ``kind``,
+    ``"double"`` or ``"float"``, is that of literals and of math.h's functions.
     """
 
     def __init__(self, tape: Tape, names: Mapping[sp.Symbol, str], kind: Real = "double") -> None:
@@ -132,11 +126,11 @@ class C99Emitter(Emitter):
                 remedy="Write the model with elementary functions",
             ) from error
 
-    def statements(self, results: Mapping[str, sp.Expr], indent: str = "    ") -> str:
+    def statements(self, results: Mapping[str, sp.Expr]) -> str:
         """Return the code that computes expressions and stores each at a C place.
 
         Stores come last, so that a result may lie where an input lay.
         """
         code, _ = self.lines(results.values(), set())
         stores = [f"{place} = {self.text(value)};" for place, value in results.items()]
-        return "\n".join(indent + line for line in [*code, *stores])
+        return "\n".join(f"    {line}" for line in [*code, *stores])

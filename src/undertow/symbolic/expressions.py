@@ -18,10 +18,7 @@ _MATRICES = ("ImmutableDenseMatrix", "MutableDenseMatrix")
 def parse_expression(text: str) -> Any:
     """Return the expression or matrix that ``sympy.srepr`` wrote.
 
-    Parameters
-    ----------
-    text
-        Calls of SymPy's own classes on numbers, texts and lists, nested.
+    The text is calls of SymPy's own classes on numbers, texts and lists, nested.
 
     Raises
     ------

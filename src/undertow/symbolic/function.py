@@ -34,18 +34,10 @@ def function_source(
 ) -> str:
     """Return the source of ``name(*inputs, *outputs)``, compiled by numba when it is imported.
 
-    Parameters
-    ----------
-    name
-        Name of the function.
-    tape
-        Where the expressions were laid.
-    inputs
-        Argument name to the symbols that its entries stand for, in order, or to the one
-        symbol that it stands for as a number.
-    outputs
-        Argument name to the expressions that fill its entries, in order: one-dimensional
-        float arrays, written last, so that an output may be the same array as an input.
+    ``inputs`` take the name of an argument to the symbols that its entries stand for, in order, or
+    to the one symbol that it stands for as a number; ``outputs`` to the expressions that fill its
+    entries: one-dimensional float arrays, written last, so that an output may be the same array as
+    an input.
     """
     places = [place for group in inputs.items() for place in _places(*group)]
     distinct(symbol for symbol, _ in places)

@@ -22,13 +22,6 @@ class SymbolNames:
     names: generators made them up.  ``given`` ones have the text that is given; all others are
     ``_p0``, ``_p1``, … in the order in which they are first asked for.
 
-    Parameters
-    ----------
-    tape
-        Whose lines are printed.
-    given
-        Text of symbols that come from outside: an element of an array, a macro.
-
     Examples
     --------
     >>> import sympy as sp

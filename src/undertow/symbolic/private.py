@@ -108,10 +108,7 @@ def is_private(folder: Path) -> bool:
     the directory of temporary files is.  On a system without numbers of users (Windows), a
     user's folders are protected by lists that are not read here.
 
-    Parameters
-    ----------
-    folder
-        Absolute, without links.
+    The folder is absolute, without links.
     """
     user = _user()
     if user is None:

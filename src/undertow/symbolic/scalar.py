@@ -116,13 +116,8 @@ class Emitter:
 
     A printer for another language overrides :meth:`language`, :meth:`assign` and :meth:`sincos`.
 
-    Parameters
-    ----------
-    tape
-        Where the expressions were laid.
-    given
-        Text of symbols that have one already; the others get names by their place, see
-        :class:`undertow.symbolic.names.SymbolNames`.
+    Symbols in ``given`` have their text already; the others get names by their place, see
+    :class:`undertow.symbolic.names.SymbolNames`.
     """
 
     def __init__(self, tape: Tape, given: Mapping[sp.Symbol, str] | None = None) -> None:

@@ -91,14 +91,8 @@ def remember(name: str, key: str, text: str) -> None:
 def generated(kind: str, name: str, key: str, write: Callable[[], str]) -> ModuleType:
     """Import a generated module, writing its source only where none is kept under the key.
 
-    Parameters
-    ----------
-    kind, name
-        What is generated, and for which mechanism: the module's name.
-    key
-        Everything that the source depends on, see :func:`content_key`.
-    write
-        Returns the source.
+    The key is everything that the source depends on, see :func:`content_key`; ``write`` returns the
+    source; ``kind`` and ``name``, of the mechanism, are the module's name.
     """
     source = recall(kind, key)
     if source is None:

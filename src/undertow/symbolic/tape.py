@@ -24,12 +24,9 @@ class Assignment(NamedTuple):
 class Tape:
     """Ordered assignments in which every distinct expression is computed once.
 
-    Parameters
-    ----------
-    constants
-        Symbols that change seldom.  What they alone determine gets lines of its own, to be computed
-        as seldom: coefficients and terms of sums, factors of products, divisors, whose
-        reciprocals become factors.
+    Symbols that change seldom are ``constants``. What they alone determine gets lines of its own,
+    to be computed as seldom: coefficients and terms of sums, factors of products, divisors, whose
+    reciprocals become factors.
 
     Examples
     --------

@@ -27,17 +27,8 @@ Layout = Mapping[str, str]
 class Workspace:
     """One block of numbers, and named views of its parts.
 
-    Parameters
-    ----------
-    layout
-        Names and dimensions.
-    **sizes
-        What the dimensions are written in.
-
-    Attributes
-    ----------
-    block
-        All of it, one-dimensional.
+    The layout has names and dimensions, written in ``sizes``; ``block`` is all of it,
+    one-dimensional.
 
     Examples
     --------
@@ -67,13 +58,13 @@ class Workspace:
         return self._views[name]
 
 
-def unpacked(layout: Layout, block: str = "block", indent: str = "    ") -> str:
+def unpacked(layout: Layout) -> str:
     """Return the lines that give a compiled function the views of a block, by name."""
     lines, at = [], "0"
     for name, parts in layout.items():
         count = " * ".join(f"({part.strip()})" for part in parts.split(","))
         end = f"{at} + {count}" if at != "0" else count
         shape = f".reshape(({parts}))" if "," in parts else ""
-        lines.append(f"{indent}{name} = {block}[{at}:{end}]{shape}")
+        lines.append(f"    {name} = block[{at}:{end}]{shape}")
         at = end
     return "\n".join(lines) + "\n"

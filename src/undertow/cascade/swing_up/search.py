@@ -159,15 +159,9 @@ def _module(mechanism: Mechanism) -> Any:
 class RatedGains:
     """Gains and what swings that the search had not seen said of them.
 
-    Attributes
-    ----------
-    gains
-        k_D, k_P, k_V, surplus, k_E.
-    arrives
-        Part of the swings that came near the target in time, of those that the gains before
-        had not brought there, or of ``SWINGS`` where fewer were left.
-    expected
-        Time until one does, s, when such swings follow one another.
+    Part of the swings that came near the target in time is ``arrives``: of those that the gains
+    before had not brought there, or of ``SWINGS`` where fewer were left. ``expected`` is the time
+    until one does, s, when such swings follow one another.
     """
 
     gains: Gains
@@ -294,19 +288,9 @@ def search(
     by CMA-ES; then the same on the swings that it has not brought up, from where it has left
     them, and so on.  Nothing that was found before is looked at.
 
-    Parameters
-    ----------
-    mechanism
-        One input with a limit, a potential, a target that stands upright.
-    seed
-        Of the gains and of the swings.
-    progress
-        Called with the part done.
-
-    Returns
-    -------
-    tuple of RatedGains
-        In the order in which they are to be tried; empty where nothing arrives.
+    The mechanism has one input with a limit, a potential, and a target that stands upright.
+    ``seed`` is that of the gains and of the swings; ``progress`` is called with the part done.
+    Gains come in the order in which they are to be tried, none where nothing arrives.
 
     Raises
     ------
@@ -347,16 +331,7 @@ def designs_for(
 ) -> tuple[RatedGains, ...]:
     """Return what :func:`search` finds, from what is kept where it was found before.
 
-    Parameters
-    ----------
-    mechanism
-        See :func:`search`.
-    seed
-        Of the search; the library keeps what seed 0 found.
-    fresh
-        Look at nothing that is kept: search.
-    progress
-        Called with the part done.
+    With ``fresh`` nothing that is kept is looked at; the library keeps what seed 0 found.
 
     Raises
     ------
@@ -384,16 +359,9 @@ def designs_for(
     return found
 
 
-def designed(
-    mechanism: Mechanism,
-    *,
-    seed: int = 0,
-    fresh: bool = False,
-    progress: Callable[[float], None] = lambda _: None,
-) -> SwingUp:
+def designed(mechanism: Mechanism, *, seed: int = 0) -> SwingUp:
     """Return the swing-up with the gains that :func:`designs_for` returns: see there."""
-    found = designs_for(mechanism, seed=seed, fresh=fresh, progress=progress)
-    return SwingUp(mechanism, tuple(one.gains for one in found))
+    return SwingUp(mechanism, tuple(one.gains for one in designs_for(mechanism, seed=seed)))
 
 
 def kept_text(found: Mapping[Mechanism, Sequence[RatedGains]]) -> str:

@@ -28,18 +28,9 @@ _EXPANDABLE = 400
 class ActuatedForm:
     """Equations ``M q̈ = f + (B u, 0)`` in coordinates z with ``q = T z``.
 
-    Attributes
-    ----------
-    coordinates
-        The n coordinates z, actuated first.
-    mass_matrix, force
-        M(z), (n, n), and f(z, ż), (n, 1).
-    input_matrix
-        B, (m, m), invertible.
-    transform
-        T, (n, n), constant: ``q = T z``, and generalised forces change with Tᵀ.
-    potential
-        V(z), J, where one was given.
+    The n ``coordinates`` are z, actuated first; M(z), (n, n); f(z, ż), (n, 1); B, (m, m), is
+    invertible; T, (n, n), is constant, and generalised forces change with Tᵀ; ``potential`` is
+    V(z), J, where one was given.
     """
 
     coordinates: tuple[Coordinate, ...]

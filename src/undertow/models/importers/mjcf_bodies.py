@@ -75,18 +75,8 @@ def link_of(
 ) -> Link:
     """Return the link of a body: its ``<inertial>``, or the sum over its geoms.
 
-    Parameters
-    ----------
-    body
-        The element.
-    name
-        Its name.
-    frame
-        Angle conventions.
-    geoms
-        Its geoms, defaults filled in.
-    infer
-        The compiler's ``inertiafromgeom``: ``"true"``, ``"false"`` or ``"auto"``.
+    ``geoms`` have their defaults filled in; ``infer`` is the compiler's ``inertiafromgeom``:
+    ``"true"``, ``"false"`` or ``"auto"``.
 
     Raises
     ------

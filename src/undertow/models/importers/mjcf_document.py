@@ -36,14 +36,8 @@ _ORIENTED = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 class Document:
     """An MJCF document of its own.
 
-    Attributes
-    ----------
-    root
-        The elements.
-    files
-        Meshes by the names that the elements have for them.
-    frozen
-        Names of the joints that were taken out.
+    ``files``: meshes by the names that the elements have for them; ``frozen``: names of the joints
+    that were taken out.
     """
 
     root: ET.Element
@@ -59,12 +53,7 @@ class Document:
 def mjcf_document(source: str | Path, frozen: Sequence[str] = ()) -> Document:
     """Read an MJCF file or text with all that it includes.
 
-    Parameters
-    ----------
-    source
-        Path of the file, or the text itself.
-    frozen
-        Joints to be taken out: their bodies stay where they are drawn.
+    Joints that are ``frozen`` are taken out: their bodies stay where they are drawn.
 
     Raises
     ------

@@ -49,15 +49,8 @@ def _makes_mechanism(value: object) -> bool:
 def object_from_file(text: str, what: str, suits: Callable[[object], bool] = callable) -> Any:
     """Run a Python file and return what one of its names holds; a callable is called.
 
-    Parameters
-    ----------
-    text
-        ``FILE.py:NAME``; without a name, the message says which there are.
-    what
-        What is looked for, in a word, for messages.
-    suits
-        Whether a name of the file may be what is looked for, to list those where the one given
-        is not there.
+    Without a name in ``FILE.py:NAME`` the message says which there are that ``suits`` says yes to;
+    ``what`` is looked for, in a word, for messages.
 
     Raises
     ------

@@ -34,14 +34,7 @@ def names_of(given: Sequence[str], what: str, of: str = "") -> list[str]:
 def described(mechanism: Mechanism, tree: Tree, how: str, frozen: Sequence[str]) -> Mechanism:
     """Return the mechanism with the lines that say what was read.
 
-    Parameters
-    ----------
-    mechanism, tree
-        What was made of the file.
-    how
-        Which file, by which reader.
-    frozen
-        Joints that were taken out.
+    ``how`` says which file, by which reader; joints that are ``frozen`` were taken out.
     """
     joints = ", ".join(_range(c) for c in mechanism.coordinates)
     gains = {a.name: a.gain for a in tree.actuators}

@@ -139,12 +139,7 @@ def mechanism_from_tree(
 def check_held(tree: Tree, actuated: Sequence[str]) -> None:
     """Refuse a tree that falls whatever its joints do: no pose of it is an equilibrium.
 
-    Parameters
-    ----------
-    tree
-        With the file's own actuators.
-    actuated
-        Joints that are driven besides.
+    The tree has the file's own actuators; joints that are driven besides are ``actuated``.
 
     Raises
     ------
@@ -387,7 +382,7 @@ def _outwards(
     if joint.kind == "slide":
         there = (r + turn * axis * q).applyfunc(tidy)
         return parent.carried(there, turn, axis * pick, extra_w)
-    turned = turn * _rotation(axis, q)
+    turned = turn * rotation_about(axis, q)
     at_anchor = parent.carried(r + turn * anchor, turned, extra_v, axis * pick)
     if not any(joint.anchor):
         return at_anchor
@@ -425,8 +420,8 @@ def _body(link: Link, frame: _Frame, book: _Book) -> tuple[sp.Matrix, sp.Expr]:
     return mass, potential
 
 
-def _rotation(axis: sp.Matrix, q: sp.Expr) -> sp.Matrix:
-    """Rodrigues' formula, exact for the axes of the frame."""
+def rotation_about(axis: sp.Matrix, q: sp.Expr) -> sp.Matrix:
+    """Return the turn by q about a unit vector, Rodrigues' formula, exact for the frame's axes."""
     K = _cross(axis)
     s, c = sp.sin(q), sp.cos(q)
     along = axis * axis.T

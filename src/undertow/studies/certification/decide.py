@@ -45,13 +45,6 @@ from undertow.proofs.claims.region import reaches
 from undertow.proofs.region.lyapunov import extent
 from undertow.studies.paper.appendix_search import search_rate
 
-__all__ = [
-    "Certified",
-    "certify_appendix",
-    "certify_run",
-    "certify_surface",
-]
-
 #: Called with (what is being done, part done).
 Progress = Callable[[str, float], None]
 
@@ -72,16 +65,9 @@ CLAIMED = 0.999
 class Certified:
     """One surface with all that is known of it.
 
-    Parameters
-    ----------
-    title
-        Its name in tables.
-    subject
-        Claims and remarks, as they go into the certificate.
-    region
-        The proved region on the surface, where there is one.
-    seconds
-        How long it took.
+    ``title``: its name in tables. ``subject``: claims and remarks, as they go into the certificate.
+    ``region``: the proved region on the surface, where there is one. ``seconds``: how long it took,
+    s.
     """
 
     title: str
@@ -106,34 +92,14 @@ def certify_surface(
 ) -> Certified:
     """Decide what can be said of a surface.
 
-    Parameters
-    ----------
-    mechanism
-        Belief and plant.
-    surface, reaching_law
-        The law.
-    start
-        A state, (2n,): its positions, with both signs, span the region in which the law must
-        exist, and say which way the region of attraction should reach.
-    title
-        For tables; the surface itself by default.
-    seconds
-        Effort for the search of the region on the surface; 0 leaves it out.
-    loop
-        Also prove how far off the target the full closed loop may start at rest: minutes.
-    hold
-        For that proof: the input is held for so many steps of 1 ms (0: at every instant).
-    uncertain
-        Plant parameters that lie in [low, high] instead of being the law's own: for the closed
-        loop, and for a second region on the surface.
-    predict
-        Also predict the motion from the start, and from random ones up to it (sampled).
-    progress
-        Called with (what, part done).
-
-    Returns
-    -------
-    Certified
+    The positions of ``start``, (2n,), with both signs, span the region in which the law must exist,
+    and say which way the region of attraction should reach; ``seconds``, s, is the effort for its
+    search, 0 leaves it out. ``loop`` also proves how far off the target the full closed loop may
+    start at rest, which takes minutes; for that the input is held for ``hold`` steps of 1 ms (0: at
+    every instant). ``uncertain`` plant parameters lie in [low, high] instead of being the law's
+    own: for the closed loop, and for a second region on the surface. ``predict`` also predicts the
+    motion from the start, and from random ones up to it (sampled). The ``title`` is for tables, the
+    surface itself by default.
     """
     began = time.perf_counter()
     tell = progress or (lambda what, part: None)
@@ -382,16 +348,10 @@ def certify_appendix(
 ) -> tuple[Certified, ...]:
     """Decide the appendix's five cases, with a P of our own, for a rotary pendulum.
 
-    Parameters
-    ----------
-    seconds
-        Effort for each region on the surface; 0 leaves them out.
-    loop
-        Also prove how far off the target the full closed loop may start at rest, up to where
-        random starts of the law at every instant, on the plant that it knows, still converge;
-        their verdict is a remark.  Minutes for each case.
-    hold, uncertain
-        As for :func:`certify_surface`.
+    ``seconds``, ``hold`` and ``uncertain`` are as for :func:`certify_surface`. ``loop`` also proves
+    how far off the target the full closed loop may start at rest, up to where random starts of the
+    law at every instant, on the plant that it knows, still converge; their verdict is a remark.
+    Minutes for each case.
     """
     constants = Constants.of(mechanism)
     certified = []

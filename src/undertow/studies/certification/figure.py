@@ -9,14 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.display.plot import COLOURS, display, style
+from undertow.closed_loop.figures import COLOURS, display, style
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs import ProvedRegion, SurfaceMotion
 from undertow.proofs.region.lyapunov import extent
 from undertow.proofs.region.motion import AutonomousSystem
-
-__all__ = ["held", "region_figure", "simulated"]
 
 #: Points a side of the picture of the simulated region.
 GRID = 101
@@ -92,13 +90,6 @@ def region_figure(region: ProvedRegion, title: str) -> Figure:
 
     The motion on the surface knows no input limit.  Where what is drawn has states that the
     actuators cannot hold there, the title says so and a line shows where they end.
-
-    Parameters
-    ----------
-    region
-        Proved, on the surface of a mechanism.
-    title
-        Of the figure.
     """
     motion = region.motion
     assert isinstance(motion, SurfaceMotion)

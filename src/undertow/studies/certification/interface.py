@@ -17,8 +17,6 @@ from undertow.proofs.claims.verify import Checked
 from undertow.proofs.claims.verify import verify as decide
 from undertow.studies.certification.decide import Progress, certify_surface
 
-__all__ = ["Verification", "certify", "verify"]
-
 
 @checked
 def certify(

@@ -9,14 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.display.plot import COLOURS, display, style
+from undertow.closed_loop.figures import COLOURS, display, style
 from undertow.law import ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.proofs import LoopClaim
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.search.closed_loop import follow
-
-__all__ = ["loop_figure"]
 
 #: Starts on one side, up to this many times the proved ones.
 STARTS, BEYOND = 100, 4.0
@@ -30,13 +28,6 @@ def loop_figure(
     Left: the coordinate over time.  Right: the same coordinate and its p, with the shadow of the
     terminal set.  The motions are those of the law that acts at every instant on the plant that
     it knows; a held input or another plant of the claim's box moves a little differently.
-
-    Parameters
-    ----------
-    claim
-        Proved.
-    title
-        Of the figure.
     """
     motion = LoopMotion(mechanism, surface, reaching)
     index = [c.name for c in mechanism.coordinates].index(claim.coordinate)

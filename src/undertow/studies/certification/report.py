@@ -21,14 +21,6 @@ from undertow.proofs.claims.verify import CLAIMS
 from undertow.proofs.kernel import claims as kernel
 from undertow.studies.certification.decide import Certified
 
-__all__ = [
-    "appendix_report",
-    "certificate_files",
-    "run_report",
-    "subject_report",
-    "verification_report",
-]
-
 _STYLES = {"proved": "green", "sampled": "yellow", "refuted": "red", "undecided": "red"}
 
 

@@ -55,19 +55,8 @@ def corrupt_optimiser(cascade: Cascade, corrupt: Corrupt, since: float) -> Casca
 class FaultyWorker(InlineWorker):
     """A slow loop whose answers are changed, held back or repeated on their way.
 
-    Parameters
-    ----------
-    compute
-        Request to answer.
-    change
-        What arrives in the place of an answer.
-    since
-        When the fault begins, s.
-
-    Attributes
-    ----------
-    act
-        Called from then on before each look for an answer.
+    ``change`` says what arrives in the place of an answer from ``since``, s, on; ``act`` is called
+    from then on before each look for an answer.
     """
 
     def __init__(self, compute: Compute, change: Change, since: float) -> None:
@@ -93,18 +82,9 @@ class FaultyWorker(InlineWorker):
 class FaultyRig(RigWrapper):
     """A simulated rig with faults between it and the controller.
 
-    Parameters
-    ----------
-    rig
-        The sound one.
-    since
-        When the faults begin, s.
-    sense, drive
-        What happens to measurements and to inputs; either may raise.
-    hang
-        How long one call of ``write`` takes, s, while the world goes on; ``clock`` shows it.
-    slow
-        How long each ``read`` takes from then on, s, while the world goes on.
+    From ``since``, s, on: ``sense`` and ``drive`` change measurements and inputs, and may raise;
+    one call of ``write`` takes ``hang``, s, and each ``read`` ``slow``, s, while the world goes on,
+    which ``clock`` shows.
     """
 
     def __init__(
@@ -162,21 +142,9 @@ class FaultyRig(RigWrapper):
 class OutputMonitor(RigWrapper):
     """Stands nearest to the controller and looks at every output that it writes.
 
-    Parameters
-    ----------
-    rig
-        What it passes everything on to.
-    limits, slew
-        Largest |u| and largest change from one write to the next, (m,).
-
-    Attributes
-    ----------
-    faults
-        What was wrong with an output, in words; empty when all were sound.
-    largest
-        Largest |u|/limit written.
-    last
-        Last output written, (m,).
+    ``limits`` and ``slew``: largest |u| and largest change from one write to the next, (m,).
+    ``faults``: what was wrong with an output, in words, empty when all were sound; ``largest``:
+    largest |u|/limit written; ``last``: last output written, (m,).
     """
 
     def __init__(self, rig: Rig, limits: FloatArray, slew: FloatArray) -> None:

@@ -46,16 +46,8 @@ _PLACES = {name: place for place, name in enumerate(OPERATIONS)}
 class Fault:
     """One fault: the n-th call of an operation fails, once or from then on, on a rig.
 
-    Parameters
-    ----------
-    operation
-        One of :data:`OPERATIONS`.
-    n
-        Which call, from 1.
-    always
-        Whether all later calls fail too.
-    rig
-        Name of the rig.
+    It is the ``n``-th call, from 1, of one of :data:`OPERATIONS`; with ``always`` all later ones
+    fail too.
     """
 
     operation: str

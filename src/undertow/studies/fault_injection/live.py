@@ -191,24 +191,13 @@ ATTEMPTS = 10
 class KillResult:
     """What was left of a run whose controller was killed.
 
-    Attributes
-    ----------
-    moment
-        When it was killed, s after its first step.
-    steps
-        Steps in the log.
-    missing
-        Time from the last step in the log to the last output that the supervisor heard, s: the
-        steps that were made and are not in the log.
-    idle
-        Time from that output to the kill, s, in which the controller said nothing.
-    identical
-        Whether the log's replay is identical, bit for bit.
-    to_zero
-        Time from the last output of the controller until the supervisor had brought it to zero, s.
-    stopped_by
-        Why the run had ended before the kill, in a safe stop of its own with the output at zero,
-        as its log tells; empty when the kill ended it.
+    It was killed ``moment``, s, after its first step; the log has ``steps``, and the replay is
+    ``identical`` if it is so bit for bit. ``missing``: time from the last step in the log to the
+    last output that the supervisor heard, s: the steps that were made and are not in the log.
+    ``idle``: time from that output to the kill, s, in which the controller said nothing.
+    ``to_zero``: time from that output until the supervisor had brought it to zero, s.
+    ``stopped_by``: why the run had ended before the kill, in a safe stop of its own with the output
+    at zero, as its log tells; empty when the kill ended it.
     """
 
     moment: float
@@ -240,14 +229,8 @@ def _victim(recipe: Recipe, log: Path, record: Path) -> None:
 def kill_run(recipe: Recipe, moment: float, folder: Path) -> KillResult:
     """Run a controller in a process of its own, its rig kept by another, and kill it.
 
-    Parameters
-    ----------
-    recipe
-        The run; compiled already, so that its process starts at once.
-    moment
-        When to kill it, s after its log has its first line.
-    folder
-        For the log and the supervisor's record.
+    The recipe is compiled already, so that its process starts at once; it is killed ``moment``, s,
+    after its log has its first line. The folder is for the log and the supervisor's record.
     """
     log, record = folder / "killed.db", folder / "supervisor.json"
     victim = fork(_victim, (recipe, log, record), "undertow victim", daemon=False)

@@ -48,31 +48,13 @@ HELD = 0.2
 class CaseResult:
     """What happened in one run of the drill.
 
-    Attributes
-    ----------
-    case
-        The fault.
-    stopped_by
-        Why the run stopped.
-    after
-        Time from the fault to the safe stop, s; NaN when it never came to one before the
-        end of the run.
-    held
-        Whether the mechanism was held to the end of the run.
-    output_faults
-        Outputs that were not finite, past their limits or too fast; empty when all were sound.
-    largest
-        Largest |u|/limit.
-    ended_safely
-        Whether the loop ended in a safe stop with the output at zero.
-    answers
-        Verdicts on the answers of the optimiser, in words.
-    replayed
-        Whether the replay of the log was identical, bit for bit.
-    verdict
-        How the run ended, with its exit code.
-    note
-        What else is worth knowing.
+    It stopped for the reason ``stopped_by``, ``after`` s from the fault (NaN: it never came to a
+    safe stop), and was ``held`` to the end of the run or not. ``output_faults`` are outputs that
+    were not finite, past their limits or too fast; ``largest`` is the largest |u|/limit;
+    ``ended_safely`` says whether the loop ended in a safe stop with the output at zero; ``answers``
+    are verdicts on the optimiser's answers, in words. ``replayed``: the log's replay was identical,
+    bit for bit; ``verdict``: how the run ended, with its exit code; ``note``: what else is worth
+    knowing.
     """
 
     case: Case
@@ -148,18 +130,8 @@ def run_case(
 ) -> CaseResult:
     """Run one fault in simulated time.
 
-    Parameters
-    ----------
-    case
-        The fault.
-    recipe, memory
-        The run, and its first optimum.
-    log
-        File for the log of the run.
-    since
-        When the fault begins, s.
-    seconds
-        Length of the run, s.
+    The fault begins at ``since``, s; the run of ``recipe``, with its first optimum in ``memory``,
+    takes ``seconds``, s, and is written to the file ``log``.
     """
     clock = SimulatedClock()
     since = since if case.since is None else case.since
@@ -239,14 +211,8 @@ def drill(
 ) -> tuple[CaseResult, ...]:
     """Run all faults and judge them.
 
-    Parameters
-    ----------
-    cases
-        The list.
-    seed
-        Of the rig and of the optimiser.
-    progress
-        Called with (what, fraction) before each.
+    The seed is the rig's and the optimiser's; ``progress`` is called with (what, fraction) before
+    each.
     """
     recipe = drill_recipe(seed)
     memory, _ = recipe.cascade.start(recipe.x0)

@@ -100,21 +100,9 @@ def chosen(count: int) -> tuple[int, ...]:
 class Device:
     """A rig that remembers what it accepted, in memory that forked processes share, and fails.
 
-    Parameters
-    ----------
-    make
-        Makes the rig, in the process where it is first used.
-    period
-        Of the rig, s.
-    m
-        Number of inputs.
-    tally
-        Counts the calls, and says which of them fail.
-
-    Attributes
-    ----------
-    last
-        What was accepted last, (m,).
+    ``make`` makes the rig of this period, s, and ``m`` inputs, in the process where it is first
+    used; ``tally`` counts the calls, and says which of them fail. ``last`` is what was accepted
+    last, (m,).
     """
 
     def __init__(self, make: Callable[[], Rig], period: float, m: int, tally: Tally) -> None:
@@ -178,16 +166,7 @@ class _InStep(RigWrapper):
 class FaultResult:
     """What came of one fault.
 
-    Attributes
-    ----------
-    fault
-        The fault.
-    wrong
-        What is not as it should be, in words; empty when all is.
-    happened
-        What happened, in words.
-    steps
-        Steps of the run.
+    ``wrong``: what is not as it should be, in words; empty when all is.
     """
 
     fault: Fault
@@ -296,15 +275,7 @@ class Systematic:
     def drill(
         self, faults: Sequence[Fault] | None = None, progress: Progress = no_progress
     ) -> tuple[FaultResult, ...]:
-        """Run faults, all by default, in turn.
-
-        Parameters
-        ----------
-        faults
-            Which.
-        progress
-            Called with (what, fraction) before each.
-        """
+        """Run faults, all by default, in turn."""
         cases = []
         faults = self.faults() if faults is None else faults
         for number, fault in enumerate(faults):

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from undertow.base import Verdict, inward, markdown_table
-from undertow.display.plot import figure_files, style
+from undertow.closed_loop.figures import figure_files, style
 from undertow.mechanisms import rotary_pendulum
 from undertow.proofs.claims.appendix import (
     CASES,
@@ -34,24 +34,12 @@ from undertow.studies.paper.appendix_search import search_interval, search_rate
 class CaseReport:
     """One case with one set of constants, the paper's P against ours.
 
-    Parameters
-    ----------
-    case, b
-        Which case; b in kg m².
-    epsilon, beta, limit
-        ε, β = p₂₂ g with the printed p₂₂, and arccos ε in rad, recomputed.
-    printed_test
-        R ≻ 0 on the printed Ĩ with the printed P.
-    printed_width
-        Half-width up to which R ≻ 0 is proved with the printed P, rad.
-    printed_sigma
-        (A27)'s σ with the printed P and λ_max(P̃).
-    false_bound
-        (A20) at the worst point found, with the printed P.
-    ours, our_rate
-        The P of the best rate on the printed Ĩ, and its σ.
-    our_width
-        Widest half-width that some P serves, rad.
+    With b in kg m². ``epsilon``, ``beta``, ``limit``: ε, β = p₂₂ g with the printed p₂₂, and arccos
+    ε in rad, recomputed. With the printed P: ``printed_test``, R ≻ 0 on the printed Ĩ;
+    ``printed_width``, half-width up to which R ≻ 0 is proved, rad; ``printed_sigma``, (A27)'s σ
+    with λ_max(P̃); ``false_bound``, (A20) at the worst point found. ``ours``, ``our_rate``: the P
+    of the best rate on the printed Ĩ, and its σ; ``our_width``: widest half-width that some P
+    serves, rad.
     """
 
     case: AppendixCase
@@ -166,13 +154,7 @@ def markdown() -> str:
 
 
 def figures() -> dict[str, Figure]:
-    """Redraw Figures 7-11: λ_min(R(y₁)), b as the appendix has it against b as it is.
-
-    Returns
-    -------
-    dict
-        Figures by file name, without its ending.
-    """
+    """Redraw Figures 7-11: λ_min(R(y₁)), b as the appendix has it against b as it is."""
     constants, drawn = Constants.of(rotary_pendulum()), {}
     for case in CASES:
         y1 = np.linspace(-1, 1, 401) * float(case.half_width)

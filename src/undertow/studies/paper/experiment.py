@@ -34,16 +34,9 @@ from undertow.studies.paper.repeats import Repeats, noisy_repeats
 class Motion:
     """A motion of the table: its total, or why there is none.
 
-    Attributes
-    ----------
-    surfaces, switch_times
-        The surfaces in use and when each took over, s.
-    trajectory
-        The motion, ``None`` where no surface was found.
-    total
-        V² s or s; ``None`` when the terminal set is not reached.
-    reason
-        Why ``total`` is ``None``, in words; empty otherwise.
+    ``switch_times``: when each surface took over, s. ``trajectory``: ``None`` where no surface was
+    found. ``total``: V² s or s; ``None`` when the terminal set is not reached, and ``reason`` says
+    why, in words.
     """
 
     surfaces: tuple[Surface, ...]
@@ -123,24 +116,10 @@ class Effort:
 class Reproduction:
     """Everything that one run found.
 
-    Attributes
-    ----------
-    rows
-        The lines of the tables.
-    own
-        (condition, objective) to our optima.
-    limits
-        Reach of the printed surfaces.
-    reach
-        d_e to the largest φ(0), rad, for which our search finds an admissible surface.
-    repeats
-        Figure 3.
-    sensitivity
-        Of the base case, *matched*.
-    seconds
-        Name of each part of the work to its duration, s.
-    seed, effort
-        What it was run with.
+    ``own``: (condition, objective) to our optima. ``limits``: reach of the printed surfaces.
+    ``reach``: d_e to the largest φ(0), rad, for which our search finds an admissible surface.
+    ``repeats``: Figure 3. ``sensitivity``: of the base case, *matched*. ``seconds``: name of each
+    part of the work to its duration, s.
     """
 
     rows: tuple[Row, ...]
@@ -186,17 +165,7 @@ def _motion(
 
 
 def printed_motion(condition: Condition, objective: str, row: str) -> Motion:
-    """Simulate a printed column: its surfaces, one every 0.1 s, the last one kept.
-
-    Parameters
-    ----------
-    condition
-        Plant and start.
-    objective
-        ``"energy"`` or ``"time"``.
-    row
-        ``"base"``, ``"one-time"`` or ``"cascade"``.
-    """
+    """Simulate a printed column: its surfaces, one every 0.1 s, the last one kept."""
     printed = PRINTED[objective, row]
     loop = ClosedLoop(condition.mechanism, OBJECTIVES[objective])
     trajectory = loop.simulate(condition.start, printed.surfaces, switch_times=printed.switch_times)
@@ -298,19 +267,8 @@ def reproduce(
 ) -> Reproduction:
     """Run the whole experiment.
 
-    Parameters
-    ----------
-    seed
-        Seed of the searches and of the noise.
-    effort
-        Budgets; the full ones by default, :meth:`Effort.quick` for a look.
-    progress
-        Called with what is being done and the fraction done so far, 0 to 1.
-
-    Returns
-    -------
-    Reproduction
-        All numbers, motions, reasons and timings.
+    ``seed`` is that of the searches and of the noise; the effort is full by default,
+    :meth:`Effort.quick` is for a look.
     """
     effort = Effort() if effort is None else effort
     tasks = list(product(effort.conditions, OBJECTIVES))

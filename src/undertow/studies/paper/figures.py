@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import COLOURS, phase, style, surface_trace
+from undertow.closed_loop.figures import COLOURS, style
+from undertow.display.plot import phase, surface_trace
 from undertow.models import FloatArray
 from undertow.studies.figures import REPEATS, ROW_LINES, beginning, draw_rows, rows_figure
 from undertow.studies.paper.data import CONDITIONS, ROWS
@@ -70,14 +71,8 @@ def comparison(
 ) -> Figure:
     """Return Figure 4 or 6: base, one-time and cascade; φ, θ and voltage.
 
-    Parameters
-    ----------
-    columns
-        Title of each column to its motions by row name.
-    until
-        Right ends of the time axes, s: of φ and the voltage, and of θ, which is slower.
-    title
-        Above the figure.
+    ``columns``: title of each column to its motions by row name. ``until``: right ends of the time
+    axes, s: of φ and the voltage, and of θ, which is slower.
     """
     short, long = until
     with style():

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from undertow.base import facts, number, table, to_csv, to_json, versions
-from undertow.display.plot import figure_files
+from undertow.closed_loop.figures import figure_files
 from undertow.optimiser import Budget
 from undertow.studies.paper.data import CASES, CONDITIONS, OBJECTIVES, PERIOD, ROWS
 from undertow.studies.paper.experiment import Reproduction, Row

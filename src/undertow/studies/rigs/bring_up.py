@@ -15,7 +15,7 @@ from rich.text import Text
 
 from undertow.base import Progress, manifest, no_progress, number, table, to_csv, versions
 from undertow.bring_up import BringUp, Identification, doublets, identify, perform, rest_state
-from undertow.display.plot import figure_bytes, style
+from undertow.closed_loop.figures import figure_bytes, style
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Encoder, Friction, RealisticRig, Timing
@@ -74,19 +74,11 @@ def deviations(seed: int, noise: float) -> Deviations:
 class CoverageRow:
     """One quantity at one noise; ``name`` is empty for all quantities together.
 
-    Attributes
-    ----------
-    noise
-        Of the positions, rad.
-    name
-        Of the quantity.
-    count, covered
-        Intervals, and those that hold the truth.
-    error
-        Standard error of the share that does: of a quantity, what chance makes of 95 % in so
-        many rigs; of all together, by the spread from rig to rig, whose intervals hang together.
-    mean, deviation
-        Of (estimate − truth)/(standard error): 0 and 1 where intervals are as they should be.
+    ``noise``: of the positions, rad. ``count``, ``covered``: intervals, and those that hold the
+    truth. ``error``: standard error of the share that does: of a quantity, what chance makes of 95
+    % in so many rigs; of all together, by the spread from rig to rig, whose intervals hang
+    together. ``mean``, ``deviation``: of (estimate − truth)/(standard error): 0 and 1 where
+    intervals are as they should be.
     """
 
     noise: float
@@ -103,14 +95,8 @@ def coverage(
 ) -> list[CoverageRow]:
     """Identify many rigs and count how often 95 % intervals hold the truth.
 
-    Parameters
-    ----------
-    seeds
-        Rigs for each of ``NOISES``.
-    keep
-        A file that keeps every rig as it is done: what it holds already is not done again.
-    progress
-        Called with what is being done and the part done.
+    There are ``seeds`` rigs for each of ``NOISES``. ``keep`` is a file that keeps every rig as it
+    is done: what it holds already is not done again.
 
     Raises
     ------

@@ -35,19 +35,10 @@ AFTER = 2.5
 class Upsets:
     """What became of the runs.
 
-    Attributes
-    ----------
-    name, real
-        Of the controller.
-    bits
-        Bits of the controller's memory, unused ones included.
-    moments
-        When they were upset, s.
-    undisturbed
-        Whether the run without an upset is held to its end.
-    runs, beyond, held
-        For each member of the memory: runs, runs with an output beyond a limit or no number at any
-        step, and runs that were held in their last second.
+    ``bits``: of the controller's memory, unused ones included; ``moments``: when they were upset,
+    s; ``undisturbed``: whether the run without an upset is held to its end. ``runs``, ``beyond``,
+    ``held``: for each member of the memory, runs, runs with an output beyond a limit or no number
+    at any step, and runs that were held in their last second.
     """
 
     name: str
@@ -147,20 +138,9 @@ def upset_every_bit(
 ) -> Upsets:
     """Upset the bits of a controller's memory, one in each run.
 
-    Parameters
-    ----------
-    build
-        The controller, in a folder of its own.
-    rig
-        At its start; its period is the controller's.
-    moments
-        When, s after the start, ascending.
-    after
-        How long a run goes on after the upset, s.
-    every
-        Upset every so manieth bit.
-    progress
-        Told the fraction done.
+    The build has a folder of its own; the rig is at its start, its period the controller's. Every
+    so manieth bit is upset at each of the ``moments``, s, ascending, and the run goes on for
+    ``after``, s.
     """
     controller = build.controller
     limit, m = controller.mechanism.input_limits, controller.mechanism.m
@@ -258,16 +238,7 @@ def measure(
 ) -> list[ExportRow]:
     """Build, test, compare and count each controller in a folder that is then removed.
 
-    Parameters
-    ----------
-    controllers
-        What to measure.
-    states
-        Random states of the comparison with Python.
-    compiler
-        A C compiler that takes GCC's options.
-    progress
-        Told what is under way, and the fraction done.
+    ``states`` random ones are compared with Python; the compiler takes GCC's options.
 
     Raises
     ------
@@ -336,18 +307,7 @@ def held_on_rigs(
 ) -> int:
     """Return on how many realistic rigs the exported controller holds the mechanism.
 
-    Parameters
-    ----------
-    one
-        The controller; it runs as a process over a pipe.
-    x0
-        Start of each run, (2n,).
-    rigs
-        How many, one for each seed.
-    compiler
-        C compiler.
-    progress
-        Called with what is being done and the part done.
+    It runs as a process over a pipe, from ``x0``, (2n,), on one rig for each seed.
     """
     bench = bench_for(one.mechanism).with_timing(period=one.period)
     held = 0

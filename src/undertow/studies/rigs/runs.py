@@ -54,16 +54,8 @@ def _histogram(whole: Histogram) -> Table:
 def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> Group:
     """Return what came of a run: deadlines, times, states, answers, chattering.
 
-    Parameters
-    ----------
-    report
-        The run.
-    period
-        Of the fast loop, s.
-    unit
-        Of the inputs.
-    simulated
-        Whether the time was simulated: then no times are shown.
+    ``period`` is that of the fast loop, s, ``unit`` that of the inputs; of simulated time no times
+    are shown.
     """
     rows = [("steps", f"{report.steps:,}")]
     if not simulated:

@@ -46,16 +46,8 @@ class Limits:
 class BalanceResult:
     """Everything that the experiment gave.
 
-    Attributes
-    ----------
-    bench, x0, seconds, seeds
-        What was run.
-    outcomes
-        (objective, row) to the runs, one for each seed.
-    ideal
-        (objective, row) to the run on the ideal rig.
-    limits
-        Row to catch limits; empty when they were not asked for.
+    ``outcomes`` and ``ideal`` are by (objective, row): the runs, one for each seed, and the run on
+    the ideal rig; ``limits`` by row, empty when they were not asked for. ``x0`` is (2n,).
     """
 
     bench: Bench
@@ -102,11 +94,10 @@ def catch_limit(
     *,
     seeds: int,
     seconds: float = 5.0,
-    resolution: float = math.radians(0.5),
 ) -> float:
     """Return the largest φ(0) from which at least 19 of 20 of the seeds are caught, rad.
 
-    Found by bisection between 20° and 60°, to ``resolution``; 0 where even 20° is too much.
+    Found by bisection between 20° and 60°, to 0.5°; 0 where even 20° is too much.
     """
 
     def holds(angle: float) -> bool:
@@ -122,7 +113,7 @@ def catch_limit(
                 return False
         return True
 
-    low, high = math.radians(20), math.radians(60)
+    low, high, resolution = math.radians(20), math.radians(60), math.radians(0.5)
     if not holds(low):
         return 0.0
     while high - low > resolution * 1.001:
@@ -134,7 +125,6 @@ def catch_limit(
 
 def balance(
     *,
-    bench: Bench | None = None,
     angle: float = math.radians(35),
     seconds: float = 10.0,
     seeds: int = 20,
@@ -145,27 +135,12 @@ def balance(
 ) -> BalanceResult:
     """Run the three controllers for both objectives on every rig.
 
-    Parameters
-    ----------
-    bench
-        A bench of the rotary pendulum; the SRV02's by default.
-    angle
-        φ(0), rad, at rest.
-    seconds
-        Length of a run, s.
-    seeds
-        Rigs.
-    budget
-        Rollouts that one re-optimisation may spend.
-    limits
-        Whether to search for the catch limits.
-    progress
-        Called with what is being done and the part done.
-    begun
-        Called once, with the result that fills as the runs are made: what is left of it where
-        they are interrupted.
+    A run begins at φ(0) = ``angle``, rad, at rest, and takes ``seconds``, s; ``seeds`` rigs are
+    made of the SRV02 bench; a re-optimisation may spend ``budget`` rollouts; ``limits`` also
+    searches for the catch limits. ``begun`` is called once, with the result that fills as the runs
+    are made: what is left of it where they are interrupted.
     """
-    bench = srv02_rig() if bench is None else bench
+    bench = srv02_rig()
     belief = bench.mechanism
     x0 = belief.state(phi=angle)
     ideal_bench = undisturbed(belief, bench.timing.period)

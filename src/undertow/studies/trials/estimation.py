@@ -34,18 +34,9 @@ def estimators_for(belief: Mechanism, bench: Bench) -> dict[str, Callable[[], Es
 class EstimatorRow:
     """One estimator: its errors, its processor time and the runs with it.
 
-    Attributes
-    ----------
-    name
-        Which.
-    balanced, seeds
-        Runs that ended balanced, of how many.
-    errors
-        Root mean square of q̇̂ − q̇ while balancing, (n,), rad/s or m/s.
-    effort, chatter
-        ∫u² dt, and the total variation of u per second, means over the balanced runs.
-    microseconds
-        Processor time of one estimate.
+    ``errors``: root mean square of q̇̂ − q̇ while balancing, (n,), rad/s or m/s. ``effort``,
+    ``chatter``: ∫u² dt, and the total variation of u per second, means over the balanced runs.
+    ``microseconds``: processor time of one estimate.
     """
 
     name: str
@@ -72,7 +63,6 @@ def _cost(estimator: Estimator, belief: Mechanism, calls: int = 5000) -> float:
 def compared(
     *,
     seeds: int = 5,
-    angle: float = math.radians(20),
     seconds: float = 8.0,
     done: Callable[[EstimatorRow], None] = lambda _row: None,
 ) -> list[EstimatorRow]:
@@ -83,7 +73,7 @@ def compared(
     """
     bench = srv02_rig()
     belief = bench.mechanism
-    x0 = belief.state(phi=angle)
+    x0 = belief.state(phi=math.radians(20))
     surface = first_surface(belief)
     law = lambda _: steady(InnerLoop(belief, surface))  # noqa: E731
     ideal = Bench(belief, tachometers={}, timing=undisturbed(belief).timing)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,22 +17,10 @@ from undertow.runtime import Recipe, session
 class LibraryRow:
     """Runs of one mechanism.
 
-    Attributes
-    ----------
-    name
-        Of the mechanism.
-    inputs
-        How many it has.
-    layer
-        Boundary layer ε that its rig's sensors need.
-    held, runs
-        Runs in which the law held it to the end, of how many.
-    ends
-        Why the others were stopped, and how often.
-    applied
-        Answers of the optimiser that were put to use, per run that was held.
-    chatter
-        Total variation per second of the input that varies most, in parts of its limit.
+    ``layer``: boundary layer ε that its rig's sensors need. ``held``: runs in which the law held it
+    to the end; ``ends``: why the others were stopped, and how often. ``applied``: answers of the
+    optimiser that were put to use, per run that was held. ``chatter``: total variation per second
+    of the input that varies most, in parts of its limit.
     """
 
     name: str
@@ -47,7 +35,6 @@ class LibraryRow:
 
 def through_the_runtime(
     *,
-    names: Sequence[str] = tuple(LIBRARY),
     seeds: int = 5,
     seconds: float = 10.0,
     evaluations: int = 256,
@@ -56,27 +43,15 @@ def through_the_runtime(
 ) -> list[LibraryRow]:
     """Run mechanisms from their usual starts, each on its realistic rigs.
 
-    Parameters
-    ----------
-    names
-        Of the mechanisms.
-    seeds
-        Rigs of each.
-    seconds
-        Length of a run, s.
-    evaluations
-        Rollouts that one re-optimisation may spend.
-    progress
-        Called with what is being done and the part done.
-    done
-        Called with each row as it is finished.
+    On ``seeds`` rigs of each, for ``seconds``, s; a re-optimisation may spend ``evaluations``
+    rollouts. ``done`` is called with each row as it is finished.
     """
     rows = []
-    for number, name in enumerate(names):
+    for number, name in enumerate(LIBRARY):
         ends: Counter[str] = Counter()
         applied, chatter = [], []
         for seed in range(seeds):
-            progress(name, (number + seed / seeds) / len(names))
+            progress(name, (number + seed / seeds) / len(LIBRARY))
             recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=evaluations)
             with session(recipe, simulated=True) as runtime:
                 report = runtime.run(seconds)

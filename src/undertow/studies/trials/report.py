@@ -15,7 +15,7 @@ from rich.text import Text
 from undertow.base import finite, number, table, to_csv
 from undertow.cascade import problem_words
 from undertow.closed_loop import Trajectory
-from undertow.display.plot import figure_files
+from undertow.closed_loop.figures import figure_files
 from undertow.objective import Goal, objective_for
 from undertow.plants import Bench, srv02_rig
 from undertow.runtime import Recipe, default_gate, estimator_for

@@ -38,6 +38,9 @@ MASSES, FRICTION, DELAY, IMPULSE = 0.20, 2.0, 0.005, 0.004
 #: surface the time to bring the arm home afterwards.
 KNOCK, SINGLE = 5.0, 20.0
 
+#: φ(0), rad, at rest; and rollouts that one re-optimisation may spend.
+ANGLE, BUDGET = math.radians(35), 256
+
 #: Names in the tables.
 NAMES = ("cascade", "fixed surface", "clipped LQR", "NMPC, 10 Hz")
 
@@ -108,16 +111,8 @@ def breaking_point(
 ) -> Breaking:
     """Find the largest change survived on all seeds, by bisection from nothing.
 
-    Parameters
-    ----------
-    run
-        (change, seed) to whether it balanced.
-    largest
-        Where to start from.
-    seeds
-        Rigs.
-    bisections
-        The interval is halved so often.
+    ``run`` takes (change, seed) and says whether it balanced; the interval is halved ``bisections``
+    times.
     """
 
     def first_failure(value: float) -> int | None:
@@ -172,12 +167,10 @@ def _read(
     return (name, what, float(value), result.seed), result
 
 
-def _makers(
-    belief: Mechanism, bench: Bench, x0: FloatArray, budget: int
-) -> dict[str, MakeController]:
+def _makers(belief: Mechanism, bench: Bench, x0: FloatArray) -> dict[str, MakeController]:
     """Return the controllers by name; NMPC where CasADi is there."""
     objective = objective_for(belief, "bench-energy")
-    made = controllers(belief, bench, objective, x0, budget=budget)
+    made = controllers(belief, bench, objective, x0, budget=BUDGET)
     makers = dict(
         zip(NAMES, (made["cascade"], made["one-time"], clipped_regulator(belief)), strict=False)
     )
@@ -190,30 +183,16 @@ def robustness(
     *,
     rigs: int = 200,
     seeds: int = 3,
-    angle: float = math.radians(35),
     seconds: float = 10.0,
-    budget: int = 256,
     ledger: Path | None = None,
     progress: Progress = no_progress,
 ) -> RobustnessResult:
     """Run every controller on the same random rigs, then look for what breaks each.
 
-    Parameters
-    ----------
-    rigs
-        Random rigs.
-    seeds
-        Rigs on which a single change must be survived; 0 looks for no breaking points.
-    angle
-        φ(0), rad, at rest.
-    seconds
-        Length of a run on a random rig, s.
-    budget
-        Rollouts that one re-optimisation may spend.
-    ledger
-        A file that keeps every run as it is made: what it holds already is not run again.
-    progress
-        Called with what is being done and the part done.
+    There are ``rigs`` random ones, and ``seeds`` on which a single change must be survived (0 looks
+    for no breaking points). A run on a random rig begins at rest at ``ANGLE`` and takes
+    ``seconds``, s. ``ledger`` is a file that keeps every run as it is made: what it holds already
+    is not run again.
 
     Raises
     ------
@@ -222,10 +201,10 @@ def robustness(
     """
     bench = srv02_rig()
     belief = bench.mechanism
-    x0: FloatArray = belief.state(phi=angle)
+    x0: FloatArray = belief.state(phi=ANGLE)
     objective = objective_for(belief, "bench-energy")
-    makers = _makers(belief, bench, x0, budget)
-    settings = {"angle": angle, "seconds": [seconds, SINGLE], "budget": budget}
+    makers = _makers(belief, bench, x0)
+    settings = {"angle": ANGLE, "seconds": [seconds, SINGLE], "budget": BUDGET}
     book = run_ledger(ledger, settings | {"fingerprint": belief.fingerprint})
 
     def once(name: str, what: str, value: float, seed: int, truth: Bench) -> Result:

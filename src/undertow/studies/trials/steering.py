@@ -40,18 +40,8 @@ class CascadeSteering:
     present state, then the next one is asked for: for the state predicted one period ahead.  Where
     it has a belief, its estimator learns what that leaves open, see :meth:`listen`.
 
-    Parameters
-    ----------
-    cascade
-        The two-rate controller.
-    start
-        What :meth:`Cascade.start` returned: the first optimisation is made before the run, as
-        on a bench.
-
-    Attributes
-    ----------
-    admitted, refused
-        How many answers passed the gate, and how many did not.
+    The first optimisation, ``start``, was made before the run by :meth:`Cascade.start`, as on a
+    bench. ``admitted`` answers passed the gate, ``refused`` did not.
     """
 
     def __init__(self, cascade: Cascade, start: tuple[CascadeState, Proposal]) -> None:
@@ -106,18 +96,9 @@ class CascadeSteering:
 class NMPC:
     """The optimal-control problem of one mechanism, warm-started from solution to solution.
 
-    Parameters
-    ----------
-    belief
-        The model.
-    objective
-        Gives the stage cost; the terminal cost is that of its quadratic part.
-    period
-        Time between solutions, s.
-    step, horizon
-        Time that an input is held, and length of the prediction, s.
-    iterations
-        Most iterations of the interior-point method per solution.
+    The objective gives the stage cost, its quadratic part the terminal cost. A solution is made
+    every ``period``, s, by at most ``iterations`` of the interior-point method, for a ``horizon``,
+    s, in which an input is held for ``step``, s, at a time.
     """
 
     def __init__(

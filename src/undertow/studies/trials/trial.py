@@ -31,22 +31,11 @@ LAST = 1.0
 class Result:
     """What came of one run, in numbers.
 
-    Attributes
-    ----------
-    seed
-        Of the rig.
-    balanced
-        Whether every coordinate was home for the last second.
-    caught
-        Whether the free coordinates were, wherever the driven ones had got to.
-    settled
-        Time after which every coordinate stayed home, s; infinite if one did not.
-    cost
-        Of the objective, along the true motion with the inputs written; NaN without one.
-    effort
-        ∫ uᵀu dt.
-    chatter
-        Total variation of the inputs per second, in their unit.
+    ``balanced``: whether every coordinate was home for the last second; ``caught``: whether the
+    free ones were, wherever the driven ones had got to. ``settled``: time after which every
+    coordinate stayed home, s; infinite if one did not. ``cost``: of the objective, along the true
+    motion with the inputs written; NaN without one. ``effort``: ∫ uᵀu dt. ``chatter``: total
+    variation of the inputs per second, in their unit.
     """
 
     seed: int
@@ -79,28 +68,14 @@ def trial(
 ) -> Outcome:
     """Run a controller on a rig, once.
 
-    Parameters
-    ----------
-    belief
-        The controller's model.
-    bench
-        The truth.
-    make
-        Returns the controller, told where the sensors say that the mechanism is held.
-    x0
-        Where the hand means to let go, (2n,).
-    seconds
-        Length of the run, s.
-    seed
-        Of the rig.
-    objective
-        What the cost is counted by.
-    estimator
-        By default :func:`undertow.runtime.controller_defaults.estimator_for` the bench, which
-        learns the usual parameters.  What it knows of a matched disturbance is taken off the
-        controller's output; a controller that has a method ``listen`` is given it.
-    compensates
-        Asked at each step: whether it is.
+    The bench is the truth, ``belief`` the controller's model. ``make`` is told where the sensors
+    say that the mechanism is held, and returns the controller; the hand means to let go at ``x0``,
+    (2n,); the run takes ``seconds``, s.
+
+    The estimator is by default that of :func:`undertow.runtime.controller_defaults.estimator_for`
+    the bench, which learns the usual parameters; a controller that has a method ``listen`` is given
+    it. What it knows of a matched disturbance is taken off the output in each step in which
+    ``compensates`` says so.
     """
     rig = RealisticRig(bench, x0, seed)
     seen = np.concatenate([rig.read().q, np.zeros(belief.n)])

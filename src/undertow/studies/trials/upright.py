@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -41,14 +41,7 @@ def searched(
 ) -> dict[Mechanism, tuple[RatedGains, ...]]:
     """Return the swing-up gains of mechanisms of the library, kept or searched for.
 
-    Parameters
-    ----------
-    names
-        Of the mechanisms.
-    fresh
-        Seed of a new search; ``None``: what is kept is taken.
-    progress
-        Called with what is being done and the part done.
+    The kept ones are taken where ``fresh``, the seed of a new search, is ``None``.
     """
     found = {}
     for mechanism in all_of(names):
@@ -63,18 +56,9 @@ def searched(
 class SwingResult:
     """Swing-ups of one mechanism.
 
-    Attributes
-    ----------
-    mechanism
-        The belief.
-    outcomes
-        The runs, angles counted from the upright that they ended in.
-    catches
-        Times of the last catch, s, of the runs that had one.
-    thrown
-        How often a run was thrown out, in all.
-    stops
-        Runs that hit an end stop.
+    ``catches``: times of the last catch, s, of the runs that had one. ``thrown``: how often a run
+    was thrown out, in all. ``stops``: runs that hit an end stop. Angles of the outcomes are counted
+    from the upright that they ended in.
     """
 
     mechanism: Mechanism
@@ -88,16 +72,9 @@ class SwingResult:
 class SwingRun:
     """One swing-up.
 
-    Attributes
-    ----------
-    outcome
-        The run, angles counted from the upright that it ended in.
-    catch
-        Time of the last catch, s; NaN for a run that did not end in one.
-    thrown
-        How often it was thrown out.
-    stop
-        Whether it hit an end stop.
+    ``outcome``: angles are counted from the upright that it ended in. ``catch``: time of the last
+    catch, s; NaN for a run that did not end in one. ``thrown``: how often it was thrown out.
+    ``stop``: whether it hit an end stop.
     """
 
     outcome: Outcome
@@ -117,18 +94,8 @@ def swing_trial(
 ) -> SwingRun:
     """Swing a mechanism up on a realistic rig, once, from hanging at rest.
 
-    Parameters
-    ----------
-    bench
-        The truth.
-    swing, region
-        The energy law and the catch, both with the controller's belief.
-    seed
-        Of the rig.
-    seconds
-        Length of the run, s.
-    estimator
-        See :func:`undertow.studies.trials.trial.trial`.
+    Energy law and catch region have the controller's belief, the bench is the truth; the run takes
+    ``seconds``, s; the estimator is as for :func:`undertow.studies.trials.trial.trial`.
     """
     mechanism = region.mechanism
     controller = SwingUpAndCatch(swing, region)
@@ -157,34 +124,17 @@ def swing_trials(
     mechanism: Mechanism,
     *,
     swing: SwingUp | None = None,
-    bench: Bench | None = None,
     seeds: int = 20,
     seconds: float = SWING_SECONDS,
-    progress: Callable[[float], None] = lambda _: None,
 ) -> SwingResult:
     """Swing a mechanism up on realistic rigs, from hanging at rest, one for each seed.
 
-    Parameters
-    ----------
-    mechanism
-        The belief.
-    swing
-        The energy law; with the gains that are kept by default.
-    bench
-        The truth; :func:`bench_of` by default.
-    seeds
-        Rigs.
-    seconds
-        Length of a run, s.
-    progress
-        Called with the part done.
+    The energy law has the gains that are kept by default; a run takes ``seconds``, s.
     """
-    bench = bench_of(mechanism) if bench is None else bench
+    bench = bench_of(mechanism)
     swing = designed(mechanism) if swing is None else swing
-    region, runs = CatchRegion(mechanism), []
-    for seed in range(seeds):
-        progress(seed / seeds)
-        runs.append(swing_trial(bench, swing, region, seed=seed, seconds=seconds))
+    region = CatchRegion(mechanism)
+    runs = [swing_trial(bench, swing, region, seed=seed, seconds=seconds) for seed in range(seeds)]
     return SwingResult(
         mechanism,
         [run.outcome for run in runs],
@@ -208,14 +158,8 @@ def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 2
 
     The same settings for all of them.
 
-    Parameters
-    ----------
-    mechanism
-        The belief; the engine gets its parameters, and none of its equations.
-    seconds
-        Length of the run, s.
-    budget
-        Rollouts that one re-optimisation may spend.
+    The same settings for all of them; the engine gets the belief's parameters, and none of its
+    equations. The run takes ``seconds``, s, a re-optimisation ``budget`` rollouts at most.
     """
     x0 = mechanism.state(**mechanism.start)
     rig = MuJoCoRig(mechanism, x0)
