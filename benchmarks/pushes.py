@@ -91,6 +91,7 @@ def main() -> int:
         for answer in cascade.optimiser.improve(x0):
             answers.append((now() - began, answer))
         whole, last = now() - began, answers[-1][1]
+        assert last.plan is not None  # each usual start has one
         least = earliest(cascade, cascade.loop.simulate(x0, last.plan))
         soon = next((f"{t:.2f}" for t, some in answers if some.cost <= 1.05 * least), "—")
         firsts.append([name, f"{least:.4f}", f"{last.cost:.4f}", soon, f"{whole:.2f}"])
