@@ -12,7 +12,9 @@ import pytest
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.bounds import bound
-from undertow.law import stability_margin
+from undertow.law import Plan, stability_margin
+from undertow.optimiser.fitting import fits
+from undertow.optimiser.following import refined
 from undertow.optimiser.open_loop import NODES, EarliestArrival, OpenLoopMotion
 
 FREE = ut.DecisionVariables(reaching=True, schedule=0.1)
@@ -96,16 +98,71 @@ def test_what_is_left_of_a_schedule_is_a_schedule() -> None:
     assert run.cost <= run.updates[0].predicted + 1e-9
 
 
-def test_a_push_is_followed_by_a_new_schedule() -> None:
-    """A plan that arrives no more is searched for anew from where its motion leads."""
-    made = cascade("rotary_pendulum")
-    x = made.mechanism.usual_start
-    first = made.optimiser.propose(x)
-    assert first.plan is not None
-    pushed = x + np.array([0.1, -0.05, 1.0, -0.5])
-    second = made.optimiser.propose(pushed, incumbent=first.plan, sequence=1)
+@pytest.mark.parametrize("push", [0.0, 0.01, -0.01])
+def test_a_pushed_schedule_is_led_back(push: float) -> None:
+    """Its surfaces are moved together until they arrive again, within the budget of a period."""
+    made = cascade("cart_pendulum")
+    rig = made.mechanism
+    state, _ = made.start(rig.usual_start)
+    x = made.loop.simulate(rig.usual_start, state.plan, duration=0.2).x[-1].copy()
+    most = np.abs(made.loop.simulate(rig.usual_start, state.plan).x).max(axis=0)
+    x[rig.n :] += push * most[rig.n :]
+    incumbent = state.plan.shifted(0.2)
+    alone = made.loop.batch(x, incumbent, precise=True)
+    kept = alone.time[0] if alone.reached[0] else math.inf
+    second = made.optimiser.propose(x, incumbent=incumbent, sequence=1)
     assert second.plan is not None
-    assert second.cost < 2 * first.cost
+    assert second.cost <= kept + 1e-9
+    assert second.evaluations <= 1.1 * 16384 / rig.n
+    motion = made.loop.simulate(x, second.plan, duration=second.cost)
+    low, high = made.loop.objective.range_of(rig)
+    arrival = EarliestArrival(rig, 0.01, low, high)
+    floor = arrival.improve(OpenLoopMotion.of(motion, second.cost))
+    assert floor is not None
+    assert second.cost < 1.25 * floor.time
+    assert push == 0.0 or second.cost < 0.5 * kept
+
+
+def test_two_inputs_that_switch_often_are_followed() -> None:
+    """Six switchings in a fifth of a second; single surfaces take three times as long."""
+    made = cascade("two_motor_three_link")
+    answers = made.optimiser.improve(made.mechanism.usual_start)
+    assert any(answer.cost < 0.25 for answer in answers)
+
+
+def test_a_surface_is_found_again_from_its_motion() -> None:
+    """With its own rate, inside the layer, what is fitted moves as what was simulated."""
+    made = cascade("rotary_pendulum")
+    rig, loop = made.mechanism, made.optimiser.loop
+    surface, law = made.optimiser.anchor, ut.ReachingLaw(eta=4000.0, layer=100.0)
+    plan = Plan((surface,), (0.0,), (law,))
+    x = rig.state(phi=0.05)
+    motion = loop.simulate(x, plan, duration=0.1, terminal=0.0)
+    assert np.abs(motion.u).max() < rig.input_limits[0]
+    qdd = np.array([rig.accelerations(0.0, x, u) for x, u in zip(motion.x, motion.u, strict=True)])
+    found = fits(made.optimiser.space, surface, motion.x.T, qdd.T)
+    vectors, gains = made.optimiser.space.decode(found)
+    ends = loop.batch(x, vectors, reaching=gains, duration=0.1, terminal=0.0).x
+    assert np.linalg.norm(ends - motion.x[-1], axis=1).min() < 1e-3 * np.abs(motion.x).max()
+
+
+def test_guesses_elsewhere_begin_at_the_same_state() -> None:
+    """The same path faster, and the other way round."""
+    motion = earliest("rotary_pendulum")
+    for guess in (motion.faster(), motion.mirrored()):
+        assert np.allclose(guess.x[0], motion.x[0])
+        assert guess.x.shape == motion.x.shape
+    assert motion.faster().time < motion.time
+    assert np.allclose(motion.mirrored().mirrored().x, motion.x)
+
+
+def test_times_are_refined() -> None:
+    """All multiples of the period, and more while there are few."""
+    assert refined([0.05], 0.1, 0.62, 0.002)[:4] == (0.0, 0.05, 0.1, 0.2)
+    few = refined([], 0.1, 0.15, 0.002)
+    assert len(few) == 6
+    assert {0.0, 0.1} <= set(few)
+    assert refined([], 0.1, 0.004, 0.002) == (0.0,)
 
 
 @pytest.mark.parametrize(("d_e", "degrees"), [(0.073, 41.0), (0.04, 33.0)])

@@ -13,7 +13,7 @@ from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task,
 from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
 from undertow.closed_loop import ClosedLoop
 from undertow.law import check_surface, first_surface
-from undertow.optimiser import Budget, Optimiser
+from undertow.optimiser import Budget, DecisionVariables, Optimiser
 from undertow.runtime import default_gate
 
 
@@ -24,6 +24,7 @@ from undertow.runtime import default_gate
     "undertow simulate rotary_pendulum --start phi=20deg "
     "--surface 'lambda_a=-0.5 alpha_u=5 lambda_u=10'",
     "undertow simulate rotary_pendulum --objective time --control one-time --plant m=0.13",
+    "undertow simulate rotary_pendulum --objective time --schedule 0.1",
     "undertow simulate rotary_pendulum --start phi=20deg --box theta=60deg "
     "--limit voltage=8 --hard-input",
     "undertow simulate overhead_crane --target x=1m --target x=-1m@2s --objective bench-time",
@@ -77,6 +78,14 @@ def simulate(
             "evidence is of one model, exact.",
         ),
     ] = None,
+    schedule: Annotated[
+        float,
+        option(
+            "Surfaces one after another with free reaching laws; for least time each for so long "
+            "at most, s, following the earliest motion over all inputs. The model is taken for "
+            "the plant. 0.1, the period, is usual. 0: one surface at a time.",
+        ),
+    ] = 0.0,
     seed: options.Seed = 0,
     out: Annotated[Path | None, folder("motion.csv, motion.png and manifest.json")] = None,
 ) -> None:
@@ -104,10 +113,20 @@ def simulate(
             limit="cascade, which follows targets",
             remedy="Leave one of them out",
         )
+    if schedule and (steering != "cascade" or known == "usual"):
+        raise InvalidInputError(
+            "--schedule",
+            value=f"{schedule:g} s, --control {steering}",
+            limit="the cascade, with a model that is taken for the plant",
+            remedy="Leave --control, --surface and --belief out",
+        )
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
-        known = known or ("usual" if accept is None else "exact")
-        cascade = Cascade(belief, goal, period=period, gate=gate, seed=seed, belief=known)
+        known = known or ("exact" if accept or schedule else "usual")
+        freedom = DecisionVariables(reaching=schedule > 0, schedule=schedule)
+        cascade = Cascade(
+            belief, goal, period=period, gate=gate, seed=seed, belief=known, freedom=freedom
+        )
         with progress_bar() as progress:
             run = cascade.simulate(
                 x0,

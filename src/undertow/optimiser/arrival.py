@@ -61,19 +61,23 @@ class ArrivalSearch:
         ‖state‖₂ that counts as arrived.
     without
         Whether so many evaluations cannot be had any more.
+    shorter, fewest
+        T after an arrival, as a part of the one before; how many members remain at least.
     """
 
     states: States
     admits: Callable[[FloatArray], NDArray[np.bool_]]
     radius: float
     without: Callable[[int], bool] = lambda _: False
+    shorter: float = SHORTER
+    fewest: int = FEWEST
 
     def run(self, z: FloatArray, T: float, members: int) -> None:
         """Search from those of some parameters (N, d) that are nearest at T, s."""
         if self.without(len(z)):
             return
         z, x, t = nearest(z, *self.states(z, T), members)
-        damping, quiet = np.full(len(z), 1e-2), 0
+        damping, quiet, earliest = np.full(len(z), 1e-2), 0, np.inf
         while quiet < PATIENCE and len(z) and not self.without(len(z) * (z.shape[1] + len(TRIALS))):
             arrived = np.linalg.norm(x, axis=1) <= self.radius
             if arrived.any():
@@ -83,8 +87,11 @@ class ArrivalSearch:
                 if not good.any():
                     z, x, t, damping = z[left], x[left], t[left], damping[left]
                     continue
-                quiet, T, z = 0, SHORTER * float(t[good].min()), z[left]
-                z, x, t = nearest(z, *self.states(z, T), max(FEWEST, int(REMAIN * len(z))))
+                now = float(t[good].min())
+                # In whole steps a short T may stay as it is: then an arrival is no news.
+                quiet, earliest = 0 if now < earliest else quiet + 1, min(now, earliest)
+                T, z = self.shorter * now, z[left]
+                z, x, t = nearest(z, *self.states(z, T), max(self.fewest, int(REMAIN * len(z))))
                 damping = np.full(len(z), 1e-2)
             else:
                 quiet += 1

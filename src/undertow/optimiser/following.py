@@ -10,18 +10,22 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from undertow.models import FloatArray
-from undertow.optimiser.arrival import TRIALS, closer, nearest
+from undertow.optimiser.arrival import closer, nearest
 from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 
 #: Surfaces that are drawn for each piece, those of them that are improved, and the most steps; and
 #: how many times as much of all three where nothing else is left.
 DRAWN, IMPROVED, STEPS, MANY = 1024, 16, 15, 4
+
+#: Surfaces that are improved further without the errors of a search, how near, in terminal radii,
+#: the best has to be for that, and the most steps.
+FINAL, PROMISES, FINISH = 2, 3.0, 8
 
 #: Steps of the shortest piece.
 SHORTEST = 10
@@ -35,6 +39,26 @@ FOLLOWS, ACCEPTED, CLOSE = 0.05, 0.5, 0.97
 LAST, AFTER, BEFORE = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 3
 
 
+#: Pieces of a motion at least, where the steps allow.
+PIECES = 6
+
+
+def refined(times: Sequence[float], period: float, end: float, step: float) -> tuple[float, ...]:
+    """Return times before an end, s, with all multiples of a period, and the longest pieces halved.
+
+    Until there are ``PIECES``, or none is longer than ``SHORTEST`` steps.
+    """
+    multiples = [round(k * period, 9) for k in range(math.ceil(end / period - 1e-9))]
+    edges = sorted({*times, *multiples, end})
+    while len(edges) <= PIECES:
+        k = int(np.argmax(np.diff(edges)))
+        middle = step * round((edges[k] + edges[k + 1]) / 2 / step)
+        if edges[k + 1] - edges[k] <= SHORTEST * step:
+            break
+        edges.insert(k + 1, round(middle, 9))
+    return tuple(edges[:-1])
+
+
 @dataclass(frozen=True, eq=False)
 class Follower:
     """Looks for surfaces that follow a motion to its end.
@@ -43,11 +67,13 @@ class Follower:
     ----------
     draw
         Draws search coordinates of so many surfaces, (N, d), some of them near the last one (d,).
+    fit
+        Search coordinates (N, d) for states (2n, K) and accelerations (n, K) to be followed.
     states
         States (N, 2n) so long, s, after a state x, for search coordinates (N, d); infinite for a
         motion that broke off.
     exact
-        The same for one surface (d,), integrated without the errors of a search: (2n,).
+        The same, integrated without the errors of a search.
     arrival
         Whose motions are followed, and found anew from where the surfaces lead.
     period
@@ -57,6 +83,7 @@ class Follower:
     """
 
     draw: Callable[[int, FloatArray | None], FloatArray]
+    fit: Callable[[FloatArray, FloatArray], FloatArray]
     states: Callable[[FloatArray, FloatArray, float], FloatArray]
     exact: Callable[[FloatArray, FloatArray, float], FloatArray]
     arrival: EarliestArrival
@@ -81,7 +108,8 @@ class Follower:
                 left, passed, off = (left, passed, 0.0) if again is None else (again, 0.0, 0.0)
             rest, divisible = left.time - passed, piece > shortest
             if rest < LAST * piece:
-                last = self._arrive(x, left.x[-1], rest, scale, divisible, before)
+                given = self.fit(*self.arrival.along(left, passed, left.time))
+                last = self._arrive(x, given, left.x[-1], rest, scale, divisible, before)
                 if last is not None:
                     return self._whole([*found, last[0]], times, times[-1] + last[1])
                 if not divisible:
@@ -91,10 +119,10 @@ class Follower:
             beside = math.inf
             if rest > time:
                 goal = self.arrival.state_at(left, passed + time)
-                z, _ = self._lead(x, goal, time, scale, FOLLOWS * radius, before)
+                given = self.fit(*self.arrival.along(left, passed, passed + time))
+                z, ends = self._lead(x, given, goal, time, scale, FOLLOWS * radius, before)
                 if len(z):
-                    end = self.exact(x, z[0], time)
-                    beside = float(np.linalg.norm(end - goal))
+                    end, beside = ends[0], float(np.linalg.norm(ends[0] - goal))
             if beside > ACCEPTED * radius and divisible:
                 piece = max(shortest, self._in_steps(time / 2))
                 continue
@@ -112,6 +140,7 @@ class Follower:
     def _arrive(
         self,
         x: FloatArray,
+        given: FloatArray,
         end: FloatArray,
         rest: float,
         scale: FloatArray,
@@ -123,13 +152,12 @@ class Follower:
         parts = AFTER[:BEFORE] if divisible else AFTER
         for part, measure in itertools.product(parts, (scale, np.full_like(x, radius))):
             time = self.step * math.ceil(part * rest / self.step)
-            z, off = self._lead(
-                x, end / part, time, measure, CLOSE * radius, before, target,
+            z, ends = self._lead(
+                x, given, end / part, time, measure, CLOSE * radius, before, target,
                 1 if divisible else MANY,
             )  # fmt: skip
-            for last in z[off < CLOSE * radius]:
-                if np.linalg.norm(self.exact(x, last, time)) < radius:
-                    return last, time
+            if len(z) and np.linalg.norm(ends[0]) < radius:
+                return z[0], time
         return None
 
     def _whole(
@@ -145,6 +173,7 @@ class Follower:
     def _lead(
         self,
         x: FloatArray,
+        given: FloatArray,
         goal: FloatArray,
         time: float,
         scale: FloatArray,
@@ -155,24 +184,36 @@ class Follower:
     ) -> tuple[FloatArray, FloatArray]:
         """Return surfaces (N, d) that lead from x to a goal in so long, s, the nearest first.
 
-        With how far from ``target``, (2n,), by default the goal, in units of the states, (N,).  The
-        search, in parts of ``scale``, (2n,), ends at the
-        first that is nearer than ``near``.  There may be none: all drawn motions may break off.
+        With the states that they lead to, (N, 2n).  The search, in parts of ``scale``, (2n,),
+        begins from some that are given and some that are drawn, and ends at the first that is
+        nearer than ``near`` to ``target``, (2n,), by default the goal.  There may be none: all
+        motions may break off.
         """
+        radius = self.arrival.radius
         beside = np.zeros_like(goal) if target is None else goal - target
-        when = np.zeros(len(TRIALS) * effort * DRAWN)
 
-        def off(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-            return (self.states(x, z, time) - goal) / scale, when[: len(z)]
+        def improved(
+            states: Callable[[FloatArray, FloatArray, float], FloatArray],
+            z: FloatArray,
+            members: int,
+            steps: int,
+        ) -> tuple[FloatArray, FloatArray]:
+            """Return the best of some surfaces after so many steps, and how far off they are."""
 
-        z = self.draw(effort * DRAWN, before)
-        z, miss, t = nearest(z, *off(z), effort * IMPROVED)
-        damping = np.full(len(z), 1e-2)
-        for _ in range(effort * STEPS):
-            close = len(z) and np.linalg.norm(miss * scale + beside, axis=1).min() < near
-            if close or not len(z) or self.arrival.late():
-                break
-            z, miss, t, damping = closer(off, z, miss, t, damping)
-        distance = np.linalg.norm(miss * scale + beside, axis=1)
-        order = np.argsort(distance, kind="stable")
-        return z[order], distance[order]
+            def off(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+                return (states(x, z, time) - goal) / scale, np.zeros(len(z))
+
+            z, miss, t = nearest(z, *off(z), members)
+            damping = np.full(len(z), 1e-2)
+            for _ in range(steps):
+                close = len(z) and np.linalg.norm(miss * scale + beside, axis=1).min() < near
+                if close or not len(z) or self.arrival.late():
+                    break
+                z, miss, t, damping = closer(off, z, miss, t, damping)
+            order = np.argsort(np.linalg.norm(miss * scale + beside, axis=1), kind="stable")
+            return z[order], miss[order] * scale + goal
+
+        z = np.vstack([given, self.draw(effort * DRAWN, before)])
+        z, ends = improved(self.states, z, effort * IMPROVED, effort * STEPS)
+        promising = len(z) and np.linalg.norm(ends[0] - goal + beside) < PROMISES * radius
+        return improved(self.exact, z[:FINAL], FINAL, FINISH if promising else 0)

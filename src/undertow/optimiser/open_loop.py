@@ -30,6 +30,9 @@ from undertow.models import FloatArray, Mechanism
 #: Nodes of a motion, and the longest Runge-Kutta step between them, s.
 NODES, LONGEST = 30, 0.01
 
+#: Samples of a part of a motion.
+SAMPLES = 12
+
 #: Sequential linear programs at most.
 PROGRAMS = 200
 
@@ -37,8 +40,14 @@ PROGRAMS = 200
 #: time shrinks, and in the end.
 FUNNEL, CLOSED = 0.1, 1e-4
 
+#: How much narrower a funnel wider than that gets with each step.
+NARROWS = 0.9
+
 #: Part of the terminal radius that is aimed for, and what missing it by itself counts as a gap.
 INSIDE, MISS = 0.8, 0.05
+
+#: How long a faster motion takes, in parts of what it is guessed from.
+SOONER = 0.85
 
 #: Step of the differences of the derivatives, in parts of the scales.
 PROBE = 1e-6
@@ -79,6 +88,17 @@ class OpenLoopMotion:
         pieces = ((nodes[1:] + nodes[:-1]) / 2 / self.time * NODES).astype(int)
         return OpenLoopMotion(self.time - t, states, self.u[np.minimum(pieces, NODES - 1)])
 
+    def faster(self) -> OpenLoopMotion:
+        """Return the same path in less time, a guess: there may be an earlier arrival nearby."""
+        x, n = self.x.copy(), self.x.shape[1] // 2
+        x[1:, n:] /= SOONER
+        return OpenLoopMotion(SOONER * self.time, x, self.u)
+
+    def mirrored(self) -> OpenLoopMotion:
+        """Return it reflected in the straight line to its end, a guess: the other way round."""
+        straight = np.linspace(self.x[0], np.zeros_like(self.x[0]), NODES + 1)
+        return OpenLoopMotion(self.time, 2 * straight - self.x, -self.u)
+
 
 @dataclass(frozen=True, eq=False)
 class EarliestArrival:
@@ -110,14 +130,25 @@ class EarliestArrival:
             :, 0
         ]
 
+    def along(self, motion: OpenLoopMotion, t: float, end: float) -> tuple[FloatArray, FloatArray]:
+        """Return states (2n, K) and accelerations (n, K) within a part of a motion, from t, s."""
+        times = t + (np.arange(SAMPLES) + 0.5) / SAMPLES * (min(end, motion.time) - t)
+        piece = motion.time / NODES
+        k = np.clip((times / piece).astype(int), 0, NODES - 1)
+        u = motion.u[k].T
+        x = self._flow(motion.x[k].T, u, times - k * piece)
+        return x, self._accelerations(x, u)
+
+    def _accelerations(self, x: FloatArray, u: FloatArray) -> FloatArray:
+        qdd = self.mechanism.function("dynamics")(0.0, *x, *u, *self.mechanism.parameter_values)
+        return np.vstack([np.broadcast_to(entry, x.shape[1:]) for entry in qdd])
+
     def _flow(self, x: FloatArray, u: FloatArray, time: FloatArray) -> FloatArray:
         """Return the states (2n, K) after the times (K,), with the inputs (m, K) held."""
-        rate_of, n = self.mechanism.function("dynamics"), self.mechanism.n
-        values = self.mechanism.parameter_values
+        n = self.mechanism.n
 
         def rate(x: FloatArray) -> FloatArray:
-            qdd = rate_of(0.0, *x, *u, *values)
-            return np.vstack([x[n:], *(np.broadcast_to(entry, x.shape[1:]) for entry in qdd)])
+            return np.vstack([x[n:], self._accelerations(x, u)])
 
         steps = max(1, math.ceil(float(time.max()) / LONGEST))
         h = time / steps
@@ -140,8 +171,13 @@ class EarliestArrival:
             np.clip(guess.u.T, -limits[:, None], limits[:, None]),
             guess.time,
         )
-        scale = np.maximum(np.abs(x).max(axis=1), radius)
         cuts: list[FloatArray] = []
+
+        def sized(x: FloatArray) -> FloatArray:
+            """Scale of each state: an early motion is faster than its guess."""
+            return np.asarray(np.maximum(np.abs(x).max(axis=1), radius))
+
+        scale = sized(x)
 
         def gaps(x: FloatArray, u: FloatArray, T: float) -> tuple[FloatArray, float]:
             """Gaps between the pieces (N, 2n), and their sum, with what misses the target."""
@@ -188,7 +224,10 @@ class EarliestArrival:
                 retries, trust, funnel = retries + 1, TRUST, 0.3 * total
                 continue
             gain = 1.0 - nT / T
-            x, u, T, gap, total = nx, nu, nT, opened, sum_
+            funnel = max(min(FUNNEL, funnel), NARROWS * funnel)
+            x, u, T = nx, nu, nT
+            scale = sized(x)
+            gap, total = gaps(x, u, T)
             if not corrects:
                 trust = min(1.0, 1.7 * trust)
             if abs(gain) < WORTHWHILE:

@@ -130,7 +130,7 @@ class Optimiser:
             return given
         size, schedule = self.space.size, self.freedom.schedule > 0
         if warm and schedule and self.counts_time:
-            return Budget(4096 * size)
+            return Budget(16384 // self.loop.mechanism.n)
         if warm:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
         if self.counts_time:

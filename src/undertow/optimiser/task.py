@@ -15,6 +15,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,10 +26,11 @@ from undertow.law import Margin, Plan, stability_margin
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
-from undertow.optimiser.following import Follower
+from undertow.optimiser.fitting import fits
+from undertow.optimiser.following import SHORTEST, Follower, refined
 from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
-from undertow.optimiser.search_space import SearchSpace
+from undertow.optimiser.search_space import DecisionVariables, SearchSpace
 from undertow.optimiser.trust_region import TrustRegion
 from undertow.symbolic import compiled
 
@@ -83,6 +85,19 @@ FEW, AROUND, NEAR_AND_FAR, FRUITLESS = 24, 8, (-1.5, 0.3), 6
 #: one is looked for that follows it.
 AS_EARLY, TRIES = 1.02, 3
 
+#: When a schedule in use is to arrive: in parts of its arrival where it is kept, else of what it
+#: promised; and whether the search begins from the designs.
+SOONER = ((0.6, True), (0.75, True), (0.88, False), (0.97, False))
+LATER = ((1.0, False), (1.1, False), (1.25, False), (1.6, True), (2.5, True), (4.0, True))
+
+#: T after an arrival, as a part of the one before, at first and in the end; members that remain;
+#: ways to sway a schedule, and how far they go; evaluations for a single surface where all fails,
+#: and twice as many without any plan.
+HURRY, UNHURRIED = 0.9, 0.98
+FEWEST, WAYS, SWAY, ALONE = 4, 3, (0.02, 0.5), 1024
+
+#: What a motion integrated to the tolerance counts as, in evaluations: it takes as long.
+EXACT = 16
 #: A single surface is divided into so many, the first but one of which takes over after this part
 #: of the time in which nearly all of the cost, this part, is spent, each later one after twice the
 #: time; and the evaluations that improving them may take, per coordinate of a single one.
@@ -274,14 +289,16 @@ class Optimisation:
         scores = self.cost(z)
         if self.optimiser.counts_time:
             yield self._earlier(min(POLISH, self.left))
-            if self.optimiser.freedom.schedule and self.follow_earliest(self.left // 2):
-                yield True
+            again, done = self.optimiser.freedom.schedule > 0, False
+            if again:
+                for done in self.follow_earliest(self.left // 2):
+                    yield done
+            if done:
                 return
-            again = self.optimiser.freedom.schedule > 0
             self.arrive_earlier(wide=True, keep=POLISH + again * (self.left // 2))
             yield self._earlier(POLISH if again else self.left)
             if again:
-                yield self.follow_earliest()
+                yield from self.follow_earliest()
             return
         if self._centre().size <= MODEL_SIZE:
             self._model_search(self._centre())
@@ -393,10 +410,13 @@ class Optimisation:
         here = self._begin(incumbent)
         if self._unscored is not None:
             self.cost(here[None])
-        # A schedule is kept while it does not need its last surface, the design.
-        kept = self.best_cost <= incumbent.times[-1]
-        if self.optimiser.freedom.schedule and (kept or self.follow_earliest()):
-            return True
+        if self.optimiser.freedom.schedule:
+            if self.lead_back(incumbent):
+                return True
+            alone = ALONE if self.best_cost < INADMISSIBLE else 2 * ALONE
+            self.arrive_earlier(keep=max(0, self.left - alone))
+            found = self.best
+            return found is not None and found is not incumbent and self.lead_back(found)
         if not self.best_cost < INADMISSIBLE:
             self._look_around(here)
         if not self.optimiser.aims:
@@ -485,38 +505,131 @@ class Optimisation:
 
     # -- schedules that follow the earliest arrival ---------------------------------------------
 
-    def follow_earliest(self, keep: int = 0) -> bool:
+    def follow_earliest(self, keep: int = 0) -> Iterator[bool]:
         """Look for the earliest arrival over all inputs, and for a schedule that follows it.
 
-        Starts from the motion of the best plan; returns whether the plan is as early by now.  So
-        many evaluations are left over.
+        Starts from the motion of the best plan, and then elsewhere: what is found is a local
+        optimum.  Yields after each whether the plan is as early by now.  So many evaluations are
+        left over.
         """
         loop, best, long = self.loop, self.best, self.best_cost
         if best is None or not np.isfinite(loop.mechanism.input_limits).all():
-            return False
+            return
         if not long < INADMISSIBLE:
             long = float(loop.batch(self.x, best, duration=self.horizon, seek=True).closest_time[0])
         if long <= loop.step:
-            return False
-        low, high = loop.objective.range_of(loop.mechanism)
-        arrival = EarliestArrival(
-            loop.mechanism,
-            loop.objective.terminal_radius,
-            low,
-            high,
-            lambda: self.left <= keep or self.late(),
-        )
+            return
         recorded = loop.simulate(self.x, best, duration=long)
+        arrival = self._arrival(keep)
         motion = arrival.improve(OpenLoopMotion.of(recorded, long))
         if motion is None:
-            return False
+            return
+        earliest = motion.time
+        self._follow(motion, keep)
+        yield self.best_cost <= AS_EARLY * earliest
+        for guess in (motion.faster(), motion.mirrored()):
+            other = arrival.improve(guess)
+            if other is not None and other.time < earliest / AS_EARLY:
+                earliest = other.time
+                self._follow(other, keep)
+                yield self.best_cost <= AS_EARLY * earliest
+
+    def _arrival(self, keep: int) -> EarliestArrival:
+        """The task over all inputs, as long as more evaluations than these are left."""
+        loop = self.loop
+        low, high = loop.objective.range_of(loop.mechanism)
+        radius = loop.objective.terminal_radius
+        return EarliestArrival(
+            loop.mechanism, radius, low, high, lambda: self.left <= keep or self.late()
+        )
+
+    def _follow(self, motion: OpenLoopMotion, keep: int) -> None:
+        """Look for a schedule that follows a motion, where that is earlier than the best plan.
+
+        So many evaluations are left over.
+        """
         if motion.time < (1.0 - WORTHWHILE) * self.best_cost - self.resolution:
             for _ in range(TRIES):
-                plan = self._schedule(arrival, motion)
+                plan = self._schedule(self._arrival(keep), motion)
                 if plan is not None:
                     self._consider(plan)
+                    self.lead_back(plan)
                     break
-        return self.best_cost <= AS_EARLY * motion.time
+
+    def lead_back(self, incumbent: Plan) -> bool:
+        """Look for earlier arrivals of a plan in use, moving all its surfaces together.
+
+        Where it arrives no more as promised, because the state was pushed, later arrivals than that
+        come first.  Returns whether it was kept or there is an arrival now.
+        """
+        promised, before = incumbent.times[-1], self.best_cost
+        kept = before <= promised or (not promised and before < INADMISSIBLE)
+        if not (kept or promised) or before <= SHORTEST * self.loop.step:  # nothing, all but there
+            return kept
+        first, tries = (before, SOONER) if kept else (promised, LATER)
+        for part, designs in tries:
+            T = min(part * first, self.horizon)
+            self._lead_back(incumbent, T, HURRY, designs)
+            if self.best_cost < before:
+                break
+        while self.best is not None and self.best_cost < (1.0 - WORTHWHILE) * before:
+            before = self.best_cost
+            self._lead_back(self.best, UNHURRIED * before, UNHURRIED)
+        return kept or self.best_cost <= T
+
+    def _lead_back(self, incumbent: Plan, T: float, shorter: float, designs: bool = False) -> None:
+        """Search for arrivals until T, s, around a plan and the same plan, stretched.
+
+        Or around the designs.
+        """
+        loop, period = self.loop, self.optimiser.freedom.schedule
+        T = max(T, 2 * loop.step)
+        times = refined([t for t in incumbent.times[:-1] if t < T], period, T, loop.step)
+        freedom = DecisionVariables(reaching=True, times=times)
+        space = SearchSpace(loop, self.optimiser.anchor, freedom)
+        laws, end = incumbent.laws(loop.reaching), max(1, len(incumbent.times) - 1)
+        moving = Plan(incumbent.surfaces[:end], incumbent.times[:end], laws[:end])
+        slower = T / max(incumbent.times[-1], loop.step) if end > 1 else 1.0
+        stretched = replace(moving, times=tuple(t * slower for t in moving.times))
+        z = np.array([space.encode(moving), space.encode(stretched)])
+        near = np.geomspace(*SWAY, WAYS)
+        z = np.vstack([z, z.repeat(WAYS, axis=0) + space.steps(self.rng, np.tile(near, len(z)))])
+        if designs:
+            z = np.tile(self.optimiser.firsts, space.segments)
+
+        def admits(z: FloatArray) -> NDArray[np.bool_]:
+            self.evaluations += EXACT * len(z)
+            vectors, gains = space.decode(z)
+            batch = loop.batch(
+                self.x, vectors, reaching=gains, switch_times=times, duration=T, precise=True
+            )
+            arrives = np.asarray(batch.reached)
+            if arrives.any():
+                best = int(np.argmin(np.where(arrives, batch.time, np.inf)))
+                assert gains is not None  # the reaching law of a schedule is free
+                plan = space.plan(vectors[best], gains[best])
+                self._consider(self._ended(plan, float(batch.time[best])))
+            return arrives
+
+        search = ArrivalSearch(
+            partial(self._states, space=space),
+            admits,
+            0.9 * loop.objective.terminal_radius,
+            lambda evaluations: self.left < evaluations or self.late(),
+            shorter,
+            FEWEST,
+        )
+        search.run(z, T, FEWEST)
+
+    def _ended(self, plan: Plan, arrives: float) -> Plan:
+        """Return a plan with the first design taking over at the next multiple of the period."""
+        period = self.optimiser.freedom.schedule
+        end = round(period * math.ceil(arrives / period - 1e-9), 9)
+        count = sum(t < end - 1e-9 for t in plan.times)
+        vectors, gains = self.space.decode(self.optimiser.firsts[:1])
+        anchor = self.space.plan(vectors[0], None if gains is None else gains[0])
+        laws = plan.laws(self.loop.reaching)[:count] + anchor.laws(self.loop.reaching)
+        return Plan(plan.surfaces[:count] + anchor.surfaces, (*plan.times[:count], end), laws)
 
     def _schedule(self, arrival: EarliestArrival, motion: OpenLoopMotion) -> Plan | None:
         """Return surfaces that follow a motion, the last but one of which arrives.
@@ -543,28 +656,30 @@ class Optimisation:
             return np.where(sound[:, None], batch.x, np.inf)
 
         def exact(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
-            vectors, gains = space.decode(z[None])
+            self.evaluations += math.ceil(len(z) * time / motion.time)
+            vectors, gains = space.decode(z)
             batch = loop.batch(
                 x, vectors, reaching=gains, duration=time, terminal=0.0, precise=True
             )
-            sound = int(batch.event[0]) == Event.HORIZON
-            return np.asarray(batch.x[0]) if sound else np.full_like(x, np.inf)
+            sound = (batch.event == Event.HORIZON) & np.isfinite(batch.x).all(axis=1)
+            return np.where(sound[:, None], batch.x, np.inf)
 
-        follower = Follower(draw, states, exact, arrival, period, loop.step)
+        fit = partial(fits, space, self.optimiser.anchor)
+        follower = Follower(draw, fit, states, exact, arrival, period, loop.step)
         found = follower.follow(motion)
         if found is None:
             return None
         z, times, end = found
-        vectors, gains = space.decode(np.vstack([z, self.firsts[0]]))
+        freedom = DecisionVariables(reaching=True, times=times)
+        whole = SearchSpace(loop, self.optimiser.anchor, freedom)
+        vectors, gains = whole.decode(z.reshape(1, -1))
         assert gains is not None  # the reaching law of a schedule is free
-        plans = [space.plan(*each) for each in zip(vectors, gains, strict=True)]
-        laws = tuple(plan.reaching[0] for plan in plans if plan.reaching)
-        return Plan(tuple(plan.surfaces[0] for plan in plans), (*times, end), laws)
+        return self._ended(whole.plan(vectors[0], gains[0]), end)
 
     def _consider(self, plan: Plan) -> None:
         """Score a plan that the coordinates cannot express, and keep it where it is the best."""
         batch = self.loop.batch(self.x, plan, duration=self.horizon, stable_only=True, precise=True)
-        self.evaluations += 1
+        self.evaluations += EXACT
         score = float(batch.score(self.horizon)[0])
         if score < self.best_cost and stability_margin(self.loop.mechanism, plan.surfaces[-1]) > 0:
             self._best, self.best_z, self.best_cost = plan, self.space.encode(plan), score
@@ -575,12 +690,15 @@ class Optimisation:
         rate = float(stability_margin(self.loop.mechanism, anchor.vector[None])[0])
         return min(self.horizon, LONG / max(rate, LONG / self.horizon))
 
-    def _states(self, z: FloatArray, T: float) -> tuple[FloatArray, FloatArray]:
+    def _states(
+        self, z: FloatArray, T: float, space: SearchSpace | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """States at T, (N, 2n), or where a motion came closest, if it arrived before; and when.
 
         They are infinite where a motion broke off.  An ensemble's first member stands for all.
         """
-        loop, space = self.loop, self.space
+        loop, space = self.loop, space or self.space
+        T = max(T, loop.step)
         self.evaluations += len(z)
         buffers = RolloutBuffers(loop, len(z), space.segments, plants=loop.ensemble is not None)
         if loop.ensemble is not None:
