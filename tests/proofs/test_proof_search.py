@@ -36,8 +36,7 @@ from undertow.proofs.region.lyapunov import (
     first_crossing,
     unit,
 )
-from undertow.proofs.region.motion import SurfaceMotion, VectorField
-from undertow.proofs.region.region import _clear
+from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
 from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _on_axis, grow
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
@@ -45,6 +44,7 @@ from undertow.proofs.search.closed_loop import _boxes, _terminal, follow
 from undertow.proofs.search.linear_program import minimise_linear
 from undertow.proofs.search.quadratic import quadratic
 from undertow.proofs.search.region import LEAP, TIGHT, _proved_chain, _tight_level
+from vector_field import VectorField
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 SURFACE = ut.Surface(-1, -0.7, 1.5, 9.0)
@@ -150,20 +150,6 @@ def test_a_stretched_set_reaches_the_points_on_its_axis() -> None:
     assert not reaches(V, [1.02 * reach, 0.0, 0.0])
     assert not reaches(V.times(1e-12), [V.pole, 0.0, 0.0])
     assert not reaches(V, [0.1, 0.0])
-
-
-def test_the_motion_is_clear_up_to_its_singularity() -> None:
-    """As far as V is defined, or ten times its size where it is defined everywhere."""
-    edge = singular_distance_on_axis(MOTION, math.pi)
-    way = np.array([1.0, 0.0, 0.0])
-    wide, small = (LyapunovFunction.quadratic(size * np.eye(3)) for size in (0.5, 0.07))
-    assert _clear(MOTION, wide, way) == pytest.approx(edge, abs=5.0 / 2000)
-    assert edge > 0.7
-    assert _clear(MOTION, small, way) == INF
-    S = np.zeros((1, 3, 3))
-    for pole, clear in ((0.9 * edge, 0.9 * edge), (1.5 * edge, edge)):
-        V = LyapunovFunction.quadratic(np.eye(3), S, pole)
-        assert _clear(MOTION, V, way) == pytest.approx(clear, abs=pole / 1000)
 
 
 def test_points_on_the_way_are_where_they_were_asked_for() -> None:

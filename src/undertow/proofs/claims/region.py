@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,6 +56,17 @@ class RegionClaim(Claim):
     functions: tuple[LyapunovFunction, ...]
     start: tuple[float, ...]
     parameters: Box = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its numbers as JSON values, the box only where there is one."""
+        data = super().to_dict()
+        return {k: v for k, v in data.items() if k != "parameters" or v}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Rebuild from :meth:`to_dict`, or from one function alone."""
+        listed = {} if "functions" in data else {"functions": [data["function"]]}
+        return super().from_dict({"parameters": {}, **data, **listed})
 
     def decide(
         self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
