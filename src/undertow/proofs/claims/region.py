@@ -73,7 +73,8 @@ class RegionClaim(Claim):
     ) -> Verdict:
         """Let the kernel decide it; the margin is the start's distance from 0."""
         model = model_of(mechanism)
-        answer = kernel.decide(model, law_of(mechanism, surface, law), self._own())
+        own = kernel.read_claim({"kind": self.kind, **self._own().data()}, model)
+        answer = kernel.decide(model, law_of(mechanism, surface, law), own)
         kind, margin = cast(Kind, answer.kind), float(np.linalg.norm(self.start)) * (1 - 1e-12)
         unit = mechanism.coordinates[mechanism.m].unit
         return Verdict(

@@ -613,7 +613,7 @@ class SurfaceRegion(Claim):
         return (
             "every motion on the surface from a compact set around the target that contains "
             f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
-            f"way, in the union of {len(self.functions)} such sets; the inputs are not limited"
+            f"way, in the union of {len(self.functions)} such sets; the inputs not limited"
         )
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
