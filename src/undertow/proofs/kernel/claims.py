@@ -556,8 +556,9 @@ def _read_plant(data: Any, model: Model) -> dict[str, tuple[Fraction, Fraction]]
     known = {p.name: p.value or Fraction(0) for p in model.parameters}
     require(isinstance(data, dict) and {*data} <= {*known}, "a plant: parameters of the model")
     box = {name: interval(ends) for name, ends in data.items()}
-    inside = all(low <= known[name] <= high for name, (low, high) in box.items())
-    require(inside, "a plant with the model's own parameters inside")
+    for name, (low, high) in box.items():
+        inside = low <= known[name] <= high
+        require(inside, f"a box of {name!r} without its {float(known[name]):g}")
     return box
 
 
