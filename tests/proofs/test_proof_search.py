@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,7 +121,8 @@ def test_crossings_of_a_level_are_the_first_on_their_rays() -> None:
     first = math.sqrt((1 - math.sqrt(1 - 0.8)) / 0.4)
     np.testing.assert_allclose(first_crossing(V, rays), [first, first, 2.0], rtol=1e-6)
     np.testing.assert_allclose(first_crossing(V, rays, 1.3), [INF, INF, 2 * math.sqrt(1.3)])
-    basis = Basis(VectorField(sp.symbols("a b", real=True), (sp.Symbol("b", real=True),) * 2), V, 4)
+    still: Any = VectorField(sp.symbols("a b", real=True), (sp.Symbol("b", real=True),) * 2)
+    basis = Basis(still, V, 4)
     row = _expansion(V, basis, np.random.default_rng(0))
     found = _crossing(basis, row, rays, 1.0)
     np.testing.assert_allclose(found, [first, first, 2.0], rtol=1e-6)
@@ -264,7 +266,7 @@ def test_first_sets_are_as_large_as_the_fall_allows(start: str, most: float) -> 
     Every set is within 10 % of what its shape allows.
     """
     x, y = sp.symbols("x y", real=True)
-    motion = VectorField((x, y), (-x + x**3, -3 * y + 3 * y**3))
+    motion: Any = VectorField((x, y), (-x + x**3, -3 * y + 3 * y**3))
     V = quadratic(motion, None, np.array([1.0, 0.0]), np.random.default_rng(0), start)  # type: ignore[arg-type]
     reach = extent(V, [1.0, 0.0])
     assert 0.9 * most < reach < 1.01 * most
@@ -283,7 +285,7 @@ def test_first_sets_keep_clear_of_the_singularity_and_of_the_pole(bent: bool) ->
             return np.asarray(1.0 if bent else 1 - np.abs(np.asarray(z)[..., 0]) / 0.6)
 
     x, y = sp.symbols("x y", real=True)
-    motion = Ending((x, y), (-x, -y))
+    motion: Any = Ending((x, y), (-x, -y))
     stretch = (np.zeros((1, 2, 2)), 0.7) if bent else None
     V = quadratic(motion, stretch, np.ones(2), np.random.default_rng(0), "round")
     end = 0.7 * POLE_PART if bent else 0.6 * (1 - CLEARANCE)
@@ -293,7 +295,7 @@ def test_first_sets_keep_clear_of_the_singularity_and_of_the_pole(bent: bool) ->
 def test_a_chain_grows_within_its_budget() -> None:
     """Each set reaches further than the one before; programs are counted; a goal ends it."""
     x = sp.Symbol("x", real=True)
-    motion = VectorField((x,), (-x + x**3,))
+    motion: Any = VectorField((x,), (-x + x**3,))
     way = np.ones(1)
     first = LyapunovFunction.quadratic(np.array([[0.5]]))
     budget = SearchBudget(4, math.inf)

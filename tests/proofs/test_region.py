@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -373,7 +374,7 @@ def test_the_graphs_of_a_stage_are_the_motion_and_its_function() -> None:
         slope = (V.monomials(z + h * z_dot) - V.monomials(z - h * z_dot)) @ V.coefficients / (2 * h)
         expected = [slope, float(V(y)), float(inner(y))]
         assert values[:3].mean(axis=1) == pytest.approx(expected, rel=1e-6)
-        assert np.ptp(values, axis=1) == pytest.approx(0, abs=1e-9 * (1 + abs(slope)))
+        assert (np.ptp(values, axis=1) < 1e-9 * (1 + abs(slope))).all()
         assert (values[-2:, 0] > 0).all()
 
 
@@ -392,7 +393,7 @@ def test_models_of_thin_and_wide_boxes_hold_their_functions(width: float) -> Non
         make("mul", number(Fraction(1, 3)), make("neg", graph.power(y, 3))),
         make("div", y, number(7)),
     ]  # fmt: skip
-    f = [
+    f: list[Any] = [
         lambda u, v: mpmath.sin(u + u * v), lambda u, v: mpmath.cos(v - u),
         lambda u, v: mpmath.exp(u * v), lambda u, v: mpmath.log(3 + u),
         lambda u, v: mpmath.sqrt(2 + v), lambda u, v: u / (3 + u * v),
