@@ -2,8 +2,7 @@
 //
 //   undertow-checker FILE [--seconds T]     decide every claim; exit status 0 if all are proved, else 1
 //   undertow-checker --evaluate FILE        enclosures of an expression graph over boxes, for tests
-#include "document.hpp"
-#include <array>
+#include "region.hpp"
 #include <cfenv>
 #include <chrono>
 #include <cstdio>
@@ -507,6 +506,198 @@ static Verdict terminal(const Model& model, const Law& law, const Matrix<Fractio
     return positive_definite(G) ? Verdict::proved : Verdict::undecided;
 }
 
+// Whether M is shown even and f odd in (q, v): 1 even, -1 odd, 0 not known.
+static bool odd_motion(const Model& model) {
+    std::vector<int> sign(model.nodes.size(), 0);
+    for (size_t i = 0; i < sign.size(); ++i) {
+        const Node& node = model.nodes[i];
+        const int a = has_operands(node.op) ? sign[node.a] : 0, b = has_two(node.op) ? sign[node.b] : a;
+        switch (node.op) {
+        case Op::number: case Op::pi: case Op::parameter: sign[i] = 1; break;
+        case Op::position: case Op::velocity: sign[i] = -1; break;
+        case Op::add: case Op::sub: sign[i] = a == b ? a : 0; break;
+        case Op::mul: case Op::div: sign[i] = a * b; break;
+        case Op::pow: sign[i] = node.b % 2 ? a : a * a; break;
+        case Op::neg: case Op::sin: case Op::tanh: sign[i] = a; break;
+        case Op::cos: sign[i] = a * a; break;
+        default: sign[i] = a == 1;
+        }
+    }
+    bool good = true;
+    for (const auto& row : model.M)
+        for (size_t k : row) good &= sign[k] == 1;
+    for (size_t k : model.f) good &= sign[k] == -1;
+    return good;
+}
+
+// No point of a box has f >= 0, a <= 1 and b >= 1: f + λ (1 - a) + μ (b - 1) < 0 there for some λ, μ >= 0.
+static bool excluded(const Quadratic& f, const Quadratic& a, const Quadratic& b) {
+    double fa = 0, fb = 0, aa = 0, ab = 0, bb = 0;
+    for (size_t i = 0; i < Quadratic::V; ++i) {
+        fa += f.g[i] * a.g[i], fb += f.g[i] * b.g[i], aa += a.g[i] * a.g[i];
+        ab += a.g[i] * b.g[i], bb += b.g[i] * b.g[i];
+    }
+    const double gap = aa * bb - ab * ab;
+    const double tried[4][3] = {{1, fa / aa, 0}, {1, 0, -fb / bb}, {1, (fa * bb - fb * ab) / gap, (fa * ab - fb * aa) / gap}, {0, 1, ab / bb}};
+    for (const auto& [one, l, u] : tried) {
+        const double lambda = l > 0 ? l : 0, mu = u > 0 ? u : 0;
+        if (!std::isfinite(lambda + mu)) continue;
+        const Quadratic sum = Quadratic(one) * f + Quadratic(lambda) * (Quadratic(1.0) - a) + Quadratic(mu) * (b - Quadratic(1.0));
+        if (negative(sum.range())) return true;
+    }
+    return false;
+}
+
+static Verdict one_function(const Model& model, const Law& law, const SurfaceRegion& claim, size_t index, bool odd) {
+    const size_t N = claim.N, all = N + claim.plant.size();
+    const Lyapunov& own = claim.functions[index];
+    const Stretch& stretch = claim.stretch;
+    const auto size = [](const Fraction& x) { return x.sign() < 0 ? -x : x; };
+    Fraction low(0), a = stretch.S.empty() ? Fraction(1) / size(own.G[0][0]) : stretch.pole;
+    for (int i = 0; i < 60 && !stretch.S.empty(); ++i) {
+        const Fraction middle = (low + a) / Fraction(2);
+        (size(own.G[0][0]) * stretch.first(middle) >= Fraction(1) ? a : low) = middle;
+    }
+    if (!stretch.S.empty() && a >= stretch.pole) return Verdict::undecided;  // the guard reaches the pole
+    const Fraction top = stretch.first(a), chord = top / a;
+    Box side, values;
+    for (size_t i = 0; i < N; ++i) side.push_back(Interval(i ? Fraction(1) + size(own.G[i][0]) * (top - a) : a));
+    for (const auto& [k, ends] : claim.plant) values.push_back(hull(Interval(ends.first), Interval(ends.second)));
+    using QJ = Jet<Quadratic>;
+    const Surface<Interval> plain(model, law, claim);
+    const Surface<Quadratic> smooth(model, law, claim);
+    const Surface<Interval>::Function V(own), before(claim.functions[index ? index - 1 : 0]);
+    const Surface<Quadratic>::Function VQ(own), beforeQ(claim.functions[index ? index - 1 : 0]);
+    const IJ chord_i{Interval(chord)};
+    const QJ chord_q{Quadratic::constant(chord)};
+    std::vector<double> core(N, 0.0);
+    const std::vector<IJ> plant(values.begin(), values.end());
+    for (int tries = 0; index == 0; ++tries) {
+        // ∇V = [G] x and ż = [Z] x on a cube, so V̇ = xᵀ Gᵀ Z x
+        if (tries == 30) return Verdict::undecided;
+        std::vector<IJ> x;
+        for (size_t i = 0; i < N; ++i) {
+            core[i] = tries ? core[i] / 1.6 : side[i].high / 4;
+            x.push_back(IJ::variable(Interval::between(-core[i], core[i]), i, N));
+        }
+        const auto at = plain.at(V, chord_i, x, plant);
+        bool good = true;
+        for (const IJ& pivot : at.pivots) good &= positive(pivot.v);
+        Matrix<Interval> G, Z;
+        for (size_t j = 0; j < N; ++j) {
+            std::vector<IJ> way(N);
+            way[j] = IJ(Interval(1.0));
+            G.push_back(V.value(at.z, way).second.g);
+            Z.push_back(at.dz[j].g);
+            G.back().resize(N, Interval(0.0));
+            Z.back().resize(N, Interval(0.0));
+        }
+        const auto Q = product(transposed(G), Z);
+        Matrix<Interval> H = sum(Q, transposed(Q));
+        for (auto& row : H)
+            for (Interval& v : row) v = -v, good &= v.defined();
+        if (good && positive_definite(H)) break;
+    }
+    Quadratic::V = all;
+    Box start;
+    for (size_t i = 0; i < N; ++i) start.push_back(Interval::between(-side[i].high, odd && i + 1 == N ? 0 : side[i].high));
+    start.insert(start.end(), values.begin(), values.end());
+    std::vector<Box> open{start};
+    for (size_t boxes = 0; !open.empty(); ++boxes) {
+        if (boxes > 20000000 || now() > deadline) return Verdict::undecided;
+        const Box box = open.back();
+        open.pop_back();
+        std::vector<QJ> x;
+        bool home = index == 0;
+        for (size_t i = 0; i < all; ++i) {
+            x.push_back(QJ(Quadratic::variable(box[i], i)));
+            if (i < N) home &= box[i].size() <= core[i];
+        }
+        const auto at = smooth.at(VQ, chord_q, {x.begin(), x.begin() + long(N)}, {x.begin() + long(N), x.end()});
+        const auto [value, rate] = VQ.value(at.z, at.dz);
+        const Interval guard = VQ.guard(at.c).v.range(), one(1.0);
+        if (positive(value.v.range() - one) || positive(guard - one)) continue;
+        bool inside = negative(guard - one), near = true, regular = true, falls = negative(rate.v.range());
+        Quadratic other(1.0);
+        if (index) {
+            other = beforeQ.value(product(beforeQ.A, at.c)).first.v;
+            near = negative(beforeQ.guard(at.c).v.range() - one);
+            home = near && negative(other.range() - one);
+        }
+        for (const QJ& pivot : at.pivots) regular &= positive(pivot.v.range());
+        falls = falls || (inside && near && excluded(rate.v, value.v, other));
+        if (inside && (home || (falls && regular))) continue;
+        size_t cut = 0;
+        double most = -1, widest = 0;
+        for (size_t i = 0; i < all; ++i) widest = std::max(widest, box[i].width() / start[i].width());
+        for (size_t i = 0, k = 0; i < all; ++i) {
+            double vary = std::fabs(rate.v.g[i]) + std::fabs(rate.v.h[k]);
+            for (size_t j = 0, at_j = 0; j < all; at_j += all - j, ++j)
+                if (j != i) vary += std::fabs(rate.v.h[j < i ? at_j + i - j : k + j - i]) / 2;
+            k += all - i;
+            const double width = start[i].width() > 0 ? box[i].width() / start[i].width() : 0;
+            if (!std::isfinite(rate.v.e)) vary = width;
+            if (width > 0.02 * widest && vary > most) most = vary, cut = i;
+        }
+        if (widest < 1e-3 || boxes % 64 == 0) {  // a point of the set where it is false?
+            std::vector<IJ> point;
+            for (const Box::value_type& b : box) point.push_back(IJ(Interval(b.low() / 2 + b.high / 2)));
+            const auto here = plain.at(V, chord_i, {point.begin(), point.begin() + long(N)}, {point.begin() + long(N), point.end()});
+            const auto [v, r] = V.value(here.z, here.dz);
+            const bool held = not_negative(one - v.v) && not_negative(one - V.guard(here.c).v);
+            bool wrong = positive(r.v) && (!index || positive(before.value(product(before.A, here.c)).first.v - one));
+            for (const IJ& pivot : here.pivots) wrong |= not_positive(pivot.v);
+            if (held && wrong) return Verdict::refuted;
+        }
+        const double m = box[cut].low() / 2 + box[cut].high / 2;
+        if (widest < 1e-7 || !(box[cut].low() < m && m < box[cut].high)) return Verdict::undecided;
+        open.push_back(box);
+        open.back()[cut] = Interval::between(m, box[cut].high);
+        open.push_back(box);
+        open.back()[cut] = Interval::between(box[cut].low(), m);
+    }
+    return Verdict::proved;
+}
+
+static Verdict surface_region(const Model& model, const Law& law, const SurfaceRegion& claim) {
+    if (claim.N + claim.plant.size() > 8) return Verdict::undecided;
+    const Surface<Exact> exact(model, law, claim);
+    std::vector<EJ> rest(claim.N, exact_zero()), plant, pivots;
+    for (const auto& [k, ends] : claim.plant) plant.push_back(EJ(hull(Exact(ends.first), Exact(ends.second))));
+    for (const EJ& rate : exact.rates(rest, plant, pivots))
+        if (!is_zero(rate.v)) return positive(rate.v) || negative(rate.v) ? Verdict::refuted : Verdict::undecided;
+    const bool odd = odd_motion(model);
+    for (size_t k = 0; k < claim.functions.size(); ++k)
+        if (const Verdict v = one_function(model, law, claim, k, odd); v != Verdict::proved) return v;
+    const Surface<Interval> plain(model, law, claim);
+    const Surface<Interval>::Function V(claim.functions.back());
+    std::vector<Interval> open{Interval::between(0, 1)};
+    for (size_t count = 0; !open.empty(); ++count) {  // the line from 0 to what is contained
+        const Interval part = open.back();
+        open.pop_back();
+        const double m = part.low() / 2 + part.high / 2;
+        const auto room = [&](const IJ& t) {
+            std::vector<IJ> y;
+            for (const Fraction& v : claim.contains) y.push_back(t * IJ(Interval(v)));
+            const auto c = product(plain.bend(y[0]).first, y);
+            const IJ one(Interval(1.0));
+            return std::array<IJ, 2>{one - V.value(product(V.A, c)).first, one - V.guard(c)};
+        };
+        const auto over = room(IJ::variable(part, 0, 1)), middle = room(IJ(Interval(m)));
+        bool good = true;
+        for (size_t i = 0; i < 2; ++i) {
+            if (negative(middle[i].v)) return Verdict::refuted;
+            const Interval slope = over[i].g.empty() ? Interval(0.0) : over[i].g[0];
+            good &= not_negative(meet(over[i].v, middle[i].v + slope * (part - Interval(m))));
+        }
+        if (good) continue;
+        if (count > 100000 || !(part.low() < m && m < part.high)) return Verdict::undecided;
+        open.push_back(Interval::between(part.low(), m));
+        open.push_back(Interval::between(m, part.high));
+    }
+    return Verdict::proved;
+}
+
 static Decided decide(const Json& claim, const Model& model, const Law& law, bool read_only) {
     of_kind(claim, Json::object, "claim");
     if (!claim.keys.count("kind")) refuse("a claim lacks the key kind");
@@ -555,8 +746,14 @@ static Decided decide(const Json& claim, const Model& model, const Law& law, boo
         r.sentence += "; input renewed at every instant, plant as in the file, no disturbance." + about;
         if (!read_only) r.verdict = terminal(model, law, W, radius);
     } else if (kind == "surface region") {
-        only_keys(claim, {"kind", "function", "contains", "plant"}, "claim", true);
-        r.sentence = "surface region: known, not decided by this checker." + about;
+        const SurfaceRegion region(claim, model);
+        r.sentence = "surface region: motions on s = 0 from a compact set that contains the line from the target to (q_u, v_u, w) = [";
+        for (size_t i = 0; i < region.N; ++i) r.sentence += (i ? ", " : "") + inwards(region.contains[i]);
+        r.sentence += "] stay in the union of " + std::to_string(region.functions.size()) + " such sets, regular all the way, and converge to the target; ";
+        for (const auto& [k, ends] : region.plant)
+            r.sentence += model.parameter_names[k] + " in [" + exactly(ends.first) + ", " + exactly(ends.second) + "], ";
+        r.sentence += "plant else as in the file, no disturbance, input not limited." + about;
+        if (!read_only) r.verdict = surface_region(model, law, region);
     } else if (kind == "closed loop") {
         only_keys(claim, {"kind", "starts", "period", "plant", "disturbance", "ball"}, "claim", true);
         r.sentence = "closed loop: known, not decided by this checker." + about;
@@ -633,11 +830,11 @@ static int evaluate_all(const std::string& text) {
                 x[part].push_back(IJ::variable(hull(Interval(ends[0]), Interval(ends[1])), at, 2 * n));
                 e[part].push_back(EJ(Exact(ends[0], ends[1])));
             }
-        IJ r = evaluate<Interval>(nodes, needed, {}, x[0], x[1]).back();
+        IJ r = evaluate<Interval>(nodes, needed, leaves_of<Interval>(nodes, needed, {}), x[0], x[1]).back();
         r.g.resize(2 * n, Interval(0.0));
         std::printf("%a %a", r.v.low(), r.v.high);
         for (const Interval& g : r.g) std::printf(" %a %a", g.low(), g.high);
-        const Exact exact = evaluate<Exact>(nodes, needed, {}, e[0], e[1]).back().v;
+        const Exact exact = evaluate<Exact>(nodes, needed, leaves_of<Exact>(nodes, needed, {}), e[0], e[1]).back().v;
         if (exact.defined())
             for (const Fraction* f : {&exact.low, &exact.high})
                 std::printf(" %s/%s", decimal(f->top).c_str(), decimal(f->bottom).c_str());

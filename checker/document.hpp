@@ -100,22 +100,32 @@ inline std::vector<Node> read_nodes(const Json& j, size_t n, size_t parameters) 
 inline bool has_operands(Op op) { return op >= Op::add; }
 inline bool has_two(Op op) { return op >= Op::add && op <= Op::div; }
 
-// Values of the nodes that are needed, at positions q and velocities v.
+// Values of the nodes that are numbers or parameters.
 template <class T>
-std::vector<Jet<T>> evaluate(const std::vector<Node>& nodes, const std::vector<bool>& needed,
-                             const std::vector<Fraction>& parameters, const std::vector<Jet<T>>& q,
-                             const std::vector<Jet<T>>& v) {
+std::vector<Jet<T>> leaves_of(const std::vector<Node>& nodes, const std::vector<bool>& needed,
+                              const std::vector<Fraction>& parameters) {
     std::vector<Jet<T>> r(nodes.size());
     for (size_t i = 0; i < nodes.size(); ++i) {
         if (!needed[i]) continue;
+        if (nodes[i].op == Op::number) r[i] = Jet<T>(T::constant(nodes[i].value));
+        if (nodes[i].op == Op::parameter) r[i] = Jet<T>(T::constant(parameters[nodes[i].a]));
+        if (nodes[i].op == Op::pi) r[i] = Jet<T>(T::pi());
+    }
+    return r;
+}
+// Values of the nodes that are needed, at positions q and velocities v, from those of the leaves.
+template <class T>
+std::vector<Jet<T>> evaluate(const std::vector<Node>& nodes, const std::vector<bool>& needed,
+                             std::vector<Jet<T>> r, const std::vector<Jet<T>>& q,
+                             const std::vector<Jet<T>>& v) {
+    for (size_t i = 0; i < nodes.size(); ++i) {
+        if (!needed[i]) continue;
         const Node& node = nodes[i];
-        const Jet<T>&a = r[node.a], &b = r[has_two(node.op) ? node.b : 0];
+        const Jet<T>&a = r[has_operands(node.op) ? node.a : 0], &b = r[has_two(node.op) ? node.b : 0];
         switch (node.op) {
-        case Op::number: r[i] = Jet<T>(T::constant(node.value)); break;
-        case Op::pi: r[i] = Jet<T>(T::pi()); break;
+        case Op::number: case Op::pi: case Op::parameter: break;
         case Op::position: r[i] = q[node.a]; break;
         case Op::velocity: r[i] = v[node.a]; break;
-        case Op::parameter: r[i] = Jet<T>(T::constant(parameters[node.a])); break;
         case Op::add: r[i] = a + b; break;
         case Op::sub: r[i] = a - b; break;
         case Op::mul: r[i] = a * b; break;
@@ -214,8 +224,10 @@ struct Model {
     }
 
     template <class T>
-    Plant<T> at(const std::vector<Jet<T>>& q, const std::vector<Jet<T>>& v, bool with_f = true) const {
-        const auto value = evaluate<T>(nodes, with_f ? needed : geometry, parameters, q, v);
+    Plant<T> at(const std::vector<Jet<T>>& q, const std::vector<Jet<T>>& v, bool with_f = true,
+                const std::vector<Jet<T>>* leaves = nullptr) const {
+        const auto& wanted = with_f ? needed : geometry;
+        const auto value = evaluate<T>(nodes, wanted, leaves ? *leaves : leaves_of<T>(nodes, wanted, parameters), q, v);
         Plant<T> p;
         p.M.assign(n, std::vector<Jet<T>>(n));
         for (size_t i = 0; i < n; ++i)

@@ -1,4 +1,4 @@
-"""Interval programs enclose; terminal ellipsoids of the full closed loop hold, for any n and m."""
+"""Terminal ellipsoids of the full closed loop hold, for any n and m."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from undertow.proofs.claims.terminal_ellipsoid import (
     ClosedLoopProgram,
     TerminalEllipsoid,
 )
-from undertow.proofs.intervals.program import Program
 from undertow.proofs.search.terminal_ellipsoid import search_for
 from undertow.studies.paper.data import CASES
-from undertow.symbolic import Tape
 
 RIG = ut.mechanisms.rotary_pendulum()
 LAW = ut.ReachingLaw()
@@ -29,51 +27,6 @@ def largest(rig: ut.Mechanism, surface: ut.Surface) -> TerminalEllipsoid:
     found = search.largest()
     assert found is not None
     return found
-
-
-def test_programs_enclose_values_and_derivatives() -> None:
-    """All functions at once, over boxes from points to half a unit wide, against 30 digits."""
-    x, y = sp.symbols("x y", real=True)
-    rows = [
-        sp.exp(x) * sp.tanh(y) + sp.sin(x * y) / (2 + sp.cos(y)) ** 3,
-        sp.sqrt(1 + x**2) * sp.log(3 + y) - sp.Abs(x) ** 3 + sp.Max(x, y, sp.Rational(1, 3)),
-        sp.tan(x / 3) - sp.Min(x, 2 * y) + sp.pi * y**5,
-    ]
-    tape = Tape()
-    program = Program.of(tape, [x, y], [], tape.let_all(rows))
-    values = sp.lambdify((x, y), rows, "mpmath")
-    slopes = sp.lambdify((x, y), list(sp.Matrix(rows).jacobian([x, y])), "mpmath")
-    import mpmath
-
-    rng = np.random.default_rng(0)
-    with mpmath.workdps(30):
-        for _ in range(150):
-            middle, half = rng.uniform(-1.4, 1.4, 2), 10.0 ** rng.uniform(-16, -0.3)
-            low, high = middle - half, middle + half
-            value, slope = program(low, high)
-            for point in rng.uniform(low, high, (3, 2)):
-                exact = values(*map(mpmath.mpf, point))
-                assert all(a <= e <= b for e, (a, b) in zip(exact, value, strict=True))
-                exact = slopes(*map(mpmath.mpf, point))
-                bounds = slope.reshape(-1, 2)
-                assert all(a <= e <= b for e, (a, b) in zip(exact, bounds, strict=True))
-
-
-def test_what_is_undefined_encloses_everything() -> None:
-    """1/0, √−1 and log 0 are the whole line, and so is what comes of them."""
-    x = sp.Symbol("x", real=True)
-    tape = Tape()
-    program = Program.of(tape, [x], [], tape.let_all([1 / x, sp.sqrt(x), sp.log(x), sp.sin(1 / x)]))
-    value, _ = program(np.array([-1.0]), np.array([1.0]))
-    assert np.isinf(value[:3]).all()
-    assert value[3].tolist() == [-1.0, 1.0]
-
-
-def test_programs_name_what_they_cannot_do() -> None:
-    x = sp.Symbol("x", real=True)
-    tape = Tape()
-    with pytest.raises(InvalidInputError, match="erf"):
-        Program.of(tape, [x], [], [tape.let(sp.erf(x))])
 
 
 def test_the_program_is_the_closed_loop() -> None:

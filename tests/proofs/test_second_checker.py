@@ -584,3 +584,34 @@ def test_mechanisms_are_decided_alike(
         for kind in theirs:
             decided["proved" if kind == "proved" else "not"] += 1
     assert min(decided.values()) >= 2 * len(names), decided
+
+
+@needs_compiler
+def test_regions_on_the_surface_are_decided_and_larger_ones_refused(
+    program: Path, tmp_path: Path
+) -> None:
+    """The first function of a kept region; at four times its level; with a start outside."""
+    kept = json.loads((ROOT / "tests/data/regions.json").read_text())
+    subject = kept["subjects"][3]
+    claim = subject["claims"][0]
+    claim |= {"functions": claim["functions"][:1], "contains": ["1/100", "0", "0"]}
+    larger, outside = json.loads(json.dumps([claim, claim]))
+    for function in larger["functions"]:
+        function["coefficients"] = [
+            (float.fromhex(v) / 4).hex() if "x" in v else f"{v}/4" for v in function["coefficients"]
+        ]
+        function["G"] = [[(float.fromhex(v) / 2).hex() if "x" in v else v for v in row]
+                         for row in function["G"]]  # fmt: skip
+    outside["contains"] = ["9/10", "0", "0"]
+    kept["subjects"] = [subject | {"claims": [claim, larger, outside]}]
+    del kept["checksum"]
+    file = tmp_path / "regions.json"
+    file.write_text(json.dumps(kept | {"checksum": digest(kept)}, ensure_ascii=False))
+    run = subprocess.run(
+        [program, file, "--seconds", "60"], capture_output=True, text=True, check=False, timeout=300
+    )
+    first, second, third = verdicts(run)
+    assert first == "proved"
+    assert second in ("refuted", "undecided")
+    assert third == "refuted"
+    assert "input not limited" in run.stdout

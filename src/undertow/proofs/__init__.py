@@ -1,10 +1,10 @@
 """Certificates: claims about a surface, a region or the closed loop, each with its verdict.
 
-``intervals`` encloses, ``region`` and ``closed_loop`` prove, ``claims`` has a file for each kind of
-claim and reads, writes and verifies certificates; what ``search`` finds is trusted nowhere.  The
-admission gate (:mod:`undertow.proofs.gate`) and random trials (:mod:`undertow.proofs.sampled`)
-prove less.  Needs the extra ``undertow[certify]`` (python-flint, Clarabel), imported when first
-used.
+``kernel`` decides, ``intervals`` and ``closed_loop`` what it does not yet; ``claims`` has a file
+for each kind of claim and reads, writes and verifies certificates; what ``search`` finds is trusted
+nowhere.  The admission gate (:mod:`undertow.proofs.gate`) and random trials
+(:mod:`undertow.proofs.sampled`) prove less.  Needs the extra ``undertow[certify]`` (python-flint,
+Clarabel), imported when first used.
 """
 
 from undertow.base.verdict import Verdict
@@ -24,14 +24,13 @@ from undertow.proofs.claims.reaching import (
     ReachingClaim,
     reaching,
 )
-from undertow.proofs.claims.region import RegionClaim
+from undertow.proofs.claims.region import RegionClaim, verify_region
 from undertow.proofs.claims.stability import StabilityClaim, hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram, TerminalEllipsoid
 from undertow.proofs.claims.verify import Checked, check_settings, proved_sets, verify
 from undertow.proofs.gate import Policy, assess, certified_gate
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
-from undertow.proofs.region.region import verify_region
 from undertow.proofs.sampled import box_starts, sampled_extent, sampled_region
 from undertow.proofs.search.closed_loop import ProvedLoop, prove_loop
 from undertow.proofs.search.region import ProvedRegion, prove_region

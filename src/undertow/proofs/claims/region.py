@@ -1,27 +1,31 @@
-"""The claim that motions on the surface converge from a region that contains a stated start."""
+"""The claim that motions on the surface converge from a region that contains a stated start.
+
+The kernel decides it; here a chain of Lyapunov functions is written in the kernel's numbers.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
-import sympy as sp
+from numpy.typing import ArrayLike
 
-from undertow.base.verdict import Verdict, inward, within
+from undertow.base.verdict import Kind, Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim, Readers, box_of, floats_of
-from undertow.proofs.intervals.exact_model import exact_number
-from undertow.proofs.intervals.taylor import TaylorProgram
-from undertow.proofs.intervals.taylor_kernel import bounds
+from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.intervals.require import require
+from undertow.proofs.kernel import claims as kernel
+from undertow.proofs.kernel.model import Matrix
+from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
-from undertow.proofs.region.region import verify_region
-from undertow.symbolic import Tape
 
-__all__ = ["RegionClaim", "reaches"]
+__all__ = ["RegionClaim", "reaches", "verify_region"]
 
 #: Functions of one region that are read.
 LONGEST_CHAIN = 200
@@ -35,13 +39,12 @@ def _chain(listed: Sequence[Mapping[str, Any]]) -> tuple[LyapunovFunction, ...]:
 
 @dataclass(frozen=True, eq=False)
 class RegionClaim(Claim):
-    """The component of {V ≤ 1} around 0 is a region of attraction and contains a start.
+    """Motions on the surface converge from a set that contains a start.
 
     Parameters
     ----------
     functions
-        A chain of V from the innermost set to the outermost, for
-        :func:`undertow.proofs.verify_region`.
+        A chain of V from the innermost set to the outermost.
     start
         A point y = (q_u, q̇_u, w) inside, (N,); the line to it from 0 is inside too.
     parameters
@@ -65,65 +68,139 @@ class RegionClaim(Claim):
         listed = {} if "functions" in data else {"functions": [data["function"]]}
         return super().from_dict({"parameters": {}, **data, **listed})
 
-    def sentence(self, motion: SurfaceMotion) -> str:
-        """Return in words what is claimed.
-
-        The line from 0 to the start is inside: with one entry it may be rounded towards 0.
-        """
-        away = {n: v for n, v in zip(motion.names, self.start, strict=True) if v}
-        points = [f"{n} = {inward(v, 6) if len(away) == 1 else repr(v)}" for n, v in away.items()]
-        ranges = "".join(f", for every {n} in {within(*v)}" for n, v in self.parameters.items())
-        return (
-            "a region of attraction on the surface, non-singular and compact, contains "
-            f"{', '.join(points) or 'the target'}{ranges}, the inputs not limited"
-        )
-
     def decide(
         self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
     ) -> Verdict:
-        """Decide it; the margin is the start's distance from 0."""
-        motion = SurfaceMotion(mechanism, surface)
-        own = {p.name: p.value for p in mechanism.parameters}
-        for name, (low, high) in self.parameters.items():
-            if not low <= own[name] <= high:
-                raise ValueError(f"a box [{low:g}, {high:g}] of {name} without its {own[name]:g}")
-        claim = self.sentence(motion)
-        verdict = verify_region(
-            motion, self.functions, parameters=self.parameters, max_seconds=seconds
+        """Let the kernel decide it; the margin is the start's distance from 0."""
+        model = model_of(mechanism)
+        own = kernel.read_claim({"kind": self.kind, **self._own().data()}, model)
+        answer = kernel.decide(model, law_of(mechanism, surface, law), own)
+        kind, margin = cast(Kind, answer.kind), float(np.linalg.norm(self.start)) * (1 - 1e-12)
+        unit = mechanism.coordinates[mechanism.m].unit
+        return Verdict(
+            answer.sentence, kind, margin if kind == "proved" else float("nan"), unit,
+            answer.witness, answer.why, answer.details,
+        )  # fmt: skip
+
+    def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
+        """Return the kernel's claim."""
+        return self._own()
+
+    def _own(self) -> kernel.SurfaceRegion:
+        functions = tuple(_function(V) for V in self.functions)
+        stretch = _stretch(self.functions[0])
+        alike = all(_stretch(V) == stretch for V in self.functions)
+        require(
+            alike and None not in functions, "functions of a region", limit="bounded, one stretch"
         )
-        verdict = replace(verdict, claim=claim)
-        if not verdict:
-            return verdict
-        if not reaches(self.functions[-1], self.start):
-            return Verdict(claim, "undecided", method="the stated start is not shown inside")
-        return replace(
-            verdict,
-            margin=float(np.linalg.norm(self.start)),
-            witness=dict(zip(motion.names, self.start, strict=True)),
-        )
+        return kernel.SurfaceRegion(
+            stretch, cast(tuple[Function, ...], functions), tuple(map(Fraction, self.start)),
+            _exact(self.parameters),
+        )  # fmt: skip
 
 
-def reaches(V: LyapunovFunction, point: Sequence[float], pieces: int = 512) -> bool:
-    """Whether V < 1 on the whole line from 0 to a point, outward-rounded: same component as 0.
+def _rows(matrix: ArrayLike) -> Matrix:
+    return tuple(tuple(map(Fraction, row)) for row in np.asarray(matrix, dtype=float).tolist())
 
-    Pieces of the line on which it is not seen are cut, some times.
+
+def _exact(box: Box) -> dict[str, tuple[Fraction, Fraction]]:
+    return {k: (Fraction(low), Fraction(high)) for k, (low, high) in box.items()}
+
+
+def _stretch(V: LyapunovFunction) -> Stretch:
+    if V.stretch is None:
+        return Stretch((), None)
+    return Stretch(tuple(_rows(S) for S in V.stretch), Fraction(V.pole))
+
+
+def _function(V: LyapunovFunction) -> Function | None:
+    """V in the kernel's numbers, with GᵀG = the guard's matrix and G lower triangular."""
+    if V.guard is None:
+        return None
+    inverse = np.linalg.inv(V.guard.scale)
+    G = np.linalg.cholesky((inverse.T @ inverse)[::-1, ::-1])[::-1, ::-1].T
+    exponents = tuple(tuple(row) for row in np.asarray(V.exponents).tolist())
+    coefficients = tuple(map(Fraction, np.asarray(V.coefficients, dtype=float).tolist()))
+    return Function(_rows(np.linalg.inv(V.scale)), _rows(np.tril(G)), exponents, coefficients)
+
+
+def verify_region(
+    motion: SurfaceMotion,
+    V: LyapunovFunction | Sequence[LyapunovFunction],
+    *,
+    parameters: Mapping[str, tuple[float, float]] | None = None,
+    max_boxes: int = 2_000_000,
+    proved: int = 0,
+) -> Verdict:
+    """Decide by the kernel whether motions on a surface converge from {V ≤ 1} around the target.
+
+    Parameters
+    ----------
+    motion
+        The sliding dynamics.
+    V
+        The function, or a chain of functions from the innermost set to the outermost.
+    parameters
+        Parameters that are only known to lie in [low, high], SI units; the set is
+        then one for every constant value in the box (with the surface as it is).
+    max_boxes
+        Effort for each function.
+    proved
+        So many functions at the head of the chain were proved before, with these very
+        parameters: they are taken for granted.  For searches; a proof leaves it at 0.
+
+    Returns
+    -------
+    Verdict
+        ``refuted``: at the witness V ≤ 1, and V does not fall though the function before is
+        > 1, or the model is not regular.  ``undecided``: the witness is where it got stuck.
+        ``details["stage"]`` counts the function that it is about, from 1.
+
+    Raises
+    ------
+    InvalidInputError
+        For an unknown parameter, an empty interval, no function, or one of another size.
     """
-    size = len(V.scale)
-    if len(point) != size or (V.stretch is not None and abs(point[0]) >= V.pole):
+    chain = [V] if isinstance(V, LyapunovFunction) else list(V)
+    box = dict(parameters or {})
+    require(chain, "chain of Lyapunov functions", "empty", "one or more")
+    for W in chain:
+        size = W.exponents.shape[1]
+        require(size == motion.size, "size of a Lyapunov function", size, motion.size)
+    unknown = set(box) - {p.name for p in motion.parameters}
+    require(not unknown, "parameter box", ", ".join(sorted(unknown)))
+    for name, (low, high) in box.items():
+        good = np.isfinite([low, high]).all() and low <= high
+        require(good, f"parameter box of '{name}'", (low, high), "finite, low ≤ high")
+    model = model_of(motion.mechanism)
+    law = law_of(motion.mechanism, motion.surface, ReachingLaw())
+    claim = "motions on the surface converge from {V ≤ 1} around the target"
+    method, boxes, before = "quadratic Taylor models, branch and bound", 0, None
+    varied = [p.name for p in motion.parameters if p.name in box]
+    for k, W in enumerate(chain, start=1):
+        function, stretch, details = _function(W), _stretch(W), {"stage": k, "boxes": boxes}
+        if k > 1 and stretch != _stretch(chain[k - 2]):
+            why = f"{method}: functions {k - 1} and {k} have different stretches"
+            return Verdict(claim, "undecided", method=why, details=details)
+        if function is None:
+            why = f"{method}: no ellipsoid was found that holds {{V ≤ 1}}"
+            return Verdict(claim, "undecided", method=why, details=details)
+        if k > proved:
+            found = Stage(model, law, stretch, function, before, _exact(box)).decide(max_boxes)
+            boxes += found.boxes
+            if found.kind != "proved":
+                witness = dict(zip([*motion.names, *varied], found.point, strict=False))
+                kind, why = cast(Kind, found.kind), f"{method}: {found.why}"
+                details["boxes"] = boxes
+                return Verdict(claim, kind, witness=witness, method=why, details=details)
+        before = function
+    return Verdict(claim, "proved", method=method, details={"stage": k, "boxes": boxes})
+
+
+def reaches(V: LyapunovFunction, point: Sequence[float]) -> bool:
+    """Whether V ≤ 1 on the whole line from 0 to a point, inside the guard."""
+    function, stretch = _function(V), _stretch(V)
+    inside = stretch.L is None or abs(Fraction(point[0])) < stretch.L
+    if function is None or not inside or len(point) != len(V.scale):
         return False
-    part = sp.Symbol("_part", real=True)
-    tape = Tape()
-    y = tape.matrix(sp.Matrix([exact_number(v) * part for v in point]))
-    value, _ = V.build_graph(tape, list(y), [sp.Integer(0)] * size)
-    program = TaylorProgram.of(tape, [part], [], [value])
-    ends = np.linspace(0.0, 1.0, pieces + 1)
-    low, high = ends[:-1], ends[1:]
-    for _ in range(12):
-        _, above = bounds(program(low[None], high[None]), 1)
-        left = ~(above[0] < 1.0)
-        if not left.any():
-            return True
-        low, high = low[left], high[left]
-        middle = 0.5 * (low + high)
-        low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
-    return False
+    return on_the_line(stretch, function, list(map(Fraction, point)), 10_000).kind == "proved"

@@ -28,11 +28,12 @@ from undertow.proofs.kernel.reader import (
     numbers,
     require,
 )
-from undertow.proofs.kernel.words import Region, inward, limits, region
+from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
+from undertow.proofs.kernel.words import Region, inward, limits, region, within
 
 __all__ = ["KINDS", "Claim", "Decision", "Nonsingular", "Reaching", "Stability",
-           "TerminalEllipsoid", "check", "decide", "ellipsoid", "ellipsoid_program",
-           "no_equilibrium", "read_claim"]  # fmt: skip
+           "SurfaceRegion", "TerminalEllipsoid", "check", "decide", "ellipsoid",
+           "ellipsoid_program", "no_equilibrium", "read_claim"]  # fmt: skip
 
 #: Boxes of a branch and bound before it gives up.
 MOST_BOXES = 200_000
@@ -529,10 +530,128 @@ def input_limits(model: Model) -> FloatArray:
     return np.array(ends)
 
 
+# -- 5.5 ------------------------------------------------------------------------------------------
+
+
+def _whole_rows(data: Any, columns: int) -> tuple[tuple[int, ...], ...]:
+    good = isinstance(data, list) and 0 < len(data) <= 5000
+    good = good and all(isinstance(row, list) and len(row) == columns for row in data)
+    require(good and all(isinstance(v, int) and 0 <= v <= 24 for row in data for v in row),
+            f"exponents: 1 to 5000 rows of {columns} whole numbers up to 24")  # fmt: skip
+    even = all(sum(row) >= 2 and sum(row) % 2 == 0 for row in data)
+    require(even and len({*map(tuple, data)}) == len(data), "different rows of an even sum ≥ 2")
+    return tuple(map(tuple, data))
+
+
+def _function(data: Any, size: int) -> Function:
+    fields(data, "a function", {"A", "G", "exponents", "coefficients"})
+    G, exponents = matrix(data["G"], size, size), _whole_rows(data["exponents"], size)
+    lower = all(v == 0 for i, row in enumerate(G) for v in row[i + 1 :])
+    require(lower and all(G[i][i] for i in range(size)), "G lower triangular, its diagonal not 0")
+    coefficients = numbers(data["coefficients"], len(exponents))
+    return Function(matrix(data["A"], size, size), G, exponents, coefficients)
+
+
+def _read_plant(data: Any, model: Model) -> dict[str, tuple[Fraction, Fraction]]:
+    known = {p.name: p.value or Fraction(0) for p in model.parameters}
+    require(isinstance(data, dict) and {*data} <= {*known}, "a plant: parameters of the model")
+    box = {name: interval(ends) for name, ends in data.items()}
+    for name, (low, high) in box.items():
+        inside = low <= known[name] <= high
+        require(inside, f"a box of {name!r} without its {float(known[name]):g}")
+    return box
+
+
+@dataclass(frozen=True)
+class SurfaceRegion(Claim):
+    """Motions on the surface converge from a set, shown by one function after another."""
+
+    kind: ClassVar[str] = "surface region"
+    keys: ClassVar[tuple[str, ...]] = ("stretch", "pole", "functions", "contains", "plant")
+    stretch: Stretch
+    functions: tuple[Function, ...]
+    contains: tuple[Fraction, ...]
+    plant: Region = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
+        size, (S, listed) = 2 * model.n - model.m, (data[k] for k in ("stretch", "functions"))
+        require(isinstance(S, list) and len(S) <= 12, "a stretch of at most 12 matrices")
+        require(isinstance(listed, list) and 0 < len(listed) <= 200, "1 to 200 functions")
+        stretch = Stretch(
+            tuple(matrix(v, size, size) for v in S), number(data["pole"]) if S else None
+        )
+        require(bool(S) or data["pole"] is None, "a pole of null without a stretch")
+        first = [v[0] for v in stretch.S]
+        require(all(row[0] >= 0 and not any(row[1:]) for row in first), "first rows (≥ 0, 0, …)")
+        contains = numbers(data["contains"], size)
+        pole = stretch.L
+        require(pole is None or 0 <= abs(contains[0]) < pole, "a pole > 0 beyond what is contained")
+        functions = tuple(_function(v, size) for v in listed)
+        return cls(stretch, functions, contains, _read_plant(data["plant"], model))
+
+    def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
+        functions = [
+            {"A": _texts(V.A), "G": _texts(V.G), "exponents": [list(e) for e in V.exponents],
+             "coefficients": _texts(V.coefficients)}
+            for V in self.functions
+        ]  # fmt: skip
+        pole = None if self.stretch.L is None else number_text(self.stretch.L)
+        return {
+            "stretch": _texts(self.stretch.S), "pole": pole, "functions": functions,
+            "contains": _texts(self.contains), "plant": _box_data(self.plant),
+        }  # fmt: skip
+
+    def sentence(self, model: Model) -> str:
+        """Return the statement in words; with one entry the point may be rounded towards 0."""
+        names = _surface_names(model)
+        away = {k: v for k, v in zip(names, self.contains, strict=True) if v}
+        exact = len(away) > 1
+        points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v)}" for k, v in away.items()]
+        ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in self.plant.items())
+        return (
+            "every motion on the surface from a compact set around the target that contains "
+            f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
+            f"way, in the union of {len(self.functions)} such sets; the inputs not limited"
+        )
+
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
+        names = (
+            *_surface_names(model),
+            *(p.name for p in model.parameters if p.name in self.plant),
+        )
+        if len(names) > 8:
+            return "undecided", f"{len(names)} variables; 8 at most", {}, {}
+        method, boxes = "quadratic Taylor models, branch and bound", 0
+        before: Function | None = None
+        for k, V in enumerate(self.functions, start=1):
+            stage = Stage(model, law, self.stretch, V, before, self.plant)
+            found = stage.decide(10 * max_boxes)  # a model settles more than intervals do
+            boxes, before = boxes + found.boxes, V
+            if found.kind != "proved":
+                why = f"{method}; function {k}: {found.why}"
+                witness = dict(zip(names, found.point, strict=False))
+                return found.kind, why, witness, {"boxes": boxes, "function": k}
+        line = on_the_line(self.stretch, self.functions[-1], self.contains, max_boxes)
+        why = method if line.kind == "proved" else f"{method}; {line.why}, not so"
+        witness = dict(zip(names, map(float, self.contains), strict=False))
+        return line.kind, why, witness, {"boxes": boxes + line.boxes}
+
+
+def _surface_names(model: Model) -> tuple[str, ...]:
+    """Names of y = (q_u, v_u, w)."""
+    names, m = [p.name for p in model.positions], model.m
+    return (*names[m:], *(f"{k}_dot" for k in names[m:]), *(f"w_{k}" for k in names[:m]))
+
+
 # -- all of them ----------------------------------------------------------------------------------
 
 KINDS: Mapping[str, type[Claim]] = {
-    claim.kind: claim for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid)
+    claim.kind: claim
+    for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid, SurfaceRegion)
 }
 
 

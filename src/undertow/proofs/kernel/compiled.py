@@ -22,8 +22,9 @@ import numba
 import numpy as np
 
 __all__ = ["ABS", "ADD", "BINARY", "COS", "DIV", "EXP", "LOG", "MAX", "MIN", "MUL", "NEG", "PI",
-           "SIN", "SQR", "SQRT", "SUB", "add", "apply", "ellipsoid", "enclose", "hulled", "inverse",
-           "jets", "mean_values", "norm", "picard", "taylor_step", "up"]  # fmt: skip
+           "SIN", "SQR", "SQRT", "SUB", "add", "apply", "ellipsoid", "enclose", "excluded",
+           "hulled", "inverse", "jets", "mean_values", "models", "norm", "picard", "ranges",
+           "taylor_step", "up"]  # fmt: skip
 
 
 #: Operations of code; those that take two operands; SIN and COS name each other as the second.
@@ -714,3 +715,260 @@ def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no
             S[i, j, 0], S[i, j, 1] = mul(a, b, scale[j], scale[j])
     margin = dominance(S)
     return (0 if margin > 0.0 else 5), margin
+
+
+# -- quadratic Taylor models ----------------------------------------------------------------------
+
+# Over a box x = m + r ε, |ε_i| ≤ 1, a quantity is c + Σ g_i ε_i + Σ_{i≤j} h_ij ε_i ε_j ± e: c, g,
+# h and one bound e of all that the polynomial leaves out, higher orders and rounding.
+# T[row, lane] is one model: rows c, g, h, e, then |g| and |h|, the sums of magnitudes.  With s =
+# |c| + |g| + |h| every coefficient of a product is a sum of few products, whose roundings are
+# together below γ s₁s₂, γ some units of 1.2e-16: ROUND s₁s₂ is added to e.  e, a sum of terms ≥ 0,
+# is raised by a part GROW above its own rounding, and by LITTLE for underflow.  Overflow and what
+# is undefined on a box make e infinite or NaN, which proves nothing.
+_ROUND, _GROW, _LITTLE, LANES = 8e-15, 1.0 + 4e-14, 1e-300, 16
+
+
+@_njit
+def _sums(C, V):  # type: ignore[no-untyped-def]
+    """|g| and |h|."""
+    E = C.shape[0] - 3
+    C[E + 1 :] = 0.0
+    for k in range(1, E):
+        for lane in range(LANES):
+            C[E + 1 if k <= V else E + 2, lane] += abs(C[k, lane])
+
+
+@_njit
+def _plus(A, B, sign, C, V):  # type: ignore[no-untyped-def]
+    """A ± B."""
+    E = C.shape[0] - 3
+    for k in range(E):
+        for lane in range(LANES):
+            C[k, lane] = A[k, lane] + sign * B[k, lane]
+    _sums(C, V)
+    for lane in range(LANES):
+        s = abs(C[0, lane]) + C[E + 1, lane] + C[E + 2, lane]
+        C[E, lane] = (A[E, lane] + B[E, lane] + _ROUND * s) * _GROW + _LITTLE
+
+
+@_njit
+def _times(A, B, C, V):  # type: ignore[no-untyped-def]
+    """A · B: what is beyond second order is bounded by magnitudes."""
+    E = C.shape[0] - 3
+    for lane in range(LANES):
+        na, ma, ea = A[E + 1, lane], A[E + 2, lane], A[E, lane]
+        nb, mb, eb = B[E + 1, lane], B[E + 2, lane], B[E, lane]
+        sa, sb = abs(A[0, lane]) + na + ma, abs(B[0, lane]) + nb + mb
+        rest = na * mb + ma * nb + ma * mb + ea * (sb + eb) + eb * sa
+        C[E, lane] = (rest + _ROUND * (sa * sb)) * _GROW + _LITTLE
+        C[0, lane] = A[0, lane] * B[0, lane]
+    for k in range(1, E):
+        for lane in range(LANES):
+            C[k, lane] = A[0, lane] * B[k, lane] + A[k, lane] * B[0, lane]
+    k = 1 + V
+    for i in range(1, 1 + V):
+        for lane in range(LANES):
+            C[k, lane] += A[i, lane] * B[i, lane]
+        k += 1
+        for j in range(i + 1, 1 + V):
+            for lane in range(LANES):
+                C[k, lane] += A[i, lane] * B[j, lane] + A[j, lane] * B[i, lane]
+            k += 1
+    _sums(C, V)
+
+
+@_njit
+def _multiple(A, low, high, C, V):  # type: ignore[no-untyped-def]
+    """A · [low, high], a number."""
+    E = C.shape[0] - 3
+    width = (high - low) * _GROW
+    for k in range(E):
+        for lane in range(LANES):
+            C[k, lane] = A[k, lane] * low
+    for lane in range(LANES):
+        s = abs(A[0, lane]) + A[E + 1, lane] + A[E + 2, lane]
+        rest = (abs(low) + width) * A[E, lane] + width * s + _ROUND * (abs(low) * s)
+        C[E, lane] = rest * _GROW + _LITTLE
+    _sums(C, V)
+
+
+@_njit
+def _composed(op, A, C, V, J):  # type: ignore[no-untyped-def]
+    """φ(A), or 1/A for DIV: φ(c) + φ'δ + ½φ''δ², with φ'''/6 over [c − r, c + r] for the rest.
+
+    The derivatives are the Taylor coefficients of φ(c + t), by the recurrences of graphs;
+    those of sin and cos are at most 1/6, of 1/x its powers.
+    """
+    E = C.shape[0] - 3
+    f, d = np.empty(4), 0.0
+    for lane in range(LANES):
+        c, n, m, e = A[0, lane], A[E + 1, lane], A[E + 2, lane], A[E, lane]
+        r = (n + m + e) * _GROW
+        J[0, 0, 0], J[0, 1, 0], d = c, 1.0, 0.0
+        for last in range(2):
+            if last:
+                J[0, 0, 0, 0], J[0, 0, 0, 1] = down(c - r), up(c + r)
+            if op == DIV:
+                p, q = reciprocal(J[0, 0, 0, 0], J[0, 0, 0, 1])
+                s, t = sqr(p, q)
+                J[2, 0, 0], J[2, 1, 0] = (p, q), (-t, -s)
+                J[2, 2, 0], J[2, 3, 0] = mul(p, q, s, t), sqr(s, t)
+            elif last and op in (SIN, COS):
+                J[2, 3, 0] = 1.0 / 6.0 + 1e-16
+            else:
+                for k in range(4 if last else 3):
+                    _line(J, op, 2, k, 0, 3)
+                    if op in (SIN, COS):  # they stand together
+                        _line(J, SIN + COS - op, 3, k, 0, 2)
+            for k in range(0 if last else 3):
+                f[k] = 0.5 * (J[2, k, 0, 0] + J[2, k, 0, 1])
+                d += J[2, k, 0, 1] - J[2, k, 0, 0]
+        f[3] = max(abs(J[2, 3, 0, 0]), abs(J[2, 3, 0, 1]))
+        square = 2.0 * n * m + m * m + (2.0 * (n + m) + e) * e
+        rest = abs(f[1]) * e + abs(f[2]) * square + f[3] * r * r * r + d * (1.0 + r + r * r)
+        near = abs(f[0]) + abs(f[1]) * r + abs(f[2]) * r * r
+        C[E, lane] = (rest + _ROUND * near) * _GROW + _LITTLE
+        C[0, lane] = f[0]
+        for k in range(1, E):
+            C[k, lane] = f[1] * A[k, lane]
+        k = 1 + V
+        for i in range(1, 1 + V):
+            for j in range(i, 1 + V):
+                C[k, lane] += (1.0 if i == j else 2.0) * f[2] * A[i, lane] * A[j, lane]
+                k += 1
+    _sums(C, V)
+
+
+@_njit
+def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
+    """Models of outputs over boxes (V, B), every input a variable: (B, O, 2 + V + V(V + 1)/2).
+
+    For code of +, −, ·, /, squares, roots, sin, cos, exp and log; of others nothing is known.
+    """
+    V, boxes = low.shape
+    first, E = V + len(constants), 1 + V + V * (V + 1) // 2
+    total = first + len(code)
+    T, J = np.zeros((total + 1, E + 3, LANES)), np.zeros((4, 4, 1, 2))
+    for i in range(len(constants)):
+        T[V + i, 0] = constants[i, 0]
+        T[V + i, E] = (constants[i, 1] - constants[i, 0]) * _GROW + _LITTLE
+    out = np.empty((boxes, len(outputs), E + 1))
+    for start in range(0, boxes, LANES):
+        for i in range(V):
+            for lane in range(LANES):
+                at = min(start + lane, boxes - 1)
+                a, b = low[i, at], high[i, at]
+                middle = 0.5 * a + 0.5 * b
+                radius = max(b - middle, middle - a) * _GROW
+                T[i, 0, lane], T[i, 1 + i, lane], T[i, E + 1, lane] = middle, radius, radius
+                T[i, E, lane] = _LITTLE
+        for line in range(len(code)):
+            op, a, b = code[line]
+            C = T[first + line]
+            if op in (MUL, SQR):
+                if op == MUL and V <= a < first:
+                    a, b = b, a
+                if op == MUL and V <= b < first:
+                    _multiple(T[a], constants[b - V, 0], constants[b - V, 1], C, V)
+                else:
+                    _times(T[a], T[b if op == MUL else a], C, V)
+            elif op in (ADD, SUB):
+                _plus(T[a], T[b], 1.0 if op == ADD else -1.0, C, V)
+            elif op == NEG:
+                _multiple(T[a], -1.0, -1.0, C, V)
+            elif op == DIV:
+                _composed(DIV, T[b], T[total], V, J)
+                _times(T[a], T[total], C, V)
+            elif op in (SQRT, SIN, COS, EXP, LOG):
+                _composed(op, T[a], C, V, J)
+            else:
+                C[:] = _NAN
+        for lane in range(min(LANES, boxes - start)):
+            for o in range(len(outputs)):
+                out[start + lane, o] = T[outputs[o], : E + 1, lane]
+    return out
+
+
+@_njit
+def _ends(model, V):  # type: ignore[no-untyped-def]
+    """Lower and upper bound of one model."""
+    total, low, high = abs(model[0]), model[0], model[0]
+    k = 1 + V
+    for i in range(V):
+        g, h = abs(model[1 + i]), model[k]
+        total += g + abs(h)
+        high += g * (g / (-4.0 * h)) if 2.0 * h < -g else g + h
+        low -= g * (g / (4.0 * h)) if 2.0 * h > g else g - h
+        for _ in range(i + 1, V):
+            k += 1
+            cross = abs(model[k])
+            total, high, low = total + cross, high + cross, low - cross
+        k += 1
+    rest = (model[k] + _ROUND * total) * _GROW + _LITTLE
+    return low - rest, high + rest
+
+
+@_njit
+def ranges(models, V):  # type: ignore[no-untyped-def]
+    """Bounds of models (B, O, 2), and how much of them is due to each variable (B, O, V)."""
+    boxes, count, _ = models.shape
+    out, spread = np.empty((boxes, count, 2)), np.zeros((boxes, count, V))
+    for box in range(boxes):
+        for o in range(count):
+            out[box, o, 0], out[box, o, 1] = _ends(models[box, o], V)
+            k = 1 + V
+            for i in range(V):
+                spread[box, o, i] += abs(models[box, o, 1 + i])
+                for j in range(i, V):
+                    part = 0.5 * abs(models[box, o, k])
+                    spread[box, o, i] += part
+                    spread[box, o, j] += part
+                    k += 1
+    return out, spread
+
+
+@_njit
+def excluded(models, V):  # type: ignore[no-untyped-def]
+    """Boxes on which f ≥ 0, a ≤ 1 and b ≥ 1 are never true at once; models (B, 3, …) of f, a, b.
+
+    Where they are, f + λ(1 − a) + μ(b − 1) ≥ 0 for all λ, μ ≥ 0, and so is (1 − a) + μ(b − 1).
+    The factors that are tried take the slopes out; whatever they are, the bound decides.
+    """
+    out = np.zeros(len(models), dtype=np.bool_)
+    trial, total = np.zeros(3), np.zeros(models.shape[2])
+    for box in range(len(models)):
+        f, a, b = models[box, :, 1 : 1 + V]
+        fa, fb, aa, ab, bb = (
+            (f * a).sum(),
+            (f * b).sum(),
+            (a * a).sum(),
+            (a * b).sum(),
+            (b * b).sum(),
+        )
+        gap = aa * bb - ab * ab + _LITTLE
+        for kind in range(4):
+            trial[:] = 1.0, 0.0, 0.0
+            if kind == 0:
+                trial[1] = -max(fa / (aa + _LITTLE), 0.0)
+            elif kind == 1:
+                trial[2] = max(-fb / (bb + _LITTLE), 0.0)
+            elif kind == 2:
+                trial[1] = -max((fa * bb - fb * ab) / gap, 0.0)
+                trial[2] = max((fa * ab - fb * aa) / gap, 0.0)
+            else:
+                trial[:] = 0.0, -1.0, max(ab / (bb + _LITTLE), 0.0)
+            shift = -trial[1] - trial[2]
+            total[:] = 0.0
+            total[0], size = shift, abs(trial[1]) + abs(trial[2])
+            for o in range(3):
+                for k in range(models.shape[2] - 1):
+                    part = trial[o] * models[box, o, k]
+                    total[k] += part
+                    size += abs(part)
+                total[-1] += abs(trial[o]) * models[box, o, -1]
+            total[-1] = (total[-1] + _ROUND * size) * _GROW
+            if _ends(total, V)[1] < 0.0:
+                out[box] = True
+                break
+    return out

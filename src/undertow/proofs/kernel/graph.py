@@ -8,7 +8,7 @@ x + 0, x · 1 and the like fall away; 0 · x does only if x is defined everywher
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
@@ -252,6 +252,52 @@ class Graph:
     def _operands(self, k: int) -> list[int]:
         node = self.nodes[k]
         return [] if node[0] in ("input", "number", "pi") else [int(v) for v in node[1:]]
+
+    def tangents(self, roots: Sequence[int], seeds: Mapping[int, int]) -> list[int]:
+        """Return derivatives of nodes along seeds (node to its derivative), by the chain rule."""
+        known = dict(seeds)
+        for k in self.depends(roots):
+            operands = self._operands(k)
+            if k in known or not any(j in known for j in operands):
+                continue
+            pairs = zip(self._slopes(k), operands, strict=True)
+            known[k] = self.sum(self.make("mul", s, known[j]) for s, j in pairs if j in known)
+        return [known.get(k, self.number(0)) for k in roots]
+
+    def _slopes(self, k: int) -> list[int]:
+        """Derivatives of a smooth operation by its operands."""
+        make, number, one = self.make, self.number, self.number(1)
+        kind, a, b = self.nodes[k][0], self.nodes[k][1], self.nodes[k][-1]
+        if kind in ("add", "sub"):
+            return [one, one if kind == "add" else number(-1)]
+        if kind == "mul":
+            return [b, a]
+        if kind == "div":
+            return [make("div", one, b), make("neg", make("div", k, b))]
+        if kind == "sqrt":
+            return [make("div", number(Fraction(1, 2)), k)]
+        if kind in ("sin", "cos"):
+            return [make("cos", a) if kind == "sin" else make("neg", make("sin", a))]
+        if kind in ("neg", "exp"):
+            return [k if kind == "exp" else number(-1)]
+        if kind not in ("sqr", "log"):
+            raise ArithmeticError(f"{kind}: not smooth")
+        return [make("mul", number(2), a) if kind == "sqr" else make("div", one, a)]
+
+    def even(self, roots: Iterable[int], variables: int) -> bool:
+        """Whether nodes are shown to stay as they are when the first inputs change their signs."""
+        parity = dict[int, int]()  # 1: even, −1: odd; absent: not known
+        for k in self.depends(roots):
+            kind, signs = self.nodes[k][0], {parity.get(j, 0) for j in self._operands(k)}
+            if kind in ("input", "number", "pi"):
+                parity[k] = -1 if kind == "input" and self.nodes[k][1] < variables else 1
+            elif kind in ("mul", "div"):
+                parity[k] = math.prod(parity.get(j, 0) for j in self._operands(k))
+            elif signs == {1} or (kind in ("sqr", "cos", "abs") and signs == {-1}):
+                parity[k] = 1
+            elif signs == {-1} and kind in ("add", "sub", "neg", "sin"):
+                parity[k] = -1
+        return all(parity.get(k) == 1 for k in roots)
 
     # -- its values ------------------------------------------------------------------------------
 

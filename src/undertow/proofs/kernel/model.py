@@ -15,7 +15,7 @@ import numpy as np
 
 from undertow.proofs.kernel.graph import FloatArray, Graph, Span, hull
 
-__all__ = ["Law", "Model", "Quantity", "System"]
+__all__ = ["Algebra", "Law", "Model", "Nodes", "Quantity", "System"]
 
 Matrix = tuple[tuple[Fraction, ...], ...]
 Nodes = list[list[int]]
@@ -69,15 +69,18 @@ class Model:
         names = [p.name for p in self.positions]
         return (*names, *(f"{name}_dot" for name in names))
 
-    def lay(self, graph: Graph) -> tuple[Nodes, list[int], Nodes]:
-        """Lay M, f and B on a graph whose inputs are x, then p."""
+    def lay(
+        self, graph: Graph, leaves: Sequence[int] | None = None
+    ) -> tuple[Nodes, list[int], Nodes]:
+        """Lay M, f and B on a graph; x and then p are its first inputs, or other nodes."""
         n, at = self.n, list[int]()
+        leaves = graph.inputs if leaves is None else leaves
         first = {"position": 0, "velocity": n, "parameter": 2 * n}
         for kind, *rest in self.nodes:
             if kind == "number":
                 at.append(graph.number(rest[0]))
             elif kind in first:
-                at.append(graph.inputs[first[kind] + rest[0]])
+                at.append(leaves[first[kind] + rest[0]])
             elif kind == "pow":
                 at.append(graph.power(at[rest[0]], rest[1]))
             elif kind == "tanh":
@@ -108,13 +111,14 @@ class Law:
         return (*(v for b in blocks for row in b for v in row), *self.eta, *self.layer)
 
 
-class _Algebra:
+class Algebra:
     """Matrices of nodes."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
 
     def times(self, A: Nodes, B: Nodes) -> Nodes:
+        """A B."""
         make = self.graph.make
         return [
             [self.graph.sum(make("mul", a, row[j]) for a, row in zip(r, B, strict=True))
@@ -123,6 +127,7 @@ class _Algebra:
         ]  # fmt: skip
 
     def each(self, kind: str, A: Nodes, B: Nodes | None = None) -> Nodes:
+        """Apply an operation entry by entry."""
         if B is None:
             return [[self.graph.make(kind, a) for a in row] for row in A]
         return [
@@ -208,7 +213,7 @@ class System:
         self.alpha_u, self.lambda_u = block(m, n - m), block(m, n - m)
         self.eta, self.layer = block(1, m)[0], block(1, m)[0]
         self.M, self.f, self.B = model.lay(graph)
-        self.algebra = algebra = _Algebra(graph)
+        self.algebra = algebra = Algebra(graph)
         M_aa, self.M_au = [r[:m] for r in self.M[:m]], [r[m:] for r in self.M[:m]]
         self.M_ua, M_uu = [r[:m] for r in self.M[m:]], [r[m:] for r in self.M[m:]]
         self.uu = algebra.factor(M_uu)

@@ -8,7 +8,7 @@ from fractions import Fraction
 
 from undertow.proofs.kernel.model import Law, Model, Quantity
 
-__all__ = ["inward", "law_words", "limits", "region"]
+__all__ = ["inward", "law_words", "limits", "region", "within"]
 
 Region = Mapping[str, tuple[Fraction, Fraction]]
 
@@ -34,7 +34,7 @@ def inward(value: Fraction, digits: int = 6) -> str:
     return _digits(value, digits, ROUND_DOWN)
 
 
-def _within(low: Fraction, high: Fraction) -> str:
+def within(low: Fraction, high: Fraction) -> str:
     """Return an interval as text, its ends rounded inwards, or exactly where it has no room."""
     ends = _digits(low, 6, ROUND_CEILING), _digits(high, 6, ROUND_FLOOR)
     if not low <= Fraction(ends[0]) <= Fraction(ends[1]) <= high:
@@ -47,7 +47,7 @@ def region(positions: Sequence[Quantity], box: Region) -> str:
     units = {p.name: p.unit for p in positions}
     parts = [
         f"|{k}| ≤ {inward(b)} {units[k]}".rstrip() if a == -b
-        else f"{k} in {_within(a, b)} {units[k]}".rstrip()
+        else f"{k} in {within(a, b)} {units[k]}".rstrip()
         for k, (a, b) in box.items()
         if a != 0 or b != 0
     ]  # fmt: skip

@@ -14,19 +14,16 @@ good: whatever V is, the checker decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.models.mechanism import FloatArray
-from undertow.proofs.intervals.exact_model import exact_matrix, exact_number
 from undertow.proofs.intervals.require import require
-from undertow.symbolic import Tape
 
 __all__ = ["LyapunovFunction", "directions", "extent", "first_crossing", "unit"]
 
@@ -237,57 +234,6 @@ class LyapunovFunction:
         ]
         least = [float(self(g.points(rays)).min()) for g in guards]
         return guards[int(np.argmax(least))]
-
-    def build_graph(
-        self, tape: Tape, y: Sequence[sp.Expr], y_dot: Sequence[sp.Expr]
-    ) -> tuple[sp.Expr, sp.Expr]:
-        """Lay V and V̇ on a tape, for y and ẏ given as atoms; the numbers enter exactly."""
-        c, c_dot = sp.Matrix(y), sp.Matrix(y_dot)
-        if self.stretch is not None:
-            total, rate = self.build_stretch_graph(tape, y[0])
-            c_dot = tape.matrix(total * c_dot + rate * c * y_dot[0])
-            c = tape.matrix(total * c)
-        return self.build_polynomial_graph(tape, c, c_dot)
-
-    def build_stretch_graph(self, tape: Tape, q: sp.Expr) -> tuple[sp.Matrix, sp.Matrix]:
-        """Lay I + Σ τ^j S_j and its derivative by y_0 = q, an atom, on a tape."""
-        assert self.stretch is not None
-        size, square = len(self.scale), exact_number(self.pole) ** 2
-        inverse = tape.let(1 / (square - q**2))
-        tau = tape.let(square * inverse - 1)
-        slope = tape.let(2 * q * inverse**2 * square)
-        total, rate = sp.eye(size), sp.zeros(size, size)
-        power: sp.Expr = sp.Integer(1)
-        for j, S in enumerate(self.stretch, start=1):
-            rate = rate + exact_matrix(S) * (j * power)
-            power = tape.let(power * tau)
-            total = total + exact_matrix(S) * power
-        return tape.matrix(total), tape.matrix(rate * slope)
-
-    def build_polynomial_graph(
-        self, tape: Tape, c: sp.Matrix, c_dot: sp.Matrix
-    ) -> tuple[sp.Expr, sp.Expr]:
-        """Lay V and V̇ on a tape, for c = T z and ċ."""
-        size = len(c)
-        inverse_scale = exact_matrix(self.scale).inv()
-        z = tape.matrix(inverse_scale * c)
-        z_dot = tape.matrix(inverse_scale * c_dot)
-        powers = [[sp.Integer(1), z[i]] for i in range(size)]
-        for i in range(size):
-            for k in range(2, int(self.exponents[:, i].max()) + 1):
-                powers[i].append(tape.let(z[i] ** k))
-        value: sp.Expr = sp.Integer(0)
-        slopes = [sp.Integer(0)] * size
-        for coefficient, e in zip(self.coefficients, self.exponents.tolist(), strict=True):
-            number = exact_number(coefficient)
-            value += number * sp.Mul(*[powers[i][k] for i, k in enumerate(e)])
-            for i in range(size):
-                if e[i]:
-                    rest = [powers[j][k - (j == i)] for j, k in enumerate(e)]
-                    slopes[i] += number * e[i] * sp.Mul(*rest)
-        atoms = tape.let_all(slopes)
-        rate_of_V = tape.let(sum(a * b for a, b in zip(atoms, z_dot, strict=True)))
-        return tape.let(value), rate_of_V
 
 
 def _array(value: Any, *shape: int) -> FloatArray:

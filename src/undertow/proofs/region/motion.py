@@ -1,8 +1,7 @@
-"""Autonomous motions that regions are proved for: on a surface, or any vector field."""
+"""The motion on a surface in float64, for searches and pictures; the kernel makes its own."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,14 +16,12 @@ from undertow.models.mechanism import FloatArray, Mechanism, Parameter
 from undertow.proofs.intervals.exact_model import (
     exact_matrix,
     exact_mechanism,
-    exact_rates,
     is_odd,
-    vanishes,
 )
 from undertow.proofs.intervals.require import require, require_autonomous
 from undertow.symbolic import Tape, compile_numpy
 
-__all__ = ["AutonomousSystem", "SurfaceMotion", "VectorField"]
+__all__ = ["SurfaceMotion"]
 
 
 def unused(names: Iterable[str], taken: Collection[str]) -> list[str]:
@@ -41,81 +38,8 @@ def unused(names: Iterable[str], taken: Collection[str]) -> list[str]:
     return found
 
 
-class AutonomousSystem(ABC):
-    """ẏ = f(y, p) with f(0, p) = 0, written once in SymPy."""
-
-    @property
-    @abstractmethod
-    def names(self) -> tuple[str, ...]:
-        """Names of y, (N,)."""
-
-    @property
-    @abstractmethod
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The parameters p with their values."""
-
-    @abstractmethod
-    def build_graph(self, tape: Tape, y: Sequence[sp.Expr]) -> tuple[list[sp.Expr], sp.Expr]:
-        """Lay ẏ, and the determinant whose zeros are singular, on a tape; y are atoms."""
-
-    @property
-    @abstractmethod
-    def odd(self) -> bool:
-        """Whether ẏ(−y) = −ẏ(y), decided on the expressions."""
-
-    @property
-    @abstractmethod
-    def at_rest(self) -> bool:
-        """Whether ẏ(0) = 0 for all parameter values, decided symbolically."""
-
-    @property
-    def size(self) -> int:
-        """N."""
-        return len(self.names)
-
-    @cached_property
-    def symbols(self) -> tuple[sp.Symbol, ...]:
-        """Symbols of the N coordinates."""
-        return tuple(sp.Symbol(f"_y{i}", real=True) for i in range(self.size))
-
-    @cached_property
-    def _field(self) -> Any:
-        tape = Tape()
-        rates, determinant = self.build_graph(tape, self.symbols)
-        inputs = [*self.symbols, *(p.symbol for p in self.parameters)]
-        return compile_numpy(tape, inputs, [*rates, determinant])
-
-    def _evaluate(self, y: ArrayLike) -> list[FloatArray]:
-        columns = np.moveaxis(np.asarray(y, dtype=float), -1, 0)
-        with np.errstate(all="ignore"):
-            values = self._field(*columns, *(p.value for p in self.parameters))
-        return [np.broadcast_to(v, columns.shape[1:]) for v in values]
-
-    def __call__(self, y: ArrayLike) -> FloatArray:
-        """Return ẏ at the points y: (…, N) to (…, N)."""
-        return np.stack(self._evaluate(y)[:-1], axis=-1)
-
-    def determinant(self, y: ArrayLike) -> FloatArray:
-        """Return the determinant at the points y, (…,)."""
-        return np.asarray(self._evaluate(y)[-1])
-
-    @cached_property
-    def _at_target(self) -> float:
-        return float(self.determinant(np.zeros(self.size)))
-
-    def margin(self, y: ArrayLike) -> FloatArray:
-        """Return what is left of the determinant at points y, as a part of that at the target."""
-        return np.asarray(self.determinant(y) / self._at_target)
-
-    @cached_property
-    def jacobian(self) -> FloatArray:
-        """∂ẏ/∂y at 0, (N, N), by central differences."""
-        h = 1e-6 * np.eye(self.size)
-        return np.asarray((self(h) - self(-h)).T / 2e-6)
-
-
 @dataclass(frozen=True, eq=False)
-class SurfaceMotion(AutonomousSystem):
+class SurfaceMotion:
     """The sliding dynamics of a mechanism in y = (q_u, q̇_u, w), of order N = 2n − m.
 
     Parameters
@@ -195,11 +119,6 @@ class SurfaceMotion(AutonomousSystem):
         return is_odd(self.mechanism.force, self.mechanism.x, self.mechanism.mass_matrix)
 
     @cached_property
-    def at_rest(self) -> bool:
-        """Whether f_u(0, 0) = 0 for all parameter values, decided symbolically."""
-        return vanishes(self.mechanism.force[self.mechanism.m :, :], self.mechanism.x)
-
-    @cached_property
     def slow(self) -> FloatArray:
         """κ, (m, n−m), in η = q_a + α_a⁻¹α_u q_u = w − κ q_u.
 
@@ -210,68 +129,47 @@ class SurfaceMotion(AutonomousSystem):
             np.linalg.solve(s.lambda_a, s.lambda_u) - np.linalg.solve(s.alpha_a, s.alpha_u)
         )
 
-
-@dataclass(frozen=True, eq=False)
-class VectorField(AutonomousSystem):
-    """Any autonomous motion ẋ = f(x, p), from expressions.
-
-    Parameters
-    ----------
-    states
-        Symbols of x, (N,).
-    rates
-        Expressions of ẋ, (N,), of the states and the parameters alone.
-    parameters
-        The parameters p.
-
-    Raises
-    ------
-    InvalidInputError
-        For another number of rates than states, or a symbol that is neither state nor
-        parameter.
-    ModelError
-        For rates that are not smooth.
-
-    Examples
-    --------
-    >>> x = sp.Symbol("x", real=True)
-    >>> motion = VectorField((x,), (-x + x**3,))
-    >>> motion.at_rest, motion.odd, float(motion([0.5])[0])
-    (True, True, -0.375)
-    """
-
-    states: tuple[sp.Symbol, ...]
-    rates: tuple[sp.Expr, ...]
-    parameters: tuple[Parameter, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Check that the expressions are closed; make them exact."""
-        rates, wanted = f"{len(self.rates)} rates", f"{len(self.states)}, one per state"
-        require(len(self.states) == len(self.rates), "vector field", rates, wanted)
-        known = {*self.states, *(p.symbol for p in self.parameters)}
-        unknown = {s for e in self.rates for s in sp.sympify(e).free_symbols} - known
-        names = ", ".join(sorted(str(s) for s in unknown))
-        remedy = "Give every other symbol as a Parameter, or its value"
-        require(not unknown, "vector field", names, "states and parameters alone", remedy)
-        values = {p.symbol: p.value for p in self.parameters}
-        object.__setattr__(self, "rates", exact_rates(self.rates, self.states, values))
-
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the states."""
-        return tuple(str(s) for s in self.states)
-
-    def build_graph(self, tape: Tape, y: Sequence[sp.Expr]) -> tuple[list[sp.Expr], sp.Expr]:
-        """Lay ẋ on a tape; nothing is singular but where an expression is."""
-        rename = dict(zip(self.states, y, strict=True))
-        return tape.let_all([e.xreplace(rename) for e in self.rates]), sp.Integer(1)
+    def size(self) -> int:
+        """N."""
+        return len(self.names)
 
     @cached_property
-    def odd(self) -> bool:
-        """Whether ẋ(−x) = −ẋ(x)."""
-        return is_odd(self.rates, self.states)
+    def symbols(self) -> tuple[sp.Symbol, ...]:
+        """Symbols of the N coordinates."""
+        return tuple(sp.Symbol(f"_y{i}", real=True) for i in range(self.size))
 
     @cached_property
-    def at_rest(self) -> bool:
-        """Whether f(0) = 0 for all parameter values."""
-        return vanishes(self.rates, self.states)
+    def _field(self) -> Any:
+        tape = Tape()
+        rates, determinant = self.build_graph(tape, self.symbols)
+        inputs = [*self.symbols, *(p.symbol for p in self.parameters)]
+        return compile_numpy(tape, inputs, [*rates, determinant])
+
+    def _evaluate(self, y: ArrayLike) -> list[FloatArray]:
+        columns = np.moveaxis(np.asarray(y, dtype=float), -1, 0)
+        with np.errstate(all="ignore"):
+            values = self._field(*columns, *(p.value for p in self.parameters))
+        return [np.broadcast_to(v, columns.shape[1:]) for v in values]
+
+    def __call__(self, y: ArrayLike) -> FloatArray:
+        """Return ẏ at the points y: (…, N) to (…, N)."""
+        return np.stack(self._evaluate(y)[:-1], axis=-1)
+
+    def determinant(self, y: ArrayLike) -> FloatArray:
+        """Return the determinant at the points y, (…,)."""
+        return np.asarray(self._evaluate(y)[-1])
+
+    @cached_property
+    def _at_target(self) -> float:
+        return float(self.determinant(np.zeros(self.size)))
+
+    def margin(self, y: ArrayLike) -> FloatArray:
+        """Return what is left of the determinant at points y, as a part of that at the target."""
+        return np.asarray(self.determinant(y) / self._at_target)
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """∂ẏ/∂y at 0, (N, N), by central differences."""
+        h = 1e-6 * np.eye(self.size)
+        return np.asarray((self(h) - self(-h)).T / 2e-6)

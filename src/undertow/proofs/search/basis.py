@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from undertow.base.errors import UnstableSurfaceError
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.region.lyapunov import LyapunovFunction
-from undertow.proofs.region.motion import AutonomousSystem
+from undertow.proofs.region.motion import SurfaceMotion
 
 __all__ = ["CLEARANCE", "POLE_PART", "Basis", "linear_part", "slowest_rate"]
 
@@ -21,7 +21,7 @@ CLEARANCE, POLE_PART = 0.01, 0.985
 class Basis:
     """Monomials of z and their rates along the motion."""
 
-    def __init__(self, motion: AutonomousSystem, chart: LyapunovFunction, degree: int) -> None:
+    def __init__(self, motion: SurfaceMotion, chart: LyapunovFunction, degree: int) -> None:
         """Take the coordinates of ``chart``."""
         self.motion, self.chart = motion, chart
         self.size = motion.size
@@ -73,12 +73,12 @@ def _even_exponents(size: int, degree: int) -> NDArray[np.int64]:
     )
 
 
-def linear_part(motion: AutonomousSystem, chart: LyapunovFunction) -> FloatArray:
+def linear_part(motion: SurfaceMotion, chart: LyapunovFunction) -> FloatArray:
     """Return the linearisation in z, (N, N)."""
     return np.asarray(np.linalg.solve(chart.scale, motion.jacobian @ chart.scale))
 
 
-def slowest_rate(motion: AutonomousSystem) -> float:
+def slowest_rate(motion: SurfaceMotion) -> float:
     """Return the slowest decay of the linearisation, 1/s.
 
     Raises
@@ -89,7 +89,7 @@ def slowest_rate(motion: AutonomousSystem) -> float:
     rate = float(-np.linalg.eigvals(motion.jacobian).real.max())
     if not rate > 0:
         raise UnstableSurfaceError(
-            f"region of attraction of {getattr(motion, 'surface', motion.names)}",
+            f"region of attraction of {motion.surface}",
             value=f"slowest rate {rate:.4g} 1/s",
             limit="> 0",
             remedy="Start from undertow.first_surface(mechanism)",

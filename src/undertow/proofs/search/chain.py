@@ -22,7 +22,7 @@ import numpy as np
 
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.region.lyapunov import LyapunovFunction, directions, extent, unit
-from undertow.proofs.region.motion import AutonomousSystem
+from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
 from undertow.proofs.search.linear_program import minimise_linear
 
@@ -58,7 +58,7 @@ class SearchBudget:
 
 
 def grow(
-    motion: AutonomousSystem,
+    motion: SurfaceMotion,
     V: LyapunovFunction,
     way: FloatArray,
     degree: int,
@@ -111,7 +111,7 @@ class _Ring:
     """The last set of a chain, in coordinates in which it is about the unit ball."""
 
     def __init__(
-        self, motion: AutonomousSystem, V: LyapunovFunction, degree: int, rng: np.random.Generator
+        self, motion: SurfaceMotion, V: LyapunovFunction, degree: int, rng: np.random.Generator
     ) -> None:
         self.motion, self.rng, self.size = motion, rng, motion.size
         chart = V

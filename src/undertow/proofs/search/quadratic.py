@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.region.lyapunov import LyapunovFunction, directions
-from undertow.proofs.region.motion import AutonomousSystem
+from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.basis import CLEARANCE, POLE_PART, slowest_rate
 
 __all__ = ["Start", "quadratic"]
@@ -19,7 +19,7 @@ Start = Literal["far", "round", "balanced"]
 
 
 def quadratic(
-    motion: AutonomousSystem,
+    motion: SurfaceMotion,
     stretch: tuple[FloatArray, float] | None,
     way: FloatArray,
     rng: np.random.Generator,
@@ -72,7 +72,7 @@ def _root(P: NDArray[Any]) -> FloatArray:
     return np.asarray(np.linalg.cholesky(np.linalg.inv(0.5 * (P + P.T))))
 
 
-def _quadratic_radius(motion: AutonomousSystem, V: LyapunovFunction, rays: FloatArray) -> float:
+def _quadratic_radius(motion: SurfaceMotion, V: LyapunovFunction, rays: FloatArray) -> float:
     """Largest r with V̇ < 0 at samples of |z| ≤ r, inside the non-singular set."""
 
     def holds(r: float) -> bool:

@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike
 from undertow.base.errors import InfeasibleError
 from undertow.base.verdict import Verdict
 from undertow.models.mechanism import FloatArray
+from undertow.proofs.claims.region import verify_region
 from undertow.proofs.region.lyapunov import LyapunovFunction, extent
-from undertow.proofs.region.motion import AutonomousSystem, SurfaceMotion
-from undertow.proofs.region.region import verify_region
+from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.chain import Progress, SearchBudget, grow
 from undertow.proofs.search.chart import natural_stretch
 from undertow.proofs.search.quadratic import Start, quadratic
@@ -59,7 +59,7 @@ class ProvedRegion:
         with a witness.
     """
 
-    motion: AutonomousSystem
+    motion: SurfaceMotion
     way: FloatArray
     chain: Chain
     verdict: Verdict
@@ -82,7 +82,7 @@ class ProvedRegion:
 
 
 def search_region(
-    motion: AutonomousSystem,
+    motion: SurfaceMotion,
     direction: ArrayLike,
     *,
     degrees: Sequence[int] = (4, 6),
@@ -99,7 +99,7 @@ def search_region(
     Parameters
     ----------
     motion
-        The sliding dynamics, or any vector field.
+        The sliding dynamics.
     direction
         In y, (N,); on a surface y = (q_u, q̇_u, w), so (1, 0, 0) is an angle at rest.
     degrees
@@ -127,9 +127,7 @@ def search_region(
     """
     rng = np.random.default_rng(seed)
     way = np.asarray(direction, dtype=float)
-    stretch = None
-    if isinstance(motion, SurfaceMotion):
-        stretch = natural_stretch(motion, slow=slow)
+    stretch = natural_stretch(motion, slow=slow)
     # A little inside what samples allow.
     chain = [quadratic(motion, stretch, way, rng, start).times(1.02)]
     for k, degree in enumerate(degrees):
@@ -140,7 +138,7 @@ def search_region(
 
 
 def prove_region(
-    motion: AutonomousSystem,
+    motion: SurfaceMotion,
     direction: ArrayLike,
     *,
     degrees: Sequence[int] = (4, 6),
@@ -196,7 +194,6 @@ def prove_region(
             chain,
             parameters=parameters,
             max_boxes=max_boxes,
-            max_seconds=math.inf,
             proved=len(chain) - 1,
         )
         if progress is not None:
@@ -214,9 +211,7 @@ def prove_region(
         chain = chain[:1]
     level, raised = _tight_level(chain, decide)
     chain[-1] = level
-    verdict = verify_region(
-        motion, chain, parameters=parameters, max_boxes=10**12, max_seconds=math.inf
-    )
+    verdict = verify_region(motion, chain, parameters=parameters, max_boxes=10**12)
     return ProvedRegion(motion, way, tuple(chain), verdict, extent(level, way) * (1 - 1e-9), raised)
 
 

@@ -226,15 +226,7 @@ class _Decisions:
         point = _inside(proved.function, proved.extent * way)
         if point is None:
             return proved, None, Verdict(words, "undecided", method="no start is shown inside")
-        claim = RegionClaim(proved.chain, point)
-        verdict = replace(
-            proved.verdict,
-            claim=claim.sentence(motion),
-            margin=float(np.linalg.norm(point)) * (1 - 1e-12),
-            unit=mechanism.coordinates[m].unit,
-            witness=dict(zip(motion.names, point, strict=True)),
-        )
-        return proved, claim, verdict
+        return proved, *self.own(RegionClaim(proved.chain, point))
 
     def region_in_box(self, region: ProvedRegion) -> _Decided:
         """The region for every plant of a box: as many functions of the chain as hold there."""

@@ -14,7 +14,6 @@ from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs import ProvedRegion, SurfaceMotion
 from undertow.proofs.region.lyapunov import extent
-from undertow.proofs.region.motion import AutonomousSystem
 
 #: Points a side of the picture of the simulated region.
 GRID = 101
@@ -73,7 +72,7 @@ def _hurry(y: FloatArray, ratio: FloatArray) -> FloatArray:
     return np.asarray(np.clip(ratio, 0.01, 1.0) / (1.0 + 0.3 * np.abs(y).max(axis=1)))[:, None]
 
 
-def _step(motion: AutonomousSystem, y: FloatArray, h: float | FloatArray) -> FloatArray:
+def _step(motion: SurfaceMotion, y: FloatArray, h: float | FloatArray) -> FloatArray:
     a = motion(y)
     b = motion(y + 0.5 * h * a)
     c = motion(y + 0.5 * h * b)
