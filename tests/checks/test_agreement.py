@@ -43,7 +43,7 @@ from undertow.closed_loop import exponential_integrator, kernel
 from undertow.law import inner_loop
 from undertow.mechanisms import LIBRARY
 from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram
-from undertow.symbolic import SELECT, C99Emitter, Tape, numba
+from undertow.symbolic import C99Emitter, Tape, numba
 from undertow.symbolic.names import SymbolNames
 
 #: Single precision, relative to the same.
@@ -58,8 +58,6 @@ def interpreted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Non
     itself for others, and that stays so in this process.
     """
     monkeypatch.setattr(numba, "njit", _as_it_is)
-    select = sys.modules[SELECT.split()[1]]
-    monkeypatch.setattr(select, "select", lambda chosen, yes, no: yes if chosen else no)
     monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path / "cache"))
     before = set(sys.modules)
     yield

@@ -307,7 +307,7 @@ def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
         build_loop_graph(rig, None, ut.MinimumEnergy(), "saturation"), sampled=False, header=""
     )
     lines = source.splitlines()
-    heads = [i for i, line in enumerate(lines) if line.strip().startswith("for i in range(")]
+    heads = [i for i, line in enumerate(lines) if re.match(r"\s*for i(__\d+)? in range\(", line)]
     assert len(heads) >= 18
     for head in heads:
         depth = len(lines[head]) - len(lines[head].lstrip())

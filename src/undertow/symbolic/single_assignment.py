@@ -19,15 +19,27 @@ from undertow.symbolic.machine import numba
 SELECT = "from undertow.symbolic.single_assignment import select\n"
 
 
-@numba.extending.intrinsic
-def select(context, condition, yes, no):  # type: ignore[no-untyped-def]
-    """``yes if condition else no``, both of which are computed: in compiled code alone."""
-    kind = context.unify_types(yes, no)
+def select(condition: Any, yes: Any, no: Any) -> Any:
+    """``yes if condition else no``, of which compiled code computes both."""
+    return yes if condition else no
 
-    def generate(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        return builder.select(*values)
 
-    return kind(numba.types.boolean, kind, kind), generate
+@numba.extending.type_callable(select)
+def _type_of_select(context):  # type: ignore[no-untyped-def]
+    def typed(condition, yes, no):  # type: ignore[no-untyped-def]
+        kind = context.unify_types(yes, no)
+        return kind(numba.types.boolean, kind, kind)
+
+    return typed
+
+
+#: For any types: what :func:`_type_of_select` lets through.
+_ANY = (numba.types.boolean, numba.types.Any, numba.types.Any)
+
+
+@numba.extending.lower_builtin(select, *_ANY)  # type: ignore[no-untyped-call]
+def _generate_select(_context, builder, _signature, values):  # type: ignore[no-untyped-def]
+    return builder.select(*values)
 
 
 def single_assignment(source: str) -> str:
