@@ -13,8 +13,9 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.bounds import bound
 from undertow.law import Plan, stability_margin
+from undertow.models import FloatArray
 from undertow.optimiser.fitting import fits
-from undertow.optimiser.following import refined
+from undertow.optimiser.following import Follower, refined
 from undertow.optimiser.open_loop import NODES, EarliestArrival, OpenLoopMotion
 
 FREE = ut.DecisionVariables(reaching=True, schedule=0.1)
@@ -186,6 +187,25 @@ def test_several_surfaces_are_nearer_to_the_bound_of_energy(d_e: float, degrees:
     assert run.cost / least - 1.0 < wasted + 1e-3
     later = [update.plan.times for update in run.updates if update.t < plan.times[-1]]
     assert all(len(a) >= len(b) for a, b in itertools.pairwise(later))
+
+
+def test_where_all_motions_break_off_there_is_no_schedule() -> None:
+    """And nothing is asked to be integrated exactly."""
+    made = cascade("rotary_pendulum")
+    motion, size = earliest("rotary_pendulum"), made.optimiser.space.size
+
+    def broken(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
+        return np.full((len(z), len(x)), np.inf)
+
+    def never(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
+        raise AssertionError("asked for")
+
+    arrival = EarliestArrival(made.mechanism, 0.01, *made.loop.objective.range_of(made.mechanism))
+    follower = Follower(
+        lambda count, before: np.zeros((count, size)), lambda x, qdd: np.zeros((1, size)),
+        broken, never, arrival, 0.1, made.loop.step,
+    )  # fmt: skip
+    assert follower.follow(motion) is None
 
 
 def test_refusals() -> None:

@@ -215,5 +215,7 @@ class Follower:
 
         z = np.vstack([given, self.draw(effort * DRAWN, before)])
         z, ends = improved(self.states, z, effort * IMPROVED, effort * STEPS)
-        promising = len(z) and np.linalg.norm(ends[0] - goal + beside) < PROMISES * radius
+        if not len(z):
+            return z, ends
+        promising = np.linalg.norm(ends[0] - goal + beside) < PROMISES * radius
         return improved(self.exact, z[:FINAL], FINAL, FINISH if promising else 0)
