@@ -10,7 +10,6 @@ fewer generations than a covariance takes to adapt; a rough one is better left t
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import lapack
@@ -23,8 +22,6 @@ STRETCHES = np.array([0.35, 0.7, 1.0, 1.4, 2.0, 3.0])
 
 #: Costs from here on are penalties and stay out of the model.
 PENALTY = 1e8
-
-_upper = lru_cache(maxsize=16)(np.triu_indices)
 
 
 class TrustRegion:
@@ -149,55 +146,93 @@ def _model_step(
     """Fit a quadratic to the costs near the best one; return its trust-region step."""
     d = best_x.size
     terms = (d + 1) * (d + 2) // 2
-    beside = known_x - best_x
-    away = np.sqrt((beside * beside).sum(axis=1))
-    near = np.argsort(away, kind="stable")[: 3 * terms]
+    away = np.empty(len(known_x))
+    _distances(known_x, best_x, away)
+    near = away.argsort(kind="stable")[: 3 * terms]
     reach = max(float(away[near[min(len(near) - 1, terms + 3)]]), 1e-6)
-    normal, right = np.zeros((terms, terms)), np.zeros(terms)
-    _normal_equations(
-        beside[near], away[near], known_f[near] - best_f, reach, best_f, normal, right
-    )
+    normal, right, H = np.zeros((terms, terms)), np.zeros(terms), np.empty((d, d))
+    _normal_equations(known_x, known_f, best_x, best_f, away, near, reach, normal, right)
     _, _, c, singular = lapack.dgesv(normal, right)
-    H = np.zeros((d, d))
-    H[_upper(d)] = c[d + 1 :]
-    curvature, basis, unsolved = lapack.dsyevd(H + H.T, lower=1)
+    _unpack(c, H)
+    curvature, basis, unsolved = lapack.dsyevd(H, lower=1)
     if singular or unsolved:
         return np.zeros(d)
-    slope = basis.T @ c[1 : d + 1]
-    top = max(abs(curvature[0]), abs(curvature[-1]), 1e-300)
-    bent, push = np.maximum(curvature, 1e-3 * top), 0.0
-    for _ in range(60):
-        y = -slope / (bent + push)
-        size = math.sqrt((y * y).sum())
-        if size <= 1.5:
-            break
-        push = max(1.5 * push, 1e-3 * top)
-    if not size < 1e3:
-        return np.zeros(d)
-    return np.asarray((basis * y * reach).sum(axis=1))
+    step = np.empty(d)
+    _shorten(curvature, basis, basis.T @ c[1 : d + 1], reach, step)
+    return step
 
 
 @compiled()
-def _normal_equations(x, distance, f, reach, best_f, normal, right):  # type: ignore[no-untyped-def]
+def _distances(x, centre, away):  # type: ignore[no-untyped-def]
+    for i in range(len(x)):
+        total = 0.0
+        for j in range(len(centre)):
+            total += (x[i, j] - centre[j]) * (x[i, j] - centre[j])
+        away[i] = math.sqrt(total)
+
+
+@compiled()
+def _unpack(c, H):  # type: ignore[no-untyped-def]
+    """Write the matrix of second derivatives of a quadratic of coefficients c."""
+    d = len(H)
+    k = d + 1
+    for a in range(d):
+        for b in range(a, d):
+            H[a, b] = c[k]
+            H[b, a] = c[k]
+            k += 1
+        H[a, a] *= 2.0
+
+
+@compiled()
+def _shorten(curvature, basis, slope, reach, step):  # type: ignore[no-untyped-def]
+    """Write the step down a slope, in the basis of the curvatures, within the trust region."""
+    d = len(slope)
+    top = max(abs(curvature[0]), abs(curvature[d - 1]), 1e-300)
+    push, size = 0.0, 0.0
+    for _ in range(60):
+        size = 0.0
+        for a in range(d):
+            part = slope[a] / (max(curvature[a], 1e-3 * top) + push)
+            size += part * part
+        size = math.sqrt(size)
+        if size <= 1.5:
+            break
+        push = max(1.5 * push, 1e-3 * top)
+    for a in range(d):
+        step[a] = 0.0
+        if size < 1e3:
+            for b in range(d):
+                part = -slope[b] / (max(curvature[b], 1e-3 * top) + push)
+                step[a] += basis[a, b] * part * reach
+
+
+@compiled()
+def _normal_equations(  # type: ignore[no-untyped-def]
+    known_x, known_f, best_x, best_f, away, near, reach, normal, right
+):
     """Add up the normal equations, a little regularised, of a quadratic around the best one.
 
     Its coefficients: the constant, the slopes, and the second-order terms row by row.
     """
-    d, terms = x.shape[1], len(right)
-    row = np.empty(terms)
-    for i in range(len(f)):
-        far, high = distance[i] / reach, f[i] / (0.5 * abs(best_f) + 1e-9)
+    d, terms = len(best_x), len(right)
+    row, x = np.empty(terms), np.empty(d)
+    for i in near:
+        f = known_f[i] - best_f
+        for a in range(d):
+            x[a] = known_x[i, a] - best_x[a]
+        far, high = away[i] / reach, f / (0.5 * abs(best_f) + 1e-9)
         weight = (1.0 / (1.0 + far**4) + 1e-3) / (1.0 + high * high)
         row[0] = 1.0
         k = d + 1
         for a in range(d):
-            row[1 + a] = x[i, a] / reach
+            row[1 + a] = x[a] / reach
             for b in range(a, d):
-                row[k] = (x[i, a] / reach) * (x[i, b] / reach)
+                row[k] = (x[a] / reach) * (x[b] / reach)
                 k += 1
         for a in range(terms):
             w = weight * row[a]
-            right[a] += w * f[i]
+            right[a] += w * f
             for b in range(terms):
                 normal[a, b] += w * row[b]
     trace = 0.0
