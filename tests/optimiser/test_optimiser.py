@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -34,6 +34,7 @@ def optimum(loop: ut.ClosedLoop, x: NDArray[np.float64], seed: int = 0) -> ut.Su
 
 
 @settings(max_examples=15)
+@example(phi=3.6, rate=-10.0, case="2 one-time, energy", name="time")
 @given(
     phi=st.floats(-35, 35),
     rate=st.floats(-60, 60),
@@ -49,8 +50,9 @@ def test_never_worse_than_the_incumbent(
     proposal = optimiser.propose(x, incumbent=CASES[case], sequence=1)
     assert proposal.cost <= proposal.incumbent_cost
     if proposal.surface is not None:
-        fresh = optimiser.loop.batch(x, [proposal.surface])
-        # A search for an earlier arrival takes small steps throughout.
+        # A search for an earlier arrival takes small steps throughout: an arrival that touches the
+        # terminal set and no more, as from phi = 3.6°, -10°/s, is another motion in large ones.
+        fresh = optimiser.loop.batch(x, [proposal.surface], seek=optimiser.counts_time)
         assert float(fresh.cost[0]) == pytest.approx(
             proposal.cost, rel=0.2 * optimiser.loop.tail_rtol
         )
