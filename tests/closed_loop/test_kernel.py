@@ -323,7 +323,7 @@ def test_lane_loops_are_compiled_to_vectors() -> None:
     """The arithmetic of a step is packed: what is left as scalars runs once a block or a call."""
     rig = ut.mechanisms.rotary_pendulum()
     loop = ut.ClosedLoop(rig)
-    loop.simulate(rig.state(phi=0.1), ut.first_surface(rig), duration=0.01)
+    loop.batch(rig.state(phi=0.1), [ut.first_surface(rig)], duration=0.01)
     cached = loop._kernels.rollout
     options = {k: cached.targetoptions[k] for k in ("nogil", "error_model", "fastmath")}
     kernel = numba.njit(**options)(cached.py_func)  # a cached one shows no assembly
