@@ -9,7 +9,7 @@ rate η/ε, kept between 1/s and what the integration step can bear.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,7 +79,7 @@ class SearchSpace:
     """
 
     def __init__(self, loop: ClosedLoop, anchor: Surface, freedom: DecisionVariables) -> None:
-        self.loop, self.freedom = loop, freedom
+        self.loop, self.anchor, self.freedom = loop, anchor, freedom
         n, m = loop.mechanism.n, loop.mechanism.m
         self.n, self.m, layout = n, m, LawLayout(n, m)
         scale, searched = np.abs(anchor.normalised().vector), np.ones(2 * m * n, dtype=bool)
@@ -92,6 +92,11 @@ class SearchSpace:
         self._places = np.flatnonzero(self._free)
         # Runge-Kutta is stable up to a rate of 2.8/step; the law is resolved up to 0.8/step.
         self._fastest = 0.8 / (loop.step * max(1, loop.zoh_steps))
+
+    def at(self, times: tuple[float, ...]) -> SearchSpace:
+        """Return the coordinates of the same kind for surfaces that take over at these times, s."""
+        freedom = replace(self.freedom, times=times, schedule=0.0)
+        return SearchSpace(self.loop, self.anchor, freedom)
 
     @property
     def segments(self) -> int:

@@ -30,7 +30,7 @@ from undertow.optimiser.fitting import fits
 from undertow.optimiser.following import SHORTEST, Follower, refined
 from undertow.optimiser.open_loop import EarliestArrival, OpenLoopMotion
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
-from undertow.optimiser.search_space import DecisionVariables, SearchSpace
+from undertow.optimiser.search_space import SearchSpace
 from undertow.optimiser.trust_region import TrustRegion
 from undertow.symbolic import compiled
 
@@ -98,6 +98,7 @@ FEWEST, WAYS, SWAY, ALONE = 4, 3, (0.02, 0.5), 1024
 
 #: What a motion integrated to the tolerance counts as, in evaluations: it takes as long.
 EXACT = 16
+
 #: A single surface is divided into so many, the first but one of which takes over after this part
 #: of the time in which nearly all of the cost, this part, is spent, each later one after twice the
 #: time; and the evaluations that improving them may take, per coordinate of a single one.
@@ -178,8 +179,7 @@ class Optimisation:
 
     def _switch_at(self, times: tuple[float, ...]) -> None:
         """Search from now on for surfaces that take over at these times, s."""
-        best, freedom = self.best, replace(self.optimiser.freedom, times=times, schedule=0.0)
-        self.space = SearchSpace(self.loop, self.optimiser.anchor, freedom)
+        best, self.space = self.best, self.space.at(times)
         self._buffers.clear()
         if best is not None:
             self._best, self.best_z = best, self.space.encode(best)
@@ -585,8 +585,7 @@ class Optimisation:
         loop, period = self.loop, self.optimiser.freedom.schedule
         T = max(T, 2 * loop.step)
         times = refined([t for t in incumbent.times[:-1] if t < T], period, T, loop.step)
-        freedom = DecisionVariables(reaching=True, times=times)
-        space = SearchSpace(loop, self.optimiser.anchor, freedom)
+        space = self.space.at(times)
         laws, end = incumbent.laws(loop.reaching), max(1, len(incumbent.times) - 1)
         moving = Plan(incumbent.surfaces[:end], incumbent.times[:end], laws[:end])
         slower = T / max(incumbent.times[-1], loop.step) if end > 1 else 1.0
@@ -670,8 +669,7 @@ class Optimisation:
         if found is None:
             return None
         z, times, end = found
-        freedom = DecisionVariables(reaching=True, times=times)
-        whole = SearchSpace(loop, self.optimiser.anchor, freedom)
+        whole = space.at(times)
         vectors, gains = whole.decode(z.reshape(1, -1))
         assert gains is not None  # the reaching law of a schedule is free
         return self._ended(whole.plan(vectors[0], gains[0]), end)
