@@ -7,6 +7,7 @@ are shown or that decide are integrated to a tolerance, by :mod:`.adaptive_integ
 
 from undertow.closed_loop.along_reference import simulate_along
 from undertow.closed_loop.buffers import RolloutBuffers
+from undertow.closed_loop.cuda import on_gpu
 from undertow.closed_loop.ensemble import Ensemble, Risk
 from undertow.closed_loop.kernel import compile_loop
 from undertow.closed_loop.rollout import RTOL, ClosedLoop
@@ -25,5 +26,6 @@ __all__ = [
     "RolloutBuffers",
     "Trajectory",
     "compile_loop",
+    "on_gpu",
     "simulate_along",
 ]

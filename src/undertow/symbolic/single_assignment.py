@@ -50,7 +50,7 @@ def single_assignment(source: str) -> str:
     tree = ast.parse(source)
     numbers = count()
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
-        loops = [node for node in ast.walk(function) if _is_straight(node)]
+        loops = [node for node in ast.walk(function) if is_straight(node)]
         inside = {id(part) for loop in loops for line in loop.body for part in ast.walk(line)}
         elsewhere = {
             node.id
@@ -64,7 +64,8 @@ def single_assignment(source: str) -> str:
     return ast.unparse(ast.fix_missing_locations(tree)) + "\n"
 
 
-def _is_straight(node: ast.AST) -> TypeGuard[ast.For]:
+def is_straight(node: ast.AST) -> TypeGuard[ast.For]:
+    """Whether a node is an innermost loop of assignments and no more."""
     return isinstance(node, ast.For) and all(
         isinstance(line, ast.Assign | ast.AugAssign) for line in node.body
     )
