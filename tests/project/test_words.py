@@ -64,7 +64,7 @@ PROBLEMS: dict[Goal, tuple[sp.Expr, float]] = {
     "time": (sp.Integer(1), 0.01),
     "bench-energy": (V**2 + 0.05 * SQUARES, 0.05),
     "bench-time": (1 + 2.25 * (V / 15) ** 2, 0.05),
-    "effort": ((V / 15) ** 2 + 0.01 * SQUARES, 0.02),
+    "effort": ((V / 15) ** 2 + 0.01 * SQUARES, 0.01),
 }
 
 

@@ -13,6 +13,7 @@ from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task,
 from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
 from undertow.closed_loop import ClosedLoop
 from undertow.law import check_surface, first_surface
+from undertow.objective import USUAL
 from undertow.optimiser import Budget, DecisionVariables, Optimiser
 from undertow.runtime import default_gate
 
@@ -35,7 +36,7 @@ def simulate(
     name: options.AnyName,
     start: options.Start = None,
     target: options.Target = None,
-    objective: options.Goal = "energy",
+    objective: options.Goal = USUAL,
     control: Annotated[
         str | None,
         option(
@@ -105,7 +106,7 @@ def simulate(
     given = None if surface is None else parse_surface(belief, surface)
     request["control"] = steering = control or ("cascade" if given is None else "given surface")
     check_out(out)
-    run = gate = None
+    run = cascade = None
     if goes_to is not None and steering != "cascade":
         raise InvalidInputError(
             f"--target with --control {steering}" if given is None else "--target with --surface",
@@ -144,7 +145,7 @@ def simulate(
         motion, surfaces = ClosedLoop(belief, goal, plant=truth).simulate(x0, given), (given,)
     written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run))
     words = ", ".join(target or ())
-    show(motion_report(belief, goal, x0, motion, surfaces[0], run, gate, words), *written)
+    show(motion_report(belief, goal, x0, motion, surfaces[0], run, cascade, words), *written)
     exit_unless(motion.event.name == "REACHED")
 
 
@@ -165,7 +166,7 @@ def _evidence_gate(accept: list[str]) -> Gate:
 def optimise(
     name: options.AnyName,
     start: options.Start = None,
-    objective: options.Goal = "energy",
+    objective: options.Goal = USUAL,
     setting: options.Settings = None,
     limit: options.Limits = None,
     hard_input: options.HardInput = False,

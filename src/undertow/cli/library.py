@@ -17,6 +17,7 @@ from undertow.cli.parsing import mechanism_named, parse_task
 from undertow.cli.terminal import check_out, command, completed, progress_bar, show, terminal, write
 from undertow.closed_loop import ClosedLoop
 from undertow.mechanisms import LIBRARY
+from undertow.objective import USUAL
 from undertow.optimiser import Optimiser
 
 
@@ -144,7 +145,7 @@ def models(
 def animate(
     name: options.AnyName,
     start: options.Start = None,
-    objective: options.Goal = "energy",
+    objective: options.Goal = USUAL,
     setting: options.Settings = None,
     limit: options.Limits = None,
     hard_input: options.HardInput = False,

@@ -82,7 +82,7 @@ Goal = Annotated[
         "What is minimised until ‖x‖ has fallen to a radius. energy: ∫uᵀu dt, and time: the "
         "duration, both to 0.01 as in the paper. bench-energy: ∫(uᵀu + 0.05 xᵀx)dt, and "
         "bench-time: ∫(1 + 2.25 Σ(u/u_max)²)dt, to 0.05. effort: ∫(Σ(u/u_max)² + 0.01 xᵀx)dt, "
-        "to 0.02.",
+        "to 0.01.",
         metavar="WORD",
     ),
 ]

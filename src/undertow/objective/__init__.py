@@ -1,6 +1,6 @@
 """What is best: cost, horizon, terminal set and constraints; and the word for each problem."""
 
-from undertow.objective.named import Goal, finite_limits, objective_for
+from undertow.objective.named import USUAL, Goal, finite_limits, objective_for
 from undertow.objective.objective import (
     TRAVEL,
     Constraint,
@@ -13,6 +13,7 @@ from undertow.objective.objective import (
 
 __all__ = [
     "TRAVEL",
+    "USUAL",
     "Constraint",
     "Goal",
     "MinimumEnergy",

@@ -91,9 +91,9 @@ def model_files(
 ) -> tuple[ModelFile, ...]:
     """Read every URDF and MJCF file below a folder, and balance what can be.
 
-    Links are not followed. ``simulate`` balances them as ``undertow simulate FILE`` does: least
-    energy from the usual start; ``seed`` is the optimisers'. ``done`` is called with each as it is
-    finished.
+    Links are not followed. ``simulate`` balances them as ``undertow simulate FILE`` does: for
+    the usual objective, from the usual start; ``seed`` is the optimisers'. ``done`` is called with
+    each as it is finished.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def _reading(row: ModelFile, mechanism: Mechanism) -> ModelFile:
 
 
 def _motion(row: ModelFile, mechanism: Mechanism, seed: int) -> ModelFile:
-    goal = objective_for(mechanism, "energy", horizon=60.0)
+    goal = objective_for(mechanism, horizon=60.0)
     try:
         cascade = Cascade(mechanism, goal, gate=default_gate(), seed=seed, belief="usual")
         motion = cascade.simulate().trajectory

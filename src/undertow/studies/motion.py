@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from undertow.base import facts, finite, manifest, table, to_csv
-from undertow.cascade import Gate, Run, Update, problem_words
+from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
 from undertow.law import Surface
@@ -76,15 +76,15 @@ def motion_report(
     motion: Trajectory,
     surface: Surface,
     run: Run | None = None,
-    gate: Gate | None = None,
+    cascade: Cascade | None = None,
     target: str = "",
 ) -> RenderableType:
     """Return a simulated motion for the terminal.
 
-    ``surface`` is the (first) one, ``run`` the cascade's record where a cascade was run, ``gate``
-    who admitted its surfaces, ``target`` where to, in words, where that is not x = 0.
+    ``surface`` is the (first) one, ``run`` the record of ``cascade`` where one was run, ``target``
+    where to, in words, where that is not x = 0.
     """
-    rows = _head(mechanism, objective, start, gate)
+    rows = _head(mechanism, objective, start, None if cascade is None else cascade.gate)
     if target:
         rows.append(("target", target))
     if run is None:
@@ -99,7 +99,7 @@ def motion_report(
         if any(verdict is not None for verdict in run.verdicts):
             rows.append(("evidence", _evidence(run)))
         if len(run.lemma3_slack):
-            rows.append(("Lemma 3", _slack_words(run, objective)))
+            rows.append(_descent(run, objective, learns=bool(cascade and cascade.known)))
     rows += [
         ("cost", f"{motion.cost:.6g} {objective.unit}"),
         (
@@ -118,11 +118,15 @@ def motion_report(
     return Group(facts(rows), mark + Text(ended(motion, objective)))
 
 
-def _slack_words(run: Run, objective: Objective) -> str:
-    """Say the smallest slack of Lemma 3, and of how many decisions none is known."""
+def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]:
+    """Say by how much predictions fall at least, or rise, from one decision to the next.
+
+    Lemma 3 is of one model; one that is learnt predicts afresh with all that it learns.
+    """
     slack = run.lemma3_slack
     known = slack[np.isfinite(slack)]
     unknown = len(slack) - len(known)
+    name = "prediction" if learns else "Lemma 3"
     without = (
         f"; {unknown} of {len(slack)} decisions begin another task or lack a finite prediction"
         if unknown and run.updates[-1].task
@@ -131,8 +135,15 @@ def _slack_words(run: Run, objective: Objective) -> str:
         else ""
     )
     if not len(known):
-        return f"no slack is known{without}"
-    return f"smallest slack {known.min():.1e} {objective.unit} (≥ 0 wanted, to rounding){without}"
+        return name, f"no slack is known{without}"
+    least = f"{known.min():.1e} {objective.unit}"
+    if not learns:
+        return name, f"smallest slack {least} (≥ 0 wanted, to rounding){without}"
+    rise = f"{max(0.0, -known.min()):.1e} {objective.unit}"
+    return (
+        name,
+        f"what was learnt raised it by {rise} at most, from one decision to the next{without}",
+    )
 
 
 def _evidence(run: Run) -> str:

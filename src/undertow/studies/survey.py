@@ -1,9 +1,9 @@
 """Every mechanism of the library brought to its target: cost, bound and gaps in one table.
 
-Nothing is chosen by hand: designed surface, optimisation and cascade are those of
-``undertow simulate NAME --belief exact``, from the mechanism's listed start; *free* is the cascade
-that may choose the reaching law, too, and for least time a schedule of surfaces.  The bound is a
-local optimum of the same task over *all* inputs, see :mod:`undertow.bounds`; a gap is what a
+Nothing is chosen by hand: designed surface, optimisation and cascade are those of ``undertow
+simulate NAME --objective energy --belief exact``, from the mechanism's listed start; *free* is the
+cascade that may choose the reaching law, too, and for least time a schedule of surfaces.  The bound
+is a local optimum of the same task over *all* inputs, see :mod:`undertow.bounds`; a gap is what a
 cascade spends beyond it.
 """
 
