@@ -26,7 +26,17 @@ from undertow.models import Mechanism
 from undertow.symbolic import C99Emitter, Tape, literal
 
 #: Values of the templates that hold a user's words: their ``ut_`` stays as it is.
-_WORDS = {"name", "title", "coordinates", "inputs", "estimator", "gain_meaning"}
+_WORDS = {
+    "name",
+    "title",
+    "coordinates",
+    "inputs",
+    "estimator",
+    "gain_meaning",
+    "include",
+    "package",
+    "joints",
+}
 
 
 def render(name: str, values: dict[str, str], prefix: str) -> bytes:
@@ -128,7 +138,7 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         "tiny": literal(1e-12, real),
         "fabs": "fabsf" if real == "float" else "fabs",
         "rate_check": "1" if sharp else "UT_PERIOD * out.gain[i] < 2 * row->layer[i]",
-        "helpers": _helpers(used),
+        "helpers": helpers(used),
         **code,
     }
     return {
@@ -215,7 +225,7 @@ def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
     return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **estimate}
 
 
-def _helpers(used: str) -> str:
+def helpers(used: str) -> str:
     """Return the functions that C99 lacks, of those that are used."""
     functions = template("helpers.c").template.rstrip().split("\n\n")
     names = (re.findall(r"ut_\w+\(", function)[0] for function in functions)
