@@ -437,6 +437,20 @@ UT_NOTHING(fmi3SetShiftDecimal, (UT_THESE, const fmi3Float64 shifts[]))
 UT_NOTHING(fmi3SetShiftFraction,
            (UT_THESE, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[]))
 
+/* Of model exchange and scheduled execution: some importers look for them before they are asked. */
+UT_NOTHING(fmi3EnterContinuousTimeMode, (UT_OF))
+UT_NOTHING(fmi3CompletedIntegratorStep,
+           (UT_OF, fmi3Boolean no_set_state, fmi3Boolean *event, fmi3Boolean *terminate))
+UT_NOTHING(fmi3SetTime, (UT_OF, fmi3Float64 time))
+UT_NOTHING(fmi3SetContinuousStates, (UT_OF, const fmi3Float64 states[], size_t n))
+UT_NOTHING(fmi3GetContinuousStateDerivatives, (UT_OF, fmi3Float64 values[], size_t n))
+UT_NOTHING(fmi3GetEventIndicators, (UT_OF, fmi3Float64 values[], size_t n))
+UT_NOTHING(fmi3GetContinuousStates, (UT_OF, fmi3Float64 values[], size_t n))
+UT_NOTHING(fmi3GetNominalsOfContinuousStates, (UT_OF, fmi3Float64 values[], size_t n))
+UT_NOTHING(fmi3GetNumberOfEventIndicators, (UT_OF, size_t *n))
+UT_NOTHING(fmi3GetNumberOfContinuousStates, (UT_OF, size_t *n))
+UT_NOTHING(fmi3ActivateModelPartition, (UT_OF, fmi3ValueReference clock, fmi3Float64 time))
+
 FMI3_Export fmi3Instance fmi3InstantiateModelExchange(
     fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
     fmi3Boolean logging, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log)
