@@ -14,7 +14,7 @@ from undertow.base import InvalidInputError, one_of
 from undertow.export.controller import EmbeddedController
 from undertow.export.fmi import fmi_units
 from undertow.export.names import ascii_words, c_name
-from undertow.export.sources import common, files, render
+from undertow.export.sources import common, controller_files, render
 
 PLATFORMS = ("fmi", "ros2", "simulink")
 
@@ -76,12 +76,12 @@ def ros2_package(controller: EmbeddedController) -> dict[str, bytes]:
     """
     mechanism = controller.mechanism
     rate = 1 / controller.period
-    if abs(rate - round(rate)) > 1e-9 * rate:
+    if abs(rate - round(rate)) > 1e-6 * rate:
         raise InvalidInputError(
             "period of a ros2_control controller",
             value=f"{controller.period:g} s",
             limit="1/k s, k whole: update rates are whole numbers, Hz",
-            remedy=f"Use for instance --period {1 / max(1, round(rate)):g}",
+            remedy=f"Use for instance --period {1 / max(1, round(rate)):.8g}",
         )
     package = "undertow_" + re.sub(r"_+", "_", controller.stem.lower()).strip("_")
     values = common(controller) | {
@@ -106,7 +106,6 @@ def ros2_package(controller: EmbeddedController) -> dict[str, bytes]:
         f"{package}/{place}": render(source, values, controller.prefix)
         for place, source in places.items()
     }
-    exported = files(controller)
-    for name in (f"{controller.stem}.h", f"{controller.stem}.c"):
-        made[f"{package}/src/{name}"] = exported[name]
+    for name, content in controller_files(controller).items():
+        made[f"{package}/src/{name}"] = content
     return made

@@ -2,7 +2,7 @@
 
 A unit (``.fmu``) is a zip archive: ``modelDescription.xml``, the sources, and a library for the
 platform that it was made on.  Both are the exported C behind the standard's functions.  The
-controller is :func:`undertow.export.files`' own, one period in each step; the plant is
+controller is :func:`undertow.export.files`'s own, one period in each step; the plant is
 M(q) q̈ = f(q, q̇) + B u by Runge and Kutta's fourth-order step.
 
 Source: Modelica Association, *Functional Mock-up Interface Specification*, version 3.0,
@@ -31,7 +31,7 @@ from undertow.export.controller import EmbeddedController, plan_numbers
 from undertow.export.estimate import build_acceleration_graph
 from undertow.export.host import compile_c
 from undertow.export.names import ascii_words
-from undertow.export.sources import common, files, helpers, render
+from undertow.export.sources import common, controller_files, helpers, render
 from undertow.models import Coordinate, Mechanism
 from undertow.symbolic import C99Emitter, Tape
 
@@ -455,14 +455,13 @@ def controller_unit(controller: EmbeddedController) -> Unit:
         "    int armed; /* the last value of loop.arm */\n",
         "step_meaning": "the controller's period",
     }
-    exported = files(controller)
     return Unit(
         f"{stem}_controller",
         f"{mechanism.name}: the controller, n = {mechanism.n}, m = {mechanism.m}",
         controller_variables(controller),
         "unit_controller.c",
         values,
-        {name: exported[name] for name in (f"{stem}.h", f"{stem}.c")},
+        controller_files(controller),
         controller.period,
         False,
         controller.prefix,

@@ -101,6 +101,18 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     ``<name>.h`` and ``<name>.c`` are the controller; ``<name>_vectors.h`` and
     ``<name>_test.c`` test it on any machine; ``<name>_pipe.c`` speaks to it in lines of text.
     """
+    name, prefix = controller.stem, controller.prefix
+    shared = common(controller)
+    place = _estimator(controller)["place"]
+    return controller_files(controller) | {
+        f"{name}_vectors.h": render("vectors.h", shared | vectors(controller), prefix),
+        f"{name}_test.c": render("test.c", shared, prefix),
+        f"{name}_pipe.c": render("pipe.c", shared | {"place": place}, prefix),
+    }
+
+
+def controller_files(controller: EmbeddedController) -> dict[str, bytes]:
+    """Return ``<name>.h`` and ``<name>.c`` alone."""
     mechanism, real = controller.mechanism, controller.real
     name, prefix = controller.stem, controller.prefix
     shared = common(controller)
@@ -144,9 +156,6 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     return {
         f"{name}.h": render("controller.h", values, prefix),
         f"{name}.c": render("controller.c", values, prefix),
-        f"{name}_vectors.h": render("vectors.h", shared | vectors(controller), prefix),
-        f"{name}_test.c": render("test.c", shared, prefix),
-        f"{name}_pipe.c": render("pipe.c", shared | {"place": code["place"]}, prefix),
     }
 
 
@@ -209,20 +218,22 @@ def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
     _, determinant = tape.adjugate(tape.matrix(blocks.alpha_a - blocks.alpha_u * target.X))
     gamma = C99Emitter(tape, names, controller.real).statements({"value": determinant})
 
-    estimate = estimate_code(
-        controller.differentiator,
-        mechanism,
-        controller.period,
-        {p.symbol: names[p.symbol] for p in mechanism.parameters},
-        controller.real,
-    )
     tape = Tape()
     powers = tape.let_all(characteristic_polynomial(mechanism, symbols.surface))
     powers += [sp.Integer(0)] * (2 * n + 2 - len(powers))
     polynomial = C99Emitter(tape, names, controller.real).statements(
         {f"a[{k}]": a for k, a in enumerate(powers)}
     )
-    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **estimate}
+    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **_estimator(controller)}
+
+
+def _estimator(controller: EmbeddedController) -> dict[str, str]:
+    """Return what the templates ask of the estimator."""
+    mechanism = controller.mechanism
+    parameters = {p.symbol: macro(i, p.name) for i, p in enumerate(mechanism.parameters)}
+    return estimate_code(
+        controller.differentiator, mechanism, controller.period, parameters, controller.real
+    )
 
 
 def helpers(used: str) -> str:
