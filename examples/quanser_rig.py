@@ -97,10 +97,9 @@ class QuanserRig:
         self.scale = np.array([2 * math.pi / e.counts for e in ENCODERS])
         self.at_zero = np.array([e.at_zero for e in ENCODERS])
         self.total = np.zeros(len(ENCODERS))
+        self.watched = False
         self.card.write_analog(self.output, 1, self.volts)
-        # A process that dies writes nothing: then the card itself switches off.
         self.card.watchdog_set_analog_expiration_state(self.output, 1, self.volts)
-        self.card.watchdog_start(WATCHDOG)
 
     def zero(self) -> None:
         """Let the counters begin where the mechanism is now: hanging, at rest."""
@@ -120,7 +119,13 @@ class QuanserRig:
         """Put out what gives the motor u, V, within the card's range."""
         wanted = float(u[0]) / OUTPUT.gain
         self.volts[0] = max(-OUTPUT.limit, min(OUTPUT.limit, wanted))
-        self.card.watchdog_reload()
+        # A process that dies writes nothing: then the card itself switches off. Not before the
+        # first write, which may be long in coming.
+        if self.watched:
+            self.card.watchdog_reload()
+        else:
+            self.card.watchdog_start(WATCHDOG)
+            self.watched = True
         self.card.write_analog(self.output, 1, self.volts)
 
     def close(self) -> None:
