@@ -18,8 +18,9 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError, MissingExtraError
-from undertow.export import EmbeddedController, Status, SuperTwistingStep, Twin, carriers, fmi
-from undertow.export.fmi import base_units, controller_unit, fmi_units, plant_unit
+from undertow.export import EmbeddedController, Status, SuperTwistingStep, Twin, carriers
+from undertow.export.co_simulation import Variable, base_units
+from undertow.export.fmi import controller_unit, fmi_units, plant_unit
 from undertow.export.host import FLAGS
 from undertow.export.twin import random_states
 from undertow.mechanisms import LIBRARY
@@ -281,8 +282,8 @@ def test_a_surface_is_tuned_while_it_runs(place: Path) -> None:
         assert "not inside (0, inf)" in law.said[-1]
 
 
-def test_single_precision_and_another_prefix(tmp_path: Path) -> None:
-    mechanism = exported().mechanism
+def test_single_precision_another_prefix_and_a_name_of_our_own_files(tmp_path: Path) -> None:
+    mechanism = replace(exported().mechanism, name="model")
     controller = EmbeddedController(
         mechanism,
         ut.first_surface(mechanism),
@@ -291,7 +292,7 @@ def test_single_precision_and_another_prefix(tmp_path: Path) -> None:
         prefix="arm",
     )
     unpack(controller, tmp_path)
-    with loaded(tmp_path, "rotary_pendulum_controller", {"loop.rates_measured": 1}) as law:
+    with loaded(tmp_path, "model_rig_controller", {"loop.rates_measured": 1}) as law:
         law["phi"] = 0.125
         law.step(0.0)
         expected = controller.laws[0](0.0, mechanism.state(phi=0.125)).u[0]
@@ -494,8 +495,6 @@ def test_what_cannot_be_built_is_refused(monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(MissingExtraError, match="s390x"):
         carriers(exported(), ["fmi"])
     unit = plant_unit(exported())
-    clash = replace(
-        unit, groups={**unit.groups, "MORE": [fmi.Variable("phi", "input", "discrete")]}
-    )
+    clash = replace(unit, groups={**unit.groups, "MORE": [Variable("phi", "input", "discrete")]})
     with pytest.raises(InvalidInputError, match="got phi, must be each of them once"):
         clash.sources()
