@@ -6,10 +6,12 @@ and types that their documentation gives.
 
 from __future__ import annotations
 
+import io
 import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+import zipfile
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +21,7 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
+from support import bar
 from undertow.base import InvalidInputError
 from undertow.cli import app
 from undertow.export import EmbeddedController, Status, Twin, carriers, files
@@ -206,6 +209,39 @@ def test_the_ros2_package_fits_together() -> None:
     )
     assert len(declared) == 3
     assert all(f"    {parameter}: " in settings for parameter in declared)
+
+
+@pytest.mark.parametrize(
+    ("name", "coordinates", "channel", "parameters", "prefix"),
+    [
+        ('2 "y" <&> \\', ("y", "float"), "return", "for while struct", "ut"),
+        ("Über/pendel", ("θ", "φ"), "main", "α EOF NAN", "foo"),
+    ],
+)
+def test_names_of_a_user_stay_clear_of_all_of_them(
+    name: str, coordinates: tuple[str, str], channel: str, parameters: str, prefix: str,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    """Keywords, quotes, angle brackets, no ASCII letter: everything compiles, and XML is XML."""
+    mechanism = bar(name, coordinates, channel, parameters)
+    controller = EmbeddedController(mechanism, ut.first_surface(mechanism), prefix=prefix)
+    build_s_function(controller, tmp_path)
+    build_ros2(controller, tmp_path)
+    package = next(tmp_path.glob("undertow_*"))
+    assert mechanism.name.startswith("2") == (package.name == "undertow_rig_2_y")
+    for path in package.glob("*.xml"):
+        ET.parse(path)
+    settings = (package / "config" / "controller.yaml").read_text()
+    assert ('joints: ["y", "float"]' in settings) == (coordinates[0] == "y")
+    for unit_name, content in carriers(controller, ["fmi"]).items():
+        with zipfile.ZipFile(io.BytesIO(content)) as unit:
+            described = ET.fromstring(unit.read("modelDescription.xml"))
+        variables = {node.get("name") for node in described.iter("Float64")}
+        assert {*coordinates, channel} <= variables
+        model = described.find("CoSimulation")
+        assert model is not None
+        assert f"{model.get('modelIdentifier')}.fmu" == unit_name
+        assert str(model.get("modelIdentifier")).isidentifier()
 
 
 def test_a_period_that_no_update_rate_has_is_refused() -> None:

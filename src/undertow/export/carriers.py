@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from xml.sax.saxutils import escape
 
 from numpy.typing import ArrayLike
 
@@ -88,7 +89,8 @@ def ros2_package(controller: EmbeddedController) -> dict[str, bytes]:
         "package": package,
         "rate": str(round(rate)),
         "m": str(mechanism.m),
-        "joints": ", ".join(c_name(c.name) for c in mechanism.coordinates),
+        # Quoted: in YAML y and n are truths.
+        "joints": ", ".join(f'"{c_name(c.name)}"' for c in mechanism.coordinates),
         "units": ", ".join(c.unit for c in mechanism.coordinates),
         "inputs": ", ".join(
             ascii_words(f"{u.name} ({u.unit}, at most {u.limit:g})") for u in mechanism.inputs
@@ -102,8 +104,11 @@ def ros2_package(controller: EmbeddedController) -> dict[str, bytes]:
         "src/controller.hpp": "ros2_controller.hpp",
         "src/controller.cpp": "ros2_controller.cpp",
     }
+    in_xml = values | {"title": escape(values["title"])}
     made = {
-        f"{package}/{place}": render(source, values, controller.prefix)
+        f"{package}/{place}": render(
+            source, in_xml if place.endswith(".xml") else values, controller.prefix
+        )
         for place, source in places.items()
     }
     for name, content in controller_files(controller).items():
