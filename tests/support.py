@@ -151,3 +151,17 @@ def runge_kutta_step(
     third = rate(x + 0.5 * h * second, middle)
     last = rate(x + h * third, later)
     return x + h / 6.0 * (first + 2.0 * second + 2.0 * third + last)
+
+
+def bar(name: str, coordinates: tuple[str, str], channel: str, names: str) -> ut.Mechanism:
+    """A pendulum on a cart under names of one's own, its two coordinates' and its parameters'."""
+    x, tilt = ut.Coordinate(coordinates[0], "m", "*/ ??/"), ut.Coordinate(coordinates[1], "rad")
+    values = zip(names.split(), (0.8, 0.3, 0.25), strict=True)
+    M, m, l = (ut.Parameter(name, value, "kg\\", low=0) for name, value in values)  # noqa: E741
+    moment, rate = m.symbol * l.symbol * sp.cos(tilt.symbol), tilt.velocity
+    kinetic = (M.symbol + m.symbol) * x.velocity**2 / 2 + moment * x.velocity * rate
+    return ut.Mechanism.from_energies(
+        name, [x, tilt], [ut.Input(channel, "N", 10.0)],
+        kinetic=kinetic + 2 * m.symbol * l.symbol**2 * rate**2 / 3, potential=9.81 * moment,
+        parameters=(M, m, l), start={tilt.name: 0.1},
+    )  # fmt: skip

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import undertow as ut
+from support import bar
 from undertow.base import (
     ArtefactError,
     InvalidInputError,
@@ -1035,19 +1036,6 @@ def test_without_control_the_rig_falls(tmp_path: Path) -> None:
 # -- names, refusals -----------------------------------------------------------------------------
 
 
-def bar(name: str, coordinates: tuple[str, str], channel: str, names: str) -> ut.Mechanism:
-    x, tilt = ut.Coordinate(coordinates[0], "m", "*/ ??/"), ut.Coordinate(coordinates[1], "rad")
-    values = zip(names.split(), (0.8, 0.3, 0.25), strict=True)
-    M, m, l = (ut.Parameter(name, value, "kg\\", low=0) for name, value in values)  # noqa: E741
-    moment, rate = m.symbol * l.symbol * sp.cos(tilt.symbol), tilt.velocity
-    kinetic = (M.symbol + m.symbol) * x.velocity**2 / 2 + moment * x.velocity * rate
-    return ut.Mechanism.from_energies(
-        name, [x, tilt], [ut.Input(channel, "N", 10.0)],
-        kinetic=kinetic + 2 * m.symbol * l.symbol**2 * rate**2 / 3, potential=9.81 * moment,
-        parameters=(M, m, l), start={tilt.name: 0.1},
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("name", "coordinates", "channel", "parameters", "stem", "prefix"),
     [
@@ -1154,7 +1142,8 @@ def test_the_example_of_the_page_compiles(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     code_of_help, shown, _ = invoke("--help")
     assert code_of_help == 0
-    wanted = set(re.findall(r"--[a-z][a-z-]+", page)) - {"--version"}
+    ours = re.sub(r"^fmpy .*", "", page, flags=re.MULTILINE)
+    wanted = set(re.findall(r"--[a-z][a-z-]+", ours)) - {"--version"}
     assert wanted <= set(re.findall(r"--[a-z-]+", shown))
 
 

@@ -23,7 +23,7 @@ import undertow as ut
 from undertow.cli import app
 from undertow.mechanisms.named import named
 from undertow.models import linearise
-from undertow.plants import check_rig
+from undertow.plants import OutputOnError, check_rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX")
@@ -303,3 +303,83 @@ def test_a_counterweight_holds_the_cart_on_its_slope(written: ModuleType) -> Non
     cart = 0.6 + 0.8 * np.sin(slope)
     wanted = 0.2 * J.T @ J + np.diag([cart, 0.2 * 0.5**2 / 12])
     np.testing.assert_allclose(mechanism.M([0.1, a]), wanted, atol=1e-8)
+
+
+# -- a card with encoders and an analogue output -------------------------------------------------
+
+
+def test_the_driver_of_a_card_balances_a_simulated_one(
+    example: Callable[[str], ModuleType],
+) -> None:
+    quanser = example("quanser_rig")
+    assert quanser.balance(quanser.simulated(), seconds=3.0) < ut.deg(1)
+
+
+def test_the_driver_of_a_card_counts_scales_and_lets_go(
+    example: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Signs, zeros, counters that begin again, the card's range, the watchdog, the end."""
+    quanser = example("quanser_rig")
+    said: list[tuple[str, Any]] = []
+
+    class HIL(quanser.SimulatedCard):  # type: ignore[misc, name-defined]
+        counts = (0, 0)
+
+        def __init__(self, *words: str) -> None:
+            said.append(("open", words))
+
+        def read_encoder(self, channels: Any, count: int, buffer: Any) -> None:
+            assert list(channels) == [0, 1]
+            for k in range(count):
+                buffer[k] = self.counts[k]
+
+        def write_analog(self, channels: Any, count: int, buffer: Any) -> None:
+            said.append(("write", buffer[0]))
+
+        def watchdog_start(self, seconds: float) -> None:
+            said.append(("watchdog", seconds))
+
+        def watchdog_reload(self) -> None:
+            said.append(("reload", None))
+
+        def close(self) -> None:
+            said.append(("close", None))
+
+    monkeypatch.setitem(sys.modules, "quanser", SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "quanser.hardware", SimpleNamespace(HIL=HIL))
+    rig = quanser.connected()
+    check_rig(rig, ut.mechanisms.rotary_pendulum())
+    assert said == [("open", ("q2_usb", "0")), ("write", 0.0)]
+    assert rig.read().q.tolist() == pytest.approx([0.0, math.pi])
+    rig.card.counts = (2**23 - 10, -2048)
+    for _ in range(2):
+        q = rig.read().q
+    rig.card.counts = (-(2**23) + 10, -2048)  # 20 counts on
+    assert rig.read().q - q == pytest.approx([20 * 2 * math.pi / 4096, 0.0])
+    assert q[1] == pytest.approx(0.0)
+    said.clear()
+    rig.write(np.array([6.0]))
+    rig.write(np.array([-99.0]))
+    assert said == [("watchdog", 0.02), ("write", 2.0), ("reload", None), ("write", -10.0)]
+    said.clear()
+    rig.close()
+    assert said == [("write", 0.0), ("close", None)]
+
+    def gone(*_: Any) -> None:
+        raise RuntimeError("-1073: the device is not there")
+
+    rig.card.write_analog = gone
+    said.clear()
+    with pytest.raises(OutputOnError, match="the device is not there"):
+        rig.close()
+    assert said == [("close", None)]
+
+
+def test_a_card_is_zeroed_where_it_hangs(example: Callable[[str], ModuleType]) -> None:
+    """The simulated one hangs: after ``zero`` it reads so, whatever its counters said before."""
+    quanser = example("quanser_rig")
+    rig = quanser.simulated(phi=math.pi)
+    rig.card.offset = [77, -1000]
+    assert abs(rig.read().q[1] - math.pi) > 1.0
+    rig.zero()
+    assert rig.read().q.tolist() == pytest.approx([0.0, math.pi], abs=1e-9)

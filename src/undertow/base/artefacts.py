@@ -203,7 +203,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:
     folder
         Made where it is not there.
     files
-        Names to contents.
+        Names to contents; a name may have folders in it, divided by "/".
 
     Returns
     -------
@@ -219,10 +219,12 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:
     try:
         earlier = _keep_earlier(folder, files)
         for name, content in files.items():
-            temporary = folder / f".{name}.{os.getpid()}.tmp"
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
             try:
                 temporary.write_bytes(content)
-                temporary.replace(folder / name)
+                temporary.replace(target)
             finally:
                 temporary.unlink(missing_ok=True)
     except OSError as error:
@@ -245,5 +247,7 @@ def _keep_earlier(folder: Path, names: Iterable[str]) -> Path | None:
     earlier = folder / f"earlier-{number}"
     earlier.mkdir()
     for path in present:
-        path.replace(earlier / path.name)
+        kept = earlier / path.relative_to(folder)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        path.replace(kept)
     return earlier

@@ -29,6 +29,7 @@ from undertow.export import (
     EmbeddedController,
     KalmanStep,
     SuperTwistingStep,
+    carriers,
     files,
 )
 from undertow.export.estimate import EstimatorStep
@@ -52,6 +53,7 @@ app.add_typer(export, name="export")
     "undertow export c bar.py:bar --velocity super-twisting --acceleration 80 --out firmware",
     "undertow export c --all --report",
     "undertow export c rotary_pendulum --start phi=35deg --bit-flips",
+    "undertow export c rotary_pendulum --for fmi --for simulink --out units",
     name="c",
     of=export,
 )
@@ -82,6 +84,16 @@ def export_c(
             "and in float. Takes minutes.",
         ),
     ] = False,
+    platforms: Annotated[
+        list[str] | None,
+        option(
+            "--for",
+            "Also write what carries it elsewhere: fmi: co-simulation units of controller and "
+            "plant, FMI 3.0, built here. ros2: a package with a ros2_control controller. "
+            "simulink: a Level-2 S-function. May be repeated.",
+            metavar="WORD",
+        ),
+    ] = None,
     control: Annotated[
         str | None,
         option(
@@ -115,7 +127,7 @@ def export_c(
     missed: Annotated[int, option("Sample periods without a measurement that are bridged.")] = 5,
     rows: Annotated[int, option("Largest number of surfaces in a plan.", min=1)] = 1,
     prefix: Annotated[str, option("Prefix of every C name.")] = "ut",
-    compiler: Annotated[str, option("C compiler for --check and --report.")] = "gcc",
+    compiler: Annotated[str, option("C compiler for --check, --report, --for fmi.")] = "gcc",
     states: Annotated[int, option("Number of random states for --report.", min=1)] = 100_000,
     setting: options.Settings = None,
     seed: options.Seed = 0,
@@ -137,6 +149,13 @@ def export_c(
             value="none of --out, --check, --rigs, --bit-flips, --report",
             limit="one of them at least",
             remedy="Write for instance --out firmware",
+        )
+    if platforms and out is None:
+        raise InvalidInputError(
+            "what to do with --for",
+            value="no --out",
+            limit="a folder for what is written",
+            remedy="Write for instance --out units",
         )
     check_out(out)
 
@@ -181,6 +200,9 @@ def export_c(
     made = [controller(mechanism_named(n, setting)) for n in names]
     starts = [parse_start(one.mechanism, start) for one in made] if rigs or bit_flips else []
     written = {file: content for one in made for file, content in files(one).items()}
+    for one in made if platforms else ():
+        x0 = parse_start(one.mechanism, start) if start else None
+        written |= carriers(one, platforms or (), compiler, x0)
     good = True
     for one in made if check else ():
         with tempfile.TemporaryDirectory(prefix="undertow-") as place:

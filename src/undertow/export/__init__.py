@@ -1,5 +1,6 @@
-"""The inner loop for a microcontroller: heap-free C99 from the kernel's own expressions."""
+"""The inner loop in heap-free C99, from the kernel's own expressions, and what carries it on."""
 
+from undertow.export.carriers import carriers
 from undertow.export.controller import EmbeddedController
 from undertow.export.estimate import (
     DerivativeStep,
@@ -26,6 +27,7 @@ __all__ = [
     "Status",
     "SuperTwistingStep",
     "Twin",
+    "carriers",
     "export_c",
     "files",
     "run_on_rig",

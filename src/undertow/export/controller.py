@@ -88,8 +88,9 @@ class EmbeddedController:
 
     @property
     def stem(self) -> str:
-        """Name of the files: the mechanism's, as far as a file and ``#include`` can bear it."""
+        """Name of the files: the mechanism's, as far as C and ``#include`` can bear it."""
         stem = re.sub(r"[^A-Za-z0-9_]+", "_", c_name(self.mechanism.name))
+        stem = f"rig_{stem}" if stem[:1].isdigit() else stem
         return f"{stem}_rig" if stem in HEADERS else stem[:60] or "rig"
 
     @cached_property

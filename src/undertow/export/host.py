@@ -58,6 +58,30 @@ def version(compiler: str) -> str:
     return _run(tool(compiler), "--version", cwd=Path.cwd()).stdout.partition("\n")[0]
 
 
+def compile_c(
+    compiler: str, folder: Path, sources: Sequence[str], program: str, *more: str
+) -> Path:
+    """Compile files of a folder, there, into a program or a library.
+
+    Raises
+    ------
+    MissingExtraError
+        When there is no such compiler.
+    ArtefactError
+        When the C does not compile, with the compiler's first complaint.
+    """
+    done = _run(tool(compiler), *FLAGS, *sources, "-o", program, *more, "-lm", cwd=folder)
+    if done.returncode != 0:
+        first = next((line for line in done.stderr.splitlines() if "error" in line), "")
+        raise ArtefactError(
+            f"C of '{program}'",
+            value=first or done.stderr[-200:],
+            limit=f"accepted by {Path(compiler).name}",
+            remedy="Report it: generated code must compile",
+        )
+    return folder / program
+
+
 def _run(*command: str, cwd: Path, text: str | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command, cwd=cwd, input=text, capture_output=True, text=True, check=False, timeout=600
@@ -124,16 +148,7 @@ class Build:
 
     def compile(self, sources: Sequence[str], program: str, *more: str) -> Path:
         """Compile files of the folder into a program."""
-        done = _run(self._compiler, *FLAGS, *sources, "-o", program, *more, "-lm", cwd=self.folder)
-        if done.returncode != 0:
-            first = next((line for line in done.stderr.splitlines() if "error" in line), "")
-            raise ArtefactError(
-                f"C of '{self.name}'",
-                value=first or done.stderr[-200:],
-                limit=f"accepted by {Path(self._compiler).name}",
-                remedy="Report it: generated code must compile",
-            )
-        return self.folder / program
+        return compile_c(self._compiler, self.folder, sources, program, *more)
 
     def self_test(self) -> tuple[bool, str]:
         """Build and run the test against the vectors: whether it passes, and what it says."""

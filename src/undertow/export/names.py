@@ -41,7 +41,7 @@ class PlanAnswer(IntEnum):
 
 
 #: Headers that the generated C includes: a file of its own under such a name would hide them.
-HEADERS = {"math", "signal", "stdio", "stdlib"}
+HEADERS = {"math", "signal", "stdio", "stdlib", "simstruc", "fmi3", "unit", "model"}
 
 
 def _letter(sign: str) -> str:

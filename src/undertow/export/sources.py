@@ -26,7 +26,17 @@ from undertow.models import Mechanism
 from undertow.symbolic import C99Emitter, Tape, literal
 
 #: Values of the templates that hold a user's words: their ``ut_`` stays as it is.
-_WORDS = {"name", "title", "coordinates", "inputs", "estimator", "gain_meaning"}
+_WORDS = {
+    "name",
+    "title",
+    "coordinates",
+    "inputs",
+    "estimator",
+    "gain_meaning",
+    "include",
+    "package",
+    "joints",
+}
 
 
 def render(name: str, values: dict[str, str], prefix: str) -> bytes:
@@ -91,6 +101,18 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
     ``<name>.h`` and ``<name>.c`` are the controller; ``<name>_vectors.h`` and
     ``<name>_test.c`` test it on any machine; ``<name>_pipe.c`` speaks to it in lines of text.
     """
+    name, prefix = controller.stem, controller.prefix
+    shared = common(controller)
+    place = _estimator(controller)["place"]
+    return controller_files(controller) | {
+        f"{name}_vectors.h": render("vectors.h", shared | vectors(controller), prefix),
+        f"{name}_test.c": render("test.c", shared, prefix),
+        f"{name}_pipe.c": render("pipe.c", shared | {"place": place}, prefix),
+    }
+
+
+def controller_files(controller: EmbeddedController) -> dict[str, bytes]:
+    """Return ``<name>.h`` and ``<name>.c`` alone."""
     mechanism, real = controller.mechanism, controller.real
     name, prefix = controller.stem, controller.prefix
     shared = common(controller)
@@ -128,15 +150,12 @@ def files(controller: EmbeddedController) -> dict[str, bytes]:
         "tiny": literal(1e-12, real),
         "fabs": "fabsf" if real == "float" else "fabs",
         "rate_check": "1" if sharp else "UT_PERIOD * out.gain[i] < 2 * row->layer[i]",
-        "helpers": _helpers(used),
+        "helpers": helpers(used),
         **code,
     }
     return {
         f"{name}.h": render("controller.h", values, prefix),
         f"{name}.c": render("controller.c", values, prefix),
-        f"{name}_vectors.h": render("vectors.h", shared | vectors(controller), prefix),
-        f"{name}_test.c": render("test.c", shared, prefix),
-        f"{name}_pipe.c": render("pipe.c", shared | {"place": code["place"]}, prefix),
     }
 
 
@@ -199,23 +218,25 @@ def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
     _, determinant = tape.adjugate(tape.matrix(blocks.alpha_a - blocks.alpha_u * target.X))
     gamma = C99Emitter(tape, names, controller.real).statements({"value": determinant})
 
-    estimate = estimate_code(
-        controller.differentiator,
-        mechanism,
-        controller.period,
-        {p.symbol: names[p.symbol] for p in mechanism.parameters},
-        controller.real,
-    )
     tape = Tape()
     powers = tape.let_all(characteristic_polynomial(mechanism, symbols.surface))
     powers += [sp.Integer(0)] * (2 * n + 2 - len(powers))
     polynomial = C99Emitter(tape, names, controller.real).statements(
         {f"a[{k}]": a for k, a in enumerate(powers)}
     )
-    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **estimate}
+    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **_estimator(controller)}
 
 
-def _helpers(used: str) -> str:
+def _estimator(controller: EmbeddedController) -> dict[str, str]:
+    """Return what the templates ask of the estimator."""
+    mechanism = controller.mechanism
+    parameters = {p.symbol: macro(i, p.name) for i, p in enumerate(mechanism.parameters)}
+    return estimate_code(
+        controller.differentiator, mechanism, controller.period, parameters, controller.real
+    )
+
+
+def helpers(used: str) -> str:
     """Return the functions that C99 lacks, of those that are used."""
     functions = template("helpers.c").template.rstrip().split("\n\n")
     names = (re.findall(r"ut_\w+\(", function)[0] for function in functions)
