@@ -50,7 +50,7 @@ from undertow.optimiser import Budget, DecisionVariables, Optimiser, Proposal
 if TYPE_CHECKING:
     from undertow.bounds import bound
     from undertow.display.derivation import derivation
-    from undertow.export import export_c
+    from undertow.export import environment, export_c, vector_environment
     from undertow.runtime import replay, run
     from undertow.studies.certification import certify, verify
     from undertow.studies.trials.compare import compare, lqr, nmpc
@@ -61,11 +61,13 @@ _LATER = {
     "certify": "studies.certification",
     "compare": "studies.trials.compare",
     "derivation": "display.derivation",
+    "environment": "export",
     "export_c": "export",
     "lqr": "studies.trials.compare",
     "nmpc": "studies.trials.compare",
     "replay": "runtime",
     "run": "runtime",
+    "vector_environment": "export",
     "verify": "studies.certification",
 }
 
@@ -102,6 +104,7 @@ __all__ = [
     "compare",
     "deg",
     "derivation",
+    "environment",
     "export_c",
     "first_surface",
     "lqr",
@@ -114,6 +117,7 @@ __all__ = [
     "run",
     "state_box",
     "surface_margins",
+    "vector_environment",
     "verify",
 ]
 

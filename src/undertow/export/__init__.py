@@ -1,5 +1,9 @@
-"""The inner loop for a microcontroller: heap-free C99 from the kernel's own expressions."""
+"""For other tools: heap-free C99 for microcontrollers, Gymnasium's environments, python-control.
 
+The classes of Gymnasium are in :mod:`undertow.export.gym`, which is imported where it is needed.
+"""
+
+from undertow.export.balancing import BalancingTask, environment, vector_environment
 from undertow.export.controller import EmbeddedController
 from undertow.export.estimate import (
     DerivativeStep,
@@ -14,6 +18,7 @@ from undertow.export.twin import Twin
 
 __all__ = [
     "Agreement",
+    "BalancingTask",
     "Build",
     "DerivativeStep",
     "DifferentiatorStep",
@@ -26,7 +31,9 @@ __all__ = [
     "Status",
     "SuperTwistingStep",
     "Twin",
+    "environment",
     "export_c",
     "files",
     "run_on_rig",
+    "vector_environment",
 ]
