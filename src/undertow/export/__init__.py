@@ -13,6 +13,13 @@ from undertow.export.estimate import (
 )
 from undertow.export.host import Agreement, Build, Footprint, HostProcess, RigRun, run_on_rig
 from undertow.export.names import PlanAnswer, Status
+from undertow.export.python_control import (
+    LoopMargins,
+    loop_margins,
+    loop_transfer,
+    nlsys,
+    phase_plane,
+)
 from undertow.export.sources import export_c, files
 from undertow.export.twin import Twin
 
@@ -26,6 +33,7 @@ __all__ = [
     "Footprint",
     "HostProcess",
     "KalmanStep",
+    "LoopMargins",
     "PlanAnswer",
     "RigRun",
     "Status",
@@ -34,6 +42,10 @@ __all__ = [
     "environment",
     "export_c",
     "files",
+    "loop_margins",
+    "loop_transfer",
+    "nlsys",
+    "phase_plane",
     "run_on_rig",
     "vector_environment",
 ]
