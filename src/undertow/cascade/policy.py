@@ -6,7 +6,7 @@ goes in and out as ``state``, one entry for each episode, as that of a recurrent
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,10 +21,12 @@ from undertow.law import InnerLoop, Plan, Surface
 from undertow.models import FloatArray, Mechanism
 
 
-class _Episode(Protocol):
+class Episode(Protocol):
     """A controller on its way through one episode: states, one a period, to inputs, (m,)."""
 
-    def __call__(self, x: FloatArray) -> FloatArray: ...
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the inputs of the next period."""
+        ...
 
 
 class Policy:
@@ -40,7 +42,7 @@ class Policy:
         Time between two calls, s.
     """
 
-    def __init__(self, mechanism: Mechanism, begin: Any, period: float) -> None:
+    def __init__(self, mechanism: Mechanism, begin: Callable[[], Episode], period: float) -> None:
         self.mechanism, self.period, self._begin = mechanism, period, begin
 
     def __repr__(self) -> str:
@@ -54,7 +56,7 @@ class Policy:
         state: Sequence[Any] | None = None,
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float64], tuple[_Episode, ...]]:
+    ) -> tuple[NDArray[np.float64], tuple[Episode, ...]]:
         """Return actions and the state to hand back with the next observation.
 
         Parameters
@@ -83,17 +85,32 @@ class Policy:
         del deterministic
         x = self.mechanism.check_state(observation)
         rows = np.atleast_2d(x)
-        begins = np.broadcast_to(False if episode_start is None else episode_start, len(rows))
-        if rows.ndim != 2 or (state is not None and len(state) != len(rows)):
+        begins = np.atleast_1d(np.asarray(False if episode_start is None else episode_start))
+        if rows.ndim != 2 or begins.shape not in ((1,), (len(rows),)):
+            raise InvalidInputError(
+                "episodes of a policy",
+                value=f"observations {x.shape}, episode_start {begins.shape}",
+                limit="(2n,), or (N, 2n) and one bool for each",
+                remedy="Leave episode_start out where none begins",
+            )
+        if state is not None and len(state) != len(rows):
             raise InvalidInputError(
                 "state of a policy",
-                value=f"of {'no' if state is None else len(state)} episodes",
-                limit=f"one for each observation, of shape {x.shape}",
+                value=f"of {len(state)} episodes",
+                limit=f"one for each of {len(rows)} observations",
                 remedy="Hand back what predict() returned, or None where episodes begin",
             )
+        begins = np.broadcast_to(begins, len(rows))
         episodes = tuple(
             self._begin() if state is None or begin else state[i] for i, begin in enumerate(begins)
         )
+        if not all(map(callable, episodes)):
+            raise InvalidInputError(
+                "state of a policy",
+                value=repr(state),
+                limit="what predict() returned",
+                remedy="Leave it out where episodes begin",
+            )
         u = np.stack([episode(row) for episode, row in zip(episodes, rows, strict=True)])
         return (u / self.mechanism.input_limits).reshape(*x.shape[:-1], -1), episodes
 

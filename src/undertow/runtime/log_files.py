@@ -70,7 +70,7 @@ def column_units(recording: Recording) -> dict[str, str]:
 
 
 @checked
-def to_parquet(recording: Recording, path: Path) -> Path:
+def to_parquet(recording: Recording, path: str | Path) -> Path:
     """Write a log as one Parquet file, and return where it is.
 
     A column a quantity, a row a step; each field's metadata has its ``unit``.  The table's
@@ -103,11 +103,11 @@ def to_parquet(recording: Recording, path: Path) -> Path:
     rest = {name: getattr(recording, name) for name in ("meta", "events", "answers")}
     facts = {"undertow": _json(rest)}
     table = arrow.table(arrays, schema=arrow.schema(fields, metadata=facts))
-    return _written(path, lambda stream: parquet.write_table(table, stream))
+    return _written(Path(path), lambda stream: parquet.write_table(table, stream))
 
 
 @checked
-def to_mcap(recording: Recording, path: Path) -> Path:
+def to_mcap(recording: Recording, path: str | Path) -> Path:
     """Write a log as one MCAP file, and return where it is.
 
     Channels with JSON messages and their JSON schemas, one message a step: ``/state``,
@@ -130,7 +130,7 @@ def to_mcap(recording: Recording, path: Path) -> Path:
         When it cannot be written.
     """
     mcap = require_extra("mcap.writer", "logs", "MCAP files need mcap")
-    return _written(path, lambda stream: _write_mcap(mcap.Writer(stream), recording))
+    return _written(Path(path), lambda stream: _write_mcap(mcap.Writer(stream), recording))
 
 
 def _write_mcap(writer: Any, recording: Recording) -> None:
