@@ -2,9 +2,10 @@
 An environment, and our controller as its policy
 ================================================
 
-A Gymnasium environment is a mechanism to be balanced: here on a bench with friction, encoders and delay, another one
-each episode. A controller of ours is a policy with stable-baselines3's ``predict``. Where the arm sticks just outside the
-terminal set an episode goes on to its horizon. Needs the extra ``gym``.
+A Gymnasium environment is a mechanism to be balanced: here on a bench with friction, encoders and
+delay, another one each episode. A controller of ours is a policy with stable-baselines3's
+``predict``. Where friction holds the arm just outside the terminal set an episode goes on to its
+horizon. Needs the extra ``gym``.
 """
 
 import matplotlib.pyplot as plt
@@ -19,13 +20,13 @@ ours = ut.policy(ut.ClosedLoop(rig), ut.first_surface(rig))
 
 def episode(predict, seed):
     """Times, rewards so far, and pictures of the first half second."""
-    observation, info = env.reset(seed=seed)
+    observation, _ = env.reset(seed=seed)
     state, rewards, pictures = None, [], []
     while True:
         if len(rewards) % 20 == 0 and len(pictures) < 5:
             pictures.append(env.render())
         action, state = predict(observation, state)
-        observation, reward, terminated, truncated, info = env.step(action)
+        observation, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)
         if terminated or truncated:
             return env.task.period * np.arange(1, len(rewards) + 1), np.cumsum(rewards), pictures

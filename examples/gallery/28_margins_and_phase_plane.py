@@ -2,8 +2,9 @@
 The closed loop in python-control
 =================================
 
-The loop under our law as a nonlinear system: a cut through its vector field shows the surface, and the loop at the
-target has gain, phase and delay margins like any other. Needs the extra ``interop``.
+The loop under our law as a nonlinear system: a cut through its vector field shows the surface, and
+the loop at the target has gain, phase and delay margins like any other. Needs the extra
+``interop``.
 """
 
 import control
@@ -30,8 +31,8 @@ left.set_title("arm held at its target")
 left.legend(loc="upper right", frameon=True)
 
 # %%
-# The loop cut at the motor: L(iω) stays far from −1, until it is as late as the delay margin says. That much a
-# bench with sampling, filters and a slow line may use up.
+# The loop cut at the motor: L(iω) stays far from −1, until it is as late as the delay margin says.
+# That much a bench with sampling, filters and a slow line may use up.
 
 (margins,) = ut.loop_margins(rig, surface)
 print(margins)
