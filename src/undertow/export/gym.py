@@ -7,20 +7,24 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
-from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from undertow.base import InvalidInputError, at_least, one_of
+from undertow.base import InvalidInputError, MissingExtraError, at_least, one_of
 from undertow.closed_loop import Event
 from undertow.display.animation import Picture
-from undertow.export.balancing import BalancingTask, BenchPlant, IdealPlant, Lanes
+from undertow.export.balancing import NEEDS, BalancingTask, BenchPlant, IdealPlant, Lanes
 from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box
+    from gymnasium.utils import seeding
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise MissingExtraError(NEEDS, remedy="pip install 'undertow[gym]'") from error
 
 #: Frames in a second of a rendered episode, at most.
 FRAMES = 50
