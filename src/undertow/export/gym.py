@@ -216,9 +216,9 @@ class VectorEnvironment(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
         observations, infos
             (N, 2n), SI units.
         """
-        if isinstance(seed, int):
-            seed = [seed + i for i in range(self.num_envs)]
         if seed is not None:
+            first = np.atleast_1d(seed)
+            seed = [int(k) for k in (first if np.ndim(seed) else first + range(self.num_envs))]
             if len(seed) != self.num_envs:
                 raise InvalidInputError(
                     "seeds of a vector environment",
