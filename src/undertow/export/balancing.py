@@ -6,7 +6,7 @@ Nothing here needs Gymnasium; :mod:`undertow.export.gym` puts its classes around
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 #: Longest Runge-Kutta step of an ideal plant, s.
 STEP = 0.0025
 
-#: Horizon, s, and radius of the terminal set of the objective that is taken where none is given.
-HORIZON, RADIUS = 10.0, 0.01
+#: Horizon of the objective that is taken where none is given, or a word for one, s.
+HORIZON = 10.0
 
 #: Time constant of the filtered derivative that a realistic environment's velocities are, s.
 FILTER = 0.005
@@ -59,7 +59,7 @@ class BalancingTask:
         What moves.
     objective
         Its stage cost is what is paid; its terminal set, constraints and horizon end an episode.
-        By default ``effort`` of :func:`undertow.objective_for`, to ‖x‖ ≤ 0.01 within 10 s.
+        By default that of :func:`undertow.objective_for`, within 10 s.
     bench
         What the mechanism's model leaves out, or ``None``: the model is the plant.
     period
@@ -99,8 +99,7 @@ class BalancingTask:
                 )
         objective = self.objective
         if objective is None:
-            usual = objective_for(self.mechanism, "effort", horizon=HORIZON)
-            objective = replace(usual, terminal_radius=RADIUS)
+            objective = objective_for(self.mechanism, horizon=HORIZON)
         objective = objective.on(self.mechanism)
         object.__setattr__(self, "objective", objective)
         if not 1 <= objective.horizon / self.period <= MOST_STEPS:
