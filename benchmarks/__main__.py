@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 #: for builds.py, which needs another checkout to compare with.
 CLOCKED = (
     "kernel", "budget", "tail", "growth", "searchers", "reoptimise", "closed_loop", "gap",
-    "admission", "pushes",
+    "admission", "pushes", "environments",
 )  # fmt: skip
 HELPERS = ("__main__", "builds", "harness", "rivals", "predictive", "acados_server")
 OTHERS = sorted(path.stem for path in HERE.glob("*.py") if path.stem not in (*CLOCKED, *HELPERS))

@@ -19,7 +19,7 @@ from math import radians as deg
 from typing import TYPE_CHECKING, Any
 
 from undertow import mechanisms
-from undertow.cascade import Cascade, Run
+from undertow.cascade import Cascade, Policy, Run, policy
 from undertow.checks import MechanismReport, check_mechanism
 from undertow.closed_loop import ClosedLoop, Event, Trajectory
 from undertow.estimators import Belief
@@ -50,7 +50,7 @@ from undertow.optimiser import Budget, DecisionVariables, Optimiser, Proposal
 if TYPE_CHECKING:
     from undertow.bounds import bound
     from undertow.display.derivation import derivation
-    from undertow.export import export_c
+    from undertow.export import environment, export_c, loop_margins, nlsys, vector_environment
     from undertow.runtime import replay, run
     from undertow.studies.certification import certify, verify
     from undertow.studies.trials.compare import compare, lqr, nmpc
@@ -61,11 +61,15 @@ _LATER = {
     "certify": "studies.certification",
     "compare": "studies.trials.compare",
     "derivation": "display.derivation",
+    "environment": "export",
     "export_c": "export",
+    "loop_margins": "export",
     "lqr": "studies.trials.compare",
+    "nlsys": "export",
     "nmpc": "studies.trials.compare",
     "replay": "runtime",
     "run": "runtime",
+    "vector_environment": "export",
     "verify": "studies.certification",
 }
 
@@ -87,6 +91,7 @@ __all__ = [
     "Optimiser",
     "Parameter",
     "Plan",
+    "Policy",
     "Proposal",
     "ReachingLaw",
     "Reference",
@@ -102,18 +107,23 @@ __all__ = [
     "compare",
     "deg",
     "derivation",
+    "environment",
     "export_c",
     "first_surface",
+    "loop_margins",
     "lqr",
     "mechanisms",
     "modelling",
+    "nlsys",
     "nmpc",
     "objective_for",
     "placed_surface",
+    "policy",
     "replay",
     "run",
     "state_box",
     "surface_margins",
+    "vector_environment",
     "verify",
 ]
 

@@ -33,7 +33,7 @@ SHORT = {
 }  # fmt: skip
 
 #: What the library makes and hands out: nobody calls their constructors.
-MADE = {"MechanismReport", "Proposal", "Run", "Trajectory"}
+MADE = {"MechanismReport", "Policy", "Proposal", "Run", "Trajectory"}
 
 #: Not meant for arguments of users: a number's own methods, ``math.radians``, tape and symbols.
 NOT_OURS = {
@@ -81,7 +81,8 @@ def parts() -> dict[str, Any]:
         "MinimumEnergy": ut.MinimumEnergy(),
         "MinimumTime": problem, "Objective": ut.Objective("o", lambda v: 1),
         "Optimiser": ut.Optimiser(loop, cold=budget, warm=budget), "Plan": ut.Plan((surface,)),
-        "Parameter": ut.Parameter("p", 1.0, "m"), "Proposal": proposal,
+        "Parameter": ut.Parameter("p", 1.0, "m"), "Policy": ut.policy(loop, surface),
+        "Proposal": proposal,
         "ReachingLaw": ut.ReachingLaw(), "Run": run, "Surface": surface,
         "SlidingModeLaw": ut.SlidingModeLaw(rig, surface), "Trajectory": run.trajectory,
         "MechanismReport": ut.check_mechanism(rig, samples=1, compiled=False),
@@ -111,6 +112,7 @@ def parts() -> dict[str, Any]:
         "child": "arm", "coefficients": {"a": 1.0}, "torque_constant": 1.0, "resistance": 1.0,
         "tree": tree, "motors": motor, "text": "rotary_pendulum.py:NAME",
         "objective": problem, "cascade": cascade, "controllers": [ut.lqr(rig)],
+        "controller": cascade, "observation": x,
         "certificate": ut.certify(rig, surface, seconds=0.0), "folder": "firmware",
         "tolerances": {"m": 0.01}, "estimate": belief.prior, "offsets": [0.0],
         "values": rig.parameter_values, "path": "run.db",

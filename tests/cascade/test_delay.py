@@ -11,7 +11,7 @@ import scipy.linalg
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cascade import noise_share, robustness_gate
-from undertow.cascade.robustness import DelayGate, _exponential, delay_margin, feedback
+from undertow.cascade.robustness import DelayGate, _exponential, delay_margin
 from undertow.law import InnerLoop, Plan
 from undertow.objective import objective_for
 from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
@@ -51,7 +51,7 @@ def test_the_feedback_is_that_of_the_law(arm: ut.Mechanism, base: ut.Surface) ->
     law = InnerLoop(arm, base)
     x = np.array([1e-4, -2e-4, 1e-3, 5e-4])
     demand = InnerLoop(arm, base)(x)
-    np.testing.assert_allclose(feedback(law) @ x, demand, rtol=1e-4)
+    np.testing.assert_allclose(law.feedback() @ x, demand, rtol=1e-4)
 
 
 def test_gates_refuse_what_bears_too_little(arm: ut.Mechanism, base: ut.Surface) -> None:

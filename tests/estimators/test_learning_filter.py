@@ -7,7 +7,6 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
-from undertow.cascade.robustness import feedback
 from undertow.closed_loop import ClosedLoop
 from undertow.estimators import Belief, KalmanFilter
 from undertow.law import InnerLoop
@@ -176,7 +175,7 @@ def test_what_noise_costs_is_its_share_of_the_input(arm: Mechanism) -> None:
             )
             before, after = plain.batch(x, surfaces), noisy.batch(x, surfaces)
             costs, times = before.cost.copy(), before.time.copy()
-            K = np.array([feedback(InnerLoop(arm, surface)) for surface in surfaces])
+            K = np.array([InnerLoop(arm, surface).feedback() for surface in surfaces])
             rate = 0.25 * np.einsum("cij,jk,cik->c", K, P, K)
             if ensemble is None:
                 np.testing.assert_allclose(after.cost - costs, rate * times, rtol=1e-4)

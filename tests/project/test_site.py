@@ -93,10 +93,12 @@ def test_the_example_of_the_first_page_runs(
 
 
 @pytest.mark.slow  # controllers compared, and several mechanisms compiled
-@pytest.mark.parametrize("name", ["tutorial", "recipes"])
+@pytest.mark.parametrize("name", ["tutorial", "recipes", "interfaces"])
 def test_what_a_page_shows_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All Python of the page, in its order."""
-    for extra in ("casadi", "flint", "clarabel", "pandas", "xarray"):
+    for extra in (
+        "casadi", "flint", "clarabel", "pandas", "xarray", "control", "gymnasium", "pyarrow",
+    ):  # fmt: skip
         pytest.importorskip(extra)
     page = (DOCS / f"{name}.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)

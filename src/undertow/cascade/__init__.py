@@ -2,6 +2,7 @@
 
 from undertow.cascade.cascade import Cascade, CascadeState
 from undertow.cascade.gate import Admission, Gate, cost_gate, gate_words, problem_words
+from undertow.cascade.policy import Policy, policy
 from undertow.cascade.robustness import derate_actuator, noise_share, robustness_gate
 from undertow.cascade.simulation import Run, Update
 from undertow.cascade.targets import Legs, legs_of
@@ -12,6 +13,7 @@ __all__ = [
     "CascadeState",
     "Gate",
     "Legs",
+    "Policy",
     "Run",
     "Update",
     "cost_gate",
@@ -19,6 +21,7 @@ __all__ = [
     "gate_words",
     "legs_of",
     "noise_share",
+    "policy",
     "problem_words",
     "robustness_gate",
 ]

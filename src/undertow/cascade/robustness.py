@@ -24,20 +24,6 @@ from undertow.law import InnerLoop, Plan, ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism, linearise
 
 
-def feedback(law: InnerLoop) -> FloatArray:
-    """Return k, (m, 2n), with u = k x near the target, inside the boundary layer."""
-    size = 2 * law.mechanism.n
-    columns = []
-    for i in range(size):
-        x = np.zeros(size)
-        x[i] = 1e-6
-        law(x)
-        ahead = law.demand.copy()
-        law(-x)
-        columns.append((ahead - law.demand) / 2e-6)
-    return np.column_stack(columns)
-
-
 def _exponential(A: FloatArray) -> FloatArray:
     """Return e^A by Taylor's series and squaring.
 
@@ -120,7 +106,7 @@ def delay_margin(
             limit="0 < period, 0 ≤ longest ≤ 1000 periods",
         )
     A, B = _sampled(mechanism, period)
-    k = feedback(InnerLoop(mechanism, surface, reaching or ReachingLaw()))
+    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
     late = 0
     while late * period <= longest and _stable(A, B, k, late):
         late += 1
@@ -154,7 +140,7 @@ def noise_share(
     >>> noise_share(rig, ut.first_surface(rig), np.zeros((4, 4)))
     0.0
     """
-    k = feedback(InnerLoop(mechanism, surface, reaching or ReachingLaw()))
+    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
     variances = np.einsum("ij,jk,ik->i", k, covariance, k)
     return float((np.sqrt(np.maximum(variances, 0.0)) / mechanism.input_limits).max())
 

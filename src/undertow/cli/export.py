@@ -1,4 +1,4 @@
-"""The controller in another language."""
+"""The controller in another language, a log for other programs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
+import typer
 from rich.text import Text
 
 from undertow.base import InvalidInputError
@@ -41,7 +42,7 @@ from undertow.optimiser import Optimiser
 from undertow.plants.bench import bench_for
 from undertow.studies.rigs.export import upsets_table
 
-export = Application(help="Write the controller in another language.")
+export = Application(help="Write the controller in C, a log for other programs.")
 app.add_typer(export, name="export")
 
 
@@ -232,3 +233,37 @@ def export_c(
         show(*tables(entries), *map(Text, notes(made[0].real, states, compiler)))
     show(*write(out, lambda: written))
     exit_unless(good)
+
+
+@command(
+    "undertow export log run.db --mcap run.mcap",
+    "undertow export log run.db --parquet run.parquet",
+    name="log",
+    of=export,
+)
+def export_log(
+    log: Annotated[Path, typer.Argument(help="Log of a run.", metavar="LOG")],
+    mcap: Annotated[
+        Path | None, option("MCAP file, for PlotJuggler and Foxglove.", metavar="FILE")
+    ] = None,
+    parquet: Annotated[
+        Path | None, option("Parquet file, for pandas and the like.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Write the log of a run for other programs, with units: every step, answer and event."""
+    from undertow.runtime import read_log, to_mcap, to_parquet
+
+    wanted = [(to_mcap, mcap), (to_parquet, parquet)]
+    if mcap is None and parquet is None:
+        raise InvalidInputError(
+            "what to write of the log",
+            value="neither --mcap nor --parquet",
+            limit="one of them at least",
+            remedy="Write for instance --mcap run.mcap",
+        )
+    recording = read_log(log)
+    for write_to, path in wanted:
+        if path is not None:
+            made = write_to(recording, path)
+            size = made.stat().st_size / 1e6
+            show(f"Written to {made}: {len(recording.steps):,} steps, {size:.3g} MB")

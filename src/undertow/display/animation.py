@@ -7,6 +7,7 @@ whole motion and then only drawn.
 from __future__ import annotations
 
 import io
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
 from PIL import Image
 
 from undertow.base import manifest, positive
@@ -104,14 +106,18 @@ class Film:
         t = start + np.arange(count) * speed / fps
         x = np.stack([np.interp(t, trajectory.t, column) for column in trajectory.x.T], axis=1)
         index = np.clip(np.searchsorted(trajectory.t, t, side="right") - 1, 0, None)
-        q = x[:, : mechanism.n]
         place = evaluator(mechanism, drawn)
+        return cls._at(mechanism, drawn, place, t, x[:, : mechanism.n], trajectory.u[index], whole)
+
+    @classmethod
+    def _at(
+        cls, mechanism: Mechanism, drawn: Sketch, place: Callable[[FloatArray], Places],
+        t: FloatArray, q: FloatArray, u: FloatArray, whole: float,
+    ) -> Film:  # fmt: skip
+        """Evaluate a sketch at positions, (F, n), see :func:`evaluator`."""
         points, angles, tip = place(q)
         flat = tuple(_project(p, drawn.view) for p in points)
-        return cls(
-            mechanism, drawn, t, q, trajectory.u[index], flat, angles,
-            _project(tip, drawn.view), whole,
-        )  # fmt: skip
+        return cls(mechanism, drawn, t, q, u, flat, angles, _project(tip, drawn.view), whole)
 
     @property
     def span(self) -> str:
@@ -194,6 +200,65 @@ class Film:
         axes.axis("off")
         if words:
             axes.set_title(f"{self.mechanism.name.replace('_', ' ')}\n{self.span}")
+
+
+class Picture:
+    """A mechanism's stick figure at one instant after another, as pixels, in one window.
+
+    The window holds what turning each angle, and moving each slide along its travel, can reach;
+    it follows what leaves it.
+
+    Parameters
+    ----------
+    mechanism
+        What is drawn.
+    size
+        Width and height, pixels.
+    """
+
+    def __init__(self, mechanism: Mechanism, size: int = 360) -> None:
+        self._mechanism, self._sketch = mechanism, sketch(mechanism)
+        self._place = evaluator(mechanism, self._sketch)
+        self._window = self._film(_reach(mechanism)).window
+        self._figure = Figure(figsize=(size / 100, size / 100), dpi=100)
+        self._canvas: Any = FigureCanvasAgg(self._figure)
+        self._axes = self._figure.add_axes((0, 0, 1, 1))
+
+    def _film(self, q: FloatArray) -> Film:
+        """Return poses, (F, n), as the frames of a film."""
+        t, u = np.zeros(len(q)), np.zeros((len(q), self._mechanism.m))
+        return Film._at(self._mechanism, self._sketch, self._place, t, q, u, 0.0)
+
+    def pixels(self, q: FloatArray) -> NDArray[np.uint8]:
+        """Return the figure at positions, (n,), as red, green, blue: (height, width, 3)."""
+        film, axes = self._film(q[None]), self._axes
+        left, right, bottom, top = self._window
+        here = film.tip[0]
+        across = here[0] - np.clip(here[0], left, right)
+        along = here[1] - np.clip(here[1], bottom, top)
+        axes.clear()
+        film.draw(axes, 0, trace=False)
+        axes.set_xlim(left + across, right + across)
+        axes.set_ylim(bottom + along, top + along)
+        axes.set_aspect("equal")
+        axes.axis("off")
+        self._canvas.draw()
+        return np.array(self._canvas.buffer_rgba())[:, :, :3]
+
+
+def _reach(mechanism: Mechanism) -> FloatArray:
+    """Return poses at the edges of what a mechanism can reach, (F, n)."""
+    n, turns = mechanism.n, np.linspace(-math.pi, math.pi, 16)
+    angles = [c.unit == "rad" for c in mechanism.coordinates]
+    alone = [turns[:, None] * np.eye(n)[i] for i in range(n) if angles[i]]
+    together = turns[:, None] * np.array(angles, dtype=float)
+    ends = [
+        (0.0,) if c.unit == "rad" else (max(c.low, -1.0), 0.0, min(c.high, 1.0))
+        for c in mechanism.coordinates
+    ]
+    slides = np.array(list(itertools.product(*ends)))
+    turned = np.vstack([np.zeros((1, n)), *alone, together])
+    return np.asarray((slides[:, None] + turned[None]).reshape(-1, n))
 
 
 #: Points of the parts, (F, k, 3), angles and radii of the discs, (F, 2), and the tip, (F, 3).

@@ -1,5 +1,9 @@
-"""The inner loop in heap-free C99, from the kernel's own expressions, and what carries it on."""
+"""For other tools: heap-free C99 and what carries it on, Gymnasium's environments, python-control.
 
+The classes of Gymnasium are in :mod:`undertow.export.gym`, which is imported where it is needed.
+"""
+
+from undertow.export.balancing import BalancingTask, environment, vector_environment
 from undertow.export.carriers import carriers
 from undertow.export.controller import EmbeddedController
 from undertow.export.estimate import (
@@ -10,11 +14,19 @@ from undertow.export.estimate import (
 )
 from undertow.export.host import Agreement, Build, Footprint, HostProcess, RigRun, run_on_rig
 from undertow.export.names import PlanAnswer, Status
+from undertow.export.python_control import (
+    LoopMargins,
+    loop_margins,
+    loop_transfer,
+    nlsys,
+    phase_plane,
+)
 from undertow.export.sources import export_c, files
 from undertow.export.twin import Twin
 
 __all__ = [
     "Agreement",
+    "BalancingTask",
     "Build",
     "DerivativeStep",
     "DifferentiatorStep",
@@ -22,13 +34,20 @@ __all__ = [
     "Footprint",
     "HostProcess",
     "KalmanStep",
+    "LoopMargins",
     "PlanAnswer",
     "RigRun",
     "Status",
     "SuperTwistingStep",
     "Twin",
     "carriers",
+    "environment",
     "export_c",
     "files",
+    "loop_margins",
+    "loop_transfer",
+    "nlsys",
+    "phase_plane",
     "run_on_rig",
+    "vector_environment",
 ]

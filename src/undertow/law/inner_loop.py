@@ -110,6 +110,16 @@ class InnerLoop:
         self.parameters[:] = after  # it is singular here in any case
         return True
 
+    def feedback(self) -> FloatArray:
+        """Return k, (m, 2n), with u = k x near the target, inside the boundary layer."""
+        columns = []
+        for x in 1e-6 * np.eye(2 * self.mechanism.n):
+            self(x)
+            ahead = self.demand.copy()
+            self(-x)
+            columns.append((ahead - self.demand) / 2e-6)
+        return np.column_stack(columns)
+
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the input at the state x, (2n,): never NaN, never past the limits, (m,)."""
         self._step(x, self.lane, self._block)

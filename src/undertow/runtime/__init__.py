@@ -10,6 +10,7 @@ from undertow.runtime.controller_defaults import (
 )
 from undertow.runtime.encoding import Columns
 from undertow.runtime.log import Log, Recording, read_log
+from undertow.runtime.log_files import column_units, to_mcap, to_parquet
 from undertow.runtime.loop import Runtime
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.recipe import Recipe
@@ -57,6 +58,7 @@ __all__ = [
     "Worker",
     "about",
     "background_worker",
+    "column_units",
     "default_gate",
     "estimator_for",
     "for_rig",
@@ -69,4 +71,6 @@ __all__ = [
     "send_target",
     "session",
     "target_of_run",
+    "to_mcap",
+    "to_parquet",
 ]

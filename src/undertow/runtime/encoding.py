@@ -141,6 +141,30 @@ class Columns:
         return same and controller.memory.sequence == row[self.surface]
 
     @staticmethod
+    def quantity(name: str) -> str:
+        """Return the state or input that a column is about, its name where it is neither."""
+        return name.removesuffix(_MEASURED).removesuffix(_DEMAND)
+
+    @staticmethod
+    def groups(names: tuple[str, ...]) -> dict[str, list[str]]:
+        """Return the columns of a log but for k and t by what they are about.
+
+        ``state``, ``measured``, ``input``, ``demand``, ``surface`` and, of the loop, all others.
+        """
+        measured = [name for name in names if name.endswith(_MEASURED)]
+        demand = [name for name in names if name.endswith(_DEMAND)]
+        surface = [name for name in names if name.startswith(_SURFACE)] + ["margin", "surface"]
+        found = {
+            "state": [Columns.quantity(name) for name in measured],
+            "measured": ["rig_t", *measured],
+            "input": [Columns.quantity(name) for name in demand],
+            "demand": demand,
+            "surface": surface,
+        }
+        taken = {"k", "t"}.union(*found.values())
+        return {**found, "loop": [name for name in names if name not in taken]}
+
+    @staticmethod
     def shown(names: tuple[str, ...]) -> tuple[list[str], list[str], list[str]]:
         """Return which columns of a log are positions, inputs and surface values, by name."""
         states = [n.removesuffix(_MEASURED) for n in names if n.endswith(_MEASURED)]

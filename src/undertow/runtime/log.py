@@ -459,7 +459,7 @@ class Recording:
         return self.steps[:, self.columns.index(name)]
 
 
-def read_log(path: Path) -> Recording:
+def read_log(path: str | Path) -> Recording:
     """Read a log, of a run that ended or was killed, with its further parts.
 
     Raises
@@ -467,6 +467,7 @@ def read_log(path: Path) -> Recording:
     ArtefactError
         When it is no log, of a later version, damaged, or was killed before its first line.
     """
+    path = Path(path)
     found = _read_part(path)
     if found.meta.get("part", 1) != 1:
         value = f"part {found.meta['part']} of a log"

@@ -80,6 +80,7 @@ def about(controller: Controller, recipe: Recipe | None = None, **more: Any) -> 
         "mechanism": mechanism.name,
         "source": _source_hash(name) if in_a_file(name) else None,
         "fingerprint": mechanism.fingerprint,
+        "coordinates": {c.name: c.unit for c in mechanism.coordinates},
         "units": {i.name: i.unit for i in mechanism.inputs},
         "memory": memory_to(controller.memory),
         "recipe": None if recipe is None else recipe.as_dict(),
