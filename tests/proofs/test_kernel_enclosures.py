@@ -20,7 +20,7 @@ from undertow.models import FloatArray
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel.graph import Graph
 from undertow.proofs.kernel.model import System
-from undertow.proofs.kernel.tube import Tube
+from undertow.proofs.kernel.tube import Field, Tube
 
 #: A function of mpmath's numbers.
 Exact = Callable[..., Any]
@@ -287,11 +287,11 @@ def test_motions_in_closed_form_stay_inside(name: str, radius: float) -> None:
     """At every corner of the box of starts, after one and after ten steps."""
     rates, solution, size, width = TOYS[name]
     graph = Graph(size)
-    program = graph.program(rates(graph))
+    field = Field(graph, rates(graph))
     none = np.zeros((0, 2))
     for h, start in itertools.product((0.125, 2.0**-6, 2.0**-10), STARTS):
         middle = np.array(start[:size])
-        tube = Tube.of(program, none, np.column_stack([middle - radius, middle + radius]))
+        tube = Tube.of(field, none, np.column_stack([middle - radius, middle + radius]))
         for k in range(1, 11):
             assert tube.advance(h) is not None
             if k not in (1, 10):
@@ -320,8 +320,7 @@ def test_a_motion_that_leaves_the_domain_has_no_tube() -> None:
         x = graph.inputs[0]
         half = graph.number(Fraction(-1, 2))
         rate = graph.make("div", half, x) if falls else graph.make("sqr", x)
-        program = graph.program([rate])
-        tube = Tube.of(program, np.zeros((0, 2)), np.array([[1.0, 1.0]]))
+        tube = Tube.of(Field(graph, [rate]), np.zeros((0, 2)), np.array([[1.0, 1.0]]))
         steps = 0
         while steps < 200 and tube.advance(1 / 64) is not None:
             steps += 1
@@ -331,22 +330,27 @@ def test_a_motion_that_leaves_the_domain_has_no_tube() -> None:
 def loop_misses(
     name: str, count: int, seed: int, times: tuple[float, ...]
 ) -> tuple[int, int, list[float]]:
-    """Thin tubes of a mechanism's clipped closed loop against power series of 60 digits."""
+    """Thin tubes of a mechanism's clipped closed loop against power series of 60 digits.
+
+    In the coordinates (q, p, s); what the reference has of q and q̇ is compared with their image.
+    """
     flint = pytest.importorskip("flint", reason="the reference takes the extra undertow[certify]")
     from motions import BITS, ORDER, Reference, exact
 
     rig = ut.mechanisms.LIBRARY[name]()
     surface, reaching = ut.first_surface(rig), ut.ReachingLaw()
     model = model_of(rig)
-    own = System(model, law_of(rig, surface, reaching))
-    n = model.n
-    program = own.graph.program([*own.graph.inputs[n : 2 * n], *own.clipped()])
+    law, n = law_of(rig, surface, reaching), model.n
+    own, plain = System(model, law, momenta=True), System(model, law)
+    field, states = Field(own.graph, own.sliding()), own.graph.program(own.x)
+    coordinates = plain.graph.program(plain.momentum_and_surface())
     reference = Reference(rig, surface, reaching)
     rng = np.random.default_rng(seed)
     misses, seen, widths = 0, 0, []
     for k in range(count):
         x = rng.uniform(-1, 1, 2 * n) * np.r_[np.full(n, 0.3), np.ones(n)] * (0.02 if k % 2 else 1)
-        tube = Tube.of(program, own.fixed(), np.column_stack([x, x]))
+        tube = Tube.of(field, own.fixed(), np.column_stack([x, x]))
+        assert tube.map(coordinates)
         with flint.ctx.workprec(BITS):
             x0 = [exact(v) for v in x]
             pieces = reference.pieces(x0)
@@ -362,7 +366,7 @@ def loop_misses(
                 seen += 1
                 misses += not all(
                     exact(low) <= v <= exact(high)
-                    for v, (low, high) in zip(there, tube.hull, strict=True)
+                    for v, (low, high) in zip(there, tube.image(states), strict=True)
                 )
                 widths.append(float((tube.hull[:, 1] - tube.hull[:, 0]).max()))
     return misses, seen, widths

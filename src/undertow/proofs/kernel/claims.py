@@ -17,7 +17,8 @@ import numpy as np
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
 from undertow.proofs.kernel.graph import FloatArray, Program, Span, hull
-from undertow.proofs.kernel.model import Law, Matrix, Model, System, system
+from undertow.proofs.kernel.loop import Loop
+from undertow.proofs.kernel.model import Law, Matrix, Model, Quantity, System, system
 from undertow.proofs.kernel.reader import (
     Document,
     fields,
@@ -31,7 +32,7 @@ from undertow.proofs.kernel.reader import (
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 from undertow.proofs.kernel.words import Region, inward, limits, region, within
 
-__all__ = ["KINDS", "Claim", "Decision", "Nonsingular", "Reaching", "Stability",
+__all__ = ["KINDS", "Claim", "ClosedLoop", "Decision", "Nonsingular", "Reaching", "Stability",
            "SurfaceRegion", "TerminalEllipsoid", "check", "decide", "ellipsoid",
            "ellipsoid_program", "no_equilibrium", "read_claim"]  # fmt: skip
 
@@ -647,11 +648,101 @@ def _surface_names(model: Model) -> tuple[str, ...]:
     return (*names[m:], *(f"{k}_dot" for k in names[m:]), *(f"w_{k}" for k in names[:m]))
 
 
+# -- 5.6 ------------------------------------------------------------------------------------------
+
+#: Step of the tubes where no hint gives another, s.
+STEP = Fraction(1, 128)
+
+
+@dataclass(frozen=True)
+class ClosedLoop(Claim):
+    """Every motion from a box of starts converges, layer and clip and all."""
+
+    kind: ClassVar[str] = "closed loop"
+    keys: ClassVar[tuple[str, ...]] = ("starts", "period", "plant", "disturbance", "ball")
+    starts: Region
+    period: Fraction
+    plant: Region
+    disturbance: tuple[Fraction, ...]
+    ball: Fraction
+    terminal: TerminalEllipsoid | None = None
+    step: Fraction = STEP
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], model: Model) -> Self:
+        """Read it from an object with its keys."""
+        starts = data["starts"]
+        require(isinstance(starts, dict), "starts: an object")
+        require(starts.keys() <= {*model.states}, "starts: names of states")
+        box = {name: interval(ends) for name, ends in starts.items()}
+        bounds, period = numbers(data["disturbance"], model.n), number(data["period"])
+        ball, hint = number(data["ball"]), data.get("hint", {})
+        require(min(*bounds, period, ball) >= 0, "a period, bounds of disturbances and a ball ≥ 0")
+        require(ball == 0 or any(bounds), "a ball of 0 without a disturbance")
+        fields(hint, "hint", (), {"terminal", "step", "horizon", "boxes"})
+        step = number(hint.get("step", number_text(STEP)))
+        require(0 < step <= 1, "a step of 0 to 1 s")
+        terminal = hint.get("terminal")
+        if terminal is not None:
+            fields(terminal, "terminal", TerminalEllipsoid.keys)
+            terminal = TerminalEllipsoid.read(terminal, model)
+        plant = _read_plant(data["plant"], model)
+        return cls(box, period, plant, bounds, ball, terminal, step)
+
+    def data(self) -> dict[str, Any]:
+        """Return the object that :meth:`read` reads."""
+        hint = {"step": number_text(self.step)}
+        known = {} if self.terminal is None else {"terminal": self.terminal.data()}
+        return {
+            "starts": _box_data(self.starts), "period": number_text(self.period),
+            "plant": _box_data(self.plant), "disturbance": _texts(self.disturbance),
+            "ball": number_text(self.ball), "hint": {**hint, **known},
+        }  # fmt: skip
+
+    def sentence(self, model: Model) -> str:
+        """Return the statement in words."""
+        rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
+        own = [Quantity(p.name, p.unit) for p in model.parameters]
+        starts = region([*model.positions, *rates], self.starts).replace("for ", "with ", 1)
+        end = f"‖x‖ ≤ {inward(self.ball)}" if self.ball else "the target"
+        held = f"held for {float(self.period)!r} s" if self.period else "renewed at every instant"
+        plant = region(own, self.plant).split(", the other")[0] if self.plant else "the model"
+        loads = ", ".join(inward(v) for v in self.disturbance)
+        return (
+            f"every motion from starts {starts}, exists for ever and converges to {end}, the law "
+            f"with its layer, its input clipped to {limits(model)} and {held}, the plant {plant}, "
+            f"{f'forces up to {loads}' if any(self.disturbance) else 'no other force'}"
+        )
+
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+        """Decide the statement."""
+        if self.period or self.plant or any(self.disturbance):
+            return "undecided", "a held input, other plants and forces: not decided here", {}, {}
+        if law.switching != "saturation" or any(law.disturbance) or self.terminal is None:
+            why = "saturation, constant gains and a terminal set are needed"
+            return "undecided", why, {}, {}
+        kind, why, _, _ = self.terminal.decide(model, law, max_boxes)
+        if kind != "proved":
+            return "undecided", f"the terminal set: {why}", {}, {}
+        box = [self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states]
+        wide = [i for i, (low, high) in enumerate(box) if low < high]
+        if wide and system(model, law).odd and all(low == -high for low, high in box):
+            box[wide[0]] = Fraction(0), box[wide[0]][1]
+        loop = Loop(model, law, self.terminal.W, self.terminal.radius)
+        end = loop.arrive([hull(*ends) for ends in box], float(self.step))
+        method = "validated tubes into an ellipsoid that is proved to be a terminal set"
+        details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}
+        if not end.all:
+            witness = dict(zip(model.states, end.lost.tolist(), strict=True))
+            return "undecided", f"{method}: a tube is lost", witness, details
+        return "proved", method, {}, details
+
+
 # -- all of them ----------------------------------------------------------------------------------
 
 KINDS: Mapping[str, type[Claim]] = {
     claim.kind: claim
-    for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid, SurfaceRegion)
+    for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid, SurfaceRegion, ClosedLoop)
 }
 
 

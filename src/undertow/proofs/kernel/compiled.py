@@ -22,8 +22,8 @@ import numba
 import numpy as np
 
 __all__ = ["ABS", "ADD", "BINARY", "COS", "DIV", "EXP", "LOG", "MAX", "MIN", "MUL", "NEG", "PI",
-           "SIN", "SQR", "SQRT", "SUB", "add", "apply", "ellipsoid", "enclose", "excluded",
-           "hulled", "inverse", "jets", "mean_values", "models", "norm", "picard", "ranges",
+           "SIN", "SQR", "SQRT", "SUB", "add", "along", "apply", "ellipsoid", "enclose", "excluded",
+           "hulled", "inverse", "jets", "mean_values", "models", "norm", "ranges", "reached",
            "taylor_step", "up"]  # fmt: skip
 
 
@@ -578,21 +578,32 @@ def dominance(S):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def picard(X, rates, low, high, h, part):  # type: ignore[no-untyped-def]
-    """Whether X + [0, h] F lies in [low, high], where F is in ``rates``; if not, widen that box.
-
-    1: it does; 0: the box was widened, by ``part`` of what it takes more; −1: F is not bounded.
-    """
-    inside = 1
+def reached(X, rates, h):  # type: ignore[no-untyped-def]
+    """X + [0, h] · rates, all (N, 2)."""
+    out = np.empty_like(X)
     for i in range(len(X)):
         a, b = mul(rates[i, 0], rates[i, 1], 0.0, h)
-        a, b = add(X[i, 0], X[i, 1], a, b)
-        if not (a - a == 0.0 and b - b == 0.0):
-            return -1
-        if not (low[i] <= a and b <= high[i]):
-            inside, room = 0, part * (b - a) + 1e-300
-            low[i], high[i] = min(low[i], a - room), max(high[i], b + room)
-    return inside
+        out[i, 0], out[i, 1] = add(X[i, 0], X[i, 1], a, b)
+    return out
+
+
+@_njit
+def along(whole, centre, C, xi, Q, r, moved):  # type: ignore[no-untyped-def]
+    """Values at m + C ξ + Q r + moved (N, 1, 2), by their intervals and their mean values, (O, 2).
+
+    ``whole`` are values and derivatives over a box that holds them, (O, 1 + N, 2), ``centre``
+    values at m, (O, 2).
+    """
+    out, slope = whole[:, 0].copy(), np.ascontiguousarray(whole[:, 1:])
+    first, second = product(product(slope, points(C)), xi), product(product(slope, points(Q)), r)
+    third = product(slope, moved)
+    for o in range(len(whole)):
+        a, b = centre[o]
+        for part in (first, second, third):
+            a, b = add(a, b, part[o, 0, 0], part[o, 0, 1])
+        if a == a and out[o, 0] == out[o, 0]:
+            out[o, 0], out[o, 1] = max(a, out[o, 0]), min(b, out[o, 1])
+    return out
 
 
 @_njit

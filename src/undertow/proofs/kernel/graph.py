@@ -21,6 +21,8 @@ from undertow.proofs.kernel import compiled as ops
 
 __all__ = ["Graph", "Program", "Span", "hull"]
 
+_NOWHERE: Mapping[int, int] = {}
+
 FloatArray = NDArray[np.float64]
 Node = tuple[Any, ...]
 
@@ -239,14 +241,14 @@ class Graph:
         """Return min(max(a, −limit), limit)."""
         return self.make("min", self.make("max", a, self.make("neg", limit)), limit)
 
-    def depends(self, roots: Iterable[int]) -> list[int]:
+    def depends(self, roots: Iterable[int], sides: Mapping[int, int] = _NOWHERE) -> list[int]:
         """Return the nodes that some depend on, in order, themselves included."""
         needed, todo = set[int](), list(roots)
         while todo:
             k = todo.pop()
             if k not in needed:
                 needed.add(k)
-                todo += self._operands(k)
+                todo += [sides[k]] if k in sides else self._operands(k)
         return sorted(needed)
 
     def _operands(self, k: int) -> list[int]:
@@ -284,20 +286,22 @@ class Graph:
             raise ArithmeticError(f"{kind}: not smooth")
         return [make("mul", number(2), a) if kind == "sqr" else make("div", one, a)]
 
-    def even(self, roots: Iterable[int], variables: int) -> bool:
-        """Whether nodes are shown to stay as they are when the first inputs change their signs."""
-        parity = dict[int, int]()  # 1: even, −1: odd; absent: not known
+    def parities(self, roots: Iterable[int], variables: int) -> list[set[int]]:
+        """Which of even (0) and odd (1) in the first inputs nodes are shown to be."""
+        found = dict[int, set[int]]()
         for k in self.depends(roots):
-            kind, signs = self.nodes[k][0], {parity.get(j, 0) for j in self._operands(k)}
-            if kind in ("input", "number", "pi"):
-                parity[k] = -1 if kind == "input" and self.nodes[k][1] < variables else 1
+            kind, of = self.nodes[k][0], [found[j] for j in self._operands(k)]
+            if kind == "input":
+                found[k] = {int(self.nodes[k][1] < variables)}
             elif kind in ("mul", "div"):
-                parity[k] = math.prod(parity.get(j, 0) for j in self._operands(k))
-            elif signs == {1} or (kind in ("sqr", "cos", "abs") and signs == {-1}):
-                parity[k] = 1
-            elif signs == {-1} and kind in ("add", "sub", "neg", "sin"):
-                parity[k] = -1
-        return all(parity.get(k) == 1 for k in roots)
+                found[k] = {(i + j) % 2 for i in of[0] for j in of[1]}
+            elif kind in ("sqr", "cos", "abs"):
+                found[k] = {0} if of[0] else set()
+            elif kind in ("add", "sub", "neg", "sin"):
+                found[k] = of[0] & of[-1]
+            else:
+                found[k] = {0, 1} if self.value(k) == 0 else set.intersection({0}, *of)
+        return [found[k] for k in roots]
 
     # -- its values ------------------------------------------------------------------------------
 
@@ -332,9 +336,16 @@ class Graph:
                 raise ArithmeticError(f"a number of more than {_MOST_BITS} bits")
         return [found[k] for k in roots]
 
-    def program(self, roots: Sequence[int]) -> Program:
-        """Lower what some nodes depend on; every input stays one."""
-        needed = self.depends(roots)
+    def corners(self, roots: Iterable[int]) -> list[int]:
+        """Return the max and min that nodes depend on."""
+        return [k for k in self.depends(roots) if self.nodes[k][0] in ("max", "min")]
+
+    def program(self, roots: Sequence[int], sides: Mapping[int, int] = _NOWHERE) -> Program:
+        """Lower what some nodes depend on; every input stays one.
+
+        ``sides`` has an operand for a max or min: the one that it is known to be.
+        """
+        needed = self.depends(roots, sides)
         count = len(self.inputs)
         place = {k: int(self.nodes[k][1]) for k in self.inputs}
         constants: list[tuple[float, float]] = []
@@ -348,6 +359,9 @@ class Graph:
         for k in needed:
             node = self.nodes[k]
             if k in place:
+                continue
+            if k in sides:
+                place[k] = place[sides[k]]
                 continue
             kind, operands = str(node[0]), [place[j] for j in self._operands(k)]
             if kind in ("sin", "cos"):

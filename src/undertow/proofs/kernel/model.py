@@ -187,7 +187,8 @@ class System:
     """The plant and the law on one graph: everything that claims are about.
 
     The inputs are x = (q, q̇), then the parameters, then, where ``law`` is None, the numbers of
-    a law as :attr:`Law.numbers` gives them; else they are exact in the graph.
+    a law as :attr:`Law.numbers` gives them; else they are exact in the graph.  With ``momenta``
+    the first inputs are (q, p, s) instead, and ``x`` are nodes of them.
     """
 
     def __init__(
@@ -196,6 +197,7 @@ class System:
         law: Law | None,
         switching: str = "saturation",
         disturbance: Sequence[Fraction] = (),
+        momenta: bool = False,
     ) -> None:
         n, m = model.n, model.m
         self.model, self.law = model, law
@@ -212,6 +214,7 @@ class System:
         self.alpha_a, self.lambda_a = block(m, m), block(m, m)
         self.alpha_u, self.lambda_u = block(m, n - m), block(m, n - m)
         self.eta, self.layer = block(1, m)[0], block(1, m)[0]
+        self.x = graph.inputs[: 2 * n]
         self.M, self.f, self.B = model.lay(graph)
         self.algebra = algebra = Algebra(graph)
         M_aa, self.M_au = [r[:m] for r in self.M[:m]], [r[m:] for r in self.M[:m]]
@@ -225,6 +228,64 @@ class System:
         self.gamma_adjugate, self.gamma_determinant = algebra.adjugate(self.gamma)
         self.B_adjugate, self.B_determinant = algebra.adjugate(self.B)
         self.bounds = [graph.number(v) for v in bounds]
+        if momenta:
+            self._slide(graph.inputs)
+
+    def _slide(self, z: list[int]) -> None:
+        """Take the inputs for (q, p, s): q̇ from M_ua v_a + M_uu v_u = D p, and s."""
+        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
+        p = [graph.make("mul", d, v) for d, v in zip(self.scale, z[n : 2 * n - m], strict=True)]
+        y = algebra.solve(self.uu, self._column(p))
+        self.s = z[2 * n - m : 2 * n]
+        right = algebra.each("sub", self._column(self.s), algebra.times(self.alpha_u, y))
+        for A, q in ((self.lambda_a, z[:m]), (self.lambda_u, z[m:n])):
+            right = algebra.each("sub", right, algebra.times(A, self._column(q)))
+        v_a = algebra.times(self.gamma_adjugate, right)
+        v_a = [[graph.make("div", row[0], self.gamma_determinant)] for row in v_a]
+        v_u = algebra.each("sub", y, algebra.times(self.X, v_a))
+        self.x = [*z[:n], *(row[0] for row in (*v_a, *v_u))]
+        _, self.f, _ = self.model.lay(graph, [*self.x, *z[2 * n :]])
+
+    @cached_property
+    def scale(self) -> list[int]:
+        """D, (n − m,), near the diagonal of M_uu at the target: p is of the size of a rate."""
+        m = self.model.m
+        at = self.graph.exact([self.M[i][i] for i in range(m, self.model.n)], self.origin())
+        return [self.graph.number(Fraction(float(v.low))) for v, _ in at]
+
+    def momentum_and_surface(self) -> list[int]:
+        """Return (q, p, s) by x."""
+        n, m = self.model.n, self.model.m
+        p = [row[0] for row in self.algebra.times(self.M[m:], self._column(self.x[n:]))]
+        p = [self.graph.make("div", a, d) for a, d in zip(p, self.scale, strict=True)]
+        return [*self.x[:n], *p, *self.s]
+
+    def sliding(self) -> list[int]:
+        """Return the rates of (q, p, s) (Lemma 7), of the loop with its layer and its clip."""
+        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
+        make, zero, v = graph.make, graph.number(0), self.x[n:]
+        speeds = dict(zip(self.x[:n], v, strict=True))
+        turned = [graph.tangents(row, speeds) for row in self.M[m:]]
+        force = algebra.each(
+            "add", self._column(self.f[m:]), algebra.times(turned, self._column(v))
+        )
+        p_dot = [make("div", row[0], d) for row, d in zip(force, self.scale, strict=True)]
+        over: Nodes = []  # d − u
+        for d, limit in zip(self.loop(layer=False)[1], self.model.inputs, strict=True):
+            end = graph.number(limit.value or 0)
+            above = make("max", make("sub", d, end), zero)
+            below = make("min", make("add", d, end), zero)
+            over.append([zero if limit.value is None else make("add", above, below)])
+        lost = algebra.times(self.gamma, algebra.solve(self.ss, algebra.times(self.B, over)))
+        pairs = zip(self.push(layer=False), lost, strict=True)
+        return [*v, *p_dot, *(make("neg", make("add", a, row[0])) for a, row in pairs)]
+
+    @property
+    def odd(self) -> bool:
+        """Whether M and B are shown to be even in x, and f odd: motions come in pairs (Lemma 8)."""
+        even = [v for row in (*self.M, *self.B) for v in row]
+        shown = self.graph.parities([*even, *self.f], 2 * self.model.n)
+        return all((k >= len(even)) in parity for k, parity in enumerate(shown))
 
     @property
     def pivots(self) -> list[int]:
@@ -244,7 +305,7 @@ class System:
     def s(self) -> list[int]:
         """s, (m,)."""
         graph, n, m = self.graph, self.model.n, self.model.m
-        x = graph.inputs
+        x = self.x
         parts = (
             (self.alpha_a, x[n : n + m]), (self.lambda_a, x[:m]),
             (self.alpha_u, x[n + m : 2 * n]), (self.lambda_u, x[m:n]),
@@ -280,24 +341,26 @@ class System:
             k.append(total)
         return k
 
-    def loop(self, *, layer: bool) -> tuple[list[int], list[int]]:
-        """Return q̈ (n,) and the demand d (m,) of the loop whose input is the demand.
-
-        ``layer``: with s_i/ε_i in place of its saturation, as inside the layer.
-        """
-        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
-        make = graph.make
-        push = []
+    def push(self, *, layer: bool) -> list[int]:
+        """K σ, (m,), with s_i/ε_i in place of its saturation if ``layer``, as inside of it."""
+        graph, push = self.graph, []
         for s, e, k in zip(self.s, self.layer, self.gains, strict=True):
-            ratio = make("div", s, e)
+            ratio = graph.make("div", s, e)
             if self.switching == "tanh":
                 ratio = graph.tanh(ratio)
             elif not layer:
                 ratio = graph.clip(ratio, graph.number(1))
-            push.append(make("mul", k, ratio))
+            push.append(graph.make("mul", k, ratio))
+        return push
+
+    def loop(self, *, layer: bool) -> tuple[list[int], list[int]]:
+        """Return q̈ (n,) and the demand d (m,) of the loop whose input is the demand."""
+        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
+        make = graph.make
+        push = self.push(layer=layer)
         y = algebra.solve(self.uu, self._column(self.f[m:]))
         h = algebra.each("sub", self._column(self.f[:m]), algebra.times(self.M_au, y))
-        x = graph.inputs
+        x = self.x
         drive = algebra.times(self.alpha_u, y)
         for A, v in ((self.lambda_a, x[n : n + m]), (self.lambda_u, x[n + m : 2 * n])):
             drive = algebra.each("add", drive, algebra.times(A, self._column(v)))

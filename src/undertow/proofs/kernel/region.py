@@ -185,7 +185,7 @@ class Stage:
         self.rates = [row[0] for row in y_dot]
         nodes = [self.rate, value, *before[:1], guard, *before[1:], *self.pivots]
         self.program, self.y = graph.program(nodes), graph.program([row[0] for row in y])
-        self.even = graph.even(nodes, size)
+        self.even = all(0 in p for p in graph.parities(nodes, size))
 
     def decide(self, max_boxes: int) -> Settled:
         """Decide (1) to (3) of the statement for this function."""
