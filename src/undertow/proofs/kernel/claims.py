@@ -728,7 +728,10 @@ class ClosedLoop(Claim):
         wide = [i for i, (low, high) in enumerate(box) if low < high]
         if wide and system(model, law).odd and all(low == -high for low, high in box):
             box[wide[0]] = Fraction(0), box[wide[0]][1]
-        loop = Loop(model, law, self.terminal.W, self.terminal.radius)
+        try:
+            loop = Loop(model, law, self.terminal.W, self.terminal.radius)
+        except ArithmeticError as error:
+            return "undecided", f"at the target: {error}", {}, {}
         end = loop.arrive([hull(*ends) for ends in box], float(self.step))
         method = "validated tubes into an ellipsoid that is proved to be a terminal set"
         details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}

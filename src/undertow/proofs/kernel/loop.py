@@ -1,6 +1,6 @@
 """The closed loop from boxes of starts: tubes of (q, p, s) that end in a terminal ellipsoid.
 
-Coordinates and rates are those of Lemma 7 of ``docs/certificate-format.md``.
+Coordinates and rates are those of Lemma 8 of ``docs/certificate-format.md``.
 """
 
 from __future__ import annotations

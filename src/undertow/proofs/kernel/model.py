@@ -261,7 +261,7 @@ class System:
         return [*self.x[:n], *p, *self.s]
 
     def sliding(self) -> list[int]:
-        """Return the rates of (q, p, s) (Lemma 7), of the loop with its layer and its clip."""
+        """Return the rates of (q, p, s) (Lemma 8), of the loop with its layer and its clip."""
         graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
         make, zero, v = graph.make, graph.number(0), self.x[n:]
         speeds = dict(zip(self.x[:n], v, strict=True))
@@ -282,7 +282,7 @@ class System:
 
     @property
     def odd(self) -> bool:
-        """Whether M and B are shown to be even in x, and f odd: motions come in pairs (Lemma 8)."""
+        """Whether M and B are shown to be even in x, and f odd: motions come in pairs (Lemma 9)."""
         even = [v for row in (*self.M, *self.B) for v in row]
         shown = self.graph.parities([*even, *self.f], 2 * self.model.n)
         return all((k >= len(even)) in parity for k, parity in enumerate(shown))
@@ -375,26 +375,6 @@ class System:
         ]
         free = algebra.each("sub", y, algebra.times(self.X, w))
         return [row[0] for row in (*w, *free)], demand
-
-    def plant(self, u: Sequence[int]) -> list[int]:
-        """Return q̈ (n,) of the plant for inputs u: S q̈_a = h + B u, q̈_u = y − X q̈_a."""
-        algebra, m = self.algebra, self.model.m
-        y = algebra.solve(self.uu, self._column(self.f[m:]))
-        h = algebra.each("sub", self._column(self.f[:m]), algebra.times(self.M_au, y))
-        push = algebra.each("add", h, algebra.times(self.B, self._column(u)))
-        q_a = algebra.solve(self.ss, push)
-        q_u = algebra.each("sub", y, algebra.times(self.X, q_a))
-        return [row[0] for row in (*q_a, *q_u)]
-
-    def clipped(self) -> list[int]:
-        """Return q̈ (n,) of the closed loop with its layer and its clip, belief equal to plant."""
-        _, demand = self.loop(layer=False)
-        graph = self.graph
-        u = [
-            d if limit.value is None else graph.clip(d, graph.number(limit.value))
-            for d, limit in zip(demand, self.model.inputs, strict=True)
-        ]
-        return self.plant(u)
 
     def fixed(self, law: Law | None = None) -> FloatArray:
         """Enclosures of all inputs but x: parameters, and a law's numbers where they are inputs."""

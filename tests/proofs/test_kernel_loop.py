@@ -1,0 +1,200 @@
+"""The kernel's closed loop: coordinates, pieces and corners, and boxes of starts that converge."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+
+import undertow as ut
+from undertow.law import ReachingLaw, SlidingModeLaw
+from undertow.models import FloatArray
+from undertow.proofs.claims.appendix import CASES
+from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.kernel.claims import ClosedLoop, TerminalEllipsoid, decide, read_claim
+from undertow.proofs.kernel.graph import Graph
+from undertow.proofs.kernel.loop import Loop
+from undertow.proofs.kernel.model import System
+from undertow.proofs.kernel.reader import Refused
+from undertow.proofs.kernel.tube import Tube
+from undertow.proofs.search.terminal_ellipsoid import search_for
+
+RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
+SURFACE, LAW = CASES[3].surface, ReachingLaw()
+MODEL, NUMBERS = model_of(RIG), law_of(RIG, SURFACE, LAW)
+STEERED = SlidingModeLaw(RIG, SURFACE, LAW)
+
+
+def terminal() -> TerminalEllipsoid:
+    search = search_for(RIG, SURFACE, LAW)
+    assert search is not None
+    found = search.around([-0.0117, 0.0071, 0.053, -0.0265])
+    assert found is not None
+    W = tuple(tuple(Fraction(float(v)) for v in row) for row in found.W)
+    return TerminalEllipsoid(W, Fraction(float(found.radius)))
+
+
+def claim(**starts: float) -> ClosedLoop:
+    box = {name: (-Fraction(v), Fraction(v)) for name, v in starts.items()}
+    return ClosedLoop(box, Fraction(0), {}, (Fraction(0),) * 2, Fraction(0), terminal())
+
+
+def test_derivatives_along_a_motion_are_those_of_the_functions() -> None:
+    graph = Graph(2)
+    a, b = graph.inputs
+    make = graph.make
+    one = make("add", make("sqr", make("sin", make("mul", a, b))), graph.number(2))
+    root = make("sqrt", one)
+    ratio = make("div", make("exp", make("neg", make("cos", a))), make("log", one))
+    speeds = {a: graph.number(Fraction(1, 2)), b: graph.number(-3)}
+    found = graph.program(graph.tangents([root, ratio], speeds))(*[np.array([0.3, 0.7])] * 2)[:, 0]
+
+    def values(t: object) -> list[object]:
+        x, y = 0.3 + t / 2, 0.7 - 3 * t  # type: ignore[operator]
+        two = mpmath.sin(x * y) ** 2 + 2
+        return [mpmath.sqrt(two), mpmath.exp(-mpmath.cos(x)) / mpmath.log(two)]
+
+    with mpmath.workdps(30):
+        for k, (low, high) in enumerate(found):
+            exact = mpmath.diff(lambda t, k=k: values(t)[k], 0)
+            assert low <= exact <= high
+            assert high - low < 1e-12
+    with pytest.raises(ArithmeticError, match="max: not smooth"):
+        graph.tangents([make("max", a, b)], speeds)
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", "double_pendulum_on_a_cart", "tora"])
+def test_the_coordinates_carry_the_plants_own_motion(name: str) -> None:
+    """d/dt of (q, p, s) along the mechanism's motion under the clipped law, by differences."""
+    rig = ut.mechanisms.LIBRARY[name]()
+    surface, n = ut.first_surface(rig), rig.n
+    model, law = model_of(rig), law_of(rig, surface, LAW)
+    own, plain = System(model, law, momenta=True), System(model, law)
+    rates, back = own.graph.program(own.sliding()), own.graph.program(own.x)
+    there = plain.graph.program(plain.momentum_and_surface())
+    fixed = own.fixed().mean(axis=1)
+
+    def at(program: object, x: FloatArray) -> FloatArray:
+        point = np.r_[x, fixed]
+        return np.asarray(program(point, point)[:, 0].mean(axis=1))  # type: ignore[operator]
+
+    rng, clipped = np.random.default_rng(0), 0
+    for _ in range(30):
+        x = rng.uniform(-1, 1, 2 * n) * np.repeat([0.4, 20.0], n)
+        u = SlidingModeLaw(rig, surface, LAW)(0.0, x)
+        clipped += bool((np.abs(u.demand) > rig.input_limits).any())
+        x_dot, h = np.r_[x[n:], rig.accelerations(0.0, x, u.u)], 1e-6
+        z = at(there, x)
+        assert at(back, z) == pytest.approx(x, rel=1e-9, abs=1e-9)
+        slope = (at(there, x + h * x_dot) - at(there, x - h * x_dot)) / (2 * h)
+        assert at(rates, z) == pytest.approx(slope, rel=1e-4, abs=1e-4)
+    assert clipped > 0
+
+
+def rk4(x: FloatArray, duration: float, h: float, law: SlidingModeLaw = STEERED) -> FloatArray:
+
+    def f(x: FloatArray) -> FloatArray:
+        return np.hstack([x[:, 2:], RIG.accelerations(0.0, x, law(0.0, x).u)])
+
+    for _ in range(round(duration / h)):
+        a = f(x)
+        b = f(x + h / 2 * a)
+        c = f(x + h / 2 * b)
+        x = x + h / 6 * (a + 2 * b + 2 * c + f(x + h * c))
+    return x
+
+
+def test_tubes_hold_motions_across_the_clip_and_the_layer() -> None:
+    """Case 2 from 40.5°: 15 V are met and left, and the edge of the layer is passed."""
+    law, numbers = SlidingModeLaw(RIG, CASES[1].surface, LAW), law_of(RIG, CASES[1].surface, LAW)
+    loop, wide = Loop(MODEL, numbers, ((Fraction(0),) * 4,) * 4, Fraction(1)), 2.0**-13
+    own = System(MODEL, numbers, momenta=True)
+    states = own.graph.program(own.x)
+    first = math.radians(40.5)
+    box = np.array([[0.0, 0.0], [first, first + wide], [0.0, 0.0], [0.0, 0.0]])
+    tube = Tube.of(loop.field, loop.fixed, box)
+    assert tube.map(loop.coordinates)
+    x = np.zeros((5, 4))
+    x[:, 1] = np.linspace(first, first + wide, 5)
+    met = set[tuple[bool, bool]]()
+    assert tube.hull[3, 0] > 0.1
+    for _ in range(100):
+        assert tube.advance(1 / 128) is not None
+        x = rk4(x, 1 / 128, 1 / 2560, law)
+        low, high = tube.image(states).T
+        assert (x >= low - 1e-5).all()
+        assert (x <= high + 1e-5).all()
+        assert (high - low).max() < 0.3
+        clipped, inside = np.abs(law(0.0, x).demand) > 15, np.abs(tube.hull[3]) < 0.1
+        met.add((bool(clipped.all()), bool(inside.all())))
+    assert met >= {(True, False), (False, False), (False, True)}
+
+
+def test_a_line_of_starts_converges_and_the_sentence_says_what() -> None:
+    found = decide(MODEL, NUMBERS, claim(phi=0.01))
+    assert found.kind == "proved", found.why
+    for words in (
+        "every motion from starts with |phi| ≤ 0.01 rad, the other coordinates at the target",
+        "its input clipped to |voltage| ≤ 15.0 V and renewed at every instant",
+        "the plant the model, no other force",
+    ):
+        assert words in found.sentence
+
+
+def test_starts_of_full_dimension_converge() -> None:
+    """A box of states, all four off the target, is one tube."""
+    loop = Loop(MODEL, NUMBERS, terminal().W, terminal().radius)
+    box = np.array([[0.02, 0.021], [0.1, 0.1005], [-0.1, -0.099], [0.05, 0.051]])
+    steps, there = loop.follow(box, 1 / 128)
+    assert there
+    assert 50 < steps < 500
+
+
+def test_what_is_false_or_not_decided_is_not_proved() -> None:
+    """45.5° falls in simulation; a larger ellipsoid is no terminal set; T > 0 is not decided."""
+    last = rk4(np.array([[0.0, math.radians(45.5), 0.0, 0.0]]), 1.0, 2e-3)
+    assert not abs(last[0, 1]) < 0.5
+    loop = Loop(MODEL, NUMBERS, terminal().W, terminal().radius)
+    end = math.radians(45.5)
+    assert not loop.follow(np.array([[0.0, 0.0], [end, end], [0.0, 0.0], [0.0, 0.0]]), 1 / 128)[1]
+    good = claim(phi=0.01)
+    assert good.terminal is not None
+    grown = replace(good, terminal=replace(good.terminal, radius=100 * good.terminal.radius))
+    for bad, why in (
+        (grown, "terminal set"),
+        (replace(good, terminal=None), "a terminal set are needed"),
+        (replace(good, period=Fraction(1, 1000)), "held"),
+        (replace(good, plant={"m": (Fraction(0), Fraction(1))}), "plants"),
+        (replace(good, disturbance=(Fraction(1), Fraction(0))), "forces"),
+    ):
+        found = decide(MODEL, NUMBERS, bad)
+        assert found.kind == "undecided"
+        assert why in found.why
+
+
+def test_a_claim_is_written_and_read_again() -> None:
+    own = claim(phi=0.01, phi_dot=0.02)
+    data = {"kind": own.kind, **own.data()}
+    assert read_claim(data, MODEL) == own
+    for key, value in (
+        ("starts", {"psi": ["0", "1"]}),
+        ("plant", {"m": ["0", "1/1000"]}),
+        ("ball", "1"),
+        ("hint", {"step": "0"}),
+    ):
+        with pytest.raises(Refused):
+            read_claim({**data, key: value}, MODEL)
+
+
+def test_an_odd_loop_is_known_by_its_nodes() -> None:
+    """Of the library, the pendulums and cranes around an upright or hanging rest are odd."""
+    assert System(MODEL, NUMBERS).odd
+    for node, wrong in ((("number", Fraction(1)), False), (("position", 1), True)):
+        k = len(MODEL.nodes)
+        nodes = (*MODEL.nodes, node, ("add", MODEL.f[1], k))
+        changed = replace(MODEL, nodes=nodes, f=(MODEL.f[0], k + 1))
+        assert System(changed, NUMBERS).odd is wrong
