@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import mpmath
 import numpy as np
@@ -15,14 +16,21 @@ from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.kernel.claims import ClosedLoop, TerminalEllipsoid, decide, read_claim
+from undertow.proofs.kernel.claims import (
+    ClosedLoop,
+    TerminalEllipsoid,
+    check,
+    decide,
+    read_claim,
+)
 from undertow.proofs.kernel.graph import Graph
 from undertow.proofs.kernel.loop import Loop
 from undertow.proofs.kernel.model import System
-from undertow.proofs.kernel.reader import Refused
+from undertow.proofs.kernel.reader import Refused, read
 from undertow.proofs.kernel.tube import Tube
 from undertow.proofs.search.terminal_ellipsoid import search_for
 
+ROOT = Path(__file__).parents[2]
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
 SURFACE, LAW = CASES[3].surface, ReachingLaw()
 MODEL, NUMBERS = model_of(RIG), law_of(RIG, SURFACE, LAW)
@@ -51,7 +59,8 @@ def test_derivatives_along_a_motion_are_those_of_the_functions() -> None:
     root = make("sqrt", one)
     ratio = make("div", make("exp", make("neg", make("cos", a))), make("log", one))
     speeds = {a: graph.number(Fraction(1, 2)), b: graph.number(-3)}
-    found = graph.program(graph.tangents([root, ratio], speeds))(*[np.array([0.3, 0.7])] * 2)[:, 0]
+    at = np.array([0.3, 0.7])
+    found = graph.program(graph.tangents([root, ratio], speeds))(at, at)[:, 0]
 
     def values(t: object) -> list[object]:
         x, y = 0.3 + t / 2, 0.7 - 3 * t  # type: ignore[operator]
@@ -198,3 +207,11 @@ def test_an_odd_loop_is_known_by_its_nodes() -> None:
         nodes = (*MODEL.nodes, node, ("add", MODEL.f[1], k))
         changed = replace(MODEL, nodes=nodes, f=(MODEL.f[0], k + 1))
         assert System(changed, NUMBERS).odd is wrong
+
+
+@pytest.mark.slow  # a minute of one core
+def test_the_kept_line_of_starts_is_proved_from_its_file() -> None:
+    content = (ROOT / "tests/data/closed_loop_v2.json").read_bytes()
+    ((_, _, found),) = check(read(content))
+    assert found.kind == "proved", found.why
+    assert "|phi| ≤ 0.682947 rad" in found.sentence
