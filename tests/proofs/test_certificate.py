@@ -34,6 +34,7 @@ from undertow.proofs.claims.certificate import (
     read_certificate,
 )
 from undertow.proofs.claims.closed_loop import LoopClaim, ProvedStarts
+from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.claims.nonsingular import nonsingular
 from undertow.proofs.claims.reaching import reaching
 from undertow.proofs.claims.region import reaches, verify_region
@@ -371,16 +372,17 @@ def test_proved_sets_are_of_one_mechanism(written: bytes) -> None:
 
 
 def test_a_claim_of_a_held_input_is_no_set_of_the_continuous_loop(written: bytes) -> None:
-    terminal = {"scale": (0.01 * np.eye(3)).tolist(), "widths": [0.01]}
-    data = {"coordinate": "phi", "edges": [0.0, 0.1], "terminal": terminal, "step": 1e-3}
+    starts: dict[str, Any] = {"starts": {"phi": ["-1/10", "1/10"]}, "plant": {}, "ball": "0"}
     item = verify(Certificate.from_bytes(edited(written, only("stability"))), RIG)[0]
-    for hold, count in ((0, 1), (1, 0)):
-        claim = StatedClaim("closed loop", data | {"horizon": 1.0, "hold": hold}, item.verdict)
+    for period, force, count in (("0", "0", 1), ("1/1000", "0", 0), ("0", "1", 0)):
+        data = starts | {"period": period, "disturbance": [force, "0"]}
+        claim = StatedClaim("closed loop", data, item.verdict)
         assert len(proved_sets(RIG, [replace(item, claim=claim)])) == count
 
 
 def test_starts_at_rest_are_a_set() -> None:
-    starts = ProvedStarts(SURFACE, ut.ReachingLaw(), 1, 0.3)
+    box = np.array([[0.0, 0.0], [-0.3, 0.3], [0.0, 0.0], [0.0, 0.0]])
+    starts = ProvedStarts(SURFACE, ut.ReachingLaw(), box)
     assert starts.contains(RIG.state(phi=-0.3))
     assert not starts.contains(RIG.state(phi=0.31))
     assert not starts.contains(RIG.state(phi=0.1, phi_dot=1e-9))
@@ -557,7 +559,10 @@ def test_a_model_with_a_kink_is_refused_by_every_claim(name: str) -> None:
     model = kinked(KINKS[name])
     law = ut.ReachingLaw()
     ellipsoid = TerminalEllipsoid(np.eye(4), np.eye(4), 0.01)
-    loop = LoopClaim("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
+    draft = LoopDraft("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0, hold=1)
+    loop = LoopClaim(
+        {"starts": {}, "period": "0", "plant": {}, "disturbance": ["0"] * 2, "ball": "0"}
+    )
     box = {"phi": (-0.1, 0.1)}
     for decide in (
         lambda: hurwitz(model, SURFACE),
@@ -565,6 +570,7 @@ def test_a_model_with_a_kink_is_refused_by_every_claim(name: str) -> None:
         lambda: reaching(model, SURFACE, box),
         lambda: verify_region(SurfaceMotion(model, SURFACE), quadratic(np.eye(3), 0.01)),
         lambda: ellipsoid.decide(model, SURFACE, law),
+        lambda: draft.decide(model, SURFACE, law),
         lambda: loop.decide(model, SURFACE, law),
         lambda: certify_surface(model, SURFACE, np.zeros(4), seconds=0.0, predict=False),
     ):
@@ -609,11 +615,11 @@ def test_an_equilibrium_that_is_off_is_not_rounded_home(shift: float) -> None:
 
 def test_a_hold_that_is_no_whole_number_is_refused() -> None:
     """0.9 steps were taken for none."""
-    claim = LoopClaim("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
+    claim = LoopDraft("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
     for hold in (0.9, 1.0, "1", True, None):
         with pytest.raises(InvalidInputError, match="hold"):
-            LoopClaim.from_dict(claim.to_dict() | {"hold": hold})
-    assert LoopClaim.from_dict(claim.to_dict() | {"hold": 2}).hold == 2
+            LoopDraft.from_dict(claim.to_dict() | {"hold": hold})
+    assert LoopDraft.from_dict(claim.to_dict() | {"hold": 2}).hold == 2
 
 
 def test_reaching_names_its_region_and_ends_at_the_singularity() -> None:

@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from undertow.base import InvalidInputError
 from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs.claims.appendix import CASES
+from undertow.proofs.claims.certificate import Certificate
+from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.verify import proved_sets, verify
 from undertow.proofs.kernel.claims import (
     ClosedLoop,
     TerminalEllipsoid,
@@ -28,7 +32,9 @@ from undertow.proofs.kernel.loop import Loop
 from undertow.proofs.kernel.model import System
 from undertow.proofs.kernel.reader import Refused, read
 from undertow.proofs.kernel.tube import Tube
+from undertow.proofs.search.closed_loop import prove_loop
 from undertow.proofs.search.terminal_ellipsoid import search_for
+from undertow.studies.certification import loop_figure
 
 ROOT = Path(__file__).parents[2]
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
@@ -154,6 +160,51 @@ def test_a_line_of_starts_converges_and_the_sentence_says_what() -> None:
         assert words in found.sentence
 
 
+def test_cuts_say_where_tubes_begin_and_decide_nothing() -> None:
+    """Points outside of the starts, or twice, cut nothing; what is cut is all followed."""
+    whole = claim(phi=0.01)
+    cut = replace(whole, cuts={"phi": tuple(Fraction(k, 1000) for k in (7, 3, 3, -5, 20))})
+    one, three = decide(MODEL, NUMBERS, whole), decide(MODEL, NUMBERS, cut)
+    assert one.kind == three.kind == "proved"
+    assert one.sentence == three.sentence
+    assert three.details["tubes"] == 3 > one.details["tubes"]
+    far = replace(cut, starts={"phi": (Fraction(-4, 5), Fraction(4, 5))})
+    assert decide(MODEL, NUMBERS, far).kind == "undecided"  # 45.8° falls
+
+
+def test_a_proved_line_is_found_written_gated_and_drawn() -> None:
+    """The search cuts it for the kernel; the gate's set is it, and a picture shows it."""
+    found = prove_loop(RIG, SURFACE, LAW, coordinate="phi", reach=0.05)
+    assert found.verdict, found.verdict
+    assert found.verdict.margin == 0.05
+    starts = found.claim.proved_set(RIG, SURFACE, LAW)
+    assert starts is not None
+    assert starts.contains(RIG.state(phi=-0.0499))
+    assert not starts.contains(RIG.state(phi=0.0501))
+    content = document_bytes(RIG, [(SURFACE, LAW, [found.claim.stated(RIG, found.verdict)])], {})
+    again = verify(Certificate.from_bytes(content), RIG)
+    assert [item.verdict.claim for item in again] == [found.verdict.claim]
+    assert proved_sets(RIG, again)[0].contains(RIG.state(phi=0.0499))
+    figure = loop_figure(RIG, SURFACE, LAW, found.claim, "case 4")
+    left, right = figure.axes
+    assert left.get_ylabel() == "φ (°)"
+    assert len(left.lines) > 10
+    assert right.patches
+    for words, name, reach in (("coordinate", "psi", 0.05), ("reach", "phi", math.nan)):
+        with pytest.raises(InvalidInputError, match=words):
+            prove_loop(RIG, SURFACE, LAW, coordinate=name, reach=reach)
+
+
+@pytest.mark.slow
+def test_another_mechanism_is_proved_by_the_same_code() -> None:
+    """A cart pendulum, from its own expressions, with the surface found for it."""
+    cart = ut.mechanisms.cart_pendulum()
+    name = cart.coordinates[1].name
+    found = prove_loop(cart, ut.first_surface(cart), LAW, coordinate=name, reach=0.4)
+    assert found.verdict, found.verdict
+    assert found.verdict.margin > 0.1
+
+
 def test_starts_of_full_dimension_converge() -> None:
     """A box of states, all four off the target, is one tube."""
     loop = Loop(MODEL, NUMBERS, terminal().W, terminal().radius)
@@ -186,7 +237,7 @@ def test_what_is_false_or_not_decided_is_not_proved() -> None:
 
 
 def test_a_claim_is_written_and_read_again() -> None:
-    own = claim(phi=0.01, phi_dot=0.02)
+    own = replace(claim(phi=0.01, phi_dot=0.02), cuts={"phi": (Fraction(1, 200),)})
     data = {"kind": own.kind, **own.data()}
     assert read_claim(data, MODEL) == own
     for key, value in (
@@ -194,6 +245,8 @@ def test_a_claim_is_written_and_read_again() -> None:
         ("plant", {"m": ["0", "1/1000"]}),
         ("ball", "1"),
         ("hint", {"step": "0"}),
+        ("hint", {"boxes": {"theta": ["0"]}}),
+        ("hint", {"boxes": {"phi": ["0"] * 20_000}}),
     ):
         with pytest.raises(Refused):
             read_claim({**data, key: value}, MODEL)

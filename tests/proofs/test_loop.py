@@ -17,7 +17,7 @@ from undertow.law import ReachingLaw, SlidingModeLaw, Surface
 from undertow.models import FloatArray
 from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.claims.certificate import read_certificate
-from undertow.proofs.claims.closed_loop import LoopClaim
+from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.run import run_tubes, start_tubes
 from undertow.proofs.closed_loop.sampled_data import SampledDataLoop
@@ -30,8 +30,7 @@ from undertow.proofs.sampled import (
     sampled_extent,
     sampled_region,
 )
-from undertow.proofs.search.closed_loop import follow, prove_loop
-from undertow.studies.certification import loop_figure
+from undertow.proofs.search.loop_draft import draft_loop, follow
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
 LAW = ReachingLaw()
@@ -125,9 +124,9 @@ def test_brackets_hold_their_ends() -> None:
 
 
 @pytest.fixture(scope="module")
-def claim() -> LoopClaim:
+def claim() -> LoopDraft:
     """Starts up to 0.9°, twice the layer: cheap."""
-    return LoopClaim(
+    return LoopDraft(
         "phi", tuple(np.radians(np.linspace(0, 0.9, 13)).tolist()), TERMINAL, 0.001, 0.8
     )
 
@@ -160,15 +159,15 @@ def test_a_terminal_set_grown_is_refused_with_a_witness() -> None:
     assert grows or np.abs(u).max() > 15
 
 
-def test_a_claim_is_verified_from_its_numbers_alone(claim: LoopClaim) -> None:
-    again = LoopClaim.from_dict(json.loads(json.dumps(claim.to_dict())))
-    verdict = again.decide(RIG, SURFACE, LAW)
-    assert verdict, verdict
-    assert verdict.margin == claim.extent
+def test_what_the_kernel_decides_is_no_draft(claim: LoopDraft) -> None:
+    with pytest.raises(InvalidInputError, match="what the kernel leaves"):
+        LoopDraft.from_dict(json.loads(json.dumps(claim.to_dict())))
+    with pytest.raises(InvalidInputError, match="prove_loop"):
+        draft_loop(RIG, SURFACE, LAW, coordinate="phi", reach=0.1)
 
 
 @pytest.mark.slow
-def test_what_does_not_follow_is_not_proved(claim: LoopClaim) -> None:
+def test_what_does_not_follow_is_not_proved(claim: LoopDraft) -> None:
     """Too short a horizon, a start beyond the singularity, another gain, a grown set."""
     assert not replace(claim, horizon=0.01).decide(RIG, SURFACE, LAW)
     beyond = replace(claim, edges=(0.0, 1.2))
@@ -181,13 +180,13 @@ def test_what_does_not_follow_is_not_proved(claim: LoopClaim) -> None:
     assert not claim.decide(weak, SURFACE, LAW)
 
 
-def test_an_unstable_or_ill_formed_claim_is_refused(claim: LoopClaim) -> None:
+def test_an_unstable_or_ill_formed_claim_is_refused(claim: LoopDraft) -> None:
     unstable = Surface(-1, -1.59, 0.5, 12.1)
     assert not claim.decide(RIG, unstable, LAW)
     with pytest.raises(InvalidInputError, match="all sets move at once"):
         replace(claim, edges=tuple(np.linspace(0.0, 0.5, 30_000)))
     with pytest.raises(InvalidInputError, match="rising from 0"):
-        LoopClaim("phi", (0.1, 0.2), TERMINAL, 0.001, 1.0)
+        LoopDraft("phi", (0.1, 0.2), TERMINAL, 0.001, 1.0)
     with pytest.raises(InvalidInputError, match="coordinate"):
         replace(claim, coordinate="psi").decide(RIG, SURFACE, LAW)
     with pytest.raises(InvalidInputError, match="singular"):
@@ -292,7 +291,7 @@ def test_a_terminal_set_of_the_sampled_loop() -> None:
 
 
 @pytest.mark.slow
-def test_a_hold_that_is_too_long_is_not_proved(claim: LoopClaim) -> None:
+def test_a_hold_that_is_too_long_is_not_proved(claim: LoopDraft) -> None:
     """At 20 ms the law is past its stable period 2 ε/η = 10 ms: simulation rings, no proof."""
     loop = ut.ClosedLoop(RIG, ut.MinimumEnergy(), LAW, zoh_steps=1)
     assert loop.batch(RIG.state(phi=0.01), SURFACE).reached
@@ -310,10 +309,10 @@ def test_a_hold_that_is_too_long_is_not_proved(claim: LoopClaim) -> None:
 
 
 @pytest.mark.slow
-def test_a_held_claim_is_verified_from_its_numbers_alone(claim: LoopClaim) -> None:
+def test_a_held_claim_is_verified_from_its_numbers_alone(claim: LoopDraft) -> None:
     """0.45° at 1 kHz; the same in a plant whose mass is off by up to 5 %, held or not."""
     near = replace(claim, edges=claim.edges[:7], terminal=THICK, hold=1)
-    again = LoopClaim.from_dict(json.loads(json.dumps(near.to_dict())))
+    again = LoopDraft.from_dict(json.loads(json.dumps(near.to_dict())))
     verdict = again.decide(RIG, SURFACE, LAW)
     assert verdict, verdict
     assert "held for 0.001 s" in verdict.claim
@@ -327,7 +326,7 @@ BLUNT = TerminalSet(
 
 
 @pytest.mark.slow
-def test_a_plant_in_a_box_is_proved_and_a_larger_box_is_not(claim: LoopClaim) -> None:
+def test_a_plant_in_a_box_is_proved_and_a_larger_box_is_not(claim: LoopDraft) -> None:
     """The mass within 5 %: a terminal set, and tubes that end in it.  Within 40 %: none."""
     near = replace(claim, edges=claim.edges[:7], terminal=BLUNT, uncertain=BOX)
     verdict = near.decide(RIG, SURFACE, LAW)
@@ -390,54 +389,19 @@ def test_sampled_starts_converge_or_are_refuted_with_a_witness() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "degrees"),
-    [
-        ("1", 35.7),
-        ("2", 39.8),
-        ("3", 26.9),
-        ("4", 39.1),
-        ("5", 28.5),
-        ("4 held", 30.6),
-        ("4 mass", 5.0),
-    ],
-)
+@pytest.mark.parametrize(("name", "degrees"), [("4 held", 30.6), ("4 mass", 5.0), ("5 held", 19.7)])
 def test_the_appendix_cases_are_proved_this_far(name: str, degrees: float) -> None:
-    """Kept claims, decided afresh: over 60 % of the simulated limits, once at 1 kHz.
-
-    And, much less, for every plant with a mass within 5 %.
-    """
+    """Kept claims, decided afresh: at 1 kHz; much less for every plant with a mass within 5 %."""
     certificate = read_certificate(Path(__file__).parents[1] / "data" / "loops.json")
-    subject = certificate.subjects[int(name[0]) - 1]
+    subject = certificate.subjects[int(name[0]) - 4]
     assert subject.surface == CASES[int(name[0]) - 1].surface
     assert subject.reaching == LAW
-    claims = [LoopClaim.from_dict(stated.data) for stated in subject.claims]
+    claims = [LoopDraft.from_dict(stated.data) for stated in subject.claims]
     kind = (int("held" in name), BOX if "mass" in name else {})
     (kept,) = (claim for claim in claims if (claim.hold, dict(claim.uncertain)) == kind)
     verdict = kept.decide(RIG, subject.surface, LAW)
     assert verdict, verdict
     assert np.degrees(verdict.margin) >= degrees
-
-
-@pytest.mark.slow
-def test_a_proved_region_is_found_and_no_motion_from_it_escapes() -> None:
-    found = prove_loop(RIG, SURFACE, LAW, coordinate="phi", reach=np.radians(30))
-    assert found.verdict, found.verdict
-    assert found.claim.extent >= np.radians(26.7)
-    loop = ut.ClosedLoop(RIG, ut.MinimumEnergy(), LAW, tail_rtol=1e-3)
-    starts = box_starts(RIG, phi=(-found.claim.extent, found.claim.extent))
-    assert sampled_region(loop, SURFACE, starts, trials=100_000).kind == "sampled"
-
-
-@pytest.mark.slow
-def test_another_mechanism_is_proved_by_the_same_code() -> None:
-    """A cart pendulum, from its own expressions, with the surface found for it."""
-    cart = ut.mechanisms.cart_pendulum()
-    surface = ut.first_surface(cart)
-    name = cart.coordinates[1].name
-    found = prove_loop(cart, surface, LAW, coordinate=name, reach=0.4, duration=4.0)
-    assert found.verdict, found.verdict
-    assert found.claim.extent > 0.1
 
 
 @pytest.mark.parametrize(
@@ -454,12 +418,3 @@ def test_options_of_the_loops_proof_are_checked_before_work(words: list[str], wh
     answer = CliRunner().invoke(app, ["certify", "rotary_pendulum", *words])
     assert answer.exit_code == 2
     assert what in answer.output
-
-
-def test_the_loops_figure_is_drawn(claim: LoopClaim) -> None:
-    """Starts that are proved, motions from beyond, the terminal set."""
-    figure = loop_figure(RIG, SURFACE, LAW, claim, "case 4")
-    left, right = figure.axes
-    assert left.get_ylabel() == "φ (°)"
-    assert len(left.lines) > 10
-    assert right.patches

@@ -41,8 +41,8 @@ from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
 from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _on_axis, grow
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
-from undertow.proofs.search.closed_loop import _boxes, _terminal, follow
 from undertow.proofs.search.linear_program import minimise_linear
+from undertow.proofs.search.loop_draft import _boxes, _terminal, follow
 from undertow.proofs.search.quadratic import quadratic
 from undertow.proofs.search.region import LEAP, TIGHT, _proved_chain, _tight_level
 from vector_field import VectorField

@@ -140,13 +140,14 @@ def test_a_region_for_every_plant_of_a_box() -> None:
 def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     """The claim of the full loop joins the others; what is sampled is a remark."""
     rig = ut.mechanisms.rotary_pendulum(d_e=0.073)
-    kept = read_certificate(Path(__file__).parents[1] / "data" / "loops.json").subjects[3]
-    claim = LoopClaim.from_dict(kept.claims[0].data)
+    kept = read_certificate(Path(__file__).parents[1] / "data" / "closed_loop_v2.json")
+    stated = kept.subjects[0].claims[0]
+    claim, sound = LoopClaim.from_dict(stated.data), Verdict("starts", "proved", 0.68, "rad")
     reaches: list[float] = []
 
     def prove(asked: decide._Decisions, hold: int) -> tuple[LoopClaim, Verdict]:
         reaches.append(np.degrees(asked.start[1]))
-        return claim, kept.claims[0].verdict
+        return claim, sound
 
     monkeypatch.setattr(decide._Decisions, "loop", prove)
     monkeypatch.setattr(decide, "CASES", CASES[3:4])

@@ -117,7 +117,7 @@ class TerminalEllipsoid(Claim):
         claim = self.sentence(mechanism)
         return Verdict(claim, cast(Kind, found.kind), margin, "", found.witness, found.why, details)
 
-    def stated(self, mechanism: Mechanism, verdict: Verdict | None) -> kernel.Claim:
+    def stated(self, mechanism: Mechanism, verdict: Verdict | None) -> kernel.TerminalEllipsoid:
         """Return it as the kernel decides it; U is a guess of the search, and not needed."""
         W = tuple(tuple(Fraction(float(v)) for v in row) for row in self.W)
         return kernel.TerminalEllipsoid(W, Fraction(self.radius))

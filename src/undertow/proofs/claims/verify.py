@@ -23,6 +23,7 @@ from undertow.proofs.claims.certificate import Certificate, StatedClaim, Subject
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.document import decide_document, match_document
+from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.claims.nonsingular import NonsingularClaim
 from undertow.proofs.claims.reaching import ReachingClaim
 from undertow.proofs.claims.region import RegionClaim
@@ -42,6 +43,7 @@ CLAIMS: Mapping[str, type[Claim]] = {
         RegionClaim,
         TerminalEllipsoid,
         LoopClaim,
+        LoopDraft,
         AppendixClaim,
     )
 }

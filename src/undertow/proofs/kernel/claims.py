@@ -5,6 +5,7 @@ Statements and lemmas are those of ``docs/certificate-format.md``, section 5, un
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -666,6 +667,7 @@ class ClosedLoop(Claim):
     disturbance: tuple[Fraction, ...]
     ball: Fraction
     terminal: TerminalEllipsoid | None = None
+    cuts: Mapping[str, tuple[Fraction, ...]] = field(default_factory=dict)
     step: Fraction = STEP
 
     @classmethod
@@ -679,7 +681,12 @@ class ClosedLoop(Claim):
         ball, hint = number(data["ball"]), data.get("hint", {})
         require(min(*bounds, period, ball) >= 0, "a period, bounds of disturbances and a ball ≥ 0")
         require(ball == 0 or any(bounds), "a ball of 0 without a disturbance")
-        fields(hint, "hint", (), {"terminal", "step", "horizon", "boxes"})
+        fields(hint, "hint", (), {"terminal", "step", "boxes"})
+        cuts = hint.get("boxes", {})
+        require(isinstance(cuts, dict) and cuts.keys() <= box.keys(), "boxes: states of the starts")
+        require(all(isinstance(v, list) for v in cuts.values()), "boxes: lists")
+        cuts = {name: numbers(v, len(v)) for name, v in cuts.items()}
+        require(math.prod(1 + len(v) for v in cuts.values()) <= 20_000, "at most 20000 boxes")
         step = number(hint.get("step", number_text(STEP)))
         require(0 < step <= 1, "a step of 0 to 1 s")
         terminal = hint.get("terminal")
@@ -687,12 +694,13 @@ class ClosedLoop(Claim):
             fields(terminal, "terminal", TerminalEllipsoid.keys)
             terminal = TerminalEllipsoid.read(terminal, model)
         plant = _read_plant(data["plant"], model)
-        return cls(box, period, plant, bounds, ball, terminal, step)
+        return cls(box, period, plant, bounds, ball, terminal, cuts, step)
 
     def data(self) -> dict[str, Any]:
         """Return the object that :meth:`read` reads."""
         hint = {"step": number_text(self.step)}
         known = {} if self.terminal is None else {"terminal": self.terminal.data()}
+        known |= {"boxes": {k: _texts(v) for k, v in self.cuts.items()}} if self.cuts else {}
         return {
             "starts": _box_data(self.starts), "period": number_text(self.period),
             "plant": _box_data(self.plant), "disturbance": _texts(self.disturbance),
@@ -732,7 +740,11 @@ class ClosedLoop(Claim):
             loop = Loop(model, law, self.terminal.W, self.terminal.radius)
         except ArithmeticError as error:
             return "undecided", f"at the target: {error}", {}, {}
-        end = loop.arrive([hull(*ends) for ends in box], float(self.step))
+        pieces = []
+        for name, (low, high) in zip(model.states, box, strict=True):
+            cuts = sorted({v for v in self.cuts.get(name, ()) if low < v < high})
+            pieces.append([hull(*ends) for ends in itertools.pairwise([low, *cuts, high])])
+        end = loop.arrive(np.array([*itertools.product(*pieces)]), float(self.step))
         method = "validated tubes into an ellipsoid that is proved to be a terminal set"
         details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}
         if not end.all:

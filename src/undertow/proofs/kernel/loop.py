@@ -5,7 +5,6 @@ Coordinates and rates are those of Lemma 8 of ``docs/certificate-format.md``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -73,11 +72,10 @@ class Loop:
                 return k, False
         return LONGEST, False
 
-    def arrive(self, box: Sequence[tuple[float, float]], step: float) -> Arrival:
-        """Follow a box of starts, halved across its relatively widest side where it is lost."""
-        whole = np.array(box)
-        size = np.maximum(whole[:, 1] - whole[:, 0], 1e-300)
-        todo, tubes, steps, latest = [whole], 0, 0, 0
+    def arrive(self, boxes: FloatArray, step: float) -> Arrival:
+        """Follow boxes (K, 2n, 2), halved across the relatively widest side where they are lost."""
+        size = np.maximum(boxes[..., 1].max(axis=0) - boxes[..., 0].min(axis=0), 1e-300)
+        todo, tubes, steps, latest = [*boxes], 0, 0, 0
         while todo:
             part, tubes = todo.pop(), tubes + 1
             taken, there = self.follow(part, step)

@@ -22,6 +22,9 @@ __all__ = ["Field", "Tube"]
 #: Coefficients of a step, the part of a step that may have a corner inside, and the shortest.
 ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
 
+#: Columns of C, more of which than those of the start come from corners, before a tube is lost.
+MOST_COLUMNS = 600
+
 
 class Field:
     """A right-hand side of the first inputs of a graph, and its analytic pieces.
@@ -99,7 +102,7 @@ class Tube:
             stay = self._step(h * part, order, part <= SHORT)
             if stay is None:
                 part *= 0.5
-                if part < SHORTEST:
+                if part < SHORTEST or self.C.shape[1] > MOST_COLUMNS:
                     return None
                 continue
             if whole is None:

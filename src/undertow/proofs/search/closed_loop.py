@@ -1,45 +1,46 @@
-"""The search behind a proof of the closed loop: a terminal set, and boxes of starts.
+"""The search behind a proof of the closed loop: a terminal set, and how to cut a line of starts.
 
-Nothing here proves anything: what is found goes to
-:meth:`undertow.proofs.LoopClaim.decide`.
+Nothing here proves anything: what is found is decided by
+:meth:`undertow.proofs.LoopClaim.decide`, from its numbers alone.
 """
 
 from __future__ import annotations
 
-import itertools
-import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from fractions import Fraction
 
 import numpy as np
 
 from undertow.base.errors import InfeasibleError
 from undertow.base.verdict import Verdict
-from undertow.law import ReachingLaw, Surface
+from undertow.law import ReachingLaw, SlidingModeLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.closed_loop import LoopClaim
-from undertow.proofs.closed_loop.loop import LoopMotion
-from undertow.proofs.closed_loop.run import run_tubes, start_tubes
-from undertow.proofs.closed_loop.terminal import TerminalSet
-from undertow.proofs.search.terminal_set import jacobian, search_terminal
+from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
+from undertow.proofs.intervals.require import require
+from undertow.proofs.kernel.claims import ClosedLoop
+from undertow.proofs.kernel.loop import Loop
+from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 __all__ = ["ProvedLoop", "follow", "prove_loop"]
 
-Progress = Callable[[str], None] | None
+#: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.
+MOTIONS, THINNEST = 24, 2.0**-13
 
 
 @dataclass(frozen=True)
 class ProvedLoop:
-    """A proved line of starts.
+    """A line of starts.
 
     Parameters
     ----------
     claim
-        What was proved.
+        What was found.
     verdict
-        Its verdict, by the checker.
+        Its verdict, by the kernel.
     seconds
         Process time of search and proof together.
     """
@@ -50,20 +51,34 @@ class ProvedLoop:
 
 
 def follow(
-    motion: LoopMotion, z: FloatArray, duration: float, step: float, every: int
+    law: SlidingModeLaw, x: FloatArray, duration: float, every: int = 4
 ) -> tuple[FloatArray, FloatArray]:
-    """Return float64 RK4 motions of the clipped loop, (K + 1, L, N), and their times."""
-    path, times = [z], [0.0]
+    """Return float64 RK4 motions of the clipped loop from states (L, 2n), and their times.
+
+    Steps are of ε/η, the time in which s decays in the layer, and of 5 ms at most.
+
+    Returns
+    -------
+    tuple of ndarray
+        States (K + 1, L, 2n), every so many steps, and times (K + 1,), s.
+    """
+    n, path, times = law.mechanism.n, [x], [0.0]
+    eta, layer = np.split(law.reaching.vector(law.mechanism.m), 2)
+    step = float(min(0.005, np.min(layer / eta)))
+
+    def rate(x: FloatArray) -> FloatArray:
+        q_dd = law.mechanism.accelerations(0.0, x, law(0.0, x).u)
+        return np.concatenate([x[..., n:], q_dd], axis=-1)
+
     with np.errstate(all="ignore"):
-        for k in range(max(1, round(duration / step))):
-            a = motion(z)[0]
-            b = motion(z + 0.5 * step * a)[0]
-            c = motion(z + 0.5 * step * b)[0]
-            d = motion(z + step * c)[0]
-            z = z + step / 6 * (a + 2 * b + 2 * c + d)
-            if (k + 1) % every == 0:
-                path.append(z)
-                times.append((k + 1) * step)
+        for k in range(1, max(1, round(duration / step)) + 1):
+            a = rate(x)
+            b = rate(x + 0.5 * step * a)
+            c = rate(x + 0.5 * step * b)
+            x = x + step / 6 * (a + 2 * b + 2 * c + rate(x + step * c))
+            if k % every == 0:
+                path.append(x)
+                times.append(k * step)
     return np.array(path), np.array(times)
 
 
@@ -74,17 +89,14 @@ def prove_loop(
     *,
     coordinate: str,
     reach: float,
-    step: float = 0.001,
-    duration: float = 3.0,
-    uncertain: Mapping[str, tuple[float, float]] | None = None,
-    hold: int = 0,
-    widest: float | None = None,
-    splits: int = 1,
-    trials: int = 150,
-    seed: int = 0,
-    progress: Progress = None,
+    duration: float = 15.0,
+    seconds: float = 300.0,
+    progress: Callable[[str], None] | None = None,
 ) -> ProvedLoop:
     """Prove that the loop converges from rest, one coordinate off the target, as far as it can.
+
+    The law acts at every instant on the plant that it knows; for a held input, or a plant in a
+    box, see :func:`undertow.proofs.draft_loop`.
 
     Parameters
     ----------
@@ -92,185 +104,93 @@ def prove_loop(
         Which one.
     reach
         Starts beyond this are not tried, SI units.
-    step
-        Step of the validated integration, s.
     duration
-        Longest tube, s.
-    uncertain
-        Plant parameters known to lie in [low, high].
-    hold
-        The law is evaluated every ``hold`` steps and its input held; 0: at every instant.
-    widest
-        Widest box of starts, at the target; a 350th of the reach by default.
-    splits
-        How often a box whose tube fails is halved.
+        Longest motion, s.
+    seconds
+        Process time of the search; the proof takes about as much again.
 
     Returns
     -------
     ProvedLoop
-        Its verdict is the checker's on the final claim.
+        Its verdict is the kernel's on the final claim.
 
     Raises
     ------
+    InvalidInputError
+        For a coordinate that the mechanism does not have, or a reach that is not positive.
     InfeasibleError
         When not even the first box could be proved.
     """
-    started = time.process_time()
+    started, names = time.process_time(), [c.name for c in mechanism.coordinates]
+    require(coordinate in names, "coordinate of the starts", coordinate, ", ".join(names))
+    for what, value in (("reach of the starts", reach), ("duration", duration)):
+        require(np.isfinite(value) and value > 0, what, value, "finite, > 0")
     law = ReachingLaw() if reaching is None else reaching
-    period = math.nextafter(hold * step, math.inf) if hold else 0.0
-    motion = LoopMotion(mechanism, surface, law, dict(uncertain or {}), period)
-
-    search = partial(search_terminal, motion, trials=trials, seed=seed, progress=progress)
-    attempt = partial(_terminal_for, search, motion, coordinate, step, duration, progress)
-    terminal, reach = _terminal(attempt, reach)
-    pending = _boxes(motion, coordinate, reach, widest)
-    done: list[tuple[float, float]] = []
-    horizon, barrier = 0.0, math.inf
-    for level in range(splits + 1):
-        lows, highs = (np.array(v) for v in zip(*pending, strict=True))
-        ends = _ends(motion, coordinate, lows, highs, terminal, step, duration)
-        good = ~np.isnan(ends)
-        done += [p for p, ok in zip(pending, good, strict=True) if ok]
-        horizon = max(horizon, float(np.nanmax(ends, initial=0.0)))
-        failed = [p for p, ok in zip(pending, good, strict=True) if not ok]
-        if progress is not None:
-            progress(f"boxes halved {level} times: {good.sum()} of {len(pending)} tubes end well")
-        if not failed or level == splits:
-            barrier = min([barrier, *(a for a, _ in failed)])
-            break
-        pending = [h for a, b in failed for h in ((a, 0.5 * (a + b)), (0.5 * (a + b), b))]
-        # Far above the first failure little is to be won: keep a window above it.
-        window = 0.15 * reach
-        pending = [p for p in pending if p[0] <= failed[0][0] + window]
-        beyond = [p for p in failed if p[0] > failed[0][0] + window]
-        barrier = min([barrier, *(a for a, _ in beyond)])
-    kept = sorted(p for p in done if p[1] <= barrier + 1e-15)
-    edges = [0.0]
-    for a, b in kept:
-        if a != edges[-1]:
-            break
-        edges.append(b)
-    if len(edges) < 2:
+    index = names.index(coordinate)
+    sliding, search = SlidingModeLaw(mechanism, surface, law), search_for(mechanism, surface, law)
+    terminal = None
+    if search is not None:
+        x = np.zeros((MOTIONS, 2 * mechanism.n))
+        x[:, index] = np.linspace(reach / MOTIONS, reach, MOTIONS)
+        terminal = _terminal(search, follow(sliding, x, duration)[0])
+    if terminal is None:
         raise InfeasibleError(
-            f"proved region of the loop with {surface}",
-            value="no tube ended in the terminal set",
-            limit=f"within {duration:g} s, steps of {step:g} s",
-            remedy="Take a smaller step, narrower boxes or a longer duration",
-        )
-    claim = LoopClaim(
-        coordinate,
-        tuple(edges),
-        terminal,
-        step,
-        horizon + max(1, hold) * step,
-        dict(uncertain or {}),
-        hold,
-    )
-    verdict = claim.decide(mechanism, surface, law, progress=progress)
-    return ProvedLoop(claim, verdict, time.process_time() - started)
-
-
-def _boxes(
-    motion: LoopMotion, coordinate: str, reach: float, widest: float | None
-) -> list[tuple[float, float]]:
-    """Neighbouring boxes of [0, reach], narrower where the motions are faster.
-
-    Around the edge of the layer they are a small part of it: a set that lies on both sides
-    of the corner of sat loses its contraction.
-    """
-    first = reach / 350 if widest is None else widest
-    index = [c.name for c in motion.mechanism.coordinates].index(coordinate)
-    weights = np.abs(motion.surface.position_row[:, index])
-    layer = float(np.min(motion.gains[1] / np.maximum(weights, 1e-12)))
-    edges = [0.0]
-    while edges[-1] < reach:
-        left = 1 - edges[-1] / reach
-        width = first * (0.4 + 0.6 * left)
-        if edges[-1] < 2 * layer:
-            width = min(width, 0.15 * layer)
-        edges.append(min(edges[-1] + width, reach))
-    return list(itertools.pairwise(edges))
-
-
-def _terminal(
-    attempt: Callable[[float], tuple[TerminalSet, float]], reach: float
-) -> tuple[TerminalSet, float]:
-    """Find a terminal set for the motions from up to ``reach``, and where they fail to enter.
-
-    A set that is made for motions from afar is not the best for those that can enter in time:
-    where many fail it is made again for a shorter reach.
-    """
-    best: tuple[TerminalSet, float] | None = None
-    for _ in range(3):
-        try:
-            found = attempt(reach)
-        except InfeasibleError:
-            if best is None:
-                raise
-            break
-        if best is not None and found[1] <= best[1]:
-            break
-        best = found
-        if found[1] > 0.85 * reach:
-            break
-        reach = 1.2 * found[1]
-    assert best is not None
-    return best
-
-
-def _terminal_for(
-    search: Callable[[FloatArray], TerminalSet],
-    motion: LoopMotion,
-    coordinate: str,
-    step: float,
-    duration: float,
-    progress: Progress,
-    reach: float,
-) -> tuple[TerminalSet, float]:
-    names = [c.name for c in motion.mechanism.coordinates]
-    x = np.zeros((64, motion.size))
-    x[:, names.index(coordinate)] = np.linspace(reach / 64, reach, 64)
-    every = max(1, round(0.01 / step))
-    path, times = follow(motion, motion.from_state(x), duration, step, every)
-    slow = motion.slow
-    calm = np.all(np.abs(path[..., slow:]) <= 1e-3 * motion.gains[1], axis=-1)
-    rates = np.linalg.eigvals(jacobian(motion)[:slow, :slow])
-    alive = np.all(np.isfinite(path), axis=(0, 2)) & calm[-1]
-    # The first start whose motion never settles ends the line.
-    last = len(alive) if alive.all() else int(np.argmin(alive))
-    if last == 0:
-        raise InfeasibleError(
-            "simulated motions",
-            value="none reaches the surface",
-            limit=f"within {duration:g} s",
+            f"terminal set of {surface}",
+            value="no motion enters a proved ellipsoid",
+            limit=f"from rest up to {coordinate} = {reach:.4g}, within {duration:g} s",
             remedy="Take a longer duration or a smaller reach",
         )
-    use = slice(max(1, last // 3), max(2, round(0.93 * last)))
-    begin = int(np.argmax(np.all(calm[:, use], axis=1)))
-    window = 4 / np.abs(rates).max()
-    keep = (np.arange(len(times)) >= begin) & (times <= times[begin] + window)
-    terminal = search(path[keep][:, use])
-    enters = np.any(terminal.value(path) <= 1, axis=0)
-    far = len(enters) if enters.all() else int(np.argmin(enters))
-    end = float(x[min(far, 63), names.index(coordinate)])
-    if progress is not None:
-        progress(f"simulated motions from up to {end:.4g} enter within {duration:g} s")
-    return terminal, end
+    own = terminal.stated(mechanism, None)
+    zero, still = Fraction(0), (Fraction(0),) * mechanism.n
+    claim = ClosedLoop({}, zero, {}, still, zero, own)
+    loop = Loop(model_of(mechanism), law_of(mechanism, surface, law), own.W, own.radius)
+    # Around the edge of the layer a box is a small part of it, or its tube crosses for long.
+    weight = np.abs(surface.position_row[:, index]).max()
+    width = min(reach / 32, 0.15 * float(np.min(law.layer)) / max(weight, 1e-12))
+    edges, box = [0.0], np.zeros((2 * mechanism.n, 2))
+    while edges[-1] < reach and width > reach * THINNEST:
+        box[index] = edges[-1], min(edges[-1] + width, reach)
+        if time.process_time() - started > seconds:
+            break
+        _, there = loop.follow(box, float(claim.step))
+        if there:
+            edges.append(float(box[index, 1]))
+            if progress is not None and len(edges) % 20 == 0:
+                progress(f"proved up to {coordinate} = {edges[-1]:.4g}")
+        width *= 1.5 if there else 0.5
+    if len(edges) < 2:
+        raise InfeasibleError(
+            f"proved starts of the loop with {surface}",
+            value="no tube ended in the terminal set",
+            limit=f"boxes down to {reach * THINNEST:.2g} of {coordinate}",
+            remedy="Give a smaller reach",
+        )
+    end = Fraction(edges[-1])
+    cuts = {coordinate: tuple(Fraction(v) for v in edges[1:-1])}
+    found = LoopClaim(
+        ClosedLoop({coordinate: (-end, end)}, zero, {}, still, zero, own, cuts).data()
+    )
+    verdict = found.decide(mechanism, surface, law)
+    return ProvedLoop(found, verdict, time.process_time() - started)
 
 
-def _ends(
-    motion: LoopMotion,
-    coordinate: str,
-    lows: FloatArray,
-    highs: FloatArray,
-    terminal: TerminalSet,
-    step: float,
-    duration: float,
-) -> FloatArray:
-    """Times at which the tubes of boxes (not neighbours) enter, NaN where they do not."""
-    edges = np.stack([lows, highs], axis=1).ravel()
-    tubes = start_tubes(motion, coordinate, edges)
-    return run_tubes(
-        motion, tubes.take(np.arange(len(edges) - 1) % 2 == 0), terminal, step, duration,
-        stop_early=False,
-    ).entered  # fmt: skip
+def _terminal(search: EllipsoidSearch, path: FloatArray) -> TerminalEllipsoid | None:
+    """A proved ellipsoid that the motions (K, L, 2n) of as many starts as may be enter early.
+
+    Each of some motions, the farthest first, proposes the one around its first state that has one.
+    """
+    best: tuple[int, int] | None = None
+    chosen, count = None, path.shape[1]
+    for j in dict.fromkeys(round(part * (count - 1)) for part in (1.0, 0.93, 0.86, 0.75, 0.6, 0.4)):
+        for state in path[:, j]:
+            if not np.isfinite(state).all() or (found := search.around(state)) is None:
+                continue
+            with np.errstate(all="ignore"):
+                inside = np.linalg.norm(path @ found.W.T, axis=-1) < 0.98 * found.radius
+            enters = inside.any(axis=0)
+            far = count if enters.all() else int(enters.argmin())
+            score = far, -int(inside[:, :far].argmax(axis=0).max(initial=0))
+            if far and (best is None or score > best):
+                best, chosen = score, found
+            break
+    return chosen

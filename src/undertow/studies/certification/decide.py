@@ -18,9 +18,11 @@ from undertow.objective import MinimumEnergy
 from undertow.proofs import (
     AppendixClaim,
     Claim,
+    DraftedLoop,
     LyapunovFunction,
     NonsingularClaim,
     Policy,
+    ProvedLoop,
     ProvedRegion,
     ReachingClaim,
     RegionClaim,
@@ -30,6 +32,7 @@ from undertow.proofs import (
     SurfaceMotion,
     assess,
     box_starts,
+    draft_loop,
     prove_loop,
     prove_region,
     reaching,
@@ -255,16 +258,15 @@ class _Decisions:
         away = np.abs(self.start[mechanism.m : mechanism.n])
         index = int(np.argmax(away))
         reach = float(away[index]) or (1.0 if free[index].unit == "rad" else 0.5)
+        about, name = (mechanism, self.surface, self.law), free[index].name
+        proved: ProvedLoop | DraftedLoop
         try:
-            proved = prove_loop(
-                mechanism,
-                self.surface,
-                self.law,
-                coordinate=free[index].name,
-                reach=reach,
-                hold=hold,
-                uncertain=self.uncertain,
-            )
+            if hold or self.uncertain:
+                proved = draft_loop(
+                    *about, coordinate=name, reach=reach, hold=hold, uncertain=self.uncertain
+                )
+            else:
+                proved = prove_loop(*about, coordinate=name, reach=reach)
         except UndertowError as error:
             words = "the full closed loop converges from rest"
             return None, Verdict(words, "undecided", method=str(error))

@@ -10,14 +10,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from undertow.closed_loop.figures import COLOURS, display, style
-from undertow.law import ReachingLaw, Surface
+from undertow.law import ReachingLaw, SlidingModeLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.proofs import LoopClaim
-from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.search.closed_loop import follow
 
 #: Starts on one side, up to this many times the proved ones.
 STARTS, BEYOND = 100, 4.0
+
+#: How long motions are followed, s.
+LONGEST = 15.0
 
 
 def loop_figure(
@@ -25,35 +27,38 @@ def loop_figure(
 ) -> Figure:
     """Draw proved and unproved starts at rest with their motions under the clipped law.
 
-    Left: the coordinate over time.  Right: the same coordinate and its p, with the shadow of the
-    terminal set.  The motions are those of the law that acts at every instant on the plant that
-    it knows; a held input or another plant of the claim's box moves a little differently.
+    Left: the first coordinate that varies, over time.  Right: the same coordinate and its rate,
+    with the shadow of the terminal set, until a motion enters it.
     """
-    motion = LoopMotion(mechanism, surface, reaching)
-    index = [c.name for c in mechanism.coordinates].index(claim.coordinate)
+    box, (W, radius) = claim.box(mechanism), claim.terminal(mechanism)
+    index = int((box[:, 1] > box[:, 0]).argmax())
+    extent = float(box[index, 1])
     ratio = np.linspace(0.0, BEYOND, STARTS + 1)[1:]
-    x = np.zeros((STARTS, motion.size))
-    x[:, index] = ratio * claim.extent
-    shown_time = max(1.0, 1.25 * claim.horizon)
-    duration = 3 * shown_time
-    path, times = follow(motion, motion.from_state(x), duration, 0.001, 5)
+    x = np.zeros((STARTS, 2 * mechanism.n))
+    x[:, index] = ratio * extent
+    path, times = follow(SlidingModeLaw(mechanism, surface, reaching), x, LONGEST)
     with np.errstate(all="ignore"):
-        home = np.any(claim.terminal.value(path) <= 1.0, axis=0)
+        inside = np.linalg.norm(path @ W.T, axis=-1) <= radius
+    home = inside.any(axis=0)
     # Beyond the first start that fails nothing is promised: one more is shown, no others.
     last = STARTS - 1 if home.all() else int(np.argmin(home))
+    proved = inside[:, ratio <= 1.0].argmax(axis=0).max()
+    shown_time = max(1.0, 1.25 * float(times[proved]))
     factor, unit = display(mechanism.coordinates[index].unit)
     rate, rate_unit = display(mechanism.coordinates[index].unit, True)
-    name = {"phi": "φ", "theta": "θ"}.get(claim.coordinate, claim.coordinate)
+    name = {"phi": "φ", "theta": "θ"}.get(
+        mechanism.coordinates[index].name, mechanism.coordinates[index].name
+    )
     with style():
         figure = Figure(figsize=(8.6, 4.0), layout="constrained")
         left, right = figure.subplots(1, 2)
-        partner = mechanism.n + max(0, index - mechanism.m)
+        partner = mechanism.n + index
         for k in range(1, last, max(1, last // 16)):
             _motion(left, times, factor * path[:, k, index], ratio[k], bool(home[k]))
             _motion(right, factor * path[:, k, index], rate * path[:, k, partner], ratio[k], True)
         if not home.all():
             _motion(left, times, factor * path[:, last, index], ratio[last], False)
-        wide = factor * claim.extent
+        wide = factor * extent
         left.plot([0, 0], [-wide, wide], color=COLOURS["blue"], lw=6, clip_on=False, zorder=4)
         shown = factor * path[:, :last, index]
         left.set_ylim(1.1 * min(shown.min(), -wide), 1.1 * factor * x[last, index])
@@ -61,20 +66,18 @@ def loop_figure(
         left.set_xlabel("t (s)")
         left.set_ylabel(f"{name} ({unit})")
         right.plot([-wide, wide], [0.0, 0.0], color=COLOURS["blue"], lw=4, solid_capstyle="butt")
-        edge = _shadow(claim.terminal.scale[[index, partner]])
+        edge = _shadow(np.asarray(radius * np.linalg.inv(W)[[index, partner]]))
         right.fill(
             factor * edge[0], rate * edge[1], color=to_rgba(COLOURS["green"], 0.35), zorder=3
         )
         right.plot(0, 0, "+", color=COLOURS["black"], ms=7, zorder=4)
         right.set_xlabel(f"{name} ({unit})")
-        right.set_ylabel(f"p ({rate_unit})")
+        right.set_ylabel(f"d{name}/dt ({rate_unit})")
         handles = [
             Line2D([], [], color=COLOURS["blue"], lw=5, label="proved starts"),
             Line2D([], [], color=COLOURS["blue"], lw=1.2, label="from there"),
             Line2D([], [], color=COLOURS["sky"], lw=1.2, label="from beyond, arrives"),
-            Line2D(
-                [], [], color=COLOURS["vermilion"], lw=1.2, label=f"not within {duration:.3g} s"
-            ),
+            Line2D([], [], color=COLOURS["vermilion"], lw=1.2, label=f"not within {LONGEST:.3g} s"),
             Patch(color=to_rgba(COLOURS["green"], 0.35), label="proved terminal set"),
         ]
         if home.all():
