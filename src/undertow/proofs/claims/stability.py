@@ -43,9 +43,9 @@ def exact_linearisation(mechanism: Mechanism) -> tuple[list[list[Any]], bool]:
     n, m = mechanism.n, mechanism.m
     blocks = [np.eye(m), np.eye(m), np.zeros((m, n - m)), np.zeros((m, n - m))]
     own = System(model_of(mechanism), law_of(mechanism, Surface(*blocks), ReachingLaw()))
-    nodes = [*(v for row in own.M for v in row), *own.f]
-    values = own.graph.exact(nodes, own.origin(), 2 * n)
-    rows = [[*(v for v, _ in values[n * i : n * i + n]), *values[n * n + i][1]] for i in range(n)]
+    graph, one = own.graph, own.graph.number(1)
+    slopes = [graph.tangents(own.f, {x: one}) for x in graph.inputs[: 2 * n]]
+    rows = [graph.exact([*own.M[i], *(d[i] for d in slopes)], own.origin()) for i in range(n)]
     exact = all(v.exact for row in rows for v in row)
     module = flint()
 

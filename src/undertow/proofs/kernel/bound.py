@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import FloatArray, Program, hull
 
-__all__ = ["Goal", "Settled", "over_boxes", "settle"]
+__all__ = ["Goal", "Settled", "halved", "over_boxes", "settle"]
 
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
 CHUNK, TRIED = 512, 16
@@ -60,6 +60,15 @@ def over_boxes(
             whole, centre[:, 0], a[:V], b[:V], m[:V]
         )
     return values, spreads
+
+
+def halved(
+    a: FloatArray, b: FloatArray, axis: NDArray[np.int64], low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return boxes low to high (V, N), and behind them both halves of boxes a to b by its axis."""
+    middle, upper, lower, every = 0.5 * a + 0.5 * b, b.copy(), a.copy(), np.arange(a.shape[1])
+    upper[axis, every] = lower[axis, every] = middle[axis, every]
+    return np.concatenate([low, a, lower], axis=1), np.concatenate([high, upper, b], axis=1)
 
 
 def settle(
@@ -132,9 +141,5 @@ def settle(
         # Across the side that an open goal varies most with, by its derivatives.
         weight = np.where(left[:, None, :], spread, 0.0).max(axis=0)
         weight = np.where(np.isfinite(weight).all(axis=0) & weight.any(axis=0), weight, width)
-        axis, every = np.where(width > 0, weight, -1.0).argmax(axis=0), np.arange(a.shape[1])
-        left_high, right_low = b.copy(), a.copy()
-        left_high[axis, every] = right_low[axis, every] = middle[axis, every]
-        low = np.concatenate([low, a, right_low], axis=1)
-        high = np.concatenate([high, left_high, b], axis=1)
+        low, high = halved(a, b, np.where(width > 0, weight, -1.0).argmax(axis=0), low, high)
     return Settled("proved", "", (), count)

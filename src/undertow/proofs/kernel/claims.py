@@ -17,9 +17,18 @@ import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
-from undertow.proofs.kernel.graph import FloatArray, Program, Span, hull
+from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
 from undertow.proofs.kernel.loop import Loop
-from undertow.proofs.kernel.model import Law, Matrix, Model, Quantity, System, system
+from undertow.proofs.kernel.model import (
+    Algebra,
+    Law,
+    Matrix,
+    Model,
+    Quantity,
+    Sliding,
+    System,
+    system,
+)
 from undertow.proofs.kernel.reader import (
     Document,
     fields,
@@ -93,41 +102,13 @@ def _texts(values: Any) -> Any:
 Spans = list[list[Span]]
 
 
-def _spans(block: Sequence[Sequence[Fraction]]) -> Spans:
-    return [[Span(v) for v in row] for row in block]
-
-
-def _times(A: Spans, B: Spans) -> Spans:
-    return [[sum((a * row[j] for a, row in zip(r, B, strict=True)), Span(0))
-             for j in range(len(B[0]))] for r in A]  # fmt: skip
-
-
-def _plus(A: Spans, B: Spans) -> Spans:
-    return [[a + b for a, b in zip(r, s, strict=True)] for r, s in zip(A, B, strict=True)]
-
-
-def _solved(A: Spans, B: Spans) -> Spans:
-    """A⁻¹ B by elimination with pivots that are not 0; ZeroDivisionError if that is not shown."""
-    rows, n = [[*a, *b] for a, b in zip(A, B, strict=True)], len(A)
-    for j in range(n):
-        size = [min(abs(r[j].low), abs(r[j].high)) * (r[j].low * r[j].high > 0) for r in rows[j:]]
-        best = j + size.index(max(size))
-        rows[j], rows[best] = rows[best], rows[j]
-        rows[j] = [v / rows[j][j] if k > j else v for k, v in enumerate(rows[j])]
-        for i in range(n):
-            if i != j:
-                factor = rows[i][j]
-                pairs = enumerate(zip(rows[i], rows[j], strict=True))
-                rows[i] = [v - factor * w if k > j else v for k, (v, w) in pairs]
-    return [row[n:] for row in rows]
-
-
 def _characteristic(A: Spans) -> list[Span]:
     """Coefficients of det(x − A), highest power first (Faddeev and LeVerrier)."""
     n, out = len(A), [Span(1)]
     N = [[Span(int(i == j)) for j in range(n)] for i in range(n)]
     for k in range(1, n + 1):
-        step = _times(A, N)
+        step = [[sum((a * r[j] for a, r in zip(row, N, strict=True)), Span(0)) for j in range(n)]
+                for row in A]  # fmt: skip
         trace = sum((step[i][i] for i in range(n)), Span(0))
         out.append(trace * Span(Fraction(-1, k)))
         N = [[v + out[-1] if i == j else v for j, v in enumerate(row)]
@@ -190,7 +171,7 @@ class Stability(Claim):
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
-        matrix = sliding_matrix(model, law)
+        matrix = _sliding_matrix(model, law)
         if isinstance(matrix, tuple):
             return *matrix, {}, {}
         rate = Span(self.rate)
@@ -202,44 +183,35 @@ class Stability(Claim):
         return {True: "proved", False: "refuted", None: "undecided"}[stable], method, {}, {}
 
 
-def sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
+def _sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
     """Return A of ż = A z, z = (q_a, q_u, v_u), or a verdict and why there is none."""
-    n, m = model.n, model.m
-    own = system(model, law)
+    n, m, size = model.n, model.m, 2 * model.n - model.m
+    graph = Graph(size)
+    algebra, z = Algebra(graph), [[k] for k in graph.inputs]
+    blocks = ((law.lambda_a, z[:m]), (law.lambda_u, z[m:n]))
+    held, free = (
+        algebra.times([[graph.number(v) for v in row] for row in A], q) for A, q in blocks
+    )
+    own = [graph.number(p.value or 0) for p in model.parameters]
+    on = Sliding.of(algebra, model, law, z[:n], algebra.each("add", held, free), z[n:], own)
+    rates, at = [row[0] for row in (*on.v_a, *z[n:], *on.v_u_dot)], [Span(0)] * size
+    none = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
     try:
-        nodes = [*(v for row in own.M for v in row), *own.f[m:]]
-        values = own.graph.exact(nodes, own.origin(), 2 * n)
-        pivots = own.graph.exact(own.pivots, own.origin())
+        if not all(v.low > 0 for v in graph.exact(on.pivots, at)):
+            return "undecided", "M is not shown to be positive definite at the target"
+        for k in on.determinants:
+            (value,) = graph.exact([k], at)
+            if value.zero:
+                return "refuted", none
+            if not _sign(value):
+                return "undecided", f"not excluded: {none}"
+        values, one = graph.exact(rates, at), graph.number(1)
+        slopes = [graph.exact(graph.tangents(rates, {k: one}), at) for k in graph.inputs]
     except ArithmeticError as error:
         return "undecided", f"at the target: {error}"
-    if not all(p.low > 0 for p, _ in pivots):
-        return "undecided", "M is not shown to be positive definite at the target"
-    if not all(v.zero for v, _ in values[n * n :]):
+    if not all(v.zero for v in values):
         return "undecided", "f_u(0, 0) = 0 is not shown exactly"
-    M = [[values[n * i + j][0] for j in range(n)] for i in range(n)]
-    alpha_a, alpha_u = _spans(law.alpha_a), _spans(law.alpha_u)
-    lambda_a, lambda_u = _spans(law.lambda_a), _spans(law.lambda_u)
-    zero, one = Span(0), Span(1)
-    try:
-        # ∂(q_a, q_u, v_a, v_u)/∂z, of which v_a = −α_a⁻¹ [λ_a, λ_u, α_u] z.
-        slope = _solved(
-            alpha_a, [[*a, *b, *c] for a, b, c in zip(lambda_a, lambda_u, alpha_u, strict=True)]
-        )
-        G = [[-v for v in row] for row in slope]
-        z = [[one if i == j else zero for j in range(2 * n - m)] for i in range(2 * n - m)]
-        whole = [*z[:n], *G, *z[n:]]
-        gradient = [d for _, d in values[n * n :]]
-        M_ua, M_uu = [r[:m] for r in M[m:]], [r[m:] for r in M[m:]]
-        drift = _plus(_times(lambda_a, G), _times(lambda_u, z[n:]))
-        pull = _times(M_ua, _solved(alpha_a, drift))
-        right = _plus(_times(gradient, whole), pull)
-        thrown = _times(M_ua, _solved(alpha_a, alpha_u))
-        E = [[a - b for a, b in zip(r, s, strict=True)] for r, s in zip(M_uu, thrown, strict=True)]
-        return [*G, *z[n:], *_solved(E, right)]
-    except ZeroDivisionError:
-        exact = all(v.exact for row in M for v in row)
-        why = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
-        return ("refuted", why) if exact else ("undecided", f"not excluded: {why}")
+    return [list(row) for row in zip(*slopes, strict=True)]
 
 
 # -- 5.2, 5.3 -------------------------------------------------------------------------------------
@@ -270,7 +242,7 @@ def _regular(own: System) -> tuple[list[int], list[Goal], Span] | str:
         at = own.graph.exact([own.B_determinant, own.gamma_determinant], own.origin())
     except ArithmeticError as error:
         return f"at the target: {error}"
-    (drive, _), (gamma, _) = at
+    drive, gamma = at
     if not _sign(drive) or not _sign(gamma):
         return "det B or det Γ may be 0 at the target"
     goals = [Goal(f"pivot {k + 1} of M is > 0") for k in range(own.model.n)]
@@ -517,7 +489,7 @@ def no_equilibrium(own: System, origin: Sequence[Span] | None = None) -> str | N
         free = own.graph.exact(own.f[own.model.m :], at)
     except ArithmeticError as error:
         return f"at the target: {error}"
-    return None if all(v.zero for v, _ in free) else "f_u(0, 0) = 0 is not shown exactly"
+    return None if all(v.zero for v in free) else "f_u(0, 0) = 0 is not shown exactly"
 
 
 def _rows(law: Law) -> FloatArray:

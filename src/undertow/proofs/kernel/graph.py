@@ -22,6 +22,7 @@ from undertow.proofs.kernel import compiled as ops
 __all__ = ["Graph", "Program", "Span", "hull"]
 
 _NOWHERE: Mapping[int, int] = {}
+_NONE = np.empty(0, dtype=np.int64)
 
 FloatArray = NDArray[np.float64]
 Node = tuple[Any, ...]
@@ -90,8 +91,16 @@ class Span:
         return self * Span(1 / other.high, 1 / other.low)
 
 
-def _function(kind: str, x: Span) -> Span:
-    """Enclose a function: exactly where that is rational, else by the compiled arithmetic."""
+def _applied(kind: str, x: Span, y: Span | None = None) -> Span:
+    """Enclose an operation: exactly where it is rational, else by the compiled arithmetic."""
+    if y is not None:
+        if kind in ("add", "sub"):
+            return x + y if kind == "add" else x - y
+        if kind in ("mul", "div"):
+            return x * y if kind == "mul" else x / y
+        raise ArithmeticError(f"{kind}: not smooth")
+    if kind in ("neg", "sqr"):
+        return -x if kind == "neg" else x * x
     if x.exact and kind in _KNOWN and x.low == _KNOWN[kind][0]:
         return Span(_KNOWN[kind][1])
     if kind == "sqrt" and x.low > 0:
@@ -305,10 +314,8 @@ class Graph:
 
     # -- its values ------------------------------------------------------------------------------
 
-    def exact(
-        self, roots: Sequence[int], at: Sequence[Span], variables: int = 0
-    ) -> list[tuple[Span, list[Span]]]:
-        """Evaluate nodes and their derivatives by the first inputs, at exact values of inputs.
+    def exact(self, roots: Sequence[int], at: Sequence[Span]) -> list[Span]:
+        """Evaluate nodes at exact values of inputs.
 
         Raises
         ------
@@ -317,22 +324,19 @@ class Graph:
         ArithmeticError
             For numbers with absurdly many digits, or what is not smooth.
         """
-        none, found = Span(0), dict[int, tuple[Span, list[Span]]]()
+        found = dict[int, Span]()
         for k in self.depends(roots):
-            node = self.nodes[k]
-            kind, flat = str(node[0]), [none] * variables
+            kind, *rest = self.nodes[k]
             if kind == "input":
-                i = int(node[1])
-                slope = [Span(int(i == j)) for j in range(variables)]
-                found[k] = at[i], slope
+                found[k] = at[rest[0]]
             elif kind == "number":
-                found[k] = Span(node[1]), flat
+                found[k] = Span(rest[0])
             elif kind == "pi":
-                found[k] = Span(*(Fraction(v) for v in ops.PI)), flat
+                found[k] = Span(*(Fraction(v) for v in ops.PI))
             else:
-                found[k] = _dual(kind, [found[j] for j in self._operands(k)])
-            ends = found[k][0]
-            if max(ends.low.numerator.bit_length(), ends.low.denominator.bit_length()) > _MOST_BITS:
+                found[k] = _applied(kind, *(found[j] for j in rest))
+            low = found[k].low
+            if max(low.numerator.bit_length(), low.denominator.bit_length()) > _MOST_BITS:
                 raise ArithmeticError(f"a number of more than {_MOST_BITS} bits")
         return [found[k] for k in roots]
 
@@ -387,40 +391,7 @@ def _folded(kind: str, x: Fraction, y: Fraction | None) -> Fraction | None:
     if kind in ("max", "min", "abs"):
         return abs(x) if y is None else max(x, y) if kind == "max" else min(x, y)
     try:
-        found, _ = _dual(kind, [(Span(v), []) for v in (x, y) if v is not None])
+        found = _applied(kind, *(Span(v) for v in (x, y) if v is not None))
     except ArithmeticError:
         return None
     return found.low if found.exact and found.low.denominator.bit_length() < _MOST_BITS else None
-
-
-Dual = tuple[Span, list[Span]]
-_NONE = np.empty(0, dtype=np.int64)
-
-
-def _dual(kind: str, operands: Sequence[Dual]) -> Dual:
-    """Value and derivatives of an operation, by the chain rule."""
-    (x, dx), (y, dy) = operands[0], operands[-1]
-    if kind in ("add", "sub"):
-        if kind == "add":
-            return x + y, [a + b for a, b in zip(dx, dy, strict=True)]
-        return x - y, [a - b for a, b in zip(dx, dy, strict=True)]
-    if kind == "mul":
-        return x * y, [a * y + x * b for a, b in zip(dx, dy, strict=True)]
-    if kind == "div":
-        w = x / y
-        return w, [(a - w * b) / y for a, b in zip(dx, dy, strict=True)]
-    if kind == "neg":
-        return -x, [-a for a in dx]
-    if kind == "sqr":
-        return x * x, [Span(2) * x * a for a in dx]
-    if kind not in ("sqrt", "sin", "cos", "exp", "log"):
-        raise ArithmeticError(f"{kind}: not smooth")
-    w = _function(kind, x)
-    if kind == "sqrt":
-        slope = Span(1) / (Span(2) * w) if dx else w
-    elif kind == "log":
-        slope = Span(1) / x
-    else:
-        slope = w if kind == "exp" else _function("cos" if kind == "sin" else "sin", x)
-        slope = -slope if kind == "cos" else slope
-    return w, [slope * a for a in dx]

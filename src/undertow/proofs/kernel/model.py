@@ -15,7 +15,7 @@ import numpy as np
 
 from undertow.proofs.kernel.graph import FloatArray, Graph, Span, hull
 
-__all__ = ["Algebra", "Law", "Model", "Nodes", "Quantity", "System"]
+__all__ = ["Algebra", "Law", "Model", "Nodes", "Quantity", "Sliding", "System"]
 
 Matrix = tuple[tuple[Fraction, ...], ...]
 Nodes = list[list[int]]
@@ -182,6 +182,46 @@ class Algebra:
         sign = number((-1) ** (m - 1))
         return [[make("mul", sign, v) for v in row] for row in N], make("mul", number((-1) ** m), c)
 
+    def inverse(self, A: Nodes) -> tuple[Nodes, int]:
+        """A⁻¹, undefined where det A = 0, and det A."""
+        adjugate, determinant = self.adjugate(A)
+        once = self.graph.make("div", self.graph.number(1), determinant)
+        return [[self.graph.make("mul", v, once) for v in row] for row in adjugate], determinant
+
+
+@dataclass(frozen=True)
+class Sliding:
+    """The motion on the surface (5.1): v_a, v̇_u, pivots of M ≻ 0, and det α_a and det E."""
+
+    v_a: Nodes
+    v_u_dot: Nodes
+    pivots: list[int]
+    determinants: list[int]
+
+    @classmethod
+    def of(
+        cls, algebra: Algebra, model: Model, law: Law, q: Nodes, pull: Nodes, v_u: Nodes,
+        p: Sequence[int],
+    ) -> Sliding:  # fmt: skip
+        """Lay it on a graph, of nodes q, pull = λ_a q_a + λ_u q_u, v_u and parameters."""
+        graph, m = algebra.graph, model.m
+        lambda_a, lambda_u, alpha_a, alpha_u = (
+            [[graph.number(v) for v in row] for row in block]
+            for block in (law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u)
+        )
+        alpha, first = algebra.inverse(alpha_a)
+        pull = algebra.each("add", pull, algebra.times(alpha_u, v_u))
+        v_a = algebra.each("neg", algebra.times(alpha, pull))
+        M, f, _ = model.lay(graph, [*(r[0] for r in (*q, *v_a, *v_u)), *p])
+        order = [*range(m, model.n), *range(m)]
+        _, pivots = algebra.factor([[M[i][j] for j in order] for i in order])
+        thrown = algebra.times([row[:m] for row in M[m:]], alpha)
+        E = algebra.each("sub", [row[m:] for row in M[m:]], algebra.times(thrown, alpha_u))
+        drift = algebra.each("add", algebra.times(lambda_a, v_a), algebra.times(lambda_u, v_u))
+        right = algebra.each("add", [[v] for v in f[m:]], algebra.times(thrown, drift))
+        back, second = algebra.inverse(E)
+        return cls(v_a, algebra.times(back, right), pivots, [first, second])
+
 
 class System:
     """The plant and the law on one graph: everything that claims are about.
@@ -251,7 +291,7 @@ class System:
         """D, (n − m,), near the diagonal of M_uu at the target: p is of the size of a rate."""
         m = self.model.m
         at = self.graph.exact([self.M[i][i] for i in range(m, self.model.n)], self.origin())
-        return [self.graph.number(Fraction(float(v.low))) for v, _ in at]
+        return [self.graph.number(Fraction(float(v.low))) for v in at]
 
     def momentum_and_surface(self) -> list[int]:
         """Return (q, p, s) by x."""

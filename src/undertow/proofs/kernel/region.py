@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.bound import Goal, Settled, settle
+from undertow.proofs.kernel.bound import Goal, Settled, halved, settle
 from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
-from undertow.proofs.kernel.model import Algebra, Law, Matrix, Model, Nodes
+from undertow.proofs.kernel.model import Algebra, Law, Matrix, Model, Nodes, Sliding
 
 __all__ = ["Function", "Stage", "Stretch", "on_the_line"]
 
@@ -102,38 +102,20 @@ def _polynomial(graph: Graph, z: Sequence[int], terms: Mapping[tuple[int, ...], 
     return total
 
 
-def _inverse(algebra: Algebra, A: Nodes) -> Nodes:
-    """A⁻¹, undefined where det A = 0."""
-    adjugate, determinant = algebra.adjugate(A)
-    once = algebra.graph.make("div", algebra.graph.number(1), determinant)
-    return [[algebra.graph.make("mul", v, once) for v in row] for row in adjugate]
-
-
-def _sliding(
+def _motion(
     algebra: Algebra, model: Model, law: Law, y: Nodes, p: Sequence[int]
 ) -> tuple[Nodes, list[int]]:
     """ẏ of the motion on the surface, y = (q_u, v_u, w), and the pivots of M."""
-    graph, m, free = algebra.graph, model.m, model.n - model.m
-
-    def numbers(A: Matrix) -> Nodes:
-        return [[graph.number(v) for v in row] for row in A]
-
-    lambda_a, alpha_u = numbers(law.lambda_a), numbers(law.alpha_u)
-    alpha = _inverse(algebra, numbers(law.alpha_a))
-    ratio = algebra.times(_inverse(algebra, lambda_a), numbers(law.lambda_u))
+    graph, free = algebra.graph, model.n - model.m
+    lambda_a, lambda_u = (
+        [[graph.number(v) for v in row] for row in block] for block in (law.lambda_a, law.lambda_u)
+    )
+    ratio = algebra.times(algebra.inverse(lambda_a)[0], lambda_u)
     q_u, v_u, w = y[:free], y[free : 2 * free], y[2 * free :]
-    q_a = algebra.each("sub", w, algebra.times(ratio, q_u))
-    pull = algebra.each("add", algebra.times(lambda_a, w), algebra.times(alpha_u, v_u))
-    v_a = algebra.each("neg", algebra.times(alpha, pull))
-    w_dot = algebra.each("add", v_a, algebra.times(ratio, v_u))
-    M, f, _ = model.lay(graph, [*(r[0] for r in (*q_a, *q_u, *v_a, *v_u)), *p])
-    order = [*range(m, model.n), *range(m)]
-    _, pivots = algebra.factor([[M[i][j] for j in order] for i in order])
-    thrown = algebra.times([row[:m] for row in M[m:]], alpha)
-    E = algebra.each("sub", [row[m:] for row in M[m:]], algebra.times(thrown, alpha_u))
-    right = algebra.times(thrown, algebra.times(lambda_a, w_dot))
-    right = algebra.each("add", [[v] for v in f[m:]], right)
-    return [*v_u, *algebra.times(_inverse(algebra, E), right), *w_dot], pivots
+    q = [*algebra.each("sub", w, algebra.times(ratio, q_u)), *q_u]
+    on = Sliding.of(algebra, model, law, q, algebra.times(lambda_a, w), v_u, p)
+    w_dot = algebra.each("add", on.v_a, algebra.times(ratio, v_u))
+    return [*v_u, *on.v_u_dot, *w_dot], on.pivots
 
 
 def on_the_line(stretch: Stretch, V: Function, end: Sequence[Fraction], max_boxes: int) -> Settled:
@@ -174,9 +156,9 @@ class Stage:
             own = make("mul", number(1 / V.G[r][r]), graph.inputs[r])
             c.append(make("sub", own, graph.sum(known)))
         right = [[make("sub", c[r], make("mul", chart.total[r][0], q))] for r in range(1, size)]
-        rest = _inverse(algebra, [row[1:] for row in chart.total[1:]])
+        rest, _ = algebra.inverse([row[1:] for row in chart.total[1:]])
         y = [[q], *algebra.times(rest, right)]
-        y_dot, self.pivots = _sliding(algebra, model, law, y, p)
+        y_dot, self.pivots = _motion(algebra, model, law, y, p)
         bend = [[make("mul", v[0], y_dot[0][0])] for v in algebra.times(chart.slope, y)]
         c_dot = algebra.each("add", algebra.times(chart.total, y_dot), bend)
         column = [[v] for v in c]
@@ -191,7 +173,7 @@ class Stage:
         """Decide (1) to (3) of the statement for this function."""
         try:
             at = [Span(0)] * self.size + [Span(*ends) for ends in self.plant]
-            if not all(v.zero for v, _ in self.graph.exact(self.rates, at)):
+            if not all(v.zero for v in self.graph.exact(self.rates, at)):
                 return Settled("undecided", "F(0) = 0 is not shown exactly", (), 0)
         except ArithmeticError as error:
             return Settled("undecided", f"at the target: {error}", (), 0)
@@ -294,11 +276,7 @@ class Stage:
                 return Settled("undecided", why, self._named(point), count)
             weight = np.where(np.isfinite(spread).all(axis=0), spread, width)
             weight = np.where(width > 0.02 * width.max(axis=0), weight, 0.0)
-            axis, every = weight.argmax(axis=0), np.arange(a.shape[1])
-            left_high, right_low = b.copy(), a.copy()
-            left_high[axis, every] = right_low[axis, every] = middle[axis, every]
-            low = np.concatenate([low, a, right_low], axis=1)
-            high = np.concatenate([high, left_high, b], axis=1)
+            low, high = halved(a, b, weight.argmax(axis=0), low, high)
         return Settled("proved", "", (), count)
 
     def _named(self, point: FloatArray) -> tuple[float, ...]:
