@@ -756,7 +756,7 @@ static Decided decide(const Json& claim, const Model& model, const Law& law, boo
         if (!read_only) r.verdict = surface_region(model, law, region);
     } else if (kind == "closed loop") {
         only_keys(claim, {"kind", "starts", "period", "plant", "disturbance", "ball"}, "claim", true);
-        r.sentence = "closed loop: known, not decided by this checker." + about;
+        r.sentence = "closed loop: this checker follows no motions, so does not decide it." + about;
     } else
         refuse("an unknown kind of claim");
     return r;

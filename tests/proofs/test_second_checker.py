@@ -65,6 +65,18 @@ def verdicts(run: subprocess.CompletedProcess[str]) -> list[str]:
     return re.findall(r"^claim \d+: (\w+),", run.stdout, re.MULTILINE)
 
 
+@needs_compiler
+@pytest.mark.slow
+def test_what_it_does_not_decide_is_left_undecided_in_words(program: Path, tmp_path: Path) -> None:
+    """It follows no motions: every claim about the whole loop is read, named and not proved."""
+    content = (ROOT / "tests/data/closed_loop_v2.json").read_bytes()
+    run = answer(program, content, tmp_path)
+    assert run.returncode == 1
+    count = sum(len(s["claims"]) for s in json.loads(content)["subjects"])
+    assert verdicts(run) == ["undecided"] * count
+    assert run.stdout.count("this checker follows no motions, so does not decide it") == count
+
+
 def digest(value: object) -> str:
     text = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

@@ -217,15 +217,21 @@ def _sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
 # -- 5.2, 5.3 -------------------------------------------------------------------------------------
 
 
-def _read_region(data: Any, model: Model) -> dict[str, tuple[Fraction, Fraction]]:
-    known = {p.name for p in model.positions}
-    require(isinstance(data, dict), "a region")
+def _read_box(data: Any, known: Mapping[str, Fraction | None]) -> dict[str, Any]:
+    """Read a box of known names, around their values where they have one."""
+    require(isinstance(data, dict), "a box: an object")
     box = {}
     for name, ends in data.items():
-        require(name in known, f"region of {name[:64]!r}: no position of the model")
-        box[name] = interval(ends)
-        require(box[name][0] <= 0 <= box[name][1], "a region with the target inside")
+        require(name in known, f"a box of {name[:64]!r}, which the model does not have there")
+        low, high = box[name] = interval(ends)
+        inside = known[name]
+        good = inside is None or low <= inside <= high
+        require(good, f"a box of {name!r} without its {float(inside or 0):g}")
     return box
+
+
+def _read_region(data: Any, model: Model) -> dict[str, Any]:
+    return _read_box(data, {p.name: Fraction(0) for p in model.positions})
 
 
 def _box_data(box: Region) -> dict[str, Any]:
@@ -526,14 +532,8 @@ def _function(data: Any, size: int) -> Function:
     return Function(matrix(data["A"], size, size), G, exponents, coefficients)
 
 
-def _read_plant(data: Any, model: Model) -> dict[str, tuple[Fraction, Fraction]]:
-    known = {p.name: p.value or Fraction(0) for p in model.parameters}
-    require(isinstance(data, dict) and {*data} <= {*known}, "a plant: parameters of the model")
-    box = {name: interval(ends) for name, ends in data.items()}
-    for name, (low, high) in box.items():
-        inside = low <= known[name] <= high
-        require(inside, f"a box of {name!r} without its {float(known[name]):g}")
-    return box
+def _read_plant(data: Any, model: Model) -> dict[str, Any]:
+    return _read_box(data, {p.name: p.value for p in model.parameters})
 
 
 @dataclass(frozen=True)
@@ -645,10 +645,7 @@ class ClosedLoop(Claim):
     @classmethod
     def read(cls, data: Mapping[str, Any], model: Model) -> Self:
         """Read it from an object with its keys."""
-        starts = data["starts"]
-        require(isinstance(starts, dict), "starts: an object")
-        require(starts.keys() <= {*model.states}, "starts: names of states")
-        box = {name: interval(ends) for name, ends in starts.items()}
+        box = _read_box(data["starts"], dict.fromkeys(model.states))
         bounds, period = numbers(data["disturbance"], model.n), number(data["period"])
         ball, hint = number(data["ball"]), data.get("hint", {})
         require(min(*bounds, period, ball) >= 0, "a period, bounds of disturbances and a ball ≥ 0")
@@ -682,11 +679,11 @@ class ClosedLoop(Claim):
     def sentence(self, model: Model) -> str:
         """Return the statement in words."""
         rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
-        own = [Quantity(p.name, p.unit) for p in model.parameters]
         starts = region([*model.positions, *rates], self.starts).replace("for ", "with ", 1)
         end = f"‖x‖ ≤ {inward(self.ball)}" if self.ball else "the target"
         held = f"held for {float(self.period)!r} s" if self.period else "renewed at every instant"
-        plant = region(own, self.plant).split(", the other")[0] if self.plant else "the model"
+        varied = ", ".join(f"{k} in {within(*ends)}" for k, ends in self.plant.items())
+        plant = f"any with {varied}" if varied else "the model"
         loads = ", ".join(inward(v) for v in self.disturbance)
         return (
             f"every motion from starts {starts}, exists for ever and converges to {end}, the law "

@@ -950,13 +950,8 @@ def excluded(models, V):  # type: ignore[no-untyped-def]
     trial, total = np.zeros(3), np.zeros(models.shape[2])
     for box in range(len(models)):
         f, a, b = models[box, :, 1 : 1 + V]
-        fa, fb, aa, ab, bb = (
-            (f * a).sum(),
-            (f * b).sum(),
-            (a * a).sum(),
-            (a * b).sum(),
-            (b * b).sum(),
-        )
+        fa, fb, aa = (f * a).sum(), (f * b).sum(), (a * a).sum()
+        ab, bb = (a * b).sum(), (b * b).sum()
         gap = aa * bb - ab * ab + _LITTLE
         for kind in range(4):
             trial[:] = 1.0, 0.0, 0.0

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_DOWN, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 
-from undertow.proofs.kernel.model import Law, Model, Quantity
+from undertow.proofs.kernel.model import Model, Quantity
 
-__all__ = ["inward", "law_words", "limits", "region", "within"]
+__all__ = ["inward", "limits", "region", "within"]
 
 Region = Mapping[str, tuple[Fraction, Fraction]]
 
@@ -64,16 +64,3 @@ def limits(model: Model) -> str:
         for i in model.inputs
     ]
     return ", ".join(parts)
-
-
-def law_words(law: Law) -> str:
-    """Return all numbers of a law."""
-    parts = []
-    for name in ("alpha_a", "lambda_a", "alpha_u", "lambda_u"):
-        rows = [[float(v) for v in row] for row in getattr(law, name)]
-        parts.append(f"{name} = {rows!r}")
-    for name in ("eta", "layer", "disturbance"):
-        row = [float(v) for v in getattr(law, name)]
-        if name != "disturbance" or any(row):
-            parts.append(f"{name} = {row!r}")
-    return f"{', '.join(parts)}, {law.switching}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -36,7 +35,7 @@ def loop_figure(
     ratio = np.linspace(0.0, BEYOND, STARTS + 1)[1:]
     x = np.zeros((STARTS, 2 * mechanism.n))
     x[:, index] = ratio * extent
-    path, times = follow(SlidingModeLaw(mechanism, surface, reaching), x, LONGEST)
+    path, times = follow(SlidingModeLaw(mechanism, surface, reaching), x, LONGEST, every=1)
     with np.errstate(all="ignore"):
         inside = np.linalg.norm(path @ W.T, axis=-1) <= radius
     home = inside.any(axis=0)
@@ -67,10 +66,7 @@ def loop_figure(
         left.set_ylabel(f"{name} ({unit})")
         right.plot([-wide, wide], [0.0, 0.0], color=COLOURS["blue"], lw=4, solid_capstyle="butt")
         edge = _shadow(np.asarray(radius * np.linalg.inv(W)[[index, partner]]))
-        right.fill(
-            factor * edge[0], rate * edge[1], color=to_rgba(COLOURS["green"], 0.35), zorder=3
-        )
-        right.plot(0, 0, "+", color=COLOURS["black"], ms=7, zorder=4)
+        right.fill(factor * edge[0], rate * edge[1], color=COLOURS["green"], zorder=5)
         right.set_xlabel(f"{name} ({unit})")
         right.set_ylabel(f"d{name}/dt ({rate_unit})")
         handles = [
@@ -78,7 +74,7 @@ def loop_figure(
             Line2D([], [], color=COLOURS["blue"], lw=1.2, label="from there"),
             Line2D([], [], color=COLOURS["sky"], lw=1.2, label="from beyond, arrives"),
             Line2D([], [], color=COLOURS["vermilion"], lw=1.2, label=f"not within {LONGEST:.3g} s"),
-            Patch(color=to_rgba(COLOURS["green"], 0.35), label="proved terminal set"),
+            Patch(color=COLOURS["green"], label="proved terminal set"),
         ]
         if home.all():
             del handles[3]
