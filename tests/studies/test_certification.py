@@ -141,7 +141,7 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
     """The claim of the full loop joins the others; what is sampled is a remark."""
     rig = ut.mechanisms.rotary_pendulum(d_e=0.073)
     kept = read_certificate(Path(__file__).parents[1] / "data" / "closed_loop_v2.json")
-    stated = kept.subjects[0].claims[0]
+    stated = kept.subjects[3].claims[0]
     claim, sound = LoopClaim.from_dict(stated.data), Verdict("starts", "proved", 0.68, "rad")
     reaches: list[float] = []
 
