@@ -726,20 +726,8 @@ class ClosedLoop:
             rows = last[None].copy()
         rows = np.vstack([rows, last])
         t = np.append(times[: len(rows) - 1], end)
-        x, u, s, cost, margin = np.split(
-            rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1
-        )
-        return Trajectory(
-            self.truth,
-            t + start,
-            x,
-            u,
-            s,
-            cost[:, 0],
-            margin[:, 0],
-            Event(int(batch.event[0])),
-            self.objective.unit,
-        )
+        ended, unit = int(batch.event[0]), self.objective.unit
+        return Trajectory.of_record(self.truth, t + start, rows, ended, unit)
 
 
 def _plans(what: object) -> list[Plan]:
