@@ -75,7 +75,8 @@ def scalar_module(
 
     def write() -> str:
         # numba's cache does not notice that an imported function has changed: the key does.
-        words = docstring(f"{title} of {name}; generated, do not edit. {key[:16]}")
+        stamp = f" {key[:16]}" if "import" in head else ""
+        words = docstring(f"{title} of {name}; generated, do not edit.{stamp}")
         return "\n\n".join([f"{words}{PREAMBLE}{head}", *functions()])
 
     return generated(kind, name, key, write)
