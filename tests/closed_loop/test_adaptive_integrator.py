@@ -110,7 +110,7 @@ def test_a_motion_that_dips_into_the_terminal_set_has_arrived(
         middle = 0.5 * (low + high)
         passes = loop.simulate(x0, plan, terminal=middle).time < whole.t[first] + 0.01
         low, high = (low, middle) if passes else (middle, high)
-    outer, inner = high * (1 + 1e-6), low * (1 - 1e-6)
+    outer, inner = float(high * (1 + 1e-6)), float(low * (1 - 1e-6))
     above, below = (loop.simulate(x0, plan, terminal=radius).time for radius in (outer, inner))
     goal = ut.MinimumTime(terminal_radius=inner)
     exact = accuracy.Reference(accuracy.Case("dip", rig, goal, x0, plan)).motion(rtol=1e-10)

@@ -14,7 +14,7 @@ import numpy as np
 import sympy as sp
 
 from undertow.closed_loop.rollout import ClosedLoop
-from undertow.closed_loop.trajectory import Event, Trajectory
+from undertow.closed_loop.trajectory import Event, Trajectory, recorded
 from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, law_module, pack_law_parameters
 from undertow.models import TIME, FloatArray, error_dynamics
 from undertow.symbolic import Tape, function_source, scalar_module
@@ -178,4 +178,4 @@ def simulate_along(
         loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, record,
     )  # fmt: skip
     t = start + np.arange(rows) * loop.step
-    return Trajectory.of_record(plant, t, record[:rows], code, loop.objective.unit)
+    return recorded(plant, t, record[:rows], code, loop.objective.unit)

@@ -29,7 +29,7 @@ from undertow.closed_loop.exponential_integrator import GIVEN_BACK
 from undertow.closed_loop.kernel import compile_look, compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
 from undertow.closed_loop.threads import shared
-from undertow.closed_loop.trajectory import Batch, Event, Trajectory
+from undertow.closed_loop.trajectory import Batch, Event, Trajectory, recorded
 from undertow.closed_loop.work_array import LANES
 from undertow.law import (
     LawLayout,
@@ -727,7 +727,7 @@ class ClosedLoop:
         rows = np.vstack([rows, last])
         t = np.append(times[: len(rows) - 1], end)
         ended, unit = int(batch.event[0]), self.objective.unit
-        return Trajectory.of_record(self.truth, t + start, rows, ended, unit)
+        return recorded(self.truth, t + start, rows, ended, unit)
 
 
 def _plans(what: object) -> list[Plan]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from html import escape
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,17 +137,6 @@ class Trajectory:
     margin: FloatArray
     event: Event
     cost_unit: str = ""
-
-    @classmethod
-    def of_record(
-        cls, mechanism: Mechanism, t: FloatArray, rows: FloatArray, event: int, cost_unit: str
-    ) -> Self:
-        """Return the motion of a kernel's record: x, u, s, cost, margin, (N, 2n + 2m + 2)."""
-        n, m = mechanism.n, mechanism.m
-        x, u, s, cost, margin = np.split(
-            rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1
-        )
-        return cls(mechanism, t, x, u, s, cost[:, 0], margin[:, 0], Event(event), cost_unit)
 
     def __repr__(self) -> str:
         """Show whose it is, how long it is and how it ended."""
@@ -282,3 +271,13 @@ class Trajectory:
             event=pieces[-1].event,
             cost_unit=first.cost_unit,
         )
+
+
+def recorded(
+    mechanism: Mechanism, t: FloatArray, rows: FloatArray, event: int, cost_unit: str
+) -> Trajectory:
+    """Return the motion of a kernel's record: x, u, s, cost, margin, (N, 2n + 2m + 2)."""
+    n, m = mechanism.n, mechanism.m
+    parts = np.split(rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1)
+    x, u, s, cost, margin = parts
+    return Trajectory(mechanism, t, x, u, s, cost[:, 0], margin[:, 0], Event(event), cost_unit)
