@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -9,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
+from scipy.integrate import solve_ivp
 
 import undertow as ut
+from undertow.base import ModelError, SingularSurfaceError, UnstableSurfaceError
 from undertow.cascade.swing_up import law as swing_law
 from undertow.checks.agreement import Difference, Subject
 from undertow.checks.exact import Number, evaluate, product, runge_kutta, solve
@@ -229,6 +232,128 @@ def exported_law(subject: Subject, folder: Path, real: Any = "double") -> Iterat
         yield from subject.compared("C: demand", x, demand, law.demand, names)
         yield from subject.compared("C: s", x, s, law.s)
         yield from subject.compared("C: margin", x, margin, [law.margin])
+
+
+#: Relative tolerance of the large steps that are compared, how far results may be off, relative
+#: to time, cost and the size of the first state, and the longest motion, s.
+FINE, SETTLED, LONGEST = 1e-5, 1e-4, 10.0
+
+
+def settling(subject: Subject, objective: ut.Objective | None = None) -> Iterator[Difference]:
+    """Compare the end of motions in large steps: where, when and at what cost they arrive.
+
+    Beside it stands the closed loop written out in NumPy from the model's own expressions and
+    integrated by SciPy: nothing of it is generated here.  From two states inside the boundary
+    layer motions go to a terminal set, and for half of that time.  A loop without a stable surface
+    or a linear model has no large steps.
+    """
+    mechanism, names = subject.mechanism, subject.mechanism.state_names
+    goal = objective or ut.MinimumEnergy(travel=False)
+    try:
+        surface = ut.first_surface(mechanism)
+    except (ModelError, SingularSurfaceError, UnstableSurfaceError):
+        return
+    reference = _Written(mechanism, surface, subject.reaching, goal)
+    # Small steps come first, as long as s changes fast: the check's own comparison judges them.
+    loop = ut.ClosedLoop(mechanism, goal, subject.reaching, step=1e-3, tail_rtol=FINE)
+    if not loop.takes_large_steps:
+        return
+    starts = np.array([reference.calm(x) for x in _motions(subject)])
+    radius = 0.1 * float(np.linalg.norm(starts, axis=1).min())
+    ends = [reference.motion(x, LONGEST, radius) for x in starts]
+    half = 0.5 * min(time for _, time, _ in ends)
+    for what, span in (("arrival", LONGEST), ("on the way", half)):
+        steps = round(span / loop.step)
+        found = loop.batch(starts, surface, duration=span, terminal=radius)
+        for k, x in enumerate(starts):
+            late = float(found.time[k])
+            state, time, cost = ends[k]
+            if not time < span:  # it ends with its last large step, which may be later
+                time = max(late, steps * loop.step)
+                state, _, cost = reference.motion(x, time, 0.0)
+            size = float(np.linalg.norm(x))
+            rows = [("time", late, time, time), ("cost", float(found.cost[k]), cost, cost)]
+            if what == "arrival" and found.steps[k] > 0.9 * late / loop.step:  # they were given up
+                rows.append(("number of steps", float(found.steps[k]), 0.0, 1.0))
+            rows += [(name, found.x[k, i], state[i], size) for i, name in enumerate(names)]
+            for name, got, true, scale in rows:
+                off = abs(got - true) / scale
+                yield Difference(
+                    f"large steps: {what} [{name}]", subject.where(x), float(got), float(true),
+                    off if math.isfinite(off) else math.inf,
+                )  # fmt: skip
+
+
+class _Written:
+    """A closed loop as the equations say, in NumPy: (1)-(5), (10), (12), (38), (39)."""
+
+    def __init__(
+        self,
+        mechanism: ut.Mechanism,
+        surface: ut.Surface,
+        reaching: ut.ReachingLaw,
+        goal: ut.Objective,
+    ) -> None:
+        values, x = mechanism.substitution, mechanism.x
+        self.n, self.m, self.surface = mechanism.n, mechanism.m, surface
+        self._terms = sp.lambdify([x], [
+            entry.subs(values) for entry in (mechanism.mass_matrix, mechanism.force)
+        ], "numpy", cse=True, dummify=True)  # fmt: skip
+        self._B = np.array(mechanism.input_matrix.subs(values), dtype=float)
+        cost = goal.stage_cost(mechanism).subs(values)
+        self._cost = sp.lambdify([x, mechanism.u], cost, "numpy", dummify=True)
+        self._eta, self._layer = np.split(reaching.vector(mechanism.m), 2)
+        self._limit = mechanism.input_limits
+
+    def law(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return M, f, s and the input that is asked for."""
+        m, n, c = self.m, self.n, self.surface
+        M, f = self._terms(x)
+        M, f = np.asarray(M, dtype=float), np.ravel(f)
+        X, y = np.linalg.solve(M[m:, m:], M[m:, :m]), np.linalg.solve(M[m:, m:], f[m:])
+        s = c.matrix @ x
+        push = self._eta * np.clip(s / self._layer, -1.0, 1.0)
+        drift = c.alpha_u @ y + c.lambda_a @ x[n : n + m] + c.lambda_u @ x[n + m :] + push
+        v = -np.linalg.solve(c.alpha_a - c.alpha_u @ X, drift)
+        u = np.linalg.solve(self._B, M[:m, :m] @ v - M[:m, m:] @ X @ v - f[:m] + M[:m, m:] @ y)
+        return M, f, s, u
+
+    def calm(self, x: FloatArray) -> FloatArray:
+        """Return a state near x's shadow on the surface, well inside the layer and the limits."""
+        C = self.surface.matrix
+        x = x - np.linalg.pinv(C) @ (C @ x - 0.3 * self._layer)
+        while True:
+            _, _, s, u = self.law(x)
+            if (np.abs(s) < 0.5 * self._layer).all() and (np.abs(u) < 0.5 * self._limit).all():
+                return x
+            x = 0.8 * x
+
+    def motion(self, x: FloatArray, span: float, radius: float) -> tuple[FloatArray, float, float]:
+        """Return where a motion ends, when, and its cost: in the terminal set, or at a time."""
+
+        def rates(_: float, row: FloatArray) -> FloatArray:
+            M, f, _s, u = self.law(row[:-1])
+            u = np.clip(u, -self._limit, self._limit)
+            forced: FloatArray = np.append(self._B @ u, np.zeros(self.n - self.m)) + f
+            return np.hstack(
+                [row[self.n : -1], np.linalg.solve(M, forced), self._cost(row[:-1], u)]
+            )
+
+        def outside(_: float, row: FloatArray) -> float:
+            return float(np.linalg.norm(row[:-1])) - radius
+
+        outside.terminal = True  # type: ignore[attr-defined]
+        found = solve_ivp(
+            rates, (0.0, span), np.append(x, 0.0), "DOP853", rtol=1e-10, atol=1e-13, events=outside
+        )
+        end: FloatArray = found.y[:, -1]
+        return end[:-1], float(found.t[-1]), float(end[-1])
+
+
+def _motions(subject: Subject) -> FloatArray:
+    """Two random states from which motions begin."""
+    rng = np.random.default_rng(subject._count)
+    return rng.uniform(-0.3, 0.3, (2, 2 * subject.mechanism.n))
 
 
 # -- names ---------------------------------------------------------------------------------------

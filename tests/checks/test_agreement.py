@@ -17,12 +17,14 @@ import sympy as sp
 import undertow as ut
 from agreements import (
     ODD_NAMES,
+    SETTLED,
     bypassing_the_door,
     estimator,
     exported_law,
     loop_programme,
     named,
     rig_stepping,
+    settling,
     sliding_motion,
     swing_up,
 )
@@ -31,11 +33,9 @@ from undertow.checks import agreement, check_mechanism, exact
 from undertow.checks.agreement import (
     LIMIT,
     QUICK,
-    SETTLED,
     Difference,
     Subject,
     numpy_functions,
-    settling,
     worst,
 )
 from undertow.checks.exact import ExactModel, Number, evaluate

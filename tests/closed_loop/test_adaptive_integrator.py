@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, minimize_scalar
 
 import undertow as ut
 from support import derivative, interpreted
@@ -104,21 +105,24 @@ def test_a_motion_that_dips_into_the_terminal_set_has_arrived(
     first = np.flatnonzero(turns)[0] + 1
     assert whole.time > whole.t[first] + 0.1
 
-    def arrival(radius: float) -> tuple[float, float]:
-        goal = ut.MinimumTime(terminal_radius=radius)
-        exact = accuracy.Reference(accuracy.Case("dip", rig, goal, x0, plan)).motion(rtol=1e-10)
-        return loop.simulate(x0, plan, terminal=radius).time, exact.time
-
     low, high = 0.9 * radii[first], 1.1 * radii[first]
     for _ in range(30):
         middle = 0.5 * (low + high)
         passes = loop.simulate(x0, plan, terminal=middle).time < whole.t[first] + 0.01
         low, high = (low, middle) if passes else (middle, high)
-    above, below = arrival(high * (1 + 1e-6)), arrival(low * (1 - 1e-6))
-    assert above[0] == pytest.approx(whole.t[first], abs=0.003)
-    assert above[0] == pytest.approx(above[1], rel=1e-5)
-    assert below[0] > above[0] + 0.01
-    assert below[0] == pytest.approx(below[1], rel=1e-5)
+    outer, inner = float(high * (1 + 1e-6)), float(low * (1 - 1e-6))
+    above, below = (loop.simulate(x0, plan, terminal=radius).time for radius in (outer, inner))
+    goal = ut.MinimumTime(terminal_radius=inner)
+    exact = accuracy.Reference(accuracy.Case("dip", rig, goal, x0, plan)).motion(rtol=1e-10)
+
+    def beyond(t: float) -> float:
+        return float(np.linalg.norm(exact.states([t])[0])) - outer
+
+    around = whole.t[first] - 0.003, whole.t[first] + 0.003
+    nearest = minimize_scalar(beyond, bounds=around, method="bounded", options={"xatol": 1e-9}).x
+    assert above == pytest.approx(brentq(beyond, around[0], nearest), rel=1e-5)
+    assert below > above + 0.01
+    assert below == pytest.approx(exact.time, rel=1e-5)
 
 
 def test_the_end_of_a_motion_is_located(rig: ut.Mechanism) -> None:

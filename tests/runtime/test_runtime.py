@@ -36,6 +36,9 @@ from undertow.runtime.session import session
 from undertow.runtime.slow_loop import Answer, Request
 from undertow.studies.fault_injection.cases import OutputMonitor
 
+#: A run from hanging: its surfaces, and the regions where they catch, are computed once for all.
+SWINGING = Recipe(rig="realistic", swing_up=True, evaluations=32)
+
 
 def settled(controller: Controller, steps: int = 30) -> int:
     """Bring the controller under its law on an ideal rig; return the number of steps made."""
@@ -113,8 +116,7 @@ def test_a_measurement_of_another_shape_is_a_safe_stop(controller: Controller, q
 
 def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path: Path) -> None:
     """Realistic rig, positions alone; the slow loop finds what catches; the replay agrees."""
-    recipe = Recipe(rig="realistic", swing_up=True, evaluations=32)
-    with session(recipe, simulated=True, log=tmp_path / "run.db") as runtime:
+    with session(SWINGING, simulated=True, log=tmp_path / "run.db") as runtime:
         report = runtime.run(4.0)
         end = runtime.rig.truth  # type: ignore[attr-defined]
     states = [text.split(":")[0] for _, what, text in report.events if what == "state"]
@@ -130,7 +132,7 @@ def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path:
 
 def test_thrown_out_it_swings_up_again_within_limits() -> None:
     """Knocked over while it balances: safe outputs throughout, and back to the top."""
-    recipe = Recipe(rig="realistic", swing_up=True, evaluations=32)
+    recipe = SWINGING
     bench = replace(recipe.bench, pushes=(Push(4.0, "phi", 0.06),))
     rig = RealisticRig(bench, recipe.x0, 0)
     controller = recipe.make_controller(recipe.first())
@@ -145,7 +147,7 @@ def test_thrown_out_it_swings_up_again_within_limits() -> None:
 
 def test_a_catch_is_refused_where_the_state_is_not_the_predicted_one() -> None:
     """An answer for another state, or for another mode, is never put to use."""
-    recipe = Recipe(rig="realistic", swing_up=True, evaluations=32)
+    recipe = SWINGING
     controller, rig = recipe.make_controller(recipe.first()), recipe.make_rig()
     answers = 0
     for k in range(3000):

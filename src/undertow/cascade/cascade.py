@@ -24,7 +24,6 @@ from undertow.base import (
     one_of,
     positive,
 )
-from undertow.cascade.gate import Admission, Gate, cost_gate
 from undertow.cascade.simulation import (
     Run,
     Update,
@@ -36,6 +35,7 @@ from undertow.cascade.simulation import (
 )
 from undertow.cascade.targets import LoopsAbout, legs_of
 from undertow.closed_loop import INADMISSIBLE, RTOL, ClosedLoop, Event, Trajectory, simulate_along
+from undertow.closed_loop.gate import Admission, Gate, cost_gate
 from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import (
     Control,

@@ -18,8 +18,8 @@ from functools import lru_cache
 import numpy as np
 
 from undertow.base import InvalidInputError
-from undertow.cascade.gate import Admission, cost_gate, gate_words
 from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
+from undertow.closed_loop.gate import Admission, cost_gate, gate_words
 from undertow.law import InnerLoop, Plan, ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism, linearise
 

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from undertow.base import InvalidInputError, Verdict, checked, positive, write_file
-from undertow.cascade.gate import Admission
 from undertow.cascade.targets import legs_of
 from undertow.closed_loop import ClosedLoop, Event, Trajectory, simulate_along
+from undertow.closed_loop.gate import Admission
 from undertow.estimators import ParameterEstimate
 from undertow.law import Plan, ReferenceMotion, SetPoints, Surface, Target, target_of
 from undertow.models import FloatArray, Mechanism, number_of

@@ -14,17 +14,10 @@ import numpy as np
 import sympy as sp
 
 from undertow.closed_loop.rollout import ClosedLoop
-from undertow.closed_loop.trajectory import Event, Trajectory
+from undertow.closed_loop.trajectory import Event, Trajectory, recorded
 from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, law_module, pack_law_parameters
 from undertow.models import TIME, FloatArray, error_dynamics
-from undertow.symbolic import (
-    PREAMBLE,
-    Tape,
-    content_key,
-    docstring,
-    function_source,
-    generated,
-)
+from undertow.symbolic import Tape, function_source, scalar_module
 
 _BODY = f"""
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -115,9 +108,8 @@ def _made(loop: ClosedLoop) -> Any:
     plant, objective = loop.truth, loop.objective
     law = law_module(error_dynamics(loop.mechanism), loop.reaching.switching)
     stage, path = objective.stage_cost(plant), objective.path_margins(plant)
-    key = content_key(law.__name__, plant.structure, plant.name, sp.srepr([stage, *path]), _BODY)
 
-    def write() -> str:
+    def functions() -> tuple[str, str, str]:
         tape = Tape()
         flow = function_source(
             "flow",
@@ -133,11 +125,11 @@ def _made(loop: ClosedLoop) -> Any:
             {"e": errors, "x": plant.x, "u": plant.u, "parameters": plant.parameter_symbols},
             {"out": tape.let_all([stage.xreplace(dict(zip(plant.x, errors, strict=True))), *path])},
         )
-        header = docstring(f"{plant.name} along a reference; generated, do not edit. {key[:16]}")
-        own = f"from {law.__name__} import law\n\nPATH = {len(path)}\n"
-        return f"{header}{PREAMBLE}{own}\n\n{flow}\n\n{measures}\n{_BODY}"
+        return flow, measures, _BODY
 
-    return generated("along", plant.name, key, write)
+    head = f"from {law.__name__} import law\n\nPATH = {len(path)}\n"
+    depends = law.__name__, plant.structure, sp.srepr([stage, *path])
+    return scalar_module("along", "Motions", plant.name, depends, functions, head)
 
 
 def simulate_along(
@@ -185,11 +177,5 @@ def simulate_along(
         plant.input_limits, start, loop.step, steps, loop.zoh_steps,
         loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, record,
     )  # fmt: skip
-    n = plain.n
-    states, u, s, cost, margin = np.split(
-        record[:rows], [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1
-    )
     t = start + np.arange(rows) * loop.step
-    return Trajectory(
-        plant, t, states, u, s, cost[:, 0], margin[:, 0], Event(code), loop.objective.unit
-    )
+    return recorded(plant, t, record[:rows], code, loop.objective.unit)

@@ -29,7 +29,7 @@ from undertow.closed_loop.exponential_integrator import GIVEN_BACK
 from undertow.closed_loop.kernel import compile_look, compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
 from undertow.closed_loop.threads import shared
-from undertow.closed_loop.trajectory import Batch, Event, Trajectory
+from undertow.closed_loop.trajectory import Batch, Event, Trajectory, recorded
 from undertow.closed_loop.work_array import LANES
 from undertow.law import (
     LawLayout,
@@ -726,20 +726,8 @@ class ClosedLoop:
             rows = last[None].copy()
         rows = np.vstack([rows, last])
         t = np.append(times[: len(rows) - 1], end)
-        x, u, s, cost, margin = np.split(
-            rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1
-        )
-        return Trajectory(
-            self.truth,
-            t + start,
-            x,
-            u,
-            s,
-            cost[:, 0],
-            margin[:, 0],
-            Event(int(batch.event[0])),
-            self.objective.unit,
-        )
+        ended, unit = int(batch.event[0]), self.objective.unit
+        return recorded(self.truth, t + start, rows, ended, unit)
 
 
 def _plans(what: object) -> list[Plan]:

@@ -271,3 +271,13 @@ class Trajectory:
             event=pieces[-1].event,
             cost_unit=first.cost_unit,
         )
+
+
+def recorded(
+    mechanism: Mechanism, t: FloatArray, rows: FloatArray, event: int, cost_unit: str
+) -> Trajectory:
+    """Return the motion of a kernel's record: x, u, s, cost, margin, (N, 2n + 2m + 2)."""
+    n, m = mechanism.n, mechanism.m
+    parts = np.split(rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1)
+    x, u, s, cost, margin = parts
+    return Trajectory(mechanism, t, x, u, s, cost[:, 0], margin[:, 0], Event(event), cost_unit)

@@ -16,17 +16,7 @@ import numpy as np
 from undertow.law.sliding import LawSymbols, SlidingModeLaw, build_law_graph
 from undertow.law.surface import ReachingLaw, Surface, Switching
 from undertow.models import FloatArray, Mechanism
-from undertow.symbolic import (
-    BRIEF,
-    PREAMBLE,
-    Tape,
-    Workspace,
-    content_key,
-    docstring,
-    function_source,
-    generated,
-    unpacked,
-)
+from undertow.symbolic import BRIEF, Tape, Workspace, function_source, scalar_module, unpacked
 
 
 @dataclass(eq=False)
@@ -161,9 +151,8 @@ def step(x, lane, block):
 @lru_cache(maxsize=64)
 def law_module(mechanism: Mechanism, switching: Switching) -> Any:
     """Return the compiled module of a law: ``law``, and ``step`` on a :func:`law_memory`."""
-    key = content_key(mechanism.structure, mechanism.name, switching)
 
-    def write() -> str:
+    def functions() -> tuple[str, str]:
         tape, symbols = Tape(), LawSymbols.of(mechanism.n, mechanism.m)
         law = build_law_graph(
             mechanism.partition(tape), mechanism.x, symbols, switching, mechanism.disturbance_bounds
@@ -178,8 +167,8 @@ def law_module(mechanism: Mechanism, switching: Switching) -> Any:
             },
             {"demand": law.u, "s": law.s, "margin": [law.margin]},
         )
-        header = docstring(f"Sliding-mode law of {mechanism.name}; generated, do not edit.")
-        sizes = f"p, m = {len(mechanism.parameters)}, {mechanism.m}\n"
-        return f"{header}{PREAMBLE}{sizes}\n\n{body}\n{_CLIP}"
+        return body, _CLIP
 
-    return generated("law", mechanism.name, key, write)
+    sizes = f"p, m = {len(mechanism.parameters)}, {mechanism.m}\n"
+    depends = mechanism.structure, switching
+    return scalar_module("law", "Sliding-mode law", mechanism.name, depends, functions, sizes)

@@ -21,16 +21,7 @@ from typing import Any
 import sympy as sp
 
 from undertow.models import TIME, FloatArray, Mechanism
-from undertow.symbolic import (
-    COMPILED,
-    PREAMBLE,
-    Tape,
-    content_key,
-    docstring,
-    function_source,
-    generated,
-    numba,
-)
+from undertow.symbolic import COMPILED, Tape, function_source, numba, scalar_module
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -348,17 +339,15 @@ def compiled_module(
 ) -> Any:
     """Return a compiled module of a mechanism's :func:`dynamics_source` and a body that uses it.
 
-    Its n, m and p are known in the body. ``imports`` are of compiled functions, whose changes
-    numba's cache does not notice: the key in the first line does.
+    Its n, m and p are known in the body; ``imports`` are of compiled functions.
     """
-    key = content_key(mechanism.structure, mechanism.name)
+    sizes = f"n, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
+    depends, head = (mechanism.structure,), f"{imports}{sizes}"
 
-    def write() -> str:
-        header = docstring(f"{title} of {mechanism.name}; generated, do not edit. {key[:16]}")
-        sizes = f"n, m, p = {mechanism.n}, {mechanism.m}, {len(mechanism.parameters)}\n"
-        return f"{header}{PREAMBLE}{imports}{sizes}\n\n{dynamics_source(mechanism)}\n{body}"
+    def functions() -> tuple[str, str]:
+        return dynamics_source(mechanism), body
 
-    return generated(kind, mechanism.name, key, write)
+    return scalar_module(kind, title, mechanism.name, depends, functions, head)
 
 
 @lru_cache(maxsize=64)

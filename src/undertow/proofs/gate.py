@@ -31,7 +31,7 @@ import numpy as np
 
 from undertow.base.arguments import at_least
 from undertow.base.verdict import Verdict
-from undertow.cascade.gate import Admission, Gate, cost_gate
+from undertow.closed_loop.gate import Admission, Gate, cost_gate
 from undertow.closed_loop.rollout import ClosedLoop
 from undertow.closed_loop.trajectory import Batch, Event
 from undertow.law import Plan, ProvedSet, ReachingLaw, Surface, stability_margin

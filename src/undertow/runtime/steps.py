@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -16,14 +17,11 @@ from undertow.runtime.modes import Mode
 from undertow.runtime.settings import Settings
 from undertow.symbolic import (
     BRIEF,
-    PREAMBLE,
     Tape,
     Workspace,
-    content_key,
-    docstring,
     function_source,
-    generated,
     numba,
+    scalar_module,
     unpacked,
 )
 
@@ -133,21 +131,15 @@ def step_memory(
 def step_module(mechanism: Mechanism, switching: Switching) -> Any:
     """Return the compiled module of a fast step: ``act`` on a :func:`step_memory`."""
     law = law_module(mechanism, switching)
-    key = content_key(mechanism.structure, mechanism.name, law.__name__)
-
-    def write() -> str:
-        # numba's cache does not notice that an imported function has changed: the key does.
-        header = docstring(f"Fast step of {mechanism.name}; generated, do not edit. {key[:16]}")
-        parts = (
-            f"from {law.__name__} import step as law\n"
-            "from undertow.estimators.recorded_run import subtract_disturbance\n"
-            "from undertow.runtime.modes import transition\n"
-            "from undertow.runtime.steps import limit_output, relative_error, accept_estimate\n"
-            f"\np, n, m = {len(mechanism.parameters)}, {mechanism.n}, {mechanism.m}\n"
-        )
-        return f"{header}{PREAMBLE}{parts}\n\n{_BODY}"
-
-    return generated("step", mechanism.name, key, write)
+    head = (
+        f"from {law.__name__} import step as law\n"
+        "from undertow.estimators.recorded_run import subtract_disturbance\n"
+        "from undertow.runtime.modes import transition\n"
+        "from undertow.runtime.steps import limit_output, relative_error, accept_estimate\n"
+        f"\np, n, m = {len(mechanism.parameters)}, {mechanism.n}, {mechanism.m}\n"
+    )
+    depends = mechanism.structure, law.__name__
+    return scalar_module("step", "Fast step", mechanism.name, depends, lambda: [_BODY], head)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -240,17 +232,15 @@ def stage_module(mechanism: Mechanism, objective: Objective) -> Any:
     ``cost``, (1,), is filled.
     """
     stage = objective.stage_cost(mechanism)
-    key = content_key(mechanism.structure, mechanism.name, sp.srepr(stage))
 
-    def write() -> str:
+    def functions() -> Iterator[str]:
         tape = Tape()
-        body = function_source(
+        yield function_source(
             "stage",
             tape,
             {"x": mechanism.x, "u": mechanism.u, "parameters": mechanism.parameter_symbols},
             {"cost": tape.let_all([stage])},
         )
-        header = f'"""Stage cost of {mechanism.name}; generated, do not edit."""\n\n'
-        return f"{header}{PREAMBLE}\n\n{body}"
 
-    return generated("stage", mechanism.name, key, write)
+    depends = mechanism.structure, sp.srepr(stage)
+    return scalar_module("stage", "Stage cost", mechanism.name, depends, functions)

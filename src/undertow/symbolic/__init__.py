@@ -2,7 +2,7 @@
 
 from undertow.symbolic.c99 import C99Emitter, Real, literal
 from undertow.symbolic.expressions import parse_expression
-from undertow.symbolic.function import COMPILED, PREAMBLE, function_source
+from undertow.symbolic.function import COMPILED, PREAMBLE, function_source, scalar_module
 from undertow.symbolic.machine import compiled, numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
@@ -44,6 +44,7 @@ __all__ = [
     "processor",
     "recall",
     "remember",
+    "scalar_module",
     "single_assignment",
     "sources_digest",
     "unpacked",

@@ -6,12 +6,14 @@ For code that runs once a sample, where :mod:`undertow.closed_loop.kernel_source
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import ModuleType
 
 import sympy as sp
 
-from undertow.symbolic.names import distinct
+from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
+from undertow.symbolic.store import content_key, generated
 from undertow.symbolic.tape import Tape
 
 #: Head of a generated module.
@@ -53,6 +55,31 @@ def function_source(
     body = "\n".join([*loads, *code, *stores])
     arguments = ", ".join([*inputs, *outputs])
     return f"{COMPILED}\ndef {name}({arguments}):\n{textwrap.indent(body, '    ')}\n"
+
+
+def scalar_module(
+    kind: str,
+    title: str,
+    name: str,
+    depends: Iterable[str],
+    functions: Callable[[], Iterable[str]],
+    head: str = "",
+) -> ModuleType:
+    """Import a module of scalar functions, writing its source only where none is kept.
+
+    ``kind``, and the ``name`` of the mechanism, are the module's; the ``title`` begins its
+    docstring.  ``depends``: texts, all that its source depends on besides the name; ``head``:
+    further imports, and constants; ``functions`` returns the sources of its functions.
+    """
+    key = content_key(*depends, name)
+
+    def write() -> str:
+        # numba's cache does not notice that an imported function has changed: the key does.
+        stamp = f" {key[:16]}" if "import" in head else ""
+        words = docstring(f"{title} of {name}; generated, do not edit.{stamp}")
+        return "\n\n".join([f"{words}{PREAMBLE}{head}", *functions()])
+
+    return generated(kind, name, key, write)
 
 
 def _places(argument: str, symbols: Sequence[sp.Symbol] | sp.Symbol) -> list[tuple[sp.Symbol, str]]:

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from undertow.base import Verdict
-from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
+from undertow.closed_loop.rollout import ClosedLoop
+from undertow.closed_loop.trajectory import INADMISSIBLE, Event
 from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
