@@ -1,12 +1,13 @@
 """A run that is watched: the fast step and its deadlines with ``undertow run --show`` and without.
 
-Runs of the rotary pendulum on the realistic rig against the clock, in turn, first one and then the
-other in front: what else the machine does meets both alike.  Somebody looks on over a web socket
-and reads every picture; with ``--browser`` a headless chromium draws them, which takes a core of
-its own.  Each row is a pair; below are the means with their 95 % intervals (Student's), and those
-of the differences.  A page costs nothing where the interval of a difference reaches down to zero.
+Runs of the rotary pendulum on the realistic rig against the clock, in turn, each kind first as
+often as the others: what else the machine does meets all alike.  *log* keeps a log, which is what
+the page is drawn from; *show* is watched, too: somebody reads every picture over a web socket, or
+with ``--browser`` a headless chromium draws them, which takes a core of its own.  Below are the
+means with their 95 % intervals (Student's), and those of the differences within a round.  A page
+costs nothing where the interval of a difference reaches down to zero.
 
-    python benchmarks/watched.py [--quick] [--browser] [--pairs 8] [--seconds 10]
+    python benchmarks/watched.py [--quick] [--browser] [--rounds 8] [--seconds 10]
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
+from tempfile import TemporaryDirectory
 from typing import IO
 
 import numpy as np
@@ -60,10 +63,10 @@ def look(address: str, browser: bool, seen: list[int]) -> None:
     seen.append(count)
 
 
-def run(seconds: float, watched: bool, browser: bool) -> tuple[list[float], int]:
+def run(seconds: float, words: Sequence[str], browser: bool = False) -> tuple[list[float], int]:
     """Make a run; its figures, and how many pictures were seen of it."""
     command = [sys.executable, "-m", "undertow", "run", "rotary_pendulum", "--rig", "realistic",
-               "--seconds", f"{seconds:g}", *["--show"] * watched]  # fmt: skip
+               "--seconds", f"{seconds:g}", *words]  # fmt: skip
     environment = {**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"}
     printed, seen, viewer = "", list[int](), None
     with subprocess.Popen(
@@ -85,41 +88,56 @@ def run(seconds: float, watched: bool, browser: bool) -> tuple[list[float], int]
     return [float(one[1].replace(",", "")) for one in figures if one], sum(seen)
 
 
+def half_width(values: FloatArray) -> float:
+    """Half of the 95 % interval of a mean."""
+    spread = values.std(ddof=1) / np.sqrt(len(values))
+    return float(student.ppf(0.975, len(values) - 1) * spread)
+
+
 def interval(values: FloatArray) -> str:
     """Mean and 95 % interval."""
-    half = student.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-    return f"{values.mean():.1f} [{values.mean() - half:.1f}, {values.mean() + half:.1f}]"
+    middle, half = values.mean(), half_width(values)
+    return f"{middle:.1f} [{middle - half:.1f}, {middle + half:.1f}]"
 
 
 def main() -> int:
     """Run in turn, and compare."""
     parser = command_line(__doc__, "--browser", clocks=False)
-    parser.add_argument("--pairs", type=int, help="pairs of runs")
+    parser.add_argument("--rounds", type=int, help="how often each kind runs")
     parser.add_argument("--seconds", type=float, help="length of a run, s")
     parser.add_argument("--browser", action="store_true", help="a chromium looks on and draws")
     options = parser.parse_args()
-    pairs = options.pairs or (2 if options.quick else 8)
+    rounds = options.rounds or (2 if options.quick else 9)
     seconds = options.seconds or (2.0 if options.quick else 10.0)
-    if pairs < 2:
-        parser.error(f"--pairs: got {pairs}, must be at least 2: an interval needs a spread")
-    run(1.0, True, False)  # everything is compiled
-    without, beside, rows = [], [], []
-    for k in progress(range(pairs), "pair"):
-        both = {w: run(seconds, w, options.browser) for w in ((False, True), (True, False))[k % 2]}
-        without.append(both[False][0])
-        beside.append(both[True][0])
-        cells = [f"{a:g} / {b:g}" for a, b in zip(without[-1], beside[-1], strict=True)]
-        rows.append((str(k + 1), *cells, f"{both[True][1] / seconds:.0f}"))
-    table(f"without / with --show, {seconds:g} s each", ("", *FIGURES, "pictures a second"), rows)
-    plain, shown = np.array(without), np.array(beside)
-    more = shown - plain
-    lines = [
-        (name, interval(plain[:, i]), interval(shown[:, i]), interval(more[:, i]))
-        for i, name in enumerate(FIGURES)
-    ]
-    table("means, with 95 % intervals", ("", "without", "with --show", "difference"), lines)
-    low = [float(interval(column).split("[")[1].split(",")[0]) for column in more.T]
-    print(f"\nlowest ends of the differences' intervals: largest {max(low):.1f} (wanted ≤ 0)")
+    if rounds < 2:
+        parser.error(f"--rounds: got {rounds}, must be at least 2: an interval needs a spread")
+    found: dict[str, list[list[float]]] = {"plain": [], "log": [], "show": []}
+    rows = []
+    with TemporaryDirectory() as folder:
+        log = ["--log", f"{folder}/run.db"]
+        words = {"plain": [], "log": log, "show": [*log, "--show"]}
+        run(1.0, words["show"])  # everything is compiled
+        for k in progress(range(rounds), "round"):
+            pictures = 0
+            for i in range(3):
+                kind = [*words][(i + k) % 3]
+                figures, seen = run(seconds, words[kind], options.browser)
+                found[kind].append(figures)
+                pictures += seen
+            last = zip(*(one[-1] for one in found.values()), strict=True)
+            cells = [" / ".join(f"{v:g}" for v in figures) for figures in last]
+            rows.append((str(k + 1), *cells, f"{pictures / seconds:.0f}"))
+    table(f"plain / log / show, {seconds:g} s each", ("", *FIGURES, "pictures a second"), rows)
+    plain, log_, show = (np.array(one) for one in found.values())
+    lines, ends = [], []
+    for i, name in enumerate(FIGURES):
+        differences = [(show - log_)[:, i], (show - plain)[:, i]]
+        lines.append((name, *(interval(one[:, i]) for one in (plain, log_, show)),
+                      *map(interval, differences)))  # fmt: skip
+        ends.append(differences[0].mean() - half_width(differences[0]))
+    head = ("", "plain", "log", "show", "show − log", "show − plain")
+    table("means, with 95 % intervals", head, lines)
+    print(f"\nlargest cost of a page beyond doubt: {max(0.0, *ends):.1f} (wanted 0)")
     return 0
 
 
