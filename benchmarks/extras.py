@@ -24,6 +24,9 @@ from packaging.utils import canonicalize_name
 #: Where the extras are listed.
 PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
+#: Extras for those who change this package, not for those who use it.
+OWN = ("dev", "docs")
+
 
 @cache
 def installed(name: str) -> Distribution | None:
@@ -79,7 +82,8 @@ def main() -> int:
     core = closure(map(Requirement, project["dependencies"]))
     rows = [row("(core)", core)]
     for extra, wanted in sorted(project["optional-dependencies"].items()):
-        rows.append(row(extra, closure(map(Requirement, wanted)) - core))
+        if extra not in OWN:
+            rows.append(row(extra, closure(map(Requirement, wanted)) - core))
     table("what is installed", ("extra", "packages", "MB", "the largest"), rows)
     return 0
 
