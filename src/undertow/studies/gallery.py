@@ -20,8 +20,9 @@ from undertow.optimiser import Optimiser
 #: Mechanisms side by side in the picture of the library.
 COLUMNS = 5
 
-#: Pictures in a second of their film, and motion seconds in one: a third of real time.
-FPS, SPEED = 15.0, 1.0 / 3.0
+#: Pictures in a second of their film, which a GIF counts in hundredths of a second; and motion
+#: seconds in one: a third of real time.
+FPS, SPEED = 12.5, 1.0 / 3.0
 
 
 def mechanism_table(width: int = 120) -> Table:
