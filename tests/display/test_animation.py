@@ -196,9 +196,8 @@ def test_the_library_is_filmed_side_by_side(monkeypatch: pytest.MonkeyPatch) -> 
     times = []
     for name in names:
         rig = LIBRARY[name]()
-        surface = (
-            ut.Optimiser(ut.ClosedLoop(rig, ut.MinimumTime())).require(rig.usual_start).surface
-        )
         loop = ut.ClosedLoop(rig, ut.MinimumTime())
-        times.append(loop.simulate(rig.usual_start, surface).time)
+        plan = ut.Optimiser(loop).require(rig.usual_start).plan
+        assert plan is not None
+        times.append(loop.simulate(rig.usual_start, plan).time)
     assert count == pytest.approx(max(times) * gallery.FPS / gallery.SPEED, abs=3)
