@@ -119,9 +119,7 @@ class Film:
         """Evaluate a sketch at positions, (F, n), see :func:`evaluator`."""
         points, angles, tip = place(q)
         flat = tuple(_project(p, drawn.view) for p in points)
-        return cls(
-            mechanism, drawn, t, q, u, flat, angles, _project(tip, drawn.view), whole, speed
-        )
+        return cls(mechanism, drawn, t, q, u, flat, angles, _project(tip, drawn.view), whole, speed)
 
     @property
     def span(self) -> str:
