@@ -22,6 +22,7 @@ from undertow.display.sketches import Label, Line, sketch
 from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray
 from undertow.plants.scenes import mujoco_scene
+from undertow.studies import gallery
 
 NAMES = sorted(LIBRARY)
 
@@ -167,3 +168,36 @@ def test_animate_on_the_command_line(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert (tmp_path / "pendubot.gif").read_bytes().startswith(b"GIF8")
     assert (tmp_path / "pendubot.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5, 2.0])
+def test_a_film_lasts_as_long_as_it_says(speed: float) -> None:
+    """Half the speed takes twice as long; the last picture stays a second."""
+    film = Film.of(motion(LIBRARY["cart_pendulum"]()), fps=10.0, speed=speed)
+    with Image.open(io.BytesIO(gif(film))) as image:
+        lengths = []
+        for k in range(getattr(image, "n_frames", 1)):
+            image.seek(k)
+            lengths.append(image.info["duration"] / 1000.0)
+    assert sum(lengths[:-1]) == pytest.approx((film.t[-1] - film.t[0]) / speed, rel=0.02)
+    assert film.pace == {1.0: "real time", 0.5: "2 times slower", 2.0: "2 times faster"}[speed]
+
+
+@pytest.mark.slow
+def test_the_library_is_filmed_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One clock, a third of real time, until the last one is there: here of two mechanisms."""
+    names = ("rotary_pendulum", "acrobot")
+    monkeypatch.setattr(gallery, "LIBRARY", {name: LIBRARY[name] for name in names})
+    files = gallery.library_files()
+    assert files["mechanisms.png"].startswith(b"\x89PNG")
+    with Image.open(io.BytesIO(files["mechanisms.gif"])) as image:
+        count = getattr(image, "n_frames", 1)
+        assert image.info["duration"] == round(1000 / gallery.FPS)
+    times = []
+    for name in names:
+        rig = LIBRARY[name]()
+        loop = ut.ClosedLoop(rig, ut.MinimumTime())
+        plan = ut.Optimiser(loop).require(rig.usual_start).plan
+        assert plan is not None
+        times.append(loop.simulate(rig.usual_start, plan).time)
+    assert count == pytest.approx(max(times) * gallery.FPS / gallery.SPEED, abs=3)

@@ -23,17 +23,17 @@ from undertow.optimiser import Optimiser
 
 @command("undertow mechanisms", "undertow mechanisms --out pictures", name="mechanisms")
 def list_mechanisms(
-    out: Annotated[Path | None, folder("mechanisms.png: all on their way to the target")] = None,
+    out: Annotated[Path | None, folder("mechanisms.png and .gif: all on their way")] = None,
 ) -> None:
     """List the mechanisms of the library; with --out also draw them."""
-    from undertow.studies.gallery import library_picture, mechanism_table
+    from undertow.studies.gallery import library_files, mechanism_table
 
     width = max(terminal().width, 80)
     show(mechanism_table(width), least=width)
     if out is not None:
         check_out(out)
         with progress_bar() as progress:
-            written = write(out, lambda: {"mechanisms.png": library_picture(progress)})
+            written = write(out, lambda: library_files(progress))
         show(*written)
 
 

@@ -9,8 +9,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
@@ -28,6 +29,7 @@ from undertow.cli.parsing import (
     parse_target,
     parse_values,
 )
+from undertow.cli.show import open_page
 from undertow.cli.terminal import (
     check_out,
     command,
@@ -45,6 +47,7 @@ from undertow.objective import Goal
 if TYPE_CHECKING:
     from undertow.models import Coordinate
     from undertow.runtime import Report, RunTarget, Runtime
+    from undertow.studies.live import Window
 
 
 @command(
@@ -54,7 +57,7 @@ if TYPE_CHECKING:
     "undertow run overhead_crane --target x=0.5m --target x=-0.5m@8s --seconds 16",
     "undertow run rotary_pendulum --target theta=20deg@0.25Hz --seconds 20",
     "undertow run rotary_pendulum --rig realistic --swing-up --seconds 20",
-    "undertow run rotary_pendulum --seconds 600 --log run.db",
+    "undertow run rotary_pendulum --seconds 600 --log run.db --show",
     "undertow run rotary_pendulum --rig examples/serial_rig.py:emulated",
 )
 def run(
@@ -112,6 +115,14 @@ def run(
     log: Annotated[
         Path | None, option("File for the log, an SQLite database.", metavar="FILE")
     ] = None,
+    watch: Annotated[
+        bool,
+        option(
+            "--show",
+            "Show the run on a live page while it goes on: from a process of its own, which reads "
+            "the log and reaches nothing else.",
+        ),
+    ] = False,
     seed: options.Seed = 0,
 ) -> None:
     """Run the two-rate controller on a rig, against the clock, and time every step.
@@ -159,46 +170,72 @@ def run(
             limit="the wall clock, by which a supervisor goes",
             remedy="Leave one of them out",
         )
+    if watch and simulated:
+        raise InvalidInputError(
+            "--show with --simulated",
+            value="simulated time",
+            limit="the wall clock, as a person looks",
+            remedy="Write --log run.db instead, and then undertow show run.db",
+        )
     processes = 3 if worker == "process" else 0
-    forked = 0 if simulated else processes + supervisor
+    forked = 0 if simulated else processes + supervisor + watch
     check_resources(processes=forked, log=log is not None)  # before a driver is opened
-    plant = rig_named(rig, recipe, supervised=supervisor)
-    with ExitStack() as stack, closed_on_failure(plant) as kept:
-        with progress_bar() as progress:
-            ready = session(
-                recipe,
-                rig=plant,
-                log=log,
-                simulated=simulated,
-                processes=processes,
-                lockstep=lockstep,
-                progress=progress,
-            )
-            runtime = stack.enter_context(ready)
-        if log is not None and not simulated:
-            free = [c for c in belief.coordinates if c.name in runtime.target.units]
-            _say_where_to_ask(log, runtime.deaf, free)
-        hold = f"Ready. Hold {name} at its start, press Enter and let go."
-        if in_a_file(rig) and not enter_pressed(hold):
-            runtime.stop()
-        stack.enter_context(_seconds_on_terminal(seconds))
-        kept.clear()  # the run closes it
-        report = _run(runtime, seconds)
-    what = "simulated time" if simulated else f"optimiser in another {worker}"
-    what += ", the rig in a supervisor" if supervisor else ""
-    where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
-    unit = ", ".join(sorted({i.unit for i in belief.inputs}))
-    show(
-        f"{name} on {where}, {1 / period:g} Hz, {what}",
-        problem_words(belief, recipe.cascade.objective, recipe.cascade.gate),
-        run_table(report, period, unit, simulated=simulated),
-    )
-    if (book := runtime.log) is not None:
-        lost = f", {book.dropped:,} rows lost" if book.dropped else ""
-        show(f"Log {log}: {book.failure or 'written'}{lost}")
-    verdict = report.verdict  # with the log closed
-    show(f"Verdict: {verdict}.")
+    with _watched(name, log) if watch else nullcontext((log, None)) as (book, window):
+        plant = rig_named(rig, recipe, supervised=supervisor)
+        with ExitStack() as stack, closed_on_failure(plant) as kept:
+            with progress_bar() as progress:
+                ready = session(
+                    recipe,
+                    rig=plant,
+                    log=book,
+                    simulated=simulated,
+                    processes=processes,
+                    lockstep=lockstep,
+                    progress=progress,
+                )
+                runtime = stack.enter_context(ready)
+                if window is not None and book is not None:
+                    progress("opening the page", 1.0)
+                    address = window.open(book)
+            if book is not None and not simulated:
+                free = [c for c in belief.coordinates if c.name in runtime.target.units]
+                _say_where_to_ask(book, runtime.deaf, free)
+            hold = f"Ready. Hold {name} at its start, press Enter and let go."
+            if window is not None:
+                open_page(f"The run of {name}", address, "It shows the run; it cannot reach it")
+                hold = hold if in_a_file(rig) else "Ready. Press Enter to begin."
+            if (in_a_file(rig) or window is not None) and not enter_pressed(hold):
+                runtime.stop()
+            stack.enter_context(_seconds_on_terminal(seconds))
+            kept.clear()  # the run closes it
+            report = _run(runtime, seconds)
+        what = "simulated time" if simulated else f"optimiser in another {worker}"
+        what += ", the rig in a supervisor" if supervisor else ""
+        where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
+        unit = ", ".join(sorted({i.unit for i in belief.inputs}))
+        show(
+            f"{name} on {where}, {1 / period:g} Hz, {what}",
+            problem_words(belief, recipe.cascade.objective, recipe.cascade.gate),
+            run_table(report, period, unit, simulated=simulated),
+        )
+        if (written := runtime.log) is not None:
+            lost = f", {written.dropped:,} rows lost" if written.dropped else ""
+            kept_as = f"Log {log}" if log else "Log of the page, not kept (--log run.db keeps it)"
+            show(f"{kept_as}: {written.failure or 'written'}{lost}")
+        verdict = report.verdict  # with the log closed
+        show(f"Verdict: {verdict}.")
     exit_unless(not verdict.exit_code, verdict.exit_code)
+
+
+@contextmanager
+def _watched(name: str, log: Path | None) -> Iterator[tuple[Path | None, Window | None]]:
+    """Begin a page for a run, which reads its log: where none is to be kept, one that is not."""
+    from undertow.studies.live import Window
+
+    with ExitStack() as stack:
+        if log is None:
+            log = Path(stack.enter_context(TemporaryDirectory(prefix="undertow-"))) / "run.db"
+        yield log, stack.enter_context(Window(name if in_a_file(name) else None))
 
 
 def _run(runtime: Runtime, seconds: float) -> Report:

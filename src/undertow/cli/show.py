@@ -6,7 +6,7 @@ import os
 import sys
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,9 @@ from undertow.cli.parsing import mechanism_named, parse_start
 from undertow.cli.terminal import command, progress_bar
 from undertow.cli.terminal import show as say
 from undertow.models import Mechanism
+
+if TYPE_CHECKING:
+    from undertow.display.live import Show
 
 #: How a log begins: an SQLite database.
 SQLITE = b"SQLite format 3\0"
@@ -45,6 +48,13 @@ def _has_windows() -> bool:
     return shown or sys.platform in ("darwin", "win32")
 
 
+def open_page(what: str, address: str, words: str, *, browser: bool = True) -> None:
+    """Say where a page is, and open it where that opens a window."""
+    say(f"{what} at {address}", words)
+    if browser and _has_windows():
+        webbrowser.open(address)
+
+
 @command(
     "undertow show rotary_pendulum",
     "undertow show overhead_crane --objective bench-time",
@@ -58,7 +68,7 @@ def show(
         typer.Argument(
             help="Mechanism of the library, or your own: FILE.py:NAME, FILE.urdf or FILE.xml, with "
             ":JOINT,JOINT for the actuated joints where the file does not name them; or the log "
-            "of a run, FILE.db.",
+            "of a run, FILE.db, also of one that goes on.",
             metavar="NAME|LOG",
         ),
     ] = "rotary_pendulum",
@@ -95,6 +105,7 @@ def show(
     Poke it with the mouse, change its plant and its target, watch the surface jump. Ctrl-C ends it.
     """
     from undertow.display.live import saved_page, serve
+    from undertow.runtime import GrowingLog
     from undertow.studies import live
 
     if save is None:
@@ -106,10 +117,15 @@ def show(
         raise InvalidInputError(
             "--mechanism", value=mechanism, limit="for a log, FILE.db", remedy="Leave it out"
         )
+    shown: Show
     with progress_bar() as progress:
         if log:
             progress(f"reading {name}", 0.3)
-            recording = live.of_log(Path(name), mechanism)
+            if save is None and not GrowingLog(Path(name)).over:
+                shown = live.Watched(Path(name), mechanism)
+            else:
+                recording = live.of_log(Path(name), mechanism)
+                shown = live.Recorded(recording)
         else:
             model = mechanism_named(name, setting, limit)
             x0 = parse_start(model, start or _a_little_off(model))
@@ -117,20 +133,17 @@ def show(
                 recording = live.recorded_run(name, model, x0, objective, period, seed, progress)
             else:
                 progress("making ready", 0.3)
-                simulation = live.simulation(name, model, x0, objective, period, seed)
+                shown = live.simulation(name, model, x0, objective, period, seed)
     if save is not None:
         written = write_file(save, saved_page(recording))
         say(f"Written to {written}: open it in a browser; it needs no other file")
         return
-    shown = live.Recorded(recording) if log else simulation
 
     def ready(address: str) -> None:
-        say(f"{name} at {address}", "On this machine alone. Ctrl-C ends it")
-        if browser and _has_windows():
-            webbrowser.open(address)
+        open_page(name, address, "On this machine alone. Ctrl-C ends it", browser=browser)
 
     try:
         serve(shown, ready, port=port)
     finally:
-        if not log:
-            simulation.close()
+        if isinstance(shown, live.Simulation):
+            shown.close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,7 +51,7 @@ class Film:
     these times. ``points``: of each part in the plane of the view, (F, k, 2), m; ``angles``: angle
     and radius of each disc, (F, 2), empty for other parts; ``tip``: in the plane of the view, (F,
     2), m. ``whole``: how long the motion takes until it has settled, s: longer than the film where
-    that is cut.
+    that is cut. ``speed``: motion seconds in a second of film.
     """
 
     mechanism: Mechanism
@@ -63,6 +63,7 @@ class Film:
     angles: tuple[FloatArray, ...]
     tip: FloatArray
     whole: float
+    speed: float = 1.0
 
     @classmethod
     def of(
@@ -107,17 +108,18 @@ class Film:
         x = np.stack([np.interp(t, trajectory.t, column) for column in trajectory.x.T], axis=1)
         index = np.clip(np.searchsorted(trajectory.t, t, side="right") - 1, 0, None)
         place = evaluator(mechanism, drawn)
-        return cls._at(mechanism, drawn, place, t, x[:, : mechanism.n], trajectory.u[index], whole)
+        q, u = x[:, : mechanism.n], trajectory.u[index]
+        return cls._at(mechanism, drawn, place, t, q, u, whole, speed)
 
     @classmethod
     def _at(
         cls, mechanism: Mechanism, drawn: Sketch, place: Callable[[FloatArray], Places],
-        t: FloatArray, q: FloatArray, u: FloatArray, whole: float,
+        t: FloatArray, q: FloatArray, u: FloatArray, whole: float, speed: float = 1.0,
     ) -> Film:  # fmt: skip
         """Evaluate a sketch at positions, (F, n), see :func:`evaluator`."""
         points, angles, tip = place(q)
         flat = tuple(_project(p, drawn.view) for p in points)
-        return cls(mechanism, drawn, t, q, u, flat, angles, _project(tip, drawn.view), whole)
+        return cls(mechanism, drawn, t, q, u, flat, angles, _project(tip, drawn.view), whole, speed)
 
     @property
     def span(self) -> str:
@@ -127,6 +129,14 @@ class Film:
         """
         shown = float(self.t[-1] - self.t[0])
         return f"0 to {shown:.3g} s" + (f" of {self.whole:.3g} s" if self.cut else "")
+
+    @property
+    def pace(self) -> str:
+        """How fast the film is, in words."""
+        if self.speed == 1.0:
+            return "real time"
+        factor = self.speed if self.speed > 1.0 else 1.0 / self.speed
+        return f"{factor:.3g} times {'faster' if self.speed > 1.0 else 'slower'}"
 
     @property
     def cut(self) -> bool:
@@ -336,19 +346,27 @@ def gif(film: Film) -> bytes:
             film.draw(scene, k)
             film.frame(scene, words=False)
             scene.text(
-                0.02, 0.98, f"{film.t[k] - film.t[0]:5.2f} s ({film.span})",
+                0.02, 0.98, f"{film.t[k] - film.t[0]:5.2f} s ({film.span}, {film.pace})",
                 transform=scene.transAxes, va="top",
             )  # fmt: skip
             gauge.clear()
             _gauge(gauge, film, k, bar)
             canvas.draw()
-            image = Image.frombuffer(
-                "RGBA", canvas.get_width_height(), bytes(canvas.buffer_rgba()), "raw", "RGBA", 0, 1
-            )
-            images.append(image.convert("RGB").quantize(64, dither=Image.Dither.NONE))
-    step = 1000.0 * float(film.t[1] - film.t[0])
+            images.append(snapshot(canvas))
+    return gif_of(images, float(film.t[1] - film.t[0]) / film.speed)
+
+
+def snapshot(canvas: Any) -> Image.Image:
+    """Return what is drawn on a canvas as a picture of few colours."""
+    size, data = canvas.get_width_height(), bytes(canvas.buffer_rgba())
+    image = Image.frombuffer("RGBA", size, data, "raw", "RGBA", 0, 1)
+    return image.convert("RGB").quantize(64, dither=Image.Dither.NONE)
+
+
+def gif_of(images: Sequence[Image.Image], step: float) -> bytes:
+    """Return pictures, ``step`` s apart, as an endless GIF that stays a second on the last one."""
     out = io.BytesIO()
-    lengths = [max(20, round(step))] * (len(images) - 1) + [1000]
+    lengths = [max(20, round(1000.0 * step))] * (len(images) - 1) + [1000]
     images[0].save(
         out, "GIF", save_all=True, append_images=images[1:], duration=lengths, loop=0, optimize=True
     )

@@ -9,7 +9,7 @@ from undertow.runtime.controller_defaults import (
     reaching_for,
 )
 from undertow.runtime.encoding import Columns
-from undertow.runtime.log import Log, Recording, read_log
+from undertow.runtime.log import GrowingLog, Log, Recording, read_log
 from undertow.runtime.log_files import column_units, to_mcap, to_parquet
 from undertow.runtime.loop import Runtime
 from undertow.runtime.modes import Command, Mode
@@ -38,6 +38,7 @@ __all__ = [
     "Command",
     "Controller",
     "Ending",
+    "GrowingLog",
     "Histogram",
     "InlineWorker",
     "Inputs",

@@ -19,6 +19,7 @@ import contextlib
 import errno
 import itertools
 import json
+import math
 import os
 import re
 import shutil
@@ -68,6 +69,15 @@ PART_BYTES = 1 << 30
 
 #: How long a disk may take over the last rows, s.
 CLOSE_TIMEOUT = 5.0
+
+#: How long the end of a log waits for who looks at it, s.
+LOOKED_AT = 0.3
+
+#: Where a file of SQLite says how it is written: 2 while there is a write-ahead log.
+WRITE_VERSION = 18
+
+#: A log whose run has written no step for so long has ended, s: the run was killed.
+SILENCE = 3.0
 
 #: Free space without which no log is begun, bytes.
 MIN_FREE_SPACE = 1 << 24
@@ -364,6 +374,81 @@ def _beyond(path: Path, part: int) -> list[Path]:
     return [part_path(path, number) for number in numbers if number > part]
 
 
+class GrowingLog:
+    """A log that a run still writes, read as it grows.
+
+    Each look opens the file to be read alone, and closes it again: who writes it waits for nothing.
+
+    Parameters
+    ----------
+    path
+        Its first file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._part, self._next = path, 1, 0
+        self._seen = {"events": 0, "answers": 0}
+        self._heard = math.inf
+
+    @property
+    def over(self) -> bool:
+        """Whether its run has closed it, or has written no step for :data:`SILENCE`.
+
+        Raises
+        ------
+        ArtefactError
+            When it is no file, or not any more.
+        """
+        path = part_path(self.path, self._part)
+        check_file(path, "log", remedy="Name a log of a run")
+        with path.open("rb") as file:
+            file.seek(WRITE_VERSION)
+            closed = file.read(1) != b"\x02" and not part_path(self.path, self._part + 1).exists()
+        return closed or time.monotonic() > self._heard + SILENCE
+
+    def news(self, every: int = 1, most: int = 1 << 20) -> Recording:
+        """Return what is new since the last look.
+
+        Parameters
+        ----------
+        every
+            Of the steps those whose number is a multiple of it.
+        most
+            Of the steps those among the last so many of a file.
+
+        Raises
+        ------
+        ArtefactError
+            As :func:`read_log`.
+        """
+        found = self._look(every, most)
+        while part_path(self.path, self._part + 1).exists():
+            self._part, self._seen = self._part + 1, dict.fromkeys(self._seen, 0)
+            more = self._look(every, most)
+            found = replace(
+                found, steps=np.concatenate([found.steps, more.steps]),
+                events=found.events + more.events, answers=found.answers + more.answers,
+            )  # fmt: skip
+        if len(found.steps):
+            self._heard = time.monotonic()
+        return found
+
+    def _look(self, every: int, most: int) -> Recording:
+        path = part_path(self.path, self._part)
+        with _read_from(path) as (file, size):
+            meta, columns = _heading(file, size)
+            (last,) = file.execute("SELECT max(k) FROM steps").fetchone()
+            after = max(self._next, (last or 0) + 1 - most)
+            which = f"WHERE k >= {after} AND k % {every:d} = 0"
+            steps = _numbers(file, len(columns), size, which)
+            self._next = max(self._next, (-1 if last is None else last) + 1)
+            new = {}
+            for table, names in (("events", EVENTS), ("answers", ANSWERS)):
+                new[table] = _lines_of(file, table, names, size, self._seen[table])
+                self._seen[table] += len(new[table])
+        return Recording(path, meta, columns, steps, _said(new["events"]), new["answers"])
+
+
 def _size(path: Path) -> int:
     """Return the size of a log's file with what waits beside it, bytes."""
     beside = Path(f"{path}-wal")
@@ -396,7 +481,17 @@ def _end(file: sqlite3.Connection) -> None:
     """Close a log, leaving one file; what the disk refuses is left for whoever opens it next."""
     with contextlib.suppress(sqlite3.Error):
         file.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        file.execute("PRAGMA journal_mode=DELETE")
+    until = time.monotonic() + LOOKED_AT
+    while True:
+        try:
+            file.execute("PRAGMA journal_mode=DELETE")
+            break
+        except sqlite3.OperationalError as error:  # somebody may look at it: see GrowingLog
+            if "locked" not in str(error) or time.monotonic() > until:
+                break
+            time.sleep(0.01)
+        except sqlite3.Error:
+            break
     with contextlib.suppress(sqlite3.Error):
         file.close()
 
@@ -491,16 +586,21 @@ def read_log(path: str | Path) -> Recording:
 
 
 def _read_part(path: Path) -> Recording:
+    with _read_from(path) as (file, most):
+        meta, columns = _heading(file, most)
+        steps = _numbers(file, len(columns), most)
+        events = _lines_of(file, "events", EVENTS, most)
+        answers = _lines_of(file, "answers", ANSWERS, most)
+    return Recording(path, meta, columns, steps, _said(events), answers)
+
+
+@contextlib.contextmanager
+def _read_from(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
+    """Open a log to be read; whatever is wrong with what is read is the log's."""
     try:
         with _opened(path) as (file, most):
             _check_tables(file)
-            meta = {}
-            for key, value in _rows(file, "SELECT key, value FROM meta", most):
-                meta[str(key)] = parse_json(str(value), finite=False)
-            columns = tuple(row[1] for row in file.execute("PRAGMA table_xinfo(steps)"))
-            steps = _numbers(file, len(columns), most)
-            events = _lines_of(file, "events", EVENTS, most)
-            answers = _lines_of(file, "answers", ANSWERS, most)
+            yield file, most
     except ArtefactError:
         raise
     except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError) as error:
@@ -508,8 +608,18 @@ def _read_part(path: Path) -> Recording:
         limit = "a log of a run, whole and of this version"
         remedy = "A run that was killed before its first step leaves an empty file"
         raise log_error(path, value, limit, remedy) from error
-    said = tuple((one["k"], one["t"], one["kind"], one["text"]) for one in events)
-    return Recording(path, meta, columns, steps, said, answers)
+
+
+def _heading(file: sqlite3.Connection, most: int) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return what the run was, and the columns of its steps."""
+    meta = {}
+    for key, value in _rows(file, "SELECT key, value FROM meta", most):
+        meta[str(key)] = parse_json(str(value), finite=False)
+    return meta, tuple(row[1] for row in file.execute("PRAGMA table_xinfo(steps)"))
+
+
+def _said(events: Iterable[dict[str, Any]]) -> tuple[tuple[int, float, str, str], ...]:
+    return tuple((one["k"], one["t"], one["kind"], one["text"]) for one in events)
 
 
 @contextlib.contextmanager
@@ -596,18 +706,22 @@ def _rows(file: sqlite3.Connection, query: str, most: int) -> Iterator[Line]:
         yield row
 
 
-def _numbers(file: sqlite3.Connection, width: int, most: int) -> FloatArray:
-    """Return the steps, (N, width); what is missing is NaN."""
-    rows, blocks = _rows(file, "SELECT * FROM steps ORDER BY k", most), []
+def _numbers(file: sqlite3.Connection, width: int, most: int, which: str = "") -> FloatArray:
+    """Return the steps, (N, width), or some of them; what is missing is NaN."""
+    rows, blocks = _rows(file, f"SELECT * FROM steps {which} ORDER BY k", most), []
     while block := list(itertools.islice(rows, 4096)):
         blocks.append(np.array(block, dtype=float).reshape(len(block), width))
     return np.concatenate(blocks) if blocks else np.empty((0, width))
 
 
 def _lines_of(
-    file: sqlite3.Connection, table: str, names: Iterable[str], most: int
+    file: sqlite3.Connection, table: str, names: Iterable[str], most: int, after: int = 0
 ) -> tuple[dict[str, Any], ...]:
-    """Return the rows of a table with their names, in the order in which they were written."""
+    """Return the rows of a table with their names, in the order in which they were written.
+
+    Those ``after`` so many of them: each row that is written gets the next number.
+    """
     names = tuple(names)
-    query = f"SELECT {', '.join(names)} FROM {table} ORDER BY rowid"
+    which = f"WHERE rowid > {after}" if after else ""
+    query = f"SELECT {', '.join(names)} FROM {table} {which} ORDER BY rowid"
     return tuple(dict(zip(names, row, strict=True)) for row in _rows(file, query, most))

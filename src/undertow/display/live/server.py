@@ -41,6 +41,9 @@ MOST_BYTES, MOST_VIEWERS = 4096, 16
 #: How long a viewer may take to answer a ping, s: a suspended page is let go.
 PATIENCE = 20.0
 
+#: How long viewers have to be told the rest of what is over, s.
+FAREWELL = 1.0
+
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
     "Cache-Control": "no-store",
@@ -121,6 +124,8 @@ class Server:
         What is shown.
     port
         Of 127.0.0.1; by default 8417, or any free one where that is taken.
+    over
+        Whether the show has ended: then its viewers are told the rest, and so ends the server.
 
     Attributes
     ----------
@@ -128,7 +133,9 @@ class Server:
         Where the page is, with its token; known once it listens.
     """
 
-    def __init__(self, show: Show, port: int | None = None) -> None:
+    def __init__(
+        self, show: Show, port: int | None = None, over: Callable[[], bool] = lambda: False
+    ) -> None:
         need = "the live page needs websockets"
         self._ws = require_extra("websockets", "show", need)
         self._serve = require_extra("websockets.asyncio.server", "show", need).serve
@@ -136,7 +143,7 @@ class Server:
         self._response = require_extra("websockets.http11", "show", need).Response
         if port is not None and not 0 <= port <= 65535:
             raise InvalidInputError("port", value=port, limit="0 to 65535", remedy="0: a free one")
-        self.show, self._wanted = show, port
+        self.show, self._wanted, self._over = show, port, over
         self.token, self.port = secrets.token_urlsafe(16), 0
         self.viewers: dict[int, Viewer] = {}
         self._count = 0
@@ -260,9 +267,9 @@ class Server:
                     await viewer.socket.send(encoded(message))
 
     async def _tick(self) -> None:
-        """Advance the show by the clock, whoever looks on."""
+        """Advance the show by the clock, whoever looks on, until it is over."""
         last = due = time.monotonic()
-        while True:
+        while not self._over():
             due = max(due + 1.0 / RATE, time.monotonic() - CATCH_UP)
             await asyncio.sleep(max(0.0, due - time.monotonic()))
             now = time.monotonic()
@@ -272,10 +279,14 @@ class Server:
                         del self.viewers[viewer.number]
                         viewer.cut_off()
             last = now
+        await asyncio.sleep(FAREWELL)
 
 
-def serve(show: Show, ready: Callable[[str], None], *, port: int | None = None) -> None:
-    """Serve a show until Ctrl-C.
+def serve(
+    show: Show, ready: Callable[[str], None], *, port: int | None = None,
+    over: Callable[[], bool] = lambda: False,
+) -> None:  # fmt: skip
+    """Serve a show until Ctrl-C, or until it is over.
 
     Parameters
     ----------
@@ -285,6 +296,8 @@ def serve(show: Show, ready: Callable[[str], None], *, port: int | None = None) 
         Called with the address once the page can be opened.
     port
         Of 127.0.0.1; by default 8417, or any free one where that is taken.
+    over
+        Whether the show has ended: then its viewers are told the rest, and so ends the server.
 
     Raises
     ------
@@ -293,7 +306,7 @@ def serve(show: Show, ready: Callable[[str], None], *, port: int | None = None) 
     ArtefactError
         For a port that is taken.
     """
-    server = Server(show, port)
+    server = Server(show, port, over)
 
     async def until_stopped() -> None:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()

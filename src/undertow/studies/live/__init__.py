@@ -1,6 +1,17 @@
-"""What the live page shows: a cascade in real time, a simulated run, the log of a run."""
+"""What the live page shows: a cascade in real time, a simulated run, a run on a rig, its log."""
 
 from undertow.studies.live.recorded import Recorded, of_log, of_run, recorded_run
 from undertow.studies.live.simulation import Simulation, simulation
+from undertow.studies.live.watched import Watched
+from undertow.studies.live.window import Window
 
-__all__ = ["Recorded", "Simulation", "of_log", "of_run", "recorded_run", "simulation"]
+__all__ = [
+    "Recorded",
+    "Simulation",
+    "Watched",
+    "Window",
+    "of_log",
+    "of_run",
+    "recorded_run",
+    "simulation",
+]

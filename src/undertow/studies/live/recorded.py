@@ -15,7 +15,7 @@ from undertow.display.live import Message, Scene
 from undertow.display.sketches import Sketch, sketch
 from undertow.display.tree_sketch import sketch_named
 from undertow.models import FloatArray, Mechanism
-from undertow.runtime import Columns, Mode, read_log
+from undertow.runtime import Columns, Mode, Recording, read_log
 from undertow.runtime.encoding import answer_from, memory_from
 from undertow.runtime.replay import legible, recorded_recipe
 from undertow.studies.live.messages import described, frame_message, plan_message
@@ -106,6 +106,72 @@ def recorded_run(
     return of_run(run, cascade, sketch_named(name, mechanism))
 
 
+class Told:
+    """A run as its log tells it: what moved, and what was decided.
+
+    Parameters
+    ----------
+    recording
+        The log, or what there is of it.
+    mechanism
+        For a log of one's own mechanism in a Python file: which one it is.
+
+    Attributes
+    ----------
+    belief
+        The mechanism.
+    first
+        The decision that the run began with.
+
+    Raises
+    ------
+    ArtefactError
+        When it is no log of a run, or is of a mechanism that has to be named.
+    """
+
+    def __init__(self, recording: Recording, mechanism: str | None = None) -> None:
+        recipe, _ = recorded_recipe(recording, mechanism)
+        self.belief, self._reaching = recipe.belief, recipe.cascade.reaching
+        self._reference, self.period = recipe.reference, recipe.period
+        self.columns = Columns.of(self.belief)
+        with legible(recording.path):
+            name = recipe.mechanism if isinstance(recipe.mechanism, str) else ""
+            figure = sketch_named(name, self.belief) if name else sketch(self.belief)
+            self.scene = Scene(self.belief, figure)
+            memory = memory_from(recording.meta["memory"], self._reference)
+            self.first = plan_message(
+                0.0, True, "first optimum", memory.surface, memory.predicted, self._reaching
+            )
+
+    def frames(self, steps: FloatArray) -> list[Message]:
+        """Return pictures of steps, (N, …)."""
+        c = self.columns
+        left = np.full(len(steps), math.nan)
+        return _pictures(
+            self.belief, self.scene, steps[:, c.t], steps[:, c.x], steps[:, c.u],
+            steps[:, c.demand], steps[:, c.s], left,
+            [Mode(int(mode)).name.lower().replace("_", " ") for mode in steps[:, c.mode]],
+        )  # fmt: skip
+
+    def decisions(self, recording: Recording) -> list[Message]:
+        """Return what a log, or a part of it, says of answers and events, in the order of time."""
+        plans: list[Message] = []
+        for row in recording.answers:
+            answer = answer_from(row, self._reference)
+            admission = answer.admission
+            plan = plan_message(
+                answer.use, admission.accepted, admission.reason, answer.memory.surface,
+                answer.memory.predicted, self._reaching,
+            )  # fmt: skip
+            target = answer.memory.target
+            goal = [] if target is None else list(target.position(answer.use))
+            plans.append(plan | {"ms": 1e3 * answer.seconds, "first": answer.jump, "goal": goal})
+        for _, at, kind, text in recording.events:
+            if kind != "answer":  # which is told above
+                plans.append({"kind": "event", "t": at, "why": f"{kind}: {text}"})
+        return sorted(plans, key=lambda one: float(one["t"]))
+
+
 def of_log(path: Path, mechanism: str | None = None) -> Message:
     """Return the log of a run as a recording.
 
@@ -122,43 +188,15 @@ def of_log(path: Path, mechanism: str | None = None) -> Message:
         When it is no log of a run, or is of a mechanism that has to be named.
     """
     recording = read_log(path)
-    recipe, _ = recorded_recipe(recording, mechanism)
-    belief, reaching = recipe.belief, recipe.cascade.reaching
+    told = Told(recording, mechanism)
     with legible(path):
-        columns, steps = Columns.of(belief), recording.steps
+        steps = recording.steps
         if len(steps) < 2:
             raise ValueError("less than two steps")
-        first = memory_from(recording.meta["memory"], recipe.reference)
-        t = steps[:, columns.t]
-        plans = [plan_message(float(t[0]), True, "first optimum", first.surface, first.predicted,
-                              reaching)]  # fmt: skip
-        for row in recording.answers:
-            answer = answer_from(row, recipe.reference)
-            admission = answer.admission
-            plan = plan_message(
-                answer.use, admission.accepted, admission.reason, answer.memory.surface,
-                answer.memory.predicted, reaching,
-            )  # fmt: skip
-            target = answer.memory.target
-            goal = [] if target is None else list(target.position(answer.use))
-            plan |= {"ms": 1e3 * answer.seconds, "first": answer.jump, "goal": goal}
-            plans.append(plan)
-        for _, at, kind, text in recording.events:
-            if kind != "answer":  # which is told above
-                plans.append({"kind": "event", "t": at, "why": f"{kind}: {text}"})
-        plans.sort(key=lambda one: float(one["t"]))
-        rows = _evenly(t)
-        frames = steps[rows]
-        name = recipe.mechanism if isinstance(recipe.mechanism, str) else ""
-        figure = sketch_named(name, belief) if name else sketch(belief)
-        left = np.full(len(rows), math.nan)
-        message = recording_of(
-            belief, figure, t[rows], frames[:, columns.x], frames[:, columns.u],
-            frames[:, columns.demand], frames[:, columns.s], left, plans,
-        )  # fmt: skip
-        for frame, mode in zip(message["frames"], frames[:, columns.mode], strict=True):
-            frame["mode"] = Mode(int(mode)).name.lower().replace("_", " ")
-        return message
+        t = steps[:, told.columns.t]
+        plans = [told.first | {"t": float(t[0])}, *told.decisions(recording)]
+        frames = told.frames(steps[_evenly(t)])
+        return _recording(told.belief, told.scene, frames, plans)
 
 
 def _evenly(t: FloatArray) -> Any:
@@ -173,14 +211,31 @@ def recording_of(
     demand: FloatArray, s: FloatArray, left: FloatArray, plans: Sequence[Message],
 ) -> Message:  # fmt: skip
     """Return instants of a motion, one a row, and its decisions as a recording."""
-    scene, values = Scene(mechanism, figure), mechanism.parameter_values
-    frames = []
-    for row in zip(t, x, u, demand, s, left, strict=True):
+    scene = Scene(mechanism, figure)
+    frames = _pictures(mechanism, scene, t, x, u, demand, s, left)
+    return _recording(mechanism, scene, frames, plans)
+
+
+def _pictures(
+    mechanism: Mechanism, scene: Scene, t: FloatArray, x: FloatArray, u: FloatArray,
+    demand: FloatArray, s: FloatArray, left: FloatArray, modes: Sequence[str] = (),
+) -> list[Message]:  # fmt: skip
+    """Return pictures of a motion, one a row; none where the state is not known."""
+    frames, values = [], mechanism.parameter_values
+    for k, row in enumerate(zip(t, x, u, demand, s, left, strict=True)):
         if not np.isfinite(row[1]).all():
             continue
         frame = frame_message(*row)
         frame["points"] = scene.places(row[1][: mechanism.n], values).tolist()
+        if modes:
+            frame["mode"] = modes[k]
         frames.append(frame)
+    return frames
+
+
+def _recording(
+    mechanism: Mechanism, scene: Scene, frames: list[Message], plans: Sequence[Message]
+) -> Message:
     return {
         **described(mechanism, scene), "live": False, "speeds": [1.0, 0.5, 0.2, 0.05],
         "controls": [], "state": {"kind": "state", "mode": "recording"}, "frames": frames,

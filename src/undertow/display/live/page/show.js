@@ -7,12 +7,12 @@
   const WINDOW = 8;          // seconds on the charts
   const KEPT = 1500;         // frames kept when live
   const TRAIL = 1.2;         // seconds of the tip's path
-  const BEHIND = 0.03;       // live pictures are shown so much later, s, so that none is missing
+  const BEHIND = 0.03;       // live pictures are shown so much later, s, so that none is missing; hello may say more
   const STYLES = [["--blue", []], ["--orange", [8, 4]], ["--green", [3, 3]], ["--purple", [10, 3, 2, 3]], ["--red", [6, 2]]];
 
   let hello = null, frames = [], plans = [], controls = new Map();
   let state = { mode: "waiting", paused: false, speed: 1, waits: "", why: "" };
-  let live = true, shown = 0, playing = true, rate = 1;
+  let live = true, watched = false, shown = 0, playing = true, rate = 1;
   let socket = null, retry = 0.4, note = "", noteUntil = 0;
   let camera = { x: 0, y: 0 }, holding = null, drag = null;
   let colours = {}, charts = {}, drawn = 0, fps = 0, counted = performance.now(), listed = "";
@@ -66,14 +66,15 @@
   }
   function begin(message) {
     hello = message; frames = message.frames; plans = message.plans; state = message.state;
-    live = message.live; shown = live ? latest() : frames.length ? frames[0].t : 0;
+    live = message.live; watched = !!message.watched; shown = live ? latest() : frames.length ? frames[0].t : 0;
     playing = live ? !state.paused : true;
-    document.body.classList.toggle("recorded", !live);
-    $("scene").classList.toggle("recorded", !live);
+    document.body.classList.toggle("recorded", !live || watched);
+    $("scene").classList.toggle("recorded", !live || watched);
+    $("transport").hidden = watched;
     document.title = `${hello.mechanism} – undertow`;
     $("name").textContent = hello.mechanism;
     $("about").textContent = hello.about;
-    $("hint").textContent = live ? "Drag a part to pull it. Space pauses, R resets." : "Space plays and pauses.";
+    $("hint").textContent = watched ? "A run, looked at: nothing reaches it from here." : live ? "Drag a part to pull it. Space pauses, R resets." : "Space plays and pauses.";
     $("speed").replaceChildren(...hello.speeds.map((v) => new Option(v === 1 ? "real time" : `1/${Math.round(1 / v)}`, v)));
     $("axis").replaceChildren(...hello.coordinates.map((c, i) => new Option(c.name, i)));
     $("axis").value = hello.coordinates.length - 1;
@@ -94,6 +95,7 @@
     socket.onmessage = (event) => hear(JSON.parse(event.data));
     socket.onclose = () => {
       holding = null;
+      if (!live) { link("recording"); return; }  // it is all here
       link("connection lost: trying again. Is undertow show still running?", true);
       setTimeout(connect, 1000 * retry);
       retry = Math.min(3, 1.6 * retry);
@@ -122,7 +124,7 @@
   $("time").oninput = (e) => { shown = Number(e.target.value); playing = false; showTransport(); };
   addEventListener("keydown", (e) => {
     const on = document.activeElement;
-    if (e.ctrlKey || e.altKey || e.metaKey || (on && ["INPUT", "SELECT"].includes(on.tagName))) return;
+    if (watched || e.ctrlKey || e.altKey || e.metaKey || (on && ["INPUT", "SELECT"].includes(on.tagName))) return;
     const speeds = hello ? hello.speeds : [];
     const acts = {
       " ": pause, s: step, ".": step, r: reset,
@@ -291,7 +293,7 @@
     return mapping(box.width, box.height).back(e.clientX - box.left, e.clientY - box.top);
   };
   $("scene").addEventListener("pointerdown", (e) => {
-    if (!live || !hello || e.button) return;
+    if (!live || watched || !hello || e.button) return;
     $("scene").setPointerCapture(e.pointerId); $("scene").focus({ preventScroll: true });
     holding = e.pointerId; $("scene").classList.add("holding");
     say({ do: "grab", at: place(e) });
@@ -476,7 +478,7 @@
   function drawWords(frame) {
     const mode = $("mode");
     let words = "", style = "";
-    if (!live) { words = frame?.mode ?? (playing ? "Recording" : "Recording, paused"); words = words[0].toUpperCase() + words.slice(1); }
+    if (!live || watched) { words = frame?.mode ?? (watched ? "Not begun" : null) ?? (playing ? "Recording" : "Recording, paused"); words = words[0].toUpperCase() + words.slice(1); }
     else if (state.mode === "waiting") words = "Looking for the first surface…";
     else if (state.mode === "fallen") [words, style] = ["Fallen", "bad"];
     else if (state.paused) words = "Paused";
@@ -517,7 +519,7 @@
     if (!hello) return;
     if (live) {
       if (drag) { say({ do: "drag", at: drag }); drag = null; }
-      const aim = latest() - (state.paused ? 0 : BEHIND * state.speed);
+      const aim = latest() - (state.paused ? 0 : (hello.behind ?? BEHIND) * state.speed);
       const next = shown + (state.paused ? 0 : passed * state.speed);
       shown = Math.abs(next - aim) > 0.25 ? aim : next + 0.1 * (aim - next);
       if (state.paused) shown = latest();
@@ -536,7 +538,7 @@
 
   // What tests, and the curious, can look at.
   window.undertow = {
-    get state() { return { ...state, live, shown, playing, fps, connected: socket?.readyState === 1, note: performance.now() < noteUntil ? note : "" }; },
+    get state() { return { ...state, live, watched, shown, playing, fps, connected: socket?.readyState === 1, note: performance.now() < noteUntil ? note : "" }; },
     get frame() { return frameAt(shown); },
     get frames() { return frames; }, get plans() { return plans; }, get hello() { return hello; },
     get controls() { return Object.fromEntries(controls); },

@@ -1,0 +1,114 @@
+"""The page of a run in a process of its own, which shares nothing with the run but its log."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from undertow.base import ArtefactError, UndertowError, require_extra
+from undertow.display.live import serve
+from undertow.runtime.processes import Background
+from undertow.studies.live.watched import Watched
+
+#: How much this process gives way to others, its niceness.
+POLITE = 10
+
+#: How long it may take to begin, s; how long it stays to tell what came of the run.
+BEGIN, LINGER = 120.0, 10.0
+
+
+class Window:
+    """A page that shows a run while it goes on, from another process.
+
+    It is begun before the run is prepared: what it has to load is loaded when the run begins.  It
+    ends once the run is over and its viewers have been told all of it.
+
+    Parameters
+    ----------
+    mechanism
+        For one's own mechanism in a Python file: which one it is.
+
+    Raises
+    ------
+    MissingExtraError
+        Where ``websockets`` is not installed.
+    """
+
+    def __init__(self, mechanism: str | None = None) -> None:
+        require_extra("websockets", "show", "the live page needs websockets")
+        context = multiprocessing.get_context("spawn")  # no lock or driver of ours is copied
+        self._line, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_show, args=(theirs, mechanism), name="undertow show", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+
+    def open(self, log: Path) -> str:
+        """Show the run that writes this log, and return the address of the page.
+
+        Raises
+        ------
+        ArtefactError
+            Where it cannot be shown.
+        """
+        self._line.send(log)
+        address, problem = None, "its process has ended"
+        if not self._line.poll(BEGIN):
+            problem = f"its process has not begun after {BEGIN:g} s"
+        else:
+            try:
+                address, problem = self._line.recv()
+            except EOFError:
+                address = None
+        if address is None:
+            raise ArtefactError(
+                "page of a run", value=problem, limit="one that can be opened",
+                remedy="Leave --show out, and look from another terminal: undertow show LOG",
+            )  # fmt: skip
+        return str(address)
+
+    def __enter__(self) -> Self:
+        """Return the window."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        """Let it tell what came of the run, and end it."""
+        self._line.close()
+        if kind is None:
+            self._process.join(LINGER)
+        self._process.terminate()
+        self._process.join(LINGER)
+
+
+def _show(line: Connection, mechanism: str | None) -> None:
+    """Show the run whose log is named over the line; end with it."""
+    if hasattr(os, "setsid"):
+        os.setsid()  # Ctrl-C in the terminal is for the run alone
+    if hasattr(os, "nice"):
+        os.nice(POLITE)
+    Background(_end_with_the_run, "undertow parent")
+    try:
+        show = Watched(line.recv(), mechanism)
+        serve(show, lambda address: line.send((address, "")), port=0, over=lambda: show.over)
+    except UndertowError as error:
+        line.send((None, str(error)))
+    except EOFError:
+        pass  # there was no run
+
+
+def _end_with_the_run() -> None:
+    """End when the process of the run does, a while later: its viewers are told."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this one was spawned
+    parent.join()
+    time.sleep(LINGER)
+    os._exit(0)
