@@ -28,7 +28,8 @@ __all__ = ["app", "main"]
 #: The order in which help shows the commands: look, steer, prove, run, repeat.
 _ORDER = (
     "mechanisms", "models", "derive", "show", "animate", "survey", "optimise", "simulate",
-    "certify", "verify", "bench", "run", "target", "replay", "drill", "trials", "campaign", "reproduce",
+    "certify", "verify", "bench", "run", "target", "replay", "drill", "trials", "campaign",
+    "reproduce",
 )  # fmt: skip
 
 app.registered_commands.sort(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from undertow.base import INTERRUPTED, InvalidInputError
+from undertow.base import INTERRUPTED, InvalidInputError, write_file
 from undertow.cli.options import option
 from undertow.cli.terminal import command, completed, exit_unless, show
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     "undertow campaign map.toml --out map.zarr --scheduler tcp://host:8786",
     "undertow campaign map.toml --out map.zarr --status",
     "undertow campaign map.toml --out map.zarr --shard 17",
+    "undertow campaign map.toml --out map.zarr --picture map.png",
 )
 def campaign(
     file: Annotated[
@@ -52,6 +53,12 @@ def campaign(
         int | None,
         option("Compute this shard alone, in this process, and compare it with the store.", min=0),
     ] = None,
+    picture: Annotated[
+        Path | None, option("Draw what the store has into this PNG, and nothing else.")
+    ] = None,
+    proof: Annotated[
+        Path | None, option("Certificate whose region on the surface the picture shows.")
+    ] = None,
 ) -> None:
     """Compute many shards of work, and keep them in a store that survives interruptions."""
     from undertow.studies.campaign import Campaign, Definition, executor_for
@@ -72,7 +79,12 @@ def campaign(
             remedy="A thread cannot be ended: add --workers 1",
         )
     task = Campaign(Definition.read(file, mechanism), out)
-    if status:
+    if picture is not None:
+        from undertow.studies.campaign.figures import picture_file
+
+        image, words = picture_file(task, proof)
+        show(*words, f"Written to {write_file(picture, image)}")
+    elif status:
         show(*status_of(task))
     elif shard is not None:
         show(*alone(task, shard))

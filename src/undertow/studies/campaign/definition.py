@@ -8,18 +8,16 @@ import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, get_args
 
 from undertow.base import ArtefactError, InvalidInputError, near, one_of, read_file
 from undertow.mechanisms.named import from_anywhere, named
 from undertow.models import Mechanism
 from undertow.models.importers.python_file import in_a_file
-from undertow.objective import Objective, objective_for
+from undertow.objective import Goal, Objective, objective_for
 
 #: Largest definition, bytes.
 LARGEST = 1 << 20
-
-T = TypeVar("T")
 
 #: Stands for a value that has to be there.
 _NEEDED: Any = object()
@@ -34,7 +32,7 @@ class Definition:
     mechanism
         Its name, as for :func:`undertow.mechanisms.named.named`; paths are whole.
     text
-        Everything else that the file says, as JSON in one order.
+        Everything else that the file says, as JSON.
     """
 
     mechanism: str
@@ -83,16 +81,22 @@ class Definition:
     def of(cls, mechanism: str, **said: Any) -> Definition:
         """Return the definition with these settings, plain numbers, words, lists and tables."""
         try:
-            return cls(mechanism, json.dumps(said, sort_keys=True, allow_nan=False))
+            return cls(mechanism, json.dumps(said, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise InvalidInputError(
                 "settings of a campaign", value=str(error), limit="finite numbers and words"
             ) from error
 
     @property
+    def said(self) -> dict[str, Any]:
+        """What the file says, but for the mechanism."""
+        found: dict[str, Any] = json.loads(self.text)
+        return found
+
+    @property
     def settings(self) -> Settings:
-        """What it says, to be read once."""
-        return Settings(json.loads(self.text), "")
+        """The same, to be taken one by one."""
+        return Settings(self.said, "")
 
 
 class Settings:
@@ -213,9 +217,10 @@ def mechanism_of(definition: Definition, settings: Settings) -> Mechanism:
     return mechanism
 
 
-def objective_of(mechanism: Mechanism, settings: Settings, horizon: float) -> Objective:
-    """Return what ``objective`` and ``horizon``, s, mean; the horizon has a default."""
-    words = ("energy", "time", "bench-energy", "bench-time", "effort")
-    word = settings.word("objective", words, "energy")
+def objective_of(
+    mechanism: Mechanism, settings: Settings, horizon: float, usual: Goal = "energy"
+) -> Objective:
+    """Return what ``objective`` and ``horizon``, s, mean; both have a usual value."""
+    word = settings.word("objective", get_args(Goal), usual)
     longest = settings.number("horizon", horizon, low=1e-3, high=1e4)
     return objective_for(mechanism, word, horizon=longest)

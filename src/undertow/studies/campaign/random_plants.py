@@ -43,7 +43,7 @@ class RandomPlants(Study):
 
     def __init__(self, mechanism: Mechanism, settings: Settings) -> None:
         self.mechanism = mechanism
-        self.objective = objective_of(mechanism, settings, 60.0)
+        self.objective = objective_of(mechanism, settings, 60.0, "bench-energy")
         self.controllers = settings.words("controllers", CONTROLLERS)
         self.spread = settings.number("spread", 0.2, low=0.0, high=0.9)
         self.friction = settings.number("friction", 2.0, low=0.0, high=100.0)

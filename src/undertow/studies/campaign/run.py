@@ -167,7 +167,7 @@ class Campaign:
         name = self.definition.mechanism
         about = {
             "title": f"{self.study.kind} of {self.study.mechanism.name}",
-            "definition": self.definition.settings._values | {"mechanism": name},
+            "definition": self.definition.said | {"mechanism": name},
             "mechanism_fingerprint": self.study.mechanism.fingerprint,
             "seed": self.study.seed,
             "versions": versions(),
@@ -325,9 +325,9 @@ def executor_for(
                     client.wait_for_workers(1, timeout=20)
                 width = sum(client.nthreads().values())
                 yield client.get_executor(pure=False), width
-        except OSError as error:  # and timeouts
-            if isinstance(error, UndertowError):
-                raise
+        except UndertowError:
+            raise
+        except (OSError, RuntimeError) as error:  # of dask: no scheduler, no workers, timeouts
             raise _lost(str(error)) from error
         finally:
             if cluster is not None:
