@@ -121,7 +121,8 @@ def overhead(shards: int, folder: Path) -> list[str]:
         compute(definition, shard)
     bare = (time.perf_counter() - clock) / real
     rows, lines = [], []
-    for name, how in (("one thread", {"threads": 1}), ("one worker", {"workers": 1})):
+    ways: dict[str, dict[str, Any]] = {"one thread": {"threads": 1}, "one worker": {"workers": 1}}
+    for name, how in ways.items():
         with executor_for(**how) as (pool, width):
             warm(region(8, 8), folder, pool, width)
             seconds, shards = timed(definition, folder, pool, width)
@@ -142,7 +143,8 @@ def two(shards: int, folder: Path) -> list[str]:
     for what, names in (("threads", ("region",)), ("workers", ("region", "plants", "designs"))):
         spent: dict[tuple[str, int], float] = {}
         for width in (1, 2):
-            with executor_for(**{what: width}) as (pool, _):
+            how: dict[str, Any] = {what: width}
+            with executor_for(**how) as (pool, _):
                 for name in names:
                     definition = kinds(shards)[name]
                     warm(kinds(2)[name], folder, pool, width)

@@ -21,7 +21,6 @@ from undertow.proofs.kernel.claims import SurfaceRegion, read_claim
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.studies.campaign.region_map import EVENTS, RegionMap
 from undertow.studies.campaign.run import Campaign
-from undertow.studies.campaign.store import dataset
 
 #: Most points of an axis that are drawn; a finer grid is thinned out.
 DRAWN = 600
@@ -55,7 +54,7 @@ def picture(campaign: Campaign, proved: LyapunovFunction | None = None) -> Figur
     InvalidInputError
         For other numbers of axes, or a proved set where the states are not on a surface.
     """
-    study, data = campaign.study, dataset(campaign.path)
+    study, data = campaign.study, campaign.dataset()
     data = data.isel({
         axis.name: slice(None, None, -(-len(axis.values) // DRAWN)) for axis in study.axes
     })  # fmt: skip
@@ -217,7 +216,7 @@ def proved_set(study: RegionMap, path: Path) -> LyapunovFunction:
 
 def proved_words(campaign: Campaign, proved: LyapunovFunction) -> str:
     """Say how many states of a finished shard in the proved set come home with the input limits."""
-    study, data = campaign.study, dataset(campaign.path)
+    study, data = campaign.study, campaign.dataset()
     assert isinstance(study, RegionMap)
     inside = home = 0
     for shard in range(study.shards):
@@ -274,4 +273,5 @@ def _title(study: Any, data: Any) -> str:
     events = np.asarray(data.event)
     home = 100 * (events == EVENTS.index("reached")).sum() / max((events >= 0).sum(), 1)
     where = ", started on the surface s = 0" if study.sliding else ""
-    return f"{title} from which motions come home{where}; {limits}; {home:.1f} % of the slice"
+    part = "slice" if len(study.axes) == 2 else "volume"
+    return f"{title} from which motions come home{where}; {limits}; {home:.1f} % of the {part}"

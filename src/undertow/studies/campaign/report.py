@@ -9,7 +9,7 @@ from rich.console import RenderableType
 
 from undertow.base import number, table
 from undertow.studies.campaign.run import Campaign, Outcome, compute, duration
-from undertow.studies.campaign.store import Store, dataset, digest
+from undertow.studies.campaign.store import Store, digest
 
 #: Numbers of shards that a sentence lists.
 LISTED = 8
@@ -58,7 +58,7 @@ def report(campaign: Campaign, outcome: Outcome) -> list[RenderableType]:
 
 def summary(campaign: Campaign) -> RenderableType:
     """Return a table of what the store has: shares of words, or ranges of numbers."""
-    data = dataset(campaign.path)
+    data = campaign.dataset()
     rows = []
     for name in campaign.study.variables:
         values, facts = data[name], data[name].attrs

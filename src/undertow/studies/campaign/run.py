@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import json
 import logging
 import threading
 import time
@@ -30,7 +31,7 @@ from undertow.studies.campaign.definition import Definition, mechanism_of
 from undertow.studies.campaign.designs import Designs
 from undertow.studies.campaign.random_plants import RandomPlants
 from undertow.studies.campaign.region_map import RegionMap
-from undertow.studies.campaign.store import Store, digest
+from undertow.studies.campaign.store import Store, dataset, digest
 from undertow.studies.campaign.study import Arrays, Study
 from undertow.symbolic.store import content_key
 
@@ -71,7 +72,11 @@ def key_of(definition: Definition) -> str:
     study = study_of(definition)
     mechanism = study.mechanism
     return content_key(
-        definition.text, mechanism.fingerprint, repr(mechanism.parameters), repr(mechanism.start)
+        json.dumps(definition.said, sort_keys=True),
+        repr([axis.name for axis in study.axes]),  # in the order in which they stand there
+        mechanism.fingerprint,
+        repr(mechanism.parameters),
+        repr(mechanism.start),
     )
 
 
@@ -164,15 +169,36 @@ class Campaign:
         """
         if resume:
             return Store(self.path, self.key)
-        name = self.definition.mechanism
-        about = {
+        return Store.create(self.path, self.study, self.key, self.about | {"versions": versions()})
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What the attributes of a store say of this campaign, whatever the version."""
+        return {
             "title": f"{self.study.kind} of {self.study.mechanism.name}",
-            "definition": self.definition.said | {"mechanism": name},
+            "definition": self.definition.said | {"mechanism": self.definition.mechanism},
             "mechanism_fingerprint": self.study.mechanism.fingerprint,
             "seed": self.study.seed,
-            "versions": versions(),
         }
-        return Store.create(self.path, self.study, self.key, about)
+
+    def dataset(self) -> Any:
+        """Return what the store has as an ``xarray.Dataset``, read lazily; of any version.
+
+        Raises
+        ------
+        ArtefactError
+            When it is of another definition or mechanism.
+        """
+        data = dataset(self.path)
+        for name, mine in self.about.items():
+            if data.attrs.get(name) != mine:
+                raise ArtefactError(
+                    f"{name} in the store '{self.path}'",
+                    value=data.attrs.get(name),
+                    limit=mine,
+                    remedy="Name the store of this campaign with --out",
+                )
+        return data
 
     def run(
         self,
