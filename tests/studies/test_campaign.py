@@ -494,7 +494,8 @@ def test_pictures_show_slices_volumes_and_proved_sets(serial: Path, tmp_path: Pa
     flat = picture(Campaign(MAP, serial))
     time, cost = flat.axes[:2]
     assert (time.get_xlabel(), time.get_ylabel()) == ("φ (°)", "φ̇ (°/s)")
-    shown = np.ma.filled(cost.collections[-1].get_array(), np.nan)
+    drawn: Any = cost.collections[-1].get_array()
+    shown = np.ma.filled(drawn, np.nan)
     assert np.nanmax(abs(shown - dataset(serial).cost.values.T)) == 0
     on_surface = Definition.of(RIG, **CASE, axes=ON_SURFACE)
     run(on_surface, tmp_path / "on")
