@@ -172,7 +172,7 @@ def killed_once(fn: Callable[..., Any], *args: Any) -> Any:
     if not mark.exists():
         mark.touch()
         study, store = module.study_of(args[0]), Store(Path(args[2]))
-        store._group["event"][study.part(args[3])] = compute(args[0], args[3])["event"]
+        store._arrays["event"][study.part(args[3])] = compute(args[0], args[3])["event"]
         os.kill(os.getpid(), signal.SIGKILL)
     return fn(*args)
 
@@ -188,6 +188,7 @@ def hangs(fn: Callable[..., Any], *args: Any) -> Any:
     return fn(*args)
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_the_middle_of_a_shard_loses_nothing(
     serial: Path, tmp_path: Path
 ) -> None:

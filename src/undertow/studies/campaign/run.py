@@ -67,6 +67,7 @@ def study_of(definition: Definition) -> Study:
     return study
 
 
+@lru_cache(maxsize=4)
 def key_of(definition: Definition) -> str:
     """Return the hash that names a campaign: settings, mechanism, sources and versions."""
     study = study_of(definition)
@@ -99,6 +100,12 @@ def compute(definition: Definition, shard: int) -> Arrays:
         return study.compute(shard)
 
 
+@lru_cache(maxsize=4)
+def _opened(path: str, key: str) -> Store:
+    """Return a store that stays open from shard to shard."""
+    return Store(Path(path), key)
+
+
 def work(definition: Definition, key: str, path: str, shard: int, limit: float | None) -> int:
     """Compute a shard and write it: what workers do; return the digest of its arrays.
 
@@ -115,7 +122,7 @@ def work(definition: Definition, key: str, path: str, shard: int, limit: float |
         faulthandler.dump_traceback_later(limit, exit=True)
     try:
         arrays = compute(definition, shard)
-        Store(Path(path), key).write(study_of(definition), shard, arrays)
+        _opened(path, key).write(study_of(definition), shard, arrays)
     finally:
         if limit is not None:
             faulthandler.cancel_dump_traceback_later()

@@ -56,7 +56,8 @@ class Store:
             self._group: Any = _zarr().open_group(str(path), mode="r+")
             self.about: dict[str, Any] = dict(self._group.attrs)
             form, found = self.about["format"], self.about["key"]
-            self._done: Any = self._group[DONE]
+            self._arrays: dict[str, Any] = dict(self._group.arrays())
+            self._done = self._arrays[DONE]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise _damaged(path, error) from error
         if form != FORMAT or (key is not None and found != key):
@@ -159,7 +160,7 @@ class Store:
         """
         try:
             for name, values in arrays.items():
-                self._group[name][study.part(shard)] = values
+                self._arrays[name][study.part(shard)] = values
             self._done[shard] = digest(arrays)
         except OSError as error:
             raise unwritten(self.path, error) from error
@@ -173,7 +174,7 @@ class Store:
             For a chunk that cannot be read.
         """
         try:
-            return {name: self._group[name][study.part(shard)] for name in study.variables}
+            return {name: self._arrays[name][study.part(shard)] for name in study.variables}
         except (OSError, ValueError, RuntimeError) as error:
             raise _damaged(self.path, error) from error
 
