@@ -208,7 +208,7 @@ def test_a_shard_that_kills_its_worker_is_named_and_the_rest_is_kept(
     path = tmp_path / "store"
     with executor_for(workers=1) as (pool, width):
         campaign = Campaign(MAP, path)
-        outcome = campaign.run(Faulty(pool, 3, fault), width=width, limit=4.0)
+        outcome = campaign.run(Faulty(pool, 3, fault), width=width, limit=20.0)
     assert outcome.done == outcome.shards - 1
     assert list(outcome.failures) == [3]
     assert "worker died" in outcome.failures[3]
