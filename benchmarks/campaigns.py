@@ -56,7 +56,7 @@ def region(side: int, shard: int) -> Definition:
 
 def kinds(shards: int) -> dict[str, Definition]:
     """Return a campaign of each kind, of so many shards that take a second or more."""
-    side = round(math.sqrt(shards * 40_000))
+    side = round(math.sqrt(shards * 150_000))
     designs = {"l": {"from": 0.15, "to": 0.19, "count": shards}}
     return {
         "region": region(side, side * -(-side // shards)),
