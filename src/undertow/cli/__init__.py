@@ -11,6 +11,7 @@ import typer
 from undertow.base import INTERRUPTED, at_once, by_exception, versions
 from undertow.cli import (  # noqa: F401 - each registers its commands
     bench,
+    campaign,
     certify,
     control,
     export,
@@ -27,7 +28,8 @@ __all__ = ["app", "main"]
 #: The order in which help shows the commands: look, steer, prove, run, repeat.
 _ORDER = (
     "mechanisms", "models", "derive", "show", "animate", "survey", "optimise", "simulate",
-    "certify", "verify", "bench", "run", "target", "replay", "drill", "trials", "reproduce",
+    "certify", "verify", "bench", "run", "target", "replay", "drill", "trials", "campaign",
+    "reproduce",
 )  # fmt: skip
 
 app.registered_commands.sort(

@@ -1,0 +1,103 @@
+"""Campaigns: many shards of work on threads, workers or machines, and their store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from undertow.base import INTERRUPTED, InvalidInputError, write_file
+from undertow.cli.options import option
+from undertow.cli.terminal import command, completed, exit_unless, show
+
+if TYPE_CHECKING:
+    from undertow.studies.campaign import Outcome
+
+
+@command(
+    "undertow campaign map.toml --out map.zarr --threads 2",
+    "undertow campaign map.toml --out map.zarr --resume --workers 2",
+    "undertow campaign map.toml --out map.zarr --scheduler tcp://host:8786",
+    "undertow campaign map.toml --out map.zarr --status",
+    "undertow campaign map.toml --out map.zarr --shard 17",
+    "undertow campaign map.toml --out map.zarr --picture map.png",
+)
+def campaign(
+    file: Annotated[
+        Path, typer.Argument(help="The definition, TOML: see docs/campaigns.md.", metavar="FILE")
+    ],
+    out: Annotated[Path, option("Folder of the store, zarr.", metavar="STORE")],
+    mechanism: Annotated[
+        str | None,
+        option("Mechanism instead of the file's; the only way to name FILE.py:NAME, which is run."),
+    ] = None,
+    threads: Annotated[int, option("Threads of this process.", min=1, max=1024)] = 1,
+    workers: Annotated[
+        int, option("Processes on this machine instead, dask's; extra campaign.", min=0, max=1024)
+    ] = 0,
+    scheduler: Annotated[
+        str, option("Address of a dask scheduler instead, which must see the same folder.")
+    ] = "",
+    limit: Annotated[
+        float | None,
+        option(
+            "Time after which a worker's shard counts as hanging, s; needs --workers or "
+            "--scheduler, for a thread cannot be ended.",
+            min=0.1,
+        ),
+    ] = None,
+    resume: Annotated[bool, option("--resume", "Go on with the store that is there.")] = False,
+    status: Annotated[bool, option("--status", "Show how far it is, and nothing else.")] = False,
+    shard: Annotated[
+        int | None,
+        option("Compute this shard alone, in this process, and compare it with the store.", min=0),
+    ] = None,
+    picture: Annotated[
+        Path | None, option("Draw what the store has into this PNG, and nothing else.")
+    ] = None,
+    proof: Annotated[
+        Path | None, option("Certificate whose region on the surface the picture shows.")
+    ] = None,
+) -> None:
+    """Compute many shards of work, and keep them in a store that survives interruptions."""
+    from undertow.studies.campaign import Campaign, Definition, executor_for
+    from undertow.studies.campaign.report import alone, report
+    from undertow.studies.campaign.report import status as status_of
+
+    if bool(scheduler) + bool(workers) + (threads > 1) > 1:
+        raise InvalidInputError(
+            "where the campaign runs",
+            value="two places",
+            limit="--threads, --workers or --scheduler",
+        )
+    if limit is not None and not (workers or scheduler):
+        raise InvalidInputError(
+            "time limit of a shard",
+            value=f"{limit:g} s, for threads",
+            limit="workers",
+            remedy="A thread cannot be ended: add --workers 1",
+        )
+    task = Campaign(Definition.read(file, mechanism), out)
+    if picture is not None:
+        from undertow.studies.campaign.figures import picture_file
+
+        image, words = picture_file(task, proof)
+        show(*words, f"Written to {write_file(picture, image)}")
+    elif status:
+        show(*status_of(task))
+    elif shard is not None:
+        show(*alone(task, shard))
+    else:
+        outcomes: list[Outcome] = []
+        with executor_for(threads=threads, workers=workers, scheduler=scheduler) as (pool, width):
+            whole = completed(
+                lambda progress: outcomes.append(
+                    task.run(pool, width=width, limit=limit, resume=resume, progress=progress)
+                )
+            )
+        if not whole:
+            show("interrupted: finished shards are kept; go on with --resume", stderr=True)
+            raise typer.Exit(INTERRUPTED)
+        show(*report(task, outcomes[0]))
+        exit_unless(outcomes[0].complete)

@@ -1,0 +1,226 @@
+"""What a campaign is, as data: read strictly from a TOML file, carried to every worker."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from undertow.base import ArtefactError, InvalidInputError, near, one_of, read_file
+from undertow.mechanisms.named import from_anywhere, named
+from undertow.models import Mechanism
+from undertow.models.importers.python_file import in_a_file
+from undertow.objective import Goal, Objective, objective_for
+
+#: Largest definition, bytes.
+LARGEST = 1 << 20
+
+#: Stands for a value that has to be there.
+_NEEDED: Any = object()
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A campaign as data.
+
+    Parameters
+    ----------
+    mechanism
+        Its name, as for :func:`undertow.mechanisms.named.named`; paths are whole.
+    text
+        Everything else that the file says, as JSON.
+    """
+
+    mechanism: str
+    text: str
+
+    @classmethod
+    def read(cls, path: Path, mechanism: str | None = None) -> Definition:
+        """Read a TOML file.
+
+        ``mechanism`` names the mechanism instead of the file.  It alone may be ``FILE.py:NAME``:
+        a definition is data, and nothing that it says is run.
+
+        Raises
+        ------
+        ArtefactError
+            For a file that cannot be read or is no TOML.
+        InvalidInputError
+            For a mechanism that is missing, or in a Python file that was not named besides.
+        """
+        content = read_file(path, "definition of a campaign", most=LARGEST)
+        try:
+            said = tomllib.loads(content.decode())
+        except ValueError as error:  # of the text, or of its encoding
+            raise ArtefactError(
+                f"definition of a campaign '{path}'", value=str(error), limit="TOML"
+            ) from error
+        name = said.pop("mechanism", None) if mechanism is None else mechanism
+        said.pop("mechanism", None)
+        if not isinstance(name, str):
+            raise InvalidInputError(
+                f"mechanism of the campaign '{path}'", value=name, limit="a name, like 'acrobot'"
+            )
+        if mechanism is None:
+            if in_a_file(name):
+                raise InvalidInputError(
+                    f"mechanism of the campaign '{path}'",
+                    value=name,
+                    limit="a name of the library, FILE.urdf or FILE.xml",
+                    remedy=f"Code of your own is named where it is run: --mechanism {name}",
+                )
+            beside = path.parent / name
+            name = str(beside) if Path(name).suffix and beside.exists() else name
+        return cls.of(from_anywhere(name), **said)
+
+    @classmethod
+    def of(cls, mechanism: str, **said: Any) -> Definition:
+        """Return the definition with these settings, plain numbers, words, lists and tables."""
+        try:
+            return cls(mechanism, json.dumps(said, allow_nan=False))
+        except (TypeError, ValueError) as error:
+            raise InvalidInputError(
+                "settings of a campaign", value=str(error), limit="finite numbers and words"
+            ) from error
+
+    @property
+    def said(self) -> dict[str, Any]:
+        """What the file says, but for the mechanism."""
+        found: dict[str, Any] = json.loads(self.text)
+        return found
+
+    @property
+    def settings(self) -> Settings:
+        """The same, to be taken one by one."""
+        return Settings(self.said, "")
+
+
+class Settings:
+    """A table of settings that are taken one by one; what is left over is refused."""
+
+    def __init__(self, values: Mapping[str, Any], where: str) -> None:
+        self.where = where
+        self._values = dict(values)
+        self._known: list[str] = []
+
+    def what(self, name: str) -> str:
+        """Say for a message which setting is meant."""
+        return f"setting '{self.where}{name}' of the campaign"
+
+    def _take(self, name: str, default: Any, limit: str) -> Any:
+        self._known.append(name)
+        value = self._values.pop(name, default)
+        if value is _NEEDED:
+            raise InvalidInputError(self.what(name), value="nothing", limit=limit)
+        return value
+
+    def number(
+        self, name: str, default: float = _NEEDED, *, low: float = -math.inf, high: float = math.inf
+    ) -> float:
+        """Take a number from ``low`` to ``high``."""
+        limit = "a finite number"
+        if low > -math.inf or high < math.inf:
+            limit = f"a number from {low:g} to {high:g}"
+        value = self._take(name, default, limit)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not low <= value <= high
+        ):
+            raise InvalidInputError(self.what(name), value=value, limit=limit)
+        return float(value)
+
+    def count(self, name: str, default: int = _NEEDED, *, low: int = 1, high: int = 10**9) -> int:
+        """Take a whole number from ``low`` to ``high``."""
+        limit = f"a whole number from {low} to {high}"
+        value = self._take(name, default, limit)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise InvalidInputError(self.what(name), value=value, limit=limit)
+        return value
+
+    def word(self, name: str, known: Collection[str], default: str = _NEEDED) -> str:
+        """Take one of some words."""
+        value = self._take(name, default, f"one of {', '.join(known)}")
+        one_of(self.what(name), value, known)
+        return str(value)
+
+    def flag(self, name: str) -> bool:
+        """Take true or false; false by default."""
+        value = self._take(name, False, "true or false")
+        if not isinstance(value, bool):
+            raise InvalidInputError(self.what(name), value=value, limit="true or false")
+        return value
+
+    def numbers(self, name: str, size: int) -> tuple[float, ...] | None:
+        """Take a list of so many numbers, where there is one."""
+        value = self._take(name, None, f"{size} numbers")
+        if value is None:
+            return None
+        good = isinstance(value, list) and len(value) == size
+        if not (good and all(type(v) in (int, float) and math.isfinite(v) for v in value)):
+            raise InvalidInputError(self.what(name), value=value, limit=f"{size} numbers")
+        return tuple(map(float, value))
+
+    def words(self, name: str, known: Collection[str]) -> tuple[str, ...]:
+        """Take a list of some of the words, all of them by default."""
+        value = self._take(name, list(known), f"a list from {', '.join(known)}")
+        if not isinstance(value, list) or not value or len(set(map(str, value))) < len(value):
+            limit = f"a list, each once, from {', '.join(known)}"
+            raise InvalidInputError(self.what(name), value=value, limit=limit)
+        for word in value:
+            one_of(self.what(name), word, known)
+        return tuple(value)
+
+    def table(self, name: str) -> Settings:
+        """Take a table; an empty one by default."""
+        value = self._take(name, {}, "a table")
+        if not isinstance(value, dict):
+            raise InvalidInputError(self.what(name), value=value, limit="a table")
+        return Settings(value, f"{self.where}{name}.")
+
+    def by_name(self, known: Collection[str]) -> dict[str, float]:
+        """Take all that is left as numbers by name."""
+        for name in self._values:
+            one_of(self.where.rstrip(".") or "settings", name, known)
+        return {name: self.number(name) for name in list(self._values)}
+
+    def tables(self, known: Collection[str]) -> dict[str, Settings]:
+        """Take all that is left as tables by name."""
+        for name in self._values:
+            one_of(self.where.rstrip(".") or "settings", name, known)
+        return {name: self.table(name) for name in list(self._values)}
+
+    def finish(self) -> None:
+        """Refuse what nobody has asked for."""
+        for name, value in self._values.items():
+            raise InvalidInputError(
+                self.what(name),
+                value=value,
+                limit=f"one of {', '.join(self._known)}",
+                remedy=near(name, self._known),
+            )
+
+
+def mechanism_of(definition: Definition, settings: Settings) -> Mechanism:
+    """Return the mechanism, with the ``parameters`` and input ``limits`` that the settings give."""
+    mechanism = named(definition.mechanism)
+    values = settings.table("parameters").by_name([p.name for p in mechanism.parameters])
+    limits = settings.table("limits").by_name([i.name for i in mechanism.inputs])
+    mechanism = mechanism.with_parameters(**values)
+    if limits:
+        known = {i.name: i.limit for i in mechanism.inputs}
+        mechanism = mechanism.with_input_limit(*(known | limits).values())
+    return mechanism
+
+
+def objective_of(
+    mechanism: Mechanism, settings: Settings, horizon: float, usual: Goal = "energy"
+) -> Objective:
+    """Return what ``objective`` and ``horizon``, s, mean; both have a usual value."""
+    word = settings.word("objective", get_args(Goal), usual)
+    longest = settings.number("horizon", horizon, low=1e-3, high=1e4)
+    return objective_for(mechanism, word, horizon=longest)

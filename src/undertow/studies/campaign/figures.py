@@ -1,0 +1,277 @@
+"""Maps of a campaign drawn: every quantity over two axes, or slices through a volume of three."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from undertow.base import InvalidInputError
+from undertow.closed_loop.figures import COLOURS, display, figure_bytes, style
+from undertow.models import FloatArray
+from undertow.proofs.claims.certificate import read_certificate
+from undertow.proofs.claims.document import match_document
+from undertow.proofs.kernel.claims import SurfaceRegion, read_claim
+from undertow.proofs.region.lyapunov import LyapunovFunction
+from undertow.studies.campaign.region_map import EVENTS, RegionMap
+from undertow.studies.campaign.run import Campaign
+
+#: Most points of an axis that are drawn; a finer grid is thinned out.
+DRAWN = 600
+
+#: Slices through a volume.
+SLICES = 6
+
+#: How states that do not come home are shown, by event.
+LOST = {
+    "singular": ("#c9c9c9", "the law ends, (37)"),
+    "constraint": ("#e3d4ea", "beyond the travel"),
+    "diverged": ("#f5d9c8", "falls"),
+    "horizon": ("#fff3c4", "not within the horizon"),
+}
+
+_GREEK = {"theta": "θ", "phi": "φ", "psi": "ψ"}
+
+
+def picture(campaign: Campaign, proved: LyapunovFunction | None = None) -> Figure:
+    """Return the maps of a campaign's store; white is what is not computed yet.
+
+    Parameters
+    ----------
+    campaign
+        Over two axes, or a region over three.
+    proved
+        A proved set of the sliding motion, drawn into a region of states on its surface.
+
+    Raises
+    ------
+    InvalidInputError
+        For other numbers of axes, or a proved set where the states are not on a surface.
+    """
+    study, data = campaign.study, campaign.dataset()
+    data = data.isel({
+        axis.name: slice(None, None, -(-len(axis.values) // DRAWN)) for axis in study.axes
+    })  # fmt: skip
+    region = isinstance(study, RegionMap)
+    if not (len(study.axes) == 2 or (region and len(study.axes) == 3)):
+        raise InvalidInputError(
+            "axes of a picture", value=len(study.axes), limit="two, or three states of a region"
+        )
+    if proved is not None and not (isinstance(study, RegionMap) and study.sliding):
+        raise InvalidInputError(
+            "proved set in a picture", value="states off the surface", limit="sliding = true"
+        )
+    if region and len(study.axes) == 3:
+        return _volume(study, data)
+    names = [name for name in study.variables if name != "event"]
+    with style():
+        figure = Figure(figsize=(4.3 * len(names) + 0.4, 4.3), layout="constrained")
+        for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+            mesh = _map(axes, study, data, name)
+            facts = data[name].attrs
+            unit = "" if facts["units"] == "1" else f" ({facts['units']})"
+            figure.colorbar(mesh, ax=axes, label=f"{name}{unit}", extend="max")
+            if proved is not None and isinstance(study, RegionMap):
+                _draw_proved(axes, study, proved)
+        _legend(figure, study, data, proved)
+        figure.suptitle(_title(study, data), fontsize=10)
+    return figure
+
+
+def picture_file(campaign: Campaign, proof: Path | None = None) -> tuple[bytes, list[str]]:
+    """Return :func:`picture` as PNG, and what is to be said of the region of a certificate.
+
+    Raises
+    ------
+    InvalidInputError, ArtefactError, CertificateError
+        As for :func:`picture` and :func:`proved_set`.
+    """
+    if proof is None:
+        return figure_bytes(picture(campaign)), []
+    if not isinstance(campaign.study, RegionMap):
+        raise InvalidInputError(
+            "certificate of a picture", value=campaign.study.kind, limit="a region"
+        )
+    proved = proved_set(campaign.study, proof)
+    return figure_bytes(picture(campaign, proved)), [proved_words(campaign, proved)]
+
+
+def _map(axes: Axes, study: Any, data: Any, name: str, most: float | None = None) -> Any:
+    """Draw one quantity over the two axes of the data, and why the rest did not come home."""
+    (fa, la), (fb, lb) = (_label(study, axis) for axis in data[name].dims)
+    a, b = (np.asarray(data[axis]) for axis in data[name].dims)
+    values = np.asarray(data[name]).T
+    if "event" in data:
+        events = np.asarray(data.event).T
+        for event, (colour, _) in LOST.items():
+            which = np.where(events == EVENTS.index(event), 1.0, np.nan)
+            axes.pcolormesh(fa * a, fb * b, which, cmap=ListedColormap([colour]), rasterized=True)
+    if most is None:
+        most = _most(values)
+    mesh = axes.pcolormesh(
+        fa * a, fb * b, values, cmap="viridis_r", vmin=0.0, vmax=most, rasterized=True
+    )
+    axes.set_xlabel(la)
+    axes.set_ylabel(lb)
+    axes.grid(visible=False)
+    return mesh
+
+
+def _volume(study: Any, data: Any) -> Figure:
+    """Draw the time to come home in slices through a volume."""
+    last = study.axes[-1]
+    factor, label = _label(study, last.name)
+    values = np.asarray(data[last.name])
+    places = np.unique(np.linspace(0, len(values) - 1, SLICES).round().astype(int))
+    most = _most(np.asarray(data.time))
+    with style():
+        figure = Figure(figsize=(9.6, 6.2), layout="constrained")
+        panels = figure.subplots(2, -(-len(places) // 2), sharex=True, sharey=True, squeeze=False)
+        mesh: Any = None
+        for axes, place in zip(panels.ravel(), places, strict=False):
+            mesh = _map(axes, study, data.isel({last.name: int(place)}), "time", most)
+            symbol, _, unit = label.partition(" (")
+            space = "" if unit.startswith("°") else " "
+            axes.set_title(f"{symbol} = {factor * values[place]:.3g}{space}{unit[:-1]}", loc="left")
+            axes.label_outer()
+        figure.colorbar(mesh, ax=panels, label="time (s)", extend="max")
+        _legend(figure, study, data, None)
+        figure.suptitle(_title(study, data), fontsize=10)
+    return figure
+
+
+def _legend(figure: Figure, study: Any, data: Any, proved: LyapunovFunction | None) -> None:
+    handles: list[Any] = []
+    if "event" in data:
+        events = np.unique(np.asarray(data.event))
+        for event, (colour, words) in LOST.items():
+            if EVENTS.index(event) in events:
+                handles.append(Patch(color=colour, label=words))
+    if proved is not None:
+        line = Line2D([], [], color=COLOURS["vermilion"], lw=1.6)
+        line.set_label("proved region of the sliding motion, inputs not limited")
+        handles.append(line)
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+
+
+def _draw_proved(axes: Axes, study: RegionMap, proved: LyapunovFunction) -> None:
+    """Draw the edge of {V ≤ 1} in the slice."""
+    (fa, _), (fb, _) = (_label(study, axis.name) for axis in study.axes)
+    a, b = (np.linspace(axis.values[0], axis.values[-1], 400) for axis in study.axes)
+    points = np.tile(study.at, (len(a), len(b), 1))
+    points[..., study.places[0]], points[..., study.places[1]] = np.meshgrid(a, b, indexing="ij")
+    with np.errstate(all="ignore"):
+        level = proved(sliding_coordinates(study, points))
+    axes.contour(
+        fa * a, fb * b, np.where(np.isfinite(level), level, 2.0).T, [1.0],
+        colors=[to_rgba(COLOURS["vermilion"])], linewidths=1.6,
+    )  # fmt: skip
+
+
+def sliding_coordinates(study: RegionMap, states: FloatArray) -> FloatArray:
+    """Return y = (q_u, q̇_u, w) of states, (…, 2n), with w = q_a + λ_a⁻¹ λ_u q_u."""
+    n, m, surface = study.mechanism.n, study.mechanism.m, study.surface
+    q_a, q_u, v_u = states[..., :m], states[..., m:n], states[..., n + m :]
+    w = q_a + q_u @ np.linalg.solve(surface.lambda_a, surface.lambda_u).T
+    return np.concatenate([q_u, v_u, w], axis=-1)
+
+
+def proved_set(study: RegionMap, path: Path) -> LyapunovFunction:
+    """Return the region that a certificate states of the study's mechanism and surface.
+
+    It is not decided again here: ``undertow verify`` does.
+
+    Raises
+    ------
+    InvalidInputError
+        When it states none of this surface.
+    ArtefactError, CertificateError
+        When it cannot be read, or is about another mechanism.
+    """
+    document = read_certificate(path).document
+    if document is not None:
+        match_document(document, study.mechanism, own_parameters=True)
+        for subject in document.subjects:
+            law = np.array([float(v) for v in subject.law.numbers])
+            if not np.array_equal(law[: len(study.surface.vector)], study.surface.vector):
+                continue
+            for said in subject.claims:
+                claim = read_claim(said, document.model)
+                if isinstance(claim, SurfaceRegion):
+                    return _function(claim)
+    raise InvalidInputError(
+        f"certificate '{path}' for a picture",
+        value="no region on this surface",
+        limit=f"one on {study.surface}",
+        remedy="Give the definition the certificate's surface",
+    )
+
+
+def proved_words(campaign: Campaign, proved: LyapunovFunction) -> str:
+    """Say how many states of a finished shard in the proved set come home with the input limits."""
+    study, data = campaign.study, campaign.dataset()
+    assert isinstance(study, RegionMap)
+    inside = home = 0
+    for shard in range(study.shards):
+        _, states = study.states(shard)
+        events = np.asarray(data.event[study.part(shard)]).ravel()
+        with np.errstate(all="ignore"):
+            within = (proved(sliding_coordinates(study, states)) <= 1.0) & (events >= 0)
+        inside += int(within.sum())
+        home += int((events[within] == EVENTS.index("reached")).sum())
+    return f"{inside} states in the proved region; {home} of them come home with the input limits"
+
+
+def _function(claim: SurfaceRegion) -> LyapunovFunction:
+    """Return the last, widest function of a claim in floats."""
+    function, stretch = claim.functions[-1], claim.stretch
+    return LyapunovFunction(
+        np.linalg.inv(np.array(function.A, dtype=float)),
+        np.array(function.exponents),
+        np.array(function.coefficients, dtype=float),
+        np.array(stretch.S, dtype=float) if stretch.S else None,
+        float(stretch.L) if stretch.L else np.inf,
+    )
+
+
+def _most(values: FloatArray) -> float:
+    """Return the end of the colours: what all but one per cent are below."""
+    good = values[np.isfinite(values)]
+    return float(np.percentile(good, 99)) if len(good) else 1.0
+
+
+def _label(study: Any, name: str) -> tuple[float, str]:
+    """Return the factor to display units, and the label of an axis."""
+    names = study.mechanism.state_names
+    if name not in names:
+        axis = next(axis for axis in study.axes if axis.name == name)
+        return 1.0, f"{name} ({axis.unit})"
+    index, n = names.index(name), study.mechanism.n
+    coordinate, rate = study.mechanism.coordinates[index % n], index >= n
+    factor, unit = display(coordinate.unit, rate)
+    stem, _, number = coordinate.name.partition("_")
+    symbol = _GREEK.get(stem, stem)
+    symbol = f"{symbol}\N{COMBINING DOT ABOVE}" if rate else symbol
+    return factor, f"{symbol}{number.translate(_LOW)} ({unit})"
+
+
+_LOW = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+
+
+def _title(study: Any, data: Any) -> str:
+    title = f"{study.mechanism.name.replace('_', ' ')}: {data.attrs['title'].partition(' ')[0]}"
+    if not isinstance(study, RegionMap):
+        return title
+    limits = ", ".join(f"|{i.name}| ≤ {i.limit:g} {i.unit}" for i in study.mechanism.inputs)
+    events = np.asarray(data.event)
+    home = 100 * (events == EVENTS.index("reached")).sum() / max((events >= 0).sum(), 1)
+    where = ", started on the surface s = 0" if study.sliding else ""
+    part = "slice" if len(study.axes) == 2 else "volume"
+    return f"{title} from which motions come home{where}; {limits}; {home:.1f} % of the {part}"

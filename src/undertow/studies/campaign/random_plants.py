@@ -1,0 +1,122 @@
+"""Controllers side by side on random plants that none of them knows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from undertow.cascade import Cascade, CascadeState
+from undertow.estimators import Belief
+from undertow.law import InnerLoop
+from undertow.models import Mechanism
+from undertow.optimiser import Proposal
+from undertow.plants import Bench
+from undertow.plants.bench import bench_for
+from undertow.runtime import estimator_for
+from undertow.studies.campaign.definition import Settings, objective_of
+from undertow.studies.campaign.study import Arrays, Axis, Study, Variable
+from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, steady
+from undertow.studies.trials.trial import MakeController, trial
+
+#: Contenders by the word for each.
+CONTROLLERS = ("cascade", "kept", "lqr")
+
+
+class RandomPlants(Study):
+    """Trials on random benches: estimator, encoders, friction and delay are in.
+
+    The contenders are the cascade, its first optimum kept, and a clipped linear-quadratic
+    regulator.  All believe the mechanism as it is and have the same kind of estimator.  A plant
+    differs in its parameters, friction and delay, drawn from (``seed``, its number).
+
+    Settings: ``plants``, how many; ``controllers``, a list of ``cascade``, ``kept``, ``lqr``;
+    ``spread``, half-width of the parameters, as a part of each; ``friction``, the most that it is
+    of the bench's; ``delay``, the longest in all, s; ``objective``, ``horizon``, s; ``start``,
+    states by name, by default the mechanism's; ``seconds`` of a trial; ``budget``, rollouts of a
+    re-optimisation; ``seed``; ``shard``, plants in each.
+    """
+
+    kind: ClassVar[str] = "plants"
+
+    def __init__(self, mechanism: Mechanism, settings: Settings) -> None:
+        self.mechanism = mechanism
+        self.objective = objective_of(mechanism, settings, 60.0, "bench-energy")
+        self.controllers = settings.words("controllers", CONTROLLERS)
+        self.spread = settings.number("spread", 0.2, low=0.0, high=0.9)
+        self.friction = settings.number("friction", 2.0, low=0.0, high=100.0)
+        self.delay = settings.number("delay", 0.005, low=0.0, high=1.0)
+        self.length = settings.number("seconds", 10.0, low=0.01, high=1e4)
+        self.seed = settings.count("seed", 0, low=0)
+        start = settings.table("start").by_name(mechanism.state_names)
+        self.start = mechanism.state(**start) if start else mechanism.usual_start
+        self.most = settings.count("shard", 4, high=10**6)
+        plants = np.arange(settings.count("plants", 200))
+        self.axes = (Axis("plant", plants, "1"),)
+        self.bench = bench_for(mechanism)
+        self.variables = {}
+        for name in self.controllers:
+            self.variables |= {
+                f"{name}_balanced": Variable("1", f"{name}: home for the last second", "int8"),
+                f"{name}_settled": Variable("s", f"{name}: time after which it stayed home"),
+                f"{name}_cost": Variable(self.objective.unit or "1", f"{name}: cost of the motion"),
+                f"{name}_chatter": Variable("1/s", f"{name}: variation of the inputs"),
+            }
+
+    def plant(self, number: int) -> Bench:
+        """Return the bench of a number, but for what its own seed draws."""
+        rng = np.random.default_rng([self.seed, number])
+        bench = self.bench.with_friction(rng.uniform(0.0, self.friction))
+        delay = rng.uniform(0.0, self.delay)
+        bench = bench.with_timing(input_delay=0.6 * delay, measurement_delay=0.4 * delay)
+        return replace(bench, tolerance=self._tolerance)
+
+    @cached_property
+    def _tolerance(self) -> dict[str, float]:
+        """Half-widths of the parameters: the spread, or what room their bounds leave."""
+        room = {
+            p.name: 0.99 * min(p.high - p.value, p.value - p.low) / abs(p.value)
+            for p in self.mechanism.parameters
+            if p.name in self.bench.tolerance
+        }
+        return {name: min(self.spread, most) for name, most in room.items()}
+
+    @cached_property
+    def _first(self) -> tuple[Cascade, tuple[CascadeState, Proposal]]:
+        cascade = Cascade(self.mechanism, self.objective, seed=self.seed)
+        return cascade, cascade.start(self.start)
+
+    def controller(self, name: str) -> MakeController:
+        """Return what makes a contender for one trial."""
+        if name == "lqr":
+            return clipped_regulator(self.mechanism)
+        cascade, first = self._first
+        if name == "cascade":
+            return lambda _: CascadeSteering(cascade, first)
+        kept = first[0].surface
+        return lambda _: steady(InnerLoop(self.mechanism, kept, cascade.reaching))
+
+    def compute(self, shard: int) -> Arrays:
+        """Try every contender on the plants of a shard."""
+        (part,) = self.part(shard)
+        numbers = range(part.start, part.stop)
+        found: Arrays = {
+            name: np.empty(len(numbers), variable.dtype)
+            for name, variable in self.variables.items()
+        }
+        for name in self.controllers:
+            make = self.controller(name)
+            for row, number in enumerate(numbers):
+                bench = self.plant(number)
+                outcome = trial(
+                    self.mechanism, bench, make, self.start, self.length, number,
+                    objective=self.objective,
+                    estimator=estimator_for(
+                        self.mechanism, self.bench, known=Belief.usual(self.mechanism)
+                    ),
+                )  # fmt: skip
+                for what in ("balanced", "settled", "cost", "chatter"):
+                    found[f"{name}_{what}"][row] = getattr(outcome, what)
+        return found

@@ -1,0 +1,263 @@
+"""A campaign's results in zarr: written by the workers, one chunk a shard, then a mark in a mask.
+
+The mask holds a digest of every finished shard.  What was killed while it wrote has none, and what
+was damaged afterwards has another one than the chunks: both are computed again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from undertow.base import ArtefactError, printable, require_extra
+from undertow.studies.campaign.study import Arrays, Study
+
+#: The mask's name, and that of the dimension that numbers the shards.
+DONE, SHARD = "done", "shard"
+
+#: Name and version of the layout.
+FORMAT = "undertow-campaign 1"
+
+
+class Store:
+    """A folder with the results of one campaign.
+
+    Parameters
+    ----------
+    path
+        The folder.
+    key
+        Hash of the campaign that it must hold; ``None`` takes any.
+
+    Raises
+    ------
+    ArtefactError
+        When it is none, damaged, or of another campaign.
+    MissingExtraError
+        Without zarr.
+    """
+
+    def __init__(self, path: Path, key: str | None = None) -> None:
+        self.path = path
+        if not (path / "zarr.json").is_file():
+            raise ArtefactError(
+                f"store '{path}'", value="none", limit="a campaign's", remedy="Leave out --resume"
+            )
+        try:
+            self._group: Any = _zarr().open_group(str(path), mode="r+")
+            self.about: dict[str, Any] = dict(self._group.attrs)
+            form, found = self.about["format"], self.about["key"]
+            self._arrays: dict[str, Any] = dict(self._group.arrays())
+            self._done = self._arrays[DONE]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise _damaged(path, error) from error
+        if form != FORMAT or (key is not None and found != key):
+            raise ArtefactError(
+                f"store '{path}'",
+                value=f"another campaign, {printable(str(found))[:12]}, made from other settings, "
+                "another mechanism or another version",
+                limit=f"this one, {str(key)[:12]}" if form == FORMAT else FORMAT,
+                remedy="Name another folder with --out, or remove this one",
+            )
+
+    @classmethod
+    def create(cls, path: Path, study: Study, key: str, about: dict[str, Any]) -> Store:
+        """Make an empty store for a study; all of it is there, or nothing.
+
+        Raises
+        ------
+        ArtefactError
+            When there is something already, or it cannot be written.
+        """
+        if path.exists():
+            raise ArtefactError(
+                f"store '{path}'",
+                value="there is one",
+                limit="a new folder",
+                remedy="Go on with it: --resume; or name another with --out",
+            )
+        zarr = _zarr()
+        making = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            facts = {"format": FORMAT, "key": key} | about
+            group = zarr.create_group(str(making), attributes=facts)
+            for axis in study.axes:
+                array = group.create_array(
+                    axis.name, shape=axis.values.shape, dtype=axis.values.dtype,
+                    chunks=axis.values.shape, dimension_names=[axis.name],
+                    attributes={"units": axis.unit},
+                )  # fmt: skip
+                array[:] = axis.values
+            for name, variable in study.variables.items():
+                words: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
+                if variable.flags:
+                    words |= {
+                        "flag_values": list(range(len(variable.flags))),
+                        "flag_meanings": " ".join(variable.flags),
+                    }
+                group.create_array(
+                    name, shape=study.shape, dtype=variable.dtype, chunks=study.chunk,
+                    dimension_names=[axis.name for axis in study.axes], attributes=words,
+                    fill_value=variable.missing,
+                )  # fmt: skip
+            group.create_array(
+                DONE, shape=(study.shards,), dtype="uint64", chunks=(1,), compressors=None,
+                dimension_names=[SHARD], fill_value=0,
+                attributes={"long_name": "digest of a finished shard, 0 for others"},
+            )  # fmt: skip
+            os.rename(making, path)
+        except OSError as error:
+            shutil.rmtree(making, ignore_errors=True)
+            raise unwritten(path, error) from error
+        return cls(path, key)
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep every other process of this machine from running a campaign into this store.
+
+        Raises
+        ------
+        ArtefactError
+            When another one does.
+        """
+        try:
+            import fcntl
+        except ImportError:  # no such locks: two processes write the same bits, and work twice
+            yield
+            return
+        handle = os.open(self.path, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise ArtefactError(
+                    f"store '{self.path}'",
+                    value="in use by another process",
+                    limit="one campaign at a time",
+                    remedy="Wait until it ends; --status shows how far it is",
+                ) from error
+            yield
+        finally:
+            os.close(handle)
+
+    def write(self, study: Study, shard: int, arrays: Arrays) -> None:
+        """Write the arrays of a shard, then its mark.
+
+        Raises
+        ------
+        ArtefactError
+            When the system refuses, like a full disk: nothing is marked then.
+        """
+        try:
+            for name, values in arrays.items():
+                self._arrays[name][study.part(shard)] = values
+            self._done[shard] = digest(arrays)
+        except OSError as error:
+            raise unwritten(self.path, error) from error
+
+    def read(self, study: Study, shard: int) -> Arrays:
+        """Return what the store has of a shard.
+
+        Raises
+        ------
+        ArtefactError
+            For a chunk that cannot be read.
+        """
+        try:
+            return {name: self._arrays[name][study.part(shard)] for name in study.variables}
+        except (OSError, ValueError, RuntimeError) as error:
+            raise _damaged(self.path, error) from error
+
+    def marks(self) -> NDArray[np.uint64]:
+        """Return the mask, (shards,): digests, 0 for what is not finished."""
+        try:
+            found: NDArray[np.uint64] = self._done[:]
+        except (OSError, ValueError, RuntimeError):  # one of them is damaged: one by one
+            found = np.zeros(self._done.shape, dtype=np.uint64)
+            for shard in range(len(found)):
+                found[shard] = self._mark(shard)
+        return found
+
+    def _mark(self, shard: int) -> int:
+        try:
+            return int(self._done[shard])
+        except (OSError, ValueError, RuntimeError):
+            return 0
+
+    def repair(self, study: Study) -> list[int]:
+        """Unmark finished shards whose chunks are not what was written; return their numbers.
+
+        Also what killed workers left of files goes away.
+        """
+        for left in self.path.rglob("*.partial"):
+            left.unlink(missing_ok=True)
+        damaged = []
+        for shard in np.flatnonzero(marks := self.marks()).tolist():
+            try:
+                good = digest(self.read(study, shard)) == int(marks[shard])
+            except ArtefactError:
+                good = False
+            if not good:
+                damaged.append(shard)
+                self._done[shard] = 0
+        return damaged
+
+
+def digest(arrays: Arrays) -> int:
+    """Return 64 bits of SHA-256 of arrays; every NaN counts as the same, and none gives 0."""
+    total = hashlib.sha256()
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name])
+        if values.dtype.kind == "f":
+            values = np.where(np.isnan(values), values.dtype.type(np.nan), values)
+        total.update(json.dumps([name, str(values.dtype), values.shape]).encode())
+        total.update(values.tobytes())
+    return int.from_bytes(total.digest()[:8], "little") or 1
+
+
+def dataset(path: Path) -> Any:
+    """Return a store as an ``xarray.Dataset``, read lazily; units and provenance in its attributes.
+
+    Raises
+    ------
+    ArtefactError
+        When it is none.
+    MissingExtraError
+        Without xarray.
+    """
+    Store(path)
+    xarray = require_extra("xarray", "campaign", "results are read with xarray")
+    return xarray.open_zarr(str(path), consolidated=False).drop_vars(DONE)
+
+
+def unwritten(path: Path, error: OSError) -> ArtefactError:
+    """Return the condition of a store that the system does not let us write."""
+    return ArtefactError(
+        f"store '{path}'",
+        value=error.strerror or str(error),
+        limit="a folder that can be written, with room on its disk",
+        remedy="Make room, then go on with --resume: what is marked is kept",
+    )
+
+
+def _damaged(path: Path, error: Exception) -> ArtefactError:
+    return ArtefactError(
+        f"store '{path}'",
+        value=f"{type(error).__name__}: {printable(str(error))[:200]}",
+        limit="a campaign's",
+        remedy="It is damaged or something else: name another folder with --out",
+    )
+
+
+def _zarr() -> Any:
+    return require_extra("zarr", "campaign", "campaigns are stored with zarr")

@@ -1,0 +1,140 @@
+"""What every kind of campaign shares: axes, shards of a grid over them, and what is recorded."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from undertow.models import FloatArray, Mechanism
+from undertow.studies.campaign.definition import Settings
+
+#: What a shard computes: arrays by the names of the variables.
+Arrays = dict[str, NDArray[np.generic]]
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A dimension of what is recorded: ``name``, ``values`` (N,), and their ``unit``."""
+
+    name: str
+    values: NDArray[np.generic]
+    unit: str
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A recorded quantity: its ``unit``, SI, what it means, and the type of its numbers.
+
+    ``flags`` are the words of whole numbers, by CF's convention, from 0 on.
+    """
+
+    unit: str
+    meaning: str
+    dtype: str = "float64"
+    flags: tuple[str, ...] = ()
+
+    @property
+    def missing(self) -> float:
+        """What stands where nothing was computed."""
+        return -1 if np.dtype(self.dtype).kind == "i" else math.nan
+
+
+class Study(ABC):
+    """One kind of campaign, made from a mechanism and settings: its result is a grid of arrays.
+
+    The grid is cut into shards along its first axes, so that a shard has at most ``most`` entries
+    where the last axes allow it.  Equal settings and shard number give the same bits anywhere.
+
+    Attributes
+    ----------
+    axes
+        Dimensions of every variable.
+    variables
+        What is recorded, by name.
+    most
+        Entries of a shard.
+    seed
+        Of what is drawn at random.
+    """
+
+    #: The word for it in a definition.
+    kind: ClassVar[str]
+
+    #: Whether shards may run in threads at once: where the kernels do the work.
+    threaded: ClassVar[bool] = False
+
+    mechanism: Mechanism
+    axes: tuple[Axis, ...]
+    variables: Mapping[str, Variable]
+    most: int
+    seed: int
+
+    @abstractmethod
+    def __init__(self, mechanism: Mechanism, settings: Settings) -> None:
+        """Take the settings of this kind, and refuse wrong ones before any work."""
+
+    @abstractmethod
+    def compute(self, shard: int) -> Arrays:
+        """Return every variable on the part of the grid that is :meth:`part` of the shard."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Size of the grid."""
+        return tuple(len(axis.values) for axis in self.axes)
+
+    @cached_property
+    def chunk(self) -> tuple[int, ...]:
+        """Size of a shard that is not at an edge."""
+        left, sizes = self.most, []
+        for size in reversed(self.shape):
+            sizes.append(max(1, min(size, left)))
+            left //= sizes[-1]
+        return tuple(reversed(sizes))
+
+    @cached_property
+    def cut(self) -> tuple[int, ...]:
+        """Shards along each axis."""
+        return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk, strict=True))
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return math.prod(self.cut)
+
+    def part(self, shard: int) -> tuple[slice, ...]:
+        """Return what a shard is of the grid."""
+        place = np.unravel_index(shard, self.cut)
+        return tuple(
+            slice(int(k) * c, min((int(k) + 1) * c, n))
+            for k, c, n in zip(place, self.chunk, self.shape, strict=True)
+        )
+
+    def points(self, shard: int) -> tuple[tuple[int, ...], list[FloatArray]]:
+        """Return the size of a shard, and every axis' values at its entries, flat."""
+        values = [axis.values[part] for axis, part in zip(self.axes, self.part(shard), strict=True)]
+        mesh = np.meshgrid(*values, indexing="ij")
+        return mesh[0].shape, [np.asarray(v, dtype=float).ravel() for v in mesh]
+
+
+def axes_of(settings: Settings, units: Mapping[str, str]) -> tuple[Axis, ...]:
+    """Take the ``axes``: tables ``from``, ``to``, ``count``, by names that have units."""
+    axes = []
+    for name, table in settings.table("axes").tables(units).items():
+        first, last = table.number("from"), table.number("to")
+        values = np.linspace(first, last, table.count("count", low=1, high=10**7))
+        table.finish()
+        axes.append(Axis(name, values, units[name]))
+    return tuple(axes)
+
+
+def state_units(mechanism: Mechanism) -> dict[str, str]:
+    """Return the units of a mechanism's states by name."""
+    units = [c.unit for c in mechanism.coordinates]
+    return dict(zip(mechanism.state_names, [*units, *(f"{u}/s" for u in units)], strict=True))

@@ -1,0 +1,530 @@
+"""Campaigns: the same bits from every executor, and nothing lost, twice or mixed by any fault."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import undertow as ut
+from undertow.base import ArtefactError, InvalidInputError, ModelError, ResourceError
+from undertow.cli import app
+from undertow.closed_loop import ClosedLoop, Event
+from undertow.studies.campaign import (
+    Campaign,
+    Definition,
+    Store,
+    compute,
+    dataset,
+    digest,
+    executor_for,
+)
+from undertow.studies.campaign.figures import (
+    picture,
+    picture_file,
+    proved_set,
+    sliding_coordinates,
+)
+from undertow.studies.campaign.run import study_of
+
+pytest.importorskip("zarr")
+distributed = pytest.importorskip("distributed")
+cloudpickle = pytest.importorskip("cloudpickle")
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
+
+RIG = "rotary_pendulum"
+AXES = {
+    "phi": {"from": -1.2, "to": 1.2, "count": 12},
+    "phi_dot": {"from": -8.0, "to": 8.0, "count": 8},
+}
+REGION: dict[str, Any] = {"kind": "region", "axes": AXES, "horizon": 8.0, "shard": 16}
+PLANTS: dict[str, Any] = {"kind": "plants", "plants": 2, "shard": 1, "seconds": 0.3}
+DESIGNS: dict[str, Any] = {
+    "kind": "designs", "plants": 4, "start": {"phi": 0.2}, "horizon": 5.0,
+    "axes": {"l": {"from": 0.15, "to": 0.18, "count": 2}},
+}  # fmt: skip
+
+MAP = Definition.of(RIG, **REGION)
+
+
+def run(definition: Definition, path: Path, **how: Any) -> Store:
+    """Run a campaign to its end."""
+    with executor_for(**how) as (pool, width):
+        outcome = Campaign(definition, path).run(pool, width=width)
+    assert outcome.complete, outcome.failures
+    return Store(path)
+
+
+def content(path: Path) -> dict[str, bytes]:
+    """All that a store says, but where its definition was."""
+    return {
+        str(file.relative_to(path)): file.read_bytes()
+        for file in sorted(path.rglob("*"))
+        if file.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("campaign") / "serial"
+    run(MAP, path)
+    return path
+
+
+def resumed(path: Path) -> Any:
+    with executor_for() as (pool, _):
+        return Campaign(MAP, path).run(pool, resume=True)
+
+
+def test_a_map_says_what_rollouts_say(serial: Path) -> None:
+    """Every state of the slice, from the store, against a batch of its own."""
+    rig = ut.mechanisms.rotary_pendulum()
+    data = dataset(serial)
+    phi, phi_dot = np.meshgrid(data.phi.values, data.phi_dot.values, indexing="ij")
+    states = np.zeros((phi.size, 4))
+    states[:, 1], states[:, 3] = phi.ravel(), phi_dot.ravel()
+    loop = ClosedLoop(rig, ut.MinimumEnergy(horizon=8.0))  # small steps to the end
+    batch = loop.batch(states, ut.first_surface(rig))
+    home = batch.event == Event.REACHED
+    assert 0.2 < home.mean() < 0.9
+    assert (data.event.values.ravel() == batch.event).all()
+    assert data.time.values.ravel()[home] == pytest.approx(batch.time[home], rel=1e-2)
+    assert data.cost.values.ravel()[home] == pytest.approx(batch.cost[home], rel=1e-2)
+    assert np.isnan(data.time.values.ravel()[~home]).all()
+
+
+def test_a_store_is_read_lazily_with_units_and_provenance(serial: Path) -> None:
+    data = dataset(serial)
+    assert data.cost.chunks == ((2,) * 6, (8,))
+    assert (data.cost.attrs["units"], data.phi_dot.attrs["units"]) == ("V² s", "rad/s")
+    assert data.attrs["definition"]["mechanism"] == RIG
+    assert data.attrs["definition"]["axes"] == AXES
+    assert data.attrs["versions"]["numba"]
+
+
+def test_states_on_the_surface_are_on_it() -> None:
+    axes = {"phi": {"from": -0.5, "to": 0.5, "count": 3}, "theta": AXES["phi"]}
+    campaign = Definition.of(RIG, kind="region", axes=axes, sliding=True)
+    study: Any = Campaign(campaign, Path("nowhere")).study
+    _, states = study.states(0)
+    s = study.surface
+    n, m = 2, 1
+    rest = states[:, :m] @ s.lambda_a.T + states[:, m:n] @ s.lambda_u.T
+    rest += states[:, n : n + m] @ s.alpha_a.T + states[:, n + m :] @ s.alpha_u.T
+    assert abs(rest).max() < 1e-12
+    assert abs(states[:, 2]).max() > 1
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{"threads": 2}, pytest.param({"workers": 1}, marks=pytest.mark.slow), {"workers": 2}],
+    ids=str,
+)
+def test_every_executor_writes_the_same_bits(
+    serial: Path, tmp_path: Path, how: dict[str, int]
+) -> None:
+    run(MAP, tmp_path / "other", **how)
+    assert content(tmp_path / "other") == content(serial)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("said", [PLANTS, DESIGNS], ids=["plants", "designs"])
+def test_studies_of_plants_and_designs_have_the_same_bits_too(
+    said: dict[str, Any], tmp_path: Path
+) -> None:
+    definition = Definition.of(RIG, **said)
+    run(definition, tmp_path / "serial")
+    for how in ({"threads": 2}, {"workers": 1}, {"workers": 2}):
+        path = tmp_path / str(how)
+        run(definition, path, **how)
+        assert content(path) == content(tmp_path / "serial"), how
+    data = dataset(tmp_path / "serial")
+    assert all(np.isfinite(data[name]).any() for name in ("energy", "lqr_cost") if name in data)
+
+
+class Faulty(Executor):
+    """Another executor, on which one shard is spoilt."""
+
+    def __init__(self, pool: Executor, shard: int, fault: Callable[..., Any]) -> None:
+        self.pool, self.shard, self.fault = pool, shard, fault
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        if args[3] == self.shard:
+            return self.pool.submit(self.fault, fn, *args)
+        return self.pool.submit(fn, *args)
+
+
+def killed_once(fn: Callable[..., Any], *args: Any) -> Any:
+    """The first time, SIGKILL when one array of the shard is written and the others are not."""
+    from undertow.studies.campaign import run as module
+
+    mark = Path(args[2]).with_suffix(".killed")
+    if not mark.exists():
+        mark.touch()
+        study, store = module.study_of(args[0]), Store(Path(args[2]))
+        store._arrays["event"][study.part(args[3])] = compute(args[0], args[3])["event"]
+        os.kill(os.getpid(), signal.SIGKILL)
+    return fn(*args)
+
+
+def segfaults(fn: Callable[..., Any], *args: Any) -> Any:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def hangs(fn: Callable[..., Any], *args: Any) -> Any:
+    from undertow.studies.campaign import run as module
+
+    module.compute = lambda *_: time.sleep(600)  # type: ignore[assignment]
+    return fn(*args)
+
+
+@pytest.mark.slow
+def test_a_worker_killed_in_the_middle_of_a_shard_loses_nothing(
+    serial: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "store"
+    with executor_for(workers=1) as (pool, width):
+        outcome = Campaign(MAP, path).run(Faulty(pool, 2, killed_once), width=width)
+    assert path.with_suffix(".killed").exists()
+    assert outcome.complete, outcome.failures
+    assert content(path) == content(serial)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [segfaults, hangs])
+def test_a_shard_that_kills_its_worker_is_named_and_the_rest_is_kept(
+    serial: Path, tmp_path: Path, fault: Callable[..., Any]
+) -> None:
+    path = tmp_path / "store"
+    with executor_for(workers=1) as (pool, width):
+        campaign = Campaign(MAP, path)
+        outcome = campaign.run(Faulty(pool, 3, fault), width=width, limit=20.0)
+    assert outcome.done == outcome.shards - 1
+    assert list(outcome.failures) == [3]
+    assert "worker died" in outcome.failures[3]
+    assert resumed(path).computed == 1
+    assert content(path) == content(serial)
+
+
+SCHEDULER = """
+import distributed, logging, sys
+if __name__ == "__main__":
+    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None,
+                                       silence_logs=logging.CRITICAL)
+    print(cluster.scheduler_address, flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A scheduler with a worker, in a process of their own."""
+    script = tmp_path / "scheduler.py"
+    script.write_text(SCHEDULER)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        stderr=subprocess.DEVNULL, env=environment,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        yield process, process.stdout.readline().strip()
+        process.kill()
+
+
+@pytest.mark.slow
+def test_a_campaign_goes_on_when_its_scheduler_was_killed(
+    serial: Path, tmp_path: Path, scheduler: tuple[subprocess.Popen[str], str]
+) -> None:
+    process, address = scheduler
+    path = tmp_path / "store"
+
+    def stop(_what: str, _part: float) -> None:
+        process.kill()
+
+    with (
+        pytest.raises(ResourceError, match=r"workers of the campaign.*--resume"),
+        executor_for(scheduler=address) as (pool, width),
+    ):
+        Campaign(MAP, path).run(pool, width=width, progress=stop)
+    outcome = resumed(path)
+    assert outcome.complete
+    assert outcome.computed < outcome.shards
+    assert content(path) == content(serial)
+
+
+def test_a_process_killed_in_between_is_resumed(serial: Path, tmp_path: Path) -> None:
+    """Kill -9 of everything after some shards; nothing finished is computed again."""
+    path = tmp_path / "store"
+    code = f"""
+import os, signal
+from pathlib import Path
+from undertow.studies.campaign import *
+def stop(what, part):
+    if part > 0.4: os.kill(os.getpid(), signal.SIGKILL)
+with executor_for(threads=2) as (pool, width):
+    Campaign(Definition({MAP.mechanism!r}, {MAP.text!r}), Path({str(path)!r})).run(
+        pool, width=width, progress=stop)
+"""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, check=False, timeout=300)
+    assert ended.returncode == -signal.SIGKILL
+    marked = int((Store(path).marks() != 0).sum())
+    assert 3 <= marked < 6
+    outcome = resumed(path)
+    assert (outcome.computed, outcome.complete) == (6 - marked, True)
+    assert content(path) == content(serial)
+
+
+def spoil(path: Path, how: str) -> None:
+    """Damage one chunk of shard 2 and one of shard 4, and the mark of shard 5."""
+    chunk = path / "cost" / "c" / "2" / "0"
+    if how == "half-written":
+        chunk.write_bytes(chunk.read_bytes()[: chunk.stat().st_size // 2])
+    elif how == "missing":
+        chunk.unlink()
+    else:
+        chunk.write_bytes((path / "cost" / "c" / "3" / "0").read_bytes())
+    (path / "time" / "c" / "4" / "0").write_bytes(b"")
+    (path / "done" / "c" / "5").write_bytes(b"123")
+    (path / "cost" / "c" / "1" / "0.abcdef.partial").write_bytes(b"left by a killed worker")
+
+
+@pytest.mark.parametrize("how", ["half-written", "missing", "of another shard"])
+def test_damaged_chunks_are_found_and_computed_again(
+    serial: Path, tmp_path: Path, how: str
+) -> None:
+    path = tmp_path / "store"
+    run(MAP, path)
+    spoil(path, how)
+    outcome = resumed(path)
+    assert outcome.repaired == [2, 4]
+    assert (outcome.computed, outcome.complete) == (3, True)
+    assert content(path) == content(serial)
+
+
+def test_a_full_disk_ends_the_campaign_and_keeps_what_is_done(serial: Path, tmp_path: Path) -> None:
+    """Files of at most so many bytes, by the system: a write fails in its middle."""
+    path = tmp_path / "store"
+    code = f"""
+import resource, signal
+from pathlib import Path
+from undertow.base import ArtefactError
+from undertow.studies.campaign import *
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+campaign = Campaign(Definition({MAP.mechanism!r}, {MAP.text!r}), Path({str(path)!r}))
+def full(what, part):
+    if part > 0.3: resource.setrlimit(resource.RLIMIT_FSIZE, (16, 16))
+with executor_for() as (pool, width):
+    try:
+        campaign.run(pool, width=1, progress=full)
+    except ArtefactError as error:
+        print(error)
+"""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run(
+        [sys.executable, "-c", code], env=environment, check=True, timeout=300,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert "File too large" in ended.stdout
+    assert "--resume" in ended.stdout
+    done = int((Store(path).marks() != 0).sum())
+    assert 2 <= done < 6
+    assert resumed(path).computed == 6 - done
+    assert content(path) == content(serial)
+
+
+def test_a_changed_definition_is_refused(serial: Path) -> None:
+    before = content(serial)
+    with executor_for() as (pool, _):
+        for other in (
+            Definition.of(RIG, **REGION | {"horizon": 9.0}),
+            Definition.of(RIG, **REGION, parameters={"m": 0.13}),
+            Definition.of("cart_pendulum", **REGION),
+        ):
+            with pytest.raises(ArtefactError, match=r"another campaign.*--out"):
+                Campaign(other, serial).run(pool, resume=True)
+        with pytest.raises(ArtefactError, match=r"there is one.*--resume"):
+            Campaign(MAP, serial).run(pool)
+    assert content(serial) == before
+
+
+def test_two_campaigns_at_once_do_not_share_a_store(serial: Path) -> None:
+    with (
+        executor_for() as (pool, _),
+        Store(serial).alone(),
+        pytest.raises(ArtefactError, match="another process"),
+    ):
+        Campaign(MAP, serial).run(pool, resume=True)
+    assert resumed(serial).computed == 0
+
+
+def test_a_shard_that_raises_is_named_and_others_go_on(
+    serial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "store"
+    campaign = Campaign(MAP, path)
+    good = type(campaign.study).compute
+
+    def bad(study: Any, shard: int) -> Any:
+        if shard == 1:
+            raise FloatingPointError("it went wrong")
+        return good(study, shard)
+
+    with monkeypatch.context() as patch, executor_for(threads=2) as (pool, width):
+        patch.setattr(type(campaign.study), "compute", bad)
+        outcome = campaign.run(pool, width=width)
+    assert list(outcome.failures) == [1]
+    assert "FloatingPointError: it went wrong" in outcome.failures[1]
+    assert resumed(path).computed == 1
+    assert content(path) == content(serial)
+
+
+def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    campaign = Campaign(MAP, path)
+    campaign.key = "0" * 64  # of the store, not of what a worker finds
+    with executor_for() as (pool, _), pytest.raises(ResourceError, match="another version"):
+        campaign.run(pool)
+    assert not Store(path).marks().any()
+
+
+TOML = """
+kind = "region"
+mechanism = "rotary_pendulum"
+horizon = 8.0
+shard = 16
+[axes.phi]
+from = -1.2
+to = 1.2
+count = 12
+[axes.phi_dot]
+from = -8.0
+to = 8.0
+count = 8
+"""
+
+
+def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path: Path) -> None:
+    file, out = tmp_path / "map.toml", tmp_path / "map.zarr"
+    file.write_text(TOML)
+    told = ["campaign", str(file), "--out", str(out)]
+    runner = CliRunner()
+    made = runner.invoke(app, [*told, "--threads", "2"])
+    assert made.exit_code == 0, made.output
+    assert "6 of 6 shards" in made.output
+    assert Store(out).about["key"] == Store(serial).about["key"]
+    assert (Store(out).marks() == Store(serial).marks()).all()
+    shown = runner.invoke(app, [*told, "--status"])
+    assert "6 of 6 shards" in shown.output
+    again = runner.invoke(app, [*told, "--shard", "4"])
+    assert "the same bits as in the store" in again.output
+    found = digest(compute(MAP, 4))
+    assert f"{found:016x}" in again.output
+    for wrong, words in (
+        (["--shard", "6"], "0 to 5"),
+        (["--limit", "3"], "--workers 1"),
+        (["--threads", "2", "--workers", "1"], "two places"),
+        ([], "--resume"),
+    ):
+        refused = runner.invoke(app, [*told, *wrong])
+        assert refused.exit_code != 0
+        assert words in " ".join(refused.output.split())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": "regions"}, "one of region, plants, designs"),
+        ({"shards": 3}, "Did you mean shard?"),
+        ({"shard": 0}, "a whole number from 1"),
+        ({"horizon": "long"}, "a number from"),
+        ({"axes": {"psi": {"from": 0.0, "to": 1.0, "count": 2}}}, "theta, phi"),
+        ({"axes": {"phi": {"from": 0.0, "to": 1.0}}}, "axes.phi.count"),
+        ({"axes": {}}, "states among theta"),
+        ({"at": {"phi": 0.1}}, "one of theta"),
+        ({"surface": [1.0, 2.0]}, "4 numbers"),
+        ({"parameters": {"mass": 1.0}}, "mass"),
+        ({"limits": {"voltage": -1.0}}, "voltage"),
+        ({"objective": "beauty"}, "one of energy"),
+        ({"sliding": "yes"}, "true or false"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(change: dict[str, Any], words: str) -> None:
+    with pytest.raises((InvalidInputError, ModelError), match=words):
+        Campaign(Definition.of(RIG, **REGION | change), Path("nowhere"))
+
+
+CASE = {"surface": [-1.0, -1.59, 1.96, 12.1], "sliding": True, "kind": "region"}
+ON_SURFACE = {
+    "phi": {"from": -1.2, "to": 1.2, "count": 41},
+    "theta": {"from": -6.0, "to": 6.0, "count": 41},
+}
+REGIONS = Path(__file__).parents[1] / "data" / "regions.json"
+
+
+def test_every_state_of_a_proved_region_comes_home_without_a_limit() -> None:
+    """The proof knows no input limit: then simulation must agree, and with 15 V it need not."""
+    limited = Campaign(Definition.of(RIG, **CASE, axes=ON_SURFACE), Path("nowhere"))
+    study: Any = limited.study
+    proved = proved_set(study, REGIONS)
+    _, states = study.states(0)
+    with np.errstate(all="ignore"):
+        inside = proved(sliding_coordinates(study, states)) <= 1.0
+    assert 0.4 < inside.mean() < 0.9
+    free = Definition.of(RIG, **CASE, axes=ON_SURFACE, limits={"voltage": 1e6})
+    assert (compute(free, 0)["event"].ravel()[inside] == Event.REACHED).all()
+    with_limit = compute(limited.definition, 0)["event"].ravel()[inside] == Event.REACHED
+    assert 0.98 < with_limit.mean() < 1.0
+    other: Any = Campaign(Definition.of(RIG, **CASE | {"surface": [-1, -1.6, 2, 12]},
+                                        axes=ON_SURFACE), Path("nowhere")).study  # fmt: skip
+    with pytest.raises(InvalidInputError, match="no region on this surface"):
+        proved_set(other, REGIONS)
+
+
+def test_pictures_show_slices_volumes_and_proved_sets(serial: Path, tmp_path: Path) -> None:
+    flat = picture(Campaign(MAP, serial))
+    time, cost = flat.axes[:2]
+    assert (time.get_xlabel(), time.get_ylabel()) == ("φ (°)", "φ̇ (°/s)")
+    drawn: Any = cost.collections[-1].get_array()
+    shown = np.ma.filled(drawn, np.nan)
+    assert np.nanmax(abs(shown - dataset(serial).cost.values.T)) == 0
+    on_surface = Definition.of(RIG, **CASE, axes=ON_SURFACE)
+    run(on_surface, tmp_path / "on")
+    image, words = picture_file(Campaign(on_surface, tmp_path / "on"), REGIONS)
+    assert image.startswith(b"\x89PNG")
+    assert "in the proved region" in words[0]
+    with pytest.raises(InvalidInputError, match="sliding = true"):
+        picture(Campaign(MAP, serial), proved_set(study_of(on_surface), REGIONS))  # type: ignore[arg-type]
+    axes = AXES | {"theta_dot": {"from": -1.0, "to": 1.0, "count": 3}}
+    volume = Definition.of(RIG, **REGION | {"axes": axes})
+    run(volume, tmp_path / "volume")
+    panels = picture(Campaign(volume, tmp_path / "volume")).axes
+    assert [a.get_title(loc="left") for a in panels[:3]][1] == "θ̇ = 0°/s"
+    with pytest.raises(ArtefactError, match="definition in the store"):
+        picture(Campaign(volume, serial))
+
+
+def test_a_definition_runs_no_code(tmp_path: Path) -> None:
+    """A Python file is run where the command line names it, and its content counts."""
+    code = tmp_path / "own.py"
+    code.write_text("import undertow as ut\nrig = ut.mechanisms.rotary_pendulum(m=0.1)\n")
+    file = tmp_path / "map.toml"
+    file.write_text(TOML.replace("rotary_pendulum", f"{code}:rig"))
+    with pytest.raises(InvalidInputError, match="--mechanism"):
+        Definition.read(file)
+    named = Definition.read(file, f"{code}:rig")
+    first = Campaign(named, tmp_path / "store")
+    assert first.study.mechanism.parameter_values[2] == 0.1
+    file.write_text("kind = ")
+    with pytest.raises(ArtefactError, match="TOML"):
+        Definition.read(file)
