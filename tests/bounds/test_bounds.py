@@ -84,15 +84,15 @@ def drive(found: Bound, x0: FloatArray, start: float, end: float) -> FloatArray:
     return np.asarray(x)
 
 
-def linear_plant(limit: float = math.inf) -> ut.Mechanism:
-    """Two masses and a spring, force on the first: linear, controllable."""
+def linear_plant(limit: float = math.inf, falling: float = 0.0) -> ut.Mechanism:
+    """Two masses and a spring, force on the first: linear, controllable; the second may fall."""
     a, b = ut.Coordinate("a", "m"), ut.Coordinate("b", "m")
     return ut.Mechanism.from_energies(
         "two_masses",
         [a, b],
         [ut.Input("force", "N", limit)],
         kinetic=a.velocity**2 / 2 + 2 * b.velocity**2 / 2,
-        potential=3 * (a.symbol - b.symbol) ** 2 / 2,
+        potential=3 * (a.symbol - b.symbol) ** 2 / 2 - sp.Float(falling) * b.symbol**2 / 2,
         dissipation=sp.Float(0.1) * b.velocity**2 / 2,
     )
 
@@ -145,6 +145,61 @@ def test_linear_plant_energy_is_that_of_the_controllability_gramian() -> None:
     found = bound(plant, ut.MinimumEnergy(terminal_radius=radius), x0, horizon=4.0)
     assert found.cost == pytest.approx(gramian_optimum(plant, x0, 4.0, radius), rel=1e-5)
     assert np.linalg.norm(found.x[-1]) == pytest.approx(radius, rel=1e-5)
+
+
+def test_energy_is_counted_until_the_terminal_set_is_reached() -> None:
+    """A mass that falls away from the target: the least over all final times, in closed form.
+
+    Held inside the terminal set until the horizon they cost more; so would any other time.
+    """
+    plant, radius, horizon = linear_plant(falling=1.0), 0.2, 8.0
+    x0 = np.array([0.3, 0.5, 0.0, 0.0])
+    objective = ut.MinimumEnergy(terminal_radius=radius)
+
+    def at(end: float) -> float:
+        return gramian_optimum(plant, x0, end, radius)
+
+    least = scipy.optimize.minimize_scalar(at, bounds=(3.0, 6.0), method="bounded")
+    assert least.fun < 0.98 * at(horizon)
+    found = bound(plant, objective, x0, horizon=horizon)
+    assert found.cost == pytest.approx(least.fun, rel=1e-4)
+    assert found.time == pytest.approx(least.x, rel=0.02)
+    inside = np.linalg.norm(found.x, axis=1) <= radius
+    assert not inside[:-1].any()
+    late = bound(plant, objective, x0, horizon=0.7 * least.x)
+    assert late.time == pytest.approx(0.7 * least.x)
+    assert late.cost == pytest.approx(at(0.7 * least.x), rel=1e-4)
+
+
+def test_an_energy_bound_is_what_the_plant_does_with_its_input() -> None:
+    """Applied to a rig sample by sample, u(t) costs and arrives as the bound says."""
+    plant, period, spent = ut.mechanisms.pendubot(), 5e-5, 0.0
+    found = bound(plant, ut.MinimumEnergy())
+    rig = ut.plants.IdealRig(plant, found.x[0], period)
+    misses = []
+    for t in np.arange(0.5 * period, found.time + 0.01, period):
+        u = found.input(t) if t < found.time else np.zeros(1)
+        rig.write(u)
+        spent += float(u @ u) * period
+        misses.append(np.linalg.norm(rig.truth))
+    assert min(misses) <= 0.01 * 1.02
+    arrives = period * (1 + np.argmax(np.array(misses) <= 0.01 * 1.02))
+    assert arrives == pytest.approx(found.time, abs=3e-3)
+    assert spent == pytest.approx(found.cost, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pendubot", "acrobot", "rotary_pendulum"])
+def test_no_cascade_costs_less_than_the_bound(name: str) -> None:
+    """Energy until arrival, by the best cascade there is: not below the bound, but by its error."""
+    plant = getattr(ut.mechanisms, name)()
+    freedom = ut.DecisionVariables(reaching=True, schedule=0.1)
+    cascade = ut.Cascade(plant, ut.MinimumEnergy(), belief="exact", freedom=freedom)
+    run = cascade.simulate(**plant.start)
+    assert run.reached
+    for guess in (None, run.trajectory):
+        found = bound(plant, ut.MinimumEnergy(), guess=guess)
+        assert 1.0 - 5e-4 < run.cost / found.cost < 1.02
 
 
 def test_cost_converges_with_the_order_of_a_piecewise_linear_input() -> None:
@@ -431,7 +486,7 @@ def test_disturbance_that_depends_on_time_is_met() -> None:
     """A plant with an explicit t in its forces: the motion is one of that plant."""
     plant = linear_plant(5.0).disturbed({"b": sp.sin(3 * ut.models.mechanism.TIME)})
     found = bound(plant, ut.MinimumEnergy(terminal_radius=0.05), [0.5, 0, 0, 0], horizon=3.0)
-    end = drive(found, found.x[0], 0.0, 3.0)
+    end = drive(found, found.x[0], 0.0, found.time)
     np.testing.assert_allclose(end, found.x[-1], atol=1e-5)
 
 

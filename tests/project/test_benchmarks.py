@@ -292,3 +292,74 @@ def test_swing_ups_meet_the_plant_that_a_seed_says(harness: ModuleType) -> None:
     rig.write(record.u[300])
     np.testing.assert_allclose(rig.truth, record.truth[301], atol=1e-12)
     assert swing_ups.row("rotary_pendulum", [first])[1] == "1 of 1"
+
+
+@pytest.fixture
+def basins(harness: ModuleType) -> ModuleType:
+    """The cold search against long ones."""
+    import basins
+
+    return basins
+
+
+def test_basins_go_on_where_they_were_interrupted(
+    basins: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Claim: a search that is in the ledger is not run again; more of them only add."""
+    ran = []
+
+    def search(_task: object, name: str) -> object:
+        ran.append(name)
+        return basins.Found(2.0 if name == basins.DEFAULT else 1.0, 0.1)
+
+    monkeypatch.setattr(basins.Task, "run", search)
+    kind, path = basins.Kind("rotary_pendulum", "time", "three"), tmp_path / "basins.jsonl"
+    names = basins.named_searches(3, ["ours", "cmaes"])
+    assert names == ["default", "ours 1", "cmaes 1", "ours 2"]
+    basins.fill(basins.ledger(path, 0), [kind], 1, names[:2], 0)
+    kept = basins.ledger(path, 0)
+    basins.fill(kept, [kind], 1, names, 0)
+    assert ran == names
+    (tally,) = basins.tallies(kept.known, [kind], 1, names)
+    assert tally.missed
+    assert tally.loss == pytest.approx(1.0)
+    with pytest.raises(UndertowError, match="other versions or settings"):
+        basins.ledger(path, 1)
+
+
+def test_basins_count_what_only_others_find_and_leave_out_what_nobody_does(
+    basins: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Claim: where only a long search arrives the default has missed; where none does, nobody."""
+    kind = basins.Kind("cart_pendulum", "energy", "free")
+    costs = [(1.0, 0.995), (1.02, 1.0), (np.inf, 3.0), (np.inf, np.inf)]
+    every = [basins.Tally(kind, k, {"default": a, "ours 1": b}) for k, (a, b) in enumerate(costs)]
+    assert [t.missed for t in every] == [False, True, True, False]
+    good, count, low, high = basins.share(every)
+    assert (good, count) == (1, 3)
+    assert low == pytest.approx(0.0615, abs=1e-3)  # Wilson's interval of 1 of 3
+    assert high == pytest.approx(0.7923, abs=1e-3)
+    basins.report(every, [kind], 0)
+    shown = capsys.readouterr().out
+    assert re.search(r"cart_pendulum, energy, free +4 +1 +1 of 3 .* fails", shown)
+    assert "1 of 3 starts, 33.3 %" in shown
+
+
+def test_a_start_of_basins_depends_on_its_number_and_seed_alone(basins: ModuleType) -> None:
+    """Random angles, rates and damping; every start is one that the task allows."""
+    for name in basins.DRAWS:
+        first, again, other = (basins.drawn(name, k, 3) for k in (5, 5, 6))
+        np.testing.assert_array_equal(first.x0, again.x0)
+        assert first.mechanism.fingerprint == again.mechanism.fingerprint
+        assert first.mechanism.fingerprint != other.mechanism.fingerprint
+        assert (first.x0 != other.x0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ours", "many", "cmaes", "evolution", "annealing"])
+def test_long_searches_of_basins_arrive(basins: ModuleType, method: str) -> None:
+    """From an easy start each method finds about what the others do: the tasks are the same."""
+    pytest.importorskip("cmaes")
+    task = basins.Task(basins.drawn("rotary_pendulum", 0, 0), "energy", "three")
+    usual = task.run(basins.DEFAULT).cost
+    assert 0.9 * usual < task.run(f"{method} 1").cost < 1.1 * usual

@@ -4,7 +4,7 @@ The sliding-mode law is one way to move; this module asks how cheap *any* admiss
 u(t) could be from the same state, so that a result has something to be measured by.
 
     min over u(·), t_f:  ∫ Φ(x, u) dt   with  ẋ = (q̇, M⁻¹(f + B u)),  x(0) = x₀,
-    |u| ≤ u_max (38),  w(x, u) ≤ 0 (25),  ‖x(t_f)‖₂ ≤ ν (31)
+    |u| ≤ u_max (38),  w(x, u) ≤ 0 (25),  ‖x(t_f)‖₂ ≤ ν (31),  t_f ≤ horizon
 
 It is transcribed by the separated Hermite-Simpson scheme (Betts, *Practical Methods for
 Optimal Control*, 2010, ch. 4; Kelly, *SIAM Review* 59, 2017): states at the nodes and

@@ -36,6 +36,9 @@ ITERATIONS = 200
 #: Iterations for trying whether a motion can be run twice as fast: mostly 10 to 45.
 HASTE = 60
 
+#: How much faster a motion that may end early is run, until that costs so much more.
+QUICKER, DEARER = 1.25, 1.05
+
 #: Mean of (u_i/u_max,i)² below which a motion could clearly be run faster.
 IDLE = 0.05
 
@@ -78,6 +81,12 @@ class Solution:
         """Times (N+1,), states (N+1, 2n) and inputs (N+1, m) at the nodes."""
         return self.times[::2], self.x[::2], self.u[::2]
 
+    def until(self, radius: float) -> Solution:
+        """Return the motion until the first node in the ball of a radius, as the terminal set."""
+        first = int(np.argmax(np.linalg.norm(self.x[::2], axis=1) <= radius * (1 + 1e-6)))
+        count = 2 * first + 1 if first else len(self.times)
+        return replace(self, times=self.times[:count], x=self.x[:count], u=self.u[:count])
+
     def as_guess(self, pace: float = 1.0) -> Guess:
         """Return the motion, run ``pace`` times as fast, as a guess for another programme."""
         n = self.x.shape[1] // 2
@@ -110,7 +119,7 @@ class Programme:
         at_rest = stage.subs(
             mechanism.substitution | dict.fromkeys((*mechanism.x, *mechanism.u), 0)
         )
-        self.free_time = float(at_rest) > 1e-12
+        self.rest_costs = float(at_rest) > 1e-12
         self.scale = time_scale(mechanism, longest)
         limits = np.where(np.isfinite(mechanism.input_limits), mechanism.input_limits, 1.0)
         # ∫ effort dt weighs every input by its limit: 1 is all inputs at their limits.
@@ -188,14 +197,24 @@ class Programme:
         fixed: float | None,
         patience: int = ITERATIONS,
     ) -> Solution:
-        """Solve on a mesh in [0, 1], at a fixed final time or a free one."""
+        """Solve on a mesh in [0, 1], at a fixed final time or a free one near the guess's.
+
+        Where rest costs something near is anywhere up to the horizon: shorter is always better.
+        Where it costs nothing the cost is flat in a time that is too long, and the search for the
+        time must not leave the valley that the guess lies in.
+        """
         ca, n, m, count = self.ca, 2 * self.mechanism.n, self.mechanism.m, len(mesh) - 1
         written = self._transcribe(mesh, dynamics)
         constraints = ca.vertcat(written.equations, written.inequalities)
         equal, unequal = written.equations.numel(), written.inequalities.numel()
 
         limits = self.mechanism.input_limits
-        shortest, longest = (1e-3 * guess.time, self.longest) if fixed is None else (fixed, fixed)
+        if fixed is not None:
+            shortest = longest = fixed
+        elif self.rest_costs:
+            shortest, longest = 1e-3 * guess.time, self.longest
+        else:
+            shortest, longest = guess.time / QUICKER, min(QUICKER * guess.time, self.longest)
         end = min(max(guess.time, shortest), longest)
         wide = np.concatenate([np.full(2 * n * count, np.inf), np.tile(limits, count + 1)])
         lower = np.concatenate([self.x0, -wide, [shortest]])
@@ -266,14 +285,17 @@ class Programme:
     def first(self, guess: Guess, count: int) -> Solution:
         """Solve on the first mesh.
 
-        A free final time collapses when it starts far from its optimum.  So the motion of
-        least effort at a fixed time comes first; the time is halved while the inputs have
-        much to spare, and only then released.
+        A free final time collapses when it starts far from its optimum.  So where rest costs
+        something the motion of least effort at a fixed time comes first; the time is halved
+        while the inputs have much to spare, and only then released.  Where rest costs nothing
+        the motion until the horizon comes first, and its time is released where it first
+        arrives.
         """
-        if not self.free_time:
+        if not self.rest_costs:
             even = rests(self.mechanism)
             mesh = first_mesh(count, 1.0 if even else self.scale / self.longest)
-            return self.solve(mesh, guess, self.cost, fixed=self.longest)
+            held = self.solve(mesh, guess, self.cost, fixed=self.longest)
+            return held if held.status is None else self._released(held, count)
         spent = 0
         mesh = np.linspace(0.0, 1.0, count + 1)
         durations = {min(guess.time, 2.0 * self.scale), guess.time, 3.0 * guess.time}
@@ -295,15 +317,40 @@ class Programme:
                 break
         return replace(tried, iterations=spent)
 
+    def _released(self, held: Solution, count: int) -> Solution:
+        """Let the final time of a motion go from where it first arrives, if that is early.
+
+        The cost hardly depends on a final time that is much too long, so ever shorter ones are
+        tried first, until the cost has risen; gains within the meshes' own error are none.
+        """
+        arrives = held.until(self.radius)
+        if arrives.time >= held.time:
+            return held
+        mesh, spent = np.linspace(0.0, 1.0, count + 1), held.iterations
+        best, next_guess = held, arrives.as_guess()
+        while next_guess.time > 1e-3 * arrives.time:
+            tried = self.solve(mesh, next_guess, self.cost, fixed=next_guess.time)
+            spent += tried.iterations
+            if tried.status is None or tried.cost > DEARER * best.cost:
+                break
+            best = min(best, tried, key=lambda s: s.cost)
+            next_guess = tried.as_guess(pace=QUICKER)
+        if best.cost >= (1.0 - SETTLED) * held.cost:
+            return replace(held, iterations=spent)
+        freed = self.solve(mesh, best.as_guess(), self.cost, fixed=None)
+        if freed.status is not None and freed.cost < best.cost:
+            best = freed
+        return replace(best, iterations=spent + freed.iterations)
+
     def refine(self, solution: Solution) -> Solution:
         """Adapt and refine the mesh until cost and defects have settled."""
-        spent = 0
+        spent, held = 0, solution.time >= self.longest
         errors = defects(self.mechanism, *solution.nodes)
         for _ in range(REFINEMENTS):
             count = math.ceil(GROWTH * (len(solution.mesh) - 1))
             mesh = adapted_mesh(solution.mesh, errors, solution.u[::2], count)
-            fixed = None if self.free_time else self.longest
-            finer = self.solve(mesh, solution.as_guess(), self.cost, fixed=fixed)
+            guess = solution.as_guess()
+            finer = self.solve(mesh, guess, self.cost, fixed=self.longest if held else None)
             spent += finer.iterations
             if finer.status is None:
                 return replace(finer, iterations=spent)
