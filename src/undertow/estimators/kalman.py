@@ -33,8 +33,17 @@ from undertow.plants.stepping import compiled_module
 from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 
 #: Parameters are learnt while some acceleration is larger than this part of what the full inputs do
-#: to it at the target: what the model leaves out, dry friction, is small beside it.
+#: to it at the target, and than what the estimated disturbance does besides: what the model leaves
+#: out, dry friction, is small beside it.
 EXCITED = 0.1
+
+#: Standard deviation of a matched disturbance before anything moves, as a part of the input's limit:
+#: half of it, two deviations, is what a controller makes up for.  With less, dry friction looks like
+#: wrong parameters until they are learnt wrongly.
+DISTURBED = 0.25
+
+#: Time over which the size of the disturbance is averaged, s.
+AVERAGED = 1.0
 
 #: Standard deviations beyond which an innovation is none of noise and model: of 10⁹ samples that
 #: are, two.
@@ -134,7 +143,7 @@ _LAYOUT = {
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
     "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
-    "excited": "n",
+    "excited": "n", "felt": "m",
 }  # fmt: skip
 
 _BODY = f"""
@@ -203,9 +212,11 @@ def estimate(h, q, u, block, size, lead, known):
         h, x, then, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous, driven
     )
     move(h, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
-    moving = learnt
+    moving, louder = learnt, 0.0
+    for i in range(m if disturbed else 0):
+        louder = max(louder, abs(x[2 * n + i]) / limits[i])
     for i in range(n):
-        if abs(base[i]) > excited[i]:
+        if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
             moving = size
     predict_covariance(F, P, A, noise, h, moving)
     if readings_after_jump(x, P, q, variance, h, odd, taken):
@@ -214,6 +225,8 @@ def estimate(h, q, u, block, size, lead, known):
     for j in range(known):
         x[learnt + j] = max(-reach[j], min(reach[j], x[learnt + j]))
         parameters[int(place[j])] = nominal[j] + tolerance[j] * x[learnt + j]
+    for i in range(m if disturbed else 0):
+        felt[i] += (abs(x[2 * n + i]) - felt[i]) * min(1.0, h / {AVERAGED})
     count[0] = start + 1.0
     out[:] = x
     for k in range(lead):
@@ -261,6 +274,8 @@ class KalmanFilter:
     ----------
     disturbance
         The estimated matched disturbance, in units of the inputs, (m,); written over.
+    felt
+        Its size, averaged over the last second, (m,); written over.
     parameters
         Values of all parameters of the mechanism that it moves with, (P,), SI units; written over.
 
@@ -337,6 +352,7 @@ class KalmanFilter:
         self._x, self._out = memory["x"], memory["out"]
         self._P: FloatArray = memory["P"]
         self._odd: FloatArray = memory["odd"]
+        self.felt: FloatArray = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
         self._variance[:] = positive("position_noise", position_noise, n) ** 2
         memory["noise"][n : 2 * n] = positive("acceleration_noise", acceleration_noise, n) ** 2
@@ -360,7 +376,7 @@ class KalmanFilter:
         """Start again from the state x0, (2n,), at rest as far as is known.
 
         ``spread`` is the standard deviation of the velocities, rad/s or m/s; that of the
-        positions is a measurement's, and the disturbance may be a tenth of its limit.  What was
+        positions is a measurement's, that of the disturbance a quarter of its limit.  What was
         learnt of parameters is forgotten.
         """
         n, learnt = self.mechanism.n, self._learnt
@@ -370,12 +386,13 @@ class KalmanFilter:
         variances = np.zeros(len(self._x))
         variances[:n], variances[n : 2 * n] = self._variance, spread**2
         if learnt > 2 * n:
-            variances[2 * n : learnt] = np.minimum(0.1 * self._limits, 1.0) ** 2
+            known = np.isfinite(self._limits)
+            variances[2 * n : learnt] = np.where(known, DISTURBED * self._limits, 1.0) ** 2
         variances[learnt:] = EVEN**2
         np.fill_diagonal(self._P, variances)
         self.parameters[:] = self.mechanism.parameter_values
         self._past[:], self._count[0], self._t = 0.0, 0, math.nan
-        self._odd[:] = 0.0
+        self._odd[:] = self.felt[:] = 0.0
         self._out[:] = self._x
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
