@@ -390,8 +390,8 @@ class Cascade:
     def reserve(self) -> tuple[Plan, ...]:
         """Plans that are there without a search: the first surface, reached ever more strongly.
 
-        It bears what it was designed for, and a large s brings its law to the limits of the input at
-        once, where the cascade's own reaching law is content with η.
+        It bears what it was designed for, and a large s brings its law to the limits of the input
+        at once, where the cascade's own reaching law is content with η.
         """
         eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
         laws = [
@@ -413,8 +413,9 @@ class Cascade:
             return plan
         plans = [plan, *self.reserve]
         scores = loop.batch(error, plans, duration=span).score(span)
-        ranks = zip(scores >= INADMISSIBLE, [sticks, *[False] * len(self.reserve)], scores, plans)
-        return min(ranks, key=lambda rank: rank[:3])[3]
+        ranks = [(score >= INADMISSIBLE, False, score) for score in scores]
+        ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
+        return plans[min(range(len(plans)), key=ranks.__getitem__)]
 
     def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
         """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
@@ -677,8 +678,8 @@ class Cascade:
         since, the admission's reason says so: after a jump the cost is compared with that of a plan
         for another task, and "cost not raised" is little.
 
-        Where the plan in use does not suit every plausible plant and one in :attr:`reserve` does, or
-        is survived longer, that one is compared with, and takes over unless the proposal does.
+        Where the plan in use does not suit every plausible plant and one in :attr:`reserve` does,
+        or is survived longer, that one is compared with, and takes over unless the proposal does.
 
         Where the target moves, what the gate admits is also rolled out along the reference, as is
         the plan in use: constraints have to hold there, and the cost must not rise.
@@ -704,7 +705,8 @@ class Cascade:
         off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
         if off > self._sticks(state, loop, old):
             cost = self.gate(loop, old, old, current, span).cost
-            words = f"a joint that sticks would move {off:.3g} off, {self.objective.terminal_radius:g} at most"
+            most = f"{self.objective.terminal_radius:g} at most"
+            words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
             admission = Admission(False, words, cost)
         if state.target is not None and state.target.moves:
             admission = self._along(state, old, proposal.plan, admission, span)

@@ -37,9 +37,9 @@ from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 #: out, dry friction, is small beside it.
 EXCITED = 0.1
 
-#: Standard deviation of a matched disturbance before anything moves, as a part of the input's limit:
-#: half of it, two deviations, is what a controller makes up for.  With less, dry friction looks like
-#: wrong parameters until they are learnt wrongly.
+#: Standard deviation of a matched disturbance before anything moves, as a part of the input's
+#: limit: half of it, two deviations, is what a controller makes up for.  With less, dry friction
+#: looks like wrong parameters, and those are learnt.
 DISTURBED = 0.25
 
 #: Time over which the size of the disturbance is averaged, s.
@@ -106,8 +106,8 @@ def readings_after_jump(
 ) -> bool:  # fmt: skip
     """Write the positions to be taken in into ``taken``; whether the velocities have jumped.
 
-    x and P are predicted.  ``odd`` is for how long readings have been off, s, how many in a row, and
-    how often velocities have jumped so far.  A jump at the beginning of that time widens P.
+    x and P are predicted.  ``odd`` is for how long readings have been off, s, how many in a row,
+    and how often velocities have jumped so far.  A jump at the beginning of that time widens P.
     """
     n, off = q.shape[0], False
     for i in range(n):
@@ -406,7 +406,7 @@ class KalmanFilter:
 
     @property
     def jumps(self) -> int:
-        """How often velocities have jumped since the start: what was planned before is of no use."""
+        """How often velocities have jumped: what was planned before is for another motion."""
         return int(self._odd[2])
 
     @property

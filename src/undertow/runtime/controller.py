@@ -17,11 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undertow.cascade import Cascade, CascadeState, Legs
+from undertow.cascade import Admission, Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators import Estimator, KalmanFilter
 from undertow.law import InnerLoop, ReferenceMotion
 from undertow.models import FloatArray, error_dynamics
+from undertow.optimiser import Proposal
 from undertow.plants import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.plan_check import PlanCheck
@@ -153,7 +154,7 @@ class Controller:
         self._parameters: FloatArray = fast["parameters"][:own]
         self._row: FloatArray = fast["parameters"][own:]
         self._learning: KalmanFilter | None = None
-        self._senses_jumps = isinstance(estimator, KalmanFilter)
+        self._filter = estimator if isinstance(estimator, KalmanFilter) else None
         self._jumps, self._early = 0, False
         if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
             self._learning = estimator
@@ -252,9 +253,9 @@ class Controller:
 
     def _jumped(self) -> bool:
         """Whether velocities have jumped in this step."""
-        if not self._senses_jumps:
+        if self._filter is None:
             return False
-        before, self._jumps = self._jumps, self.estimator.jumps
+        before, self._jumps = self._jumps, self._filter.jumps
         return self._jumps > before and self.mode in (Mode.CATCH, Mode.BALANCE)
 
     def _take_reserve(self, t: float) -> None:

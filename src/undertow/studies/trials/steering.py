@@ -41,11 +41,11 @@ EARLY = 0.02
 class CascadeSteering:
     """The cascade in simulated time; its optimiser answers one period later, as on a real rig.
 
-    Every period the answer asked for one period ago is judged from the present state, then the next
-    one is asked for: for the state predicted one period ahead.  After a jump of the velocities a plan
-    in reserve takes over at once, what was asked for before is given up, and the next answer is
-    there after ``EARLY``.  Where it has a belief, its estimator learns what that leaves open, see
-    :meth:`listen`.
+    Every period the answer asked for one period ago is judged from the present state, then the
+    next one is asked for: for the state predicted one period ahead.  After a jump of the velocities
+    a plan in reserve takes over at once, what was asked for before is given up, and the next answer
+    is there after ``EARLY``.  Where it has a belief, its estimator learns what that leaves open,
+    see :meth:`listen`.
 
     The first optimisation, ``start``, was made before the run by :meth:`Cascade.start`, as on a
     bench. ``admitted`` answers passed the gate, ``refused`` did not.
