@@ -167,8 +167,8 @@ def test_a_plan_in_reserve_takes_over_where_the_one_in_use_falls(arm: ut.Mechani
     soft = Plan.of(ut.Surface(-1, -0.4, 12.0, 30.0))
     x = arm.state(theta=-0.27, phi=0.15, theta_dot=2.3, phi_dot=5.3)
     failed = ut.Proposal(None, "failed", np.inf, np.inf, (), 0, 0.0, 1, 0.0, "for the test")
-    for belief, stays in (("usual", False), ("exact", True)):
-        cascade = ut.Cascade(arm, objective, belief=belief)
+    usual, exact = ut.Cascade(arm, objective), ut.Cascade(arm, objective, belief="exact")
+    for cascade, stays in ((usual, False), (exact, True)):
         after, admission = cascade.apply_gate(CascadeState(soft, x=tuple(x)), failed, x)
         assert (after.plan == soft) == stays
         if not stays:

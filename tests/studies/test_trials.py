@@ -237,4 +237,5 @@ def test_the_cascade_bears_dry_friction_that_its_soft_surfaces_do_not() -> None:
     last = outcome.record.t > 6.0
     assert outcome.caught
     assert np.abs(outcome.record.truth[last, 0]).max() < math.radians(20)
+    assert estimator.learnt is not None
     assert np.abs(estimator.learnt.offset).max() < 1.0
