@@ -184,7 +184,7 @@ def sticking_distance(
         )
     if not sizes.any():
         return 0.0
-    k = feedback(InnerLoop(mechanism, surface, reaching or ReachingLaw()))
+    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
     gains = np.linalg.norm(k[:, mechanism.m : mechanism.n], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.where(sizes > 0, 2.0 * sizes / gains, 0.0).max())
