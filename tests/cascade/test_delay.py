@@ -10,8 +10,8 @@ import scipy.linalg
 
 import undertow as ut
 from undertow.base import InvalidInputError
-from undertow.cascade import noise_share, robustness_gate
-from undertow.cascade.robustness import DelayGate, _exponential, delay_margin
+from undertow.cascade import CascadeState, noise_share, robustness_gate
+from undertow.cascade.robustness import DelayGate, _exponential, delay_margin, sticking_distance
 from undertow.law import InnerLoop, Plan
 from undertow.objective import objective_for
 from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
@@ -125,3 +125,64 @@ def test_the_exponential_is_scipys() -> None:
         exact = scipy.linalg.expm(A)
         np.testing.assert_allclose(_exponential(A), exact, atol=1e-11 * np.abs(exact).max())
     np.testing.assert_array_equal(_exponential(np.zeros((3, 3))), np.eye(3))
+
+
+def test_a_joint_sticks_until_the_others_are_off_by_what_is_said(arm: ut.Mechanism) -> None:
+    """The arm held still by 2 V and by what was taken off for as much the other way before."""
+    surface, strong = ut.first_surface(arm), ut.ReachingLaw(160.0, 0.8)
+    off = sticking_distance(arm, surface, np.array([2.0]), strong)
+    law = InnerLoop(arm, surface, strong)
+    assert abs(law(arm.state(phi=1.02 * off))[0]) > 4.0 > abs(law(arm.state(phi=0.98 * off))[0])
+    assert sticking_distance(arm, surface, np.zeros(1)) == 0.0
+    for wrong in (np.zeros(2), np.array([np.nan])):
+        with pytest.raises(InvalidInputError, match="disturbance that holds a joint"):
+            sticking_distance(arm, surface, wrong)
+
+
+def test_while_friction_is_large_soft_surfaces_are_refused(arm: ut.Mechanism) -> None:
+    """What is admitted without friction is not with 3 V; nor is a soft one kept."""
+    objective = objective_for(arm, "bench-energy")
+    cascade = ut.Cascade(arm, objective)
+    soft, x = ut.Surface(-1, -0.3, 4.83, 13.0), arm.state(phi=0.02)
+    proposal = ut.Proposal(Plan.of(soft), "converged", 0.0, 0.0, (), 1, 0.0, 1, 0.0)
+    free = CascadeState(cascade.reserve[0], x=tuple(x))
+    after, admission = cascade.apply_gate(free, proposal, x)
+    assert admission.accepted
+    assert after.surface == soft
+    rough = replace(free, disturbance=(3.0,))
+    after, admission = cascade.apply_gate(rough, proposal, x)
+    assert not admission.accepted
+    assert "sticks" in admission.reason
+    assert after.plan == rough.plan
+    failed = replace(proposal, plan=None, status="failed")
+    after, admission = cascade.apply_gate(replace(rough, plan=Plan.of(soft)), failed, x)
+    assert admission.accepted
+    assert "in reserve" in admission.reason
+    assert after.plan in cascade.reserve
+
+
+def test_a_plan_in_reserve_takes_over_where_the_one_in_use_falls(arm: ut.Mechanism) -> None:
+    """From the state after a knock that a soft surface does not bear; an exact belief keeps it."""
+    objective = objective_for(arm, "bench-energy")
+    soft = Plan.of(ut.Surface(-1, -0.4, 12.0, 30.0))
+    x = arm.state(theta=-0.27, phi=0.15, theta_dot=2.3, phi_dot=5.3)
+    failed = ut.Proposal(None, "failed", np.inf, np.inf, (), 0, 0.0, 1, 0.0, "for the test")
+    usual, exact = ut.Cascade(arm, objective), ut.Cascade(arm, objective, belief="exact")
+    for cascade, stays in ((usual, False), (exact, True)):
+        after, admission = cascade.apply_gate(CascadeState(soft, x=tuple(x)), failed, x)
+        assert (after.plan == soft) == stays
+        if not stays:
+            assert after.plan in cascade.reserve
+            assert np.isfinite(admission.cost)
+
+
+def test_the_plans_in_reserve_are_one_feedback_near_the_target(arm: ut.Mechanism) -> None:
+    cascade = ut.Cascade(arm)
+    laws = [plan.laws(cascade.reaching)[0] for plan in cascade.reserve]
+    near = [
+        InnerLoop(arm, plan.surfaces[0], law).feedback()
+        for plan, law in zip(cascade.reserve, laws, strict=True)
+    ]
+    for other in near[1:]:
+        np.testing.assert_allclose(other, near[0], rtol=1e-6)
+    assert [law.vector(1)[0] for law in laws] == [20.0, 40.0, 80.0, 160.0]

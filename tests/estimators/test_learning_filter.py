@@ -190,3 +190,52 @@ def test_senseless_beliefs_are_refused(arm: Mechanism) -> None:
         KalmanFilter(arm, belief=other)
     with pytest.raises(InvalidInputError, match="parameter_drift"):
         KalmanFilter(arm, belief=Belief.usual(arm), parameter_drift=-1.0)
+
+
+def _knocked(
+    arm: Mechanism, knock: float, bad: int = -1
+) -> tuple[KalmanFilter, FloatArray, FloatArray, FloatArray]:
+    """After a run in which φ̇ jumps at 0.4 s and reading ``bad`` of φ is 0.03 rad off.
+
+    The filter; the offsets before and after; how far the rates are off 5 ms after the jump.
+    """
+    rng, kalman, u = np.random.default_rng(6), _learning(arm, disturbance_drift=1.5), np.zeros(1)
+    law, x = InnerLoop(arm, ut.first_surface(arm)), arm.state(phi=0.3)
+    kalman.reset(x)
+    before, off = np.empty(0), np.empty(0)
+    for k in range(600):
+        if k == 400:
+            assert kalman.learnt is not None
+            before = kalman.learnt.offset
+            x = x + np.array([0.0, 0.0, 0.4 * knock, knock])
+        rig = IdealRig(arm, x, PERIOD)
+        q = x[:2] + NOISE * rng.standard_normal(2) + (0.03 if k == bad else 0.0)
+        estimate = kalman.estimate(Measurement(k * PERIOD, q), u)
+        if k == 405:
+            off = estimate[2:] - x[2:]
+        u = law(estimate).copy()
+        rig.write(u)
+        seen = rig.read()
+        assert seen.v is not None
+        x = np.concatenate([seen.q, seen.v])
+    assert kalman.learnt is not None
+    return kalman, before, kalman.learnt.offset, off
+
+
+@pytest.mark.parametrize("knock", [-2.0, 6.0])
+def test_a_knock_is_a_jump_of_the_velocities_and_no_parameter(arm: Mechanism, knock: float) -> None:
+    """Velocities are found within 5 ms; parameters move no farther than without the knock."""
+    calm, before, after, off = _knocked(arm, 0.0)
+    assert calm.jumps == 0
+    usual = np.abs(after - before).max()
+    kalman, before, after, off = _knocked(arm, knock)
+    assert kalman.jumps == 1
+    assert np.abs(off).max() < 0.3
+    assert np.abs(after - before).max() < max(0.2, 2.0 * usual)
+
+
+def test_a_single_bad_reading_is_left_out(arm: Mechanism) -> None:
+    kalman, before, after, off = _knocked(arm, 0.0, bad=404)
+    assert kalman.jumps == 0
+    assert np.abs(off).max() < 0.1
+    assert np.abs(after - before).max() < 0.2

@@ -130,6 +130,31 @@ def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path:
     assert again.judged > 10
 
 
+def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early() -> None:
+    """φ̇ jumps by 13 rad/s; what is not knocked over by it is up 1.2 s later."""
+    recipe = replace(RECIPE, rig="realistic", parameters={})
+    bench = replace(recipe.bench, pushes=(Push(1.0, "phi", 0.034),))
+    rig = RealisticRig(bench, recipe.x0, 0)
+    controller = recipe.make_controller(recipe.first())
+    worker = InlineWorker(recipe.respond, 0.015)
+    said: list[tuple[float, str, str]] = []
+    t = 0.0
+    for k in range(2200):
+        t = 1e-3 * k
+        command = Command.START if k == 0 else Command.NONE
+        rig.write(controller.step(Inputs(t, rig.read(), worker.take(t), command)))
+        said += [(t, note.kind, note.text) for note in controller.notes]
+        if controller.request is not None:
+            worker.ask(controller.request)
+    (jump,) = (t for t, kind, _ in said if kind == "jump")
+    assert 1.0 < jump < 1.004
+    used = [t for t, kind, text in said if kind == "answer" and "applied" in text and t > jump]
+    assert used[0] < jump + 0.002
+    assert used[1] < jump + 0.025
+    assert abs(rig.truth[1]) < 0.1
+    assert controller.mode in (Mode.CATCH, Mode.BALANCE)
+
+
 def test_thrown_out_it_swings_up_again_within_limits() -> None:
     """Knocked over while it balances: safe outputs throughout, and back to the top."""
     recipe = SWINGING

@@ -24,6 +24,7 @@ from undertow.base import (
     one_of,
     positive,
 )
+from undertow.cascade.robustness import sticking_distance
 from undertow.cascade.simulation import (
     Run,
     Update,
@@ -61,6 +62,10 @@ RESOLVED = 1.0
 #: again in smaller steps; and how much smaller they are.
 AGREES, FINER = 1.01, 4
 
+#: How many times the reaching gains and layers of the plans in reserve are the cascade's: near the
+#: target all are the same feedback, far from it each asks for more input before it saturates.
+STRONGER = (1.0, 2.0, 4.0, 8.0)
+
 #: How far positions may be off what the plan in use predicted for them before an admission says
 #: so: this much, rad or m, and this part of how far the plan was to move them meanwhile.  A target
 #: that jumps shows in positions at once; what a model does not know shows in velocities first.
@@ -75,7 +80,9 @@ class CascadeState:
     proposal considered; ``predicted`` is the predicted cost J̃_k at the last decision;
     ``scale`` that of the first; ``x`` the state at ``since``, empty where it is not known;
     ``estimate`` what is known of the plant's parameters, where the cascade learns them;
-    ``target`` where the target is, where it is not at x = 0: ``x`` is counted from it.
+    ``target`` where the target is, where it is not at x = 0: ``x`` is counted from it;
+    ``disturbance`` how large a matched disturbance is, in the inputs' units, (m,), where it is
+    estimated.
     """
 
     plan: Plan
@@ -86,6 +93,7 @@ class CascadeState:
     x: tuple[float, ...] = ()
     estimate: ParameterEstimate | None = None
     target: ReferenceMotion | None = None
+    disturbance: tuple[float, ...] = ()
 
     @property
     def surface(self) -> Surface:
@@ -378,6 +386,46 @@ class Cascade:
         made = {field.name: getattr(self, field.name) for field in fields(self)}
         return made | {"objective": self.objective.written(self.mechanism)}
 
+    @cached_property
+    def reserve(self) -> tuple[Plan, ...]:
+        """Plans that are there without a search: the first surface, reached ever more strongly.
+
+        It bears what it was designed for, and a large s brings its law to the limits of the input
+        at once, where the cascade's own reaching law is content with η.
+        """
+        eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
+        laws = [
+            replace(self.reaching, eta=tuple(c * eta), layer=tuple(c * layer)) for c in STRONGER
+        ]
+        return tuple(Plan((self.optimiser.anchor,), (0.0,), (law,)) for law in laws)
+
+    def _standing(
+        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
+    ) -> Plan:
+        """The plan in use, or where it does not suit every plausible plant the best in reserve.
+
+        A plan with which a joint sticks suits none.
+        """
+        if loop.ensemble is None:
+            return plan
+        sticks = self._sticks(state, loop, plan) > 0
+        if not sticks and loop.batch(error, plan, duration=span).score(span)[0] < INADMISSIBLE:
+            return plan
+        plans = [plan, *self.reserve]
+        scores = loop.batch(error, plans, duration=span).score(span)
+        ranks = [(score >= INADMISSIBLE, False, score) for score in scores]
+        ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
+        return plans[min(range(len(plans)), key=ranks.__getitem__)]
+
+    def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
+        """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
+        if not state.disturbance or loop.ensemble is None:
+            return 0.0
+        law = plan.laws(self.reaching)[-1]
+        size = np.array(state.disturbance)
+        off = sticking_distance(loop.mechanism, plan.surfaces[-1], size, law)
+        return off if off > self.objective.terminal_radius else 0.0
+
     # -- the state machine ----------------------------------------------------------------
 
     @checked
@@ -598,9 +646,11 @@ class Cascade:
         sequence = state.sequence + 1
         try:
             planner = self._planner(self._loops(state.estimate), state.target, t)
+            error = state.error(t, self.mechanism.check_state(x))
+            span = self.objective.horizon if horizon is None else horizon
             return planner.propose(
-                state.error(t, self.mechanism.check_state(x)),
-                incumbent=state.at(t),
+                error,
+                incumbent=self._standing(state, self.loop_at(state, t), state.at(t), error, span),
                 horizon=horizon,
                 sequence=sequence,
                 computed_for=t,
@@ -628,6 +678,9 @@ class Cascade:
         since, the admission's reason says so: after a jump the cost is compared with that of a plan
         for another task, and "cost not raised" is little.
 
+        Where the plan in use does not suit every plausible plant and one in :attr:`reserve` does,
+        or is survived longer, that one is compared with, and takes over unless the proposal does.
+
         Where the target moves, what the gate admits is also rolled out along the reference, as is
         the plan in use: constraints have to hold there, and the cost must not rise.
         """
@@ -637,20 +690,29 @@ class Cascade:
             stale = f"stale: number {proposal.sequence} after {state.sequence}"
             return state, Admission(False, stale, state.predicted)
         t = proposal.computed_for
-        old, current = state.at(t), state.error(t, current)
+        current = state.error(t, current)
         jump = self._jump(state, t, current)
         loop = self.loop_at(state, t)
+        used = state.at(t)
+        old = self._standing(state, loop, used, current, span)
         state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
         if proposal.plan is None:
             kept = self.gate(loop, old, old, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
             admission = replace(kept, accepted=False, reason=reason)
-            return replace(state, predicted=kept.cost), admission
+            return replace(state, predicted=kept.cost), _reserved(admission, old, used)
         admission = self.gate(loop, old, proposal.plan, current, span)
+        off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
+        if off > self._sticks(state, loop, old):
+            cost = self.gate(loop, old, old, current, span).cost
+            most = f"{self.objective.terminal_radius:g} at most"
+            words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
+            admission = Admission(False, words, cost)
         if state.target is not None and state.target.moves:
             admission = self._along(state, old, proposal.plan, admission, span)
         admission = replace(admission, reason=f"{admission.reason}{jump}")
         plan = proposal.plan if admission.accepted else old
+        admission = _reserved(admission, plan, used)
         return replace(state, plan=plan, predicted=admission.cost), admission
 
     def _along(
@@ -791,6 +853,13 @@ class Cascade:
             if not (motion.event == Event.HORIZON or (arrived and leg.stays)):
                 break
         return Run(Trajectory.join(pieces), tuple(updates))
+
+
+def _reserved(admission: Admission, plan: Plan, used: Plan) -> Admission:
+    """The admission of the plan that stays; where one in reserve took over, that is admitted."""
+    if admission.accepted or plan is used:
+        return admission
+    return replace(admission, accepted=True, reason=f"a plan in reserve: {admission.reason}")
 
 
 def _kept(x: FloatArray) -> tuple[float, ...]:

@@ -145,6 +145,51 @@ def noise_share(
     return float((np.sqrt(np.maximum(variances, 0.0)) / mechanism.input_limits).max())
 
 
+def sticking_distance(
+    mechanism: Mechanism,
+    surface: Surface,
+    disturbance: FloatArray,
+    reaching: ReachingLaw | None = None,
+) -> float:
+    """Return how far free joints are off at least before a driven joint that sticks moves again.
+
+    Near the target u = k x.  Where a driven joint turns round, friction turns with it, and what was
+    taken off for it before adds to it: until k_u q_u is more than both the joint stands, and the
+    free ones fall.  ‖q_u‖ = 2 |d_i| / ‖k_u,i‖ for the input i, rad or m; of several inputs the
+    largest.  A soft law sways so far from side to side for ever, however well it does without
+    friction.
+
+    Parameters
+    ----------
+    mechanism
+        The model.
+    surface, reaching
+        The law; the paper's gains by default.
+    disturbance
+        Size of the matched disturbance, (m,), in the inputs' units.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> rig = ut.mechanisms.rotary_pendulum()
+    >>> round(sticking_distance(rig, ut.first_surface(rig), np.array([2.0])), 3)
+    0.027
+    """
+    sizes = np.abs(np.asarray(disturbance, dtype=float))
+    if sizes.shape != (mechanism.m,) or not np.isfinite(sizes).all():
+        raise InvalidInputError(
+            "disturbance that holds a joint",
+            value=disturbance,
+            limit=f"{mechanism.m} finite numbers, one for each input",
+        )
+    if not sizes.any():
+        return 0.0
+    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+    gains = np.linalg.norm(k[:, mechanism.m : mechanism.n], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.where(sizes > 0, 2.0 * sizes / gains, 0.0).max())
+
+
 @dataclass(frozen=True)
 class DelayGate:
     """A gate that, besides the cost, asks every surface to bear a delay.

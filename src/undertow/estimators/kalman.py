@@ -6,6 +6,13 @@ by one, so that nothing is inverted and a missing one is left out.  Optionally a
 disturbance d, in the units of the inputs, is estimated with the state as a random walk:
 a disturbance observer, whose estimate the controller can take off its output.  So are, where a
 belief says that they are uncertain, parameters: the filter moves with what it has learnt of them.
+
+A knock changes velocities at once, which no parameter explains.  A reading that is off by more than
+the filter's own statistics allow is left out, if it is the only one in a row: it was bad.  The next
+one means that the velocities have jumped: their covariance takes in as large a jump as the readings
+show, and parameters are not learnt from that sample (a test of the innovations, and a reset of the
+covariance; Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
+2001, 11.6).
 """
 
 from __future__ import annotations
@@ -26,8 +33,21 @@ from undertow.plants.stepping import compiled_module
 from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 
 #: Parameters are learnt while some acceleration is larger than this part of what the full inputs do
-#: to it at the target: what the model leaves out, dry friction, is small beside it.
+#: to it at the target, and than what the estimated disturbance does besides: what the model leaves
+#: out, dry friction, is small beside it.
 EXCITED = 0.1
+
+#: Standard deviation of a matched disturbance before anything moves, as a part of the input's
+#: limit: half of it, two deviations, is what a controller makes up for.  With less, dry friction
+#: looks like wrong parameters, and those are learnt.
+DISTURBED = 0.25
+
+#: Time over which the size of the disturbance is averaged, s.
+AVERAGED = 1.0
+
+#: Standard deviations beyond which an innovation is none of noise and model: of 10⁹ samples that
+#: are, two.
+JUMP = 6.0
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -79,14 +99,51 @@ def measurement_update(
                 P[k, j] -= column[k] * column[j] / spread
 
 
+@numba.njit(cache=True, error_model="numpy")
+def readings_after_jump(
+    x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, h: float,
+    odd: FloatArray, taken: FloatArray,
+) -> bool:  # fmt: skip
+    """Write the positions to be taken in into ``taken``; whether the velocities have jumped.
+
+    x and P are predicted.  ``odd`` is for how long readings have been off, s, how many in a row,
+    and how often velocities have jumped so far.  A jump at the beginning of that time widens P.
+    """
+    n, off = q.shape[0], False
+    for i in range(n):
+        error = q[i] - x[i]
+        taken[i] = q[i]
+        if error * error > JUMP * JUMP * (P[i, i] + variance[i]):
+            off, taken[i] = True, math.nan
+    if not off:
+        odd[0] = odd[1] = 0.0
+        return False
+    odd[0] += h
+    odd[1] += 1.0
+    if odd[1] < 2.0:
+        return False
+    if odd[1] == 2.0:
+        odd[2] += 1.0
+    for i in range(n):
+        taken[i] = q[i]
+        if q[i] == q[i]:
+            way = (q[i] - x[i]) ** 2
+            P[i, i] += way
+            P[i, n + i] += way / odd[0]
+            P[n + i, i] += way / odd[0]
+            P[n + i, n + i] += way / odd[0] ** 2
+    odd[0] = 0.0
+    return True
+
+
 #: What the filter remembers: ``size`` numbers are estimated, the last ``known`` of them offsets of
 #: parameters, in tolerances; inputs act ``lead`` periods late.
 _LAYOUT = {
     "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
-    "F": "size, size", "A": "size, size", "work": "6, size",
+    "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
-    "excited": "n",
+    "excited": "n", "felt": "m",
 }  # fmt: skip
 
 _BODY = f"""
@@ -145,8 +202,8 @@ def estimate(h, q, u, block, size, lead, known):
     learnt = size - known
     disturbed = learnt > 2 * n
     start = int(count[0])
-    stage, total, qdd, base, viscous, driven = (
-        work[0], work[1], work[2], work[3], work[4], work[5]
+    stage, total, qdd, base, viscous, driven, taken = (
+        work[0], work[1], work[2], work[3], work[4], work[5], work[6]
     )
     for i in range(m):
         past[start % (lead + 1), i] = max(-limits[i], min(limits[i], u[i]))
@@ -155,15 +212,21 @@ def estimate(h, q, u, block, size, lead, known):
         h, x, then, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous, driven
     )
     move(h, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
-    moving = learnt
+    moving, louder = learnt, 0.0
+    for i in range(m if disturbed else 0):
+        louder = max(louder, abs(x[2 * n + i]) / limits[i])
     for i in range(n):
-        if abs(base[i]) > excited[i]:
+        if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
             moving = size
     predict_covariance(F, P, A, noise, h, moving)
-    measurement_update(x, P, q, variance, total, moving)
+    if readings_after_jump(x, P, q, variance, h, odd, taken):
+        moving = learnt
+    measurement_update(x, P, taken[:n], variance, total, moving)
     for j in range(known):
         x[learnt + j] = max(-reach[j], min(reach[j], x[learnt + j]))
         parameters[int(place[j])] = nominal[j] + tolerance[j] * x[learnt + j]
+    for i in range(m if disturbed else 0):
+        felt[i] += (abs(x[2 * n + i]) - felt[i]) * min(1.0, h / {AVERAGED})
     count[0] = start + 1.0
     out[:] = x
     for k in range(lead):
@@ -175,6 +238,7 @@ def estimate(h, q, u, block, size, lead, known):
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
     parts = "from undertow.estimators.kalman import predict_covariance, measurement_update\n"
+    parts += "from undertow.estimators.kalman import readings_after_jump\n"
     return compiled_module(mechanism, "kalman", "Kalman filter", _BODY, parts)
 
 
@@ -210,6 +274,8 @@ class KalmanFilter:
     ----------
     disturbance
         The estimated matched disturbance, in units of the inputs, (m,); written over.
+    felt
+        Its size, averaged over the last second, (m,); written over.
     parameters
         Values of all parameters of the mechanism that it moves with, (P,), SI units; written over.
 
@@ -285,6 +351,8 @@ class KalmanFilter:
         self._block, self._count, self._past = memory.block, memory["count"], memory["past"]
         self._x, self._out = memory["x"], memory["out"]
         self._P: FloatArray = memory["P"]
+        self._odd: FloatArray = memory["odd"]
+        self.felt: FloatArray = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
         self._variance[:] = positive("position_noise", position_noise, n) ** 2
         memory["noise"][n : 2 * n] = positive("acceleration_noise", acceleration_noise, n) ** 2
@@ -308,7 +376,7 @@ class KalmanFilter:
         """Start again from the state x0, (2n,), at rest as far as is known.
 
         ``spread`` is the standard deviation of the velocities, rad/s or m/s; that of the
-        positions is a measurement's, and the disturbance may be a tenth of its limit.  What was
+        positions is a measurement's, that of the disturbance a quarter of its limit.  What was
         learnt of parameters is forgotten.
         """
         n, learnt = self.mechanism.n, self._learnt
@@ -318,11 +386,13 @@ class KalmanFilter:
         variances = np.zeros(len(self._x))
         variances[:n], variances[n : 2 * n] = self._variance, spread**2
         if learnt > 2 * n:
-            variances[2 * n : learnt] = np.minimum(0.1 * self._limits, 1.0) ** 2
+            known = np.isfinite(self._limits)
+            variances[2 * n : learnt] = np.where(known, DISTURBED * self._limits, 1.0) ** 2
         variances[learnt:] = EVEN**2
         np.fill_diagonal(self._P, variances)
         self.parameters[:] = self.mechanism.parameter_values
         self._past[:], self._count[0], self._t = 0.0, 0, math.nan
+        self._odd[:] = self.felt[:] = 0.0
         self._out[:] = self._x
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
@@ -333,6 +403,11 @@ class KalmanFilter:
             h = self.period
         self._estimate(h, measurement.q, u, self._block, self._size, self._lead, self._known)
         return self._state
+
+    @property
+    def jumps(self) -> int:
+        """How often velocities have jumped: what was planned before is for another motion."""
+        return int(self._odd[2])
 
     @property
     def learnt(self) -> ParameterEstimate | None:

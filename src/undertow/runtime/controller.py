@@ -17,11 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from undertow.cascade import Cascade, CascadeState, Legs
+from undertow.cascade import Admission, Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators import Estimator, KalmanFilter
 from undertow.law import InnerLoop, ReferenceMotion
 from undertow.models import FloatArray, error_dynamics
+from undertow.optimiser import Proposal
 from undertow.plants import Measurement
 from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.plan_check import PlanCheck
@@ -48,6 +49,9 @@ JUMP_LEAD, MOST_JUMP_LEAD = 1.0, 8.0
 
 #: Time after which a target is asked for again for which no plan was found, s.
 JUMP_RETRY = 1.0
+
+#: Least time from a jump of the velocities to the use of the next plan, s: one search.
+EARLY_LEAD = 0.02
 
 #: How the reason begins for which an answer is refused that no sound slow loop gives.
 UNSOUND = "unsound: "
@@ -150,6 +154,8 @@ class Controller:
         self._parameters: FloatArray = fast["parameters"][:own]
         self._row: FloatArray = fast["parameters"][own:]
         self._learning: KalmanFilter | None = None
+        self._filter = estimator if isinstance(estimator, KalmanFilter) else None
+        self._jumps, self._early = 0, False
         if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
             self._learning = estimator
             self._bears = InnerLoop(mechanism, memory.surface, cascade.reaching)
@@ -234,6 +240,8 @@ class Controller:
                 self._note_outcome(used)
             if self._learning is not None:
                 self._believe(self._learning.parameters)
+            if self._jumped():
+                self._take_reserve(self._t)
             if self._told:
                 self._retarget(self._t, self._told)
             if answer is not None:
@@ -242,6 +250,39 @@ class Controller:
                 self._ask(self._t)
         except Exception as error:
             self._stop(f"{type(error).__name__}: {error}")
+
+    def _jumped(self) -> bool:
+        """Whether velocities have jumped in this step."""
+        if self._filter is None:
+            return False
+        before, self._jumps = self._jumps, self._filter.jumps
+        return self._jumps > before and self.mode in (Mode.CATCH, Mode.BALANCE)
+
+    def _take_reserve(self, t: float) -> None:
+        """Have the next step go on with the strongest plan in reserve; another one comes soon.
+
+        What was asked for before is for a motion that is no more.  A plan for another target, which
+        takes a while, is waited for.
+        """
+        asked, pending = self._asked, self._pending
+        if (asked is not None and asked.target is not None) or (
+            pending is not None and pending.jump
+        ):
+            return
+        if asked is not None:
+            self._sequence, self._asked = max(self._sequence, asked.sequence), None
+        number, use = self._sequence + 1, t + self.period
+        plan = self.cascade.reserve[-1]
+        before, why = self.memory, "a plan in reserve: the velocities have jumped"
+        memory = replace(before, plan=plan, since=use, sequence=number, x=())
+        proposal = Proposal(plan, "budget spent", math.inf, math.inf, (), 0, 0.0, number, use)
+        self._packed, self._early = self._plans.pack(plan), True
+        self._pending = Answer(
+            number, use, self.wrapped.copy(), proposal, Admission(True, why, math.inf), before,
+            memory, self._packed, 0.0,
+        )  # fmt: skip
+        self._make_ready(self._pending)
+        self.notes.append(Note("jump", "the velocities have jumped: a plan in reserve takes over"))
 
     def _believe(self, learnt: FloatArray) -> None:
         """Have the next step go on with what is learnt, if the surface in use bears it."""
@@ -438,8 +479,10 @@ class Controller:
         if self._pending is not None:
             return
         if self._learning is not None:
-            learnt = self._learning.learnt
-            self.memory = replace(self.memory, sequence=self._sequence, estimate=learnt)
+            learnt, felt = self._learning.learnt, tuple(self._learning.felt.tolist())
+            self.memory = replace(
+                self.memory, sequence=self._sequence, estimate=learnt, disturbance=felt
+            )
         elif self.memory.sequence != self._sequence:
             self.memory = replace(self.memory, sequence=self._sequence)
         if self._jumps_next(t):
@@ -448,7 +491,8 @@ class Controller:
             use = t + math.ceil(max(self._jump_lead, begin - t) / step - 1e-9) * step
             self._asked = Request(t, self.wrapped.copy(), use, self.memory, -1, motion)
         elif self.mode is not Mode.SWING_UP:
-            self._asked = Request(t, self.wrapped.copy(), t + self._lead, self.memory)
+            lead = EARLY_LEAD if self._early else self._lead
+            self._asked, self._early = Request(t, self.wrapped.copy(), t + lead, self.memory), False
         elif self.swing_up is not None and self.swing_up.worth_asking(self.x):
             use = t + self._catch_lead
             self._asked = Request(t, self.x.copy(), use, self.memory, self._gains_in_use(t))

@@ -222,6 +222,7 @@ def memory_to(memory: CascadeState) -> dict[str, Any]:
         "x": list(memory.x),
         "target": None if memory.target is None else _target_to(memory.target),
         "estimate": None if memory.estimate is None else _estimate_to(memory.estimate),
+        "disturbance": list(memory.disturbance),
     }
 
 
@@ -264,6 +265,7 @@ def memory_from(value: Mapping[str, Any], reference: ReferenceMotion | None = No
         "x": x,
         "target": target,
         "estimate": None if learnt is None else _estimate_from(learnt),
+        "disturbance": tuple(value.get("disturbance", ())),
     }
     return CascadeState(**{**value, **changed})
 

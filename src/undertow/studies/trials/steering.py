@@ -24,6 +24,7 @@ from undertow.law import InnerLoop
 from undertow.models import FloatArray, Mechanism, linearise, require_smooth
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
+from undertow.runtime import Settings
 from undertow.studies.trials.trial import MakeController
 from undertow.symbolic import Tape
 
@@ -33,12 +34,18 @@ def steady(law: InnerLoop) -> Callable[[float, FloatArray], FloatArray]:
     return lambda t, x: law(x)
 
 
+#: Time from a jump of the velocities to the next decision, s: a search takes so long.
+EARLY = 0.02
+
+
 class CascadeSteering:
     """The cascade in simulated time; its optimiser answers one period later, as on a real rig.
 
-    At every multiple of the period the answer asked for one period ago is judged from the
-    present state, then the next one is asked for: for the state predicted one period ahead.  Where
-    it has a belief, its estimator learns what that leaves open, see :meth:`listen`.
+    Every period the answer asked for one period ago is judged from the present state, then the
+    next one is asked for: for the state predicted one period ahead.  After a jump of the velocities
+    a plan in reserve takes over at once, what was asked for before is given up, and the next answer
+    is there after ``EARLY``.  Where it has a belief, its estimator learns what that leaves open,
+    see :meth:`listen`.
 
     The first optimisation, ``start``, was made before the run by :meth:`Cascade.start`, as on a
     bench. ``admitted`` answers passed the gate, ``refused`` did not.
@@ -50,12 +57,18 @@ class CascadeSteering:
         self.law = InnerLoop(cascade.mechanism, self.memory.surface, cascade.reaching)
         self.waiting: Proposal | None = None
         self.ticks = self.admitted = self.refused = 0
+        self.began = 0.0
+        self.estimator: KalmanFilter | None = None
         self.learning: KalmanFilter | None = None
+        self.jumps = 0
 
     def listen(self, estimator: Estimator) -> None:
-        """Go on with the parameters that an estimator learns, if it is for the same belief."""
+        """Hear of jumps, and go on with the parameters that are learnt for the same belief."""
         known = self.cascade.known
-        if known is None or not isinstance(estimator, KalmanFilter) or estimator.belief is None:
+        if not isinstance(estimator, KalmanFilter):
+            return
+        self.estimator, self.jumps = estimator, estimator.jumps
+        if known is None or estimator.belief is None:
             return
         if estimator.belief.tolerances == known.tolerances:
             self.learning = estimator
@@ -64,8 +77,14 @@ class CascadeSteering:
         """Return the input at (t, x)."""
         if self.learning is not None:
             self.law.believe(self.learning.parameters, x)
-        if t >= self.ticks * self.cascade.period - 1e-9:
-            self._slow(self.ticks * self.cascade.period, x)
+        due = self.began + self.ticks * self.cascade.period
+        if self.estimator is not None and self.estimator.jumps > self.jumps:
+            self.jumps = self.estimator.jumps
+            self.began, self.ticks = t + EARLY, 0
+            self._take_reserve(t, x)
+            self._ask(t, x, self.began)
+        elif t >= due - 1e-9:
+            self._slow(due, x)
             self.ticks += 1
         if len(self.memory.plan.surfaces) > 1:
             self._use(t)
@@ -73,8 +92,18 @@ class CascadeSteering:
 
     def _use(self, t: float) -> None:
         surface, reaching = self.memory.plan.at(t - self.memory.since)
-        if surface != self.law.surface or (reaching or self.law.reaching) != self.law.reaching:
+        reaching = reaching or self.cascade.reaching
+        if (surface, reaching) != (self.law.surface, self.law.reaching):
             self.law.use(surface, reaching)
+
+    def _take_reserve(self, t: float, x: FloatArray) -> None:
+        """Go on with the strongest plan in reserve, where its law exists."""
+        plan = self.cascade.reserve[-1]
+        self.law.use(plan.surfaces[0], plan.laws(self.cascade.reaching)[0])
+        self.law(x)
+        if self.law.margin[0] > Settings().min_margin:
+            self.memory = replace(self.memory, plan=plan, since=t)
+        self._use(t)
 
     def _slow(self, t: float, x: FloatArray) -> None:
         cascade = self.cascade
@@ -87,10 +116,16 @@ class CascadeSteering:
             self.admitted += admission.accepted
             self.refused += not admission.accepted
             self._use(t)
-        later = t + cascade.period
-        loop = cascade.loop_at(self.memory, t)
-        ahead = loop.batch(x, self.memory.at(t), duration=cascade.period, terminal=0.0)
-        self.waiting = cascade.propose(self.memory, ahead.x[0], later)
+        self._ask(t, x, t + cascade.period)
+
+    def _ask(self, t: float, x: FloatArray, later: float) -> None:
+        """Ask at the time t for a plan to be used at another, s."""
+        if self.estimator is not None:
+            felt = tuple(self.estimator.felt.tolist())
+            self.memory = replace(self.memory, disturbance=felt)
+        loop = self.cascade.loop_at(self.memory, t)
+        ahead = loop.batch(x, self.memory.at(t), duration=later - t, terminal=0.0)
+        self.waiting = self.cascade.propose(self.memory, ahead.x[0], later)
 
 
 class NMPC:
