@@ -119,6 +119,10 @@ def test_verify_asks_both(program: Path, tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(second, "BUILT", liar)
     shown = CliRunner().invoke(app, ["verify", str(KEPT), "--both"])
     assert shown.exit_code == 1
+    assert shown.output.count("proved by one alone") == 5
+    liar.write_text(liar.read_text().replace("undecided", "refuted"))
+    shown = CliRunner().invoke(app, ["verify", str(KEPT), "--both"])
+    assert shown.exit_code == 1
     assert shown.output.count("DISAGREE") == 5
 
 

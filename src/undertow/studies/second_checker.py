@@ -81,7 +81,8 @@ def agreement_table(
     lines = [f"{'claim':<20} {'kernel':<20} {'second checker':<20}"]
     fine = len(kinds) == len(first) == len(second)
     for kind, (a, s), (b, t) in zip(kinds, first, second, strict=False):
-        word = "agree" if agree(a, b) else "DISAGREE"
+        one_alone = "undecided" in (a, b)
+        word = "agree" if agree(a, b) else "proved by one alone" if one_alone else "DISAGREE"
         lines.append(f"{kind:<20} {f'{a}, {s:.3f} s':<20} {f'{b}, {t:.3f} s':<20} {word}")
         fine = fine and agree(a, b)
     return "\n".join(lines), fine
