@@ -37,10 +37,12 @@ LAST_HARMLESS = NOT_YET
 
 #: What the watch remembers; settings: period, jump, frozen, patience, stall, weight of a step in a
 #: share, largest share; clock: the rig's at the last reading, ours, time waited, whether there was
-#: a sound reading at all; shares: part of the readings that was missing of late.
+#: a sound reading at all; shares: part of the readings that was missing of late; offs: how far the
+#: readings of the last step were off what was expected, 0 where they were not accepted.
 _LAYOUT = {
     "settings": "7", "clock": "4", "q": "n", "v": "n", "band": "m", "gain": "n",
     "parameters": "p", "viscous": "n", "W": "n * n", "last": "n", "gaps": "n", "ages": "n",
+    "offs": "n",
     "counts": "n", "shares": "n", "quiet": "1", "expected": "2 * n",
     "free": "n, 2 * n", "work": "3, 2 * n",
 }  # fmt: skip
@@ -85,8 +87,11 @@ def gate_measurement(x, u, block):
     missing, worst, still, moved = 0, 0, -1, False
     probing = quiet[0] >= {PROBE}
     for i in range(n):
-        if abs(q[i] - expected[i]) <= jump + 2.0 * h * abs(expected[n + i]):
-            gaps[i] = 0.0
+        # A knock grows from step to step, by less than a jump in each.
+        off, before = q[i] - expected[i], offs[i]
+        offs[i] = 0.0
+        if min(abs(off), abs(off - before)) <= jump + 2.0 * h * abs(expected[n + i]):
+            gaps[i], offs[i] = 0.0, off
             shares[i] -= settings[5] * shares[i]
         else:
             q[i] = v[i] = math.nan

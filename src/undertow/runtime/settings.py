@@ -35,7 +35,8 @@ class Settings:
         Longest gap in a sensor that the model bridges, s.
     max_innovation
         Largest difference between a position and its prediction that is accepted, rad or m,
-        besides two periods of motion at the present speed.
+        besides two periods of motion at the present speed; or by which it grows from one accepted
+        reading to the next, as after a knock.
     frozen_threshold
         A reading that does not move while the model has moved by this, rad or m, is frozen.
     dead_band
