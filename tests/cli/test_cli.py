@@ -288,7 +288,7 @@ def cost(out: str) -> float:
 @pytest.mark.slow  # kernels of their own
 def test_a_box_binds_the_motion_and_one_that_breaks_is_named() -> None:
     """The optimum of a box that binds costs more, and its margin is in degrees."""
-    words = ("--start", "phi=20deg", "--set", "d_e=0.025")
+    words = ("--start", "phi=20deg", "--set", "d_e=0.025", "--objective", "energy")
     _, free, _ = run("optimise", RIG, *words)
     code, out, _ = run("optimise", RIG, *words, "--box", "theta=60deg")
     assert code == 0

@@ -128,7 +128,7 @@ def test_a_driver_skeleton_runs(tmp_path: Path) -> None:
     driver, card, *_ = blocks(text, "python")
     (tmp_path / "my_rig.py").write_text(driver, encoding="utf-8")
     (tmp_path / "daq.py").write_text(card, encoding="utf-8")
-    (command,) = lines(text, "undertow run ")
+    command = next(line for line in lines(text, "undertow run ") if "my_rig.py" in line)
     printed = typed(command, tmp_path, (0, 3, 6))
     assert "SWING_UP" in printed
     assert "BALANCE" in printed
