@@ -99,7 +99,7 @@ def test_what_is_left_of_a_schedule_is_a_schedule() -> None:
     assert run.cost <= run.updates[0].predicted + 1e-9
 
 
-@pytest.mark.parametrize("push", [0.0, 0.01, -0.01])
+@pytest.mark.parametrize("push", [pytest.param(0.0, marks=pytest.mark.slow), 0.01, -0.01])
 def test_a_pushed_schedule_is_led_back(push: float) -> None:
     """Its surfaces are moved together until they arrive again, within the budget of a period."""
     made = cascade("cart_pendulum")
@@ -124,6 +124,7 @@ def test_a_pushed_schedule_is_led_back(push: float) -> None:
     assert push == 0.0 or second.cost < 0.5 * kept
 
 
+@pytest.mark.slow
 def test_two_inputs_that_switch_often_are_followed() -> None:
     """Six switchings in a fifth of a second; single surfaces take three times as long."""
     made = cascade("two_motor_three_link")

@@ -171,6 +171,7 @@ def test_cuts_say_where_tubes_begin_and_decide_nothing() -> None:
     assert decide(MODEL, NUMBERS, far).kind == "undecided"  # 45.8° falls
 
 
+@pytest.mark.slow
 def test_a_proved_line_is_found_written_gated_and_drawn() -> None:
     """The search cuts it for the kernel; the gate's set is it, and a picture shows it."""
     found = prove_loop(RIG, SURFACE, LAW, coordinate="phi", reach=0.05)
