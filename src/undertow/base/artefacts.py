@@ -14,7 +14,8 @@ import math
 import os
 import platform
 import tempfile
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -181,6 +182,17 @@ def check_folder(folder: Path) -> None:
         tempfile.TemporaryFile(dir=folder).close()
 
 
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Give a place to write to; what is there at the end becomes the file, or nothing does."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def write_file(path: Path, content: bytes) -> Path:
     """Write one file in place of any earlier one, and return where it is.
 
@@ -221,12 +233,8 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:
         for name, content in files.items():
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
-            temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-            try:
+            with whole(target) as temporary:
                 temporary.write_bytes(content)
-                temporary.replace(target)
-            finally:
-                temporary.unlink(missing_ok=True)
     except OSError as error:
         raise ArtefactError(
             f"results in '{folder}'",

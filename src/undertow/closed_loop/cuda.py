@@ -90,10 +90,9 @@ class CudaText:
     """
 
     def __init__(self, loop: ClosedLoop) -> None:
-        plant = None if loop.plant is None and loop.ensemble is None else loop.truth
         graph = build_loop_graph(
             loop.mechanism,
-            plant,
+            loop._given,
             loop.objective,
             loop.reaching.switching,
             many_plants=loop.ensemble is not None,

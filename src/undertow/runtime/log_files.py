@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,6 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from undertow.base import checked, require_extra, versions
+from undertow.base.artefacts import whole
 from undertow.base.errors import or_refused
 from undertow.mechanisms import LIBRARY
 from undertow.runtime.encoding import Columns
@@ -216,12 +216,7 @@ def _plain(value: Any) -> Any:
 
 def _written(path: Path, write: Callable[[BinaryIO], None]) -> Path:
     """Write a file that appears whole or not at all."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with or_refused(f"file '{path}'", "a file that can be written", "Choose another folder"):
-        try:
-            with open(draft, "wb") as stream:
-                write(stream)
-            draft.replace(path)
-        finally:
-            draft.unlink(missing_ok=True)
+    refusal = "a file that can be written", "Choose another folder"
+    with or_refused(f"file '{path}'", *refusal), whole(path) as draft, open(draft, "wb") as stream:
+        write(stream)
     return path

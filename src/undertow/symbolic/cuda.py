@@ -316,10 +316,8 @@ def _assignments(function: ast.FunctionDef) -> Iterable[tuple[ast.expr, ast.expr
 
 
 def _range(ends: list[str]) -> tuple[str, str, str]:
-    first, last, step = {1: ["0LL", *ends], 2: ends}.get(len(ends), ends)[:2] + (
-        ends[2:] or ["1LL"]
-    )
-    return first, last, step
+    first, last = ("0LL", *ends) if len(ends) == 1 else ends[:2]
+    return first, last, ends[2] if len(ends) > 2 else "1LL"
 
 
 def _unknown(node: ast.AST) -> ModelError:

@@ -50,6 +50,30 @@ class ProvedLoop:
     seconds: float
 
 
+def runge_kutta(
+    rate: Callable[[FloatArray], FloatArray],
+    x: FloatArray,
+    duration: float,
+    step: float,
+    every: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Return float64 RK4 motions from states (L, N), (K + 1, L, N) every so many steps, and times.
+
+    ``rate`` is of the states; ``duration`` and ``step`` are in s.
+    """
+    path, times = [x], [0.0]
+    with np.errstate(all="ignore"):
+        for k in range(1, max(1, round(duration / step)) + 1):
+            a = rate(x)
+            b = rate(x + 0.5 * step * a)
+            c = rate(x + 0.5 * step * b)
+            x = x + step / 6 * (a + 2 * b + 2 * c + rate(x + step * c))
+            if k % every == 0:
+                path.append(x)
+                times.append(k * step)
+    return np.array(path), np.array(times)
+
+
 def follow(
     law: SlidingModeLaw, x: FloatArray, duration: float, every: int = 4
 ) -> tuple[FloatArray, FloatArray]:
@@ -62,7 +86,7 @@ def follow(
     tuple of ndarray
         States (K + 1, L, 2n), every so many steps, and times (K + 1,), s.
     """
-    n, path, times = law.mechanism.n, [x], [0.0]
+    n = law.mechanism.n
     eta, layer = np.split(law.reaching.vector(law.mechanism.m), 2)
     step = float(min(0.005, np.min(layer / eta)))
 
@@ -70,16 +94,7 @@ def follow(
         q_dd = law.mechanism.accelerations(0.0, x, law(0.0, x).u)
         return np.concatenate([x[..., n:], q_dd], axis=-1)
 
-    with np.errstate(all="ignore"):
-        for k in range(1, max(1, round(duration / step)) + 1):
-            a = rate(x)
-            b = rate(x + 0.5 * step * a)
-            c = rate(x + 0.5 * step * b)
-            x = x + step / 6 * (a + 2 * b + 2 * c + rate(x + step * c))
-            if k % every == 0:
-                path.append(x)
-                times.append(k * step)
-    return np.array(path), np.array(times)
+    return runge_kutta(rate, x, duration, step, every)
 
 
 def prove_loop(

@@ -24,6 +24,7 @@ from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.run import run_tubes, start_tubes
 from undertow.proofs.closed_loop.terminal import TerminalSet
 from undertow.proofs.intervals.require import require
+from undertow.proofs.search.closed_loop import runge_kutta
 from undertow.proofs.search.terminal_set import jacobian, search_terminal
 
 __all__ = ["DraftedLoop", "draft_loop", "follow"]
@@ -54,18 +55,7 @@ def follow(
     motion: LoopMotion, z: FloatArray, duration: float, step: float, every: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return float64 RK4 motions of the clipped loop, (K + 1, L, N), and their times."""
-    path, times = [z], [0.0]
-    with np.errstate(all="ignore"):
-        for k in range(max(1, round(duration / step))):
-            a = motion(z)[0]
-            b = motion(z + 0.5 * step * a)[0]
-            c = motion(z + 0.5 * step * b)[0]
-            d = motion(z + step * c)[0]
-            z = z + step / 6 * (a + 2 * b + 2 * c + d)
-            if (k + 1) % every == 0:
-                path.append(z)
-                times.append((k + 1) * step)
-    return np.array(path), np.array(times)
+    return runge_kutta(lambda z: motion(z)[0], z, duration, step, every)
 
 
 def draft_loop(
