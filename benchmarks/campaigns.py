@@ -173,7 +173,10 @@ def motion(study: Any, x0: FloatArray) -> tuple[float, float] | None:
         return reference.evaluate(x, surface, law, reference.modes(x, surface, law))
 
     def lost(_: float, x: FloatArray) -> float:
-        return float(np.min(at(x).margins))
+        try:
+            return float(np.min(at(x).margins))
+        except np.linalg.LinAlgError:  # at the singularity itself
+            return 0.0
 
     def arrives(_: float, x: FloatArray) -> float:
         return float(np.linalg.norm(x[:-1])) - float(objective.terminal_radius)
