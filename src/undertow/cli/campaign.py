@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     "undertow campaign map.toml --out map.zarr --status",
     "undertow campaign map.toml --out map.zarr --shard 17",
     "undertow campaign map.toml --out map.zarr --picture map.png",
+    "undertow campaign league.toml --out league.zarr --entrant mine.py:Controller --workers 2",
+    "undertow campaign league.toml --out league.zarr --tables",
 )
 def campaign(
     file: Annotated[
@@ -31,6 +33,10 @@ def campaign(
     mechanism: Annotated[
         str | None,
         option("Mechanism instead of the file's; the only way to name FILE.py:NAME, which is run."),
+    ] = None,
+    entrant: Annotated[
+        list[str] | None,
+        option("Controller of your own for a league, FILE.py:NAME, which is run; repeatable."),
     ] = None,
     threads: Annotated[int, option("Threads of this process.", min=1, max=1024)] = 1,
     workers: Annotated[
@@ -53,6 +59,9 @@ def campaign(
         int | None,
         option("Compute this shard alone, in this process, and compare it with the store.", min=0),
     ] = None,
+    tables: Annotated[
+        bool, option("--tables", "Print what the store has, of any version, and nothing else.")
+    ] = False,
     picture: Annotated[
         Path | None, option("Draw what the store has into this PNG, and nothing else.")
     ] = None,
@@ -64,6 +73,7 @@ def campaign(
     from undertow.studies.campaign import Campaign, Definition, executor_for
     from undertow.studies.campaign.report import alone, report
     from undertow.studies.campaign.report import status as status_of
+    from undertow.studies.campaign.report import tables as tables_of
 
     if bool(scheduler) + bool(workers) + (threads > 1) > 1:
         raise InvalidInputError(
@@ -78,12 +88,14 @@ def campaign(
             limit="workers",
             remedy="A thread cannot be ended: add --workers 1",
         )
-    task = Campaign(Definition.read(file, mechanism), out)
+    task = Campaign(Definition.read(file, mechanism, entrant or ()), out)
     if picture is not None:
         from undertow.studies.campaign.figures import picture_file
 
         image, words = picture_file(task, proof)
         show(*words, f"Written to {write_file(picture, image)}")
+    elif tables:
+        show(*tables_of(task))
     elif status:
         show(*status_of(task))
     elif shard is not None:

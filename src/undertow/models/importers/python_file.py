@@ -49,6 +49,19 @@ def _makes_mechanism(value: object) -> bool:
 def object_from_file(text: str, what: str, suits: Callable[[object], bool] = callable) -> Any:
     """Run a Python file and return what one of its names holds; a callable is called.
 
+    See :func:`named_in_file`.
+    """
+    return named_in_file(text, what, suits, lambda found: found() if callable(found) else found)
+
+
+def named_in_file(
+    text: str,
+    what: str,
+    suits: Callable[[object], bool] = callable,
+    use: Callable[[Any], Any] = lambda found: found,
+) -> Any:
+    """Run a Python file, and return what ``use`` makes of what one of its names holds.
+
     Without a name in ``FILE.py:NAME`` the message says which there are that ``suits`` says yes to;
     ``what`` is looked for, in a word, for messages.
 
@@ -89,8 +102,7 @@ def object_from_file(text: str, what: str, suits: Callable[[object], bool] = cal
         exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
         if name not in vars(module):
             raise _nameless(vars(module), name, file, suits)
-        found = vars(module)[name]
-        return found() if callable(found) else found
+        return use(vars(module)[name])
     except UndertowError as error:
         where = raised_at(error, str(path))
         if not where:

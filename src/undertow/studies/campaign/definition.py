@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -33,17 +34,20 @@ class Definition:
         Its name, as for :func:`undertow.mechanisms.named.named`; paths are whole.
     text
         Everything else that the file says, as JSON.
+    code
+        Controllers of one's own that are entered, ``FILE.py:NAME`` with whole paths.
     """
 
     mechanism: str
     text: str
+    code: tuple[str, ...] = ()
 
     @classmethod
-    def read(cls, path: Path, mechanism: str | None = None) -> Definition:
+    def read(cls, path: Path, mechanism: str | None = None, code: Sequence[str] = ()) -> Definition:
         """Read a TOML file.
 
-        ``mechanism`` names the mechanism instead of the file.  It alone may be ``FILE.py:NAME``:
-        a definition is data, and nothing that it says is run.
+        ``mechanism`` names the mechanism instead of the file.  It and ``code`` alone may be
+        ``FILE.py:NAME``: a definition is data, and nothing that it says is run.
 
         Raises
         ------
@@ -59,8 +63,12 @@ class Definition:
             raise ArtefactError(
                 f"definition of a campaign '{path}'", value=str(error), limit="TOML"
             ) from error
-        name = said.pop("mechanism", None) if mechanism is None else mechanism
+        several = said.get("mechanisms")
+        first = several[0] if isinstance(several, list) and several else None
+        name = said.pop("mechanism", first) if mechanism is None else mechanism
         said.pop("mechanism", None)
+        if mechanism is not None:
+            said.pop("mechanisms", None)
         if not isinstance(name, str):
             raise InvalidInputError(
                 f"mechanism of the campaign '{path}'", value=name, limit="a name, like 'acrobot'"
@@ -75,7 +83,8 @@ class Definition:
                 )
             beside = path.parent / name
             name = str(beside) if Path(name).suffix and beside.exists() else name
-        return cls.of(from_anywhere(name), **said)
+        whole = tuple(from_anywhere(one) for one in code)
+        return replace(cls.of(from_anywhere(name), **said), code=whole)
 
     @classmethod
     def of(cls, mechanism: str, **said: Any) -> Definition:
@@ -92,6 +101,13 @@ class Definition:
         """What the file says, but for the mechanism."""
         found: dict[str, Any] = json.loads(self.text)
         return found
+
+    @property
+    def code_hashes(self) -> tuple[str, ...]:
+        """SHA-256 of every file of ``code``, in its order."""
+        files = (Path(one.rpartition(":")[0]) for one in self.code)
+        read = (read_file(file, "a controller's file", most=LARGEST) for file in files)
+        return tuple(hashlib.sha256(content).hexdigest() for content in read)
 
     @property
     def settings(self) -> Settings:
@@ -173,6 +189,16 @@ class Settings:
             raise InvalidInputError(self.what(name), value=value, limit=limit)
         for word in value:
             one_of(self.what(name), word, known)
+        return tuple(value)
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Take a list of words, each once; an empty one by default."""
+        value = self._take(name, [], "a list of names")
+        good = isinstance(value, list) and all(isinstance(one, str) for one in value)
+        if not good or len(set(value)) < len(value):
+            raise InvalidInputError(
+                self.what(name), value=value, limit="a list of names, each once"
+            )
         return tuple(value)
 
     def table(self, name: str) -> Settings:

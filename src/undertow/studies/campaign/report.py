@@ -26,7 +26,7 @@ def status(campaign: Campaign) -> list[str]:
 def alone(campaign: Campaign, shard: int) -> list[str]:
     """Compute one shard in this process, and say whether the store has the same."""
     arrays = compute(campaign.definition, shard)
-    found = digest(arrays)
+    found = digest(campaign.study.same_bits(arrays))
     said = "there is no store"
     if campaign.path.exists():
         mark = int(Store(campaign.path, campaign.key).marks()[shard])
@@ -41,9 +41,7 @@ def alone(campaign: Campaign, shard: int) -> list[str]:
 
 def report(campaign: Campaign, outcome: Outcome) -> list[RenderableType]:
     """Return what came of a run: numbers of every variable, and what failed."""
-    parts: list[RenderableType] = []
-    if outcome.done:
-        parts.append(summary(campaign))
+    parts = tables(campaign) if outcome.done else []
     repaired = f", {len(outcome.repaired)} because they were damaged" if outcome.repaired else ""
     parts.append(
         f"{outcome.done} of {outcome.shards} shards in {campaign.path}; {outcome.computed} of them "
@@ -56,9 +54,14 @@ def report(campaign: Campaign, outcome: Outcome) -> list[RenderableType]:
     return parts
 
 
-def summary(campaign: Campaign) -> RenderableType:
-    """Return a table of what the store has: shares of words, or ranges of numbers."""
+def tables(campaign: Campaign) -> list[RenderableType]:
+    """Return what the store has, of any version: the tables of its kind, or a summary."""
     data = campaign.dataset()
+    return campaign.study.report(data) or [summary(campaign, data)]
+
+
+def summary(campaign: Campaign, data: Any) -> RenderableType:
+    """Return a table of what the store has: shares of words, or ranges of numbers."""
     rows = []
     for name in campaign.study.variables:
         values, facts = data[name], data[name].attrs

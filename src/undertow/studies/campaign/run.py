@@ -29,6 +29,7 @@ from undertow.base import (
 )
 from undertow.studies.campaign.definition import Definition, mechanism_of
 from undertow.studies.campaign.designs import Designs
+from undertow.studies.campaign.league import League
 from undertow.studies.campaign.random_plants import RandomPlants
 from undertow.studies.campaign.region_map import RegionMap
 from undertow.studies.campaign.store import Store, dataset, digest
@@ -36,7 +37,9 @@ from undertow.studies.campaign.study import Arrays, Study
 from undertow.symbolic.store import content_key
 
 #: Kinds of campaigns by the word for each.
-KINDS: dict[str, type[Study]] = {kind.kind: kind for kind in (RegionMap, RandomPlants, Designs)}
+KINDS: dict[str, type[Study]] = {
+    kind.kind: kind for kind in (RegionMap, RandomPlants, Designs, League)
+}
 
 #: Failures after which a campaign ends: what they have in common will not pass.
 MOST_FAILURES = 20
@@ -63,6 +66,8 @@ def study_of(definition: Definition) -> Study:
         settings = definition.settings
         kind = settings.word("kind", KINDS)
         study = KINDS[kind](mechanism_of(definition, settings), settings)
+        if definition.code:
+            study.enter(definition.code)
         settings.finish()
     return study
 
@@ -71,13 +76,15 @@ def study_of(definition: Definition) -> Study:
 def key_of(definition: Definition) -> str:
     """Return the hash that names a campaign: settings, mechanism, sources and versions."""
     study = study_of(definition)
-    mechanism = study.mechanism
     return content_key(
         json.dumps(definition.said, sort_keys=True),
         repr([axis.name for axis in study.axes]),  # in the order in which they stand there
-        mechanism.fingerprint,
-        repr(mechanism.parameters),
-        repr(mechanism.start),
+        *definition.code_hashes,
+        *(
+            text
+            for mechanism in study.studied
+            for text in (mechanism.fingerprint, repr(mechanism.parameters), repr(mechanism.start))
+        ),
     )
 
 
@@ -126,7 +133,7 @@ def work(definition: Definition, key: str, path: str, shard: int, limit: float |
     finally:
         if limit is not None:
             faulthandler.cancel_dump_traceback_later()
-    return digest(arrays)
+    return digest(study_of(definition).same_bits(arrays))
 
 
 @dataclass
@@ -181,12 +188,13 @@ class Campaign:
     @property
     def about(self) -> dict[str, Any]:
         """What the attributes of a store say of this campaign, whatever the version."""
+        studied, code = self.study.studied, self.definition.code_hashes
         return {
-            "title": f"{self.study.kind} of {self.study.mechanism.name}",
+            "title": f"{self.study.kind} of {', '.join(m.name for m in studied)}",
             "definition": self.definition.said | {"mechanism": self.definition.mechanism},
-            "mechanism_fingerprint": self.study.mechanism.fingerprint,
+            "mechanism_fingerprint": " ".join(m.fingerprint for m in studied),
             "seed": self.study.seed,
-        }
+        } | ({"code": list(self.definition.code), "code_hashes": list(code)} if code else {})
 
     def dataset(self) -> Any:
         """Return what the store has as an ``xarray.Dataset``, read lazily; of any version.

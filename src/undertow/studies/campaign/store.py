@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -95,16 +95,12 @@ class Store:
                 array = group.create_array(
                     axis.name, shape=axis.values.shape, dtype=axis.values.dtype,
                     chunks=axis.values.shape, dimension_names=[axis.name],
-                    attributes={"units": axis.unit},
+                    attributes={"units": axis.unit} | _meanings(axis.words),
                 )  # fmt: skip
                 array[:] = axis.values
             for name, variable in study.variables.items():
-                words: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
-                if variable.flags:
-                    words |= {
-                        "flag_values": list(range(len(variable.flags))),
-                        "flag_meanings": " ".join(variable.flags),
-                    }
+                words = {"units": variable.unit, "long_name": variable.meaning}
+                words |= _meanings(variable.flags)
                 group.create_array(
                     name, shape=study.shape, dtype=variable.dtype, chunks=study.chunk,
                     dimension_names=[axis.name for axis in study.axes], attributes=words,
@@ -161,7 +157,7 @@ class Store:
         try:
             for name, values in arrays.items():
                 self._arrays[name][study.part(shard)] = values
-            self._done[shard] = digest(arrays)
+            self._done[shard] = digest(study.same_bits(arrays))
         except OSError as error:
             raise unwritten(self.path, error) from error
 
@@ -204,13 +200,19 @@ class Store:
         damaged = []
         for shard in np.flatnonzero(marks := self.marks()).tolist():
             try:
-                good = digest(self.read(study, shard)) == int(marks[shard])
+                good = digest(study.same_bits(self.read(study, shard))) == int(marks[shard])
             except ArtefactError:
                 good = False
             if not good:
                 damaged.append(shard)
                 self._done[shard] = 0
         return damaged
+
+
+def _meanings(words: Sequence[str]) -> dict[str, Any]:
+    """Return the attributes that say what whole numbers stand for, by CF's convention."""
+    joined = " ".join(word.replace(" ", "_") for word in words)
+    return {"flag_values": list(range(len(words))), "flag_meanings": joined} if words else {}
 
 
 def digest(arrays: Arrays) -> int:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import RenderableType
 
+from undertow.base import InvalidInputError
 from undertow.models import FloatArray, Mechanism
 from undertow.studies.campaign.definition import Settings
 
@@ -21,24 +23,35 @@ Arrays = dict[str, NDArray[np.generic]]
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """A dimension of what is recorded: ``name``, ``values`` (N,), and their ``unit``."""
+    """A dimension of what is recorded: ``name``, ``values`` (N,), and their ``unit``.
+
+    ``words`` are what whole numbers from 0 on stand for.
+    """
 
     name: str
     values: NDArray[np.generic]
     unit: str
+    words: tuple[str, ...] = ()
+
+    @classmethod
+    def of_words(cls, name: str, words: Sequence[str]) -> Axis:
+        """Return a dimension along which things are named."""
+        return cls(name, np.arange(len(words)), "1", tuple(words))
 
 
 @dataclass(frozen=True)
 class Variable:
     """A recorded quantity: its ``unit``, SI, what it means, and the type of its numbers.
 
-    ``flags`` are the words of whole numbers, by CF's convention, from 0 on.
+    ``flags`` are the words of whole numbers, by CF's convention, from 0 on.  What is ``measured``
+    of the machine, like time spent, is no function of the definition: two runs may differ in it.
     """
 
     unit: str
     meaning: str
     dtype: str = "float64"
     flags: tuple[str, ...] = ()
+    measured: bool = False
 
     @property
     def missing(self) -> float:
@@ -54,6 +67,8 @@ class Study(ABC):
 
     Attributes
     ----------
+    mechanism, mechanisms
+        What is studied; where there are several, all of them.
     axes
         Dimensions of every variable.
     variables
@@ -71,6 +86,7 @@ class Study(ABC):
     threaded: ClassVar[bool] = False
 
     mechanism: Mechanism
+    mechanisms: tuple[Mechanism, ...] = ()
     axes: tuple[Axis, ...]
     variables: Mapping[str, Variable]
     most: int
@@ -83,6 +99,34 @@ class Study(ABC):
     @abstractmethod
     def compute(self, shard: int) -> Arrays:
         """Return every variable on the part of the grid that is :meth:`part` of the shard."""
+
+    def enter(self, code: Sequence[str]) -> None:
+        """Take controllers of one's own, ``FILE.py:NAME``.
+
+        Raises
+        ------
+        InvalidInputError
+            Where the kind takes none.
+        """
+        raise InvalidInputError(
+            "controllers entered",
+            value=", ".join(code),
+            limit=f"none: kind '{self.kind}' takes none",
+            remedy='Enter them to a definition with kind = "league"',
+        )
+
+    @property
+    def studied(self) -> tuple[Mechanism, ...]:
+        """Every mechanism that results depend on."""
+        return self.mechanisms or (self.mechanism,)
+
+    def same_bits(self, arrays: Arrays) -> Arrays:
+        """Return the arrays that the definition alone decides."""
+        return {k: v for k, v in arrays.items() if not self.variables[k].measured}
+
+    def report(self, data: Any) -> list[RenderableType]:
+        """Return tables of what a store has, an ``xarray.Dataset``; none: the usual one."""
+        return []
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -241,12 +241,15 @@ def predictive(belief: Mechanism, objective: Objective, **settings: Any) -> Make
     return make
 
 
-def clipped_regulator(belief: Mechanism) -> MakeController:
-    """Return a linear-quadratic regulator, its output clipped: Q of the first surface."""
+def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
+    """Return a linear-quadratic regulator, its output clipped: Q of the first surface.
+
+    ``free`` is the weight of the free coordinates.
+    """
     lin = linearise(belief)
     n, m = belief.n, belief.m
     limit = belief.input_limits
-    Q = np.diag([1.0] * m + [10.0] * (n - m) + [0.1] * n)
+    Q = np.diag([1.0] * m + [free] * (n - m) + [0.1] * n)
     R = np.diag(1.0 / limit**2)
     P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
     k = -np.linalg.solve(R, lin.input.T @ P)

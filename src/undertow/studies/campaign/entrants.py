@@ -1,0 +1,224 @@
+"""Who enters the league: a small protocol, the library's own controllers, and those of others."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from undertow.base import InvalidInputError
+from undertow.cascade import Cascade, CascadeState
+from undertow.estimators import Estimator, StateFeedback
+from undertow.law import InnerLoop, first_surface
+from undertow.models import FloatArray, Mechanism
+from undertow.models.importers.python_file import in_a_file, named_in_file
+from undertow.objective import Objective
+from undertow.optimiser import Proposal
+from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, predictive, steady
+
+#: Settings of a controller by name: what it is made with besides mechanism and objective.
+Setting = Mapping[str, Any]
+
+
+class Entrant(Protocol):
+    """A controller in the league, made by a class or function: ``NAME(mechanism, objective)``.
+
+    It knows the mechanism as it is in the library and the objective that is scored.  What makes it
+    may have an attribute ``settings``, a list of keyword arguments to choose from: the league tries
+    at most :data:`MOST_SETTINGS` of them on plants that are not scored, and takes the best.  Where
+    it has a method ``listen``, it is given the estimator.
+    """
+
+    def reset(self, x0: FloatArray) -> None:
+        """Begin a run: the estimated start is (q, q̇), (2n,), SI units."""
+
+    def step(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input, (m,), at the time t, s, and the estimated state, (2n,); every 1 ms."""
+
+
+#: What makes an entrant.
+Maker = Callable[..., Entrant]
+
+#: Settings that are tried for each entrant and mechanism: the same budget for all.
+MOST_SETTINGS = 4
+
+#: Why an entrant forfeits a run.
+FAULTS = ("none", "raised", "wrong_shape", "not_finite")
+
+
+class ForfeitError(Exception):
+    """An entrant gave no input."""
+
+    def __init__(self, fault: int, words: str) -> None:
+        super().__init__(words)
+        self.fault = fault
+
+
+class Refereed:
+    """An entrant in a run: its inputs are checked, its processor time is counted.
+
+    ``seconds`` has the processor time of every step, s.
+    """
+
+    def __init__(self, entrant: Entrant, x0: FloatArray, m: int) -> None:
+        self.entrant, self.m = entrant, m
+        self.seconds: list[float] = []
+        self._call(entrant.reset, x0.copy())
+        if hasattr(entrant, "listen"):
+            self.listen: Callable[[Estimator], None] = entrant.listen
+
+    def __call__(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at (t, x).
+
+        Raises
+        ------
+        ForfeitError
+            When the entrant raises, or its answer is no input.
+        """
+        began = time.process_time()
+        answer = self._call(self.entrant.step, t, x.copy())
+        self.seconds.append(time.process_time() - began)
+        try:
+            u = np.asarray(answer, dtype=float).reshape(-1)
+        except (TypeError, ValueError) as error:
+            raise ForfeitError(2, f"no numbers: {str(answer)[:80]}") from error
+        if u.shape != (self.m,):
+            raise ForfeitError(2, f"{u.size} inputs for {self.m}")
+        if not np.isfinite(u).all():
+            raise ForfeitError(3, f"input {u} at {t:g} s")
+        return u
+
+    @staticmethod
+    def _call(what: Callable[..., Any], *given: Any) -> Any:
+        try:
+            return what(*given)
+        except Exception as error:
+            raise ForfeitError(1, f"{type(error).__name__}: {error}") from error
+
+
+class Feedback:
+    """An entrant made of a state feedback that is begun anew for each run."""
+
+    def __init__(self, begin: Callable[[FloatArray], StateFeedback]) -> None:
+        self.begin = begin
+
+    def reset(self, x0: FloatArray) -> None:
+        """Begin a run."""
+        self.step: StateFeedback = self.begin(x0)
+
+
+@lru_cache(maxsize=4)
+def _started(
+    mechanism: Mechanism, objective: Objective, start: bytes
+) -> tuple[Cascade, tuple[CascadeState, Proposal]]:
+    cascade = Cascade(mechanism, objective)
+    return cascade, cascade.start(np.frombuffer(start))
+
+
+class OurCascade:
+    """The cascade as it is without further arguments: ensemble, learning, gate, 10 decisions/s."""
+
+    def __init__(self, mechanism: Mechanism, objective: Objective) -> None:
+        self.given = mechanism, objective
+
+    def reset(self, x0: FloatArray) -> None:
+        """Optimise the first surface, before anything moves."""
+        usual = self.given[0].usual_start
+        cascade, first = _started(*self.given, usual.tobytes())
+        self.steering = CascadeSteering(cascade, first)
+
+    def listen(self, estimator: Estimator) -> None:
+        """Learn with the estimator."""
+        self.steering.listen(estimator)
+
+    def step(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input."""
+        return self.steering(t, x)
+
+
+def kept(mechanism: Mechanism, objective: Objective) -> Feedback:
+    """Return the cascade's first optimum, kept."""
+
+    def begin(_: FloatArray) -> StateFeedback:
+        cascade, first = _started(mechanism, objective, mechanism.usual_start.tobytes())
+        return steady(InnerLoop(mechanism, first[0].surface, cascade.reaching))
+
+    return Feedback(begin)
+
+
+def designed(mechanism: Mechanism, objective: Objective) -> Feedback:
+    """Return sliding mode on the designed surface, which nothing optimises."""
+    return Feedback(lambda _: steady(InnerLoop(mechanism, first_surface(mechanism))))
+
+
+def regulator(mechanism: Mechanism, objective: Objective, *, free: float = 10.0) -> Feedback:
+    """Return a linear-quadratic regulator, its output clipped; ``free`` weighs q_u."""
+    return Feedback(clipped_regulator(mechanism, free=free))
+
+
+regulator.settings = [{"free": w} for w in (1.0, 10.0, 100.0, 1000.0)]  # type: ignore[attr-defined]
+
+
+class NMPC10(Feedback):
+    """Nonlinear model-predictive control, IPOPT, ten solutions a second, open loop in between."""
+
+    settings: ClassVar = [{"horizon": h} for h in (0.8, 1.2, 2.0, 3.0)]
+
+    def __init__(self, mechanism: Mechanism, objective: Objective, horizon: float = 1.2) -> None:
+        super().__init__(predictive(mechanism, objective.on(mechanism), horizon=horizon))
+
+
+#: The library's entrants by name.
+OURS: dict[str, Maker] = {
+    "cascade": OurCascade,
+    "kept": kept,
+    "designed": designed,
+    "lqr": regulator,
+    "nmpc": NMPC10,
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entrant's name, what makes it, and the settings to choose from."""
+
+    name: str
+    make: Maker
+    settings: list[Setting] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, name: str) -> Entry:
+        """Return the entry of a name of the library, or of ``FILE.py:NAME``.
+
+        Raises
+        ------
+        InvalidInputError
+            When it cannot be called, or its settings are none.
+        """
+        make = named_in_file(name, "entrant") if in_a_file(name) else OURS[name]
+        if not callable(make):
+            raise InvalidInputError(
+                f"entrant '{name}'",
+                value=f"a {type(make).__name__}",
+                limit="a class or function of (mechanism, objective)",
+            )
+        settings = getattr(make, "settings", [{}])
+        good = isinstance(settings, list | tuple) and all(isinstance(s, Mapping) for s in settings)
+        if not good or not 1 <= len(settings) <= MOST_SETTINGS:
+            raise InvalidInputError(
+                f"settings of entrant '{name}'",
+                value=str(settings)[:80],
+                limit=f"a list of 1 to {MOST_SETTINGS} mappings of keyword arguments",
+            )
+        return cls(name.rpartition(":")[2], make, list(settings))
+
+
+def spent(seconds: list[float]) -> tuple[float, float]:
+    """Return the mean and the longest of the times of steps, but for the first, s."""
+    later = seconds[1:]
+    return (float(np.mean(later)), float(np.max(later))) if later else (math.nan, math.nan)
