@@ -13,7 +13,7 @@ from undertow.base import number, table
 from undertow.models import FloatArray
 
 #: Of the normal distribution, two-sided 95 %; draws of the bootstrap.
-Z95, DRAWS = 1.959964, 2000
+Z95, DRAWS = 1.959963984540054, 2000
 
 
 def wilson(won: int, runs: int) -> tuple[float, float]:
@@ -57,8 +57,8 @@ def tables(data: Any) -> list[RenderableType]:
     total = _scores(names, won, ratio, data)
     return [
         total,
-        _shares("Runs won, %, by task", names, tasks, won.transpose(1, 2, 0, 3)),
-        _shares("Runs won, %, by mechanism", names, mechanisms, won.transpose(1, 0, 2, 3)),
+        _shares("Runs won, %, by task", tasks, names, won.transpose(2, 1, 0, 3)),
+        _shares("Runs won, %, by mechanism", mechanisms, names, won),
         _best(mechanisms, tasks, names, won, ratio),
     ]
 
@@ -67,42 +67,44 @@ def _scores(names: list[str], won: NDArray[Any], ratio: FloatArray, data: Any) -
     """Return the table of all runs, the most won first."""
     mean, most = (np.asarray(data[k].values)[:, 1:] for k in ("step_mean", "step_most"))
     fault = np.asarray(data.fault.values)[:, 1:]
-    rows = []
+    rows, forfeits = [], dict[str, int]()
     for k, name in enumerate(names):
         runs, wins = int((won[:, k] >= 0).sum()), int((won[:, k] == 1).sum())
         low, high = wilson(wins, runs)
         good = ratio[:, k][np.isfinite(ratio[:, k])]
         middle, least, largest = median_interval(good)
         worst = float(good.max()) if len(good) else math.nan
-        forfeits = int((fault[:, k] > 0).sum())
+        forfeits[name] = int((fault[:, k] > 0).sum())
         rows.append((
             -wins / max(runs, 1), middle,
             [
                 name, f"{wins} of {runs}", f"{100 * low:.0f}-{100 * high:.0f}",
                 number(middle, ".2f"), f"{least:.2f}-{largest:.2f}" if len(good) else "—",
                 number(worst, ".2f"), number(1e6 * _mean(mean[:, k]), ".0f"),
-                number(1e3 * _most(most[:, k]), ".1f"), str(forfeits or ""),
+                number(1e3 * _most(most[:, k]), ".1f"),
             ],
         ))  # fmt: skip
+    gave_none = ", ".join(f"{name} in {count}" for name, count in forfeits.items() if count)
+    heads = ["entrant", "won", "95 %", "cost", "95 %", "worst", "step, µs", "most, ms"]
     return table(
-        ["entrant", "won", "95 %", "cost", "95 %", "worst", "step, µs", "longest, ms", "forfeits"],
+        heads,
         [cells for *_, cells in sorted(rows, key=lambda row: (row[0], _last(row[1])))],
-        title=data.attrs["title"],
-        note="cost: of won runs, over the plant's own bound: median, 95 % by the bootstrap, worst\n"
-        "step: processor time of a call, one a millisecond: mean; and the longest, but the first",
+        whole=heads,
+        title=f"{len(names)} entrants on {data.sizes['mechanism']} mechanisms",
+        note="cost: of won runs, over the plant's own bound: median, 95 % of it, worst\n"
+        "step: processor time of a call, one a millisecond; mean, and the longest"
+        + (f"\nforfeited runs: {gave_none}" if gave_none else ""),
     )
 
 
 def _shares(title: str, names: list[str], heads: list[str], won: NDArray[Any]) -> RenderableType:
-    """Return shares of won runs; ``won`` is (entrant, head, …)."""
+    """Return shares of won runs; ``won`` is (name, head, …)."""
     rows = []
-    for k, name in enumerate(names):
-        cells = []
-        for j in range(len(heads)):
-            runs = int((won[k, j] >= 0).sum())
-            cells.append(number(100 * (won[k, j] == 1).sum() / runs if runs else None, ".0f"))
-        rows.append([name, *cells])
-    return table(["", *(h.replace("_", " ") for h in heads)], rows, title=title)
+    for name, line in zip(names, won, strict=True):
+        runs, wins = (line >= 0).sum(axis=(1, 2)), (line == 1).sum(axis=(1, 2))
+        parts = [100 * w / r if r else None for w, r in zip(wins, runs, strict=True)]
+        rows.append([name.replace("_", " "), *(number(part, ".0f") for part in parts)])
+    return table(["", *heads], rows, title=title)
 
 
 def _best(
