@@ -358,7 +358,7 @@ def executor_for(
         try:
             if workers:
                 cluster = distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address=None,
+                    n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0",
                     silence_logs=logging.CRITICAL,
                 )  # fmt: skip
             with distributed.Client(cluster or scheduler, set_as_default=False) as client:
