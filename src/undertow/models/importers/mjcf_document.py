@@ -1,7 +1,7 @@
 """MJCF as one document: what is included put in, what cannot move a body taken out.
 
-Both readers, MuJoCo's compiler and the one of this package, start from it.  Files are data: those
-that a document names are read from relative paths only, each up to a size, so many at most.
+MuJoCo's compiler is given it.  Files are data: those that a document names are read from relative
+paths only, each up to a size, so many at most.
 """
 
 from __future__ import annotations

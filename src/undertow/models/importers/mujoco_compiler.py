@@ -1,4 +1,4 @@
-"""MJCF through MuJoCo's own compiler, where it is installed: the compiled numbers as a tree.
+"""MJCF through MuJoCo's own compiler: the compiled numbers as a tree.
 
 What the compiler makes of includes, default classes, frames, meshes and gears is taken as it is,
 body by body; what the class of mechanisms has no place for is refused by its name.  A mechanism
@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import importlib
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -37,6 +38,9 @@ _STATES = 16
 #: How many numbers attributes of a URDF have.
 _LENGTHS = {"xyz": 3, "rpy": 3, "lower": 1, "upper": 1}
 
+#: What the compiler's refusals of masses and moments of inertia have in them.
+_INERTIA = re.compile(r"\binertia\b")
+
 _ALIKE = "accelerations as its own to"
 _EYE, _ORIGIN = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
@@ -61,24 +65,61 @@ def _quiet(mujoco: Any) -> Iterator[None]:
 
 
 def compiled(mujoco: Any, document: Document) -> Any:
-    """Return MuJoCo's model of a document.
+    """Return MuJoCo's model of a document, with the moments of inertia that the document gives.
+
+    The compiler refuses those that no body has, and files round theirs and have thin rods; what
+    they are is for the tree to judge.
 
     Raises
     ------
     InvalidInputError
         In MuJoCo's own words, where its compiler refuses.
+    ModelError
+        Likewise, where the mechanics is the reason: an inertia, or a part that does not exist.
     """
     try:
         with _quiet(mujoco):
-            return mujoco.MjModel.from_xml_string(document.text, document.files)
+            try:
+                return mujoco.MjModel.from_xml_string(document.text, document.files)
+            except ValueError as error:
+                if not _INERTIA.search(str(error)):
+                    raise
+                return _of_any_inertia(mujoco, document)
     except (ValueError, mujoco.FatalError) as error:
         said = " ".join(str(error).split())
-        raise InvalidInputError(
+        mechanics = _INERTIA.search(said) or "not found" in said
+        refusal = ModelError if mechanics else InvalidInputError
+        raise refusal(
             "MJCF",
             value=said.removeprefix("XML ").removeprefix("Error: "),
             limit="a model that MuJoCo's compiler takes",
             remedy="Correct the file there; MuJoCo's documentation says what each element takes",
         ) from error
+
+
+def _of_any_inertia(mujoco: Any, document: Document) -> Any:
+    """Compile with masses and moments of 1 in place of those that are given, and put these in."""
+    spec = mujoco.MjSpec.from_string(document.text, assets=document.files)
+    given = []
+    whole = spec.compiler  # what it makes of all masses together
+    if max(whole.settotalmass, whole.boundmass, whole.boundinertia) <= 0:
+        for body in spec.bodies[1:]:
+            if not body.explicitinertial and body.geoms:
+                continue
+            moments = np.array(body.inertia)
+            if not np.isnan(body.fullinertia[0]):
+                xx, yy, zz, xy, xz, yz = body.fullinertia
+                moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+                axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])  # right-handed
+                turn = np.zeros(4)
+                mujoco.mju_mat2Quat(turn, axes.ravel())
+                body.iquat, body.fullinertia[0] = turn, math.nan
+            given.append((body, body.mass, moments))
+            body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
+    model = spec.compile()
+    for body, mass, moments in given:
+        model.body_mass[body.id], model.body_inertia[body.id] = mass, moments
+    return model
 
 
 def tree_of(mujoco: Any, model: Any, name: str, *, motors: bool = True) -> Tree:
