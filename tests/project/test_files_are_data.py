@@ -355,7 +355,7 @@ BODY = '<body name="{0}"><joint name="x" type="slide"/><geom size="{1}" {2}/></b
 MODELS: dict[str, tuple[str, type[UndertowError]]] = {
     "nested 3,000 deep": (mjcf("<body>" * 3000 + "</body>" * 3000), InvalidInputError),
     "too many elements": (mjcf("<body/>" * 30_000), InvalidInputError),
-    "a body that is the world": (mjcf(BODY.format("world", "1", "")), ModelError),
+    "a body that is the world": (mjcf(BODY.format("world", "1", "")), InvalidInputError),
     "a size too few": (mjcf(BODY.format("a", "1", 'type="capsule"')), InvalidInputError),
     "a size of nothing": (mjcf(BODY.format("a", "0 0", 'type="capsule"')), InvalidInputError),
     "a size beyond all": (mjcf(BODY.format("a", "1e200 1e200", 'type="capsule"')), UndertowError),
