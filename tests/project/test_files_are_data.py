@@ -20,7 +20,6 @@ import undertow as ut
 from undertow.base import (
     ArtefactError,
     InvalidInputError,
-    ModelError,
     UndertowError,
     parse_json,
     read_file,
