@@ -263,7 +263,7 @@ class ClosedLoop:
         The equations stay, and so do the kernels: nothing is compiled or looked up again.
         """
         end = None
-        if self._adapts:
+        if self.adapts:
             assert self._look is not None  # found once, for all copies
         if self.plant is None and (self.ensemble is None) == (ensemble is None):
             end = self.linear_end and self.linear_end.believing(mechanism, ensemble)
@@ -576,7 +576,7 @@ class ClosedLoop:
                 limit="one of them",
                 remedy="Look for the closest approach in the steps of the loop",
             )
-        precise = precise and self._adapts
+        precise = precise and self.adapts
         return (self._follow if precise else partial(self.roll_out, seek=seek))(
             RolloutBuffers(self, count, len(switch_times)).fill(states, vectors, reaching),
             switch_times,
@@ -587,7 +587,7 @@ class ClosedLoop:
         )
 
     @property
-    def _adapts(self) -> bool:
+    def adapts(self) -> bool:
         """Whether motions are integrated to a tolerance where that is asked for."""
         return self.rtol > 0 and self.reaching.switching != "sign" and self.ensemble is None
 
@@ -656,7 +656,7 @@ class ClosedLoop:
         span = self.objective.horizon if duration is None else duration
         buffers = RolloutBuffers(self, 1, len(plan.times))
         record = self._record(buffers, -(-self._steps(span) // every))
-        batch = (self._follow if self._adapts else self.roll_out)(
+        batch = (self._follow if self.adapts else self.roll_out)(
             buffers.fill(x0, plan.vectors, plan.gains(self.reaching)),
             plan.times,
             span,
@@ -700,7 +700,7 @@ class ClosedLoop:
         surface, law = plan.at(end)
         gains = (law or self.reaching).vector(self.mechanism.m)
         buffers = RolloutBuffers(self, 1, 1).fill(batch.x, surface.vector, gains)
-        if self._adapts:
+        if self.adapts:
             m, x = self.mechanism.m, np.append(batch.x[0], batch.cost[0])
             u, seen = self._looked(buffers.lanes[0, 0], x, start + end)
             return np.concatenate([x[:-1], u, seen[:m], x[-1:], seen[2 * m : 2 * m + 1]])
