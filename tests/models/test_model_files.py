@@ -103,6 +103,38 @@ def test_without_mujoco_the_extra_is_named(pole: Path, monkeypatch: pytest.Monke
         modelling.from_mjcf(pole)
 
 
+@pytest.mark.parametrize(
+    "given",
+    ["diaginertia='0 1 1'", "diaginertia='0.5 0.3 0.805'", "fullinertia='2 2.05 1.5 0 1 0'"],
+)
+@pytest.mark.parametrize("turn", ["", "euler='20 30 0'"])
+def test_inertias_that_mujoco_refuses(given: str, turn: str, mujoco: Any) -> None:
+    """Claim: thin rods and rounded moments, which the compiler refuses, are read as the file has
+    them, R I Rᵀ in the axes of the body, and moved as MuJoCo's engine then has them."""
+    if "full" in given:
+        turn = ""  # it takes no axes of its own
+    text = f"""<mujoco><worldbody><body name="cart">
+      <joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/>
+      <body name="rod"><joint name="phi" axis="0 1 0"/>
+        <inertial mass="0.2" pos="0.1 0 0.3" {given} {turn}/></body></body></worldbody>
+      <actuator><motor name="push" joint="x"/></actuator></mujoco>"""
+    with pytest.raises(ValueError, match="inertia"):
+        mujoco.MjModel.from_xml_string(text)
+    numbers = [float(word) for word in given.partition("'")[2].rstrip("'").split()]
+    tensor = np.diag(numbers[:3])
+    if len(numbers) == 6:
+        for (i, j), value in zip([(0, 1), (0, 2), (1, 2)], numbers[3:], strict=True):
+            tensor[i, j] = tensor[j, i] = value
+    a, b = np.radians([20, 30] if turn else [0, 0])
+    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    axes = about_x @ about_y
+    rod = modelling.read_mjcf(text).links[-1]
+    assert np.allclose(rod.inertia, axes @ tensor @ axes.T, rtol=0, atol=1e-12)
+    assert rod.mass == 0.2
+    assert float(agreement(modelling.from_mjcf(text))) < AGREEMENT
+
+
 def test_what_was_read_is_said_in_five_lines(pole: Path) -> None:
     lines = named(str(pole)).description.splitlines()
     assert [line.split()[0] for line in lines] == ["MJCF", "joints", "inputs", "left", "target"]
