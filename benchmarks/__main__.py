@@ -21,7 +21,7 @@ CLOCKED = (
     "kernel", "budget", "tail", "growth", "searchers", "reoptimise", "closed_loop", "gap",
     "admission", "pushes", "environments",
 )  # fmt: skip
-HELPERS = ("__main__", "builds", "harness", "rivals", "predictive", "acados_server")
+HELPERS = ("__main__", "builds", "harness", "rivals", "predictive", "acados_server", "entrants")
 OTHERS = sorted(path.stem for path in HERE.glob("*.py") if path.stem not in (*CLOCKED, *HELPERS))
 NAMES = (*CLOCKED, *OTHERS)
 

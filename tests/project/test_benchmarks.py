@@ -19,7 +19,7 @@ from undertow.studies import survey
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))
-HELPERS = {"__main__", "builds", "harness", "rivals", "predictive", "acados_server"}
+HELPERS = {"__main__", "builds", "harness", "rivals", "predictive", "acados_server", "entrants"}
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
