@@ -27,8 +27,10 @@ demo: $(STAMP) ## repeat the paper's experiment, tables and figures into results
 test: $(STAMP) ## run the tests, but for the slow ones
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-slow: $(STAMP) ## run the slow tests; having none is fine (pytest then exits with 5)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow || [ $$? -eq 5 ]
+# With MINUTES=25, say, so much of them as fits, files in an order that the commit draws.
+slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow $(if $(MINUTES),--minutes=$(MINUTES) \
+	    --draw=$$(git rev-parse HEAD 2>/dev/null)) || [ $$? -eq 5 ]
 
 check: $(STAMP) ## formatting, lint, types, direction of imports
 	$(BIN)/ruff format --check .

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import random
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,6 +20,32 @@ if TYPE_CHECKING:
 # The same examples on every run: a failure on one machine is a failure on all.
 settings.register_profile("undertow", deadline=None, derandomize=True, database=None)
 settings.load_profile("undertow")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let a run have so many minutes, for a part of the tests that a word draws."""
+    group = parser.getgroup("undertow")
+    group.addoption("--minutes", type=float, help="start no test later; its files in a drawn order")
+    group.addoption("--draw", default="", help="what the order is drawn by, such as a commit")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put files in the drawn order where not all of them may have their turn."""
+    if config.getoption("minutes") is not None:
+        files = sorted({str(item.path) for item in items})
+        random.Random(config.getoption("draw")).shuffle(files)
+        place = {name: k for k, name in enumerate(files)}
+        items.sort(key=lambda item: place[str(item.path)])
+
+
+BEGUN = time.monotonic()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out what comes too late, and say so."""
+    minutes = item.config.getoption("minutes")
+    if minutes is not None and time.monotonic() - BEGUN > 60 * minutes:
+        pytest.skip(f"left out after {minutes:g} minutes; make slow runs all")
 
 
 def pytest_configure(config: pytest.Config) -> None:

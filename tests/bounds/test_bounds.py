@@ -371,6 +371,7 @@ def test_swinging_through_the_bottom_costs_a_twentieth() -> None:
     assert np.abs(found.x[:, 1]).max() > math.pi
 
 
+@pytest.mark.slow
 def test_direct_optimum_is_that_of_all_motions_above_the_horizontal() -> None:
     """With |φ| ≤ 90°, where every stable surface lives, the swing is out and 11.839 stands."""
     rig = pendulum()
@@ -410,6 +411,7 @@ def test_as_printed_no_input_catches_45_degrees_above_the_horizontal() -> None:
     assert np.abs(bound(rig, ut.MinimumEnergy(), x0, swing=True).x[:, 1]).max() > math.pi / 2
 
 
+@pytest.mark.slow
 def test_simulated_closed_loop_as_guess_costs_no_less_than_the_bound() -> None:
     """A sliding-mode motion is admissible, so it cannot cost less; as a guess it leads there."""
     rig = pendulum()

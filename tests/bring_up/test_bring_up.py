@@ -142,6 +142,7 @@ def test_a_fault_on_the_realistic_rig_is_found_and_nothing_else(
     assert wrong(wizard(fault, learn=False)) == {found}
 
 
+@pytest.mark.slow
 def test_swapped_encoders_are_found_by_the_shape_of_the_motion() -> None:
     """Their plugs changed over: said so, and undone, so that nothing else looks wrong."""
     found = wizard("swap=theta,phi", learn=False)

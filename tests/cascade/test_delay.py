@@ -96,6 +96,7 @@ def test_the_boundary_layer_is_as_thick_as_the_sensors_need(arm: ut.Mechanism) -
     assert noise_share(crane, surface, P, law) <= NOISE < noise_share(crane, surface, P, thinner)
 
 
+@pytest.mark.slow
 def test_a_weaker_motor_must_do(arm: ut.Mechanism) -> None:
     """Where the whole input is needed, a gate that wants a reserve refuses the plan."""
     edge = arm.state(phi=ut.deg(44))
@@ -139,6 +140,7 @@ def test_a_joint_sticks_until_the_others_are_off_by_what_is_said(arm: ut.Mechani
             sticking_distance(arm, surface, wrong)
 
 
+@pytest.mark.slow
 def test_while_friction_is_large_soft_surfaces_are_refused(arm: ut.Mechanism) -> None:
     """What is admitted without friction is not with 3 V; nor is a soft one kept."""
     objective = objective_for(arm, "bench-energy")

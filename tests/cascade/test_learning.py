@@ -76,6 +76,7 @@ def test_the_first_plan_is_the_best_for_the_estimate(pendulum: ut.Mechanism) -> 
     assert cost[0] == pytest.approx(cost[1], rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_target_is_planned_on_what_was_learnt(pendulum: ut.Mechanism) -> None:
     """Its first plan costs, on the plant that was learnt, what one that knew this plant finds."""
     objective = ut.objective_for(pendulum, "bench-energy", horizon=10.0)

@@ -196,6 +196,7 @@ def test_what_is_kept_swings_up_whatever_is_a_little_different(name: str) -> Non
     assert abs(np.isfinite(before[:, 0]).mean() - np.isfinite(after[:, 0]).mean()) < 0.1
 
 
+@pytest.mark.slow
 def test_the_next_gains_meet_what_those_before_have_left() -> None:
     """Swings that were not brought up come first, from where they are; the others start again."""
     mechanism = ut.mechanisms.pendubot()

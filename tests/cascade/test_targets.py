@@ -69,6 +69,7 @@ def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
     assert np.nanmin(run.lemma3_slack) >= -1e-9
 
 
+@pytest.mark.slow
 def test_a_set_point_is_0_seen_from_elsewhere() -> None:
     """On a plant that changes on the way, too: early decisions, and an end on arrival."""
     rig = ut.mechanisms.rotary_pendulum()

@@ -360,7 +360,7 @@ MUTANTS = {
 @pytest.mark.parametrize(
     "mutant",
     [
-        pytest.param(name, marks=() if place == "finish" or name == "r changes sign" else SLOW)
+        pytest.param(name, marks=() if place == "finish" else SLOW)
         for name, (place, _, _) in MUTANTS.items()
     ],
 )

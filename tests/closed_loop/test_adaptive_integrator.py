@@ -93,6 +93,7 @@ def test_the_tolerance_is_a_dial(accuracy: ModuleType, rig: ut.Mechanism) -> Non
     assert errors[2] <= max(0.01 * errors[1], 1e-9)
 
 
+@pytest.mark.slow
 def test_a_motion_that_dips_into_the_terminal_set_has_arrived(
     accuracy: ModuleType, rig: ut.Mechanism
 ) -> None:

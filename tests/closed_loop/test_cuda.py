@@ -47,7 +47,7 @@ def agree(
 @pytest.mark.parametrize(
     "loop",
     [
-        ClosedLoop(RIG, ut.MinimumEnergy(horizon=2.0)),
+        pytest.param(ClosedLoop(RIG, ut.MinimumEnergy(horizon=2.0)), marks=pytest.mark.slow),
         ClosedLoop(RIG, ut.MinimumTime(horizon=2.0), zoh_steps=2),
         ClosedLoop(
             RIG,
@@ -68,6 +68,7 @@ def test_plan_with_closest_approach() -> None:
     agree(ClosedLoop(RIG, ut.MinimumEnergy(horizon=1.0)), plan, seek=True)
 
 
+@pytest.mark.slow
 def test_ensemble() -> None:
     """Every lane with a plant of its own."""
     values = RIG.parameter_values * np.array([[1.0], [1.02]])

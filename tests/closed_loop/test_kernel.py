@@ -118,9 +118,13 @@ def test_compiled_formulas_equal_sympys(evaluate: Evaluate, name: str, rig: ut.M
 LOOPS = [(n, m, "saturation") for n, m in SHAPES] + [
     (n, m, switching) for n, m in ((2, 1), (4, 2)) for switching in ("tanh", "sign")
 ]
+SOME = {(2, 1, "saturation"), (2, 1, "tanh"), (2, 1, "sign"), (4, 2, "saturation")}
 
 
-@pytest.mark.parametrize(("n", "m", "switching"), LOOPS)
+@pytest.mark.parametrize(
+    ("n", "m", "switching"),
+    [pytest.param(*shape, marks=() if shape in SOME else pytest.mark.slow) for shape in LOOPS],
+)
 def test_continuous_kernels_step_as_runge_kutta_in_numpy_does(
     n: int, m: int, switching: Switching
 ) -> None:

@@ -159,6 +159,7 @@ def test_a_push_is_an_impulse_and_is_recovered_from(simulation: Simulation) -> N
     assert abs(simulation.rig.truth[1]) < 0.05
 
 
+@pytest.mark.slow
 def test_what_has_fallen_says_so_and_is_caught_again(simulation: Simulation) -> None:
     """Beyond the law there is no input; near the upright it takes over by itself."""
     go(simulation, 0.5)
@@ -273,6 +274,7 @@ def test_a_mechanism_that_cannot_be_shown_is_refused_at_once() -> None:
         Simulation(crane, sketch(crane), crane.state(x=9.0), worker=InlineWorker(planner(crane)))
 
 
+@pytest.mark.slow
 def test_a_simulated_run_becomes_a_recording() -> None:
     """Frames a sixtieth of a second apart, the surfaces in use, the cost that is left: ≥ 0."""
     cascade = cascade_for(RIG, Task("bench-energy", (15.0,), 0.1))

@@ -624,6 +624,7 @@ def test_each_word_of_the_memory_is_checked_where_it_is_used(real: str, tmp_path
             assert u == pytest.approx(expected, rel=1e-12 if real == "double" else 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("real", "every"), [("double", 37), pytest.param("float", 7, marks=pytest.mark.slow)]
 )

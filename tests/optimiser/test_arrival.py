@@ -88,7 +88,7 @@ def test_steps_are_those_of_the_normal_equations() -> None:
             np.testing.assert_allclose(steps[k, j], wanted, rtol=1e-9)
 
 
-SEEDS = range(3), pytest.param(range(3, 14), marks=pytest.mark.slow)
+SEEDS = range(1), pytest.param(range(1, 14), marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize("seeds", SEEDS)

@@ -33,7 +33,7 @@ def optimum(loop: ut.ClosedLoop, x: NDArray[np.float64], seed: int = 0) -> ut.Su
     return surface
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @example(phi=3.6, rate=-10.0, case="2 one-time, energy", name="time")
 @given(
     phi=st.floats(-35, 35),

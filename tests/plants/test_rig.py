@@ -66,6 +66,7 @@ def test_same_seed_same_bits_other_seed_other_motion(arm: ut.Mechanism) -> None:
     assert not np.array_equal(paths[0], paths[2])
 
 
+@pytest.mark.slow
 def test_friction_takes_energy_and_never_gives_any() -> None:
     cart = ut.mechanisms.cart_pendulum(b_c=0.0, b_p=0.0)
     friction = {"x": Friction(0.3, 0.5), "phi": Friction(0.01, 0.02)}

@@ -119,7 +119,8 @@ def test_a_plan_of_least_time_arrives_when_it_says(rivals: ModuleType, rig: ut.M
     assert abs(outcome.time - promised) < 0.02
 
 
-@pytest.mark.parametrize("goal", ["energy", pytest.param("time", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("goal", ["energy", "time"])
 def test_fatrop_finds_the_plan_of_ipopt(rivals: ModuleType, rig: ut.Mechanism, goal: str) -> None:
     if shutil.which("gcc") is None:
         pytest.skip("needs gcc")
@@ -278,6 +279,7 @@ def test_a_grid_counts_what_fails_and_leaves_out_what_nothing_can(
     assert drawn.patches[2].get_hatch()
 
 
+@pytest.mark.slow
 def test_swing_ups_meet_the_plant_that_a_seed_says(harness: ModuleType) -> None:
     """The plant moves, not the model; the same number of the same seed does the same again."""
     import plants

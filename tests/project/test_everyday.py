@@ -114,6 +114,7 @@ def test_linearise(names: dict[str, Any]) -> None:
     np.testing.assert_allclose(system.poles(), np.linalg.eigvals(plant.A))
 
 
+@pytest.mark.slow
 def test_a_run_from_objects_is_replayed_where_they_have_names(tmp_path: Path) -> None:
     """Bit for bit, and with the gate's decisions; a problem of one's own says that it has none."""
     rig = RIG.with_parameters(m=0.13)

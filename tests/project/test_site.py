@@ -80,6 +80,7 @@ def test_every_public_name_has_its_place_in_the_reference() -> None:
             assert hasattr(module, one), (name, one)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_first_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

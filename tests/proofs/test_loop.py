@@ -131,6 +131,7 @@ def claim() -> LoopDraft:
     )
 
 
+@pytest.mark.slow
 def test_the_terminal_set_is_proved_and_its_motions_converge() -> None:
     """W falls along simulated motions from its boundary, and they end at the target."""
     verdict = verify_terminal(MOTION, TERMINAL)

@@ -443,6 +443,7 @@ def test_the_laws_own_gains_always_suffice() -> None:
     assert again.verdict.kind == "refuted"
 
 
+@pytest.mark.slow
 def test_reaching_with_two_inputs() -> None:
     """m = 2: the bound holds for the plant at random positions, every surface."""
     mechanism = two_arm()

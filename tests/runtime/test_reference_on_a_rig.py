@@ -185,6 +185,7 @@ def test_a_reference_that_cannot_be_followed_is_refused(
         replace(RECIPE, **changed)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_references_on_the_command_line(tmp_path: Path) -> None:
     """A sine, and a path from a file, with its log."""
     path, log = tmp_path / "path.csv", tmp_path / "run.db"

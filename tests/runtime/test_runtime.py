@@ -155,6 +155,7 @@ def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early()
     assert controller.mode in (Mode.CATCH, Mode.BALANCE)
 
 
+@pytest.mark.slow
 def test_thrown_out_it_swings_up_again_within_limits() -> None:
     """Knocked over while it balances: safe outputs throughout, and back to the top."""
     recipe = SWINGING

@@ -167,6 +167,7 @@ def test_the_simulated_region_is_the_non_singular_strip() -> None:
     assert home.tolist() == [False, True, True, True, True, True, False]
 
 
+@pytest.mark.slow
 def test_the_picture_names_its_axes_in_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figure, "GRID", 9)
     drawn = region_figure(region(), "a title")

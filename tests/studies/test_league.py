@@ -144,6 +144,7 @@ def test_the_better_setting_is_chosen_and_kept(file: Path) -> None:
     assert (rows["Gains"]["setting"].item(), rows["Gains"]["won"].item()) == (1, 1)
 
 
+@pytest.mark.slow
 def test_threads_and_serial_give_the_same_bits_and_a_changed_file_is_another_league(
     file: Path, tmp_path: Path
 ) -> None:
@@ -175,7 +176,16 @@ def test_every_task_is_a_bench_on_which_a_regulator_stands(task: str, file: Path
     assert 0.05 < rows["bound"]["cost"].item() < rows["lqr"]["cost"].item()
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", "overhead_crane", "two_motor_three_link"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "overhead_crane",
+        *(
+            pytest.param(k, marks=pytest.mark.slow)
+            for k in ("rotary_pendulum", "two_motor_three_link")
+        ),
+    ],
+)
 def test_the_push_moves_the_free_coordinate_by_half_of_the_start(name: str) -> None:
     """The speed after the impulse, times the slowest time constant, against ‖q(0)‖_∞ / 2."""
     study: Any = study_of(Definition.of(name, **LEAGUE | {"mechanisms": [name]}))

@@ -174,6 +174,7 @@ def test_survey_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert all(name in listed.stdout for name in NAMES)
 
 
+@pytest.mark.slow
 def test_a_start_from_which_nothing_is_admissible_is_a_line_too() -> None:
     """Claim: where no surface is, and no motion at all, the line says so and is no error."""
     weak = ut.mechanisms.rotary_pendulum(d_e=0.025).with_input_limit(0.5)

@@ -41,6 +41,7 @@ def arm() -> ut.Mechanism:
     return ut.mechanisms.rotary_pendulum()
 
 
+@pytest.mark.slow
 def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
     """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
     x0, goal = arm.state(phi=ut.deg(35)), objective_for(arm, "bench-energy")
@@ -211,6 +212,7 @@ def test_what_is_taken_off_keeps_to_its_share_and_to_the_limits(
     assert out[1] == u[1] - disturbance[1]
 
 
+@pytest.mark.slow
 def test_the_cascade_bears_a_knock_that_its_soft_surfaces_do_not() -> None:
     """φ̇ jumps by 11 rad/s at 2 s: a decision a period later comes too late."""
     bench, x0 = srv02_rig(), srv02_rig().mechanism.state(phi=math.radians(20))
@@ -224,6 +226,7 @@ def test_the_cascade_bears_a_knock_that_its_soft_surfaces_do_not() -> None:
     assert fallen < math.radians(60)
 
 
+@pytest.mark.slow
 def test_the_cascade_bears_dry_friction_that_its_soft_surfaces_do_not() -> None:
     """Fifteen times the bench's: the arm is held, where it swayed and drifted before."""
     bench = srv02_rig()
