@@ -27,10 +27,10 @@ demo: $(STAMP) ## repeat the paper's experiment, tables and figures into results
 test: $(STAMP) ## run the tests, but for the slow ones
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-# With MINUTES=25, say, so much of them as fits, files in an order that the commit draws.
+# With MINUTES=25, say, so much of them as fits, their files in an order that the source draws.
 slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow $(if $(MINUTES),--minutes=$(MINUTES) \
-	    --draw=$$(git rev-parse HEAD 2>/dev/null)) || [ $$? -eq 5 ]
+	    --draw=$$(git rev-parse HEAD:src 2>/dev/null)) || [ $$? -eq 5 ]
 
 check: $(STAMP) ## formatting, lint, types, direction of imports
 	$(BIN)/ruff format --check .
