@@ -163,6 +163,23 @@ def positive(
         raise InvalidInputError(what, value=value, limit=limit, remedy=remedy)
 
 
+def one_for_each(
+    what: str, values: ArrayLike, count: int, *, infinite: bool = False
+) -> np.typing.NDArray[np.float64]:
+    """Return positive numbers, (count,), from one for all of them or one for each.
+
+    Raises
+    ------
+    InvalidInputError
+        For another shape, and for what :func:`positive` refuses.
+    """
+    numbers, remedy = np.asarray(values, dtype=np.float64), "One number serves all"
+    if numbers.shape not in ((), (count,)):
+        raise InvalidInputError(what, value=values, limit=f"one number or {count}", remedy=remedy)
+    positive(what, values, remedy, infinite=infinite)
+    return np.array(np.broadcast_to(numbers, (count,)))
+
+
 def one_of(
     what: str,
     name: str,

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 #: This package: lines of its own are not where a user's file raised.
@@ -47,6 +48,11 @@ class UndertowError(Exception):
         ]
         message = what + (": " + ", ".join(facts) if facts else "")
         super().__init__(f"{message}. {remedy}" if remedy else message + ".")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it by its parts; value and limit, which may be anything, as text."""
+        value, limit = (None if f is None else str(f) for f in (self.value, self.limit))
+        return partial(type(self), value=value, limit=limit, remedy=self.remedy), (self.what,)
 
 
 class InvalidInputError(UndertowError, ValueError):

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, one_for_each
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
 from undertow.law import LawLayout, Plan, ReachingLaw, SlidingModeLaw, Surface, check_surface
@@ -102,15 +102,8 @@ class EmbeddedController:
     def slew_rates(self) -> FloatArray:
         """Largest rate of each input, its unit per second, (m,); infinite where there is none."""
         m = self.mechanism.m
-        rates = np.atleast_1d(np.asarray(np.inf if self.slew is None else self.slew, dtype=float))
-        if rates.shape not in {(1,), (m,)} or not (rates > 0).all():
-            raise InvalidInputError(
-                "slew rate",
-                value=self.slew,
-                limit=f"one number > 0, or {m} of them",
-                remedy="Leave it out for no limit",
-            )
-        return np.array(np.broadcast_to(rates, (m,)))
+        slew = np.inf if self.slew is None else self.slew
+        return one_for_each("slew rate", slew, m, infinite=True)
 
     @property
     def most_rows(self) -> int:

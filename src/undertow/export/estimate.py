@@ -20,8 +20,8 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.base import one_for_each
 from undertow.estimators import Estimator, FilteredDerivative, KalmanFilter, SuperTwisting
-from undertow.estimators.interface import positive
 from undertow.export.names import LARGEST, template
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Measurement
@@ -93,7 +93,7 @@ class DerivativeStep:
 
     def gains(self, n: int) -> FloatArray:
         """Return τ for each coordinate, (n,)."""
-        return positive("time_constant of a derivative", self.time_constant, n)
+        return one_for_each("time_constant of a derivative", self.time_constant, n)
 
     def build(self, tape: Tape, symbols: StepSymbols) -> tuple[sp.Expr, sp.Expr]:
         """Return the new position and velocity of the memory."""
@@ -127,7 +127,7 @@ class SuperTwistingStep:
 
     def gains(self, n: int) -> FloatArray:
         """Return L for each coordinate, (n,)."""
-        return positive("acceleration of a differentiator", self.acceleration, n)
+        return one_for_each("acceleration of a differentiator", self.acceleration, n)
 
     def build(self, tape: Tape, symbols: StepSymbols) -> tuple[sp.Expr, sp.Expr]:
         """Return the new position and velocity of the memory."""
@@ -170,8 +170,8 @@ class KalmanStep:
     def noises(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the noises of positions and accelerations, (n,) each; both must be positive."""
         return (
-            positive("position_noise", self.position_noise, n),
-            positive("acceleration_noise", self.acceleration_noise, n),
+            one_for_each("position_noise", self.position_noise, n),
+            one_for_each("acceleration_noise", self.acceleration_noise, n),
         )
 
     def gains(self, mechanism: Mechanism, period: float) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from undertow.base import facts, finite, manifest, table, to_csv
+from undertow.base import facts, finite, manifest, mark, table, to_csv
 from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
@@ -114,8 +114,7 @@ def motion_report(
     good = motion.event == Event.REACHED
     if good and motion.time == motion.t[0]:
         return Group(facts(rows), Text(ended(motion, objective)))
-    mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
-    return Group(facts(rows), mark + Text(ended(motion, objective)))
+    return Group(facts(rows), mark(good) + Text(f" {ended(motion, objective)}"))
 
 
 def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import Verdict, inward
+from undertow.base import Verdict, inward, mark
 from undertow.base import artefacts as results
 from undertow.cascade import Run
 from undertow.models import Mechanism
@@ -160,15 +160,13 @@ def verification_report(certificate: Certificate, checked: Sequence[Checked]) ->
             words.append(f"\n{item.verdict.method}", style="red")
         table.add_row(_kind(item.verdict), words, _margin(item.verdict))
     held = sum(bool(item.verdict) for item in checked)
-    good = held == len(checked)
-    mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
     values = ", ".join(f"{k} = {v!r}" for k, v in certificate.parameters.items())
     others = sum(item.reworded for item in checked)
     remarks = sum(len(s.remarks) for s in certificate.subjects)
     lines: list[RenderableType] = [
         table,
         Text(f"{certificate.name} with {values}", style="dim"),
-        mark + Text(f"{held} of {len(checked)} claims proved again"),
+        mark(held == len(checked)) + Text(f" {held} of {len(checked)} claims proved again"),
     ]
     if certificate.document is not None:
         alone = all(item.model == certificate.structure for item in checked)
