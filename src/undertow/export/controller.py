@@ -162,11 +162,12 @@ class EmbeddedController:
     @cached_property
     def laws(self) -> tuple[SlidingModeLaw, ...]:
         """The laws of the plan, one for each surface."""
-        plan = self.plan
-        return tuple(
-            SlidingModeLaw(self.mechanism, surface, plan.at(t)[1] or self.reaching)
-            for surface, t in zip(plan.surfaces, plan.times, strict=True)
-        )
+        return self.laws_of(self.plan)
+
+    def laws_of(self, plan: Plan) -> tuple[SlidingModeLaw, ...]:
+        """Return the laws of a plan, one for each surface."""
+        pairs = zip(plan.surfaces, plan.laws(self.reaching), strict=True)
+        return tuple(SlidingModeLaw(self.mechanism, surface, law) for surface, law in pairs)
 
     def starts(self, plan: Plan) -> list[int]:
         """Return the periods, from the start of a plan, at which its surfaces take over."""
@@ -243,8 +244,7 @@ def plan_numbers(
     m = controller.mechanism.m
     layout = LawLayout(controller.mechanism.n, m)
     rows = []
-    for surface, t in zip(plan.surfaces, plan.times, strict=True):
-        law = plan.at(t)[1] or controller.reaching
+    for surface, law in zip(plan.surfaces, plan.laws(controller.reaching), strict=True):
         values = np.concatenate([surface.vector, law.vector(m)])
         held = np.array([as_held(v, controller.real) for v in values.tolist()])
         rows.append((held[layout.surface], held[layout.eta], held[layout.layer]))
