@@ -23,7 +23,7 @@ import scipy.optimize
 import scipy.signal
 
 from undertow.base import InvalidInputError
-from undertow.bring_up.motion import MotionRecord, Predictor
+from undertow.bring_up.motion import MotionRecord, Predictor, input_gains
 from undertow.models import FloatArray, Mechanism, Parameter
 
 #: Encoder zeros from which a predicted motion is counted.
@@ -150,10 +150,7 @@ def candidates(mechanism: Mechanism, coulomb: float, record: MotionRecord) -> li
     Delay, dry friction, damping, inertias and motor constants first; then damping that the
     model leaves out, factors of the inputs, lengths, and masses last.
     """
-    levels = (
-        np.abs(np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=float))
-        @ mechanism.input_limits
-    )
+    levels = input_gains(mechanism) @ mechanism.input_limits
     what = "from a write to its effect in a reading"
     variables = [Quantity("delay", "s", what, 1e-3, 1e-3, high=0.1)]
     for i, c in enumerate(mechanism.coordinates):

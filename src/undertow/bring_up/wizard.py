@@ -16,6 +16,7 @@ from undertow.bring_up.motion import (
     MotionRecord,
     Predictor,
     doublets,
+    input_gains,
     perform,
     ramp,
     rest_state,
@@ -314,9 +315,8 @@ class _Wizard:
     def _modest(self, u: FloatArray) -> FloatArray:
         """Return inputs small enough for what the model says they do: within half the guards."""
         belief, n = self.belief, self.belief.n
-        gain = np.abs(np.array(belief.input_matrix.subs(belief.substitution), dtype=float))
         coulomb = np.zeros((2, n))
-        coulomb[:, : belief.m] = gain @ self.breakaway
+        coulomb[:, : belief.m] = input_gains(belief) @ self.breakaway
         t = np.arange(len(u), dtype=np.float64) * self.rig.period
         for _ in range(20):
             states = self.predictor.states(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -340,16 +340,6 @@ class Bench:
     def with_timing(self, **changes: Any) -> Self:
         """Return the bench with another period, jitter or delay."""
         return replace(self, timing=replace(self.timing, **changes))
-
-    def sources(self) -> dict[str, str]:
-        """Return what is known of where each part's numbers come from."""
-        parts: dict[str, Any] = {"bench": self, "timing": self.timing}
-        for group in fields(self):
-            value = getattr(self, group.name)
-            if isinstance(value, Mapping):
-                parts |= {f"{group.name} of {name}": part for name, part in value.items()}
-        found = {name: getattr(part, "source", "") for name, part in parts.items()}
-        return {name: source for name, source in found.items() if source}
 
 
 SRV02 = "Quanser, SRV02 Rotary Servo Base Unit User Manual: specifications"

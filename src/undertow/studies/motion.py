@@ -97,7 +97,7 @@ def motion_report(
             ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
         ]
         if any(verdict is not None for verdict in run.verdicts):
-            rows.append(("evidence", _evidence(run)))
+            rows.append(("evidence", evidence_counts(run)))
         if len(run.lemma3_slack):
             rows.append(_descent(run, objective, learns=bool(cascade and cascade.known)))
     rows += [
@@ -145,18 +145,20 @@ def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]
     )
 
 
-def _evidence(run: Run) -> str:
+#: Kinds of evidence, in words.
+_EVIDENCE = {
+    "region": "in a proved set",
+    "dual": "predicted into a proved set",
+    "sampled": "sampled nearby",
+    "local": "stable near the target",
+}
+
+
+def evidence_counts(run: Run, words: Mapping[str, str] = _EVIDENCE) -> str:
     """Count what is known of the plan in use at each decision."""
     kinds = [None if v is None else v.details.get("evidence") for v in run.verdicts]
-    words = {
-        "region": "in a proved set",
-        "dual": "predicted into a proved set",
-        "sampled": "sampled nearby",
-        "local": "stable near the target",
-        None: "without accepted evidence",
-    }
-    counts = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kinds.count(kind)]
-    return ", ".join(counts)
+    rows = (*words.items(), (None, "without accepted evidence"))
+    return ", ".join(f"{kinds.count(kind)} {text}" for kind, text in rows if kinds.count(kind))
 
 
 def _decision(update: Update) -> dict[str, object]:

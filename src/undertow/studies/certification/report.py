@@ -20,6 +20,7 @@ from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.verify import CLAIMS
 from undertow.proofs.kernel import claims as kernel
 from undertow.studies.certification.decide import Certified
+from undertow.studies.motion import evidence_counts
 
 _STYLES = {"proved": "green", "sampled": "yellow", "refuted": "red", "undecided": "red"}
 
@@ -121,12 +122,8 @@ def run_report(run: Run) -> RenderableType:
     lines: list[RenderableType] = [table]
     if len(shown) < len(updates):
         lines.append(Text(f"{len(updates) - len(shown)} decisions not shown", style="dim"))
-    kinds = [v.details.get("evidence") if v is not None else None for v in run.verdicts]
-    counts = ", ".join(
-        f"{kinds.count(k)} {k or 'without accepted evidence'}"
-        for k in ("region", "dual", "sampled", "local", None)
-        if kinds.count(k)
-    )
+    kinds = ("region", "dual", "sampled", "local")
+    counts = evidence_counts(run, dict(zip(kinds, kinds, strict=True)))
     lines.append(Text(f"{len(updates)} decisions: {counts}"))
     if np.isfinite(run.lemma3_slack).any():
         smallest = float(np.nanmin(run.lemma3_slack))

@@ -491,8 +491,9 @@ class Simulation:
         error = self._error(x)
         s, demand = (self.law.surface.s(error), self.law.demand)
         predicted = math.nan if self.memory is None else self.memory.predicted - self._spent
-        frame = frame_message(self.t, x, self._u, demand, s, predicted)
-        frame["points"] = self.scene.places(x[: self.mechanism.n], self._parameters).tolist()
+        frame = frame_message(
+            self.scene, self._parameters, self.t, x, self._u, demand, s, predicted
+        )
         if self.hands:
             frame["held"] = self.hands.shown(x[: self.mechanism.n], self._parameters)
         if not self._history or self._history[-1]["t"] < self.t:

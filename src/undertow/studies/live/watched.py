@@ -6,10 +6,10 @@ import math
 from collections import deque
 from pathlib import Path
 
-from undertow.base import ArtefactError, InvalidInputError
+from undertow.base import ArtefactError
 from undertow.display.live import Message
 from undertow.runtime import GrowingLog, Recording
-from undertow.studies.live.messages import described
+from undertow.studies.live.messages import LookedAt, described
 from undertow.studies.live.recorded import RATE, Told, of_log
 
 #: Time between two looks at the log, s; how much later pictures are shown than they came about, so
@@ -20,7 +20,7 @@ LOOK, BEHIND, PAST = 0.04, 0.12, 8.0
 DECISIONS = 400
 
 
-class Watched:
+class Watched(LookedAt):
     """A run, shown while it goes on; once it is over, what was recorded of it.
 
     Parameters
@@ -40,6 +40,8 @@ class Watched:
     ArtefactError
         When it is no log of a run, or is of a mechanism that has to be named.
     """
+
+    what, remedy = "run", "Give it another target from a terminal: undertow target"
 
     def __init__(self, path: Path, mechanism: str | None = None) -> None:
         self._log, self._mechanism, self.over = GrowingLog(path), mechanism, False
@@ -82,19 +84,3 @@ class Watched:
         self._frames += frames
         self._plans += plans
         return [*plans, *frames]
-
-    def hear(self, said: Message, viewer: int) -> None:
-        """Refuse whatever is asked for: nothing reaches the run from here.
-
-        Raises
-        ------
-        InvalidInputError
-            Always.
-        """
-        raise InvalidInputError(
-            "run", value=repr(said.get("do"))[:40], limit="looked at",
-            remedy="Give it another target from a terminal: undertow target",
-        )  # fmt: skip
-
-    def gone(self, viewer: int) -> None:
-        """Nothing was held."""
