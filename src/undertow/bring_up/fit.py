@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import scipy.optimize
@@ -230,10 +229,6 @@ def _values(free: list[Quantity], z: FloatArray) -> dict[str, float]:
     return {v.name: float(a) * v.scale for v, a in zip(free, z, strict=True)}
 
 
-def _tell(progress: Callable[[str, float], None], part: float, what: str) -> None:
-    progress(what, part)
-
-
 class Fit:
     """Residuals and Jacobians of one record."""
 
@@ -392,8 +387,9 @@ class Fit:
         """
         best: tuple[float, list[Quantity], FloatArray] | None = None
         for number, route in enumerate(ROUTES):
-            progress("which quantities the motion tells apart", number / len(ROUTES))
-            free, z = self.follow(route, partial(_tell, progress, number / len(ROUTES)))
+            part = number / len(ROUTES)
+            progress("which quantities the motion tells apart", part)
+            free, z = self.follow(route, lambda what, part=part: progress(what, part))
             cost = float((self.residual(free, z) ** 2).sum())
             if best is None or cost < best[0]:
                 best = cost, free, z

@@ -19,7 +19,7 @@ from undertow.base.artefacts import whole
 from undertow.base.errors import or_refused
 from undertow.mechanisms import LIBRARY
 from undertow.runtime.encoding import Columns
-from undertow.runtime.log import Recording
+from undertow.runtime.recording import Recording
 
 #: Units of the columns that are not of the mechanism.
 _UNITS = {

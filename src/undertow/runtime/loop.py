@@ -33,10 +33,11 @@ from undertow.runtime.encoding import TOLD, Stamps, answer_row, legs_to
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.processes import Background, resource_errors
-from undertow.runtime.slow_loop import Answer, Worker, is_answer
+from undertow.runtime.slow_loop import Answer, is_answer
 from undertow.runtime.steps import limit_output, stage_module
 from undertow.runtime.targets import RunTarget, legs_from_here, named_positions
 from undertow.runtime.verdict import Report
+from undertow.runtime.workers import Worker
 
 #: How long before a step is due the lockstep check makes the last one again, s.
 LOCKSTEP_TIME = 1.5e-4

@@ -151,17 +151,13 @@ class Recipe:
                 f"{stall:g} s",
                 remedy="1 ms is usual; a longer one needs Settings(max_step_interval=...)",
             )
-        if not 0 < self.horizon <= FARTHEST:
-            raise InvalidInputError(
-                "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
-            )
-        if not 0 < self.duration <= FARTHEST:
-            raise InvalidInputError(
-                "length of a reference",
-                value=f"{self.duration:g} s",
-                limit=f"> 0, ≤ {FARTHEST:g} s",
-                remedy="Make the run shorter, or give set-points",
-            )
+        for what, span, remedy in (
+            ("horizon of a run", self.horizon, ""),
+            ("length of a reference", self.duration, "Make the run shorter, or give set-points"),
+        ):
+            if not 0 < span <= FARTHEST:
+                limit = f"> 0, ≤ {FARTHEST:g} s"
+                raise InvalidInputError(what, value=f"{span:g} s", limit=limit, remedy=remedy)
         assert self.legs is not None  # found here, so that its checks run before anything moves
 
     @cached_property

@@ -30,9 +30,9 @@ from undertow.runtime.encoding import (
     memory_from,
     memory_to,
 )
-from undertow.runtime.log import Recording, read_log
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
+from undertow.runtime.recording import Recording, read_log
 from undertow.runtime.slow_loop import Answer, judge, law_vectors_of
 from undertow.symbolic import processor, sources_digest
 

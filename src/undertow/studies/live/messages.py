@@ -49,7 +49,7 @@ def frame_message(
     }  # fmt: skip
 
 
-class LookedAt:
+class ReadOnlyShow:
     """A show that is only looked at: whatever its viewers ask for is refused."""
 
     what, remedy = "recording", ""

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from undertow.base import Progress, no_progress, table, to_csv
 from undertow.export import Agreement, EmbeddedController, Footprint
-from undertow.export.host import FLAGS, HELD, NEAREST, Build, run_on_rig, version
+from undertow.export.host import FLAGS, NEAREST, Build, is_held, run_on_rig, version
 from undertow.export.sources import render
 from undertow.export.twin import run_positions
 from undertow.models import FloatArray
@@ -149,7 +149,6 @@ def upset_every_bit(
         places = process.places
     names, begins = list(places), list(places.values())
     runs, beyond, held = (dict.fromkeys(names, 0) for _ in range(3))
-    last = max(1, round(1.0 / rig.period))
     chosen = range(0, library.bits, every)
     undisturbed, done = True, 0
     library.begin()
@@ -158,8 +157,7 @@ def upset_every_bit(
         _run(library, rig, round(moment / rig.period) - round(so_far / rig.period))
         memory = library.memory.copy()
         q, u = _run(library, _copied(rig), round(after / rig.period))
-        balanced = bool((np.abs(q[-last:, m:]) <= HELD).all())
-        undisturbed &= balanced
+        undisturbed &= is_held(q, m, rig.period)
         for bit in chosen:
             library.memory[:] = memory
             library.flip(bit)
@@ -171,7 +169,7 @@ def upset_every_bit(
             name = names[bisect_right(begins, bit // 8) - 1]
             runs[name] += 1
             beyond[name] += not (np.abs(given) <= limit).all()
-            held[name] += len(seen) == len(q) and bool((np.abs(seen[-last:, m:]) <= HELD).all())
+            held[name] += len(seen) == len(q) and is_held(seen, m, rig.period)
             done += 1
             if done % 64 == 0:
                 progress(done / len(chosen) / len(moments))
