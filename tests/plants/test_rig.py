@@ -251,9 +251,11 @@ def test_a_usual_bench_can_be_made_of_any_mechanism(name: str) -> None:
 
 
 def test_numbers_carry_their_sources() -> None:
-    sources = srv02_rig().sources()
-    assert "4096" in sources["encoders of theta"]
-    assert all(sources.values())
+    bench = srv02_rig()
+    groups = (bench.friction, bench.encoders, bench.amplifiers)
+    parts = [bench, bench.timing, *(part for group in groups for part in group.values())]
+    assert "4096" in bench.encoders["theta"].source
+    assert all(part.source for part in parts)
 
 
 @pytest.mark.parametrize(

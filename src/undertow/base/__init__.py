@@ -9,6 +9,7 @@ at_once()
 from undertow.base.arguments import (
     REMEDIES,
     at_least,
+    between,
     check_fields,
     checked,
     floats,
@@ -68,6 +69,7 @@ __all__ = [
     "as_text",
     "at_least",
     "at_once",
+    "between",
     "by_exception",
     "check_fields",
     "check_file",

@@ -133,6 +133,22 @@ def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
         )
 
 
+def between(
+    what: str, value: float, low: float, high: float, unit: str = "", remedy: str = ""
+) -> None:
+    """Refuse a number outside of an interval, and NaN.
+
+    Raises
+    ------
+    InvalidInputError
+        With the value and the limits.
+    """
+    if not low <= value <= high:
+        shown = (f"{number:g} {unit}".rstrip() for number in (value, low, high))
+        got, *ends = shown
+        raise InvalidInputError(what, value=got, limit=" to ".join(ends), remedy=remedy)
+
+
 def positive(
     what: str, value: ArrayLike, remedy: str = "", *, zero: bool = False, infinite: bool = False
 ) -> None:

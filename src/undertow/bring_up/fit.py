@@ -14,14 +14,14 @@ Jacobian of the weighed residuals, (N n, p), its rows coordinate by coordinate.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
 import scipy.signal
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, Progress
 from undertow.bring_up.motion import MotionRecord, Predictor, input_gains
 from undertow.models import FloatArray, Mechanism, Parameter
 
@@ -379,7 +379,7 @@ class Fit:
         swing = np.maximum(self.moved.std(axis=0), 1e-300)
         return np.asarray(1.0 - (self.difference(free, z).std(axis=0) / swing) ** 2)
 
-    def search(self, progress: Callable[[str, float], None]) -> tuple[list[Quantity], FloatArray]:
+    def search(self, progress: Progress) -> tuple[list[Quantity], FloatArray]:
         """Return the least squares of the best of the ways: of the first, if that will do.
 
         What is sharp, delay and dry friction, leaves minima beside the least: from each of them
@@ -389,7 +389,7 @@ class Fit:
         for number, route in enumerate(ROUTES):
             part = number / len(ROUTES)
             progress("which quantities the motion tells apart", part)
-            free, z = self.follow(route, lambda what, part=part: progress(what, part))
+            free, z = self.follow(route, progress, part)
             cost = float((self.residual(free, z) ** 2).sum())
             if best is None or cost < best[0]:
                 best = cost, free, z
@@ -408,7 +408,7 @@ class Fit:
         return free, z
 
     def follow(
-        self, route: tuple[Stage, ...], tell: Callable[[str], None]
+        self, route: tuple[Stage, ...], progress: Progress, part_done: float
     ) -> tuple[list[Quantity], FloatArray]:
         """Fit stage by stage; what a whole motion told apart once stays free."""
         values: dict[str, float] = {}
@@ -418,7 +418,7 @@ class Fit:
             first = [] if self.pieces else free
             self.look_at(piece, part)
             free = self.choose(values, first, () if sharp else ("breakaway_",))
-            tell(f"identifying {len(free)} quantities")
+            progress(f"identifying {len(free)} quantities", part_done)
             z = self.solve(free, values, 1e-9 if number == len(route) - 1 else 1e-4)
             values = _values(free, z)
         return free, z

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, one_for_each
+from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
 from undertow.law import LawLayout, Plan, ReachingLaw, SlidingModeLaw, Surface, check_surface
@@ -133,13 +133,11 @@ class EmbeddedController:
         ):
             if not good:
                 raise InvalidInputError(what, value=value, limit=limit)
-        if not np.isfinite(limits).all():
-            raise InvalidInputError(
-                f"input limits of '{self.mechanism.name}'",
-                value=limits.tolist(),
-                limit="finite",
-                remedy="Name what the actuators can deliver: mechanism.with_input_limit",
-            )
+        positive(
+            f"input limits of '{self.mechanism.name}'",
+            limits,
+            "Name what the actuators can deliver: mechanism.with_input_limit",
+        )
         for law in self.laws:
             check_surface(self.mechanism, law.surface)
             layer = law.reaching.vector(self.mechanism.m)[self.mechanism.m :]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, at_least
 from undertow.models import FloatArray, Mechanism
 from undertow.plants.bench import Amplifier, Backlash, Bench, Encoder, Friction, Timing
 from undertow.plants.interface import Measurement
@@ -48,8 +48,7 @@ class RealisticRig:
     """
 
     def __init__(self, bench: Bench, x0: ArrayLike | None = None, seed: int = 0) -> None:
-        if seed < 0:
-            raise InvalidInputError("seed of a rig", value=seed, limit="≥ 0")
+        at_least("seed of a rig", seed, 0)
         self.bench = bench
         self.period = bench.timing.period
         self._rng = np.random.default_rng([seed, 0])

@@ -560,10 +560,7 @@ class Simulation:
                 self._step()
 
     def _go(self, speed: float) -> None:
-        if speed not in SPEEDS:
-            raise InvalidInputError(
-                "speed", value=f"{speed:g}", limit=f"one of {', '.join(map(str, SPEEDS))}"
-            )
+        one_of("speed", str(speed), map(str, SPEEDS))
         self.speed = speed
 
     def _push(self, side: float) -> None:
