@@ -156,11 +156,11 @@ class _Wizard:
         remedy = "" if said == "right" else remedy
         self.findings.append(RigFinding(check, part, measured, expected, said, remedy))
 
-    def _wait_for_rest(self, rig: Rig, seconds: float = CALM) -> FloatArray:
-        """Leave the inputs at zero until nothing moves, or for so long: the last motion, (n,)."""
+    def _wait_for_rest(self, rig: Rig) -> FloatArray:
+        """Leave the inputs at zero until nothing moves, or for ``CALM``: the last motion, (n,)."""
         count = round(LOOK / self.rig.period)
         moved = np.full(self.belief.n, np.inf)
-        for _ in range(max(1, round(seconds / LOOK))):
+        for _ in range(round(CALM / LOOK)):
             loop = control_loop(rig, lambda _: np.zeros(self.belief.m), count)
             rows = [np.array(measured.q, dtype=float) for measured, _ in loop]
             moved = np.ptp(np.array(rows), axis=0)

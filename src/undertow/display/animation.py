@@ -222,15 +222,13 @@ class Picture:
     ----------
     mechanism
         What is drawn.
-    size
-        Width and height, pixels.
     """
 
-    def __init__(self, mechanism: Mechanism, size: int = 360) -> None:
+    def __init__(self, mechanism: Mechanism) -> None:
         self._mechanism, self._sketch = mechanism, sketch(mechanism)
         self._place = evaluator(mechanism, self._sketch)
         self._window = self._film(_reach(mechanism)).window
-        self._figure = Figure(figsize=(size / 100, size / 100), dpi=100)
+        self._figure = Figure(figsize=(3.6, 3.6), dpi=100)
         self._canvas: Any = FigureCanvasAgg(self._figure)
         self._axes = self._figure.add_axes((0, 0, 1, 1))
 

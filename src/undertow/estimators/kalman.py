@@ -417,12 +417,12 @@ class KalmanFilter:
         information = 0.5 * (information + information.T)
         return ParameterEstimate(self._x[place].copy(), information, int(self._count[0]))
 
-    def _at_rest(self, seconds: float = 0.5) -> KalmanFilter:
-        """Return a filter like this one, after so long at rest at the target, s."""
+    def _at_rest(self) -> KalmanFilter:
+        """Return a filter like this one, after half a second at rest at the target."""
         double = KalmanFilter(**self._arguments)
         n, m = self.mechanism.n, self.mechanism.m
         double.reset(np.zeros(2 * n))
-        for k in range(round(seconds / self.period)):
+        for k in range(round(0.5 / self.period)):
             double.estimate(Measurement(k * self.period, np.zeros(n)), np.zeros(m))
         return double
 

@@ -87,8 +87,8 @@ def _motion(axes: Axes, a: FloatArray, b: FloatArray, ratio: float, home: bool) 
     axes.plot(a, b, color=colour, lw=0.9)
 
 
-def _shadow(rows: FloatArray, count: int = 181) -> FloatArray:
-    """Edge of {rows x, ‖x‖ ≤ 1} in the plane, (2, count)."""
+def _shadow(rows: FloatArray) -> FloatArray:
+    """Edge of {rows x, ‖x‖ ≤ 1} in the plane, (2, 181)."""
     u, s, _ = np.linalg.svd(rows, full_matrices=False)
-    angle = np.linspace(0, 2 * np.pi, count)
+    angle = np.linspace(0, 2 * np.pi, 181)
     return np.asarray(u @ (s[:, None] * np.array([np.cos(angle), np.sin(angle)])))
