@@ -47,6 +47,7 @@ from undertow.base.errors import (
     printable,
     raised_at,
     require_extra,
+    said,
 )
 from undertow.base.files import check_file, file_hash, parse_json, read_file
 from undertow.base.progress import Progress, no_progress
@@ -94,6 +95,7 @@ __all__ = [
     "raised_at",
     "read_file",
     "require_extra",
+    "said",
     "table",
     "to_csv",
     "to_json",

@@ -130,6 +130,15 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
+def said(error: BaseException) -> str:
+    """Return what an error of whatever kind says, after its name.
+
+    >>> said(KeyError("x")), said(MemoryError())
+    ("KeyError: 'x'", 'MemoryError')
+    """
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
 def near(name: str, names: Iterable[str]) -> str:
     """Return "Did you mean …?" with the names that are like a wrong one; nothing where none is.
 

@@ -15,6 +15,7 @@ from typing import TypeGuard
 
 import numpy as np
 
+from undertow.base import said
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.closed_loop import Event
@@ -138,7 +139,7 @@ def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -
         )  # fmt: skip
         return replace(answer, jump=True)
     except Exception as error:
-        proposal = _failed(request, f"{type(error).__name__}: {error}")
+        proposal = _failed(request, said(error))
         return _answer(request, x, proposal, *judge(cascade, memory, proposal, x, use), began)
 
 
@@ -196,7 +197,7 @@ def judge(
         after, admission = cascade.apply_gate(memory, proposal, memory.absolute(use, x))
         return after, admission, law_vectors_of(cascade, after)
     except Exception as error:  # an optimiser's answer may be anything
-        reason = f"gate: {type(error).__name__}: {error}"
+        reason = f"gate: {said(error)}"
         admission = Admission(False, reason, memory.predicted)
         number = memory.sequence + 1
         after = replace(memory, plan=memory.at(use), since=use, sequence=number, x=())
