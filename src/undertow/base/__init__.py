@@ -43,11 +43,11 @@ from undertow.base.errors import (
     SingularSurfaceError,
     UndertowError,
     UnstableSurfaceError,
+    error_text,
     near,
     printable,
     raised_at,
     require_extra,
-    said,
 )
 from undertow.base.files import check_file, file_hash, parse_json, read_file
 from undertow.base.progress import Progress, no_progress
@@ -76,6 +76,7 @@ __all__ = [
     "check_file",
     "check_folder",
     "checked",
+    "error_text",
     "facts",
     "file_hash",
     "finite",
@@ -95,7 +96,6 @@ __all__ = [
     "raised_at",
     "read_file",
     "require_extra",
-    "said",
     "table",
     "to_csv",
     "to_json",

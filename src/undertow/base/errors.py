@@ -130,10 +130,10 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
-def said(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Return what an error of whatever kind says, after its name.
 
-    >>> said(KeyError("x")), said(MemoryError())
+    >>> error_text(KeyError("x")), error_text(MemoryError())
     ("KeyError: 'x'", 'MemoryError')
     """
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from undertow.base import InvalidInputError, checked, said
+from undertow.base import InvalidInputError, checked, error_text
 from undertow.cascade import Legs
 from undertow.law import SetPoints
 from undertow.models import FloatArray, invariant_coordinates
@@ -250,7 +250,7 @@ class Runtime:
         """Take down what ended the loop itself: its output comes to zero without it."""
         self._reserve = b""
         report, controller = self.report, self.controller
-        reason = f"loop: {said(error)}"
+        reason = f"loop: {error_text(error)}"
         if isinstance(error, KeyboardInterrupt):
             reason = "operator: interrupt"
         if controller.mode is not Mode.SAFE_STOP:
@@ -271,7 +271,7 @@ class Runtime:
         try:
             failure = self._bring_to_zero() if not report.output_zero else ""
         except BaseException as error:  # an interrupt: the rig is closed all the same
-            failure = said(error)
+            failure = error_text(error)
         self._heartbeat = float("inf")
         output = (
             [] if report.output_zero else [f"the device did not take an output of zero: {failure}"]
@@ -282,7 +282,7 @@ class Runtime:
         try:
             self.rig.close()
         except BaseException as error:  # a rig that failed may fail again
-            output.append(f"close: {said(error)}")
+            output.append(f"close: {error_text(error)}")
             report.output_zero = report.output_zero and not isinstance(error, OutputOnError)
         self._waiting_since = math.inf
         report.output_problem = "; ".join(output)
@@ -307,7 +307,7 @@ class Runtime:
             try:
                 self.rig.write(u.copy())
             except BaseException as error:  # it must come to zero whatever a driver does
-                failure = said(error)
+                failure = error_text(error)
             else:
                 if not u.any():
                     self.report.output_zero = True
@@ -352,7 +352,7 @@ class Runtime:
                     self.log.columns.fill(self.log.row, k, stamps, inputs, self.controller)
                     self.log.commit_row()
             except Exception as error:  # the output must come to zero before the loop may end
-                alarm = alarm or said(error)
+                alarm = alarm or error_text(error)
             if self.lockstep is not None:
                 self._behind.append((inputs, u.copy()))
             np.abs(u - before, out=before)
@@ -405,7 +405,7 @@ class Runtime:
         try:
             measurement = _copied(self.rig.read(), self.controller.x.shape[0] // 2)
         except Exception as error:
-            what = f"read: {said(error)}"
+            what = f"read: {error_text(error)}"
             self._log_event("rig", what)
         if measurement is not None:
             self._time_without_reading = 0.0
@@ -430,7 +430,7 @@ class Runtime:
         try:
             answer = self.worker.take(t)
         except Exception as error:
-            self._unreached(said(error))
+            self._unreached(error_text(error))
             return None
         if answer is None or is_answer(answer):
             return answer
@@ -450,7 +450,7 @@ class Runtime:
         try:
             self.rig.write(u.copy())  # the rig may keep it, or change it
         except Exception as error:
-            what = f"write: {said(error)}"
+            what = f"write: {error_text(error)}"
         else:
             self._time_without_write, report.output_zero = 0.0, zero
             self._writes.add(0)
@@ -488,7 +488,7 @@ class Runtime:
             if controller.request is not None:
                 self.worker.ask(controller.request)
         except Exception as error:
-            self._unreached(said(error))
+            self._unreached(error_text(error))
         if log is not None:
             if inputs.command:
                 log.event(k, inputs.t, "command", inputs.command.name)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import ArtefactError, UndertowError, checked, file_hash, said, versions
+from undertow.base import ArtefactError, UndertowError, checked, error_text, file_hash, versions
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
@@ -173,7 +173,7 @@ def legible(path: Path) -> Iterator[None]:
     ) as error:  # fmt: skip
         raise ArtefactError(
             f"log '{path}'",
-            value=said(error),
+            value=error_text(error),
             limit="complete, with what a run of this version writes",
             remedy="It is damaged, or of another version: replay with the one that wrote it",
         ) from error

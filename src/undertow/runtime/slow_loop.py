@@ -15,7 +15,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from undertow.base import said
+from undertow.base import error_text
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.closed_loop import Event
@@ -139,7 +139,7 @@ def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -
         )  # fmt: skip
         return replace(answer, jump=True)
     except Exception as error:
-        proposal = _failed(request, said(error))
+        proposal = _failed(request, error_text(error))
         return _answer(request, x, proposal, *judge(cascade, memory, proposal, x, use), began)
 
 
@@ -197,7 +197,7 @@ def judge(
         after, admission = cascade.apply_gate(memory, proposal, memory.absolute(use, x))
         return after, admission, law_vectors_of(cascade, after)
     except Exception as error:  # an optimiser's answer may be anything
-        reason = f"gate: {said(error)}"
+        reason = f"gate: {error_text(error)}"
         admission = Admission(False, reason, memory.predicted)
         number = memory.sequence + 1
         after = replace(memory, plan=memory.at(use), since=use, sequence=number, x=())

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from undertow.base import ArtefactError, UndertowError, errors, said
+from undertow.base import ArtefactError, UndertowError, error_text, errors
 from undertow.models import FloatArray
 from undertow.plants import Measurement, OutputOnError, Rig
 from undertow.runtime.clock import real_time_priority
@@ -223,7 +223,7 @@ def _refusal(error: Exception) -> UndertowError:
         return error
     return ArtefactError(
         "rig of a supervisor",
-        value=said(error),
+        value=error_text(error),
         limit="a rig that can be made and read",
     )
 
@@ -277,7 +277,7 @@ def _apply(
     try:
         rig.close()
     except BaseException as error:  # a rig that failed may fail again
-        close = f"close: {said(error)}"
+        close = f"close: {error_text(error)}"
         output = output or (close if isinstance(error, OutputOnError) else "")
     with contextlib.suppress(OSError):
         ours.send(_Farewell(output, close))
@@ -295,7 +295,7 @@ def _attempt(rig: Rig, u: FloatArray) -> str:
     try:
         rig.write(u.copy())
     except BaseException as error:  # a driver may do anything; the supervisor stays
-        return said(error)
+        return error_text(error)
     return ""
 
 
@@ -304,6 +304,6 @@ def _reply(ours: Connection, rig: Rig, failure: str) -> None:
     try:
         reply = _Reply(rig.read(), "", failure)
     except BaseException as error:
-        reply = _Reply(None, said(error), failure)
+        reply = _Reply(None, error_text(error), failure)
     with contextlib.suppress(Exception):  # who listens no more is found out by what comes
         ours.send(reply)
