@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import ctypes
 import tempfile
 from bisect import bisect_right
@@ -107,15 +106,6 @@ class _Library:
         return self._u.astype(float)
 
 
-def _copied(rig: RealisticRig) -> RealisticRig:
-    """Return a rig that goes on by itself; what never changes is shared."""
-    twin = copy.copy(rig)
-    for name, value in vars(rig).items():
-        if isinstance(value, np.ndarray | np.random.Generator):
-            setattr(twin, name, copy.deepcopy(value))
-    return twin
-
-
 def _run(library: _Library, rig: RealisticRig, periods: int) -> tuple[FloatArray, FloatArray]:
     """Return positions (N, n) and outputs (N, m); an output that no rig takes ends the run."""
     positions, outputs = [], []
@@ -144,7 +134,7 @@ def upset_every_bit(
     """
     controller = build.controller
     limit, m = controller.mechanism.input_limits, controller.mechanism.m
-    library, rig = _Library(build), _copied(rig)
+    library, rig = _Library(build), rig.copied()
     with build.start() as process:
         places = process.places
     names, begins = list(places), list(places.values())
@@ -156,7 +146,7 @@ def upset_every_bit(
         so_far = moments[number - 1] if number else 0.0
         _run(library, rig, round(moment / rig.period) - round(so_far / rig.period))
         memory = library.memory.copy()
-        q, u = _run(library, _copied(rig), round(after / rig.period))
+        q, u = _run(library, rig.copied(), round(after / rig.period))
         undisturbed &= is_held(q, m, rig.period)
         for bit in chosen:
             library.memory[:] = memory
@@ -165,7 +155,7 @@ def upset_every_bit(
             if not np.array_equal(given, u):
                 library.memory[:] = memory
                 library.flip(bit)
-                seen, given = _run(library, _copied(rig), len(q))
+                seen, given = _run(library, rig.copied(), len(q))
             name = names[bisect_right(begins, bit // 8) - 1]
             runs[name] += 1
             beyond[name] += not (np.abs(given) <= limit).all()
