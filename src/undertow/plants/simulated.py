@@ -84,7 +84,10 @@ class RealisticRig:
 
     def _use(self, memory: Workspace) -> None:
         """Work on a memory: what the rig is like, and where it is."""
-        self._memory, self._x, self._q, self._u = memory, memory["x"], memory["q"], memory["u"]
+        self._memory = memory
+        self._x: FloatArray = memory["x"]
+        self._q: FloatArray = memory["q"]
+        self._u: FloatArray = memory["u"]
 
     def copied(self) -> Self:
         """Return the rig as it stands, to go on by itself."""
