@@ -27,7 +27,7 @@ import numpy as np
 
 from undertow.base import ArtefactError
 from undertow.models import FloatArray
-from undertow.runtime.log import Recording, read_log
+from undertow.runtime.recording import Recording, read_log
 
 HERE = Path(__file__).parent
 SECTOR = 512

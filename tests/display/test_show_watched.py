@@ -93,7 +93,7 @@ def test_a_log_that_goes_on_in_another_file_is_followed(
 
 def test_a_killed_run_is_over_after_a_while(book: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     growing = GrowingLog(book.path)
-    monkeypatch.setattr("undertow.runtime.log.SILENCE", 0.0)
+    monkeypatch.setattr("undertow.runtime.recording.SILENCE", 0.0)
     assert not growing.over  # it has not begun
     write(book, 0, 2)
     growing.news()

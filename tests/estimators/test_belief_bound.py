@@ -22,7 +22,7 @@ from undertow.base import InvalidInputError
 from undertow.estimators import Belief, KalmanFilter, ParameterEstimate
 from undertow.estimators.belief import AXES, LEAST, SLIPS, _contracted
 from undertow.models import FloatArray
-from undertow.runtime.encoding import _estimate_from, _estimate_to
+from undertow.runtime.encoding import _estimate_from, _plain
 
 SPREAD = {
     "cart_pendulum": {"m_c": 0.1, "m_p": 0.2, "b_c": 0.5},
@@ -293,7 +293,7 @@ def test_what_a_bound_cannot_be_and_where_it_is_refused() -> None:
     with pytest.raises(InvalidInputError, match=r"Belief\.prior"):
         belief.learn(replace(belief, bound=None).prior, np.arange(3.0), x, x[:, :1])
     for prior in (replace(belief.prior, contradictions=2), replace(belief, bound=None).prior):
-        again = _estimate_from(_estimate_to(prior))
+        again = _estimate_from(_plain(prior))
         assert np.array_equal(again.low, prior.low)
         assert np.array_equal(again.high, prior.high)
         assert again.contradictions == prior.contradictions

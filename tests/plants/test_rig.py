@@ -251,10 +251,24 @@ def test_a_usual_bench_can_be_made_of_any_mechanism(name: str) -> None:
     assert np.isfinite(path).all()
 
 
+def test_a_copy_of_a_rig_goes_on_by_itself() -> None:
+    """The same inputs give the same bits, noise and delays included, and leave the other alone."""
+    bench = replace(srv02_rig(), tachometers={"theta": 0.01}, pushes=(Push(0.2, "phi", 0.001),))
+    rig, inputs = RealisticRig(bench, seed=2), np.sin(np.arange(400.0))[:, None]
+    _run(rig, inputs[:100])
+    twin, before = rig.copied(), rig.truth
+    path = _run(twin, inputs[100:])
+    assert np.array_equal(rig.truth, before)
+    assert np.array_equal(_run(rig, inputs[100:]), path)
+    assert rig.read().q.tolist() == twin.read().q.tolist()
+
+
 def test_numbers_carry_their_sources() -> None:
-    sources = srv02_rig().sources()
-    assert "4096" in sources["encoders of theta"]
-    assert all(sources.values())
+    bench = srv02_rig()
+    groups = (bench.friction, bench.encoders, bench.amplifiers)
+    parts = [bench, bench.timing, *(part for group in groups for part in group.values())]
+    assert "4096" in bench.encoders["theta"].source
+    assert all(part.source for part in parts)
 
 
 @pytest.mark.parametrize(

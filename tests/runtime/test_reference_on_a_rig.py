@@ -14,8 +14,8 @@ from undertow.base import InvalidInputError
 from undertow.law import ReferenceMotion
 from undertow.runtime import Recipe, Request, Settings, send_target, session
 from undertow.runtime.encoding import memory_from, memory_to, reference_from, reference_to
-from undertow.runtime.slow_loop import Packer
 from undertow.runtime.steps import reference_row
+from undertow.runtime.workers import Packer
 
 SINE = ut.Reference.sine(0.25, theta=ut.deg(20))
 RECIPE = Recipe(start=(0.0, 0.1, 0.0, 0.0), evaluations=64, horizon=8.0, target=SINE, duration=8.0)

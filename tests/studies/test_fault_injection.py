@@ -14,7 +14,7 @@ from undertow.cascade import CascadeState
 from undertow.law import Plan
 from undertow.plants import IdealRig
 from undertow.runtime import Columns, InlineWorker, Recipe, Runtime, SimulatedClock, respond
-from undertow.runtime.log import read_log
+from undertow.runtime.recording import read_log
 from undertow.studies.fault_injection.cases import CASES, Case, OutputMonitor
 from undertow.studies.fault_injection.live import (
     KillResult,

@@ -21,11 +21,12 @@ from undertow.base import ArtefactError, InvalidInputError, ResourceError
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray
 from undertow.plants import Measurement
-from undertow.runtime import Columns, background_worker, processes, slow_loop
+from undertow.runtime import Columns, background_worker, processes, workers
 from undertow.runtime import log as logs
-from undertow.runtime.log import Log, read_log
+from undertow.runtime.log import Log
 from undertow.runtime.loop import Runtime
 from undertow.runtime.processes import Background, check_resources, fork, pipe
+from undertow.runtime.recording import read_log
 from undertow.runtime.replay import replay_controller
 from undertow.runtime.session import session
 from undertow.studies.fault_injection.failing_calls import (
@@ -337,7 +338,7 @@ def test_an_optimiser_whose_process_ends_at_once_is_an_error(
 ) -> None:
     """As when the system kills it for lack of memory; those before it are ended."""
     begun: list[Any] = []
-    honest = slow_loop._serve
+    honest = workers._serve
 
     def serve(*args: Any) -> None:
         if len(begun) == 1:
@@ -349,8 +350,8 @@ def test_an_optimiser_whose_process_ends_at_once_is_an_error(
         begun.append(process)
         return process
 
-    monkeypatch.setattr(slow_loop, "_serve", serve)
-    monkeypatch.setattr(slow_loop, "fork", child)
+    monkeypatch.setattr(workers, "_serve", serve)
+    monkeypatch.setattr(workers, "fork", child)
     with pytest.raises(ResourceError, match="ended with exit code 9"):
         background_worker(campaign.recipes["ideal"].respond, processes=3)
     assert len(begun) == 2
@@ -545,7 +546,7 @@ def test_a_stop_while_processes_are_made_leaves_none(campaign: Systematic) -> No
 
             sys.settrace(trace)
             try:
-                slow_loop.background_worker(campaign.recipes["ideal"].respond, processes=2).close()
+                workers.background_worker(campaign.recipes["ideal"].respond, processes=2).close()
             finally:
                 sys.settrace(None)
                 say.send(left > 0)

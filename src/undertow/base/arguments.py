@@ -133,6 +133,22 @@ def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
         )
 
 
+def between(
+    what: str, value: float, low: float, high: float, unit: str = "", remedy: str = ""
+) -> None:
+    """Refuse a number outside of an interval, and NaN.
+
+    Raises
+    ------
+    InvalidInputError
+        With the value and the limits.
+    """
+    if not low <= value <= high:
+        shown = (f"{number:g} {unit}".rstrip() for number in (value, low, high))
+        got, *ends = shown
+        raise InvalidInputError(what, value=got, limit=" to ".join(ends), remedy=remedy)
+
+
 def positive(
     what: str, value: ArrayLike, remedy: str = "", *, zero: bool = False, infinite: bool = False
 ) -> None:
@@ -161,6 +177,23 @@ def positive(
     if not good.all():
         limit = f"{'' if infinite else 'finite and '}{'≥ 0' if zero else '> 0'}"
         raise InvalidInputError(what, value=value, limit=limit, remedy=remedy)
+
+
+def one_for_each(
+    what: str, values: ArrayLike, count: int, *, infinite: bool = False
+) -> np.typing.NDArray[np.float64]:
+    """Return positive numbers, (count,), from one for all of them or one for each.
+
+    Raises
+    ------
+    InvalidInputError
+        For another shape, and for what :func:`positive` refuses.
+    """
+    numbers, remedy = np.asarray(values, dtype=np.float64), "One number serves all"
+    if numbers.shape not in ((), (count,)):
+        raise InvalidInputError(what, value=values, limit=f"one number or {count}", remedy=remedy)
+    positive(what, values, remedy, infinite=infinite)
+    return np.array(np.broadcast_to(numbers, (count,)))
 
 
 def one_of(

@@ -25,6 +25,7 @@ from undertow.base.errors import ArtefactError, or_refused
 if TYPE_CHECKING:  # Rich takes time to import, which a table is worth and an import is not
     from rich.console import RenderableType
     from rich.table import Table
+    from rich.text import Text
 
 PACKAGES = ("undertow", "numpy", "scipy", "sympy", "numba", "matplotlib", "casadi")
 
@@ -149,6 +150,13 @@ def facts(rows: Iterable[tuple[RenderableType, RenderableType]], gap: int = 2) -
     for row in rows:
         grid.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     return grid
+
+
+def mark(good: bool) -> Text:
+    """Return a green ✓ or a red ✗."""
+    from rich.text import Text
+
+    return Text("✓", style="green") if good else Text("✗", style="red")
 
 
 def as_text(*shown: RenderableType) -> bytes:

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 #: This package: lines of its own are not where a user's file raised.
@@ -47,6 +48,11 @@ class UndertowError(Exception):
         ]
         message = what + (": " + ", ".join(facts) if facts else "")
         super().__init__(f"{message}. {remedy}" if remedy else message + ".")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it by its parts; value and limit, which may be anything, as text."""
+        value, limit = (None if f is None else str(f) for f in (self.value, self.limit))
+        return partial(type(self), value=value, limit=limit, remedy=self.remedy), (self.what,)
 
 
 class InvalidInputError(UndertowError, ValueError):
@@ -122,6 +128,15 @@ def printable(text: str) -> str:
     'an escape: ?[2J'
     """
     return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def error_text(error: BaseException) -> str:
+    """Return what an error of whatever kind says, after its name.
+
+    >>> error_text(KeyError("x")), error_text(MemoryError())
+    ("KeyError: 'x'", 'MemoryError')
+    """
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def near(name: str, names: Iterable[str]) -> str:

@@ -14,16 +14,15 @@ Jacobian of the weighed residuals, (N n, p), its rows coordinate by coordinate.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import scipy.optimize
 import scipy.signal
 
-from undertow.base import InvalidInputError
-from undertow.bring_up.motion import MotionRecord, Predictor
+from undertow.base import InvalidInputError, Progress
+from undertow.bring_up.motion import MotionRecord, Predictor, input_gains
 from undertow.models import FloatArray, Mechanism, Parameter
 
 #: Encoder zeros from which a predicted motion is counted.
@@ -150,10 +149,7 @@ def candidates(mechanism: Mechanism, coulomb: float, record: MotionRecord) -> li
     Delay, dry friction, damping, inertias and motor constants first; then damping that the
     model leaves out, factors of the inputs, lengths, and masses last.
     """
-    levels = (
-        np.abs(np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=float))
-        @ mechanism.input_limits
-    )
+    levels = input_gains(mechanism) @ mechanism.input_limits
     what = "from a write to its effect in a reading"
     variables = [Quantity("delay", "s", what, 1e-3, 1e-3, high=0.1)]
     for i, c in enumerate(mechanism.coordinates):
@@ -231,10 +227,6 @@ STEP = 2e-3
 
 def _values(free: list[Quantity], z: FloatArray) -> dict[str, float]:
     return {v.name: float(a) * v.scale for v, a in zip(free, z, strict=True)}
-
-
-def _tell(progress: Callable[[str, float], None], part: float, what: str) -> None:
-    progress(what, part)
 
 
 class Fit:
@@ -387,7 +379,7 @@ class Fit:
         swing = np.maximum(self.moved.std(axis=0), 1e-300)
         return np.asarray(1.0 - (self.difference(free, z).std(axis=0) / swing) ** 2)
 
-    def search(self, progress: Callable[[str, float], None]) -> tuple[list[Quantity], FloatArray]:
+    def search(self, progress: Progress) -> tuple[list[Quantity], FloatArray]:
         """Return the least squares of the best of the ways: of the first, if that will do.
 
         What is sharp, delay and dry friction, leaves minima beside the least: from each of them
@@ -395,8 +387,9 @@ class Fit:
         """
         best: tuple[float, list[Quantity], FloatArray] | None = None
         for number, route in enumerate(ROUTES):
-            progress("which quantities the motion tells apart", number / len(ROUTES))
-            free, z = self.follow(route, partial(_tell, progress, number / len(ROUTES)))
+            part = number / len(ROUTES)
+            progress("which quantities the motion tells apart", part)
+            free, z = self.follow(route, progress, part)
             cost = float((self.residual(free, z) ** 2).sum())
             if best is None or cost < best[0]:
                 best = cost, free, z
@@ -415,7 +408,7 @@ class Fit:
         return free, z
 
     def follow(
-        self, route: tuple[Stage, ...], tell: Callable[[str], None]
+        self, route: tuple[Stage, ...], progress: Progress, part_done: float
     ) -> tuple[list[Quantity], FloatArray]:
         """Fit stage by stage; what a whole motion told apart once stays free."""
         values: dict[str, float] = {}
@@ -425,7 +418,7 @@ class Fit:
             first = [] if self.pieces else free
             self.look_at(piece, part)
             free = self.choose(values, first, () if sharp else ("breakaway_",))
-            tell(f"identifying {len(free)} quantities")
+            progress(f"identifying {len(free)} quantities", part_done)
             z = self.solve(free, values, 1e-9 if number == len(route) - 1 else 1e-4)
             values = _values(free, z)
         return free, z

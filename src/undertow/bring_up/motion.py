@@ -13,7 +13,8 @@ import numpy as np
 from undertow.base import InfeasibleError, UndertowError
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Rig, control_loop
-from undertow.plants.stepping import stepping
+from undertow.plants.stepping import RIG_LAYOUT, stepping
+from undertow.symbolic import Workspace
 
 
 def rest_state(mechanism: Mechanism) -> FloatArray:
@@ -57,6 +58,12 @@ def _growth(mechanism: Mechanism, x: FloatArray) -> float:
     below = ((a[: 2 * n] - a[2 * n :]) / (2 * step)).T
     A = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), below])
     return float(np.linalg.eigvals(A).real.max())
+
+
+def input_gains(mechanism: Mechanism) -> FloatArray:
+    """Return |B| with the model's parameters, (m, m): what the inputs do to the driven joints."""
+    B = mechanism.input_matrix.subs(mechanism.substitution)
+    return np.asarray(np.abs(np.array(B, dtype=float)))
 
 
 class GuardError(UndertowError):
@@ -162,14 +169,12 @@ class Predictor:
 
     def __init__(self, mechanism: Mechanism, x0: FloatArray) -> None:
         self.mechanism, self.x0 = mechanism, np.array(x0, dtype=float)
-        self._module = stepping(mechanism)
-        n, m = mechanism.n, mechanism.m
-        limits = mechanism.input_limits
-        self._amplifier = np.array([[v, 0.0, 0.0, 0.0] for v in limits])
-        self._gap = np.tile([0.0, 1.0], (m, 1))
-        self._stops = np.tile([-np.inf, np.inf], (n, 1))
-        self._encoder, self._phase, self._noise = np.zeros((n, 2)), np.zeros(n), np.zeros(n)
-        self._pushes, self._delays = np.zeros((0, 1 + n)), np.zeros(2, dtype=np.int64)
+        self._module, n = stepping(mechanism), mechanism.n
+        self._sizes = {"late": 0, "old": 0, "seen": n, "knocks": 0}
+        p = len(mechanism.parameters)
+        self._memory = memory = Workspace(RIG_LAYOUT, n=n, m=mechanism.m, p=p, **self._sizes)
+        memory["amplifier"][:, 0] = mechanism.input_limits
+        memory["gap"][:], memory["stops"][:] = (0.0, 1.0), (-np.inf, np.inf)
 
     def states(
         self,
@@ -186,19 +191,15 @@ class Predictor:
         ``viscous``: damping besides the mechanism's own, (n,); ``gain``: factor of each input,
         (m,); ``start``: state at the first sample, (2n,), at rest by default.
         """
-        n, m = self.mechanism.n, self.mechanism.m
-        friction = np.column_stack([*coulomb, np.full(n, STRIBECK), viscous])
-        x = np.array(self.x0 if start is None else start)
-        q, applied = np.zeros(n), np.zeros(m)
-        counts = np.array([0, STEPS, 0], dtype=np.int64)
-        drive, held = np.zeros((3, m)), np.zeros((1, m))
-        past, work = np.tile(x[:n], (1, 1)), np.zeros((8, max(n * n, 2 * n)))
-        rows = np.empty((len(record), 2 * n))
+        n, memory = self.mechanism.n, self._memory
+        memory["x"][:] = self.x0 if start is None else start
+        memory["past"][:], memory["drive"][:] = memory["x"][:n], 0.0
+        memory["counts"][:], memory["parameters"][:] = (0, STEPS, 0), parameters
+        memory["friction"][:] = np.column_stack([*coulomb, np.full(n, STRIBECK), viscous])
+        rows, noise = np.empty((len(record), 2 * n)), np.zeros(n)
         self._module.play(
-            record.t, record.u * gain, rows, counts, x, drive, held, past, self._delays,
-            parameters, friction, self._stops, self._amplifier, self._gap, self._encoder,
-            self._phase, self._pushes, self._noise, q, applied, work,
-        )  # fmt: skip
+            record.t, record.u * gain, rows, noise, memory.block, *self._sizes.values()
+        )
         return rows
 
     def positions(self, record: MotionRecord, states: FloatArray, delay: float) -> FloatArray:

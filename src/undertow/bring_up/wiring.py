@@ -17,7 +17,7 @@ from typing import Self
 
 import numpy as np
 
-from undertow.bring_up.motion import MotionRecord, Predictor
+from undertow.bring_up.motion import MotionRecord, Predictor, input_gains
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, RigWrapper
 
@@ -217,8 +217,7 @@ def push_response(predictor: Predictor, record: MotionRecord, i: int, calm: Floa
     not moved it.
     """
     belief, n = predictor.mechanism, predictor.mechanism.n
-    full = np.abs(np.array(belief.input_matrix.subs(belief.substitution), dtype=float)).diagonal()
-    full = full * belief.input_limits
+    full = input_gains(belief).diagonal() * belief.input_limits
     push = float(np.abs(record.u[:, i]).max()) / belief.input_limits[i]
     predicted = []
     for shares in itertools.product(LEVELS, repeat=belief.m):

@@ -16,6 +16,7 @@ from undertow.bring_up.motion import (
     MotionRecord,
     Predictor,
     doublets,
+    input_gains,
     perform,
     ramp,
     rest_state,
@@ -155,11 +156,11 @@ class _Wizard:
         remedy = "" if said == "right" else remedy
         self.findings.append(RigFinding(check, part, measured, expected, said, remedy))
 
-    def _wait_for_rest(self, rig: Rig, seconds: float = CALM) -> FloatArray:
-        """Leave the inputs at zero until nothing moves, or for so long: the last motion, (n,)."""
+    def _wait_for_rest(self, rig: Rig) -> FloatArray:
+        """Leave the inputs at zero until nothing moves, or for ``CALM``: the last motion, (n,)."""
         count = round(LOOK / self.rig.period)
         moved = np.full(self.belief.n, np.inf)
-        for _ in range(max(1, round(seconds / LOOK))):
+        for _ in range(round(CALM / LOOK)):
             loop = control_loop(rig, lambda _: np.zeros(self.belief.m), count)
             rows = [np.array(measured.q, dtype=float) for measured, _ in loop]
             moved = np.ptp(np.array(rows), axis=0)
@@ -314,9 +315,8 @@ class _Wizard:
     def _modest(self, u: FloatArray) -> FloatArray:
         """Return inputs small enough for what the model says they do: within half the guards."""
         belief, n = self.belief, self.belief.n
-        gain = np.abs(np.array(belief.input_matrix.subs(belief.substitution), dtype=float))
         coulomb = np.zeros((2, n))
-        coulomb[:, : belief.m] = gain @ self.breakaway
+        coulomb[:, : belief.m] = input_gains(belief) @ self.breakaway
         t = np.arange(len(u), dtype=np.float64) * self.rig.period
         for _ in range(20):
             states = self.predictor.states(

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from undertow.base import INTERRUPTED, InvalidInputError, write_file
+from undertow.base import InvalidInputError, write_file
 from undertow.cli.options import option
-from undertow.cli.terminal import command, completed, exit_unless, show
+from undertow.cli.terminal import command, completed, end_interrupted, exit_unless, show
 
 if TYPE_CHECKING:
     from undertow.studies.campaign import Outcome
@@ -109,7 +109,6 @@ def campaign(
                 )
             )
         if not whole:
-            show("interrupted: finished shards are kept; go on with --resume", stderr=True)
-            raise typer.Exit(INTERRUPTED)
+            end_interrupted("interrupted: finished shards are kept; go on with --resume")
         show(*report(task, outcomes[0]))
         exit_unless(outcomes[0].complete)

@@ -39,11 +39,8 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
     for name, percent in parse_values(within).items():
         one_of(f"--within {name}={percent:g}", name, own)
         if not 0 < percent < 100:
-            raise InvalidInputError(
-                f"--within {name}={percent:g}",
-                value=f"{percent:g}",
-                limit="between 0 and 100 per cent",
-            )
+            what, limit = f"--within {name}={percent:g}", "between 0 and 100 per cent"
+            raise InvalidInputError(what, value=f"{percent:g}", limit=limit)
         ends = own[name] * (1 - percent / 100), own[name] * (1 + percent / 100)
         box[name] = (min(ends), max(ends))
     return box

@@ -137,59 +137,25 @@ def export_c(
     from undertow.studies.rigs.export import csv, flip_bits, held_on_rigs, measure, notes, tables
 
     options.check_control(control, ("designed", "one-time"), surface)
-    if every == (name is not None):
-        raise InvalidInputError(
-            "mechanism to export",
-            value="a name and --all" if every else "neither a name nor --all",
-            limit="one of them",
-            remedy="Write for instance: undertow export c rotary_pendulum --out firmware",
-        )
-    if out is None and not (check or report or rigs or bit_flips):
-        raise InvalidInputError(
-            "what to do with the C",
-            value="none of --out, --check, --rigs, --bit-flips, --report",
-            limit="one of them at least",
-            remedy="Write for instance --out firmware",
-        )
-    if platforms and out is None:
-        raise InvalidInputError(
-            "what to do with --for",
-            value="no --out",
-            limit="a folder for what is written",
-            remedy="Write for instance --out units",
-        )
+    wanted = check or report or bool(rigs) or bit_flips
+    _check_request(name, out, every=every, wanted=wanted, carried=bool(platforms))
     check_out(out)
-
-    def chosen_surface(belief: Mechanism, law: ReachingLaw) -> Surface:
-        if surface is not None:
-            return parse_surface(belief, surface)
-        if control != "one-time":
-            return first_surface(belief)
-        goal = objective_named(objective, belief, 60.0)
-        loop = ClosedLoop(belief, goal, reaching=law)
-        best = Optimiser(loop, seed=seed).require(parse_start(belief, start)).surface
-        assert best is not None  # require() raises otherwise
-        return best
-
-    def estimator(belief: Mechanism) -> EstimatorStep:
-        if velocity == "kalman":
-            encoders = bench_for(belief).encoders
-            counts = [encoders[c.name].resolution for c in belief.coordinates]
-            return KalmanStep(tuple(count / math.sqrt(12) for count in counts))
-        if velocity == "super-twisting":
-            return SuperTwistingStep(acceleration)
-        return DerivativeStep(time_constant)
+    law = ReachingLaw(eta, layer)
 
     def controller(belief: Mechanism) -> EmbeddedController:
-        law = ReachingLaw(eta, layer)
-        used = chosen_surface(belief, law)
+        if surface is not None:
+            used = parse_surface(belief, surface)
+        elif control == "one-time":
+            used = _first_optimum(belief, objective, law, start, seed)
+        else:
+            used = first_surface(belief)
         check_surface(belief, used)
         return EmbeddedController(
             belief,
             used,
             law,
             period=period,
-            differentiator=estimator(belief),
+            differentiator=_estimator(belief, velocity, time_constant, acceleration),
             slew=slew,
             missed=missed,
             rows=rows,
@@ -233,6 +199,56 @@ def export_c(
         show(*tables(entries), *map(Text, notes(made[0].real, states, compiler)))
     show(*write(out, lambda: written))
     exit_unless(good)
+
+
+def _check_request(
+    name: str | None, out: Path | None, *, every: bool, wanted: bool, carried: bool
+) -> None:
+    """Refuse options of ``export c`` that leave open what is to be done, or with what."""
+    if every == (name is not None):
+        raise InvalidInputError(
+            "mechanism to export",
+            value="a name and --all" if every else "neither a name nor --all",
+            limit="one of them",
+            remedy="Write for instance: undertow export c rotary_pendulum --out firmware",
+        )
+    if out is None and not wanted:
+        raise InvalidInputError(
+            "what to do with the C",
+            value="none of --out, --check, --rigs, --bit-flips, --report",
+            limit="one of them at least",
+            remedy="Write for instance --out firmware",
+        )
+    if carried and out is None:
+        raise InvalidInputError(
+            "what to do with --for",
+            value="no --out",
+            limit="a folder for what is written",
+            remedy="Write for instance --out units",
+        )
+
+
+def _first_optimum(
+    belief: Mechanism, objective: str, law: ReachingLaw, start: list[str] | None, seed: int
+) -> Surface:
+    """Return the surface that is best from the start."""
+    loop = ClosedLoop(belief, objective_named(objective, belief, 60.0), reaching=law)
+    best = Optimiser(loop, seed=seed).require(parse_start(belief, start)).surface
+    assert best is not None  # require() raises otherwise
+    return best
+
+
+def _estimator(
+    belief: Mechanism, velocity: str, time_constant: float, acceleration: float
+) -> EstimatorStep:
+    """Return where velocities come from, by its name."""
+    if velocity == "kalman":
+        encoders = bench_for(belief).encoders
+        counts = [encoders[c.name].resolution for c in belief.coordinates]
+        return KalmanStep(tuple(count / math.sqrt(12) for count in counts))
+    if velocity == "super-twisting":
+        return SuperTwistingStep(acceleration)
+    return DerivativeStep(time_constant)
 
 
 @command(

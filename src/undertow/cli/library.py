@@ -9,12 +9,20 @@ from typing import Annotated
 
 import typer
 
-from undertow.base import INTERRUPTED
 from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.options import folder, option
 from undertow.cli.parsing import mechanism_named, parse_task
-from undertow.cli.terminal import check_out, command, completed, progress_bar, show, terminal, write
+from undertow.cli.terminal import (
+    check_out,
+    command,
+    completed,
+    end_interrupted,
+    progress_bar,
+    show,
+    terminal,
+    write,
+)
 from undertow.closed_loop import ClosedLoop
 from undertow.mechanisms import LIBRARY
 from undertow.objective import USUAL
@@ -101,12 +109,14 @@ def survey(
         ended, part = divmod(len(entries), len(names))
         left = dict.fromkeys(goals[ended:], names)
         left[goals[ended]] = names[part:]
-        show(f"interrupted: {len(entries)} of {len(goals) * len(names)} are done. The others, with "
-             "the options as before:", stderr=True)  # fmt: skip
-        for goal, others in left.items():
-            words = " ".join(f"--only {name}" for name in others)
-            show(f"undertow survey --objective {goal} {words}", stderr=True)
-        raise typer.Exit(INTERRUPTED)
+        end_interrupted(
+            f"interrupted: {len(entries)} of {len(goals) * len(names)} are done. The others, with "
+            "the options as before:",
+            *(
+                f"undertow survey --objective {goal} {' '.join(f'--only {one}' for one in others)}"
+                for goal, others in left.items()
+            ),
+        )
 
 
 @command("undertow models robots", "undertow models robots --no-simulate --out tables")
@@ -134,8 +144,7 @@ def models(
     show(study.read_table(rows), study.refused_table(rows), least=100)
     show(study.summary(rows), *written, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
     if not whole:
-        show("interrupted: the files after these are not read", stderr=True)
-        raise typer.Exit(INTERRUPTED)
+        end_interrupted("interrupted: the files after these are not read")
 
 
 @command(

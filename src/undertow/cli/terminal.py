@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import Any, NoReturn, ParamSpec
 
 import typer
 from rich import progress as bars
@@ -217,6 +217,12 @@ def enter_pressed(question: str) -> bool:
         return True
     show(question)
     return bool(sys.stdin.readline())
+
+
+def end_interrupted(*lines: str) -> NoReturn:
+    """End a command that Ctrl-C has cut short, with what is to be said of it."""
+    show(*lines, stderr=True)
+    raise typer.Exit(INTERRUPTED)
 
 
 def exit_unless(good: bool, code: int = 1) -> None:

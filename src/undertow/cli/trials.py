@@ -8,9 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from undertow.base import INTERRUPTED
 from undertow.cli.options import option
-from undertow.cli.terminal import check_out, command, completed, show, write
+from undertow.cli.terminal import check_out, command, completed, end_interrupted, show, write
 
 
 @command(
@@ -87,8 +86,7 @@ def trials(
     written = write(out, lambda: files) if files else ()
     show(*([] if report is None else [report]), *written)
     if not whole:
-        show(_how_to_go_on(what, out), stderr=True)
-        raise typer.Exit(INTERRUPTED)
+        end_interrupted(_how_to_go_on(what, out))
 
 
 def _how_to_go_on(what: str, out: Path | None) -> str:

@@ -69,6 +69,18 @@ def display(unit: str, rate: bool = False) -> tuple[float, str]:
     return factor, f"{name}/s" if rate else name
 
 
+def symbol_of(name: str, rate: bool = False) -> str:
+    """Return a coordinate, or its rate, as it is written on plots.
+
+    >>> symbol_of("phi"), symbol_of("q_1", rate=True)
+    ('φ', 'dq_1/dt')
+    """
+    symbol = _GREEK.get(name, name)
+    if not rate:
+        return symbol
+    return f"{symbol}\N{COMBINING DOT ABOVE}" if len(symbol) == 1 else f"d{symbol}/dt"
+
+
 def axis(trajectory: Trajectory, name: str) -> tuple[FloatArray, str]:
     """Return the values of a state in display units, and its label."""
     values = trajectory[name]
@@ -76,11 +88,7 @@ def axis(trajectory: Trajectory, name: str) -> tuple[FloatArray, str]:
     index = trajectory.mechanism.state_names.index(name) % len(coordinates)
     rate = name == str(coordinates[index].velocity)
     factor, unit = display(coordinates[index].unit, rate)
-    stem = coordinates[index].name
-    symbol = _GREEK.get(stem, stem)
-    if rate:
-        symbol = f"{symbol}\N{COMBINING DOT ABOVE}" if len(symbol) == 1 else f"d{symbol}/dt"
-    return factor * values, f"{symbol} ({unit})"
+    return factor * values, f"{symbol_of(coordinates[index].name, rate)} ({unit})"
 
 
 def state_series(axes: Axes, trajectory: Trajectory, name: str, **line: Any) -> None:

@@ -25,15 +25,12 @@ from PIL import Image
 from undertow.base import manifest, positive
 from undertow.closed_loop import Trajectory
 from undertow.closed_loop.figures import COLOURS, figure_bytes, style
-from undertow.display.sketches import Box, Disc, Label, Line, Sketch, sketch
+from undertow.display.sketches import Box, Disc, Label, Line, Sketch, projected, sketch
 from undertow.models import FloatArray, Mechanism, check_symbols, vocabulary
 from undertow.symbolic import compile_expressions
 
 #: A motion is shown until all of it stays within this part of where it has been.
 SETTLED = 0.03
-
-#: Direction of the y axis in the oblique view: to the right and up, shortened.
-OBLIQUE = (0.42, 0.30)
 
 _KINDS: dict[str, dict[str, Any]] = {
     "link": {"color": COLOURS["blue"], "linewidth": 4.0, "solid_capstyle": "round"},
@@ -118,8 +115,11 @@ class Film:
     ) -> Film:  # fmt: skip
         """Evaluate a sketch at positions, (F, n), see :func:`evaluator`."""
         points, angles, tip = place(q)
-        flat = tuple(_project(p, drawn.view) for p in points)
-        return cls(mechanism, drawn, t, q, u, flat, angles, _project(tip, drawn.view), whole, speed)
+        *flat, end = (
+            np.stack(projected(tuple(np.moveaxis(p, -1, 0)), drawn.view), axis=-1)
+            for p in (*points, tip)
+        )
+        return cls(mechanism, drawn, t, q, u, tuple(flat), angles, end, whole, speed)
 
     @property
     def span(self) -> str:
@@ -222,15 +222,13 @@ class Picture:
     ----------
     mechanism
         What is drawn.
-    size
-        Width and height, pixels.
     """
 
-    def __init__(self, mechanism: Mechanism, size: int = 360) -> None:
+    def __init__(self, mechanism: Mechanism) -> None:
         self._mechanism, self._sketch = mechanism, sketch(mechanism)
         self._place = evaluator(mechanism, self._sketch)
         self._window = self._film(_reach(mechanism)).window
-        self._figure = Figure(figsize=(size / 100, size / 100), dpi=100)
+        self._figure = Figure(figsize=(3.6, 3.6), dpi=100)
         self._canvas: Any = FigureCanvasAgg(self._figure)
         self._axes = self._figure.add_axes((0, 0, 1, 1))
 
@@ -306,16 +304,6 @@ def evaluator(mechanism: Mechanism, figure: Sketch) -> Callable[[FloatArray], Pl
         return at, turned, take(3)
 
     return place
-
-
-def _project(points: FloatArray, view: str) -> FloatArray:
-    """Return points (…, 3) in the plane of a view, (…, 2)."""
-    x, y, z = np.moveaxis(points, -1, 0)
-    if view == "front":
-        return np.stack([x, z], axis=-1)
-    if view == "top":
-        return np.stack([x, y], axis=-1)
-    return np.stack([x + OBLIQUE[0] * y, z + OBLIQUE[1] * y], axis=-1)
 
 
 def _settled(trajectory: Trajectory) -> float:

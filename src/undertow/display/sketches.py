@@ -21,6 +21,20 @@ Point = tuple[Any, Any, Any]
 View = Literal["front", "top", "oblique"]
 
 
+#: Direction of the y axis in the oblique view: to the right and up, shortened.
+OBLIQUE = (0.42, 0.30)
+
+
+def projected(point: Point, view: View) -> tuple[Any, Any]:
+    """Return a point, or many as arrays, in the plane of a view."""
+    x, y, z = point
+    if view == "top":
+        return x, y
+    if view == "front":
+        return x, z
+    return x + OBLIQUE[0] * y, z + OBLIQUE[1] * y
+
+
 @dataclass(frozen=True)
 class Line:
     """A line through points: a ``"link"``, a ``"rope"``, or part of the ``"frame"``.

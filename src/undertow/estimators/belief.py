@@ -25,7 +25,15 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, check_fields, checked, floats, one_of, positive
+from undertow.base import (
+    InvalidInputError,
+    check_fields,
+    checked,
+    floats,
+    one_for_each,
+    one_of,
+    positive,
+)
 from undertow.closed_loop import Ensemble, Risk
 from undertow.law import LawLayout
 from undertow.models import AT_REST, FloatArray, Mechanism, linear_accelerations, number_of
@@ -188,16 +196,8 @@ class Belief:
                     remedy="Leave certain parameters out",
                 )
         for name, most in (("noise", self.noise), ("bound", self.bound)):
-            numbers = np.asarray(1.0 if most is None else most, dtype=float)
-            if (
-                numbers.shape not in ((), (self.mechanism.n,))
-                or not (np.isfinite(numbers) & (numbers > 0)).all()
-            ):
-                raise InvalidInputError(
-                    f"{name} of a belief",
-                    value=most,
-                    limit=f"one number, or {self.mechanism.n}, finite and > 0",
-                )
+            if most is not None:
+                one_for_each(f"{name} of a belief", most, self.mechanism.n)
 
     @classmethod
     @checked

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Measurement
 from undertow.symbolic import numba
@@ -82,19 +82,6 @@ class Measured:
         return self._x
 
 
-def positive(what: str, values: ArrayLike, n: int) -> FloatArray:
-    """Return one positive number per coordinate, (n,), from one or n of them."""
-    array = np.asarray(values, dtype=float)
-    if array.shape not in ((), (n,)) or not ((array > 0).all() and np.isfinite(array).all()):
-        raise InvalidInputError(
-            what,
-            value=values,
-            limit=f"one number or {n}, finite and > 0",
-            remedy="One number serves all coordinates",
-        )
-    return np.array(np.broadcast_to(array, (n,)))
-
-
 @numba.njit(cache=True, nogil=True)
 def _filtered(x: FloatArray, last: FloatArray, q: FloatArray, h: float, rest: FloatArray) -> None:
     """Tustin's form of s/(τ s + 1), coordinate by coordinate."""
@@ -137,8 +124,8 @@ class _Differentiator:
     """What both share: a state, a clock, a first measurement."""
 
     def __init__(self, mechanism: Mechanism, period: float) -> None:
-        self.mechanism = mechanism
-        self.period = float(positive("period of an estimator", [period], 1)[0])
+        positive("period of an estimator", period)
+        self.mechanism, self.period = mechanism, float(period)
         self._x = np.zeros(2 * mechanism.n)
         self._t = math.nan
         self.disturbance = np.zeros(mechanism.m)
@@ -172,7 +159,7 @@ class FilteredDerivative(_Differentiator):
         self, mechanism: Mechanism, period: float = 0.001, time_constant: ArrayLike = 0.01
     ) -> None:
         super().__init__(mechanism, period)
-        self._rest = positive("time_constant of a derivative", time_constant, mechanism.n)
+        self._rest = one_for_each("time_constant of a derivative", time_constant, mechanism.n)
         self._last = np.zeros(mechanism.n)
 
     def reset(self, x0: ArrayLike) -> None:
@@ -210,7 +197,7 @@ class SuperTwisting(_Differentiator):
         self, mechanism: Mechanism, period: float = 0.001, acceleration: ArrayLike = 200.0
     ) -> None:
         super().__init__(mechanism, period)
-        self._bound = positive("acceleration of a differentiator", acceleration, mechanism.n)
+        self._bound = one_for_each("acceleration of a differentiator", acceleration, mechanism.n)
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
         """Return the differentiator's (z₀, z₁); the inputs are not used."""

@@ -24,9 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.estimators.belief import EVEN, Belief, ParameterEstimate
-from undertow.estimators.interface import positive
 from undertow.models import FloatArray, Mechanism, require_smooth
 from undertow.plants import Measurement
 from undertow.plants.stepping import compiled_module
@@ -312,14 +311,13 @@ class KalmanFilter:
             mechanism.x,
         )
         n, m = mechanism.n, mechanism.m
-        settings = disturbance_drift, delay, parameter_drift
-        if not all(0 <= setting < math.inf for setting in settings):
-            raise InvalidInputError(
-                "disturbance_drift, delay and parameter_drift of a Kalman filter",
-                value=settings,
-                limit="finite and ≥ 0",
-                remedy="0 turns each off",
-            )
+        positive("period of an estimator", period)
+        positive(
+            "disturbance_drift, delay and parameter_drift of a Kalman filter",
+            (disturbance_drift, delay, parameter_drift),
+            "0 turns each off",
+            zero=True,
+        )
         if belief is not None and belief.mechanism.fingerprint != mechanism.fingerprint:
             raise InvalidInputError(
                 "belief of a Kalman filter",
@@ -339,8 +337,7 @@ class KalmanFilter:
             "acceleration_noise": acceleration_noise, "disturbance_drift": disturbance_drift,
             "delay": delay, "belief": belief, "parameter_drift": parameter_drift,
         }  # fmt: skip
-        self.mechanism = mechanism
-        self.period = float(positive("period of an estimator", [period], 1)[0])
+        self.mechanism, self.period = mechanism, float(period)
         self._known = known = 0 if belief is None else len(belief.tolerances)
         self._learnt = 2 * n + (m if disturbance_drift > 0 else 0)
         size = self._learnt + known
@@ -354,8 +351,9 @@ class KalmanFilter:
         self._odd: FloatArray = memory["odd"]
         self.felt: FloatArray = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
-        self._variance[:] = positive("position_noise", position_noise, n) ** 2
-        memory["noise"][n : 2 * n] = positive("acceleration_noise", acceleration_noise, n) ** 2
+        self._variance[:] = one_for_each("position_noise", position_noise, n) ** 2
+        unknown = one_for_each("acceleration_noise", acceleration_noise, n)
+        memory["noise"][n : 2 * n] = unknown**2
         memory["noise"][2 * n : self._learnt] = disturbance_drift**2
         memory["limits"][:] = self._limits = mechanism.input_limits
         self.parameters: FloatArray = memory["parameters"]
@@ -419,12 +417,12 @@ class KalmanFilter:
         information = 0.5 * (information + information.T)
         return ParameterEstimate(self._x[place].copy(), information, int(self._count[0]))
 
-    def _at_rest(self, seconds: float = 0.5) -> KalmanFilter:
-        """Return a filter like this one, after so long at rest at the target, s."""
+    def _at_rest(self) -> KalmanFilter:
+        """Return a filter like this one, after half a second at rest at the target."""
         double = KalmanFilter(**self._arguments)
         n, m = self.mechanism.n, self.mechanism.m
         double.reset(np.zeros(2 * n))
-        for k in range(round(seconds / self.period)):
+        for k in range(round(0.5 / self.period)):
             double.estimate(Measurement(k * self.period, np.zeros(n)), np.zeros(m))
         return double
 

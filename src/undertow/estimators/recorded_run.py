@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import InvalidInputError
+from undertow.base import between
 from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, control_loop
@@ -64,12 +64,7 @@ def run_recorded(
     rig's clock; the record has one line per sample.
     """
     count = round(seconds / rig.period)
-    if not 1 <= count <= 10_000_000:
-        raise InvalidInputError(
-            "length of a run on a rig",
-            value=f"{seconds:g} s",
-            limit=f"{rig.period:g} s to {1e7 * rig.period:g} s, 1 to 10000000 samples",
-        )
+    between("samples of a run on a rig", count, 1, 10_000_000)
     last: FloatArray = np.zeros(0)
     nothing = np.full(1, np.nan)
     rows: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = []

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from undertow.base import (
     InvalidInputError,
     at_least,
+    between,
     check_fields,
     checked,
     positive,
@@ -89,26 +90,16 @@ class BalancingTask:
         check_fields(self)
         positive("period of an environment, s", self.period, "5 ms suits most")
         positive("escape of an environment", self.escape, "Leave it out for the usual value")
-        for given in self.mechanism.inputs:
-            if not math.isfinite(given.limit):
-                raise InvalidInputError(
-                    f"limit of input '{given.name}' of '{self.mechanism.name}'",
-                    value=given.limit,
-                    limit="finite: an action of 1 is the whole input",
-                    remedy=f"Give the mechanism an Input({given.name!r}, limit=…)",
-                )
+        for given in self.mechanism.inputs:  # an action of 1 is the whole input
+            what = f"limit of input '{given.name}' of '{self.mechanism.name}'"
+            positive(what, given.limit, f"Give the mechanism an Input({given.name!r}, limit=…)")
         objective = self.objective
         if objective is None:
             objective = objective_for(self.mechanism, horizon=HORIZON)
         objective = objective.on(self.mechanism)
         object.__setattr__(self, "objective", objective)
-        if not 1 <= objective.horizon / self.period <= MOST_STEPS:
-            raise InvalidInputError(
-                "horizon of an environment",
-                value=f"{objective.horizon:g} s",
-                limit=f"1 to {MOST_STEPS} periods of {self.period:g} s",
-                remedy="Change the objective's horizon, or the period",
-            )
+        steps, remedy = objective.horizon / self.period, "Change the horizon, or the period"
+        between("horizon of an environment", steps, 1, MOST_STEPS, "periods", remedy)
         if self.penalty is None:
             object.__setattr__(self, "penalty", objective.horizon)
         at_least("penalty of an environment", self.paid, 0, "0 pays nothing for falling")

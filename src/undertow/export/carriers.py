@@ -17,8 +17,6 @@ from undertow.export.fmi import fmi_units
 from undertow.export.names import ascii_words, c_name
 from undertow.export.sources import common, controller_files, render
 
-PLATFORMS = ("fmi", "ros2", "simulink")
-
 
 def carriers(
     controller: EmbeddedController,
@@ -56,7 +54,7 @@ def carriers(
     }
     made: dict[str, bytes] = {}
     for platform in dict.fromkeys(platforms):
-        one_of("platform to export for", platform, PLATFORMS)
+        one_of("platform to export for", platform, makers)
         made |= makers[platform]()
     return made
 

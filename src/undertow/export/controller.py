@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
 from undertow.law import LawLayout, Plan, ReachingLaw, SlidingModeLaw, Surface, check_surface
@@ -102,15 +102,8 @@ class EmbeddedController:
     def slew_rates(self) -> FloatArray:
         """Largest rate of each input, its unit per second, (m,); infinite where there is none."""
         m = self.mechanism.m
-        rates = np.atleast_1d(np.asarray(np.inf if self.slew is None else self.slew, dtype=float))
-        if rates.shape not in {(1,), (m,)} or not (rates > 0).all():
-            raise InvalidInputError(
-                "slew rate",
-                value=self.slew,
-                limit=f"one number > 0, or {m} of them",
-                remedy="Leave it out for no limit",
-            )
-        return np.array(np.broadcast_to(rates, (m,)))
+        slew = np.inf if self.slew is None else self.slew
+        return one_for_each("slew rate", slew, m, infinite=True)
 
     @property
     def most_rows(self) -> int:
@@ -140,13 +133,11 @@ class EmbeddedController:
         ):
             if not good:
                 raise InvalidInputError(what, value=value, limit=limit)
-        if not np.isfinite(limits).all():
-            raise InvalidInputError(
-                f"input limits of '{self.mechanism.name}'",
-                value=limits.tolist(),
-                limit="finite",
-                remedy="Name what the actuators can deliver: mechanism.with_input_limit",
-            )
+        positive(
+            f"input limits of '{self.mechanism.name}'",
+            limits,
+            "Name what the actuators can deliver: mechanism.with_input_limit",
+        )
         for law in self.laws:
             check_surface(self.mechanism, law.surface)
             layer = law.reaching.vector(self.mechanism.m)[self.mechanism.m :]
@@ -169,11 +160,12 @@ class EmbeddedController:
     @cached_property
     def laws(self) -> tuple[SlidingModeLaw, ...]:
         """The laws of the plan, one for each surface."""
-        plan = self.plan
-        return tuple(
-            SlidingModeLaw(self.mechanism, surface, plan.at(t)[1] or self.reaching)
-            for surface, t in zip(plan.surfaces, plan.times, strict=True)
-        )
+        return self.laws_of(self.plan)
+
+    def laws_of(self, plan: Plan) -> tuple[SlidingModeLaw, ...]:
+        """Return the laws of a plan, one for each surface."""
+        pairs = zip(plan.surfaces, plan.laws(self.reaching), strict=True)
+        return tuple(SlidingModeLaw(self.mechanism, surface, law) for surface, law in pairs)
 
     def starts(self, plan: Plan) -> list[int]:
         """Return the periods, from the start of a plan, at which its surfaces take over."""
@@ -250,8 +242,7 @@ def plan_numbers(
     m = controller.mechanism.m
     layout = LawLayout(controller.mechanism.n, m)
     rows = []
-    for surface, t in zip(plan.surfaces, plan.times, strict=True):
-        law = plan.at(t)[1] or controller.reaching
+    for surface, law in zip(plan.surfaces, plan.laws(controller.reaching), strict=True):
         values = np.concatenate([surface.vector, law.vector(m)])
         held = np.array([as_held(v, controller.real) for v in values.tolist()])
         rows.append((held[layout.surface], held[layout.eta], held[layout.layer]))

@@ -20,9 +20,9 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.base import one_for_each
 from undertow.estimators import Estimator, FilteredDerivative, KalmanFilter, SuperTwisting
-from undertow.estimators.interface import positive
-from undertow.export.names import LARGEST, template
+from undertow.export.names import LARGEST, macros, template
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Measurement
 from undertow.symbolic import C99Emitter, Real, Tape, literal
@@ -93,7 +93,7 @@ class DerivativeStep:
 
     def gains(self, n: int) -> FloatArray:
         """Return τ for each coordinate, (n,)."""
-        return positive("time_constant of a derivative", self.time_constant, n)
+        return one_for_each("time_constant of a derivative", self.time_constant, n)
 
     def build(self, tape: Tape, symbols: StepSymbols) -> tuple[sp.Expr, sp.Expr]:
         """Return the new position and velocity of the memory."""
@@ -127,7 +127,7 @@ class SuperTwistingStep:
 
     def gains(self, n: int) -> FloatArray:
         """Return L for each coordinate, (n,)."""
-        return positive("acceleration of a differentiator", self.acceleration, n)
+        return one_for_each("acceleration of a differentiator", self.acceleration, n)
 
     def build(self, tape: Tape, symbols: StepSymbols) -> tuple[sp.Expr, sp.Expr]:
         """Return the new position and velocity of the memory."""
@@ -170,8 +170,8 @@ class KalmanStep:
     def noises(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the noises of positions and accelerations, (n,) each; both must be positive."""
         return (
-            positive("position_noise", self.position_noise, n),
-            positive("acceleration_noise", self.acceleration_noise, n),
+            one_for_each("position_noise", self.position_noise, n),
+            one_for_each("acceleration_noise", self.acceleration_noise, n),
         )
 
     def gains(self, mechanism: Mechanism, period: float) -> FloatArray:
@@ -211,45 +211,41 @@ class Observer:
         return x
 
 
-def build_acceleration_graph(mechanism: Mechanism, tape: Tape) -> list[sp.Expr]:
-    """Return q̈(x, u), (3)-(4), on a tape."""
-    n, m = mechanism.n, mechanism.m
+def acceleration_code(mechanism: Mechanism, parameters: Mapping[sp.Symbol, str], real: Real) -> str:
+    """Return the C of q̈(x, u), (3)-(4), into ``rate``; ``parameters`` are the texts of theirs."""
+    n, m, tape = mechanism.n, mechanism.m, Tape()
     M = sp.Matrix(n, n, tape.let_all(list(mechanism.mass_matrix)))
     factor = tape.cholesky(sp.Matrix(n, n, lambda i, j: M[min(i, j), max(i, j)]))
     driven = mechanism.input_matrix * sp.Matrix(mechanism.u)
     total = [f + (driven[i] if i < m else 0) for i, f in enumerate(mechanism.force)]
-    return list(factor.solve(sp.Matrix(tape.let_all(total))))
+    rates = factor.solve(sp.Matrix(tape.let_all(total)))
+    names = {x: f"x[{i}]" for i, x in enumerate(mechanism.x)}
+    names |= {u: f"u[{i}]" for i, u in enumerate(mechanism.u)}
+    emitter = C99Emitter(tape, {**names, **parameters}, real)
+    return emitter.statements({f"rate[{i}]": a for i, a in enumerate(rates)})
 
 
 EstimatorStep = DifferentiatorStep | KalmanStep
 
 
 def estimate_code(
-    step: EstimatorStep,
-    mechanism: Mechanism,
-    period: float,
-    parameters: Mapping[sp.Symbol, str],
-    real: Real,
+    step: EstimatorStep, mechanism: Mechanism, period: float, real: Real
 ) -> dict[str, str]:
     """Return the parts of the templates that make the state from positions.
 
-    ``period`` is the controller's, s; ``parameters`` have the C text of the parameters' symbols.
+    ``period`` is the controller's, s.
     """
 
     def row(values: list[float]) -> str:
         return ", ".join(literal(v, real) for v in values)
 
-    tape = Tape()
     if isinstance(step, KalmanStep):
-        names = {x: f"x[{i}]" for i, x in enumerate(mechanism.x)}
-        names |= {u: f"u[{i}]" for i, u in enumerate(mechanism.u)}
-        rates = {f"rate[{i}]": a for i, a in enumerate(build_acceleration_graph(mechanism, tape))}
-        body = C99Emitter(tape, {**names, **parameters}, real).statements(rates)
+        body = acceleration_code(mechanism, macros(mechanism.parameters), real)
         rows = [f"    {{{row(r)}}}," for r in step.gains(mechanism, period).tolist()]
         values = {"gains": "\n".join(rows), "step": body, "half": literal(0.5, real)}
         text = template("observer.c").substitute(values)
         return {"estimate": text.rstrip(), "memory": "", "place": "", "remember": ""}
-    symbols = StepSymbols.new()
+    tape, symbols = Tape(), StepSymbols.new()
     position, velocity = step.build(tape, symbols)
     names = {
         symbols.gain: "gain",

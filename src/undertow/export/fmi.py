@@ -6,16 +6,16 @@ M(q) q̈ = f(q, q̇) + B u by Runge and Kutta's fourth-order step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
 from undertow.export.co_simulation import Groups, Unit, Variable
 from undertow.export.controller import EmbeddedController, plan_numbers
-from undertow.export.estimate import build_acceleration_graph
+from undertow.export.estimate import acceleration_code
 from undertow.export.sources import common, controller_files, helpers
 from undertow.models import Coordinate, Mechanism
-from undertow.symbolic import C99Emitter, Tape
 
 
 def _states(coordinates: Sequence[Coordinate]) -> list[tuple[str, str, str]]:
@@ -57,63 +57,45 @@ def controller_variables(controller: EmbeddedController) -> Groups:
         for k in range(1, columns + 1)
     ]
     numbers = [f"[{i}]" for i in range(1, m + 1)]
+    gains = {
+        "eta": (eta, "reaching gain, units of s per second"),
+        "layer": (layer, "half-width of the boundary layer, units of s"),
+    }
+    arm = "rising: let the output on again after a lost sensor or a fault"
     whole = "use the measured rates; otherwise they are estimated from the positions"
+    bits = "status bits of the last period, as in the C header"
+
+    def tunable(name: str, value: float, words: str = "", low: float = -math.inf) -> Variable:
+        return Variable(name, "parameter", "tunable", float(value), "", words, low=low)
+
+    def output(name: str, unit: str = "", words: str = "", kind: str = "Float64") -> Variable:
+        return Variable(name, "output", "discrete", 0.0, unit, words, kind)
+
     return {
         "MEASURED": [
             Variable(name, "input", "continuous", 0.0, unit, words, any_number=True)
             for name, unit, words in states
         ],
-        "ARM": [
-            Variable(
-                "loop.arm", "input", "discrete", type="Boolean",
-                description="rising: let the output on again after a lost sensor or a fault",
-            )
-        ],
+        "ARM": [Variable("loop.arm", "input", "discrete", 0.0, "", arm, "Boolean")],
         "RATES_MEASURED": [
             Variable("loop.rates_measured", "parameter", "fixed", 0.0, "", whole, "Boolean")
         ],
         "SURFACE": [
+            *(tunable(name, v) for name, v in zip(entries, surface, strict=True)),
             *(
-                Variable(name, "parameter", "tunable", float(v))
-                for name, v in zip(entries, surface, strict=True)
-            ),
-            *(
-                Variable(
-                    f"reaching.{name}{index}", "parameter", "tunable", float(v), low=0.0,
-                    description=words,
-                )
-                for name, values, words in (
-                    ("eta", eta, "reaching gain, units of s per second"),
-                    ("layer", layer, "half-width of the boundary layer, units of s"),
-                )
+                tunable(f"reaching.{name}{index}", v, words, 0.0)
+                for name, (values, words) in gains.items()
                 for index, v in zip(numbers, values, strict=True)
             ),
         ],
         "OUTPUTS": [
-            Variable(u.name, "output", "discrete", 0.0, u.unit, f"at most {u.limit:g} {u.unit}")
-            for u in mechanism.inputs
+            output(u.name, u.unit, f"at most {u.limit:g} {u.unit}") for u in mechanism.inputs
         ],
-        "STATUS": [
-            Variable(
-                "loop.status", "output", "discrete", type="Int32",
-                description="status bits of the last period, as in the C header",
-            )
-        ],
-        "S": [
-            Variable(f"loop.s{index}", "output", "discrete", description="value of the surface")
-            for index in numbers
-        ],
-        "MARGIN": [
-            Variable(
-                "loop.margin", "output", "discrete",
-                description="det Γ(q)/det Γ(0): > 0 where the law exists",
-            )
-        ],
-        "ESTIMATE": [
-            Variable(f"estimate.{name}", "output", "discrete", 0.0, unit)
-            for name, unit, _ in states
-        ],
-    }  # fmt: skip
+        "STATUS": [output("loop.status", "", bits, "Int32")],
+        "S": [output(f"loop.s{index}", "", "value of the surface") for index in numbers],
+        "MARGIN": [output("loop.margin", "", "det Γ(q)/det Γ(0): > 0 where the law exists")],
+        "ESTIMATE": [output(f"estimate.{name}", unit) for name, unit, _ in states],
+    }
 
 
 def plant_unit(controller: EmbeddedController, start: ArrayLike | None = None) -> Unit:
@@ -123,12 +105,8 @@ def plant_unit(controller: EmbeddedController, start: ArrayLike | None = None) -
     default the mechanism's usual start.
     """
     mechanism = controller.mechanism
-    tape = Tape()
-    names = {x: f"x[{i}]" for i, x in enumerate(mechanism.x)}
-    names |= {u: f"u[{i}]" for i, u in enumerate(mechanism.u)}
-    names |= {p.symbol: f"p[{i}]" for i, p in enumerate(mechanism.parameters)}
-    rates = {f"rate[{i}]": a for i, a in enumerate(build_acceleration_graph(mechanism, tape))}
-    body = C99Emitter(tape, names, "double").statements(rates)
+    parameters = {p.symbol: f"p[{i}]" for i, p in enumerate(mechanism.parameters)}
+    body = acceleration_code(mechanism, parameters, "double")
     values = common(controller) | {
         "n": str(mechanism.n),
         "states": str(2 * mechanism.n),

@@ -340,6 +340,12 @@ class HostProcess:
 HELD = 0.1
 
 
+def is_held(q: FloatArray, m: int, period: float) -> bool:
+    """Whether all but the m driven of the positions, (N, n), were held for the last second."""
+    last = max(1, round(1.0 / period))
+    return bool((np.abs(q[-last:, m:]) <= HELD).all())
+
+
 @dataclass(frozen=True, eq=False)
 class RigRun:
     """One run on a rig, period by period.
@@ -371,6 +377,5 @@ def run_on_rig(process: HostProcess, rig: Rig, seconds: float) -> RigRun:
     for measurement, u in control_loop(rig, step, round(seconds / rig.period)):
         positions.append(measurement.q)
         outputs.append(u)
-    last = np.array(positions[-max(1, round(1.0 / rig.period)) :])[:, m:]
-    held = bool((np.abs(last) <= HELD).all())
-    return RigRun(np.array(positions), np.array(outputs), tuple(status), held)
+    q = np.array(positions)
+    return RigRun(q, np.array(outputs), tuple(status), is_held(q, m, rig.period))

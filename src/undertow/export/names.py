@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Iterable
 from enum import IntEnum, IntFlag
 from importlib import resources
 from string import Template
+
+import sympy as sp
+
+from undertow.models import Parameter
 
 #: A measurement beyond is no number either.
 LARGEST = 1e9
@@ -60,9 +65,9 @@ def c_name(name: str) -> str:
     return "".join(map(_letter, name))
 
 
-def macro(index: int, name: str) -> str:
-    """Return the C name of a parameter: its place makes it one of a kind, its name readable."""
-    return f"UT_PARAMETER_{index}_{c_name(name)[:32]}"
+def macros(parameters: Iterable[Parameter]) -> dict[sp.Symbol, str]:
+    """Return C names of parameters: the place makes each one of a kind, its name readable."""
+    return {p.symbol: f"UT_PARAMETER_{i}_{c_name(p.name)[:32]}" for i, p in enumerate(parameters)}
 
 
 def ascii_words(text: str) -> str:

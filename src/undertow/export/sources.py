@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 import re
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from undertow.base import checked, write_files
+from undertow.base import checked, versions, write_files
 from undertow.export.controller import FACTOR, WIDTH, EmbeddedController, plan_text
 from undertow.export.estimate import estimate_code
-from undertow.export.names import LARGEST, ascii_words, c_name, macro, prefixed, template
+from undertow.export.names import LARGEST, ascii_words, c_name, macros, prefixed, template
 from undertow.export.routh import characteristic_polynomial
 from undertow.export.twin import vectors
 from undertow.law import LawSymbols, Plan, Surface, build_law_graph
@@ -47,18 +46,12 @@ def render(name: str, values: dict[str, str], prefix: str) -> bytes:
     return re.sub(r"[ \t]+$", "", text, flags=re.MULTILINE).encode("ascii")
 
 
-def _version() -> str:
-    try:
-        return metadata.version("undertow")
-    except metadata.PackageNotFoundError:
-        return "(from source)"
-
-
 def common(controller: EmbeddedController) -> dict[str, str]:
     """Return what every template is told."""
     mechanism = controller.mechanism
     title = f"{mechanism.name}: sliding-mode law, n = {mechanism.n}, m = {mechanism.m}"
-    return {"name": controller.stem, "title": ascii_words(title), "version": _version()}
+    version = versions()["undertow"] or "(from source)"
+    return {"name": controller.stem, "title": ascii_words(title), "version": version}
 
 
 @checked
@@ -179,9 +172,9 @@ def _inputs(controller: EmbeddedController) -> str:
 
 
 def _parameters(controller: EmbeddedController) -> str:
-    lines = []
-    for i, p in enumerate(controller.mechanism.parameters):
-        define = f"#define {macro(i, p.name)} {literal(p.value, controller.real)}"
+    lines, parameters = [], controller.mechanism.parameters
+    for p, name in zip(parameters, macros(parameters).values(), strict=True):
+        define = f"#define {name} {literal(p.value, controller.real)}"
         words = ": ".join(filter(None, (ascii_words(p.unit), ascii_words(p.description))))
         lines.append(f"{define} /* {words} */" if words else define)
     return "\n".join(lines)
@@ -200,7 +193,7 @@ def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
     names |= {s: f"row->eta[{i}]" for i, s in enumerate(symbols.eta)}
     names |= {s: f"row->layer[{i}]" for i, s in enumerate(symbols.layer)}
     names[symbols.gamma_target] = "row->gamma"
-    names |= {p.symbol: macro(i, p.name) for i, p in enumerate(mechanism.parameters)}
+    names |= macros(mechanism.parameters)
 
     tape = Tape()
     law = build_law_graph(
@@ -229,10 +222,8 @@ def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
 
 def _estimator(controller: EmbeddedController) -> dict[str, str]:
     """Return what the templates ask of the estimator."""
-    mechanism = controller.mechanism
-    parameters = {p.symbol: macro(i, p.name) for i, p in enumerate(mechanism.parameters)}
     return estimate_code(
-        controller.differentiator, mechanism, controller.period, parameters, controller.real
+        controller.differentiator, controller.mechanism, controller.period, controller.real
     )
 
 

@@ -33,12 +33,7 @@ class Twin:
         self._newest = controller.number
 
     def _use(self, plan: Plan) -> None:
-        controller = self.controller
-        self._laws = [
-            SlidingModeLaw(controller.mechanism, surface, plan.at(t)[1] or controller.reaching)
-            for surface, t in zip(plan.surfaces, plan.times, strict=True)
-        ]
-        self._starts = controller.starts(plan)
+        self._laws, self._starts = self.controller.laws_of(plan), self.controller.starts(plan)
         self._row, self._clock = 0, 0
 
     @property

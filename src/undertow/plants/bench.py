@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 
-from undertow.base import InvalidInputError, positive
+from undertow.base import InvalidInputError, at_least, between, one_of, positive
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism, Parameter
 
@@ -56,13 +56,9 @@ class Friction:
     def __post_init__(self) -> None:
         """Refuse negative numbers, and a breakaway below Coulomb's level."""
         _at_least_zero("friction", self, ("coulomb", "viscous"))
-        if not 0 < self.stribeck_speed < math.inf or not self.F_s >= self.coulomb:
-            raise InvalidInputError(
-                "friction",
-                value=f"breakaway {self.F_s}, stribeck_speed {self.stribeck_speed}",
-                limit="breakaway ≥ coulomb, stribeck_speed > 0 and finite",
-                remedy="A joint breaks away at no less than it slides with",
-            )
+        positive("stribeck_speed of friction", self.stribeck_speed)
+        least = "A joint breaks away at no less than it slides with"
+        at_least("breakaway of friction", self.F_s, self.coulomb, least)
 
     @property
     def F_s(self) -> float:
@@ -205,21 +201,13 @@ class Timing:
     def __post_init__(self) -> None:
         """Refuse a period that is not positive, jitter that overtakes it, endless delays."""
         _at_least_zero("the timing", self, ("jitter", "input_delay", "measurement_delay"))
-        if not 0 < self.period < math.inf or self.steps < 1 or self.jitter >= self.period:
-            raise InvalidInputError(
-                "timing of a rig",
-                value=f"period {self.period} s, jitter {self.jitter} s, {self.steps} steps",
-                limit="0 ≤ jitter < period, at least one step",
-                remedy="1 ms with 4 steps is usual",
-            )
-        longest = 1000 * self.period
-        if max(self.input_delay, self.measurement_delay) > longest:
-            raise InvalidInputError(
-                "delay of a rig",
-                value=f"{max(self.input_delay, self.measurement_delay):g} s",
-                limit=f"at most 1000 periods, {longest:g} s",
-                remedy="Give delays in seconds",
-            )
+        positive("period of a rig, s", self.period, "1 ms is usual")
+        at_least("steps of a period of a rig", self.steps, 1, "4 are usual")
+        if self.jitter >= self.period:
+            limit = f"below the period, {self.period:g} s"
+            raise InvalidInputError("jitter of a rig", value=f"{self.jitter:g} s", limit=limit)
+        late = max(self.input_delay, self.measurement_delay) / self.period
+        between("delay of a rig", late, 0, 1000, "periods", "Give delays in seconds")
 
     @property
     def step(self) -> float:
@@ -294,14 +282,8 @@ class Bench:
             ("tolerance", self.tolerance, [p.name for p in mechanism.parameters]),
             ("hand", self.hand, list(mechanism.state_names)),
         ):
-            unknown = sorted(set(names) - set(known))
-            if unknown:
-                raise InvalidInputError(
-                    f"{what} of a bench of '{mechanism.name}'",
-                    value=", ".join(unknown),
-                    limit=f"among {', '.join(known)}",
-                    remedy="Use the mechanism's own names",
-                )
+            for name in names:
+                one_of(f"{what} of a bench of '{mechanism.name}'", name, known)
         wild = {k: v for k, v in self.tolerance.items() if not 0 <= v < 1}
         if wild:
             raise InvalidInputError(
@@ -340,16 +322,6 @@ class Bench:
     def with_timing(self, **changes: Any) -> Self:
         """Return the bench with another period, jitter or delay."""
         return replace(self, timing=replace(self.timing, **changes))
-
-    def sources(self) -> dict[str, str]:
-        """Return what is known of where each part's numbers come from."""
-        parts: dict[str, Any] = {"bench": self, "timing": self.timing}
-        for group in fields(self):
-            value = getattr(self, group.name)
-            if isinstance(value, Mapping):
-                parts |= {f"{group.name} of {name}": part for name, part in value.items()}
-        found = {name: getattr(part, "source", "") for name, part in parts.items()}
-        return {name: source for name, source in found.items() if source}
 
 
 SRV02 = "Quanser, SRV02 Rotary Servo Base Unit User Manual: specifications"

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from undertow.base import ArtefactError, InvalidInputError, UndertowError, raised_at
+from undertow.base import ArtefactError, InvalidInputError, UndertowError, error_text, raised_at
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import object_from_file
 
@@ -212,7 +212,7 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
     except Exception as error:  # a driver may do anything
         raise ArtefactError(
             f"first reading of '{name}'",
-            value=f"{type(error).__name__}: {error}{raised_at(error)}",
+            value=f"{error_text(error)}{raised_at(error)}",
             limit="an undertow.plants.Measurement",
             remedy="Is it connected, and switched on?",
         ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, check_file, require_extra
+from undertow.base import InvalidInputError, at_least, check_file, positive, require_extra
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.rigid_body import identifier
 from undertow.plants.interface import Measurement
@@ -60,12 +59,8 @@ class MuJoCoRig:
         steps: int = 1,
     ) -> None:
         mujoco = require_extra("mujoco", "mujoco", "MuJoCo is not installed")
-        if not 0 < period < math.inf or steps < 1:
-            raise InvalidInputError(
-                "timing of a MuJoCo rig",
-                value=f"period {period} s, {steps} steps",
-                limit="period > 0, at least one step",
-            )
+        positive("period of a MuJoCo rig, s", period)
+        at_least("steps of a MuJoCo rig", steps, 1)
         self.mechanism, self.period = mechanism, period
         self._engine: Any = mujoco
         given = mujoco_scene(mechanism) if scene is None else scene

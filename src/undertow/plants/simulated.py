@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, at_least
 from undertow.models import FloatArray, Mechanism
 from undertow.plants.bench import Amplifier, Backlash, Bench, Encoder, Friction, Timing
 from undertow.plants.interface import Measurement
-from undertow.plants.stepping import measure, stepping
+from undertow.plants.stepping import RIG_LAYOUT, measure, stepping
+from undertow.symbolic import Workspace
 
 #: Periods for which noise is drawn at once.
 _BLOCK = 4096
@@ -48,8 +51,7 @@ class RealisticRig:
     """
 
     def __init__(self, bench: Bench, x0: ArrayLike | None = None, seed: int = 0) -> None:
-        if seed < 0:
-            raise InvalidInputError("seed of a rig", value=seed, limit="≥ 0")
+        at_least("seed of a rig", seed, 0)
         self.bench = bench
         self.period = bench.timing.period
         self._rng = np.random.default_rng([seed, 0])
@@ -57,68 +59,78 @@ class RealisticRig:
         self.mechanism = bench.drawn(draw)
         n, m, timing = self.mechanism.n, self.mechanism.m, bench.timing
         start = self.mechanism.state(**self.mechanism.start) if x0 is None else x0
-        self._x = bench.released(self.mechanism.check_state(start), draw)
-        self._phase = draw.uniform(0.0, 1.0, n)
+        x0 = bench.released(self.mechanism.check_state(start), draw)
         self._module = stepping(self.mechanism)
-        self._parameters = self.mechanism.parameter_values
-        self._tables()
-        late = [
-            round(delay / timing.step) for delay in (timing.input_delay, timing.measurement_delay)
-        ]
-        self._delays = np.array(late, dtype=np.int64)
-        self._counts = np.array([0, timing.steps, 0], dtype=np.int64)
-        self._drive, self._held = np.zeros((5, m)), np.zeros((late[0] + 1, m))
-        # Positions, and velocities too where they are measured.
-        seen = self._x[:n] if self._rates is None else self._x
-        self._past = np.tile(seen, (late[1] + 1, 1))
-        self._applied, self._u = np.zeros(m), np.zeros(m)
-        self._work = np.zeros((8, max(n * n, 2 * n)))
+        self._rates = None
+        if bench.tachometers is not None:
+            names = (c.name for c in self.mechanism.coordinates)
+            self._rates = np.array([bench.tachometers.get(name, 0.0) for name in names])
+        # Positions are kept, and velocities too where they are measured.
+        self._sizes = {
+            "late": round(timing.input_delay / timing.step),
+            "old": round(timing.measurement_delay / timing.step),
+            "seen": n if self._rates is None else 2 * n,
+            "knocks": 1 + len(bench.pushes),
+        }
+        self._use(Workspace(RIG_LAYOUT, n=n, m=m, p=len(self.mechanism.parameters), **self._sizes))
+        memory = self._memory
+        memory["x"][:], memory["past"][:] = x0, x0[: self._sizes["seen"]]
+        memory["counts"][1], memory["phase"][:] = timing.steps, draw.uniform(0.0, 1.0, n)
+        memory["parameters"][:] = self.mechanism.parameter_values
+        self._fill_tables()
         self._t, self._lateness, self._samples = 0.0, 0.0, 0
         self._row = _BLOCK
-        self._q = np.zeros(n)
-        measure(0, self._past, 0, self._encoder, self._phase, self._draw()[1:], self._q)
+        measure(0, memory["past"], 0, memory["encoder"], memory["phase"], self._draw()[1:], self._q)
 
-    def _tables(self) -> None:
-        """Lay the bench out in arrays, in the order of coordinates and inputs."""
-        bench, mechanism = self.bench, self.mechanism
+    def _use(self, memory: Workspace) -> None:
+        """Work on a memory: what the rig is like, and where it is."""
+        self._memory = memory
+        self._x: FloatArray = memory["x"]
+        self._q: FloatArray = memory["q"]
+        self._u: FloatArray = memory["u"]
+
+    def copied(self) -> Self:
+        """Return the rig as it stands, to go on by itself."""
+        twin, n, m = copy.copy(self), self.mechanism.n, self.mechanism.m
+        twin._rng, p = copy.deepcopy(self._rng), len(self.mechanism.parameters)
+        twin._use(Workspace(RIG_LAYOUT, n=n, m=m, p=p, **self._sizes))
+        twin._memory.block[:] = self._memory.block
+        return twin
+
+    def _fill_tables(self) -> None:
+        """Lay the bench out in the memory, in the order of coordinates and inputs."""
+        bench, mechanism, memory = self.bench, self.mechanism, self._memory
         coordinates = mechanism.coordinates
         friction = [bench.friction.get(c.name, Friction()) for c in coordinates]
-        self._friction = np.array(
-            [[f.coulomb, f.F_s, f.stribeck_speed, f.viscous] for f in friction], dtype=float
-        )
-        self._stops = np.array([[c.low, c.high] for c in coordinates])
+        memory["friction"][:] = [[f.coulomb, f.F_s, f.stribeck_speed, f.viscous] for f in friction]
+        memory["stops"][:] = [[c.low, c.high] for c in coordinates]
         encoders = [bench.encoders.get(c.name, Encoder()) for c in coordinates]
-        self._encoder = np.array([[e.resolution, e.noise] for e in encoders])
+        memory["encoder"][:] = [[e.resolution, e.noise] for e in encoders]
         amplifiers = [bench.amplifiers.get(i.name, Amplifier()) for i in mechanism.inputs]
-        self._amplifier = np.array(
-            [
-                [min(a.limit, i.limit), a.resolution, a.dead_band, a.time_constant]
-                for a, i in zip(amplifiers, mechanism.inputs, strict=True)
-            ]
-        )
+        memory["amplifier"][:] = [
+            [min(a.limit, i.limit), a.resolution, a.dead_band, a.time_constant]
+            for a, i in zip(amplifiers, mechanism.inputs, strict=True)
+        ]
         gaps = [bench.backlash.get(c.name, Backlash(0.0, 1.0)) for c in coordinates[: mechanism.m]]
-        self._gap = np.array([[g.gap, g.inertia] for g in gaps])
+        memory["gap"][:] = [[g.gap, g.inertia] for g in gaps]
         names = [c.name for c in coordinates]
-        self._pushes = np.zeros((1 + len(bench.pushes), 1 + mechanism.n))
-        self._pushes[0, 0] = math.inf  # a knock that is given while it runs
-        for row, push in zip(self._pushes[1:], bench.pushes, strict=True):
+        memory["pushes"][0, 0] = math.inf  # a knock that is given while it runs
+        for row, push in zip(memory["pushes"][1:], bench.pushes, strict=True):
             row[0] = push.t if push.t >= 0.0 else math.inf
             row[1 + names.index(push.coordinate)] = push.impulse
         self._refuse_heavy_rotors()
-        self._rates = None
-        if bench.tachometers is not None:
-            self._rates = np.array([bench.tachometers.get(name, 0.0) for name in names])
 
     def _refuse_heavy_rotors(self) -> None:
         """A rotor behind a gap is part of its joint's inertia, wherever the mechanism is."""
-        places = np.vstack([self._x[: self.mechanism.n], np.zeros(self.mechanism.n)])
-        for i in np.flatnonzero(self._gap[:, 0] > 0):
+        gap, places = self._memory["gap"], np.zeros((2, self.mechanism.n))
+        places[0] = self._x[: self.mechanism.n]
+        for i in np.flatnonzero(gap[:, 0] > 0):
             own = 1.0 / np.linalg.inv(self.mechanism.M(places))[:, i, i].max()
-            if not self._gap[i, 1] < own:
+            if not gap[i, 1] < own:
                 name = self.mechanism.coordinates[i].name
                 raise InvalidInputError(
                     f"inertia of the backlash of '{name}'",
-                    value=f"{self._gap[i, 1]:g}",
+                    value=f"{gap[i, 1]:g}",
                     limit=f"below the joint's own, {own:.3g}",
                     remedy="The mechanism's inertia must hold its rotor's, felt at the joint",
                 )
@@ -148,12 +160,12 @@ class RealisticRig:
     @property
     def applied(self) -> FloatArray:
         """What drove the joints in the last integration step, (m,)."""
-        return self._applied.copy()
+        return np.array(self._memory["applied"])
 
     @property
     def stops_hit(self) -> int:
         """How often an end stop was run into."""
-        return int(self._counts[2])
+        return int(self._memory["counts"][2])
 
     def read(self) -> Measurement:
         """Return the present measurement."""
@@ -161,8 +173,9 @@ class RealisticRig:
             return Measurement(self._t, self._q.copy())
         n = self.mechanism.n
         noise = self._noise[self._row - 1, 1 + n :]
-        row = max(0, int(self._counts[0]) - int(self._delays[1])) % len(self._past)
-        return Measurement(self._t, self._q.copy(), self._past[row, n:] + self._rates * noise)
+        past, step = self._memory["past"], int(self._memory["counts"][0])
+        row = max(0, step - self._sizes["old"]) % len(past)
+        return Measurement(self._t, self._q.copy(), past[row, n:] + self._rates * noise)
 
     def write(self, u: ArrayLike) -> None:
         """Apply the inputs u, (m,), and advance to the next sample.
@@ -184,11 +197,7 @@ class RealisticRig:
         timing: Timing = self.bench.timing
         lateness = timing.jitter * float(noise[0])
         length = timing.period + lateness - self._lateness
-        self._module.advance(
-            self._t, length, self._counts, self._x, self._u, self._drive, self._held, self._past,
-            self._delays, self._parameters, self._friction, self._stops, self._amplifier, self._gap,
-            self._encoder, self._phase, self._pushes, noise[1:], self._q, self._applied, self._work,
-        )  # fmt: skip
+        self._module.advance(self._t, length, noise[1:], self._memory.block, *self._sizes.values())
         self._samples += 1
         self._lateness = lateness
         self._t = self._samples * timing.period + lateness
@@ -201,7 +210,8 @@ class RealisticRig:
         impulse
             Generalised impulse on each coordinate, (n,), N m s or N s.
         """
-        self._pushes[0, 0], self._pushes[0, 1:] = self._t, impulse
+        pushes = self._memory["pushes"]
+        pushes[0, 0], pushes[0, 1:] = self._t, impulse
 
     def close(self) -> None:
         """Let go of the rig."""

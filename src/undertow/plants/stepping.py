@@ -21,7 +21,7 @@ from typing import Any
 import sympy as sp
 
 from undertow.models import TIME, FloatArray, Mechanism
-from undertow.symbolic import COMPILED, Tape, function_source, numba, scalar_module
+from undertow.symbolic import COMPILED, Tape, function_source, numba, scalar_module, unpacked
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -234,14 +234,22 @@ def rk4_step(t, h, elapse, n, x, u, viscous, parameters, stage, total, qdd):
         x[i] += h / 6.0 * total[i]
 """
 
+#: What a rig is like and remembers; ``late`` and ``old``: delays of inputs and of readings, in
+#: steps; ``seen``: how many numbers of the state are kept for readings; ``knocks``: how many pushes
+#: there may be.  counts: index of the step, steps per period, stops run into; friction, stops,
+#: amplifier, gap and encoder as :class:`undertow.plants.Bench` has them.
+RIG_LAYOUT = {
+    "x": "2 * n", "counts": "3", "u": "m", "drive": "5, m", "held": "late + 1, m",
+    "past": "old + 1, seen", "parameters": "p", "friction": "n, 4", "stops": "n, 2",
+    "amplifier": "m, 4", "gap": "m, 2", "encoder": "n, 2", "phase": "n",
+    "pushes": "knocks, 1 + n", "q": "n", "applied": "m", "work": "8, n * n + 2 * n",
+}  # fmt: skip
+
 _BODY = f"""
 {COMPILED}
-def advance(
-    t, length, counts, x, u, drive, held, past, delays, parameters, friction, stops, amplifier,
-    gap, encoder, phase, pushes, noise, q, applied, work,
-):
-    # One period: ``counts`` holds the index of the step, steps per period, stops run into.
-    n = x.shape[0] // 2
+def advance(t, length, noise, block, late, old, seen, knocks):
+    # One period, with the noise of its reading.
+{unpacked(RIG_LAYOUT)}
     h = length / counts[1]
     W, before, impulse, viscous, gain = work[3], work[4], work[5], work[6], work[7]
     gains(parameters, gain)
@@ -252,10 +260,10 @@ def advance(
         bounded = bounded or stops[i, 1] < math.inf or stops[i, 0] > -math.inf
     for i in range(gap.shape[0]):
         loose = loose or gap[i, 0] > 0.0
-    for _ in range(counts[1]):
-        j = counts[0]
-        transmit(j, h, u, held, delays[0], amplifier, gap, gain, drive, applied)
-        for k in range(pushes.shape[0]):
+    for _ in range(int(counts[1])):
+        j = int(counts[0])
+        transmit(j, h, u, held, late, amplifier, gap, gain, drive, applied)
+        for k in range(knocks):
             if pushes[k, 0] < t + h:
                 pushes[k, 0] = math.inf  # once, whatever the rounding of t
                 mobility(x, parameters, W)
@@ -276,24 +284,18 @@ def advance(
             backlash_impact(h, x, before, drive, gap, gain, W)
         t += h
         counts[0] = j + 1
-        past[(j + 1) % past.shape[0]] = x[: past.shape[1]]
-    measure(counts[0], past, delays[1], encoder, phase, noise, q)
-    return t
+        past[(j + 1) % past.shape[0]] = x[:seen]
+    measure(int(counts[0]), past, old, encoder, phase, noise, q)
 
 
 {COMPILED}
-def play(
-    times, inputs, rows, counts, x, drive, held, past, delays, parameters, friction, stops,
-    amplifier, gap, encoder, phase, pushes, noise, q, applied, work,
-):
+def play(times, inputs, rows, noise, block, late, old, seen, knocks):
     # Inputs, (N, m), from one of the times to the next; ``rows`` gets the states there.
+{unpacked(RIG_LAYOUT)}
     rows[0] = x
     for k in range(times.shape[0] - 1):
-        advance(
-            times[k], times[k + 1] - times[k], counts, x, inputs[k], drive, held, past, delays,
-            parameters, friction, stops, amplifier, gap, encoder, phase, pushes, noise, q,
-            applied, work,
-        )
+        u[:] = inputs[k]
+        advance(times[k], times[k + 1] - times[k], noise, block, late, old, seen, knocks)
         rows[k + 1] = x
 """
 

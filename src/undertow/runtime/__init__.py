@@ -9,26 +9,20 @@ from undertow.runtime.controller_defaults import (
     reaching_for,
 )
 from undertow.runtime.encoding import Columns
-from undertow.runtime.log import GrowingLog, Log, Recording, read_log
+from undertow.runtime.log import Log
 from undertow.runtime.log_files import column_units, to_mcap, to_parquet
 from undertow.runtime.loop import Runtime
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.recipe import Recipe
+from undertow.runtime.recording import GrowingLog, Recording, read_log
 from undertow.runtime.replay import Replay, about, replay, replay_controller
 from undertow.runtime.session import run, session
 from undertow.runtime.settings import Settings
-from undertow.runtime.slow_loop import (
-    Answer,
-    BackgroundWorker,
-    InlineWorker,
-    Request,
-    Worker,
-    background_worker,
-    respond,
-)
+from undertow.runtime.slow_loop import Answer, Request, respond
 from undertow.runtime.supervisor import SupervisedRig
 from undertow.runtime.targets import RunTarget, send_target, target_of_run
 from undertow.runtime.verdict import EXIT_CODES, Ending, Report, RunVerdict
+from undertow.runtime.workers import BackgroundWorker, InlineWorker, Worker, background_worker
 
 __all__ = [
     "EXIT_CODES",

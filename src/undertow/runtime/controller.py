@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from undertow.base import error_text
 from undertow.cascade import Admission, Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators import Estimator, KalmanFilter
@@ -226,7 +227,7 @@ class Controller:
         try:
             self._compute(inputs)
         except Exception as error:  # whatever it was, the output goes to zero within its slew
-            self._stop(f"{type(error).__name__}: {error}")
+            self._stop(error_text(error))
             limit_output(self._wanted, self.u, self.limits, self.slew)
         return self.u
 
@@ -249,7 +250,7 @@ class Controller:
             elif self._free:
                 self._ask(self._t)
         except Exception as error:
-            self._stop(f"{type(error).__name__}: {error}")
+            self._stop(error_text(error))
 
     def _jumped(self) -> bool:
         """Whether velocities have jumped in this step."""
@@ -524,7 +525,7 @@ class Controller:
         try:
             fault = self._mismatch(t, answer) or self._invalid(answer)
         except Exception as error:  # what came may be anything
-            fault = f"{UNSOUND}{type(error).__name__}: {error}"
+            fault = f"{UNSOUND}{error_text(error)}"
         if fault:
             self.notes.append(Note("answer", f"{answer.sequence}: refused, {fault}"))
             if self._asked is not None and answer.sequence == self._asked.sequence:

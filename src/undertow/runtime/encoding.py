@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, NamedTuple, Self, TypeGuard
 
 import numpy as np
@@ -167,10 +167,10 @@ class Columns:
     @staticmethod
     def shown(names: tuple[str, ...]) -> tuple[list[str], list[str], list[str]]:
         """Return which columns of a log are positions, inputs and surface values, by name."""
-        states = [n.removesuffix(_MEASURED) for n in names if n.endswith(_MEASURED)]
-        positions = [name for name in states if not name.endswith("_dot")]
-        inputs = [n.removesuffix(_DEMAND) for n in names if n.endswith(_DEMAND)]
-        return positions, inputs, [name for name in names if name.startswith(_SURFACE)]
+        groups = Columns.groups(names)
+        positions = [name for name in groups["state"] if not name.endswith("_dot")]
+        surfaces = [name for name in groups["surface"] if name.startswith(_SURFACE)]
+        return positions, groups["input"], surfaces
 
 
 #: Paths of references that are data, by name.
@@ -186,15 +186,13 @@ TOLD = "set-points"
 OLD_KEYS = {"lanes": "law_vectors"}
 
 
-def _plan_to(plan: Plan) -> dict[str, Any]:
-    laws = None
-    if plan.reaching is not None:
-        laws = [{"eta": r.eta, "layer": r.layer, "switching": r.switching} for r in plan.reaching]
-    surfaces = [
-        {name: getattr(s, name).tolist() for name in ("alpha_a", "lambda_a", "alpha_u", "lambda_u")}
-        for s in plan.surfaces
-    ]
-    return {"surfaces": surfaces, "times": list(plan.times), "reaching": laws}
+def _plain(value: Any) -> Any:
+    """Return data classes, arrays and tuples as what JSON has: fields by name, lists."""
+    if is_dataclass(value):
+        return {item.name: _plain(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [_plain(one) for one in value] if isinstance(value, tuple) else value
 
 
 def _plan_from(value: Mapping[str, Any]) -> Plan:
@@ -212,43 +210,20 @@ def _plan_from(value: Mapping[str, Any]) -> Plan:
 
 
 def memory_to(memory: CascadeState) -> dict[str, Any]:
-    """Return a memory of the cascade as JSON values."""
-    return {
-        "plan": _plan_to(memory.plan),
-        "sequence": memory.sequence,
-        "predicted": memory.predicted,
-        "scale": memory.scale,
-        "since": memory.since,
-        "x": list(memory.x),
-        "target": None if memory.target is None else _target_to(memory.target),
-        "estimate": None if memory.estimate is None else _estimate_to(memory.estimate),
-        "disturbance": list(memory.disturbance),
-    }
+    """Return a memory of the cascade as JSON values.
 
-
-def _target_to(target: ReferenceMotion) -> list[float] | str:
-    """Return where a target is; of the one that moves that it does: the recipe has it."""
-    return MOVING if target.moves else list(target.position(0.0))
-
-
-def _estimate_to(estimate: ParameterEstimate) -> dict[str, Any]:
-    kept = {
-        "offset": estimate.offset.tolist(),
-        "information": estimate.information.tolist(),
-        "samples": estimate.samples,
-    }
-    if not len(estimate.low):  # no bound
-        return kept
-    box = {"low": estimate.low.tolist(), "high": estimate.high.tolist()}
-    return {**kept, **box, "contradictions": estimate.contradictions}
+    Of a target that moves it only says that it does: the recipe has it.
+    """
+    target, kept = memory.target, _plain(replace(memory, target=None))
+    if target is not None:
+        kept["target"] = MOVING if target.moves else list(target.position(0.0))
+    return dict(kept)
 
 
 def _estimate_from(value: Mapping[str, Any]) -> ParameterEstimate:
-    offset, information = np.array(value["offset"]), np.array(value["information"])
-    box = np.array(value.get("low", ())), np.array(value.get("high", ()))
-    return ParameterEstimate(
-        offset, information, value["samples"], *box, value.get("contradictions", 0)
-    )
+    """Return the estimate that was encoded; logs before 0.2.0 say nothing of a bound."""
+    arrays = {name: np.array(v) for name, v in value.items() if isinstance(v, list)}
+    return ParameterEstimate(**{**value, **arrays})
 
 
 def memory_from(value: Mapping[str, Any], reference: ReferenceMotion | None = None) -> CascadeState:
@@ -290,7 +265,7 @@ def reference_to(reference: Reference) -> dict[str, Any] | None:
         kind = type(path).__name__
         if PATHS.get(kind) is not type(path):
             return None
-        paths[name] = {"kind": kind, **asdict(path)}  # type: ignore[call-overload]
+        paths[name] = {"kind": kind, **_plain(path)}
     return {"paths": paths, "period": reference.period}
 
 
@@ -320,7 +295,7 @@ def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
         "after": memory_to(answer.memory),
         "law_vectors": answer.law_vectors.tolist(),
         # What an optimiser says may be anything: only what can be judged again is kept.
-        "plan": _plan_to(plan) if _is_sound(plan) else None,
+        "plan": _plain(plan) if _is_sound(plan) else None,
         "number": proposal.sequence,
         "computed_for": proposal.computed_for,
         "message": proposal.message,

@@ -19,7 +19,8 @@ from undertow.base.artefacts import whole
 from undertow.base.errors import or_refused
 from undertow.mechanisms import LIBRARY
 from undertow.runtime.encoding import Columns
-from undertow.runtime.log import Recording
+from undertow.runtime.log import ANSWERS
+from undertow.runtime.recording import Recording
 
 #: Units of the columns that are not of the mechanism.
 _UNITS = {
@@ -28,8 +29,7 @@ _UNITS = {
 }  # fmt: skip
 
 #: What of an answer of the slow loop is shown; all of it is in the log alone.
-_ANSWER = ("sequence", "use", "accepted", "reason", "status", "cost", "incumbent_cost", "predicted",
-           "evaluations", "seconds")  # fmt: skip
+_ANSWER = tuple(name for name in ANSWERS if name not in ("k", "body"))
 
 #: Foxglove's schema of a line of text, for the panel that shows them; 2 is information, 4 an error.
 _LINE = {

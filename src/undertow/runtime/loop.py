@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from undertow.base import InvalidInputError, checked
+from undertow.base import InvalidInputError, checked, error_text
 from undertow.cascade import Legs
 from undertow.law import SetPoints
 from undertow.models import FloatArray, invariant_coordinates
@@ -33,10 +33,11 @@ from undertow.runtime.encoding import TOLD, Stamps, answer_row, legs_to
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.processes import Background, resource_errors
-from undertow.runtime.slow_loop import Answer, Worker, is_answer
+from undertow.runtime.slow_loop import Answer, is_answer
 from undertow.runtime.steps import limit_output, stage_module
 from undertow.runtime.targets import RunTarget, legs_from_here, named_positions
 from undertow.runtime.verdict import Report
+from undertow.runtime.workers import Worker
 
 #: How long before a step is due the lockstep check makes the last one again, s.
 LOCKSTEP_TIME = 1.5e-4
@@ -249,7 +250,7 @@ class Runtime:
         """Take down what ended the loop itself: its output comes to zero without it."""
         self._reserve = b""
         report, controller = self.report, self.controller
-        reason = f"loop: {type(error).__name__}: {error}"
+        reason = f"loop: {error_text(error)}"
         if isinstance(error, KeyboardInterrupt):
             reason = "operator: interrupt"
         if controller.mode is not Mode.SAFE_STOP:
@@ -270,7 +271,7 @@ class Runtime:
         try:
             failure = self._bring_to_zero() if not report.output_zero else ""
         except BaseException as error:  # an interrupt: the rig is closed all the same
-            failure = f"{type(error).__name__}: {error}"
+            failure = error_text(error)
         self._heartbeat = float("inf")
         output = (
             [] if report.output_zero else [f"the device did not take an output of zero: {failure}"]
@@ -281,7 +282,7 @@ class Runtime:
         try:
             self.rig.close()
         except BaseException as error:  # a rig that failed may fail again
-            output.append(f"close: {type(error).__name__}: {error}")
+            output.append(f"close: {error_text(error)}")
             report.output_zero = report.output_zero and not isinstance(error, OutputOnError)
         self._waiting_since = math.inf
         report.output_problem = "; ".join(output)
@@ -306,7 +307,7 @@ class Runtime:
             try:
                 self.rig.write(u.copy())
             except BaseException as error:  # it must come to zero whatever a driver does
-                failure = f"{type(error).__name__}: {error}"
+                failure = error_text(error)
             else:
                 if not u.any():
                     self.report.output_zero = True
@@ -351,7 +352,7 @@ class Runtime:
                     self.log.columns.fill(self.log.row, k, stamps, inputs, self.controller)
                     self.log.commit_row()
             except Exception as error:  # the output must come to zero before the loop may end
-                alarm = alarm or f"{type(error).__name__}: {error}"
+                alarm = alarm or error_text(error)
             if self.lockstep is not None:
                 self._behind.append((inputs, u.copy()))
             np.abs(u - before, out=before)
@@ -404,7 +405,7 @@ class Runtime:
         try:
             measurement = _copied(self.rig.read(), self.controller.x.shape[0] // 2)
         except Exception as error:
-            what = f"read: {type(error).__name__}: {error}"
+            what = f"read: {error_text(error)}"
             self._log_event("rig", what)
         if measurement is not None:
             self._time_without_reading = 0.0
@@ -429,7 +430,7 @@ class Runtime:
         try:
             answer = self.worker.take(t)
         except Exception as error:
-            self._unreached(f"{type(error).__name__}: {error}")
+            self._unreached(error_text(error))
             return None
         if answer is None or is_answer(answer):
             return answer
@@ -449,7 +450,7 @@ class Runtime:
         try:
             self.rig.write(u.copy())  # the rig may keep it, or change it
         except Exception as error:
-            what = f"write: {type(error).__name__}: {error}"
+            what = f"write: {error_text(error)}"
         else:
             self._time_without_write, report.output_zero = 0.0, zero
             self._writes.add(0)
@@ -487,7 +488,7 @@ class Runtime:
             if controller.request is not None:
                 self.worker.ask(controller.request)
         except Exception as error:
-            self._unreached(f"{type(error).__name__}: {error}")
+            self._unreached(error_text(error))
         if log is not None:
             if inputs.command:
                 log.event(k, inputs.t, "command", inputs.command.name)

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from undertow.base import InvalidInputError, ResourceError
+from undertow.base import InvalidInputError, ResourceError, error_text
 
 if TYPE_CHECKING:  # not on Windows
     from multiprocessing.context import ForkProcess
@@ -118,7 +118,7 @@ def fork(
         except (OSError, MemoryError) as error:
             raise ResourceError(
                 f"process '{name}'",
-                value=_said(error),
+                value=error_text(error),
                 limit=f"a process more, {_limit('RLIMIT_NPROC', '-u')}",
                 remedy="End other processes of this user, raise the limit, or run the optimiser "
                 "in a thread: --worker thread",
@@ -217,7 +217,7 @@ class Background(threading.Thread):
         try:
             self.start()
         except (RuntimeError, MemoryError) as error:
-            raise self._refused(_said(error)) from error
+            raise self._refused(error_text(error)) from error
         if not self._begun.wait(START_TIMEOUT):
             raise self._refused(f"it has not begun after {START_TIMEOUT:g} s")
 
@@ -266,7 +266,7 @@ def _check_memory(need: int) -> None:
         with contextlib.closing(mmap.mmap(-1, need)):  # address space, not touched
             pass
     except (OSError, ValueError) as error:
-        limit, what = _limit("RLIMIT_AS", "-v"), _said(error)
+        limit, what = _limit("RLIMIT_AS", "-v"), error_text(error)
     else:
         if free >= need:
             return
@@ -308,7 +308,7 @@ def _check_files(need: int) -> None:
 def _no_files(error: OSError, need: int = 2) -> ResourceError:
     return ResourceError(
         "open files of this process",
-        value=_said(error),
+        value=error_text(error),
         limit=f"{need} more; {_limit('RLIMIT_NOFILE', '-n')}",
         remedy="Raise the limit: ulimit -n 1024",
     )
@@ -342,11 +342,7 @@ def resource_errors(what: str) -> Iterator[None]:
             raise
         raise ResourceError(
             what,
-            value=_said(error),
+            value=error_text(error),
             limit="what the system gives: ulimit -a, free -m, df",
             remedy="End other programs, or raise the limit",
         ) from error
-
-
-def _said(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -11,14 +11,14 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
-from undertow.base import InvalidInputError, UndertowError, one_of
+from undertow.base import InvalidInputError, UndertowError, check_fields, one_of
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import KalmanFilter
 from undertow.law import Plan, ReachingLaw, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
-from undertow.models import FloatArray, Mechanism, invariant_coordinates, number_of
+from undertow.models import FloatArray, Mechanism, invariant_coordinates
 from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, IdealRig, RealisticRig
@@ -43,6 +43,9 @@ SHORTEST, FARTHEST = 1e-5, 3600.0
 #: "energy" and "time" are "bench-energy" and "bench-time" now.  Runs before 3 took their mechanism
 #: for exact.
 WORDS = 3
+
+#: What to do about a log with fields that are not known.
+_ANOTHER_VERSION = "It was written by another version of Undertow: replay it with that"
 
 #: Names of settings in logs before version 0.2.0, and what they are now.
 OLD_SETTINGS = {
@@ -137,8 +140,8 @@ class Recipe:
         """Refuse an unknown objective, a period that no loop keeps, and a horizon too far."""
         if not isinstance(self.objective, Objective):
             one_of("objective of a run", self.objective, get_args(Goal))
-        for what in ("period", "horizon", "duration"):
-            number_of(f"{what} of a run", getattr(self, what))
+        one_of("rig of a run", self.rig, ("ideal", "realistic"))
+        check_fields(self)
         stall = self.settings.max_step_interval
         if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
@@ -148,18 +151,13 @@ class Recipe:
                 f"{stall:g} s",
                 remedy="1 ms is usual; a longer one needs Settings(max_step_interval=...)",
             )
-        if not 0 < self.horizon <= FARTHEST:
-            raise InvalidInputError(
-                "horizon of a run", value=f"{self.horizon:g} s", limit=f"> 0, ≤ {FARTHEST:g} s"
-            )
-        if not 0 < self.duration <= FARTHEST:
-            raise InvalidInputError(
-                "length of a reference",
-                value=f"{self.duration:g} s",
-                limit=f"> 0, ≤ {FARTHEST:g} s",
-                remedy="Make the run shorter, or give set-points",
-            )
-        one_of("rig of a run", self.rig, ("ideal", "realistic"))
+        for what, span, remedy in (
+            ("horizon of a run", self.horizon, ""),
+            ("length of a reference", self.duration, "Make the run shorter, or give set-points"),
+        ):
+            if not 0 < span <= FARTHEST:
+                limit = f"> 0, ≤ {FARTHEST:g} s"
+                raise InvalidInputError(what, value=f"{span:g} s", limit=limit, remedy=remedy)
         assert self.legs is not None  # found here, so that its checks run before anything moves
 
     @cached_property
@@ -352,51 +350,22 @@ class Recipe:
         InvalidInputError
             For fields that a recipe has not, or values that are none for them.
         """
-        taken = _of_types(cls, _in_words_of_now(values))
-        for name, kind in (("start", taken["start"]), ("parameters", taken["parameters"].values())):
-            if not all(isinstance(v, int | float) for v in kind):
-                raise InvalidInputError(f"{name} of a recipe", value=kind, limit="numbers")
-        renamed = {OLD_SETTINGS.get(name, name): v for name, v in taken["settings"].items()}
-        settings = Settings(**_of_types(Settings, renamed))
-        target: Any = taken["target"]
+        taken = _in_words_of_now(values)
+        settings = {
+            OLD_SETTINGS.get(name, name): value for name, value in taken.get("settings", {}).items()
+        }
+        for made, given in ((cls, taken), (Settings, settings)):
+            known = [item.name for item in fields(made) if item.name != "design"]  # an object
+            for name in given:
+                one_of(f"field of a log's {made.__name__}", name, known, _ANOTHER_VERSION)
+        target: Any = taken.get("target", ())
         if len(target) == 2 and target[0] == MOVING:
             target = reference_from(target[1])
         else:
             target = SetPoints(target).pairs if target else ()
-        changed = {"start": tuple(taken["start"]), "target": target, "settings": settings}
+        start = tuple(taken.get("start", ()))
+        changed = {"start": start, "target": target, "settings": Settings(**settings)}
         return cls(**{**taken, **changed})
-
-
-def _of_types(made: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values for the fields of a data class; refuse others, and those of other types.
-
-    Raises
-    ------
-    InvalidInputError
-        With the first that is refused.
-    """
-    usual = {item.name: getattr(made(), item.name) for item in fields(made)}
-    usual.pop("design", None)  # an object, which no file holds
-    for name, value in values.items():
-        if name not in usual:
-            raise InvalidInputError(
-                f"{made.__name__} of a log",
-                value=f"field {name!r}",
-                limit=f"one of {', '.join(usual)}",
-                remedy="It was written by another version of Undertow: replay it with that",
-            )
-        kinds = _KINDS.get(type(usual[name]), (dict,))
-        if type(value) not in kinds or (isinstance(value, float) and math.isnan(value)):
-            raise InvalidInputError(
-                f"{name} of a log", value=repr(value)[:80], limit=f"a {kinds[0].__name__}"
-            )
-    return {name: values.get(name, usual[name]) for name in usual}
-
-
-#: What JSON has for values of a type.
-_KINDS: Mapping[type, tuple[type, ...]] = {
-    bool: (bool,), int: (int,), float: (int, float), str: (str,), tuple: (list, tuple),
-}  # fmt: skip
 
 
 def _in_words_of_now(values: Mapping[str, Any]) -> dict[str, Any]:

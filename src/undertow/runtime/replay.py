@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import ArtefactError, UndertowError, checked, file_hash, versions
+from undertow.base import ArtefactError, UndertowError, checked, error_text, file_hash, versions
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
@@ -30,9 +30,9 @@ from undertow.runtime.encoding import (
     memory_from,
     memory_to,
 )
-from undertow.runtime.log import Recording, read_log
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
+from undertow.runtime.recording import Recording, read_log
 from undertow.runtime.slow_loop import Answer, judge, law_vectors_of
 from undertow.symbolic import processor, sources_digest
 
@@ -173,7 +173,7 @@ def legible(path: Path) -> Iterator[None]:
     ) as error:  # fmt: skip
         raise ArtefactError(
             f"log '{path}'",
-            value=f"{type(error).__name__}: {error}",
+            value=error_text(error),
             limit="complete, with what a run of this version writes",
             remedy="It is damaged, or of another version: replay with the one that wrote it",
         ) from error

@@ -31,10 +31,10 @@ from undertow.runtime.processes import (
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
 from undertow.runtime.settings import Settings
-from undertow.runtime.slow_loop import InlineWorker, Worker, background_worker
 from undertow.runtime.supervisor import SupervisedRig
 from undertow.runtime.targets import Listener
 from undertow.runtime.verdict import Report
+from undertow.runtime.workers import InlineWorker, Worker, background_worker
 
 
 def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:

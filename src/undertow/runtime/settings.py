@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from undertow.base import positive
+from undertow.base import check_fields, positive
 from undertow.models import FloatArray, Mechanism
 
 
@@ -104,6 +104,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse what is not positive."""
+        check_fields(self)
         for item in fields(self):
             value = getattr(self, item.name)
             positive(

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from undertow.base import ArtefactError, UndertowError, errors
+from undertow.base import ArtefactError, UndertowError, error_text, errors
 from undertow.models import FloatArray
 from undertow.plants import Measurement, OutputOnError, Rig
 from undertow.runtime.clock import real_time_priority
@@ -48,30 +48,6 @@ class _Reply(NamedTuple):
     measurement: Measurement | None
     read: str
     write: str
-
-
-class _Refused(NamedTuple):
-    """The condition for which a rig could not be made: its class and what it says."""
-
-    kind: str
-    what: str
-    value: str | None
-    limit: str | None
-    remedy: str
-
-    @classmethod
-    def of(cls, error: Exception) -> _Refused:
-        if isinstance(error, UndertowError):
-            value, limit = (None if f is None else str(f) for f in (error.value, error.limit))
-            return cls(type(error).__name__, error.what, value, limit, error.remedy)
-        return cls(
-            "ArtefactError", "rig of a supervisor", f"{type(error).__name__}: {error}",
-            "a rig that can be made and read", "",
-        )  # fmt: skip
-
-    def error(self) -> UndertowError:
-        kind: type[UndertowError] = getattr(errors, self.kind, ArtefactError)
-        return kind(self.what, value=self.value, limit=self.limit, remedy=self.remedy)
 
 
 class _Farewell(NamedTuple):
@@ -129,7 +105,7 @@ class SupervisedRig:
 
     def _first(self) -> _Reply:
         try:
-            said: _Reply | _Refused = self._pipe.recv()
+            said: _Reply | UndertowError = self._pipe.recv()
         except EOFError as error:
             raise ArtefactError(
                 "rig of a supervisor",
@@ -137,8 +113,8 @@ class SupervisedRig:
                 limit="a rig that can be read",
                 remedy="The supervisor's own error is printed above",
             ) from error
-        if isinstance(said, _Refused):
-            raise said.error()
+        if isinstance(said, UndertowError):
+            raise said
         return said
 
     def read(self) -> Measurement:
@@ -234,11 +210,22 @@ def _supervise(
         try:
             rig = make()
         except Exception as error:  # a driver may do anything
-            ours.send(_Refused.of(error))
+            ours.send(_refusal(error))
             return
         facts = _apply(rig, ours, *bounds)
     if record is not None:
         record.write_text(json.dumps(facts))
+
+
+def _refusal(error: Exception) -> UndertowError:
+    """Return why a rig could not be made, as a condition that the other process knows."""
+    if isinstance(error, UndertowError) and hasattr(errors, type(error).__name__):
+        return error
+    return ArtefactError(
+        "rig of a supervisor",
+        value=error_text(error),
+        limit="a rig that can be made and read",
+    )
 
 
 def _apply(
@@ -290,7 +277,7 @@ def _apply(
     try:
         rig.close()
     except BaseException as error:  # a rig that failed may fail again
-        close = f"close: {type(error).__name__}: {error}"
+        close = f"close: {error_text(error)}"
         output = output or (close if isinstance(error, OutputOnError) else "")
     with contextlib.suppress(OSError):
         ours.send(_Farewell(output, close))
@@ -308,7 +295,7 @@ def _attempt(rig: Rig, u: FloatArray) -> str:
     try:
         rig.write(u.copy())
     except BaseException as error:  # a driver may do anything; the supervisor stays
-        return f"{type(error).__name__}: {error}"
+        return error_text(error)
     return ""
 
 
@@ -317,6 +304,6 @@ def _reply(ours: Connection, rig: Rig, failure: str) -> None:
     try:
         reply = _Reply(rig.read(), "", failure)
     except BaseException as error:
-        reply = _Reply(None, f"{type(error).__name__}: {error}", failure)
+        reply = _Reply(None, error_text(error), failure)
     with contextlib.suppress(Exception):  # who listens no more is found out by what comes
         ours.send(reply)

@@ -29,6 +29,7 @@ from undertow.base import (
     InvalidInputError,
     UndertowError,
     checked,
+    error_text,
     parse_json,
     read_file,
 )
@@ -170,7 +171,7 @@ class Listener:
             self._say_where()
         except OSError as error:  # a run is not lost for that
             self._door.close()
-            self.failure = f"{type(error).__name__}: {error}"
+            self.failure = error_text(error)
             return
         try:
             Background(self._listen, "undertow targets")
@@ -240,7 +241,7 @@ class Listener:
         except UndertowError as error:
             return True, _told(error)
         except Exception as error:  # the thread goes on, whatever was asked for
-            unknown = f"{type(error).__name__}: {error}"
+            unknown = error_text(error)
             return True, _told(InvalidInputError("set-points", value=unknown))
         return True, {"target": asdict(found)}
 

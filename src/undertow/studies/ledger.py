@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from undertow.base import ArtefactError, parse_json, read_file
+from undertow.base import ArtefactError, error_text, parse_json, read_file
 
 #: Largest ledger that is read, bytes.
 LARGEST = 1 << 28
@@ -60,7 +60,7 @@ class Ledger(Generic[K, V]):
             AttributeError,
             ArithmeticError,
         ) as error:
-            cause, value = error, f"{type(error).__name__}: {error}"
+            cause, value = error, error_text(error)
             limit = "a ledger that can be read and written"
         remedy = "Name another folder, or remove the file"
         raise ArtefactError(f"ledger '{path}'", value=value, limit=limit, remedy=remedy) from cause

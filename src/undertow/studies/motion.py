@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from undertow.base import facts, finite, manifest, table, to_csv
+from undertow.base import facts, finite, manifest, mark, table, to_csv
 from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
@@ -97,7 +97,7 @@ def motion_report(
             ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
         ]
         if any(verdict is not None for verdict in run.verdicts):
-            rows.append(("evidence", _evidence(run)))
+            rows.append(("evidence", evidence_counts(run)))
         if len(run.lemma3_slack):
             rows.append(_descent(run, objective, learns=bool(cascade and cascade.known)))
     rows += [
@@ -114,8 +114,7 @@ def motion_report(
     good = motion.event == Event.REACHED
     if good and motion.time == motion.t[0]:
         return Group(facts(rows), Text(ended(motion, objective)))
-    mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
-    return Group(facts(rows), mark + Text(ended(motion, objective)))
+    return Group(facts(rows), mark(good) + Text(f" {ended(motion, objective)}"))
 
 
 def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]:
@@ -146,18 +145,20 @@ def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]
     )
 
 
-def _evidence(run: Run) -> str:
+#: Kinds of evidence, in words.
+_EVIDENCE = {
+    "region": "in a proved set",
+    "dual": "predicted into a proved set",
+    "sampled": "sampled nearby",
+    "local": "stable near the target",
+}
+
+
+def evidence_counts(run: Run, words: Mapping[str, str] = _EVIDENCE) -> str:
     """Count what is known of the plan in use at each decision."""
     kinds = [None if v is None else v.details.get("evidence") for v in run.verdicts]
-    words = {
-        "region": "in a proved set",
-        "dual": "predicted into a proved set",
-        "sampled": "sampled nearby",
-        "local": "stable near the target",
-        None: "without accepted evidence",
-    }
-    counts = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kinds.count(kind)]
-    return ", ".join(counts)
+    rows = (*words.items(), (None, "without accepted evidence"))
+    return ", ".join(f"{kinds.count(kind)} {text}" for kind, text in rows if kinds.count(kind))
 
 
 def _decision(update: Update) -> dict[str, object]:

@@ -15,8 +15,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.display.animation import OBLIQUE
-from undertow.display.sketches import Box, Disc, Label, Line, Sketch
+from undertow.display.sketches import Box, Disc, Label, Line, Sketch, projected
 from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import compile_expressions
 
@@ -60,11 +59,10 @@ class Scene:
         further: list[sp.Expr] = []
         self.parts: list[dict[str, Any]] = []
         self._segments: list[tuple[int, int]] = []
-        self._solid: list[int] = []  # points that move with the mechanism
         for part in figure.parts:
             first = len(points)
             places = part.points if isinstance(part, Line) else (part.centre,)
-            points += [_projected(place, figure.view) for place in places]
+            points += [projected(place, figure.view) for place in places]
             count = len(points) - first
             one: dict[str, Any] = {"at": first, "count": count}
             if isinstance(part, Line):
@@ -81,9 +79,9 @@ class Scene:
             elif isinstance(part, Label):
                 one |= {"kind": "label", "text": part.text}
             self.parts.append(one)
-        points.append(_projected(figure.tip, figure.view))
+        points.append(projected(figure.tip, figure.view))
         self.count = len(points)
-        flat = [value for point in points for value in point]
+        flat = [sp.sympify(value) for point in points for value in point]
         arguments = [*mechanism.q, *mechanism.parameter_symbols]
         self._places = compile_expressions(arguments, [*flat, *further])
         slopes = [sp.diff(value, q) for value in flat for q in mechanism.q]
@@ -158,13 +156,3 @@ class Scene:
         right, top = cloud.max(axis=0)
         margin = 0.04 * max(right - left, top - bottom) + float(max(sizes, default=0.0))
         return left - margin, right + margin, bottom - margin, top + margin
-
-
-def _projected(point: Sequence[Any], view: str) -> tuple[sp.Expr, sp.Expr]:
-    """Return a point in the plane of a view."""
-    x, y, z = (sp.sympify(v) for v in point)
-    if view == "top":
-        return x, y
-    if view == "front":
-        return x, z
-    return x + OBLIQUE[0] * y, z + OBLIQUE[1] * y

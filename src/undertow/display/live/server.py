@@ -18,7 +18,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any, Protocol
 
-from undertow.base import ArtefactError, InvalidInputError, parse_json, require_extra
+from undertow.base import ArtefactError, InvalidInputError, between, parse_json, require_extra
 from undertow.display.live.page import FILES, content, encoded
 
 #: What is said to viewers: JSON values.  ``kind`` is "frame" for a picture, of which a slow viewer
@@ -141,8 +141,7 @@ class Server:
         self._serve = require_extra("websockets.asyncio.server", "show", need).serve
         self._headers = require_extra("websockets.datastructures", "show", need).Headers
         self._response = require_extra("websockets.http11", "show", need).Response
-        if port is not None and not 0 <= port <= 65535:
-            raise InvalidInputError("port", value=port, limit="0 to 65535", remedy="0: a free one")
+        between("port", port or 0, 0, 65535, remedy="0: a free one")
         self.show, self._wanted, self._over = show, port, over
         self.token, self.port = secrets.token_urlsafe(16), 0
         self.viewers: dict[int, Viewer] = {}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from undertow.base import UndertowError, Verdict, inward
+from undertow.base import Progress, UndertowError, Verdict, inward, no_progress
 from undertow.cascade import Run
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, ReachingLaw, Surface
@@ -47,9 +47,6 @@ from undertow.proofs.claims.claim import Box
 from undertow.proofs.claims.region import reaches
 from undertow.proofs.region.lyapunov import extent
 from undertow.studies.paper.appendix_search import search_rate
-
-#: Called with (what is being done, part done).
-Progress = Callable[[str, float], None]
 
 #: Most coordinates of a motion on the surface for which a region is searched.
 LARGEST_REGION = 4
@@ -91,7 +88,7 @@ def certify_surface(
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
     predict: bool = True,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Certified:
     """Decide what can be said of a surface.
 
@@ -105,7 +102,6 @@ def certify_surface(
     surface itself by default.
     """
     began = time.perf_counter()
-    tell = progress or (lambda what, part: None)
     claims: list[StatedClaim] = []
     remarks: list[Verdict] = []
 
@@ -115,34 +111,34 @@ def certify_surface(
         else:
             remarks.append(verdict)
 
-    tell("stability", 0.0)
+    progress("stability", 0.0)
     decide = _Decisions(mechanism, surface, reaching_law, start, dict(uncertain or {}))
     keep(*decide.own(StabilityClaim()))
     region = None
     if claims:
-        tell("terminal set", 0.03)
+        progress("terminal set", 0.03)
         keep(*decide.ellipsoid())
-        tell("non-singularity", 0.05)
+        progress("non-singularity", 0.05)
         if decide.box:
             keep(*decide.nonsingular())
-        tell("disturbances", 0.08)
+        progress("disturbances", 0.08)
         for claim, verdict in decide.disturbances():
             keep(claim, verdict)
         if seconds > 0:
-            tell("region on the surface", 0.1)
+            progress("region on the surface", 0.1)
             region, found, verdict = decide.region(seconds)
             keep(found, verdict)
             if region is not None and uncertain:
                 keep(*decide.region_in_box(region))
         if loop:
-            tell("the whole closed loop", 0.5)
+            progress("the whole closed loop", 0.5)
             keep(*decide.loop(hold))
         if predict and start.any():
-            tell("prediction", 0.95)
+            progress("prediction", 0.95)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
             horizon = closed.objective.horizon
             remarks.append(assess(closed, Plan.of(surface), start, horizon, Policy()))
-            tell("random starts", 0.97)
+            progress("random starts", 0.97)
             remarks += _sampled(closed, surface, start)
     subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
     return Certified(title or str(surface), subject, region, time.perf_counter() - began)
@@ -301,8 +297,7 @@ def certify_run(
     mechanism: Mechanism,
     run: Run,
     *,
-    reaching_law: ReachingLaw = ReachingLaw(),
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[Certified, ...]:
     """Decide stability and a terminal set for every surface that a run applied, in order.
 
@@ -315,19 +310,13 @@ def certify_run(
             verdicts.append(update.admission.verdict)
     certified = []
     for index, (surface, verdicts) in enumerate(seen.items()):
-        if progress is not None:
-            progress("surfaces of the run", index / len(seen))
+        progress("surfaces of the run", index / len(seen))
         base = certify_surface(
-            mechanism,
-            surface,
-            np.zeros(2 * mechanism.n),
-            reaching_law=reaching_law,
-            seconds=0.0,
-            predict=False,
-        )
+            mechanism, surface, np.zeros(2 * mechanism.n), title=f"surface {index + 1}",
+            seconds=0.0, predict=False,
+        )  # fmt: skip
         remarks = (*base.subject.remarks, *(v for v in verdicts if not v))
-        subject = Subject(surface, reaching_law, base.subject.claims, remarks)
-        certified.append(Certified(f"surface {index + 1}", subject, None, base.seconds))
+        certified.append(replace(base, subject=replace(base.subject, remarks=remarks)))
     return tuple(certified)
 
 
@@ -338,7 +327,7 @@ def certify_appendix(
     loop: bool = False,
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[Certified, ...]:
     """Decide the appendix's five cases, with a P of our own, for a rotary pendulum.
 
@@ -351,8 +340,7 @@ def certify_appendix(
     certified = []
     for index, case in enumerate(CASES):
         name = f"case {case.number}, {case.title}"
-        if progress is not None:
-            progress(name, index / len(CASES))
+        progress(name, index / len(CASES))
         start = mechanism.state(phi=float(case.half_width))
         base = certify_surface(
             mechanism, case.surface, start, seconds=seconds, uncertain=uncertain, title=name,
@@ -372,6 +360,6 @@ def certify_appendix(
         claims = (*base.subject.claims, *proved)
         rest = (v for c, v in decided if c is None or not v)
         remarks = (*base.subject.remarks, *rest, *more)
-        subject = Subject(case.surface, ReachingLaw(), claims, remarks)
-        certified.append(Certified(name, subject, base.region, base.seconds))
+        subject = replace(base.subject, claims=claims, remarks=remarks)
+        certified.append(replace(base, subject=subject))
     return tuple(certified)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.closed_loop.figures import COLOURS, display, style
+from undertow.closed_loop.figures import COLOURS, display, style, symbol_of
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs import ProvedRegion, SurfaceMotion
@@ -210,16 +210,11 @@ def _units(motion: SurfaceMotion, index: int) -> tuple[float, str]:
     """Return the factor to display units and the label of a coordinate of y."""
     mechanism = motion.mechanism
     m, free = mechanism.m, mechanism.n - mechanism.m
-    names = {"phi": "φ", "theta": "θ"}
     if index < 2 * free:
         coordinate = mechanism.coordinates[m + index % free]
         factor, unit = display(coordinate.unit, index >= free)
-        stem = names.get(coordinate.name, coordinate.name)
-        if index >= free:
-            stem = f"{stem}\N{COMBINING DOT ABOVE}" if len(stem) == 1 else f"d{stem}/dt"
-        return factor, f"{stem} ({unit})"
+        return factor, f"{symbol_of(coordinate.name, index >= free)} ({unit})"
     coordinate = mechanism.coordinates[index - 2 * free]
     factor, unit = display(coordinate.unit)
-    stem = names.get(coordinate.name, coordinate.name)
-    other = mechanism.coordinates[m].name if free == 1 else "q_u"
-    return factor, f"w = {stem} + λₐ⁻¹λᵤ {names.get(other, other)} ({unit})"
+    other = symbol_of(mechanism.coordinates[m].name) if free == 1 else "q_u"
+    return factor, f"w = {symbol_of(coordinate.name)} + λₐ⁻¹λᵤ {other} ({unit})"

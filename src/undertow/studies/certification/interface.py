@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import checked, positive, versions
+from undertow.base import Progress, checked, no_progress, positive, versions
 from undertow.law import ReachingLaw, Surface
 from undertow.models import Mechanism
 from undertow.proofs import Certificate, read_certificate
 from undertow.proofs.claims.verify import Checked
 from undertow.proofs.claims.verify import verify as decide
-from undertow.studies.certification.decide import Progress, certify_surface
+from undertow.studies.certification.decide import certify_surface
 
 
 @checked
@@ -87,7 +87,7 @@ def certify(
         loop=loop,
         hold=hold,
         uncertain=uncertain,
-        progress=progress,
+        progress=progress or no_progress,
     )
     return Certificate.of(mechanism, [certified.subject], versions())
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from undertow.closed_loop.figures import COLOURS, display, style
+from undertow.closed_loop.figures import COLOURS, display, style, symbol_of
 from undertow.law import ReachingLaw, SlidingModeLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.proofs import LoopClaim
@@ -43,11 +43,10 @@ def loop_figure(
     last = STARTS - 1 if home.all() else int(np.argmin(home))
     proved = inside[:, ratio <= 1.0].argmax(axis=0).max()
     shown_time = max(1.0, 1.25 * float(times[proved]))
-    factor, unit = display(mechanism.coordinates[index].unit)
-    rate, rate_unit = display(mechanism.coordinates[index].unit, True)
-    name = {"phi": "φ", "theta": "θ"}.get(
-        mechanism.coordinates[index].name, mechanism.coordinates[index].name
-    )
+    coordinate = mechanism.coordinates[index]
+    factor, unit = display(coordinate.unit)
+    rate, rate_unit = display(coordinate.unit, True)
+    name = symbol_of(coordinate.name)
     with style():
         figure = Figure(figsize=(8.6, 4.0), layout="constrained")
         left, right = figure.subplots(1, 2)
@@ -88,8 +87,8 @@ def _motion(axes: Axes, a: FloatArray, b: FloatArray, ratio: float, home: bool) 
     axes.plot(a, b, color=colour, lw=0.9)
 
 
-def _shadow(rows: FloatArray, count: int = 181) -> FloatArray:
-    """Edge of {rows x, ‖x‖ ≤ 1} in the plane, (2, count)."""
+def _shadow(rows: FloatArray) -> FloatArray:
+    """Edge of {rows x, ‖x‖ ≤ 1} in the plane, (2, 181)."""
     u, s, _ = np.linalg.svd(rows, full_matrices=False)
-    angle = np.linspace(0, 2 * np.pi, count)
+    angle = np.linspace(0, 2 * np.pi, 181)
     return np.asarray(u @ (s[:, None] * np.array([np.cos(angle), np.sin(angle)])))

@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import Verdict, inward
+from undertow.base import Verdict, inward, mark
 from undertow.base import artefacts as results
 from undertow.cascade import Run
 from undertow.models import Mechanism
@@ -20,6 +20,7 @@ from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.verify import CLAIMS
 from undertow.proofs.kernel import claims as kernel
 from undertow.studies.certification.decide import Certified
+from undertow.studies.motion import evidence_counts
 
 _STYLES = {"proved": "green", "sampled": "yellow", "refuted": "red", "undecided": "red"}
 
@@ -121,12 +122,8 @@ def run_report(run: Run) -> RenderableType:
     lines: list[RenderableType] = [table]
     if len(shown) < len(updates):
         lines.append(Text(f"{len(updates) - len(shown)} decisions not shown", style="dim"))
-    kinds = [v.details.get("evidence") if v is not None else None for v in run.verdicts]
-    counts = ", ".join(
-        f"{kinds.count(k)} {k or 'without accepted evidence'}"
-        for k in ("region", "dual", "sampled", "local", None)
-        if kinds.count(k)
-    )
+    kinds = ("region", "dual", "sampled", "local")
+    counts = evidence_counts(run, dict(zip(kinds, kinds, strict=True)))
     lines.append(Text(f"{len(updates)} decisions: {counts}"))
     if np.isfinite(run.lemma3_slack).any():
         smallest = float(np.nanmin(run.lemma3_slack))
@@ -160,15 +157,13 @@ def verification_report(certificate: Certificate, checked: Sequence[Checked]) ->
             words.append(f"\n{item.verdict.method}", style="red")
         table.add_row(_kind(item.verdict), words, _margin(item.verdict))
     held = sum(bool(item.verdict) for item in checked)
-    good = held == len(checked)
-    mark = Text("✓ " if good else "✗ ", style="green" if good else "red")
     values = ", ".join(f"{k} = {v!r}" for k, v in certificate.parameters.items())
     others = sum(item.reworded for item in checked)
     remarks = sum(len(s.remarks) for s in certificate.subjects)
     lines: list[RenderableType] = [
         table,
         Text(f"{certificate.name} with {values}", style="dim"),
-        mark + Text(f"{held} of {len(checked)} claims proved again"),
+        mark(held == len(checked)) + Text(f" {held} of {len(checked)} claims proved again"),
     ]
     if certificate.document is not None:
         alone = all(item.model == certificate.structure for item in checked)

@@ -264,9 +264,9 @@ def _ending(recording: Recording, columns: Columns) -> str:
     return reasons[-1].partition("SAFE_STOP: ")[2] or "no reason in the log"
 
 
-def _first_line(log: Path, victim: ForkProcess, patience: float = 120.0) -> float:
+def _first_line(log: Path, victim: ForkProcess) -> float:
     """Wait until the log has its first step; return when that was made, s."""
-    deadline = time.perf_counter() + patience
+    deadline = time.perf_counter() + 120.0
     while time.perf_counter() < deadline and victim.is_alive():
         with contextlib.suppress(ArtefactError):
             recording = read_log(log)

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import table
+from undertow.base import mark, table
 from undertow.studies.fault_injection.failing_calls import OPERATIONS
 from undertow.studies.fault_injection.live import KillResult, LiveResult
 from undertow.studies.fault_injection.simulated import CaseResult
@@ -35,12 +35,12 @@ def drill_table(outcomes: Sequence[CaseResult], live: Sequence[LiveResult] = ())
         if not outcome.replayed:
             happened += Text("; ") + Text("its replay differs", style="red")
         ended, largest = f"{verdict.ending} {verdict.exit_code}", f"{outcome.largest:.0%}"
-        made.add_row(_indented(case.name), happened, ended, largest, _mark(outcome.passed))
+        made.add_row(_indented(case.name), happened, ended, largest, mark(outcome.passed))
     if live:
         made.add_row(Text("against the clock", style="bold"))
     for one in live:
         what = _indented(f"{one.part}: {one.name}")
-        made.add_row(what, Text(one.happened), "", "", _mark(one.passed))
+        made.add_row(what, Text(one.happened), "", "", mark(one.passed))
     return made
 
 
@@ -55,7 +55,7 @@ def kill_table(killed: Sequence[KillResult]) -> Group:
             "" if one.stopped_by else f"{1e3 * one.idle:.0f}",
             Text("same bits") if one.identical else Text("differs", style="red"),
             f"{1e3 * one.to_zero:.0f}",
-            _mark(one.passed),
+            mark(one.passed),
         )
         for one in killed
     ]
@@ -88,7 +88,7 @@ def systematic_table(cases: Sequence[FaultResult]) -> Group:
             by_rig = [sum(case.fault.rig == rig for case in here) for rig in RIGS]
             passed = sum(case.passed for case in here)
             counts = (f"{n:,}" for n in (*by_rig, len(here), passed))
-            rows.append((operation, *counts, _mark(passed == len(here))))
+            rows.append((operation, *counts, mark(passed == len(here))))
     lines = [
         Text(f"{case.fault}: {'; '.join(case.wrong)} ({case.happened})")
         for case in cases
@@ -100,7 +100,3 @@ def systematic_table(cases: Sequence[FaultResult]) -> Group:
 
 def _indented(text: str) -> Padding:
     return Padding(Text(text), (0, 0, 0, 2))
-
-
-def _mark(passed: bool) -> Text:
-    return Text("✓", style="green") if passed else Text("✗", style="red")

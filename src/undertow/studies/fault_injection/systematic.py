@@ -30,7 +30,7 @@ from types import FrameType
 
 import numpy as np
 
-from undertow.base import InvalidInputError, Progress, UndertowError, no_progress
+from undertow.base import InvalidInputError, Progress, UndertowError, error_text, no_progress
 from undertow.cascade import CascadeState
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, RigWrapper
@@ -269,7 +269,7 @@ class Systematic:
                 return FaultResult(fault, (f"still going after {CASE_TIMEOUT:g} s",), "it hung")
             except Exception as error:  # whatever came through is a finding
                 _end_children()
-                return FaultResult(fault, (f"{type(error).__name__}: {error}",), "it raised")
+                return FaultResult(fault, (error_text(error),), "it raised")
             return self._judged(fault, tally, run, before)
 
     def drill(

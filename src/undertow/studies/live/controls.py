@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from undertow.base import InvalidInputError, one_of
+from undertow.base import between, one_of
 from undertow.closed_loop.figures import display
 from undertow.models import Mechanism, Parameter, invariant_coordinates, number_of
 from undertow.objective import Goal
@@ -86,13 +86,10 @@ class Control:
             return replace(self, value=str(value))
         number = number_of(self.label, value)
         rounded = 1e-5 * max(abs(self.low), abs(self.high))  # viewers have six digits
-        if not self.low - rounded <= number <= self.high + rounded:
-            raise InvalidInputError(
-                self.label,
-                value=f"{number:g} {self.unit}".rstrip(),
-                limit=f"{self.low:g} to {self.high:g}",
-            )
-        return replace(self, value=min(max(number, self.low), self.high))
+        inside = min(max(number, self.low), self.high)
+        if not abs(number - inside) <= rounded:
+            between(self.label, number, self.low, self.high, self.unit)
+        return replace(self, value=inside)
 
     def shown(self) -> dict[str, Any]:
         """Return it as JSON values."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from undertow.base import InvalidInputError
 from undertow.closed_loop.figures import display
 from undertow.display.live import Message, Scene
 from undertow.law import ReachingLaw, Surface
@@ -34,13 +35,38 @@ def described(mechanism: Mechanism, scene: Scene) -> Message:
 
 
 def frame_message(
-    t: float, x: FloatArray, u: FloatArray, demand: FloatArray, s: FloatArray, predicted: float
-) -> Message:
-    """Return a picture: time, state, input, what the law asked for, s, and what is left to pay."""
+    scene: Scene, parameters: FloatArray, t: float, x: FloatArray, u: FloatArray,
+    demand: FloatArray, s: FloatArray, predicted: float,
+) -> Message:  # fmt: skip
+    """Return a picture: time, state, input, what the law asked for, s, and what is left to pay.
+
+    And where the points of the figure are, of a plant with these parameters.
+    """
     return {
         "kind": "frame", "t": float(t), "x": x.tolist(), "u": u.tolist(),
         "demand": np.asarray(demand).tolist(), "s": s.tolist(), "left": float(predicted),
+        "points": scene.places(x[: len(x) // 2], parameters).tolist(),
     }  # fmt: skip
+
+
+class ReadOnlyShow:
+    """A show that is only looked at: whatever its viewers ask for is refused."""
+
+    what, remedy = "recording", ""
+
+    def hear(self, said: Message, viewer: int) -> None:
+        """Refuse whatever is asked for.
+
+        Raises
+        ------
+        InvalidInputError
+            Always.
+        """
+        asked = repr(said.get("do"))[:40]
+        raise InvalidInputError(self.what, value=asked, limit="looked at", remedy=self.remedy)
+
+    def gone(self, viewer: int) -> None:
+        """Nothing was held."""
 
 
 def plan_message(

@@ -38,11 +38,11 @@ class Task:
     period: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Job(Request):
     """A request, what for, and what was seen of the plant since the one before: t, x and u."""
 
-    task: Task | None = None
+    task: Task
     seen: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
 
@@ -55,7 +55,6 @@ def planner(mechanism: Mechanism, seed: int = 0) -> Callable[[Request], Answer]:
 
     def answer(request: Request) -> Answer:
         assert isinstance(request, Job)  # the page asks for nothing else
-        assert request.task is not None  # and says what for
         controller, memory = cascade(request.task), request.memory
         if request.seen is not None and len(request.seen[0]) > 1:
             try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import InvalidInputError, Progress, no_progress
+from undertow.base import Progress, no_progress
 from undertow.cascade import Cascade, Run
 from undertow.display.live import Message, Scene
 from undertow.display.sketches import Sketch, sketch
@@ -18,14 +18,14 @@ from undertow.models import FloatArray, Mechanism
 from undertow.runtime import Columns, Mode, Recording, read_log
 from undertow.runtime.encoding import answer_from, memory_from
 from undertow.runtime.replay import legible, recorded_recipe
-from undertow.studies.live.messages import described, frame_message, plan_message
+from undertow.studies.live.messages import ReadOnlyShow, described, frame_message, plan_message
 from undertow.studies.live.planner import Task, cascade_for
 
 #: Pictures in a second, and most of them: a long recording has fewer a second.
 RATE, MOST = 60.0, 12_000
 
 
-class Recorded:
+class Recorded(ReadOnlyShow):
     """A recording, shown: every viewer moves the time bar of his own.
 
     Parameters
@@ -44,19 +44,6 @@ class Recorded:
     def advance(self, seconds: float) -> list[Message]:
         """Nothing is new."""
         return []
-
-    def hear(self, said: Message, viewer: int) -> None:
-        """Refuse whatever is asked for: what is over does not change.
-
-        Raises
-        ------
-        InvalidInputError
-            Always.
-        """
-        raise InvalidInputError("recording", value=repr(said.get("do"))[:40], limit="looked at")
-
-    def gone(self, viewer: int) -> None:
-        """Nothing was held."""
 
 
 def of_run(run: Run, cascade: Cascade, figure: Sketch | None = None) -> Message:
@@ -106,7 +93,7 @@ def recorded_run(
     return of_run(run, cascade, sketch_named(name, mechanism))
 
 
-class Told:
+class LoggedRun:
     """A run as its log tells it: what moved, and what was decided.
 
     Parameters
@@ -188,15 +175,15 @@ def of_log(path: Path, mechanism: str | None = None) -> Message:
         When it is no log of a run, or is of a mechanism that has to be named.
     """
     recording = read_log(path)
-    told = Told(recording, mechanism)
+    run = LoggedRun(recording, mechanism)
     with legible(path):
         steps = recording.steps
         if len(steps) < 2:
             raise ValueError("less than two steps")
-        t = steps[:, told.columns.t]
-        plans = [told.first | {"t": float(t[0])}, *told.decisions(recording)]
-        frames = told.frames(steps[_evenly(t)])
-        return _recording(told.belief, told.scene, frames, plans)
+        t = steps[:, run.columns.t]
+        plans = [run.first | {"t": float(t[0])}, *run.decisions(recording)]
+        frames = run.frames(steps[_evenly(t)])
+        return _recording(run.belief, run.scene, frames, plans)
 
 
 def _evenly(t: FloatArray) -> Any:
@@ -225,8 +212,7 @@ def _pictures(
     for k, row in enumerate(zip(t, x, u, demand, s, left, strict=True)):
         if not np.isfinite(row[1]).all():
             continue
-        frame = frame_message(*row)
-        frame["points"] = scene.places(row[1][: mechanism.n], values).tolist()
+        frame = frame_message(scene, values, *row)
         if modes:
             frame["mode"] = modes[k]
         frames.append(frame)

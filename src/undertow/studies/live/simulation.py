@@ -295,8 +295,9 @@ class Simulation:
             self._apply(answer)
 
     def _error(self, x: FloatArray) -> FloatArray:
+        """Return how far states, (…, 2n), are off the target in force."""
         error = x.copy()
-        error[: self.mechanism.n] -= self._goal
+        error[..., : self.mechanism.n] -= self._goal
         return error
 
     def _free_angles(self) -> list[int]:
@@ -376,8 +377,7 @@ class Simulation:
         seen = None
         if len(self._seen) > 1 and not first:
             t, states, inputs = zip(*self._seen, strict=True)
-            seen = np.array(t), np.array(states), np.array(inputs)
-            seen = (seen[0], seen[1] - np.concatenate([self._goal, 0 * self._goal]), seen[2])
+            seen = np.array(t), self._error(np.array(states)), np.array(inputs)
         self._seen.clear()
         job = Job(
             self.t, self._error(x), use, replace(memory, sequence=self._sequence - 1),
@@ -391,8 +391,7 @@ class Simulation:
         answer = self._worker.take(self.t)
         if answer is None or self._asked is None or answer.sequence != self._asked[0]:
             return  # of before a reset
-        job = self._asked[1]
-        self._asked = None
+        job, self._asked = self._asked[1], None
         if self.memory is None:
             if answer.proposal.plan is None or answer.memory.plan is None or not answer.jump:
                 self._why = answer.proposal.message or answer.proposal.status
@@ -402,24 +401,18 @@ class Simulation:
                 self.mode = RUNNING
                 return
             if not job.target or not any(job.target.position(0.0)):
-                assert job.task is not None
                 self._firsts[job.task] = answer
-            self._task = job.task or self._task
-            self._apply(answer)
+        elif self.t <= answer.use + 1.5 * PICTURE * self.speed:
+            if answer.seconds < 0.5 * self._lead:
+                self._lead = max(0.9 * self._lead, 0.01)
+            self._task, self._waiting = job.task, answer
             return
-        if self.t > answer.use + 1.5 * PICTURE * self.speed:
-            late = self.t - answer.use
-            if answer.jump:  # what is for another task may be late: the state is looked at
-                self._task = job.task or self._task
-                self._apply(answer)
-                return
+        elif not answer.jump:  # what is for another task may be late: the state is looked at
             self._lead = min(1.5 * self._lead, self._settings.max_lead_time)
-            self._decide(answer, False, f"late by {1e3 * late:.0f} ms")
+            self._decide(answer, False, f"late by {1e3 * (self.t - answer.use):.0f} ms")
             return
-        if answer.seconds < 0.5 * self._lead:
-            self._lead = max(0.9 * self._lead, 0.01)
-        self._task = job.task or self._task
-        self._waiting = answer
+        self._task = job.task
+        self._apply(answer)
 
     def _apply(self, answer: Answer) -> None:
         """Use an answer, now that its time has come, unless it is for another state."""
@@ -491,8 +484,9 @@ class Simulation:
         error = self._error(x)
         s, demand = (self.law.surface.s(error), self.law.demand)
         predicted = math.nan if self.memory is None else self.memory.predicted - self._spent
-        frame = frame_message(self.t, x, self._u, demand, s, predicted)
-        frame["points"] = self.scene.places(x[: self.mechanism.n], self._parameters).tolist()
+        frame = frame_message(
+            self.scene, self._parameters, self.t, x, self._u, demand, s, predicted
+        )
         if self.hands:
             frame["held"] = self.hands.shown(x[: self.mechanism.n], self._parameters)
         if not self._history or self._history[-1]["t"] < self.t:
@@ -559,10 +553,7 @@ class Simulation:
                 self._step()
 
     def _go(self, speed: float) -> None:
-        if speed not in SPEEDS:
-            raise InvalidInputError(
-                "speed", value=f"{speed:g}", limit=f"one of {', '.join(map(str, SPEEDS))}"
-            )
+        one_of("speed", str(speed), map(str, SPEEDS))
         self.speed = speed
 
     def _push(self, side: float) -> None:

@@ -6,11 +6,11 @@ import math
 from collections import deque
 from pathlib import Path
 
-from undertow.base import ArtefactError, InvalidInputError
+from undertow.base import ArtefactError
 from undertow.display.live import Message
 from undertow.runtime import GrowingLog, Recording
-from undertow.studies.live.messages import described
-from undertow.studies.live.recorded import RATE, Told, of_log
+from undertow.studies.live.messages import ReadOnlyShow, described
+from undertow.studies.live.recorded import RATE, LoggedRun, of_log
 
 #: Time between two looks at the log, s; how much later pictures are shown than they came about, so
 #: that none is missing; and how much of the past who comes later is shown.
@@ -20,7 +20,7 @@ LOOK, BEHIND, PAST = 0.04, 0.12, 8.0
 DECISIONS = 400
 
 
-class Watched:
+class Watched(ReadOnlyShow):
     """A run, shown while it goes on; once it is over, what was recorded of it.
 
     Parameters
@@ -41,13 +41,15 @@ class Watched:
         When it is no log of a run, or is of a mechanism that has to be named.
     """
 
+    what, remedy = "run", "Give it another target from a terminal: undertow target"
+
     def __init__(self, path: Path, mechanism: str | None = None) -> None:
         self._log, self._mechanism, self.over = GrowingLog(path), mechanism, False
         first = self._log.news(most=1)
-        self._told = Told(first, mechanism)
-        self._every = max(1, round(1.0 / (RATE * self._told.period)))
+        self._run = LoggedRun(first, mechanism)
+        self._every = max(1, round(1.0 / (RATE * self._run.period)))
         self._frames: deque[Message] = deque(maxlen=math.ceil(PAST * RATE))
-        self._plans: deque[Message] = deque([self._told.first], maxlen=DECISIONS)
+        self._plans: deque[Message] = deque([self._run.first], maxlen=DECISIONS)
         self._recording: Message | None = None
         self._wait = 0.0
         self._tell(first)
@@ -55,7 +57,7 @@ class Watched:
     def hello(self) -> Message:
         """Return what a new viewer must know: the last seconds, or all of a run that is over."""
         return self._recording or {
-            **described(self._told.belief, self._told.scene), "live": True, "watched": True,
+            **described(self._run.belief, self._run.scene), "live": True, "watched": True,
             "behind": BEHIND, "speeds": [1.0], "controls": [], "frames": [*self._frames],
             "state": {"kind": "state", "mode": "watched", "paused": False, "speed": 1.0},
             "plans": [*self._plans],
@@ -78,23 +80,7 @@ class Watched:
         return [self._recording]
 
     def _tell(self, news: Recording) -> list[Message]:
-        frames, plans = self._told.frames(news.steps), self._told.decisions(news)
+        frames, plans = self._run.frames(news.steps), self._run.decisions(news)
         self._frames += frames
         self._plans += plans
         return [*plans, *frames]
-
-    def hear(self, said: Message, viewer: int) -> None:
-        """Refuse whatever is asked for: nothing reaches the run from here.
-
-        Raises
-        ------
-        InvalidInputError
-            Always.
-        """
-        raise InvalidInputError(
-            "run", value=repr(said.get("do"))[:40], limit="looked at",
-            remedy="Give it another target from a terminal: undertow target",
-        )  # fmt: skip
-
-    def gone(self, viewer: int) -> None:
-        """Nothing was held."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import ctypes
 import tempfile
 from bisect import bisect_right
@@ -16,7 +15,7 @@ from rich.table import Table
 
 from undertow.base import Progress, no_progress, table, to_csv
 from undertow.export import Agreement, EmbeddedController, Footprint
-from undertow.export.host import FLAGS, HELD, NEAREST, Build, run_on_rig, version
+from undertow.export.host import FLAGS, NEAREST, Build, is_held, run_on_rig, version
 from undertow.export.sources import render
 from undertow.export.twin import run_positions
 from undertow.models import FloatArray
@@ -107,15 +106,6 @@ class _Library:
         return self._u.astype(float)
 
 
-def _copied(rig: RealisticRig) -> RealisticRig:
-    """Return a rig that goes on by itself; what never changes is shared."""
-    twin = copy.copy(rig)
-    for name, value in vars(rig).items():
-        if isinstance(value, np.ndarray | np.random.Generator):
-            setattr(twin, name, copy.deepcopy(value))
-    return twin
-
-
 def _run(library: _Library, rig: RealisticRig, periods: int) -> tuple[FloatArray, FloatArray]:
     """Return positions (N, n) and outputs (N, m); an output that no rig takes ends the run."""
     positions, outputs = [], []
@@ -144,12 +134,11 @@ def upset_every_bit(
     """
     controller = build.controller
     limit, m = controller.mechanism.input_limits, controller.mechanism.m
-    library, rig = _Library(build), _copied(rig)
+    library, rig = _Library(build), rig.copied()
     with build.start() as process:
         places = process.places
     names, begins = list(places), list(places.values())
     runs, beyond, held = (dict.fromkeys(names, 0) for _ in range(3))
-    last = max(1, round(1.0 / rig.period))
     chosen = range(0, library.bits, every)
     undisturbed, done = True, 0
     library.begin()
@@ -157,9 +146,8 @@ def upset_every_bit(
         so_far = moments[number - 1] if number else 0.0
         _run(library, rig, round(moment / rig.period) - round(so_far / rig.period))
         memory = library.memory.copy()
-        q, u = _run(library, _copied(rig), round(after / rig.period))
-        balanced = bool((np.abs(q[-last:, m:]) <= HELD).all())
-        undisturbed &= balanced
+        q, u = _run(library, rig.copied(), round(after / rig.period))
+        undisturbed &= is_held(q, m, rig.period)
         for bit in chosen:
             library.memory[:] = memory
             library.flip(bit)
@@ -167,11 +155,11 @@ def upset_every_bit(
             if not np.array_equal(given, u):
                 library.memory[:] = memory
                 library.flip(bit)
-                seen, given = _run(library, _copied(rig), len(q))
+                seen, given = _run(library, rig.copied(), len(q))
             name = names[bisect_right(begins, bit // 8) - 1]
             runs[name] += 1
             beyond[name] += not (np.abs(given) <= limit).all()
-            held[name] += len(seen) == len(q) and bool((np.abs(seen[-last:, m:]) <= HELD).all())
+            held[name] += len(seen) == len(q) and is_held(seen, m, rig.period)
             done += 1
             if done % 64 == 0:
                 progress(done / len(chosen) / len(moments))

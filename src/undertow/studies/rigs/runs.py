@@ -221,11 +221,15 @@ def _exceedance(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return ordered, 1.0 - np.arange(len(ordered)) / max(1, len(ordered))
 
 
-def chatter_figure(recording: Recording, window: float = 0.1) -> bytes:
-    """Return a PNG of the total variation of each input in windows of ``window`` s."""
+#: Windows in which the total variation of the inputs is shown, s.
+WINDOW = 0.1
+
+
+def chatter_figure(recording: Recording) -> bytes:
+    """Return a PNG of the total variation of each input in windows of ``WINDOW`` s."""
     _, inputs, _ = Columns.shown(recording.columns)
     units = recording.meta.get("units", {})
-    count = max(1, round(window / float(recording.meta["period"])))
+    count = max(1, round(WINDOW / float(recording.meta["period"])))
     figure = _figure(3.2)
     ax = figure.subplots()
     total = 0.0
@@ -240,7 +244,7 @@ def chatter_figure(recording: Recording, window: float = 0.1) -> bytes:
     unit = ", ".join(sorted(set(units.values())))
     ax.set(
         xlabel="time, s", ylabel=f"total variation, {unit}/s", yscale="symlog",
-        title=f"chattering: {total:.4g} {unit} in all, in windows of {window:g} s",
+        title=f"chattering: {total:.4g} {unit} in all, in windows of {WINDOW:g} s",
     )  # fmt: skip
     ax.title.set_fontsize(10)
     ax.set_ylim(bottom=0)
