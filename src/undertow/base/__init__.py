@@ -46,7 +46,7 @@ from undertow.base.errors import (
     require_extra,
 )
 from undertow.base.files import check_file, file_hash, parse_json, read_file
-from undertow.base.progress import Progress, no_progress
+from undertow.base.progress import Progress, duration, no_progress
 from undertow.base.verdict import Verdict, inward
 
 __all__ = [
@@ -71,6 +71,7 @@ __all__ = [
     "check_file",
     "check_folder",
     "checked",
+    "duration",
     "facts",
     "file_hash",
     "finite",
