@@ -29,7 +29,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +39,6 @@ import scipy.optimize
 from scipy.stats import binomtest
 
 import undertow as ut
-from undertow.base import versions
 from undertow.closed_loop.figures import state_words
 from undertow.models import FloatArray
 from undertow.objective import objective_for
@@ -93,7 +92,8 @@ class Kind(NamedTuple):
     freedom: str
 
 
-class Found(NamedTuple):
+@dataclass(frozen=True)
+class Found:
     """Simulated cost, ``inf`` where nothing arrives, and processor time, s."""
 
     cost: float
@@ -274,18 +274,13 @@ def named_searches(count: int, methods: Sequence[str]) -> list[str]:
 # -- what was found --------------------------------------------------------------------------------
 
 
-def ledger(path: Path | None, seed: int) -> Ledger[Place, Found]:
+def ledger(path: Path | None, seed: int) -> Ledger[Found]:
     """Return what is known already."""
-
-    def read(line: Any) -> tuple[Place, Found]:
-        *place, cost, seconds = line
-        return Place(*place), Found(float(cost), float(seconds))
-
-    return Ledger(path, {"basins": versions(), "seed": seed}, read)
+    return Ledger(path, tuple[str, str, str, int, str, Found], {"basins": True, "seed": seed})
 
 
 def fill(
-    kept: Ledger[Place, Found],
+    kept: Ledger[Found],
     kinds: Sequence[Kind],
     starts: int,
     searches: Sequence[str],
@@ -300,7 +295,7 @@ def fill(
         task = Task(drawn(kind.mechanism, number, seed), kind.goal, kind.freedom)
         for place in wanting:
             found = task.run(place.search)
-            kept.keep(place, found, [*place, repr(found.cost), repr(found.seconds)])
+            kept.keep(place, found)
 
 
 class Tally(NamedTuple):
@@ -327,7 +322,7 @@ class Tally(NamedTuple):
 
 
 def tallies(
-    known: Mapping[Place, Found], kinds: Sequence[Kind], starts: int, searches: Sequence[str]
+    known: Mapping[Any, Found], kinds: Sequence[Kind], starts: int, searches: Sequence[str]
 ) -> list[Tally]:
     """Gather the costs of every start and kind."""
     return [

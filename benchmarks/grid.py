@@ -18,6 +18,7 @@ from harness import command_line, need, table  # isort: skip
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 import undertow as ut
-from undertow.base import number, versions, write_files
+from undertow.base import number, write_files
 from undertow.closed_loop.figures import COLOURS, figure_files, state_words, style
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray
@@ -78,7 +79,8 @@ class Sheet(NamedTuple):
     task: Callable[[int, int], Task]
 
 
-class Found(NamedTuple):
+@dataclass(frozen=True)
+class Found:
     """Costs of a cell; ``inf`` where a cascade does not arrive, NaN where no bound was found."""
 
     cascade: float
@@ -125,20 +127,15 @@ def own_sheet() -> Sheet:
 SHEETS: dict[str, Callable[[], Sheet]] = {"rotary": rotary_sheet, "own": own_sheet}
 
 
-def ledger(path: Path | None, seed: int) -> Ledger[Place, Found]:
+def ledger(path: Path | None, seed: int) -> Ledger[Found]:
     """Return what is known already."""
-
-    def read(line: Any) -> tuple[Place, Found]:
-        name, row, column, goal, *values = line
-        return (name, row, column, goal), Found(*map(float, values))
-
-    return Ledger(path, {"grid": versions(), "seed": seed}, read)
+    return Ledger(path, tuple[str, int, int, str, Found], {"grid": True, "seed": seed})
 
 
 def fill(
     name: str,
     sheet: Sheet,
-    kept: Ledger[Place, Found],
+    kept: Ledger[Found],
     places: Iterable[tuple[int, int]],
     seed: int,
 ) -> dict[tuple[int, int, str], Found]:
@@ -158,7 +155,7 @@ def fill(
                     within=ut.state_box(**dict.fromkeys(upright, math.pi / 2)),
                 )
                 found = Found(e.cascade, e.free, e.bound, e.seconds)
-                kept.keep(place, found, [*place, *map(repr, found)])
+                kept.keep(place, found)
                 gaps = ", ".join(f"{KINDS[kind]} {percent(found.gap(kind))}" for kind in KINDS)
                 print(f"{mechanism.name} {sheet.rows[row].splitlines()[0]}, "
                       f"{sheet.columns[column]}, {goal}: bound {found.bound:.5g}, {gaps} "

@@ -52,7 +52,8 @@ from undertow.runtime import (
     replay,
     respond,
 )
-from undertow.studies.trials.robustness import run_ledger
+from undertow.studies.ledger import Ledger
+from undertow.studies.trials.trial import Result
 from undertow.symbolic import store
 from undertow.symbolic.private import private_folder
 
@@ -490,9 +491,14 @@ class Certificates:
 
 SETTINGS = {"angle": 0.5, "seconds": 10.0}
 RESULT = {
-    "seed": 4, "balanced": True, "caught": True, "settled": None, "cost": 2.5, "effort": 1.5,
+    "seed": 4, "balanced": True, "caught": True, "settled": "inf", "cost": 2.5, "effort": 1.5,
     "chatter": 20.0,
 }  # fmt: skip
+
+
+def ledger(path: Path) -> Ledger[Result]:
+    """Read one."""
+    return Ledger(path, tuple[str, str, float, Result], SETTINGS)
 
 
 class Ledgers:
@@ -509,7 +515,7 @@ class Ledgers:
         content = "\n".join(map(written, lines)).encode("utf-8", "surrogatepass") + b"\n"
         target = case / "ledger.jsonl"
         target.write_bytes(flipped(content, rng) if rng.random() < 0.2 else content)
-        return lambda: run_ledger(target, SETTINGS)
+        return lambda: ledger(target)
 
 
 class Manifests:
@@ -528,7 +534,7 @@ class Manifests:
         content = written(mutated(self.sample, rng)).encode("utf-8", "surrogatepass")
         target.write_bytes(flipped(content, rng) if rng.random() < 0.3 else content)
         readers: tuple[Callable[[Path], object], ...] = (
-            read_certificate, replay, lambda path: run_ledger(path, SETTINGS),
+            read_certificate, replay, ledger,
             modelling.from_urdf, modelling.from_mjcf,
         )  # fmt: skip
         reader = rng.choice(readers)

@@ -249,8 +249,10 @@ def test_what_was_done_is_not_done_again(tmp_path: Path) -> None:
     """The table comes from the file alone; of other versions it is refused."""
     file = tmp_path / "coverage.jsonl"
     done = [[noise, seed, {"l": 3.0 * seed - 1.0}] for noise in NOISES for seed in (0, 1)]
-    file.write_text("\n".join(map(json.dumps, [versions(), *done])) + "\n")
-    rows = coverage(2, keep=file)
+    head = {"settings": {}, "versions": versions()}
+    file.write_text("\n".join(map(json.dumps, [head, *done])) + "\n")
+    work = coverage(2)
+    rows = work.run(work.ledger(tmp_path))
     assert [(row.name, row.count, row.covered) for row in rows] == [("l", 2, 1), ("", 2, 1)] * 2
     assert rows[0].mean == 0.5
     console = Console(width=100)
@@ -259,7 +261,7 @@ def test_what_was_done_is_not_done_again(tmp_path: Path) -> None:
     assert "50.0 %" in shown.get()
     file.write_text("{}\n")
     with pytest.raises(ArtefactError, match="other versions"):
-        coverage(2, keep=file)
+        work.ledger(tmp_path)
 
 
 @pytest.mark.slow

@@ -477,7 +477,7 @@ def test_a_folder_of_files(pole: Path, tmp_path: Path) -> None:
     )
     (tmp_path / "broken.urdf").write_text("<robot>")
     (tmp_path / "two.urdf").write_text(URDF.replace('effort="30"', 'effort="0"'))
-    rows = {row.name: row for row in model_files(tmp_path, simulate=False)}
+    rows = {row.name: row for row in model_files(tmp_path, simulate=False).run()}
     assert set(rows) == {"broken.urdf", "common/look.xml", "free.xml", "note.xml", "pole.xml",
                          "two.urdf:slide"}  # fmt: skip
     refused = {name: row.refused for name, row in rows.items()}

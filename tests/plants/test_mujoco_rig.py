@@ -132,4 +132,4 @@ def test_a_target_with_another_name_is_refused() -> None:
 def test_the_cascade_balances_in_mujoco_without_retuning(name: str) -> None:
     from undertow.studies.trials.upright import engine_trial
 
-    assert engine_trial(ut.mechanisms.LIBRARY[name](), seconds=6.0, budget=128).outcome.balanced
+    assert engine_trial(name, seconds=6.0, budget=128).outcome.balanced

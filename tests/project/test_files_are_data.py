@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import sqlite3
@@ -40,8 +41,9 @@ from undertow.runtime import (
     replay,
 )
 from undertow.runtime.slow_loop import respond
+from undertow.studies.ledger import Ledger
 from undertow.studies.rigs.bring_up import coverage
-from undertow.studies.trials.robustness import run_ledger
+from undertow.studies.trials.trial import Result
 
 MEMORY = CascadeState(Plan.of(ut.Surface(alpha_a=-1, lambda_a=-0.25, alpha_u=1.6, lambda_u=17.3)))
 
@@ -282,8 +284,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     ).read_certificate(path),
     "urdf": modelling.from_urdf,
     "mjcf": modelling.from_mjcf,
-    "ledger": lambda path: run_ledger(path, {}),
-    "coverage": lambda path: coverage(1, keep=path),
+    "ledger": lambda path: Ledger(path, tuple[str, Result], {}),
+    "coverage": lambda path: Ledger(path, coverage(1).line, {}),
 }
 
 
@@ -376,7 +378,7 @@ def test_a_model_that_is_none_is_refused_at_once(what: str) -> None:
 
 LINE: list[Any] = [
     "cascade", "delay", 0.5,
-    {"seed": 1, "balanced": True, "caught": True, "settled": None, "cost": 1.0, "effort": 1.0,
+    {"seed": 1, "balanced": True, "caught": True, "settled": "inf", "cost": 1.0, "effort": 1.0,
      "chatter": 1.0},
 ]  # fmt: skip
 
@@ -385,15 +387,18 @@ LINE: list[Any] = [
     "line",
     [7, [1, 2, 3], ["a", "b", 1.0, []], ["a", "b", "x", LINE[3]], [["a"], "b", 1.0, LINE[3]],
      ["a", "b", 1.0, {**LINE[3], "more": 1}], ["a", "b", 1.0, {**LINE[3], "balanced": "yes"}],
-     ["a", "b", 1.0, {**LINE[3], "seed": [1]}]],
+     ["a", "b", 1.0, {**LINE[3], "seed": [1]}], ["a", "b", 1.0, {**LINE[3], "cost": "1.0"}],
+     ["a", "b", 1.0, {**LINE[3], "cost": None}], ["a", "b", True, LINE[3]]],
 )  # fmt: skip
 def test_a_line_that_is_no_result_is_refused(tmp_path: Path, line: Any) -> None:
     path = tmp_path / "ledger.jsonl"
-    run_ledger(path, {"angle": 0.5})
+    kind = tuple[str, str, float, Result]
+    Ledger(path, kind, {"angle": 0.5})
     with path.open("a") as file:
         file.write(json.dumps(LINE) + "\n")
-    assert run_ledger(path, {"angle": 0.5}).known.get(("cascade", "delay", 0.5, 1)) is not None
+    again: Ledger[Result] = Ledger(path, kind, {"angle": 0.5})
+    assert again.known["cascade", "delay", 0.5].settled == math.inf
     with path.open("a") as file:
         file.write(json.dumps(line) + "\n")
     with pytest.raises(ArtefactError, match="ledger"):
-        run_ledger(path, {"angle": 0.5})
+        Ledger(path, kind, {"angle": 0.5})

@@ -623,31 +623,39 @@ def test_ctrl_c_at_any_moment_is_one_line(moment: str) -> None:
 def test_an_interrupted_survey_keeps_its_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Shown, on disk, and how to go on; the exit status is a shell's for Ctrl-C."""
+    """Shown, on disk, and gone on with by the same command; the exit status is a shell's."""
     made: list[str] = []
 
-    def one(mechanism: ut.Mechanism, objective: ut.Objective, **_: Any) -> survey.Entry:
-        if made:
+    def one(mechanism: ut.Mechanism, objective: ut.Objective, goal: str, **_: Any) -> survey.Entry:
+        made.append(f"{goal},{mechanism.name}")
+        if len(made) == 2:
             raise KeyboardInterrupt
-        made.append(mechanism.name)
         return survey.Entry(
-            "energy", mechanism.name, 2, 1, "", "", 3.0, 2.0, 1.0, 1.0, 4.0, 0.01, math.nan, 0.5
+            goal, mechanism.name, 2, 1, "", "", 3.0, 2.0, 1.0, 1.0, 4.0, 0.01, math.nan, 0.5
         )
 
     monkeypatch.setattr(survey, "survey_one", one)
     words = ["survey", "--only", "tora", "--only", "acrobot", "--only", "pendubot"]
-    result = CliRunner().invoke(app, [*words, "--no-bounds", "--out", str(tmp_path)])
+    words += ["--no-bounds", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, words)
     assert result.exit_code == 130
     assert "1 of 1" in result.stdout
-    said = result.stderr.splitlines()
-    assert any(line.startswith("interrupted: 1 of 6 are done") for line in said)
-    first, then = "--only acrobot --only pendubot", "--only tora --only acrobot --only pendubot"
-    assert said[-2:] == [
-        f"undertow survey --objective energy {first}", f"undertow survey --objective time {then}"
-    ]  # fmt: skip
+    kept = tmp_path / "survey.jsonl"
+    said = f"interrupted: 1 of 6 are done, they are in {kept}; the same command goes on there"
+    assert said in result.stderr.splitlines()
     rows = (tmp_path / "survey.csv").read_text().splitlines()
     assert len(rows) == 2
     assert rows[1].startswith("energy,tora")
+    refused = CliRunner().invoke(app, [*words, "--seed", "1"])
+    assert refused.exit_code == 1
+    assert "other versions or settings" in refused.stderr
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert len(made) == 1 + 6  # the one that was interrupted, and every other once
+    assert "energy,tora" not in made[1:]
+    rows = (tmp_path / "survey.csv").read_text().splitlines()
+    assert [",".join(row.split(",")[:2]) for row in rows[1:]] == [made[0], *made[2:]]
+    assert not kept.exists()  # all of it is in the table
 
 
 def test_interrupted_trials_keep_their_rows(
@@ -656,15 +664,16 @@ def test_interrupted_trials_keep_their_rows(
     from undertow.studies.trials import library
     from undertow.studies.trials.library import LibraryRow
 
-    def some(*, done: Callable[[LibraryRow], None], **_: Any) -> None:
-        done(LibraryRow("tora", 1, 0.1, 1, 1, {}, 3.0, 0.5))
-        raise KeyboardInterrupt
+    def some(name: str, **_: Any) -> LibraryRow:
+        if name != next(iter(LIBRARY)):
+            raise KeyboardInterrupt
+        return LibraryRow("tora", 1, 0.1, 1, 1, {}, 3.0, 0.5)
 
     monkeypatch.setattr(library, "through_the_runtime", some)
     result = CliRunner().invoke(app, ["trials", "library", "--out", str(tmp_path)])
     assert result.exit_code == 130
     assert "tora" in result.stdout
-    assert "interrupted" in result.stderr
+    assert "interrupted: 1 of 13 are done" in result.stderr
     kept = (tmp_path / "library.txt").read_text()
     assert "tora" in kept
     assert "bench-energy: ∫ (uᵀu + 0.05 xᵀx) dt" in plain(kept)
@@ -688,7 +697,8 @@ def test_interrupted_balance_keeps_what_is_whole(
     words = ["trials", "balance", "--seeds", "1", "--no-limits", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 130, result.output
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["balance.csv", "balance.txt"]
+    names = ["balance.csv", "balance.jsonl", "balance.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
     rows = (tmp_path / "balance.csv").read_text().splitlines()
     assert rows[1].startswith("bench-energy,base,0,")
     assert len(rows) == 2

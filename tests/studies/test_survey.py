@@ -27,7 +27,7 @@ PROMPT = "rotary_pendulum"
 
 @cache
 def entry(name: str, bounds: bool = False, goal: str = "energy") -> survey.Entry:
-    return survey.survey([name], goals=[goal], bounds=bounds)[0]
+    return survey.survey([name], goals=[goal], bounds=bounds).run()[0]
 
 
 def documented(goal: str = "energy") -> dict[str, list[str]]:

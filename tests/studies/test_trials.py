@@ -19,21 +19,18 @@ from undertow.law import InnerLoop
 from undertow.objective import objective_for
 from undertow.plants import Friction, Push, srv02_rig
 from undertow.runtime.controller_defaults import estimator_for
-from undertow.studies.trials.balance import controllers
+from undertow.studies.experiment import grouped
+from undertow.studies.ledger import Ledger
+from undertow.studies.trials.balance import Balance, controllers
 from undertow.studies.trials.report import balance_files, balance_report
-from undertow.studies.trials.robustness import (
-    breaking_point,
-    keep_run,
-    random_bench,
-    run_ledger,
-)
+from undertow.studies.trials.robustness import breaking_point, random_bench
 from undertow.studies.trials.steering import (
     CascadeSteering,
     clipped_regulator,
     predictive,
     steady,
 )
-from undertow.studies.trials.trial import Outcome, judge, spread, trial, undisturbed
+from undertow.studies.trials.trial import Outcome, Result, judge, spread, trial, undisturbed
 
 
 @pytest.fixture(scope="module")
@@ -112,15 +109,14 @@ def test_a_fixed_law_is_that_of_the_formulas(arm: ut.Mechanism, base: ut.Surface
 def test_the_report_prints_what_was_run() -> None:
     from rich.console import Console
 
-    from undertow.studies.trials.balance import balance
-
-    result = balance(seeds=2, seconds=4.0, budget=64, limits=False)
+    asked = Balance(seeds=2, seconds=4.0, budget=64, limits=False)
+    found = grouped({key: task() for key, task in asked.tasks().items()})
     console = Console(record=True, width=100)
-    console.print(balance_report(result))
+    console.print(balance_report(asked, found))
     text = console.export_text()
     assert "of 2" in text
     assert "φ(0) = 35°" in text
-    files = balance_files(result)
+    files = balance_files(asked, found)
     assert files["balance.csv"].decode().count("\n") == 1 + 2 * 3 * 2
 
 
@@ -161,22 +157,24 @@ def test_predictive_control_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
 
 def test_a_ledger_goes_on_where_it_ended(tmp_path: Path) -> None:
     """Kept runs come back, a line cut off by a kill is left out, other settings are refused."""
-    path = tmp_path / "ledger.jsonl"
+    path, line = tmp_path / "ledger.jsonl", tuple[str, str, float, Result]
     record = Record(*(np.zeros((1, k)) for k in (1, 2, 4, 1, 4)))
-    lost = Outcome(4, False, True, math.inf, math.nan, 1.5, 2.5, record)
-    keep_run(run_ledger(path, {"angle": 0.5}), "cascade", "delay", 0.25, lost)
+    lost = Outcome(4, False, True, math.inf, math.nan, 1.5, 2.5, record).numbers
+    first: Ledger[Result] = Ledger(path, line, {"angle": 0.5})
+    first.keep(("cascade", "delay", 0.25), lost)
     with path.open("a") as file:
         file.write('["cascade", "delay", 0.5, {"se')
-    again = run_ledger(path, {"angle": 0.5})
-    found = again.known.get(("cascade", "delay", 0.25, 4))
-    assert found is not None
+    again: Ledger[Result] = Ledger(path, line, {"angle": 0.5})
+    found = again.known["cascade", "delay", 0.25]
     assert (found.seed, found.balanced, found.caught, found.effort) == (4, False, True, 1.5)
     assert found.settled == math.inf
-    assert again.known.get(("cascade", "delay", 0.5, 4)) is None
-    keep_run(again, "cascade", "delay", 0.5, lost)
-    assert run_ledger(path, {"angle": 0.5}).known.get(("cascade", "delay", 0.5, 4)) is not None
+    assert math.isnan(found.cost)
+    assert ("cascade", "delay", 0.5) not in again.known
+    again.keep(("cascade", "delay", 0.5), lost)
+    third: Ledger[Result] = Ledger(path, line, {"angle": 0.5})
+    assert list(third.known) == [("cascade", "delay", 0.25), ("cascade", "delay", 0.5)]
     with pytest.raises(ArtefactError, match="other versions or settings"):
-        run_ledger(path, {"angle": 0.6})
+        Ledger(path, line, {"angle": 0.6})
 
 
 def test_the_observed_disturbance_frees_an_arm_that_stiction_holds(arm: ut.Mechanism) -> None:

@@ -50,7 +50,7 @@ from undertow.base.errors import (
     require_extra,
 )
 from undertow.base.files import check_file, file_hash, parse_json, read_file
-from undertow.base.progress import Progress, no_progress
+from undertow.base.progress import Progress, duration, no_progress
 from undertow.base.verdict import Verdict, inward
 
 __all__ = [
@@ -76,6 +76,7 @@ __all__ = [
     "check_file",
     "check_folder",
     "checked",
+    "duration",
     "error_text",
     "facts",
     "file_hash",

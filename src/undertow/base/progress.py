@@ -10,3 +10,14 @@ Progress = Callable[[str, float], None]
 
 def no_progress(_what: str, _part: float) -> None:
     """Tell nobody: the default where progress may be watched."""
+
+
+def duration(seconds: float) -> str:
+    """Return a time for people.
+
+    >>> duration(42.0), duration(600.0), duration(9000.0)
+    ('42 s', '10 min', '2.5 h')
+    """
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -1,8 +1,9 @@
-"""SymPy expressions to CasADi ones, and absolute values to smooth constraints."""
+"""SymPy expressions to CasADi ones, dynamics too, and absolute values to smooth constraints."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from itertools import product
 from typing import Any
@@ -10,6 +11,8 @@ from typing import Any
 import sympy as sp
 
 from undertow.base import InvalidInputError
+from undertow.models import TIME, Mechanism
+from undertow.symbolic import Tape
 
 _SAME = "acos asin atan atan2 cos cosh exp log sign sin sinh tan tanh"
 FUNCTIONS = {
@@ -66,3 +69,21 @@ def smooth(margin: sp.Expr) -> list[sp.Expr]:
         plain.xreplace({z: s * a.args[0] for z, s, a in zip(stand_ins, row, absolute, strict=True)})
         for row in signs
     ]
+
+
+def dynamics(ca: Any, mechanism: Mechanism, stage: sp.Expr, margins: Sequence[sp.Expr] = ()) -> Any:
+    """Return the CasADi function (t, x, u) -> (ẋ, Φ, margins)."""
+    tape = Tape()
+    outputs = mechanism.partition(tape).accelerations(sp.Matrix(mechanism.u))
+    outputs += tape.let_all([stage, *margins])
+    t = ca.SX.sym("t")
+    x, u = ca.SX.sym("x", 2 * mechanism.n), ca.SX.sym("u", mechanism.m)
+    known: dict[sp.Basic, Any] = {TIME: t, **mechanism.substitution}
+    known |= zip(mechanism.x, ca.vertsplit(x), strict=True)
+    known |= zip(mechanism.u, ca.vertsplit(u), strict=True)
+    for line in tape.live(outputs):
+        known[line.symbol] = translate(ca, line.expression, known)
+    values = [translate(ca, output, known) for output in outputs]
+    n = mechanism.n
+    rates = ca.vertcat(x[n:], *values[:n])
+    return ca.Function("dynamics", [t, x, u], [rates, values[n], ca.vertcat(*values[n + 1 :])])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -12,12 +11,11 @@ import scipy.interpolate
 import sympy as sp
 
 from undertow.base import InvalidInputError
-from undertow.bounds.expressions import smooth, translate
+from undertow.bounds.expressions import dynamics, smooth
 from undertow.bounds.guesses import Guess, rests, time_scale
 from undertow.bounds.mesh import adapted_mesh, defects, first_mesh
-from undertow.models import TIME, FloatArray, Mechanism, require_smooth
+from undertow.models import FloatArray, Mechanism, require_smooth
 from undertow.objective import Objective
-from undertow.symbolic import Tape
 
 #: Largest defect (see ``Bound.defect``) that a result may have: coarse meshes let a
 #: programme "move" in ways that the mechanism cannot.
@@ -133,28 +131,10 @@ class Programme:
             (f"force of '{mechanism.name}', to be optimised,", mechanism.force),
         ):
             require_smooth(what, expressions, (*mechanism.x, *mechanism.u))
-        self.cost = self._dynamics(stage, margins)
+        self.cost = dynamics(ca, mechanism, stage, margins)
         #: The cost that IPOPT's tolerances, which are absolute, take for one.
         self.unit = 1.0
-        self.effort = self._dynamics(sp.sympify(effort) / mechanism.m, margins)
-
-    def _dynamics(self, stage: sp.Expr, margins: Sequence[sp.Expr]) -> Any:
-        """Return the CasADi function (t, x, u) -> (ẋ, Φ, margins)."""
-        ca, mechanism = self.ca, self.mechanism
-        tape = Tape()
-        outputs = mechanism.partition(tape).accelerations(sp.Matrix(mechanism.u))
-        outputs += tape.let_all([stage, *margins])
-        t = ca.SX.sym("t")
-        x, u = ca.SX.sym("x", 2 * mechanism.n), ca.SX.sym("u", mechanism.m)
-        known: dict[sp.Basic, Any] = {TIME: t, **mechanism.substitution}
-        known |= zip(mechanism.x, ca.vertsplit(x), strict=True)
-        known |= zip(mechanism.u, ca.vertsplit(u), strict=True)
-        for line in tape.live(outputs):
-            known[line.symbol] = translate(ca, line.expression, known)
-        values = [translate(ca, output, known) for output in outputs]
-        n = mechanism.n
-        rates = ca.vertcat(x[n:], *values[:n])
-        return ca.Function("dynamics", [t, x, u], [rates, values[n], ca.vertcat(*values[n + 1 :])])
+        self.effort = dynamics(ca, mechanism, sp.sympify(effort) / mechanism.m, margins)
 
     def _interval(self, dynamics: Any) -> Any:
         """One interval: its defects (4n), its cost, and the margins at its midpoint and end."""

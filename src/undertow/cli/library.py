@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -13,18 +11,8 @@ from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.options import folder, option
 from undertow.cli.parsing import mechanism_named, parse_task
-from undertow.cli.terminal import (
-    check_out,
-    command,
-    completed,
-    end_interrupted,
-    progress_bar,
-    show,
-    terminal,
-    write,
-)
+from undertow.cli.terminal import carry_out, check_out, command, progress_bar, show, terminal, write
 from undertow.closed_loop import ClosedLoop
-from undertow.mechanisms import LIBRARY
 from undertow.objective import USUAL
 from undertow.optimiser import Optimiser
 
@@ -95,28 +83,11 @@ def survey(
     request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.studies import survey as study
 
-    check_out(out)
-    began, entries = time.perf_counter(), list[study.Entry]()
-    names, goals = only or list(LIBRARY), objective or list(study.GOALS)
-    work = partial(study.survey, names, goals=goals, horizon=horizon, seed=seed, bounds=bounds)
-    whole = completed(lambda told: work(progress=told, done=entries.append), entries)
-    written = write(out, lambda: study.files(request, entries))
-    for some in study.by_goal(entries):
-        show("", some[0].goal, study.survey_table(some), least=80, crop=False, soft_wrap=True)
-        show(*study.summary(some))
-    show(*written, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
-    if not whole:
-        ended, part = divmod(len(entries), len(names))
-        left = dict.fromkeys(goals[ended:], names)
-        left[goals[ended]] = names[part:]
-        end_interrupted(
-            f"interrupted: {len(entries)} of {len(goals) * len(names)} are done. The others, with "
-            "the options as before:",
-            *(
-                f"undertow survey --objective {goal} {' '.join(f'--only {one}' for one in others)}"
-                for goal, others in left.items()
-            ),
-        )
+    work = study.survey(
+        only or None, goals=objective or study.GOALS, horizon=horizon, seed=seed, bounds=bounds,
+        request=request,
+    )  # fmt: skip
+    carry_out(work, out, seed=seed, least=80, crop=False, soft_wrap=True)
 
 
 @command("undertow models robots", "undertow models robots --no-simulate --out tables")
@@ -136,15 +107,8 @@ def models(
     """Read every URDF and MJCF file of a folder: what is balanced, and what is not and why."""
     from undertow.studies import model_files as study
 
-    check_out(out)
-    began, rows = time.perf_counter(), list[study.ModelFile]()
-    work = partial(study.model_files, folder_of_files, simulate=simulate, seed=seed)
-    whole = completed(lambda told: work(progress=told, done=rows.append), rows)
-    written = write(out, lambda: study.files_of(rows))
-    show(study.read_table(rows), study.refused_table(rows), least=100)
-    show(study.summary(rows), *written, f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
-    if not whole:
-        end_interrupted("interrupted: the files after these are not read")
+    work = study.model_files(folder_of_files, simulate=simulate, seed=seed)
+    carry_out(work, out, seed=seed, least=100)
 
 
 @command(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Annotated
 
-from undertow.base import MissingExtraError
 from undertow.cli import options
 from undertow.cli.options import folder, option
-from undertow.cli.terminal import check_out, command, progress_bar, show, write
+from undertow.cli.terminal import carry_out, command
 
 
 @command(
@@ -28,21 +26,7 @@ def reproduce(
 
     Also its appendix, corrected: tables of the five cases and Figures 7 to 11 (not with --quick).
     """
-    from undertow.studies import paper
-    from undertow.studies.paper import appendix_report as appendix
+    from undertow.studies.paper import Effort, reproduction
 
-    check_out(out)
-    began = time.perf_counter()
-    effort = paper.Effort.quick() if quick else paper.Effort()
-    with progress_bar() as progress:
-        result = paper.reproduce(seed=seed, effort=effort, progress=progress)
-        more, missing = {}, list[str]()
-        if not quick:
-            progress("appendix", 1.0)
-            try:
-                more = appendix.files()
-            except MissingExtraError as error:
-                missing.append(f"Without the appendix. {error}")
-    written = write(out, lambda: paper.files(result) | more)
-    took = f"Took {time.perf_counter() - began:.0f} s, seed {seed}."
-    show(paper.report(result), "", *written, *missing, took)
+    effort = Effort.quick() if quick else Effort()
+    carry_out(reproduction(seed=seed, effort=effort), out, seed=seed)

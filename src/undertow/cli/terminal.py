@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
+import time
 from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any, NoReturn, ParamSpec
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec
 
 import typer
 from rich import progress as bars
@@ -22,10 +23,14 @@ from undertow.base import (
     Progress,
     UndertowError,
     check_folder,
+    duration,
     near,
     printable,
     write_files,
 )
+
+if TYPE_CHECKING:
+    from undertow.studies.experiment import Experiment
 
 P = ParamSpec("P")
 
@@ -151,13 +156,24 @@ def terminal(*, stderr: bool = False) -> Console:
 def progress_bar() -> Iterator[Progress]:
     """Show progress on standard error: a bar on a terminal, else a line for each new part."""
     console = terminal(stderr=True)
-    if not console.is_terminal:
-        told: list[str] = []
+    begun: list[tuple[float, float]] = []
 
-        def tell(what: str, _fraction: float) -> None:
-            if what not in told:
-                told.append(what)
-                show(f"… {what}", stderr=True)
+    def told(what: str, part: float) -> str:
+        """Add how long the rest takes, once that is known."""
+        now = time.monotonic()
+        begun[:] = begun or [(part, now)]
+        done = part - begun[0][0]
+        left = f", {duration((now - begun[0][1]) * (1 - part) / done)} left" if done > 0 else ""
+        return what + (left if part < 1 else "")
+
+    if not console.is_terminal:
+        said: list[str] = []
+
+        def tell(what: str, part: float) -> None:
+            line = told(what, part)
+            if what not in said:
+                said.append(what)
+                show(f"… {line}", stderr=True)
 
         yield tell
         return
@@ -169,7 +185,7 @@ def progress_bar() -> Iterator[Progress]:
     )
     with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
+        yield lambda what, part: bar.update(task, description=told(what, part), completed=part)
 
 
 def completed(work: Callable[[Progress], object], kept: Sized = (1,)) -> bool:
@@ -182,6 +198,38 @@ def completed(work: Callable[[Progress], object], kept: Sized = (1,)) -> bool:
             raise
         return False
     return True
+
+
+def carry_out(
+    work: Experiment[Any, Any], out: Path | None, *, seed: int | None = None, **how: Any
+) -> None:
+    """Do the tasks of an experiment, show what came of them and write it to a folder.
+
+    Tasks that are finished are kept there until all are, and the next time not done again; Ctrl-C
+    leaves what can be shown of them.  ``seed`` is named at the end with the time taken; ``how``
+    is for :func:`show`.
+    """
+    check_out(out)
+    began, ledger = time.perf_counter(), work.ledger(out)
+    every = completed(lambda told: work.run(ledger, progress=told), ledger.known)
+    found = work.finished(ledger)
+    parts: list[RenderableType] = []
+    if every or not work.whole:
+        result = work.gather(found)
+        written = write(out, lambda: work.files(result))
+        parts = [*work.report(result), *written, *work.notes(result)]
+        if every and written and ledger.path is not None:
+            ledger.path.unlink()
+    if seed is not None:
+        parts.append(f"Took {time.perf_counter() - began:.0f} s, seed {seed}.")
+    show(*parts, **how)
+    if not every:
+        kept = "nothing was kept; with --out every result is, as it is found"
+        if ledger.path is not None:
+            kept = f"they are in {ledger.path}; the same command goes on there"
+        done = f"{len(found)} of {len(work.tasks)} are done"
+        show(f"interrupted: {done}, {kept}", stderr=True)
+        raise typer.Exit(INTERRUPTED)
 
 
 def show(*parts: RenderableType, stderr: bool = False, least: int = 0, **how: Any) -> None:
@@ -206,6 +254,8 @@ def write(out: Path | None, files: Callable[[], Mapping[str, bytes]]) -> tuple[s
     if out is None:
         return ()
     made = files()
+    if not made:
+        return ()
     earlier = write_files(out, made)
     written = f"Written to {out}/: {', '.join(made)}"
     return (written,) if earlier is None else (f"Earlier results moved to {earlier}/", written)

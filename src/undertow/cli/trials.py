@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from undertow.cli.options import option
-from undertow.cli.terminal import check_out, command, completed, end_interrupted, show, write
+from undertow.cli.terminal import carry_out, command
 
 
 @command(
@@ -63,36 +63,21 @@ def trials(
         option(
             "Folder for the table as text. balance: for balance.csv and the figures too. "
             "swing-up: for gains.json too, the gains as the library keeps them. robustness and "
-            "coverage: for robustness.jsonl or coverage.jsonl alone, each run as it is made; "
-            "the same command goes on from there."
+            "coverage: for robustness.jsonl or coverage.jsonl alone. Each result is kept there as "
+            "it is found; after an interruption the same command goes on."
         ),
     ] = None,
 ) -> None:
     """Run controllers on realistic rigs with many seeds, and show the results as tables."""
-    from undertow.studies.trials.campaign import Campaign
+    from undertow.studies.trials.experiments import experiment
 
-    check_out(out)
-    campaign = Campaign(
+    work = experiment(
+        what,
         seeds=min(seeds, 3) if quick else seeds,
         angle=math.radians(angle),
         limits=limits and not quick,
         rigs=min(rigs, 10) if quick else rigs,
         single=single and not quick,
         fresh=fresh,
-        folder=out,
     )
-    whole = completed(lambda progress: campaign.run(what, progress))
-    report, files = campaign.finished()
-    written = write(out, lambda: files) if files else ()
-    show(*([] if report is None else [report]), *written)
-    if not whole:
-        end_interrupted(_how_to_go_on(what, out))
-
-
-def _how_to_go_on(what: str, out: Path | None) -> str:
-    """Say what an interrupted experiment left, and how it is finished."""
-    if what not in ("robustness", "coverage"):
-        return "interrupted: what is shown is finished; the same command begins again"
-    if out is None:
-        return "interrupted: nothing was kept; with --out every run is, as it is made"
-    return f"interrupted: finished runs are in {out / what}.jsonl; the same command goes on there"
+    carry_out(work, out)

@@ -6,9 +6,10 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from textwrap import shorten
@@ -19,10 +20,8 @@ from undertow.base import (
     ArtefactError,
     InvalidInputError,
     ModelError,
-    Progress,
     UndertowError,
     markdown_table,
-    no_progress,
     table,
     to_csv,
 )
@@ -35,6 +34,7 @@ from undertow.models.importers.mujoco_compiler import agreement
 from undertow.models.importers.urdf import read_urdf
 from undertow.objective import objective_for
 from undertow.runtime import default_gate
+from undertow.studies.experiment import Experiment
 
 #: Most files of a folder.
 MOST = 20_000
@@ -82,18 +82,12 @@ class ModelFile:
 
 
 def model_files(
-    folder: Path,
-    *,
-    simulate: bool = True,
-    seed: int = 0,
-    progress: Progress = no_progress,
-    done: Callable[[ModelFile], None] = lambda _: None,
-) -> tuple[ModelFile, ...]:
-    """Read every URDF and MJCF file below a folder, and balance what can be.
+    folder: Path, *, simulate: bool = True, seed: int = 0
+) -> Experiment[ModelFile, tuple[ModelFile, ...]]:
+    """Return the experiment that reads every URDF and MJCF file below a folder.
 
-    Links are not followed. ``simulate`` balances them as ``undertow simulate FILE`` does: for
-    the usual objective, from the usual start; ``seed`` is the optimisers'. ``done`` is called with
-    each as it is finished.
+    Links are not followed. ``simulate`` balances what can be as ``undertow simulate FILE`` does:
+    for the usual objective, from the usual start; ``seed`` is the optimisers'.
 
     Raises
     ------
@@ -113,13 +107,15 @@ def model_files(
             limit=f"1 to {MOST} files that end in {', '.join(FILES)}",
             remedy="Name the folder that they are in",
         )
-    rows = []
-    for index, file in enumerate(files):
-        short = str(file.relative_to(folder))
-        progress(short, index / len(files))
-        rows.append(_one(file, short, simulate, seed))
-        done(rows[-1])
-    return tuple(rows)
+    shorts = {str(file.relative_to(folder)): file for file in files}
+    return Experiment(
+        "models",
+        tuple[str, ModelFile],
+        {(short,): partial(_one, file, short, simulate, seed) for short, file in shorts.items()},
+        {"simulate": simulate, "seed": seed, "files": [os.lstat(file).st_mtime for file in files]},
+        lambda rows: [read_table(rows), refused_table(rows), summary(rows)],
+        files_of,
+    )
 
 
 def _one(file: Path, short: str, simulate: bool, seed: int) -> ModelFile:

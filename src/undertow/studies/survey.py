@@ -13,6 +13,8 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from statistics import median
 
 import numpy as np
@@ -22,11 +24,9 @@ from rich.text import Text
 
 from undertow.base import (
     InfeasibleError,
-    Progress,
     finite,
     manifest,
     markdown_table,
-    no_progress,
     number,
     table,
     to_csv,
@@ -40,6 +40,8 @@ from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, linearise
 from undertow.objective import TRAVEL, Constraint, Objective, objective_for
 from undertow.optimiser import DecisionVariables
+from undertow.studies.experiment import Experiment
+from undertow.studies.ledger import Key
 
 #: What is minimised where nothing else is asked for.
 GOALS = ("energy", "time")
@@ -96,38 +98,33 @@ def survey(
     horizon: float = 60.0,
     seed: int = 0,
     bounds: bool = True,
-    progress: Progress = no_progress,
-    done: Callable[[Entry], None] | None = None,
-) -> tuple[Entry, ...]:
-    """Bring every mechanism from its listed start to its target.
+    request: Mapping[str, object] | None = None,
+) -> Experiment[Entry, tuple[Entry, ...]]:
+    """Return the experiment that brings every mechanism from its listed start to its target.
 
     All of the library by default, for each of the ``goals``, words of
     :func:`undertow.objective_for`, within ``horizon``, s; ``bounds`` also computes the
-    optimal-control bound (extra ``bounds``). ``done`` is called with each line as it is finished:
-    what an interrupted survey leaves.
+    optimal-control bound (extra ``bounds``). ``request`` is what the manifest says was asked for.
 
     Raises
     ------
     InvalidInputError
         For an unknown mechanism or goal, or one without a usual start, before any work.
-    MissingExtraError
-        When bounds are asked for without CasADi.
     """
     chosen = [named(name) for name in (LIBRARY if names is None else names)]
-    jobs = [
-        (goal, mechanism, objective_for(mechanism, goal, horizon=horizon))
-        for goal in goals
-        for mechanism in chosen
-    ]
-    for _, mechanism, objective in jobs:
+    tasks: dict[Key, Callable[[], Entry]] = {}
+    for goal, mechanism in product(goals, chosen):
+        objective = objective_for(mechanism, goal, horizon=horizon)
         objective.check_start(mechanism, mechanism.usual_start)
-    entries = []
-    for index, (goal, mechanism, objective) in enumerate(jobs):
-        progress(f"{mechanism.name}, {goal}", index / len(jobs))
-        entries.append(survey_one(mechanism, objective, goal=goal, seed=seed, bounds=bounds))
-        if done is not None:
-            done(entries[-1])
-    return tuple(entries)
+        tasks[mechanism.name, goal] = partial(
+            survey_one, mechanism, objective, goal=goal, seed=seed, bounds=bounds
+        )
+    models = [mechanism.fingerprint for mechanism in chosen]
+    settings = {"horizon": horizon, "seed": seed, "bounds": bounds, "models": models}
+    return Experiment(
+        "survey", tuple[str, str, Entry], tasks, settings, report,
+        partial(files, request or settings),
+    )  # fmt: skip
 
 
 def survey_one(
@@ -300,6 +297,14 @@ def by_goal(entries: Sequence[Entry]) -> list[list[Entry]]:
     return [
         [e for e in entries if e.goal == goal] for goal in dict.fromkeys(e.goal for e in entries)
     ]
+
+
+def report(entries: Sequence[Entry]) -> list[RenderableType]:
+    """Return for each goal its table and the sentences under it."""
+    parts: list[RenderableType] = []
+    for some in by_goal(entries):
+        parts += ["", some[0].goal, survey_table(some), *summary(some)]
+    return parts
 
 
 def summary(entries: Sequence[Entry]) -> list[str]:

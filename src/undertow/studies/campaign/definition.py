@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -115,6 +115,12 @@ class Definition:
         return Settings(self.said, "")
 
 
+def _each_once(value: Any) -> bool:
+    """Whether a value is a list of words, all different."""
+    words = isinstance(value, list) and all(isinstance(one, str) for one in value)
+    return words and len(set(value)) == len(value)
+
+
 class Settings:
     """A table of settings that are taken one by one; what is left over is refused."""
 
@@ -127,11 +133,12 @@ class Settings:
         """Say for a message which setting is meant."""
         return f"setting '{self.where}{name}' of the campaign"
 
-    def _take(self, name: str, default: Any, limit: str) -> Any:
+    def _take(self, name: str, default: Any, limit: str, fits: Callable[[Any], bool]) -> Any:
         self._known.append(name)
         value = self._values.pop(name, default)
-        if value is _NEEDED:
-            raise InvalidInputError(self.what(name), value="nothing", limit=limit)
+        if value is _NEEDED or not fits(value):
+            shown = "nothing" if value is _NEEDED else value
+            raise InvalidInputError(self.what(name), value=shown, limit=limit)
         return value
 
     def number(
@@ -141,71 +148,49 @@ class Settings:
         limit = "a finite number"
         if low > -math.inf or high < math.inf:
             limit = f"a number from {low:g} to {high:g}"
-        value = self._take(name, default, limit)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not low <= value <= high
-        ):
-            raise InvalidInputError(self.what(name), value=value, limit=limit)
-        return float(value)
+        fits = lambda v: type(v) in (int, float) and low <= v <= high  # noqa: E731
+        return float(self._take(name, default, limit, fits))
 
     def count(self, name: str, default: int = _NEEDED, *, low: int = 1, high: int = 10**9) -> int:
         """Take a whole number from ``low`` to ``high``."""
         limit = f"a whole number from {low} to {high}"
-        value = self._take(name, default, limit)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise InvalidInputError(self.what(name), value=value, limit=limit)
-        return value
+        return int(self._take(name, default, limit, lambda v: type(v) is int and low <= v <= high))
 
     def word(self, name: str, known: Collection[str], default: str = _NEEDED) -> str:
         """Take one of some words."""
-        value = self._take(name, default, f"one of {', '.join(known)}")
+        value = self._take(name, default, f"one of {', '.join(known)}", lambda _: True)
         one_of(self.what(name), value, known)
         return str(value)
 
     def flag(self, name: str) -> bool:
         """Take true or false; false by default."""
-        value = self._take(name, False, "true or false")
-        if not isinstance(value, bool):
-            raise InvalidInputError(self.what(name), value=value, limit="true or false")
-        return value
+        return bool(self._take(name, False, "true or false", lambda v: type(v) is bool))
 
     def numbers(self, name: str, size: int) -> tuple[float, ...] | None:
         """Take a list of so many numbers, where there is one."""
-        value = self._take(name, None, f"{size} numbers")
-        if value is None:
-            return None
-        good = isinstance(value, list) and len(value) == size
-        if not (good and all(type(v) in (int, float) and math.isfinite(v) for v in value)):
-            raise InvalidInputError(self.what(name), value=value, limit=f"{size} numbers")
-        return tuple(map(float, value))
+
+        def fits(v: Any) -> bool:
+            good = isinstance(v, list) and len(v) == size
+            return good and all(type(x) in (int, float) and math.isfinite(x) for x in v)
+
+        value = self._take(name, None, f"{size} numbers", lambda v: v is None or fits(v))
+        return None if value is None else tuple(map(float, value))
 
     def words(self, name: str, known: Collection[str]) -> tuple[str, ...]:
         """Take a list of some of the words, all of them by default."""
-        value = self._take(name, list(known), f"a list from {', '.join(known)}")
-        if not isinstance(value, list) or not value or len(set(map(str, value))) < len(value):
-            limit = f"a list, each once, from {', '.join(known)}"
-            raise InvalidInputError(self.what(name), value=value, limit=limit)
+        limit = f"a list, each once, from {', '.join(known)}"
+        value = self._take(name, list(known), limit, lambda v: bool(v) and _each_once(v))
         for word in value:
             one_of(self.what(name), word, known)
         return tuple(value)
 
     def names(self, name: str) -> tuple[str, ...]:
         """Take a list of words, each once; an empty one by default."""
-        value = self._take(name, [], "a list of names")
-        good = isinstance(value, list) and all(isinstance(one, str) for one in value)
-        if not good or len(set(value)) < len(value):
-            raise InvalidInputError(
-                self.what(name), value=value, limit="a list of names, each once"
-            )
-        return tuple(value)
+        return tuple(self._take(name, [], "a list of names, each once", _each_once))
 
     def table(self, name: str) -> Settings:
         """Take a table; an empty one by default."""
-        value = self._take(name, {}, "a table")
-        if not isinstance(value, dict):
-            raise InvalidInputError(self.what(name), value=value, limit="a table")
+        value = self._take(name, {}, "a table", lambda v: isinstance(v, dict))
         return Settings(value, f"{self.where}{name}.")
 
     def by_name(self, known: Collection[str]) -> dict[str, float]:

@@ -13,14 +13,12 @@ from rich.console import RenderableType
 
 from undertow.base import InvalidInputError, MissingExtraError, UndertowError
 from undertow.bounds import bound
-from undertow.estimators import Belief
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, linearise
 from undertow.objective import Goal, Objective, objective_for
 from undertow.objective.named import finite_limits
 from undertow.plants import Bench, Encoder, Push, RealisticRig
 from undertow.plants.bench import bench_for
-from undertow.runtime import estimator_for
 from undertow.studies.campaign import league_report
 from undertow.studies.campaign.definition import Settings
 from undertow.studies.campaign.entrants import (
@@ -33,7 +31,7 @@ from undertow.studies.campaign.entrants import (
     spent,
 )
 from undertow.studies.campaign.study import Arrays, Axis, Study, Variable
-from undertow.studies.trials.trial import LAST, Outcome, trial, undisturbed
+from undertow.studies.trials.trial import Outcome, trial, undisturbed
 
 #: Of the definition of tasks and scores: a change of either makes it another one.
 VERSION = 1
@@ -218,11 +216,11 @@ class League(Study):
         truth, told = self.bench(mechanism, task), bench_for(mechanism)
         if task == "noise":  # the data sheet of an encoder is at hand
             told = replace(told, encoders=truth.encoders)
-        estimator = estimator_for(mechanism, told, known=Belief.usual(mechanism))
         try:
             outcome = trial(
                 mechanism, truth, make, mechanism.usual_start, self.length, seed,
-                objective=objective, estimator=estimator,
+                objective=objective, told=told,
+                home=home(mechanism),
             )  # fmt: skip
         except ForfeitError as forfeit:
             return {"won": 0, "fault": forfeit.fault}
@@ -282,14 +280,9 @@ def _push(mechanism: Mechanism) -> Push:
 
 def _scores(mechanism: Mechanism, outcome: Outcome) -> dict[str, float]:
     record = outcome.record
-    away = ~(np.abs(record.truth[:, : mechanism.n]) <= home(mechanism)).all(axis=1)
-    last = np.flatnonzero(away)
-    settled = 0.0 if not len(last) else math.inf
-    if len(last) and last[-1] + 1 < len(record.t):
-        settled = float(record.t[last[-1] + 1])
     return {
-        "won": int(settled <= record.t[-1] - LAST),
-        "settled": settled if math.isfinite(settled) else math.nan,
+        "won": int(outcome.balanced),
+        "settled": outcome.settled if math.isfinite(outcome.settled) else math.nan,
         "cost": outcome.cost if math.isfinite(outcome.cost) else math.nan,
         "chatter": float(
             np.abs(np.diff(record.u, axis=0) / finite_limits(mechanism)).sum() / record.t[-1]

@@ -9,13 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from undertow.cascade import Cascade, CascadeState
-from undertow.estimators import Belief
 from undertow.law import InnerLoop
 from undertow.models import Mechanism
 from undertow.optimiser import Proposal
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
-from undertow.runtime import estimator_for
 from undertow.studies.campaign.definition import Settings, objective_of
 from undertow.studies.campaign.study import Arrays, Axis, Study, Variable
 from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, steady
@@ -112,10 +110,7 @@ class RandomPlants(Study):
                 bench = self.plant(number)
                 outcome = trial(
                     self.mechanism, bench, make, self.start, self.length, number,
-                    objective=self.objective,
-                    estimator=estimator_for(
-                        self.mechanism, self.bench, known=Belief.usual(self.mechanism)
-                    ),
+                    objective=self.objective, told=self.bench,
                 )  # fmt: skip
                 for what in ("balanced", "settled", "cost", "chatter"):
                     found[f"{name}_{what}"][row] = getattr(outcome, what)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 
-from undertow.base import number, table
-from undertow.studies.campaign.run import Campaign, Outcome, compute, duration
+from undertow.base import duration, number, table
+from undertow.studies.campaign.run import Campaign, Outcome, compute
 from undertow.studies.campaign.store import Store, digest
 
 #: Numbers of shards that a sentence lists.

@@ -7,8 +7,8 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -34,6 +34,7 @@ from undertow.studies.campaign.random_plants import RandomPlants
 from undertow.studies.campaign.region_map import RegionMap
 from undertow.studies.campaign.store import Store, dataset, digest
 from undertow.studies.campaign.study import Arrays, Study
+from undertow.studies.experiment import Serial, ended
 from undertow.symbolic.store import content_key
 
 #: Kinds of campaigns by the word for each.
@@ -43,9 +44,6 @@ KINDS: dict[str, type[Study]] = {
 
 #: Failures after which a campaign ends: what they have in common will not pass.
 MOST_FAILURES = 20
-
-#: Shards that each worker finds waiting.
-WAITING = 2
 
 #: How often a worker may die of a shard before it counts as failed.
 DEATHS = 2
@@ -237,7 +235,7 @@ class Campaign:
         resume
             Go on with the store that is there; what was damaged is computed again.
         progress
-            Told how many shards are done, and the time left.
+            Told how many shards are done.
 
         Raises
         ------
@@ -251,11 +249,14 @@ class Campaign:
             repaired = store.repair(self.study) if resume else []
             marks = store.marks()
             outcome = Outcome(len(marks), int((marks != 0).sum()), repaired=repaired)
+            missing = (
+                (k, (work, self.definition, self.key, str(self.path), k, limit))
+                for k in (marks == 0).nonzero()[0].tolist()
+            )
             clock = time.perf_counter()
             try:
-                for shard, ended in self._ended(executor, marks, width, limit):
-                    outcome.seconds = time.perf_counter() - clock
-                    self._count(outcome, shard, ended)
+                for shard, future in ended(executor, missing, width):
+                    self._count(outcome, shard, future)
                     progress(_words(outcome), outcome.done / outcome.shards)
                     if len(outcome.failures) >= MOST_FAILURES:
                         break
@@ -263,32 +264,11 @@ class Campaign:
                 outcome.seconds = time.perf_counter() - clock
         return outcome
 
-    def _ended(
-        self, executor: Executor, marks: Any, width: int, limit: float | None
-    ) -> Iterator[tuple[int, Future[int]]]:
-        """Yield every missing shard with its ended future; only a few are under way at once."""
-        missing = iter([k for k, mark in enumerate(marks.tolist()) if not mark])
-        running: dict[Future[int], int] = {}
-        try:
-            while True:
-                for shard in missing:
-                    job = self.definition, self.key, str(self.path), shard, limit
-                    running[executor.submit(work, *job)] = shard
-                    if len(running) >= width * WAITING:
-                        break
-                if not running:
-                    return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    yield running.pop(future), future
-        finally:
-            for future in running:
-                future.cancel()
-
-    def _count(self, outcome: Outcome, shard: int, ended: Future[int]) -> None:
+    def _count(self, outcome: Outcome, shard: int, future: Future[int]) -> None:
         """Count an ended shard; raise what is wrong with the store or the executor."""
-        if ended.cancelled():
+        if future.cancelled():
             raise _lost("it cancelled a shard")
-        error = ended.exception()
+        error = future.exception()
         if error is None:
             outcome.done += 1
             outcome.computed += 1
@@ -305,19 +285,6 @@ class Campaign:
         else:
             words = f"{name}: {error}{raised_at(error)}"
         outcome.failures[shard] = printable(" ".join(words.split()))
-
-
-class Serial(Executor):
-    """An executor that computes at once, in the calling thread."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Compute now."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 @contextmanager
@@ -385,19 +352,6 @@ def _lost(words: str) -> ResourceError:
 
 
 def _words(outcome: Outcome) -> str:
-    """Say how far a campaign is, and how long it takes yet; a new sentence at each per cent."""
-    part = 100 * outcome.done // outcome.shards
-    left = (outcome.shards - outcome.done) * outcome.seconds / max(outcome.computed, 1)
+    """Say how far a campaign is; a new sentence at each per cent."""
     failed = f", {len(outcome.failures)} failed" if outcome.failures else ""
-    return f"{part} % of {outcome.shards} shards{failed}, {duration(left)} left"
-
-
-def duration(seconds: float) -> str:
-    """Return a time for people.
-
-    >>> duration(42.0), duration(600.0), duration(9000.0)
-    ('42 s', '10 min', '2.5 h')
-    """
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+    return f"{100 * outcome.done // outcome.shards} % of {outcome.shards} shards{failed}"

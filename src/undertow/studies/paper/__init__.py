@@ -6,12 +6,11 @@ from undertow.studies.paper.experiment import (
     LowerBound,
     Reproduction,
     printed_motion,
-    reproduce,
 )
 from undertow.studies.paper.figures import figures
 from undertow.studies.paper.findings import Finding, findings
 from undertow.studies.paper.limits import catch_limit, singular_angle
-from undertow.studies.paper.tables import files, report
+from undertow.studies.paper.tables import files, report, reproduce, reproduction
 
 __all__ = [
     "CASES",
@@ -31,5 +30,6 @@ __all__ = [
     "printed_motion",
     "report",
     "reproduce",
+    "reproduction",
     "singular_angle",
 ]

@@ -5,45 +5,84 @@ Every number of the report is computed here, in the run that prints it.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from itertools import product
 from math import degrees, pi
+from typing import Any
 
-from undertow.base import InfeasibleError, MissingExtraError, Progress, UndertowError, no_progress
+from undertow.base import InfeasibleError, MissingExtraError, UndertowError
 from undertow.cascade import Cascade, Run
 from undertow.closed_loop import ClosedLoop, Event, Trajectory
 from undertow.law import Surface, first_surface
 from undertow.mechanisms import rotary_pendulum
 from undertow.objective import state_box
 from undertow.optimiser import Budget
-from undertow.studies.paper.data import CONDITIONS, OBJECTIVES, PERIOD, PRINTED, ROWS, Condition
+from undertow.studies.ledger import Key
+from undertow.studies.paper import appendix_report
+from undertow.studies.paper.data import (
+    CASES,
+    CONDITIONS,
+    OBJECTIVES,
+    PERIOD,
+    PRINTED,
+    ROWS,
+    Condition,
+)  # fmt: skip
 from undertow.studies.paper.limits import (
     Limit,
     Sensitivity,
     base_sensitivity,
-    case_limits,
+    catch_limit,
     own_reach,
-)
+    singular_angle,
+)  # fmt: skip
 from undertow.studies.paper.repeats import Repeats, noisy_repeats
+
+#: Dampings d_e for which reach is computed, N m s/rad.
+DAMPINGS = sorted({condition.d_e for condition in CONDITIONS.values()})
+
+#: Key of the appendix.
+APPENDIX: Key = ("appendix", "", "")
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A motion of the table: its total, or why there is none.
 
-    ``switch_times``: when each surface took over, s. ``trajectory``: ``None`` where no surface was
-    found. ``total``: V² s or s; ``None`` when the terminal set is not reached, and ``reason`` says
-    why, in words.
+    ``condition``, ``objective``: where it begins, and what it costs. ``surfaces``: none where none
+    was found. ``switch_times``: when each took over, s. ``total``: V² s or s; ``None`` when the
+    terminal set is not reached, and ``reason`` says why, in words.
     """
 
+    condition: str
+    objective: str
     surfaces: tuple[Surface, ...]
     switch_times: tuple[float, ...]
-    trajectory: Trajectory | None
     total: float | None
     reason: str = ""
+
+    @classmethod
+    def of(
+        cls, condition: Condition, objective: str, surfaces: Sequence[Surface],
+        switch_times: Sequence[float] = (0.0,), run: Trajectory | None = None,
+    ) -> Motion:  # fmt: skip
+        """Return the motion of surfaces, and what came of it, by default in a simulation."""
+        motion = cls(condition.key, objective, tuple(surfaces), tuple(switch_times), None)
+        run = motion.trajectory if run is None else run
+        assert run is not None  # there are surfaces
+        total = run.cost if run.event == Event.REACHED else None
+        return replace(motion, total=total, reason=_ending(run))
+
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        """The motion, simulated; ``None`` where no surface was found."""
+        if not self.surfaces:
+            return None
+        place = CONDITIONS[self.condition]
+        loop = ClosedLoop(place.mechanism, OBJECTIVES[self.objective])
+        return loop.simulate(place.start, self.surfaces, switch_times=self.switch_times)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,17 +138,18 @@ class Row:
 
 @dataclass(frozen=True)
 class Effort:
-    """What the optimisations may spend, and whether bounds are computed."""
+    """What the optimisations may spend, and whether bounds and the appendix are computed."""
 
     cold: Budget = Budget(3072)
     warm: Budget = Budget(1024)
     bounds: bool = True
+    appendix: bool = True
     conditions: tuple[str, ...] = tuple(CONDITIONS)
 
     @classmethod
     def quick(cls) -> Effort:
-        """Return a tenth of the work: *matched* alone, short searches, no bounds."""
-        return cls(Budget(768), Budget(64), bounds=False, conditions=("matched",))
+        """Return a tenth of the work: *matched* alone, short searches, no bounds, no appendix."""
+        return cls(Budget(768), Budget(64), False, False, ("matched",))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +158,8 @@ class Reproduction:
 
     ``own``: (condition, objective) to our optima. ``limits``: reach of the printed surfaces.
     ``reach``: d_e to the largest φ(0), rad, for which our search finds an admissible surface.
-    ``repeats``: Figure 3. ``sensitivity``: of the base case, *matched*. ``seconds``: name of each
-    part of the work to its duration, s.
+    ``repeats``: Figure 3. ``sensitivity``: of the base case, *matched*. ``appendix``: why there is
+    none, empty where there is.
     """
 
     rows: tuple[Row, ...]
@@ -128,9 +168,9 @@ class Reproduction:
     reach: dict[float, float]
     repeats: Repeats
     sensitivity: Sensitivity
-    seconds: dict[str, float]
     seed: int
     effort: Effort
+    appendix: str
 
     def row(self, condition: str, objective: str, row: str) -> Row:
         """Return one line of the tables."""
@@ -151,34 +191,14 @@ def _ending(trajectory: Trajectory) -> str:
     }.get(trajectory.event, trajectory.event.name.lower())
 
 
-def _motion(
-    trajectory: Trajectory, surfaces: Sequence[Surface], switch_times: Sequence[float]
-) -> Motion:
-    reached = trajectory.event == Event.REACHED
-    return Motion(
-        tuple(surfaces),
-        tuple(switch_times),
-        trajectory,
-        trajectory.cost if reached else None,
-        _ending(trajectory),
-    )
-
-
 def printed_motion(condition: Condition, objective: str, row: str) -> Motion:
     """Simulate a printed column: its surfaces, one every 0.1 s, the last one kept."""
     printed = PRINTED[objective, row]
-    loop = ClosedLoop(condition.mechanism, OBJECTIVES[objective])
-    trajectory = loop.simulate(condition.start, printed.surfaces, switch_times=printed.switch_times)
-    return _motion(trajectory, printed.surfaces, printed.switch_times)
+    return Motion.of(condition, objective, printed.surfaces, printed.switch_times)
 
 
 def own_optimum(
-    condition: Condition,
-    objective: str,
-    *,
-    seed: int = 0,
-    effort: Effort | None = None,
-    progress: Callable[[float], None] = lambda _: None,
+    condition: Condition, objective: str, *, seed: int = 0, effort: Effort | None = None
 ) -> OwnOptimum:
     """Optimise: the designed first surface, the one-time optimum, the cascade.
 
@@ -186,21 +206,20 @@ def own_optimum(
     base case is the feasible surface that its optimisation starts from.
     """
     effort = Effort() if effort is None else effort
-    rig, goal = condition.mechanism, OBJECTIVES[objective]
-    loop = ClosedLoop(rig, goal)
-    first = first_surface(rig)
-    motions = {"base": _motion(loop.simulate(condition.start, first), [first], [0.0])}
+    rig = condition.mechanism
+    motions = {"base": Motion.of(condition, objective, [first_surface(rig)])}
     cascade = Cascade(
-        rig, goal, period=PERIOD, cold=effort.cold, warm=effort.warm, seed=seed, belief="exact"
-    )
+        rig, OBJECTIVES[objective],
+        period=PERIOD, cold=effort.cold, warm=effort.warm, seed=seed, belief="exact",
+    )  # fmt: skip
     try:
-        run = cascade.simulate(condition.start, progress=lambda t, end: progress(t / end))
+        run = cascade.simulate(condition.start)
     except InfeasibleError as error:
-        missing = Motion((), (), None, None, f"no admissible surface: {error.value}")
+        reason = f"no admissible surface: {error.value}"
+        missing = Motion(condition.key, objective, (), (), None, reason)
         return OwnOptimum(motions | {"one-time": missing, "cascade": missing})
-    once = run.surfaces[0]
-    motions["one-time"] = _motion(loop.simulate(condition.start, once), [once], [0.0])
-    motions["cascade"] = _motion(run.trajectory, *_schedule(run))
+    motions["one-time"] = Motion.of(condition, objective, run.surfaces[:1])
+    motions["cascade"] = Motion.of(condition, objective, *_schedule(run), run.trajectory)
     return OwnOptimum(
         motions,
         tuple(float(v) for v in run.lemma3_slack),
@@ -237,80 +256,63 @@ def lower_bound(condition: Condition, objective: str) -> LowerBound:
     return LowerBound(float(found.cost))
 
 
-class _Clock:
-    """Times the parts of the work and reports how much of it is done."""
-
-    def __init__(self, progress: Progress, total: float) -> None:
-        self.progress, self.total, self.done = progress, total, 0.0
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def part(self, name: str, weight: float) -> Iterator[Callable[[float], None]]:
-        """Time a part of the given weight; yields a function that takes its fraction done."""
-
-        def inner(fraction: float) -> None:
-            self.progress(name, (self.done + weight * min(fraction, 1.0)) / self.total)
-
-        inner(0.0)
-        began = time.perf_counter()
-        yield inner
-        inner(1.0)
-        self.done += weight
-        self.seconds[name] = round(time.perf_counter() - began, 3)
-
-
-def reproduce(
-    *,
-    seed: int = 0,
-    effort: Effort | None = None,
-    progress: Progress = no_progress,
-) -> Reproduction:
-    """Run the whole experiment.
-
-    ``seed`` is that of the searches and of the noise; the effort is full by default,
-    :meth:`Effort.quick` is for a look.
-    """
-    effort = Effort() if effort is None else effort
-    tasks = list(product(effort.conditions, OBJECTIVES))
-    clock = _Clock(progress, len(tasks) * (3 + 3 * effort.bounds) + 4)
-
-    with clock.part("printed surfaces", 1):
-        printed = {
-            (key, goal, row): printed_motion(CONDITIONS[key], goal, row)
-            for key, goal in tasks
-            for row in ROWS
-        }
-        sensitivity = base_sensitivity(CONDITIONS["matched"])
-        repeats = noisy_repeats(CONDITIONS["matched"], seed=seed)
-    dampings = sorted({CONDITIONS[key].d_e for key in CONDITIONS})
-    with clock.part("catch limits", 3):
-        limits = case_limits(dampings)
-        reach = {
-            d: own_reach(rotary_pendulum(d_e=d), seed=seed, budget=Budget(512)) for d in dampings
-        }
-    own: dict[tuple[str, str], OwnOptimum] = {}
-    bounds: dict[tuple[str, str], LowerBound] = {}
-    for key, goal in tasks:
-        title = f"{CONDITIONS[key].title}, {goal}"
-        with clock.part(f"cascade ({title})", 3) as inner:
-            own[key, goal] = own_optimum(
-                CONDITIONS[key], goal, seed=seed, effort=effort, progress=inner
-            )
+def tasks(seed: int, effort: Effort) -> dict[Key, Callable[[], Any]]:
+    """Return what is searched for: reach of surfaces, our optima, bounds, the appendix."""
+    found: dict[Key, Callable[[], Any]] = {}
+    for d in DAMPINGS:
+        rig = rotary_pendulum(d_e=d)
+        for case, surface in CASES.items():
+            found["catch limit", case, f"{d:g}"] = partial(catch_limit, rig, [surface])
+        found["reach", "", f"{d:g}"] = partial(own_reach, rig, seed=seed, budget=Budget(512))
+    for key, goal in product(effort.conditions, OBJECTIVES):
+        place = CONDITIONS[key], goal
+        found["cascade", key, goal] = partial(own_optimum, *place, seed=seed, effort=effort)
         if effort.bounds:
-            with clock.part(f"bound ({title})", 3):
-                bounds[key, goal] = lower_bound(CONDITIONS[key], goal)
+            found["bound", key, goal] = partial(lower_bound, *place)
+    return found | ({APPENDIX: _appendix} if effort.appendix else {})
+
+
+def _appendix() -> str:
+    """Decide the appendix's claims, which are remembered; return why they cannot be."""
+    try:
+        appendix_report.markdown()
+    except MissingExtraError as error:
+        return f"Without the appendix. {error}"
+    return ""
+
+
+def gathered(seed: int, effort: Effort, found: Mapping[Key, Any]) -> Reproduction:
+    """Return the results, and what is simulated in no time: printed surfaces, repeats."""
+    places = list(product(effort.conditions, OBJECTIVES))
+    own = {place: found["cascade", *place] for place in places}
     skipped = LowerBound(None, "not computed: --quick")
     rows = tuple(
         Row(
-            key,
-            goal,
+            *place,
             row,
-            PRINTED[goal, row].total,
-            printed[key, goal, row],
-            own[key, goal].motions[row],
-            bounds.get((key, goal), skipped),
+            PRINTED[place[1], row].total,
+            printed_motion(CONDITIONS[place[0]], place[1], row),
+            own[place].motions[row],
+            found.get(("bound", *place), skipped),
         )
-        for key, goal in tasks
-        for row in ROWS
+        for place, row in product(places, ROWS)
     )
-    return Reproduction(rows, own, limits, reach, repeats, sensitivity, clock.seconds, seed, effort)
+    limits = tuple(
+        Limit(
+            case,
+            singular_angle(rotary_pendulum(), surface),
+            {d: found["catch limit", case, f"{d:g}"] for d in DAMPINGS},
+        )
+        for case, surface in CASES.items()
+    )
+    return Reproduction(
+        rows,
+        own,
+        limits,
+        {d: found["reach", "", f"{d:g}"] for d in DAMPINGS},
+        noisy_repeats(CONDITIONS["matched"], seed=seed),
+        base_sensitivity(CONDITIONS["matched"]),
+        seed,
+        effort,
+        found.get(APPENDIX, ""),
+    )

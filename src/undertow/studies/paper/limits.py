@@ -14,7 +14,7 @@ from undertow.mechanisms import rotary_pendulum
 from undertow.models import Mechanism
 from undertow.objective import MinimumTime, Objective
 from undertow.optimiser import Budget, Optimiser
-from undertow.studies.paper.data import CASES, OBJECTIVES, PRINTED, Condition
+from undertow.studies.paper.data import OBJECTIVES, PRINTED, Condition
 
 
 @dataclass(frozen=True)
@@ -94,18 +94,6 @@ def own_reach(mechanism: Mechanism, *, seed: int, budget: Budget) -> float:
         found = optimiser.propose(mechanism.state(phi=middle)).surface is not None
         low, high = (middle, high) if found else (low, middle)
     return low
-
-
-def case_limits(dampings: Sequence[float]) -> tuple[Limit, ...]:
-    """Return the reach of the appendix's five surfaces for each d_e, N m s/rad."""
-    return tuple(
-        Limit(
-            name,
-            singular_angle(rotary_pendulum(), surface),
-            {d: catch_limit(rotary_pendulum(d_e=d), [surface]) for d in dampings},
-        )
-        for name, surface in CASES.items()
-    )
 
 
 def base_sensitivity(condition: Condition) -> Sensitivity:

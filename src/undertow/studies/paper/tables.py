@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import degrees
 from typing import Any
 
@@ -14,8 +15,18 @@ from rich.text import Text
 from undertow.base import facts, number, table, to_csv, to_json, versions
 from undertow.closed_loop.figures import figure_files
 from undertow.optimiser import Budget
+from undertow.studies.experiment import Experiment
+from undertow.studies.paper import appendix_report
 from undertow.studies.paper.data import CASES, CONDITIONS, OBJECTIVES, PERIOD, ROWS
-from undertow.studies.paper.experiment import Reproduction, Row
+from undertow.studies.paper.experiment import (
+    Effort,
+    LowerBound,
+    OwnOptimum,
+    Reproduction,
+    Row,
+    gathered,
+    tasks,
+)  # fmt: skip
 from undertow.studies.paper.figures import figures
 from undertow.studies.paper.findings import findings
 from undertow.studies.paper.repeats import ANGLE_NOISE, COULOMB_FRICTION, RATE_NOISE, START_SPREAD
@@ -137,7 +148,6 @@ def manifest(result: Reproduction) -> dict[str, Any]:
         },
         "reasons": reasons(result),
         "findings": [{"agrees": f.agrees, "text": f.text} for f in findings(result)],
-        "seconds": result.seconds,
     }
 
 
@@ -255,8 +265,35 @@ def report(result: Reproduction) -> RenderableType:
 
 def files(result: Reproduction) -> dict[str, bytes]:
     """Return everything that a run leaves behind, by file name."""
+    wanted = result.effort.appendix and not result.appendix
     return {
         "tables.csv": csv(result),
         "manifest.json": to_json(manifest(result)),
         **figure_files(figures(result), ("png", "pdf")),
+        **(appendix_report.files() if wanted else {}),
     }
+
+
+def reproduction(*, seed: int = 0, effort: Effort | None = None) -> Experiment[Any, Reproduction]:
+    """Return the whole experiment.
+
+    ``seed`` is that of the searches and of the noise; the effort is full by default,
+    :meth:`Effort.quick` is for a look.
+    """
+    effort = Effort() if effort is None else effort
+    return Experiment(
+        "reproduce",
+        tuple[str, str, str, float | OwnOptimum | LowerBound | str],
+        tasks(seed, effort),
+        {"seed": seed, "effort": effort},
+        lambda result: [report(result), ""],
+        files,
+        lambda result: [result.appendix] if result.appendix else [],
+        gather=partial(gathered, seed, effort),
+        whole=True,
+    )
+
+
+def reproduce(*, seed: int = 0, effort: Effort | None = None) -> Reproduction:
+    """Run the whole experiment, see :func:`reproduction`."""
+    return reproduction(seed=seed, effort=effort).run()

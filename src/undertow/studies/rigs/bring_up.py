@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import scipy.stats
@@ -13,13 +13,14 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import Progress, manifest, no_progress, number, table, to_csv, versions
+from undertow.base import manifest, number, table, to_csv
 from undertow.bring_up import BringUp, Identification, doublets, identify, perform, rest_state
 from undertow.closed_loop.figures import display, figure_bytes, style
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Encoder, Friction, RealisticRig, Timing
-from undertow.studies.ledger import Ledger
+from undertow.studies.experiment import Experiment, grouped
+from undertow.studies.ledger import Key
 
 #: Noise of the positions before they are counted, rad, standard deviation: with some, the
 #: errors of the counts are nearly independent; without, they hang together for many samples.
@@ -90,38 +91,35 @@ class CoverageRow:
     deviation: float
 
 
-def coverage(
-    seeds: int, *, keep: Path | None = None, progress: Progress = no_progress
-) -> list[CoverageRow]:
-    """Identify many rigs and count how often 95 % intervals hold the truth.
+def coverage(seeds: int) -> Experiment[Deviations, list[CoverageRow]]:
+    """Return the experiment that counts how often 95 % intervals hold the truth.
 
-    There are ``seeds`` rigs for each of ``NOISES``. ``keep`` is a file that keeps every rig as it
-    is done: what it holds already is not done again.
-
-    Raises
-    ------
-    ArtefactError
-        When the file is of other versions.
+    Of ``seeds`` rigs for each of ``NOISES``.
     """
-    ledger = Ledger(keep, versions(), _read)
+    return Experiment(
+        "coverage",
+        tuple[float, int, Deviations],
+        {(noise, k): partial(deviations, k, noise) for noise in NOISES for k in range(seeds)},
+        {},
+        lambda rows: [coverage_table(rows)],
+        gather=coverage_rows,
+        whole=True,
+    )
+
+
+def coverage_rows(found: Mapping[Key, Deviations]) -> list[CoverageRow]:
+    """Return how often intervals hold the truth, by noise and quantity."""
     rows = []
-    for place, noise in enumerate(NOISES):
+    for noise, rigs in grouped(found).items():
         every: dict[str, list[float]] = {}
-        shares = []
-        for seed in range(seeds):
-            progress(f"noise {1e3 * noise:g} mrad", (place + seed / seeds) / len(NOISES))
-            found = ledger.known.get((noise, seed))
-            if found is None:
-                found = deviations(seed, noise)
-                ledger.keep((noise, seed), found, [noise, seed, found])
-            shares.append(_covered(found.values()) / len(found))
-            for name, value in found.items():
-                every.setdefault(name, []).append(value)
-        together = [value for values in every.values() for value in values]
+        for name, value in (item for some in rigs for item in some.items()):
+            every.setdefault(name, []).append(value)
         for name, values in every.items():
             chance = math.sqrt(0.95 * 0.05 / len(values))
             rows.append(_row(noise, name, values, chance))
-        rows.append(_row(noise, "", together, _deviation(shares) / math.sqrt(seeds)))
+        together = [value for values in every.values() for value in values]
+        shares = [_covered(some.values()) / len(some) for some in rigs]
+        rows.append(_row(noise, "", together, _deviation(shares) / math.sqrt(len(rigs))))
     return rows
 
 
@@ -137,11 +135,6 @@ def _deviation(values: list[float]) -> float:
 def _row(noise: float, name: str, values: list[float], error: float) -> CoverageRow:
     mean = float(np.mean(values))
     return CoverageRow(noise, name, len(values), _covered(values), error, mean, _deviation(values))
-
-
-def _read(line: tuple[float, int, Mapping[str, float]]) -> tuple[tuple[float, int], Deviations]:
-    noise, seed, found = line
-    return (float(noise), int(seed)), {str(k): float(v) for k, v in found.items()}
 
 
 _STYLES = {"right": "green", "wrong": "bold red", "unclear": "yellow"}

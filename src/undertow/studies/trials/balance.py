@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import product
 
-import numpy as np
-
-from undertow.base import InfeasibleError, Progress, no_progress
+from undertow.base import InfeasibleError
 from undertow.cascade import Cascade
 from undertow.law import InnerLoop, Surface
 from undertow.models import FloatArray, Mechanism
@@ -22,8 +22,9 @@ from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, srv02_rig
 from undertow.runtime import estimator_for, for_rig
+from undertow.studies.ledger import Key
 from undertow.studies.trials.steering import CascadeSteering, steady
-from undertow.studies.trials.trial import MakeController, Outcome, trial, undisturbed
+from undertow.studies.trials.trial import MakeController, Outcome, Result, trial, undisturbed
 
 #: The base case of Tables 1 and 2.
 BASE = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
@@ -33,30 +34,8 @@ GOALS: tuple[Goal, ...] = ("bench-energy", "bench-time")
 
 ROWS = ("base", "one-time", "cascade")
 
-
-@dataclass(frozen=True)
-class Limits:
-    """Largest φ(0) from which a controller balances, rad: ideal rig, realistic rigs."""
-
-    ideal: float
-    realistic: float
-
-
-@dataclass(frozen=True, eq=False)
-class BalanceResult:
-    """Everything that the experiment gave.
-
-    ``outcomes`` and ``ideal`` are by (objective, row): the runs, one for each seed, and the run on
-    the ideal rig; ``limits`` by row, empty when they were not asked for. ``x0`` is (2n,).
-    """
-
-    bench: Bench
-    x0: FloatArray
-    seconds: float
-    seeds: int
-    outcomes: dict[tuple[str, str], list[Outcome]]
-    ideal: dict[tuple[str, str], Outcome]
-    limits: dict[str, Limits]
+#: Stands for the ideal rig among seeds; for the searches for catch limits among objectives.
+IDEAL, LIMIT = -1, "catch limit"
 
 
 def controllers(
@@ -86,91 +65,88 @@ def controllers(
     }
 
 
-def catch_limit(
-    belief: Mechanism,
-    bench: Bench,
-    row: str,
-    objective: Objective,
-    *,
-    seeds: int,
-    seconds: float = 5.0,
-) -> float:
+@lru_cache(maxsize=2)
+def makers(goal: Goal, angle: float, budget: int) -> dict[str, MakeController]:
+    """Return the three on the SRV02, for φ(0) = ``angle``, rad, from rest."""
+    bench = srv02_rig()
+    belief = bench.mechanism
+    x0 = belief.state(phi=angle)
+    return controllers(belief, bench, objective_for(belief, goal), x0, budget=budget)
+
+
+def place(seed: int) -> Bench:
+    """Return the bench of a seed: the SRV02, or the ``IDEAL`` one."""
+    bench = srv02_rig()
+    return undisturbed(bench.mechanism, bench.timing.period) if seed == IDEAL else bench
+
+
+def catch_limit(row: str, seeds: int, *, seconds: float = 5.0) -> float:
     """Return the largest φ(0) from which at least 19 of 20 of the seeds are caught, rad.
 
-    Found by bisection between 20° and 60°, to 0.5°; 0 where even 20° is too much.
+    ``IDEAL`` is one run on that rig.  Found by bisection between 20° and 60°, to 0.5°; 0 where
+    even 20° is too much.
     """
+    bench, runs = place(seeds), max(seeds, 1)
+    belief = bench.mechanism
+    objective = objective_for(belief, "bench-energy")
 
-    def holds(angle: float) -> bool:
-        x0 = belief.state(phi=angle)
+    def holds(halves: int) -> bool:
+        x0 = belief.state(phi=math.radians(0.5 * halves))
         try:
             make = controllers(belief, bench, objective, x0)[row]
         except InfeasibleError:
             return False
         missed = 0
-        for seed in range(seeds):
+        for seed in range(runs):
             missed += not trial(belief, bench, make, x0, seconds, seed).caught
-            if missed > 0.05 * seeds + 1e-9:
+            if missed > 0.05 * runs + 1e-9:
                 return False
         return True
 
-    low, high, resolution = math.radians(20), math.radians(60), math.radians(0.5)
+    low, high = 40, 120
     if not holds(low):
         return 0.0
-    while high - low > resolution * 1.001:
-        middle = low + resolution * math.floor(0.5 * (high - low) / resolution + 1e-9)
-        middle = middle if middle > low else low + resolution
+    while high - low > 1:
+        middle = (low + high) // 2
         low, high = (middle, high) if holds(middle) else (low, middle)
-    return low
+    return math.radians(0.5 * low)
 
 
-def balance(
-    *,
-    angle: float = math.radians(35),
-    seconds: float = 10.0,
-    seeds: int = 20,
-    budget: int = 256,
-    limits: bool = True,
-    progress: Progress = no_progress,
-    begun: Callable[[BalanceResult], None] = lambda _result: None,
-) -> BalanceResult:
-    """Run the three controllers for both objectives on every rig.
+@dataclass(frozen=True)
+class Balance:
+    """The experiment: three controllers, two objectives, the same rigs for all.
 
     A run begins at φ(0) = ``angle``, rad, at rest, and takes ``seconds``, s; ``seeds`` rigs are
     made of the SRV02 bench; a re-optimisation may spend ``budget`` rollouts; ``limits`` also
-    searches for the catch limits. ``begun`` is called once, with the result that fills as the runs
-    are made: what is left of it where they are interrupted.
+    searches for the catch limits.
     """
-    bench = srv02_rig()
-    belief = bench.mechanism
-    x0 = belief.state(phi=angle)
-    ideal_bench = undisturbed(belief, bench.timing.period)
-    outcomes: dict[tuple[str, str], list[Outcome]] = {}
-    ideal: dict[tuple[str, str], Outcome] = {}
-    found: dict[str, Limits] = {}
-    result = BalanceResult(bench, np.asarray(x0), seconds, seeds, outcomes, ideal, found)
-    begun(result)
-    parts = len(GOALS) * len(ROWS) + limits * 2 * len(ROWS)
-    done = 0
-    for goal in GOALS:
-        objective = objective_for(belief, goal)
-        made = controllers(belief, bench, objective, x0, budget=budget)
-        for row in ROWS:
-            what = f"{goal}, {row}"
-            ideal[goal, row] = trial(
-                belief, ideal_bench, made[row], x0, seconds, 0, objective=objective
-            )
-            runs = []
-            for seed in range(seeds):
-                progress(what, (done + seed / seeds) / parts)
-                runs.append(trial(belief, bench, made[row], x0, seconds, seed, objective=objective))
-            outcomes[goal, row] = runs
-            done += 1
-    for row in ROWS if limits else ():
-        progress(f"catch limit, {row}", done / parts)
-        goal_objective = objective_for(belief, "bench-energy")
-        alone = catch_limit(belief, ideal_bench, row, goal_objective, seeds=1)
-        progress(f"catch limit on the bench, {row}", (done + 1) / parts)
-        real = catch_limit(belief, bench, row, goal_objective, seeds=seeds)
-        found[row] = Limits(alone, real)
-        done += 2
-    return result
+
+    angle: float = math.radians(35)
+    seconds: float = 10.0
+    seeds: int = 20
+    budget: int = 256
+    limits: bool = True
+
+    def tasks(self) -> dict[Key, Callable[[], Result | float]]:
+        """Return the runs by objective, controller and seed, and the catch limits after them."""
+        seeds = IDEAL, *range(self.seeds)
+        tasks: dict[Key, Callable[[], Result | float]] = {
+            key: partial(self.result, *key) for key in product(GOALS, ROWS, seeds)
+        }
+        for key in product(ROWS, (IDEAL, self.seeds)) if self.limits else ():
+            tasks[LIMIT, *key] = partial(catch_limit, *key)
+        return tasks
+
+    def result(self, goal: Goal, row: str, seed: int) -> Result:
+        """Return the numbers of a run."""
+        return self.run(goal, row, seed).numbers
+
+    def run(self, goal: Goal, row: str, seed: int) -> Outcome:
+        """Run a controller on the rig of a seed, or on the ``IDEAL`` one."""
+        bench = place(seed)
+        belief = bench.mechanism
+        return trial(
+            belief, bench, makers(goal, self.angle, self.budget)[row],
+            belief.state(phi=self.angle), self.seconds, max(seed, 0),
+            objective=objective_for(belief, goal),
+        )  # fmt: skip

@@ -15,19 +15,22 @@ from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Measurement, srv02_rig
 from undertow.runtime import estimator_for
 from undertow.studies.trials.steering import steady
-from undertow.studies.trials.trial import Outcome, balanced, trial, undisturbed
+from undertow.studies.trials.trial import Outcome, trial, undisturbed
 
+#: What nothing but exact states would give: the model itself, sampled.
+EXACT = "exact states"
 
-def estimators_for(belief: Mechanism, bench: Bench) -> dict[str, Callable[[], Estimator]]:
-    """Return the estimators that are compared, by name."""
-    period = bench.timing.period
-    return {
-        "filtered derivative": lambda: FilteredDerivative(belief, period, 0.005),
-        "super-twisting": lambda: SuperTwisting(belief, period, 100.0),
-        "Kalman": lambda: KalmanFilter(belief, period),
-        "Kalman, delay": lambda: estimator_for(belief, bench, drift=0.0),
-        "Kalman, delay and d̂": lambda: estimator_for(belief, bench),
-    }
+#: The estimators that are compared, by name, each made for a belief and a bench.
+ESTIMATORS: dict[str, Callable[[Mechanism, Bench], Estimator]] = {
+    EXACT: lambda belief, _: Measured(belief),
+    "filtered derivative": lambda belief, bench: FilteredDerivative(
+        belief, bench.timing.period, 0.005
+    ),
+    "super-twisting": lambda belief, bench: SuperTwisting(belief, bench.timing.period, 100.0),
+    "Kalman": lambda belief, bench: KalmanFilter(belief, bench.timing.period),
+    "Kalman, delay": lambda belief, bench: estimator_for(belief, bench, drift=0.0),
+    "Kalman, delay and d̂": estimator_for,
+}
 
 
 @dataclass(frozen=True)
@@ -60,45 +63,33 @@ def _cost(estimator: Estimator, belief: Mechanism, calls: int = 5000) -> float:
     return 1e6 * (time.process_time() - began) / calls
 
 
-def compared(
-    *,
-    seeds: int = 5,
-    seconds: float = 8.0,
-    done: Callable[[EstimatorRow], None] = lambda _row: None,
-) -> list[EstimatorRow]:
-    """Balance the SRV02 with the designed surface and each of the estimators.
-
-    The first row is what nothing but exact states would give: the model itself, sampled.
-    ``done`` is called with each row as it is finished.
-    """
+def compared(name: str, *, seeds: int = 5, seconds: float = 8.0) -> EstimatorRow:
+    """Balance the SRV02 with the designed surface and one of the ``ESTIMATORS``."""
     bench = srv02_rig()
     belief = bench.mechanism
     x0 = belief.state(phi=math.radians(20))
     surface = first_surface(belief)
     law = lambda _: steady(InnerLoop(belief, surface))  # noqa: E731
+    exact = name == EXACT
     ideal = Bench(belief, tachometers={}, timing=undisturbed(belief).timing)
-    rows = []
-    made: dict[str, Callable[[], Estimator]] = {"exact states": lambda: Measured(belief)}
-    for name, make in (made | estimators_for(belief, bench)).items():
-        truth = ideal if name in made else bench
-        runs = [
-            trial(belief, truth, law, x0, seconds, seed, estimator=make()) for seed in range(seeds)
-        ]
-        errors = [_error(belief, run) for run in runs if run.balanced]
-        good = [run for run in runs if run.balanced]
-        rows.append(
-            EstimatorRow(
-                name,
-                balanced(runs),
-                seeds,
-                np.mean(errors, axis=0) if errors else np.full(belief.n, math.nan),
-                float(np.mean([run.effort for run in good])) if good else math.nan,
-                float(np.mean([run.chatter for run in good])) if good else math.nan,
-                math.nan if name in made else _cost(make(), belief),
-            )
+    make = ESTIMATORS[name]
+    runs = [
+        trial(
+            belief, ideal if exact else bench, law, x0, seconds, seed, estimator=make(belief, bench)
         )
-        done(rows[-1])
-    return rows
+        for seed in range(seeds)
+    ]
+    good = [run for run in runs if run.balanced]
+    errors = [_error(belief, run) for run in good]
+    return EstimatorRow(
+        name,
+        len(good),
+        seeds,
+        np.mean(errors, axis=0) if good else np.full(belief.n, math.nan),
+        float(np.mean([run.effort for run in good])) if good else math.nan,
+        float(np.mean([run.chatter for run in good])) if good else math.nan,
+        math.nan if exact else _cost(make(belief, bench), belief),
+    )
 
 
 def _error(belief: Mechanism, run: Outcome) -> FloatArray:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import Progress, no_progress
-from undertow.mechanisms import LIBRARY
 from undertow.runtime import Recipe, session
 
 
@@ -34,44 +31,31 @@ class LibraryRow:
 
 
 def through_the_runtime(
-    *,
-    seeds: int = 5,
-    seconds: float = 10.0,
-    evaluations: int = 256,
-    progress: Progress = no_progress,
-    done: Callable[[LibraryRow], None] = lambda _row: None,
-) -> list[LibraryRow]:
-    """Run mechanisms from their usual starts, each on its realistic rigs.
+    name: str, *, seeds: int = 5, seconds: float = 10.0, evaluations: int = 256
+) -> LibraryRow:
+    """Run a mechanism from its usual start, on its realistic rigs.
 
-    On ``seeds`` rigs of each, for ``seconds``, s; a re-optimisation may spend ``evaluations``
-    rollouts. ``done`` is called with each row as it is finished.
+    On ``seeds`` of them, for ``seconds``, s; a re-optimisation may spend ``evaluations`` rollouts.
     """
-    rows = []
-    for number, name in enumerate(LIBRARY):
-        ends: Counter[str] = Counter()
-        applied, chatter = [], []
-        for seed in range(seeds):
-            progress(name, (number + seed / seeds) / len(LIBRARY))
-            recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=evaluations)
-            with session(recipe, simulated=True) as runtime:
-                report = runtime.run(seconds)
-            if not report.stopped_by.startswith("operator"):
-                ends[report.stopped_by] += 1
-                continue
-            applied.append(report.answers.get("applied", 0))
-            limits = recipe.settings.limits(recipe.belief)
-            chatter.append(float((report.total_variation / limits).max() / seconds))
-        rows.append(
-            LibraryRow(
-                name,
-                recipe.belief.m,
-                float(np.max(recipe.cascade.reaching.layer)),
-                seeds - ends.total(),
-                seeds,
-                dict(ends),
-                float(np.mean(applied)) if applied else 0.0,
-                float(np.mean(chatter)) if chatter else float("nan"),
-            )
-        )
-        done(rows[-1])
-    return rows
+    ends: Counter[str] = Counter()
+    applied, chatter = [], []
+    for seed in range(seeds):
+        recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=evaluations)
+        with session(recipe, simulated=True) as runtime:
+            report = runtime.run(seconds)
+        if not report.stopped_by.startswith("operator"):
+            ends[report.stopped_by] += 1
+            continue
+        applied.append(report.answers.get("applied", 0))
+        limits = recipe.settings.limits(recipe.belief)
+        chatter.append(float((report.total_variation / limits).max() / seconds))
+    return LibraryRow(
+        name,
+        recipe.belief.m,
+        float(np.max(recipe.cascade.reaching.layer)),
+        seeds - ends.total(),
+        seeds,
+        dict(ends),
+        float(np.mean(applied)) if applied else 0.0,
+        float(np.mean(chatter)) if chatter else float("nan"),
+    )

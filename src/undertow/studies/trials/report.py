@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import degrees
 from typing import Any
@@ -12,20 +12,21 @@ from matplotlib.figure import Figure
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from undertow.base import finite, number, table, to_csv
+from undertow.base import as_text, finite, number, table, to_csv
 from undertow.cascade import problem_words
 from undertow.closed_loop import Trajectory
 from undertow.closed_loop.figures import figure_files
+from undertow.mechanisms import LIBRARY
 from undertow.objective import Goal, objective_for
 from undertow.plants import Bench, srv02_rig
 from undertow.runtime import Recipe, default_gate, estimator_for
 from undertow.studies.figures import REPEATS, ROW_LINES, beginning, rows_figure
-from undertow.studies.trials.balance import GOALS, ROWS, BalanceResult
+from undertow.studies.trials.balance import GOALS, IDEAL, LIMIT, ROWS, Balance
 from undertow.studies.trials.estimation import EstimatorRow
 from undertow.studies.trials.library import LibraryRow
-from undertow.studies.trials.robustness import FACTORS, SINGLE, RobustnessResult
-from undertow.studies.trials.trial import Result, balanced, motion, spread
-from undertow.studies.trials.upright import EngineResult, SwingResult
+from undertow.studies.trials.robustness import FACTORS, RANDOM, SEEDS, SINGLE
+from undertow.studies.trials.trial import Outcome, Result, balanced, motion, spread
+from undertow.studies.trials.upright import SWING_SECONDS, EngineResult, SwingResult
 
 
 def _problem(word: Goal, bench: Bench | None = None, horizon: float = 60.0) -> str:
@@ -48,110 +49,117 @@ def _means(runs: Sequence[Result]) -> list[str]:
     return [str(spread(runs, what)) for what in ("cost", "effort", "settled", "chatter")]
 
 
-def balance_report(result: BalanceResult) -> RenderableType:
-    """Return the tables of :func:`undertow.studies.trials.balance.balance` for the terminal."""
-    belief = result.bench.mechanism
-    gate = default_gate(estimator_for(belief, result.bench))
+def balance_report(asked: Balance, found: Mapping[Any, list[Any]]) -> RenderableType:
+    """Return the tables of :class:`.balance.Balance` for the terminal, of what is finished.
+
+    ``found`` are results by objective and controller: on the ideal rig, then on the others.
+    """
+    bench = srv02_rig()
+    belief = bench.mechanism
+    gate = default_gate(estimator_for(belief, bench))
     titles = {"bench-energy": "Minimum energy", "bench-time": "Minimum time"}
     parts: list[RenderableType] = []
     for goal, title in titles.items():
         objective, rows = objective_for(belief, goal), []
-        for row in (row for row in ROWS if (goal, row) in result.outcomes):
-            runs, alone = result.outcomes[goal, row], result.ideal[goal, row]
-            ideal = f"{alone.cost:.2f}" if alone.balanced else "lost"
-            rows.append((row, ideal, f"{balanced(runs)} of {len(runs)}", *_means(runs)))
+        for row in ROWS:
+            alone, *runs = found.get((goal, row), [None])
+            if runs:
+                ideal = f"{alone.cost:.2f}" if alone.balanced else "lost"
+                rows.append((row, ideal, f"{balanced(runs)} of {len(runs)}", *_means(runs)))
         if not rows:  # interrupted before
             continue
         parts.append(
             table(
                 ("", f"ideal\n{objective.unit}", "balanced", *_heads(objective.unit)),
                 rows,
-                title=f"{title}\nSRV02, φ(0) = {degrees(result.x0[1]):g}° at rest, "
-                f"{1e3 * result.bench.timing.period:g} ms, positions only",
+                title=f"{title}\nSRV02, φ(0) = {degrees(asked.angle):g}° at rest, "
+                f"{1e3 * bench.timing.period:g} ms, positions only",
                 note="mean ± standard deviation over the balanced runs\n"
                 f"{problem_words(belief, objective, gate)}",
                 ruled=True,
             )
         )
-    if result.limits:
+    ends = [(row, *found[LIMIT, row]) for row in ROWS if len(found.get((LIMIT, row), ())) == 2]
+    if ends:
         parts.append(
             table(
-                ("", "ideal rig", f"at least 19 of 20 of {result.seeds} rigs"),
+                ("", "ideal rig", f"at least 19 of 20 of {asked.seeds} rigs"),
                 [
-                    (
-                        row,
-                        f"{degrees(limit.ideal):.1f}°",
-                        f"{degrees(limit.realistic):.1f}°" if limit.realistic else "below 20°",
-                    )
-                    for row, limit in result.limits.items()
+                    (row, _degrees(ideal), _degrees(real) if real else "below 20°")
+                    for row, ideal, real in ends
                 ],
                 title="Largest φ(0) that is caught, minimum-energy surfaces",
                 note="to 0.5°",
                 ruled=True,
             )
         )
-    parts.append(Text(f"Sources: {result.bench.source}", style="dim"))
+    parts.append(Text(f"Sources: {bench.source}", style="dim"))
     return Group(*parts)
 
 
-def balance_files(result: BalanceResult) -> dict[str, bytes]:
-    """Return figures and ``balance.csv``, by file name."""
+def _degrees(angle: float) -> str:
+    return f"{degrees(angle):.1f}°"
+
+
+def balance_files(asked: Balance, found: Mapping[Any, list[Any]]) -> dict[str, bytes]:
+    """Return the tables, ``balance.csv`` and the figures, by file name."""
     header = [
         "objective", "controller", "seed", "balanced", "cost", "effort_V2s", "settled_s",
         "chatter_V_per_s",
     ]  # fmt: skip
+    runs = {key: some[1:] for key, some in found.items() if key[0] in GOALS}
     rows = [
-        [goal, row, o.seed, int(o.balanced), *map(finite, (o.cost, o.effort, o.settled, o.chatter))]
-        for (goal, row), runs in result.outcomes.items()
-        for o in runs
+        [*key, o.seed, int(o.balanced), *map(finite, (o.cost, o.effort, o.settled, o.chatter))]
+        for key, some in runs.items()
+        for o in some
     ]
-    files = {"balance.csv": to_csv(header, rows)}
-    if len(result.outcomes) == len(GOALS) * len(ROWS):  # not interrupted
-        drawn = {
-            "figure-3-bench": repeats_figure(result),
-            "figure-4-bench": comparison_figure(result),
-        }
-        files |= figure_files(drawn)
+    files = {
+        "balance.txt": as_text(balance_report(asked, found)),
+        "balance.csv": to_csv(header, rows),
+    }
+    if sum(map(len, runs.values())) == len(GOALS) * len(ROWS) * asked.seeds:  # not interrupted
+        files |= figure_files(
+            {"figure-3-bench": repeats_figure(asked), "figure-4-bench": comparison_figure(asked)}
+        )
     return files
 
 
-def repeats_figure(result: BalanceResult) -> Figure:
+def repeats_figure(asked: Balance) -> Figure:
     """Return Figure 3 on the bench: one-time minimum time, three rigs and the ideal one."""
-    mechanism = result.bench.mechanism
-    motions: list[tuple[Trajectory, dict[str, Any]]] = [
-        (
-            motion(mechanism, outcome.record, 2),
-            {"color": colour, "linewidth": 0.8, "label": f"rig of seed {outcome.seed}"},
-        )
-        for outcome, colour in zip(result.outcomes["bench-time", "one-time"], REPEATS, strict=False)
-    ]
-    ideal = motion(mechanism, result.ideal["bench-time", "one-time"].record, 2)
-    motions.append((ideal, {"color": "black", "linestyle": (0, (4, 2)), "label": "ideal rig"}))
+    looks: dict[int, dict[str, Any]] = {
+        seed: {"color": colour, "linewidth": 0.8, "label": f"rig of seed {seed}"}
+        for seed, colour in zip(range(asked.seeds), REPEATS, strict=False)
+    }
+    looks[IDEAL] = {"color": "black", "linestyle": (0, (4, 2)), "label": "ideal rig"}
     return rows_figure(
-        motions,
-        until=min(3.0, result.seconds),
+        [(_motion(asked.run("bench-time", "one-time", k)), look) for k, look in looks.items()],
+        until=min(3.0, asked.seconds),
         title=f"One-time minimum-time surface on the SRV02 bench, φ(0) = "
-        f"{degrees(result.x0[1]):g}°\n"
+        f"{degrees(asked.angle):g}°\n"
         "1 kHz, encoders only, friction, delay, parameters and hand by seed (simulated)",
         columns=2,
     )
 
 
-def comparison_figure(result: BalanceResult) -> Figure:
+def comparison_figure(asked: Balance) -> Figure:
     """Return Figure 4 on the bench: the three controllers for minimum energy on one rig."""
     motions = []
     for row, look in ROW_LINES.items():
-        outcome = result.outcomes["bench-energy", row][0]
+        outcome = asked.run("bench-energy", row, 0)
         ended = "" if outcome.balanced else ", lost"
-        run = _until_fallen(motion(result.bench.mechanism, outcome.record, 2))
-        motions.append((run, {**look, "linewidth": 1.0, "label": row + ended}))
+        motions.append(
+            (_until_fallen(_motion(outcome)), {**look, "linewidth": 1.0, "label": row + ended})
+        )
     return rows_figure(
         motions,
-        until=min(6.0, result.seconds),
-        title=f"Minimum energy on the SRV02 bench, φ(0) = {degrees(result.x0[1]):g}°, "
-        "rig of seed 0",
+        until=min(6.0, asked.seconds),
+        title=f"Minimum energy on the SRV02 bench, φ(0) = {degrees(asked.angle):g}°, rig of seed 0",
         columns=3,
     )
+
+
+def _motion(outcome: Outcome) -> Trajectory:
+    return motion(srv02_rig().mechanism, outcome.record, 2)
 
 
 def _until_fallen(run: Trajectory) -> Trajectory:
@@ -160,18 +168,19 @@ def _until_fallen(run: Trajectory) -> Trajectory:
     return beginning(run, int(fallen[0]) if len(fallen) else len(run.t))
 
 
-def swing_report(found: Sequence[SwingResult], seconds: float) -> RenderableType:
+def swing_report(found: Sequence[SwingResult]) -> RenderableType:
     """Return swing-ups for the terminal."""
     rows = []
     for result in found:
-        times, name = np.array(result.catches or [np.nan]), result.mechanism.name
+        times = np.array(result.catches or [np.nan])
         caught = f"{np.median(times):.2f}", f"{times.max():.2f}"
         held = f"{balanced(result.outcomes)} of {len(result.outcomes)}"
-        rows.append((name, held, *caught, str(result.thrown), str(result.stops)))
+        rows.append((result.name, held, *caught, str(result.thrown), str(result.stops)))
     return table(
         ("", "balanced", "caught after\nmedian, s", "longest\ns", "thrown\nout", "end stop\nhit"),
         rows,
-        title=f"From hanging at rest to balanced, realistic rigs, {seconds:g} s, positions only",
+        title="From hanging at rest to balanced, realistic rigs, "
+        f"{SWING_SECONDS:g} s, positions only",
         note="balanced: home for the last second",
         ruled=True,
     )
@@ -207,28 +216,32 @@ def engine_report(found: Sequence[EngineResult]) -> RenderableType:
     """Return runs in MuJoCo for the terminal."""
     rows = []
     for result in found:
-        final = result.outcome.record.truth[-1, : result.mechanism.n]
         words = ", ".join(
             f"{degrees(v):.2f}°" if c.unit == "rad" else f"{1e3 * v:.1f} mm"
-            for c, v in zip(result.mechanism.coordinates, final, strict=True)
+            for c, v in zip(LIBRARY[result.name]().coordinates, result.final, strict=True)
         )
         held, settled = "yes" if result.outcome.balanced else "no", f"{result.outcome.settled:.2f}"
-        rows.append((result.mechanism.name, held, settled, words, str(result.admitted)))
+        rows.append((result.name, held, settled, words, str(result.admitted)))
     return table(
         ("", "balanced", "settled\ns", "positions at the end", "surfaces\nadmitted"),
         rows,
         title="MuJoCo as the truth: the cascade from the listed starts, no retuning",
-        note=_problem("effort", Bench(found[0].mechanism)) if found else "",
+        note=_problem("effort", Bench(LIBRARY[found[0].name]())),
         ruled=True,
     )
 
 
-def robustness_report(result: RobustnessResult) -> RenderableType:
-    """Return the tables of :func:`.robustness.robustness` for the terminal."""
+def robustness_report(found: Mapping[Any, list[Any]]) -> RenderableType:
+    """Return the tables of :func:`.robustness.robustness` for the terminal.
+
+    ``found`` are results by controller and what was changed.
+    """
+    names = [name for name, what in found if what == RANDOM]
     # Costs are compared where all of them balanced, or the weaker one would have easier rigs.
-    both = [all(o.balanced for o in runs) for runs in zip(*result.outcomes.values(), strict=True)]
+    every = [found[name, RANDOM] for name in names]
+    both = [all(o.balanced for o in runs) for runs in zip(*every, strict=True)]
     rows = []
-    for name, runs in result.outcomes.items():
+    for name, runs in zip(names, every, strict=True):
         fair = [run for run, keep in zip(runs, both, strict=True) if keep]
         rows.append(
             (name, f"{balanced(runs)}", f"{sum(run.caught for run in runs)}", *_means(fair))
@@ -245,25 +258,21 @@ def robustness_report(result: RobustnessResult) -> RenderableType:
             ruled=True,
         )
     ]
-    if result.breaking:
-        names = list(result.outcomes)
-        lines = []
-        for factor, (_, _, unit, scale) in FACTORS.items():
-            cells = []
-            for name in names:
-                found = result.breaking[name, factor]
-                broken = "" if found.seed is None else f" ({found.seed})"
-                more = "≥ " if found.seed is None else ""
-                cells.append(f"{more}{scale * found.survived:.3g}{broken}")
-            lines.append((f"{factor}, {unit}", *cells))
+    lines = []
+    for factor, (_, _, unit, scale) in FACTORS.items():
+        cells = []
+        for one in (found[name, factor][0] for name in names if (name, factor) in found):
+            broken = "" if one.seed is None else f" ({one.seed})"
+            more = "≥ " if one.seed is None else ""
+            cells.append(f"{more}{scale * one.survived:.3g}{broken}")
+        lines.append((f"{factor}, {unit}", *cells))
+    if len(found) > len(names):
         parts.append(
             table(
                 ("", *(name.replace(" ", "\n", 1) for name in names)),
                 lines,
-                title=(
-                    f"Largest single change from which all of {result.seeds} rigs come home in "
-                    f"{SINGLE:g} s"
-                ),
+                title=f"Largest single change from which all of {SEEDS} rigs "
+                f"come home in {SINGLE:g} s",
                 note=(
                     "(n): what the rig of seed n does not survive is larger by 1/32\n"
                     "of the largest change tried; ≥: that was survived"

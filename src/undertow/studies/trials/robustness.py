@@ -10,38 +10,34 @@ until one of the rigs is lost.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import product
 
 import numpy as np
 
-from undertow.base import MissingExtraError, Progress, no_progress, versions
-from undertow.estimators import Belief
-from undertow.models import FloatArray, Mechanism
+from undertow.base import versions
 from undertow.objective import objective_for
 from undertow.plants import Bench, Push, srv02_rig
-from undertow.runtime import estimator_for
-from undertow.studies.ledger import Ledger
-from undertow.studies.trials.balance import controllers
+from undertow.studies.ledger import Key
+from undertow.studies.trials.balance import makers
 from undertow.studies.trials.steering import clipped_regulator, predictive
-from undertow.studies.trials.trial import MakeController, Outcome, Result, trial
+from undertow.studies.trials.trial import MakeController, Result, trial
 
 #: Half-width of the masses; scale of friction; delay in all, s; impulse, N m s.
 MASSES, FRICTION, DELAY, IMPULSE = 0.20, 2.0, 0.005, 0.004
 
-#: When a knock comes, s; and the length of a run with a single change, which leaves a slow
-#: surface the time to bring the arm home afterwards.
-KNOCK, SINGLE = 5.0, 20.0
+#: When a knock comes, s; the length of a run on a random rig, and of one with a single change,
+#: which leaves a slow surface the time to bring the arm home afterwards.
+KNOCK, SECONDS, SINGLE = 5.0, 10.0, 20.0
 
-#: φ(0), rad, at rest; and rollouts that one re-optimisation may spend.
-ANGLE, BUDGET = math.radians(35), 256
+#: φ(0), rad, at rest; rollouts that one re-optimisation may spend; rigs of a single change.
+ANGLE, BUDGET, SEEDS = math.radians(35), 256, 3
 
-#: Names in the tables.
+#: What the random rigs are among changes; names in the tables.
+RANDOM = "random"
 NAMES = ("cascade", "fixed surface", "clipped LQR", "NMPC, 10 Hz")
 
 
@@ -94,18 +90,6 @@ class Breaking:
     seed: int | None
 
 
-@dataclass(frozen=True, eq=False)
-class RobustnessResult:
-    """Results by controller, and breaking points by (controller, factor).
-
-    ``seeds`` is the number of rigs on which a single change must be survived.
-    """
-
-    outcomes: dict[str, list[Result]]
-    breaking: dict[tuple[str, str], Breaking]
-    seeds: int
-
-
 def breaking_point(
     run: Callable[[float, int], bool], largest: float, *, seeds: int, bisections: int = 5
 ) -> Breaking:
@@ -132,112 +116,50 @@ def breaking_point(
     return Breaking(low, high, seed)
 
 
-#: Types of the numbers of a result.
-_KINDS: Mapping[str, tuple[type, ...]] = {
-    field.name: {"int": (int,), "bool": (bool,)}.get(str(field.type), (int, float))
-    for field in fields(Result)
-}
-
-#: Controller, what was changed, by how much, and seed.
-RunKey = tuple[str, str, float, int]
-RunLedger = Ledger[RunKey, Result]
-
-
-def run_ledger(path: Path | None, settings: Mapping[str, Any]) -> RunLedger:
-    """Return the ledger of runs with some settings, JSON values."""
-    return Ledger(path, {"settings": settings, "versions": versions()}, _read)
+@cache
+def _maker(name: str) -> MakeController:
+    belief = srv02_rig().mechanism
+    if name == NAMES[2]:
+        return clipped_regulator(belief)
+    if name == NAMES[3]:
+        return predictive(belief, objective_for(belief, "bench-energy"))
+    return makers("bench-energy", ANGLE, BUDGET)["cascade" if name == NAMES[0] else "one-time"]
 
 
-def keep_run(ledger: RunLedger, name: str, what: str, value: float, outcome: Outcome) -> Result:
-    """Keep the numbers of a run."""
-    result = Result(**{name: getattr(outcome, name) for name in _KINDS})
-    numbers = {k: v if math.isfinite(v) else None for k, v in asdict(result).items()}
-    return ledger.keep((name, what, value, outcome.seed), result, [name, what, value, numbers])
-
-
-def _read(
-    line: tuple[str, str, float, dict[str, Any]],
-) -> tuple[tuple[str, str, float, int], Result]:
-    name, what, value, numbers = line
-    kept: dict[str, Any] = {k: math.inf if v is None else v for k, v in numbers.items()}
-    result = Result(**kept)
-    whole = all(type(getattr(result, key)) in kinds for key, kinds in _KINDS.items())
-    if not (isinstance(name, str) and isinstance(what, str) and whole):
-        raise ValueError(f"a line that is no result: {str(line)[:80]}")
-    return (name, what, float(value), result.seed), result
-
-
-def _makers(belief: Mechanism, bench: Bench, x0: FloatArray) -> dict[str, MakeController]:
-    """Return the controllers by name; NMPC where CasADi is there."""
-    objective = objective_for(belief, "bench-energy")
-    made = controllers(belief, bench, objective, x0, budget=BUDGET)
-    makers = dict(
-        zip(NAMES, (made["cascade"], made["one-time"], clipped_regulator(belief)), strict=False)
-    )
-    with contextlib.suppress(MissingExtraError):  # then there is nothing to compare with
-        makers[NAMES[-1]] = predictive(belief, objective)
-    return makers
-
-
-def robustness(
-    *,
-    rigs: int = 200,
-    seeds: int = 3,
-    seconds: float = 10.0,
-    ledger: Path | None = None,
-    progress: Progress = no_progress,
-) -> RobustnessResult:
-    """Run every controller on the same random rigs, then look for what breaks each.
-
-    There are ``rigs`` random ones, and ``seeds`` on which a single change must be survived (0 looks
-    for no breaking points). A run on a random rig begins at rest at ``ANGLE`` and takes
-    ``seconds``, s. ``ledger`` is a file that keeps every run as it is made: what it holds already
-    is not run again.
-
-    Raises
-    ------
-    ArtefactError
-        When the ledger is of another version or of other settings.
-    """
+def run(name: str, truth: Bench, seconds: float, seed: int) -> Result:
+    """Run a controller on a rig that it does not know, from rest at ``ANGLE``."""
     bench = srv02_rig()
     belief = bench.mechanism
-    x0: FloatArray = belief.state(phi=ANGLE)
-    objective = objective_for(belief, "bench-energy")
-    makers = _makers(belief, bench, x0)
-    settings = {"angle": ANGLE, "seconds": [seconds, SINGLE], "budget": BUDGET}
-    book = run_ledger(ledger, settings | {"fingerprint": belief.fingerprint})
+    return trial(
+        belief, truth, _maker(name), belief.state(phi=ANGLE), seconds, seed,
+        objective=objective_for(belief, "bench-energy"), told=bench,
+    ).numbers  # fmt: skip
 
-    def once(name: str, what: str, value: float, seed: int, truth: Bench) -> Result:
-        known = book.known.get((name, what, value, seed))
-        if known is not None:
-            return known
-        told = estimator_for(belief, bench, known=Belief.usual(belief))
-        length = seconds if what == "random" else SINGLE
-        outcome = trial(
-            belief, truth, makers[name], x0, length, seed, objective=objective, estimator=told
-        )
-        return keep_run(book, name, what, value, outcome)
 
-    def survived(
-        name: str, factor: str, change: Callable[[Bench, float], Bench], value: float, seed: int
-    ) -> bool:
-        return once(name, factor, value, seed, change(bench, value)).balanced
+def on_random_rig(name: str, seed: int) -> Result:
+    """Run a controller on a random rig."""
+    return run(name, random_bench(srv02_rig(), seed), SECONDS, seed)
 
-    parts = len(makers) * (1 + (len(FACTORS) if seeds else 0))
-    done = 0
-    outcomes: dict[str, list[Result]] = {}
-    for name in makers:
-        outcomes[name] = []
-        for seed in range(rigs):
-            progress(f"{rigs} random rigs, {name}", (done + seed / rigs) / parts)
-            outcomes[name].append(once(name, "random", 0.0, seed, random_bench(bench, seed)))
-        done += 1
-    breaking: dict[tuple[str, str], Breaking] = {}
-    for factor, (change, largest, _, _) in FACTORS.items() if seeds else ():
-        for name in makers:
-            progress(f"{factor}, {name}", done / parts)
 
-            run = partial(survived, name, factor, change)
-            breaking[name, factor] = breaking_point(run, largest, seeds=seeds)
-            done += 1
-    return RobustnessResult(outcomes, breaking, seeds)
+def broken_by(name: str, factor: str) -> Breaking:
+    """Find what a controller survives of one of the ``FACTORS``."""
+    change, largest, _, _ = FACTORS[factor]
+
+    def survived(value: float, seed: int) -> bool:
+        return run(name, change(srv02_rig(), value), SINGLE, seed).balanced
+
+    return breaking_point(survived, largest, seeds=SEEDS)
+
+
+def robustness(rigs: int = 200, single: bool = True) -> dict[Key, Callable[[], Result | Breaking]]:
+    """Return every controller on the same random rigs, then the search for what breaks each.
+
+    By controller, what is changed, and seed. There are ``rigs`` random ones; with ``single`` a
+    single change is looked for that is not survived on all of ``SEEDS``.
+    """
+    names = NAMES if versions()["casadi"] else NAMES[:-1]
+    factors = product(FACTORS if single else (), names)
+    return {
+        (name, RANDOM, seed): partial(on_random_rig, name, seed)
+        for name, seed in product(names, range(rigs))
+    } | {(name, what, SEEDS): partial(broken_by, name, what) for what, name in factors}

@@ -17,7 +17,7 @@ import scipy.linalg
 import sympy as sp
 
 from undertow.base import require_extra
-from undertow.bounds.expressions import translate
+from undertow.bounds.expressions import dynamics
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, KalmanFilter, StateFeedback
 from undertow.law import InnerLoop
@@ -26,7 +26,6 @@ from undertow.objective import Objective
 from undertow.optimiser import Proposal
 from undertow.runtime import Settings
 from undertow.studies.trials.trial import MakeController
-from undertow.symbolic import Tape
 
 
 def steady(law: InnerLoop) -> Callable[[float, FloatArray], FloatArray]:
@@ -150,20 +149,19 @@ class NMPC:
         self.period, self.step, self.count = period, step, round(horizon / step)
         self.size, self.m = 2 * belief.n, belief.m
         limit = belief.input_limits
-        flow, stage = _functions(ca, belief, objective)
+        rates = dynamics(ca, belief, objective.stage_cost(belief))
         x, u = ca.SX.sym("x", self.size), ca.SX.sym("u", self.m)
-        k1 = flow(x, u)
-        k2 = flow(x + step / 2 * k1, u)
-        k3 = flow(x + step / 2 * k2, u)
-        k4 = flow(x + step * k3, u)
+        k1 = rates(0.0, x, u)[0]
+        k2 = rates(0.0, x + step / 2 * k1, u)[0]
+        k3 = rates(0.0, x + step / 2 * k2, u)[0]
+        k4 = rates(0.0, x + step * k3, u)[0]
         ahead = ca.Function("ahead", [x, u], [x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
         X, U = ca.MX.sym("X", self.size, self.count + 1), ca.MX.sym("U", self.m, self.count)
         x0 = ca.MX.sym("x0", self.size)
         gaps = X[:, 1:] - ahead.map(self.count)(X[:, :-1], U)
         P = _terminal(belief, objective)
-        cost = step * ca.sum2(stage.map(self.count)(X[:, :-1], U)) + ca.bilin(
-            ca.DM(P), X[:, -1], X[:, -1]
-        )
+        stages = rates.map(self.count)(0.0, X[:, :-1], U)[1]
+        cost = step * ca.sum2(stages) + ca.bilin(ca.DM(P), X[:, -1], X[:, -1])
         unknowns = ca.veccat(X, U)
         problem = {"x": unknowns, "p": x0, "f": cost, "g": ca.veccat(X[:, 0] - x0, gaps)}
         options: Any = {
@@ -198,22 +196,6 @@ class NMPC:
             self._began, self._due = t, self._due + self.period
         k = min(int((t - self._began) / self.step + 1e-6), self.count - 1)
         return np.asarray(self._plan[k])
-
-
-def _functions(ca: Any, belief: Mechanism, objective: Objective) -> tuple[Any, Any]:
-    """Return ẋ(x, u) and Φ(x, u) as CasADi functions."""
-    tape = Tape()
-    qdd = belief.partition(tape).accelerations(sp.Matrix(belief.u))
-    (stage,) = tape.let_all([objective.stage_cost(belief)])
-    x, u = ca.SX.sym("x", 2 * belief.n), ca.SX.sym("u", belief.m)
-    known: dict[sp.Basic, Any] = dict(belief.substitution)
-    known |= {symbol: x[i] for i, symbol in enumerate(belief.x)}
-    known |= {symbol: u[i] for i, symbol in enumerate(belief.u)}
-    for line in tape.live([*qdd, stage]):
-        known[line.symbol] = translate(ca, line.expression, known)
-    outputs = [translate(ca, e, known) for e in (*belief.x[belief.n :], *qdd)]
-    flow = ca.Function("flow", [x, u], [ca.vertcat(*outputs)])
-    return flow, ca.Function("stage", [x, u], [translate(ca, stage, known)])
 
 
 def _terminal(belief: Mechanism, objective: Objective) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,6 +53,11 @@ class Outcome(Result):
 
     record: Record
 
+    @property
+    def numbers(self) -> Result:
+        """The same without the record."""
+        return Result(**{one.name: getattr(self, one.name) for one in fields(Result)})
+
 
 def trial(
     belief: Mechanism,
@@ -64,6 +69,8 @@ def trial(
     *,
     objective: Objective | None = None,
     estimator: Estimator | None = None,
+    told: Bench | None = None,
+    home: ArrayLike | None = None,
     compensates: Callable[[], bool] = lambda: True,
 ) -> Outcome:
     """Run a controller on a rig, once.
@@ -73,33 +80,40 @@ def trial(
     (2n,); the run takes ``seconds``, s.
 
     The estimator is by default that of :func:`undertow.runtime.controller_defaults.estimator_for`
-    the bench, which learns the usual parameters; a controller that has a method ``listen`` is given
-    it. What it knows of a matched disturbance is taken off the output in each step in which
-    ``compensates`` says so.
+    the bench, or the one that it is ``told`` of instead, which learns the usual parameters; a
+    controller that has a method ``listen`` is given it. What it knows of a matched disturbance is
+    taken off the output in each step in which ``compensates`` says so. ``home`` is as for
+    :func:`judge`.
     """
     rig = RealisticRig(bench, x0, seed)
     seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
     if estimator is None:
-        estimator = estimator_for(belief, bench, known=Belief.usual(belief))
+        estimator = estimator_for(belief, told or bench, known=Belief.usual(belief))
     estimator.reset(seen)
     steering = make(seen)
     if hasattr(steering, "listen"):
         steering.listen(estimator)
     controller = compensated(steering, estimator, belief.input_limits, compensates)
     record = run_recorded(rig, estimator, controller, seconds)
-    return judge(belief, record, seed, objective)
+    return judge(belief, record, seed, objective, home)
 
 
 def judge(
-    mechanism: Mechanism, record: Record, seed: int = 0, objective: Objective | None = None
+    mechanism: Mechanism,
+    record: Record,
+    seed: int = 0,
+    objective: Objective | None = None,
+    home: ArrayLike | None = None,
 ) -> Outcome:
-    """Return what came of a recorded run."""
-    settled = _settled(mechanism, record, 0)
+    """Return what came of a recorded run; ``home``, (n,), is how near the target that is."""
+    driven = np.arange(mechanism.n) < mechanism.m
+    near = np.where(driven, HOME_DRIVEN, HOME_FREE) if home is None else np.asarray(home)
+    settled = _settled(record, near)
     last = record.t[-1] - LAST
     return Outcome(
         seed=seed,
         balanced=bool(settled <= last),
-        caught=bool(_settled(mechanism, record, mechanism.m) <= last),
+        caught=bool(_settled(record, np.where(driven, math.inf, near)) <= last),
         settled=settled,
         cost=math.nan if objective is None else _cost(mechanism, objective, record),
         effort=record.effort,
@@ -113,11 +127,9 @@ def balanced(outcomes: Sequence[Result]) -> int:
     return sum(outcome.balanced for outcome in outcomes)
 
 
-def _settled(mechanism: Mechanism, record: Record, first: int) -> float:
-    """Return when the last of the coordinates from ``first`` on came home for good, s."""
-    home = np.where(np.arange(mechanism.n) < mechanism.m, HOME_DRIVEN, HOME_FREE)
-    at_home = np.abs(record.truth[:, first : mechanism.n]) <= home[first:]
-    away = np.logical_not(np.asarray(at_home).all(axis=1))
+def _settled(record: Record, home: FloatArray) -> float:
+    """Return when the last of the coordinates came home for good, s."""
+    away = np.logical_not((np.abs(record.truth[:, : len(home)]) <= home).all(axis=1))
     if away[-1]:
         return math.inf
     return float(record.t[np.flatnonzero(away)[-1] + 1]) if away.any() else 0.0

@@ -9,18 +9,18 @@ from functools import partial
 
 import numpy as np
 
-from undertow.base import Progress, no_progress
 from undertow.cascade import Cascade
-from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, designed, hanging
+from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
 from undertow.cascade.swing_up.search import RatedGains, designs_for
 from undertow.estimators import Estimator, StateFeedback, compensated, run_recorded
+from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, MuJoCoRig, plausible_rig, srv02_rig
 from undertow.runtime import default_gate, estimator_for
 from undertow.studies.trials.steering import CascadeSteering
-from undertow.studies.trials.trial import Outcome, judge, trial
+from undertow.studies.trials.trial import Outcome, Result, judge, trial
 
 #: Length of a swing-up run, s.
 SWING_SECONDS = 30.0
@@ -36,34 +36,19 @@ def bench_of(mechanism: Mechanism) -> Bench:
     return plausible_rig(mechanism)
 
 
-def searched(
-    names: Sequence[str], fresh: int | None = None, progress: Progress = no_progress
-) -> dict[Mechanism, tuple[RatedGains, ...]]:
-    """Return the swing-up gains of mechanisms of the library, kept or searched for.
-
-    The kept ones are taken where ``fresh``, the seed of a new search, is ``None``.
-    """
-    found = {}
-    for mechanism in all_of(names):
-        what = f"gains of {mechanism.name}"
-        found[mechanism] = designs_for(
-            mechanism, seed=fresh or 0, fresh=fresh is not None, progress=partial(progress, what)
-        )
-    return found
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class SwingResult:
-    """Swing-ups of one mechanism.
+    """Swing-ups of one mechanism of the library, by its ``name``.
 
-    ``catches``: times of the last catch, s, of the runs that had one. ``thrown``: how often a run
-    was thrown out, in all. ``stops``: runs that hit an end stop. Angles of the outcomes are counted
-    from the upright that they ended in.
+    ``gains``: those of the energy law. ``catches``: times of the last catch, s, of the runs that
+    had one. ``thrown``: how often a run was thrown out, in all. ``stops``: runs that hit an end
+    stop. Angles of the outcomes are counted from the upright that they ended in.
     """
 
-    mechanism: Mechanism
-    outcomes: list[Outcome]
-    catches: list[float]
+    name: str
+    gains: tuple[RatedGains, ...]
+    outcomes: tuple[Result, ...]
+    catches: tuple[float, ...]
     thrown: int
     stops: int
 
@@ -122,45 +107,55 @@ def swing_trial(
 
 def swing_trials(
     mechanism: Mechanism,
+    gains: Sequence[RatedGains],
     *,
-    swing: SwingUp | None = None,
     seeds: int = 20,
     seconds: float = SWING_SECONDS,
 ) -> SwingResult:
     """Swing a mechanism up on realistic rigs, from hanging at rest, one for each seed.
 
-    The energy law has the gains that are kept by default; a run takes ``seconds``, s.
+    The energy law has the ``gains``; a run takes ``seconds``, s.
     """
-    bench = bench_of(mechanism)
-    swing = designed(mechanism) if swing is None else swing
-    region = CatchRegion(mechanism)
+    bench, region = bench_of(mechanism), CatchRegion(mechanism)
+    swing = SwingUp(mechanism, tuple(one.gains for one in gains))
     runs = [swing_trial(bench, swing, region, seed=seed, seconds=seconds) for seed in range(seeds)]
     return SwingResult(
-        mechanism,
-        [run.outcome for run in runs],
-        [run.catch for run in runs if math.isfinite(run.catch)],
+        mechanism.name,
+        tuple(gains),
+        tuple(run.outcome.numbers for run in runs),
+        tuple(run.catch for run in runs if math.isfinite(run.catch)),
         sum(run.thrown for run in runs),
         sum(run.stop for run in runs),
     )
 
 
+def searched(name: str, *, seeds: int, fresh: int | None = None) -> SwingResult:
+    """Do the same for a mechanism of the library with its gains, kept or searched for.
+
+    The kept ones are taken where ``fresh``, the seed of a new search, is ``None``.
+    """
+    mechanism = LIBRARY[name]()
+    gains = designs_for(mechanism, seed=fresh or 0, fresh=fresh is not None)
+    return swing_trials(mechanism, gains, seeds=seeds)
+
+
 @dataclass(frozen=True, eq=False)
 class EngineResult:
-    """A run of the cascade in MuJoCo."""
+    """A run of the cascade in MuJoCo; ``final``, (n,), are the positions at its end."""
 
-    mechanism: Mechanism
-    outcome: Outcome
+    name: str
+    outcome: Result
+    final: FloatArray
     admitted: int
 
 
-def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 256) -> EngineResult:
+def engine_trial(name: str, *, seconds: float = 10.0, budget: int = 256) -> EngineResult:
     """Balance a mechanism of the library in MuJoCo, from its usual start, positions only.
-
-    The same settings for all of them.
 
     The same settings for all of them; the engine gets the belief's parameters, and none of its
     equations. The run takes ``seconds``, s, a re-optimisation ``budget`` rollouts at most.
     """
+    mechanism = LIBRARY[name]()
     x0 = mechanism.state(**mechanism.start)
     rig = MuJoCoRig(mechanism, x0)
     objective = objective_for(mechanism, "effort")
@@ -172,15 +167,10 @@ def engine_trial(mechanism: Mechanism, *, seconds: float = 10.0, budget: int = 2
     kalman.reset(x0)
     controller = compensated(steering, kalman, mechanism.input_limits)
     record = run_recorded(rig, kalman, controller, seconds)
-    return EngineResult(mechanism, judge(mechanism, record, 0, objective), steering.admitted)
+    outcome = judge(mechanism, record, 0, objective)
+    final = record.truth[-1, : mechanism.n]
+    return EngineResult(mechanism.name, outcome.numbers, final, steering.admitted)
 
 
 def _given(controller: StateFeedback, _start: FloatArray) -> StateFeedback:
     return controller
-
-
-def all_of(names: Sequence[str]) -> list[Mechanism]:
-    """Return mechanisms of the library by name."""
-    from undertow import mechanisms
-
-    return [mechanisms.LIBRARY[name]() for name in names]
