@@ -31,7 +31,7 @@ from undertow.mechanisms import rotary_pendulum
 from undertow.models import Mechanism
 from undertow.objective import MinimumEnergy, objective_for
 from undertow.plants import IdealRig
-from undertow.proofs.search.terminal_ellipsoid import search_for
+from undertow.proofs import search_for
 from undertow.runtime import run
 from undertow.symbolic.private import cache_folder, private_folder
 
@@ -88,7 +88,9 @@ def extras() -> list[Extra]:
         if found:
             needed.setdefault(found[2], []).append((found[1], _version(found[1])))
     order = [*ADDS, *sorted({*needed} - {*ADDS, *OWN})]
-    return [Extra(name, ADDS.get(name, ""), tuple(needed[name])) for name in order if name in needed]
+    return [
+        Extra(name, ADDS.get(name, ""), tuple(needed[name])) for name in order if name in needed
+    ]
 
 
 def _version(package: str) -> str | None:
@@ -131,7 +133,9 @@ def _cache() -> str:
         kept = folder == cache_folder().resolve()
     except RuntimeError:  # the user has no home
         kept = False
-    return words if kept else f"{words}; temporary: set UNDERTOW_CACHE to a folder that only you write"
+    return (
+        words if kept else f"{words}; temporary: set UNDERTOW_CACHE to a folder that only you write"
+    )
 
 
 @dataclass(frozen=True)
@@ -236,8 +240,9 @@ def _clock(mechanism: Mechanism) -> tuple[bool, str]:
     late, steps = done.missed_deadlines + done.skipped_periods, max(1, done.steps)
     response, woken = done.response_times, done.wakeup_delays
     words = (
-        f"woken {1e6 * woken.quantile(0.5):.0f} µs late in the median, {1e6 * woken.quantile(0.99):.0f}"
-        f" µs at the 99th percentile; output after {1e6 * response.quantile(0.99):.0f} µs (p99); "
+        f"woken {1e6 * woken.quantile(0.5):.0f} µs late in the median, "
+        f"{1e6 * woken.quantile(0.99):.0f} µs at the 99th percentile; "
+        f"output after {1e6 * response.quantile(0.99):.0f} µs (p99); "
         f"{late} of {steps} periods missed"
     )
     if late > 0.001 * steps:

@@ -56,7 +56,8 @@ class Watched:
         """Return what a new viewer must know: the last seconds, or all of a run that is over."""
         return self._recording or {
             **described(self._told.belief, self._told.scene), "live": True, "watched": True,
-            "behind": BEHIND, "speeds": [1.0], "controls": [], "frames": [*self._frames],
+            "behind": BEHIND, "speeds": [1.0], "controls": [], "beside": [],
+            "frames": [*self._frames],
             "state": {"kind": "state", "mode": "watched", "paused": False, "speed": 1.0},
             "plans": [*self._plans],
         }  # fmt: skip
