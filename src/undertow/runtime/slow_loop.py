@@ -126,7 +126,8 @@ class Answer:
 Compute = Callable[[Request], Answer]
 
 #: What a background worker is asked, and what it answers: for a slow loop these two.
-Asked, Said = TypeVar("Asked"), TypeVar("Said")
+Asked = TypeVar("Asked")
+Said = TypeVar("Said")
 
 
 def is_answer(said: object) -> TypeGuard[Answer]:

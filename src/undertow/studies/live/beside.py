@@ -32,8 +32,9 @@ from undertow.symbolic import compile_expressions
 #: Cells of a map on each side; intervals of the first mesh of a bound; how nice both are, of 19.
 SIDE, INTERVALS, NICE = 17, 50, 19
 
-#: A map is drawn again after so many times as long as it took, and this long at least, s.
-REST, SOONEST = 4.0, 0.4
+#: A map is drawn again after so many times as long as it took, between these, s: the first one has
+#: compiled what it needs, too.
+REST, SOONEST, LATEST = 3.0, 0.4, 3.0
 
 #: What a cell of a map is: lost; brought home with the input at its limit there; brought home.
 LOST, LIMITED, HOME = 0, 1, 2
@@ -224,7 +225,7 @@ class Beside:
             if len(self._drawn):  # else it is of what is over
                 said.append(drawn)
             took = clock - (clock if self._mapping is None else self._mapping)
-            self._mapping, self._due = None, clock + max(SOONEST, REST * took)
+            self._mapping, self._due = None, clock + min(max(SOONEST, REST * took), LATEST)
         return said
 
     def close(self) -> None:
