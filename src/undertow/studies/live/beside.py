@@ -36,6 +36,9 @@ SIDE, INTERVALS, NICE = 17, 50, 19
 #: compiled what it needs, too.
 REST, SOONEST, LATEST = 3.0, 0.4, 3.0
 
+#: Bounds that are remembered.
+KEPT = 16
+
 #: What a cell of a map is: lost; brought home with the input at its limit there; brought home.
 LOST, LIMITED, HOME = 0, 1, 2
 
@@ -72,8 +75,17 @@ class MapAsked:
 
 def bounds_of(mechanism: Mechanism) -> Callable[[BoundAsked], Message]:
     """Return what finds optimal-control bounds of a mechanism; one that is not found says why."""
+    found_before: dict[tuple[object, ...], Message] = {}  # after a reset it is asked for again
 
     def answer(asked: BoundAsked) -> Message:
+        key = (asked.t, asked.task, *asked.parameters.tolist(), *asked.x.tolist())
+        if key not in found_before:
+            if len(found_before) >= KEPT:
+                found_before.clear()
+            found_before[key] = find(asked)
+        return found_before[key]
+
+    def find(asked: BoundAsked) -> Message:
         objective = cascade_for(mechanism, asked.task).objective
         plant = mechanism.with_values(asked.parameters).with_input_limit(*asked.task.limits)
         try:

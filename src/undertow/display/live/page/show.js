@@ -327,10 +327,10 @@
     c.save(); c.fillStyle = colour("--blue");
     c.beginPath();
     for (let k = 0; k < side * side; k++) {
-      const left = px(-far + w * (k % side)), right = px(-far + w * (k % side + 1)), low = py(-fast + h * Math.floor(k / side)), up = py(-fast + h * (Math.floor(k / side) + 1));
+      const [left, right, low, up] = [px(-far + w * (k % side)), px(-far + w * (k % side + 1)), py(-fast + h * Math.floor(k / side)), py(-fast + h * (Math.floor(k / side) + 1))].map(Math.round);
       if (map.cells[k] === "0") { c.rect(left, up, right - left, low - up); continue; }
       c.globalAlpha = map.cells[k] === "2" ? 0.34 : 0.14;
-      c.fillRect(left, up, right - left + 0.4, low - up + 0.4);
+      c.fillRect(left, up, right - left, low - up);
     }
     c.clip(); c.globalAlpha = 0.35; c.strokeStyle = colour("--soft"); c.lineWidth = 1; c.setLineDash([]);  // lost: hatched
     c.beginPath();
@@ -377,7 +377,7 @@
     box.replaceChildren();
     if (!words) return;
     if (words === "wait") { box.textContent = "What comes home from here is being mapped."; return; }
-    for (const [style, text] of [["home", "comes home  "], ["limited", "so with the input at its limit  "], ["lost", "lost  "]]) {
+    for (const [style, text] of [["home", "comes home, "], ["limited", "with the input at its limit, "], ["lost", "lost. "]]) {
       const mark = document.createElement("i");
       mark.className = style;
       box.append(mark, text);
@@ -404,9 +404,11 @@
     drawRegion(c, px, py);
     c.strokeStyle = colour("--grid"); c.lineWidth = 1; c.setLineDash([]);
     c.beginPath(); c.moveTo(0, py(0)); c.lineTo(w, py(0)); c.moveTo(px(0), 0); c.lineTo(px(0), h); c.stroke();
-    c.fillStyle = colour("--soft"); c.font = "12px system-ui, sans-serif";
-    c.textAlign = "right"; c.fillText(`→ ${own.name}, ±${short(mx * f, 2)} ${own.unit}`, w - 6, h - 7);
-    c.textAlign = "left"; c.fillText(`↑ its rate, ±${short(my * f, 2)} ${own.unit}/s`, 6, 15);
+    const written = (words, x, y, side, style) => {  // readable on a hatched ground, too
+      c.font = "12px system-ui, sans-serif"; c.textAlign = side; c.lineJoin = "round"; c.setLineDash([]);
+      c.strokeStyle = colour("--panel"); c.lineWidth = 4; c.strokeText(words, x, y);
+      c.fillStyle = colour(style); c.fillText(words, x, y);
+    };
     const s0 = (p, alpha, dash) => {
       if (!p || !p.rows) return;
       const goal = p.goal || [];
@@ -438,7 +440,9 @@
     for (let k = from; k <= to; k++) { const x = px(frames[k].x[i]), y = py(frames[k].x[n + i]); k > from && !turned(k, i) ? c.lineTo(x, y) : c.moveTo(x, y); }
     c.stroke();
     c.fillStyle = colour("--blue"); c.beginPath(); c.arc(px(frame.x[i]), py(frame.x[n + i]), 5, 0, 7); c.fill();
-    c.fillStyle = colour("--red"); c.textAlign = "left"; c.fillText("s = 0", 6, h - 7);
+    written("s = 0", 6, h - 7, "left", "--red");
+    written(`→ ${own.name}, ±${short(mx * f, 2)} ${own.unit}`, w - 6, h - 7, "right", "--soft");
+    written(`↑ its rate, ±${short(my * f, 2)} ${own.unit}/s`, 6, 15, "left", "--soft");
   }
 
   // -- charts ----------------------------------------------------------------------------------
@@ -555,8 +559,8 @@
   let costLegend = () => {};
   function drawCharts() {
     const from = before(frames, shown - WINDOW), to = before(frames, shown);
-    const some = frames.slice(from, to + 1), t = some.map((f) => f.t), low = Math.max(shown - WINDOW, frames.length ? Math.min(frames[0].t, shown - 1) : 0);
-    const x = { min: Math.min(low, shown - 0.5), max: Math.max(shown, low + 0.5) };
+    const some = frames.slice(from, to + 1), t = some.map((f) => f.t), low = Math.max(shown - WINDOW, frames.length ? frames[0].t : 0);
+    const x = { min: low, max: Math.max(shown, low + 1) };
     const set = (id, data) => { charts[id].setData(data, false); charts[id].setScale("x", x); };
     set("states", [t, ...hello.coordinates.map((c, k) => some.map((f, j) => (j && turned(from + j, k) ? null : f.x[k] * c.factor)))]);
     set("input", [t, ...hello.inputs.map((_, k) => some.map((f) => f.u[k]))]);
@@ -571,7 +575,7 @@
     const timed = decided.filter((p) => p.ms != null && !p.first), times = new Map(timed.map((p) => [p.t, p.ms]));
     set("ms", [[...times.keys()], [...times.values()]]);
   }
-  const took = (p) => (p.ms < 1000 ? `${short(p.ms)} ms` : `${short(p.ms / 1000, 2)} s${p.first ? " from nothing" : ""}`);
+  const took = (p) => (p.ms < 1000 ? `${short(p.ms)} ms` : `${short(p.ms / 1000, 2)} s`);
   let learnt = {};
   function drawLearnt() {  // what the controller takes the plant's parameters to be by now
     learnt = planAt(shown)?.learnt ?? {};
@@ -683,6 +687,7 @@
   window.undertow = {
     get state() { return { ...state, live, watched, shown, playing, fps, connected: socket?.readyState === 1, note: performance.now() < noteUntil ? note : "" }; },
     get frame() { return frameAt(shown); },
+    get window() { const x = charts.states.scales.x; return { min: x.min, max: x.max }; },
     get bounds() { return bounds; }, get region() { return region; },
     get frames() { return frames; }, get plans() { return plans; }, get hello() { return hello; },
     get controls() { return Object.fromEntries(controls); },
