@@ -111,7 +111,7 @@ def page(browser: Browser, address: str) -> Iterator[Any]:
         made.click("#pause")
     made.click("#reset")
     until(made, "undertow.frames.length && undertow.frames.at(-1).t < 1", 20)
-    until(made, "undertow.state.mode === 'running' && undertow.plans.length > 0", 90)
+    until(made, "undertow.state.mode === 'running' && undertow.plans.length > 0", 240)
     yield made
     made.close()
 
