@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -409,3 +410,56 @@ def test_quick_reproduction_end_to_end(tmp_path: Path) -> None:
     assert "Table 2" in out
     names = {path.name for path in tmp_path.iterdir()}
     assert {"tables.csv", "manifest.json", "figure-3-repeats.png", "figure-5-phase.png"} <= names
+
+
+def test_the_doctor_tells_what_is_here_and_what_could_be() -> None:
+    """Every extra that a user may want stands there with what it adds, or how to get it."""
+    from undertow.studies import doctor
+
+    code, out, _ = run("doctor", "--no-test")
+    assert code == 0
+    for extra in doctor.extras():
+        assert extra.name in out
+        assert extra.adds
+        if extra.missing:
+            assert f"undertow[{extra.name}]" in out.replace("\n", "")
+    text = Path(__file__).parents[2].joinpath("pyproject.toml").read_text(encoding="utf-8")
+    named = set(tomllib.loads(text)["project"]["optional-dependencies"])
+    assert named == {*doctor.ADDS, *doctor.OWN}
+
+
+def test_the_doctor_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A test that breaks off, or finds a difference, fails the command; the others go on."""
+    from undertow.studies import doctor
+
+    def broken(*_: object) -> tuple[bool, str]:
+        raise ZeroDivisionError("of a broken machine")
+
+    names = ("_formulas", "_motion", "_balance", "_proof", "_c", "_clock")
+    for name in names:
+        monkeypatch.setattr(doctor, name, lambda _: (True, "fine"))
+    assert run("doctor")[0] == 0
+    monkeypatch.setattr(doctor, "_motion", broken)
+    monkeypatch.setattr(doctor, "_c", lambda _: (False, "7 apart"))
+    code, out, _ = run("doctor")
+    assert code == 1
+    assert out.count("\nFAIL ") == 2
+    assert "ZeroDivisionError: of a broken machine" in out
+    assert out.count("ok  ") == 4
+
+
+@pytest.mark.slow
+def test_the_doctor_passes_here() -> None:
+    """All six tests, on this machine."""
+    code, out, _ = run("doctor")
+    assert code == 0, out
+    assert out.count("ok  ") == 6
+
+
+def test_without_arguments_it_says_what_to_try() -> None:
+    """Each line that it proposes is a command that there is."""
+    _, out, _ = run()
+    tried = [line.split() for line in out.splitlines() if line.startswith(" undertow ")]
+    assert len(tried) >= 4
+    assert {words[1] for words in tried} <= {path[0] for path in COMMANDS}
+    assert "doctor" in {words[1] for words in tried}

@@ -6,6 +6,7 @@ What is asserted is the state that the page exposes as ``window.undertow``, and 
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shutil
@@ -110,7 +111,7 @@ def page(browser: Browser, address: str) -> Iterator[Any]:
         made.click("#pause")
     made.click("#reset")
     until(made, "undertow.frames.length && undertow.frames.at(-1).t < 1", 20)
-    until(made, "undertow.state.mode === 'running' && undertow.plans.length > 0", 90)
+    until(made, "undertow.state.mode === 'running' && undertow.plans.length > 0", 240)
     yield made
     made.close()
 
@@ -226,6 +227,67 @@ def test_the_pendulum_is_grabbed_thrown_and_caught_again(page: Any) -> None:
         page.mouse.down()
     assert page.evaluate("undertow.state.mode") == "running"
     assert abs(page.evaluate("undertow.frame.x[1]")) < 0.2
+
+
+def test_a_finger_pulls_as_a_mouse_does(browser: Browser, page: Any, address: str) -> None:
+    """On a touch screen: what is taken hold of follows the finger, and is let go with it."""
+    phone = browser.open(address, viewport={"width": 390, "height": 844}, has_touch=True)
+    until(phone, "window.undertow && undertow.frame && undertow.state.mode === 'running'", 60)
+    until(phone, "undertow.frame?.t > 2")
+    x, y = phone.evaluate(TIP)
+    touch = phone.context.new_cdp_session(phone)
+    for kind, points in (
+        ("touchStart", [{"x": x, "y": y}]),
+        ("touchMove", [{"x": x + 6, "y": y}]),
+        ("touchMove", [{"x": x + 12, "y": y}]),
+    ):
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    until(phone, "undertow.frame.held && undertow.frame.held.length === 1", 10)
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    until(phone, "!undertow.frames.at(-1).held", 10)
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+    phone.close()
+
+
+def test_bound_map_and_ensemble_stand_beside_the_motion(page: Any) -> None:
+    """The map is of the plane that is chosen; the bound is no dearer than what was predicted; the
+    ensemble closes in."""
+    until(page, "undertow.region?.axis === 1", 120)
+    until(page, "/home|proved/.test(document.getElementById('region').innerText)")
+    cells = page.evaluate("undertow.region.cells")
+    assert {"0", "2"} <= set(cells)
+    assert page.evaluate("undertow.region.proved.length") == 4
+    page.select_option("#axis", "0")
+    until(page, "undertow.region?.axis === 0", 60)
+    page.select_option("#axis", "1")
+    page.click("#reset")
+    if importlib.util.find_spec("casadi"):
+        until(page, "undertow.bounds.some(b => b.cost > 0)", 60)
+        until(page, "document.getElementById('legend-cost').innerText.includes('best of all')")
+        found = page.evaluate("undertow.bounds.find(b => b.cost > 0).cost")
+        first = page.evaluate("undertow.plans.find(p => p.first).predicted")
+        assert 0.9 * first < found < 1.02 * first
+        page.click("#right")  # from here on it is another motion
+        until(page, "undertow.bounds.at(-1).cost === null", 10)
+    span = """(p => p.plausible.map(r => Math.max(...r.members) - Math.min(...r.members)))"""
+    before = page.evaluate(f"{span}(undertow.plans[0])")
+    assert len(before) == page.evaluate("undertow.plans[0].plausible.length") > 4
+    until(page, "undertow.frame?.t > 3")
+    after = page.evaluate(f"{span}(undertow.plans.at(-1))")
+    assert sum(b / a for a, b in zip(before, after, strict=True)) < 0.8 * len(before)
+    assert page.is_visible("#plausible")
+
+
+def test_charts_begin_with_the_motion(page: Any) -> None:
+    """After a reset the axis of time starts at zero: nothing was before."""
+    page.click("#pause")
+    page.click("#reset")
+    until(page, "undertow.frames.length > 0 && undertow.frames[0].t < 0.2", 20)
+    until(page, "document.querySelector('#states canvas')")
+    page.wait_for_timeout(300)
+    assert page.evaluate("undertow.window.min") >= 0.0
+    assert page.evaluate("undertow.window.max") >= 1.0
+    page.click("#pause")
 
 
 def test_two_viewers_ten_reconnects_and_a_closed_lid(

@@ -14,6 +14,7 @@ from undertow.cli import (  # noqa: F401 - each registers its commands
     campaign,
     certify,
     control,
+    doctor,
     export,
     library,
     paper,
@@ -29,7 +30,7 @@ __all__ = ["app", "main"]
 _ORDER = (
     "mechanisms", "models", "derive", "show", "animate", "survey", "optimise", "simulate",
     "certify", "verify", "bench", "run", "target", "replay", "drill", "trials", "campaign",
-    "reproduce",
+    "reproduce", "doctor",
 )  # fmt: skip
 
 app.registered_commands.sort(
@@ -44,7 +45,13 @@ def _version(asked: bool) -> None:
 
 
 @app.callback(
-    epilog=folded("undertow simulate rotary_pendulum --start phi=35deg", "undertow simulate --help")
+    epilog=folded(
+        "undertow show rotary_pendulum             # watch it live, poke it",
+        "undertow simulate rotary_pendulum         # balance it, with numbers",
+        "undertow mechanisms                       # what else there is",
+        "undertow doctor                           # what is installed, and a test",
+        "undertow simulate --help                  # each command has examples",
+    )
 )
 def root(
     version: Annotated[

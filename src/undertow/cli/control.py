@@ -140,7 +140,10 @@ def simulate(
         if given is None:
             given = first_surface(belief)
             if steering == "one-time":
-                given = Optimiser(ClosedLoop(belief, goal), seed=seed).require(x0).surface or given
+                with progress_bar() as progress:
+                    progress("searching for the best surface", 0.0)
+                    found = Optimiser(ClosedLoop(belief, goal), seed=seed).require(x0)
+                given = found.surface or given
         check_surface(belief, given, x0)
         motion, surfaces = ClosedLoop(belief, goal, plant=truth).simulate(x0, given), (given,)
     written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run))
@@ -183,6 +186,8 @@ def optimise(
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
     check_out(out)
     optimiser = Optimiser(ClosedLoop(belief, goal), cold=Budget(evaluations), seed=seed)
-    proposal = optimiser.require(x0)
+    with progress_bar() as progress:
+        progress("searching for the best surface", 0.0)
+        proposal = optimiser.require(x0)
     written = write(out, lambda: proposal_files(request, proposal))
     show(proposal_report(belief, goal, x0, proposal), *written)

@@ -49,7 +49,9 @@ def derive(
 
     mechanism = mechanism_named(name)
     check_out(out)
-    formulas = derivation(mechanism)
+    with progress_bar() as progress:
+        progress("deriving", 0.0)
+        formulas = derivation(mechanism)
     written = write(out, formulas.files)
     typer.echo(formulas.latex() if latex else formulas.text(), nl=False)
     show(*written, stderr=True)
@@ -140,11 +142,14 @@ def animate(
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
     check_out(out)
     loop = ClosedLoop(belief, goal)
-    plan = Optimiser(loop, seed=seed).require(x0).plan
-    assert plan is not None  # require() raises otherwise
-    motion = loop.simulate(x0, plan)
-    film = Film.of(motion, speed=speed, longest=longest)
-    written = write(out, lambda: film_files(film, request))
+    with progress_bar() as progress:
+        progress("searching for the best surface", 0.0)
+        plan = Optimiser(loop, seed=seed).require(x0).plan
+        assert plan is not None  # require() raises otherwise
+        motion = loop.simulate(x0, plan)
+        film = Film.of(motion, speed=speed, longest=longest)
+        progress("drawing the film", 0.5)
+        written = write(out, lambda: film_files(film, request))
     show(problem_words(belief, goal), f"{ended(motion, goal)}. Shown: {film.span}")
     if film.cut:
         show("The film is cut: --longest shows more of the motion, --speed all of it faster")

@@ -9,10 +9,10 @@ import os
 import pickle
 import signal
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from undertow.base import ResourceError
 from undertow.runtime.processes import START_TIMEOUT, STOPPING, Background, fork, pipe
@@ -109,14 +109,19 @@ class InlineWorker:
         """Nothing to stop."""
 
 
-class BackgroundWorker:
+#: What a background worker is asked, and what it answers: for a slow loop these two.
+Asked = TypeVar("Asked")
+Said = TypeVar("Said")
+
+
+class BackgroundWorker(Generic[Asked, Said]):
     """Computes in other threads, which may in turn wait for other processes.
 
     Every computer has its thread from the beginning: a run that needs the next one asks the
     system for nothing.
     """
 
-    def __init__(self, computers: list[_Computer]) -> None:
+    def __init__(self, computers: list[_Computer[Asked, Said]]) -> None:
         self.computers = computers
         try:
             for computer in computers:
@@ -130,11 +135,11 @@ class BackgroundWorker:
         """Process ids of the computers, the one that computes first."""
         return [c.process.pid or 0 for c in self.computers if isinstance(c, _Child)]
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: Asked) -> None:
         """Hand the request over; costs some microseconds."""
         self.computers[0].requests.put(request)
 
-    def take(self, t: float) -> Answer | None:
+    def take(self, t: float) -> Said | None:
         """Return an answer that has arrived."""
         answers = self.computers[0].answers
         return answers.popleft() if answers else None
@@ -152,13 +157,13 @@ class BackgroundWorker:
             computer.close()
 
 
-class _Computer:
+class _Computer(Generic[Asked, Said]):
     """A computation, and a thread that carries requests there and answers back."""
 
-    def __init__(self, compute: Compute) -> None:
+    def __init__(self, compute: Callable[[Asked], Said]) -> None:
         self.compute = compute
-        self.requests: SimpleQueue[Request | None] = SimpleQueue()
-        self.answers: deque[Answer] = deque()
+        self.requests: SimpleQueue[Asked | None] = SimpleQueue()
+        self.answers: deque[Said] = deque()
 
     def begin(self) -> None:
         """Start the thread; processes are forked before."""
@@ -174,10 +179,10 @@ class _Computer:
         self.requests.put(None)
 
 
-class _Child(_Computer):
+class _Child(_Computer[Asked, Said]):
     """A forked process: it has everything compiled already, and can be ended at any time."""
 
-    def __init__(self, compute: Compute, packer: Packer) -> None:
+    def __init__(self, compute: Callable[[Asked], Said], packer: Packer) -> None:
         self.pipe, theirs = pipe()
         self._packer = packer
         try:
@@ -210,9 +215,9 @@ class _Child(_Computer):
         with self.pipe:  # closed by the thread that reads it: a descriptor read by one and closed
             super()._carry()  # by another may by then belong to another file
 
-    def _exchange(self, request: Request) -> Answer:
+    def _exchange(self, request: Asked) -> Said:
         self.pipe.send_bytes(self._packer.pack(request))
-        answer: Answer = self._packer.unpack(self.pipe.recv_bytes())
+        answer: Said = self._packer.unpack(self.pipe.recv_bytes())
         return answer
 
     def close(self) -> None:
@@ -221,7 +226,9 @@ class _Child(_Computer):
         super().close()
 
 
-def _serve(compute: Compute, ours: Connection, theirs: Connection, packer: Packer) -> None:
+def _serve(
+    compute: Callable[[Any], Any], ours: Connection, theirs: Connection, packer: Packer
+) -> None:
     """Answer requests until the other end is gone."""
     theirs.close()
     with contextlib.suppress(OSError, AttributeError):  # Linux: do not outlive the fast loop
@@ -233,8 +240,8 @@ def _serve(compute: Compute, ours: Connection, theirs: Connection, packer: Packe
 
 
 def background_worker(
-    compute: Compute, *, processes: int = 3, shared: Sequence[object] = ()
-) -> BackgroundWorker:
+    compute: Callable[[Asked], Said], *, processes: int = 3, shared: Sequence[object] = ()
+) -> BackgroundWorker[Asked, Said]:
     """Return a worker on another core: one process computes, the others stand by.
 
     ``compute`` has been called once before, so that everything is compiled. ``processes`` are
@@ -248,7 +255,7 @@ def background_worker(
         When the system has no process or thread more.
     """
     forked = processes >= 1 and hasattr(os, "fork")
-    computers: list[_Computer] = []
+    computers: list[_Computer[Asked, Said]] = []
     try:
         for _ in range(max(1, processes)):
             computers.append(_Child(compute, Packer(shared)) if forked else _Computer(compute))

@@ -9,6 +9,7 @@ import numpy as np
 from undertow.base import InvalidInputError
 from undertow.closed_loop.figures import display
 from undertow.display.live import Message, Scene
+from undertow.estimators import Belief, ParameterEstimate
 from undertow.law import ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism
 
@@ -78,3 +79,26 @@ def plan_message(
         "predicted": float(predicted), "rows": surface.matrix.tolist(),
         "layer": reaching.vector(surface.m)[surface.m :].tolist(),
     }  # fmt: skip
+
+
+def plausible(belief: Belief | None, estimate: ParameterEstimate | None) -> list[dict[str, Any]]:
+    """Return what the controller takes for possible of each uncertain parameter, SI units.
+
+    ``low`` to ``high`` is its tolerance; ``members`` are its values on the corners of the ensemble,
+    which close in as it learns; ``estimate`` is the most plausible one.
+    """
+    if belief is None or not belief.tolerances:
+        return []
+    estimate = estimate or belief.prior
+    best = belief.values(estimate.offset)
+    values = belief.ensemble(estimate).values
+    corners = values[(values != best).any(axis=1)]
+    nominal = belief.mechanism.parameter_values
+    return [
+        {
+            "name": name, "estimate": float(best[place]),
+            "low": float(nominal[place] - off), "high": float(nominal[place] + off),
+            "members": corners[:, place].tolist(),
+        }
+        for place, (name, off) in zip(belief.places, belief.tolerances.items(), strict=True)
+    ]  # fmt: skip

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from undertow.base import Progress, no_progress
+from undertow.base import (
+    InfeasibleError,
+    MissingExtraError,
+    Progress,
+    no_progress,
+)
+from undertow.bounds import Bound, bound
 from undertow.cascade import Cascade, Run
 from undertow.display.live import Message, Scene
 from undertow.display.sketches import Sketch, sketch
@@ -18,7 +25,14 @@ from undertow.models import FloatArray, Mechanism
 from undertow.runtime import Columns, Mode, Recording, read_log
 from undertow.runtime.encoding import answer_from, memory_from
 from undertow.runtime.replay import legible, recorded_recipe
-from undertow.studies.live.messages import ReadOnlyShow, described, frame_message, plan_message
+from undertow.studies.live.beside import INTERVALS, bound_message
+from undertow.studies.live.messages import (
+    ReadOnlyShow,
+    described,
+    frame_message,
+    plan_message,
+    plausible,
+)
 from undertow.studies.live.planner import Task, cascade_for
 
 #: Pictures in a second, and most of them: a long recording has fewer a second.
@@ -46,7 +60,9 @@ class Recorded(ReadOnlyShow):
         return []
 
 
-def of_run(run: Run, cascade: Cascade, figure: Sketch | None = None) -> Message:
+def of_run(
+    run: Run, cascade: Cascade, figure: Sketch | None = None, least: Bound | None = None
+) -> Message:
     """Return a simulated run as a recording.
 
     Parameters
@@ -57,6 +73,8 @@ def of_run(run: Run, cascade: Cascade, figure: Sketch | None = None) -> Message:
         Whose run it is.
     figure
         What is drawn; the mechanism's own stick figure by default.
+    least
+        The optimal-control bound from its start, where that is known.
     """
     motion, mechanism = run.trajectory, cascade.mechanism
     plans = []
@@ -75,10 +93,12 @@ def of_run(run: Run, cascade: Cascade, figure: Sketch | None = None) -> Message:
     decided = np.clip(np.searchsorted(starts, motion.t[rows] + 1e-9, side="right") - 1, 0, None)
     paid = np.interp(starts, motion.t, motion.accumulated_cost)
     left = predicted[decided] - (motion.accumulated_cost[rows] - paid[decided])
-    return recording_of(
+    recording = recording_of(
         mechanism, figure or sketch(mechanism), motion.t[rows], motion.x[rows], motion.u[rows],
         motion.u[rows], motion.s[rows], left, plans,
     )  # fmt: skip
+    beside = [] if least is None else [bound_message(least, cascade.objective)]
+    return recording | {"beside": beside}
 
 
 def recorded_run(
@@ -90,7 +110,11 @@ def recorded_run(
     cascade = cascade_for(mechanism, Task(objective, limits, period), seed)
     progress("simulating", 0.0)
     run = cascade.simulate(x0, progress=lambda t, end: progress("simulating", t / end))
-    return of_run(run, cascade, sketch_named(name, mechanism))
+    least = None
+    with suppress(MissingExtraError, InfeasibleError):  # then there is none to compare with
+        progress("the bound", 0.9)
+        least = bound(cascade.mechanism, cascade.objective, x0, intervals=INTERVALS)
+    return of_run(run, cascade, sketch_named(name, mechanism), least)
 
 
 class LoggedRun:
@@ -120,6 +144,7 @@ class LoggedRun:
         recipe, _ = recorded_recipe(recording, mechanism)
         self.belief, self._reaching = recipe.belief, recipe.cascade.reaching
         self._reference, self.period = recipe.reference, recipe.period
+        self._known = recipe.cascade.known
         self.columns = Columns.of(self.belief)
         with legible(recording.path):
             name = recipe.mechanism if isinstance(recipe.mechanism, str) else ""
@@ -152,7 +177,8 @@ class LoggedRun:
             )  # fmt: skip
             target = answer.memory.target
             goal = [] if target is None else list(target.position(answer.use))
-            plans.append(plan | {"ms": 1e3 * answer.seconds, "first": answer.jump, "goal": goal})
+            plan |= {"ms": 1e3 * answer.seconds, "first": answer.jump, "goal": goal}
+            plans.append(plan | {"plausible": plausible(self._known, answer.memory.estimate)})
         for _, at, kind, text in recording.events:
             if kind != "answer":  # which is told above
                 plans.append({"kind": "event", "t": at, "why": f"{kind}: {text}"})
@@ -224,6 +250,6 @@ def _recording(
 ) -> Message:
     return {
         **described(mechanism, scene), "live": False, "speeds": [1.0, 0.5, 0.2, 0.05],
-        "controls": [], "state": {"kind": "state", "mode": "recording"}, "frames": frames,
-        "plans": [*plans],
+        "controls": [], "beside": [], "state": {"kind": "state", "mode": "recording"},
+        "frames": frames, "plans": [*plans],
     }  # fmt: skip

@@ -33,9 +33,10 @@ from undertow.plants import Bench, RealisticRig
 from undertow.plants.bench import Friction
 from undertow.runtime import Answer, Settings, Worker, background_worker
 from undertow.runtime.processes import Background
+from undertow.studies.live.beside import Beside, BoundAsked, MapAsked, beside
 from undertow.studies.live.controls import OBJECTIVE, PERIOD, PUSH, Control, controls_of
 from undertow.studies.live.hands import Hands
-from undertow.studies.live.messages import described, frame_message, plan_message
+from undertow.studies.live.messages import described, frame_message, plan_message, plausible
 from undertow.studies.live.planner import Job, Task, cascade_for, planner
 from undertow.symbolic import compile_expressions
 
@@ -87,6 +88,8 @@ class Simulation:
         Of the optimiser.
     worker
         Who plans; by default a process of its own.
+    beside
+        Who finds bounds and maps of what comes home; ``None``: nobody does.
 
     Attributes
     ----------
@@ -134,6 +137,7 @@ class Simulation:
         period: float = DELTA,
         seed: int = 0,
         worker: Worker | None = None,
+        beside: Beside | None = None,
     ) -> None:
         self.mechanism, self.scene = mechanism, Scene(mechanism, figure)
         self._x0 = mechanism.initial_state(x0, {})
@@ -150,6 +154,10 @@ class Simulation:
         self._idle = CascadeState(Plan.of(surface))
         self._costs: dict[str, tuple[Objective, Callable[..., Any]]] = {}
         self._worker = worker or background_worker(planner(mechanism, seed), processes=2)
+        self._beside = beside or Beside(None, None)
+        self._look: tuple[int, tuple[float, float]] | None = None  # whose plane is shown, how far
+        self._bound: Message = {}
+        self._region: Message = {}
         self.paused, self.speed, self.mode = False, 1.0, WAITING
         self._sequence, self._lead, self._clock = 0, self._settings.lead_time, 0.0
         self._firsts: dict[Task, Answer] = {}
@@ -228,6 +236,7 @@ class Simulation:
             "state": self._state(),
             "frames": [*self._history],
             "plans": [*self._decisions],
+            "beside": [one for one in (self._bound, self._region) if one],
         }
 
     def _state(self) -> Message:
@@ -248,10 +257,15 @@ class Simulation:
             self._ask()
         if not self.paused and self.mode != WAITING:
             self._debt += seconds * self.speed
+            shown = self.t
             while self._debt >= STEP:
                 self._debt -= STEP
                 self._step()
+                if self.t - shown > 1.5 * PICTURE * self.speed and self._debt >= STEP:
+                    shown = self.t  # it was held up: what moved meanwhile is shown, too
+                    self._say_frame()
         self._say_frame()
+        self._look_beside()
         now = self._state()
         if now != self._said:
             self._said = now
@@ -274,6 +288,7 @@ class Simulation:
                 self.mode, self._anew, self._why = RUNNING, True, ""
         held = bool(self.hands)
         if held:
+            self._end_bound()
             self.rig.knock(STEP * self.hands.force(x, self._parameters))
         if held or self._touched:
             self._seen.clear()  # what a hand does is nothing to learn from
@@ -338,6 +353,58 @@ class Simulation:
         objective, stage_of = self._costs[word]
         if np.linalg.norm(error) > objective.terminal_radius:
             self._spent += STEP * float(stage_of(*error, *u)[0])
+
+    # -- beside it ----------------------------------------------------------------------------
+
+    def _look_beside(self) -> None:
+        """Tell what has been found of bound and region, and ask for the next map."""
+        for found in self._beside.take(self._clock):
+            if found["kind"] == "bound":
+                self._bound = found
+            else:
+                self._region = found
+            self._fresh.append(found)
+        if self._look is not None and self.memory is not None and self.mode == RUNNING:
+            self._beside.draw(self._clock, self._map)
+
+    def _map(self) -> MapAsked:
+        """Return the question of what comes home in the plane that is looked at."""
+        assert self._look is not None  # else nothing is asked
+        assert self.memory is not None
+        axis, reach = self._look
+        return MapAsked(
+            self.t, self._task, self.law.parameters.copy(), self.memory.surface,
+            self.law.reaching, self._error(self.rig.truth), self._goal.copy(), axis, reach,
+        )  # fmt: skip
+
+    def _begin_bound(self) -> None:
+        """Ask what the best input would pay from here, for the plant as it is."""
+        self._end_bound()
+        free = all(
+            math.isinf(c.low) and math.isinf(c.high)
+            for c, moved in zip(self.mechanism.coordinates, self._goal, strict=True)
+            if moved
+        )  # a travel would be another one, counted from the target
+        if free and not self.hands and self.mode == RUNNING:
+            x = self._error(self.rig.truth)
+            self._beside.begin(BoundAsked(self.t, self._task, self._parameters.copy(), x))
+
+    def _end_bound(self) -> None:
+        """Forget the bound: it is of an undisturbed motion of another plant, or from elsewhere."""
+        self._beside.begin(None)
+        if self._bound.get("cost") is not None:
+            self._bound = {"kind": "bound", "t": self.t, "cost": None, "why": ""}
+            self._fresh.append(self._bound)
+
+    def _set_look(self, axis: object, reach: object) -> None:
+        number = number_of("axis of the phase plane", axis)
+        one_of("axis of the phase plane", f"{number:g}", [str(i) for i in range(self.mechanism.n)])
+        if not isinstance(reach, list) or len(reach) != 2:
+            raise InvalidInputError("reach", value=repr(reach)[:80], limit="[far, fast], SI units")
+        far, fast = (number_of("reach of the phase plane", one) for one in reach)
+        if not (0 < far < 1e6 and 0 < fast < 1e6):
+            raise InvalidInputError("reach", value=f"{far:g}, {fast:g}", limit="above 0, below 1e6")
+        self._look = int(number), (far, fast)
 
     # -- the slow loop ------------------------------------------------------------------------
 
@@ -444,6 +511,8 @@ class Simulation:
         self._spent = 0.0
         if self.mode == WAITING:
             self.mode = RUNNING
+        if answer.jump:
+            self._begin_bound()
         first = "first optimum of a task" if answer.jump else ""
         # After a jump the search near the plan in use is followed by one everywhere.
         why, jumped, _ = answer.admission.reason.partition("; the state is")
@@ -466,6 +535,7 @@ class Simulation:
         message |= {
             "ms": 1e3 * answer.seconds, "first": answer.jump, "learnt": learnt, "ghost": ghost,
             "goal": self._goal.tolist(), "objective": self._task.objective,
+            "plausible": plausible(self._belief, memory.estimate),
         }  # fmt: skip
         self._decisions.append(message)
         self._fresh.append(message)
@@ -516,6 +586,7 @@ class Simulation:
             "grab": lambda: self.hands.grab(viewer, self.plant, here, _place(said.get("at"))),
             "drag": lambda: self.hands.move(viewer, _place(said.get("at"))),
             "release": lambda: self.gone(viewer),
+            "look": lambda: self._set_look(said.get("axis"), said.get("reach")),
             "set": lambda: self._set(str(said.get("name")), said.get("value")),
             "defaults": self._defaults,
         }
@@ -540,6 +611,8 @@ class Simulation:
         self.law.parameters[:] = self.mechanism.parameter_values
         for kept in (self._seen, self.hands, self._history, self._decisions, self._said):
             kept.clear()
+        self._beside.forget()
+        self._bound, self._region = {}, {}
         self._fresh.append({"kind": "reset"})
 
     def _pause(self, on: bool) -> None:
@@ -564,6 +637,7 @@ class Simulation:
         impulse[-1] = side * change / inverse[-1, -1]
         self.rig.knock(impulse)
         self._touched, self._due = True, self.t
+        self._end_bound()
 
     def _set(self, name: str, value: object) -> None:
         one_of("control", name, self.controls)
@@ -581,6 +655,7 @@ class Simulation:
             if any(c.group == "plant" or c.name.startswith("limit") for c in changed.values()):
                 self.rig = self._rig(self.rig.truth)
                 self._limit(self.task.limits)
+                self._end_bound()
         except UndertowError as error:
             self.controls = before
             raise InvalidInputError(
@@ -604,6 +679,7 @@ class Simulation:
     def close(self) -> None:
         """End the slow loop."""
         self._worker.close()
+        self._beside.close()
 
 
 def simulation(
@@ -611,7 +687,14 @@ def simulation(
 ) -> Simulation:
     """Return a simulation of a mechanism that was asked for by name, with the figure for that."""
     figure = sketch_named(name, mechanism)
-    return Simulation(mechanism, figure, x0, objective=objective, period=period, seed=seed)
+    looks_on = beside(mechanism)
+    try:
+        return Simulation(
+            mechanism, figure, x0, objective=objective, period=period, seed=seed, beside=looks_on
+        )  # fmt: skip
+    except BaseException:
+        looks_on.close()
+        raise
 
 
 def _place(value: object) -> FloatArray:

@@ -58,7 +58,8 @@ class Watched(ReadOnlyShow):
         """Return what a new viewer must know: the last seconds, or all of a run that is over."""
         return self._recording or {
             **described(self._run.belief, self._run.scene), "live": True, "watched": True,
-            "behind": BEHIND, "speeds": [1.0], "controls": [], "frames": [*self._frames],
+            "behind": BEHIND, "speeds": [1.0], "controls": [], "beside": [],
+            "frames": [*self._frames],
             "state": {"kind": "state", "mode": "watched", "paused": False, "speed": 1.0},
             "plans": [*self._plans],
         }  # fmt: skip

@@ -10,7 +10,7 @@
   const BEHIND = 0.03;       // live pictures are shown so much later, s, so that none is missing; hello may say more
   const STYLES = [["--blue", []], ["--orange", [8, 4]], ["--green", [3, 3]], ["--purple", [10, 3, 2, 3]], ["--red", [6, 2]]];
 
-  let hello = null, frames = [], plans = [], controls = new Map();
+  let hello = null, frames = [], plans = [], bounds = [], region = null, controls = new Map();
   let state = { mode: "waiting", paused: false, speed: 1, waits: "", why: "" };
   let live = true, watched = false, shown = 0, playing = true, rate = 1;
   let socket = null, retry = 0.4, note = "", noteUntil = 0;
@@ -58,9 +58,11 @@
         break;
       }
       case "plan": plans.push(message); if (plans.length > 400) plans.shift(); break;
+      case "bound": bounds.push(message); if (bounds.length > 20) bounds.shift(); break;
+      case "region": region = message; break;
       case "state": state = message; playing = !state.paused; showTransport(); break;
       case "controls": for (const control of message.controls) put(control); break;
-      case "reset": frames = []; plans = []; shown = 0; camera = { x: 0, y: 0 }; break;
+      case "reset": frames = []; plans = []; bounds = []; region = null; shown = 0; camera = { x: 0, y: 0 }; break;
       case "note": note = message.text; noteUntil = performance.now() + 6000; break;
     }
   }
@@ -82,6 +84,7 @@
     $("reset").textContent = live ? "Reset" : "To the start";
     if (!live && frames.length) { $("time").min = frames[0].t; $("time").max = latest(); }
     controls = new Map(message.controls.map((one) => [one.name, one]));
+    bounds = []; region = null; asked = ""; (message.beside ?? []).forEach(hear);
     makeControls(); makeCharts(); makeLegends(); showTransport();
   }
 
@@ -306,6 +309,84 @@
   };
   for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) $("scene").addEventListener(kind, release);
 
+  // -- what comes home -------------------------------------------------------------------------
+  let asked = "", askedAt = 0;
+  function ask(axis, mx, my) {  // which plane is looked at: the server maps it when it can
+    if (!live || watched) return;
+    const key = `${axis} ${Math.round(8 * Math.log(mx))} ${Math.round(8 * Math.log(my))}`, now = performance.now();
+    if (key === asked || now < askedAt + 300 || socket?.readyState !== 1) return;
+    asked = key; askedAt = now;
+    say({ do: "look", axis, reach: [mx, my] });
+  }
+  const cellsOf = () => (region && region.axis === Number($("axis").value) && region.t <= shown + 1 ? region : null);
+  function drawRegion(c, px, py) {  // every cell was simulated to its end, with the input's limits
+    const map = cellsOf();
+    if (!map) return;
+    const [far, fast] = map.reach, side = map.side, w = (2 * far) / side, h = (2 * fast) / side;
+    const gap = 5;
+    c.save(); c.fillStyle = colour("--blue");
+    c.beginPath();
+    for (let k = 0; k < side * side; k++) {
+      const [left, right, low, up] = [px(-far + w * (k % side)), px(-far + w * (k % side + 1)), py(-fast + h * Math.floor(k / side)), py(-fast + h * (Math.floor(k / side) + 1))].map(Math.round);
+      if (map.cells[k] === "0") { c.rect(left, up, right - left, low - up); continue; }
+      c.globalAlpha = map.cells[k] === "2" ? 0.34 : 0.14;
+      c.fillRect(left, up, right - left, low - up);
+    }
+    c.clip(); c.globalAlpha = 0.35; c.strokeStyle = colour("--soft"); c.lineWidth = 1; c.setLineDash([]);  // lost: hatched
+    c.beginPath();
+    const width = c.canvas.clientWidth, height = c.canvas.clientHeight;
+    for (let d = -height; d < width; d += gap) { c.moveTo(d, height); c.lineTo(d + height, 0); }
+    c.stroke(); c.restore();
+  }
+  // A proved set {|W x| ≤ 1}: whether a state is inside, and where the plane through it cuts the set.
+  const within = (rows, x) => Math.hypot(...rows.map((row) => row.reduce((sum, v, k) => sum + v * x[k], 0))) < 1;
+  function drawProved(c, px, py, frame, goal, i, n) {
+    const rows = region?.proved ?? [];
+    if (!rows.length) return;
+    const x = frame.x.map((v, k) => v - (k < n ? goal[k] || 0 : 0));
+    let aa = 0, ab = 0, bb = 0, ar = 0, br = 0, rr = 0;  // |a z1 + b z2 + r|²
+    for (const row of rows) {
+      const a = row[i], b = row[n + i];
+      let r = 0;
+      for (let k = 0; k < 2 * n; k++) if (k !== i && k !== n + i) r += row[k] * x[k];
+      aa += a * a; ab += a * b; bb += b * b; ar += a * r; br += b * r; rr += r * r;
+    }
+    const det = aa * bb - ab * ab, z1 = (ab * br - bb * ar) / det, z2 = (ab * ar - aa * br) / det;
+    const room = 1 - (rr + ar * z1 + br * z2);
+    if (!(room > 0)) return;
+    c.strokeStyle = colour("--green"); c.lineWidth = 2; c.setLineDash([]); c.beginPath();
+    const l = Math.sqrt(aa), m = ab / l, q = Math.sqrt(det / aa), size = Math.sqrt(room);  // Cholesky's factor
+    for (let k = 0; k <= 60; k++) {
+      const p1 = size * Math.cos((k * Math.PI) / 30), p2 = size * Math.sin((k * Math.PI) / 30), v = p2 / q, u = (p1 - m * v) / l;
+      const sx = px(z1 + u + (goal[i] || 0)), sy = py(z2 + v);
+      k ? c.lineTo(sx, sy) : c.moveTo(sx, sy);
+    }
+    c.stroke();
+  }
+  let keyed = "";
+  function wordRegion(frame, plan) {
+    let words = "";
+    if (live && !watched) {
+      const map = cellsOf(), n = hello.coordinates.length, goal = plan?.goal ?? [];
+      const x = frame.x.map((v, k) => v - (k < n ? goal[k] || 0 : 0));
+      words = !map ? "wait" : map.proved.length ? (within(map.proved, x) ? "in" : "out") : "none";
+    }
+    if (words === keyed) return;
+    keyed = words;
+    const box = $("region");
+    box.replaceChildren();
+    if (!words) return;
+    if (words === "wait") { box.textContent = "What comes home from here is being mapped."; return; }
+    for (const [style, text] of [["home", "comes home, "], ["limited", "with the input at its limit, "], ["lost", "lost. "]]) {
+      const mark = document.createElement("i");
+      mark.className = style;
+      box.append(mark, text);
+    }
+    const proved = document.createElement("b");
+    proved.textContent = { in: "In the proved set.", out: "Not in the proved set (green).", none: "No set is proved." }[words];
+    box.append(proved);
+  }
+
   // -- phase plane -----------------------------------------------------------------------------
   function drawPhase(frame, plan) {
     const [c, w, h] = fit($("phase"));
@@ -319,11 +400,15 @@
     drawPhase.mx = Math.max(mx, 0.97 * (drawPhase.mx || mx)); drawPhase.my = Math.max(my, 0.97 * (drawPhase.my || my));
     mx = drawPhase.mx; my = drawPhase.my;
     const px = (v) => w / 2 + (v / mx) * (w / 2 - 6), py = (v) => h / 2 - (v / my) * (h / 2 - 6);
+    ask(i, mx, my);
+    drawRegion(c, px, py);
     c.strokeStyle = colour("--grid"); c.lineWidth = 1; c.setLineDash([]);
     c.beginPath(); c.moveTo(0, py(0)); c.lineTo(w, py(0)); c.moveTo(px(0), 0); c.lineTo(px(0), h); c.stroke();
-    c.fillStyle = colour("--soft"); c.font = "12px system-ui, sans-serif";
-    c.textAlign = "right"; c.fillText(`→ ${own.name}, ±${short(mx * f, 2)} ${own.unit}`, w - 6, h - 7);
-    c.textAlign = "left"; c.fillText(`↑ its rate, ±${short(my * f, 2)} ${own.unit}/s`, 6, 15);
+    const written = (words, x, y, side, style) => {  // readable on a hatched ground, too
+      c.font = "12px system-ui, sans-serif"; c.textAlign = side; c.lineJoin = "round"; c.setLineDash([]);
+      c.strokeStyle = colour("--panel"); c.lineWidth = 4; c.strokeText(words, x, y);
+      c.fillStyle = colour(style); c.fillText(words, x, y);
+    };
     const s0 = (p, alpha, dash) => {
       if (!p || !p.rows) return;
       const goal = p.goal || [];
@@ -349,11 +434,15 @@
       if (old && age < 0.5) s0(old, 0.5 * (1 - age / 0.5), [4, 4]);
       s0(plan, 1, []);
     }
+    if (live && !watched) drawProved(c, px, py, frame, plan?.goal ?? [], i, n);
+    wordRegion(frame, plan);
     c.strokeStyle = colour("--blue"); c.lineWidth = 1.8; c.lineJoin = "round"; c.beginPath();
     for (let k = from; k <= to; k++) { const x = px(frames[k].x[i]), y = py(frames[k].x[n + i]); k > from && !turned(k, i) ? c.lineTo(x, y) : c.moveTo(x, y); }
     c.stroke();
     c.fillStyle = colour("--blue"); c.beginPath(); c.arc(px(frame.x[i]), py(frame.x[n + i]), 5, 0, 7); c.fill();
-    c.fillStyle = colour("--red"); c.textAlign = "left"; c.fillText("s = 0", 6, h - 7);
+    written("s = 0", 6, h - 7, "left", "--red");
+    written(`→ ${own.name}, ±${short(mx * f, 2)} ${own.unit}`, w - 6, h - 7, "right", "--soft");
+    written(`↑ its rate, ±${short(my * f, 2)} ${own.unit}/s`, 6, 15, "left", "--soft");
   }
 
   // -- charts ----------------------------------------------------------------------------------
@@ -395,6 +484,31 @@
     }
     c.restore();
   };
+  const boundAt = (t) => { let found = null; for (const one of bounds) if (one.t <= t + 1e-6) found = one; return found; };
+  function drawBound(u) {  // what would be left, had the best of all inputs been chosen from the start of the task
+    const one = boundAt(shown);
+    if (!one || one.cost == null) return;
+    const c = u.ctx, { left, top, width, height } = u.bbox;
+    c.save(); c.beginPath(); c.rect(left, top, width, height); c.clip();
+    c.strokeStyle = colour("--green"); c.lineWidth = 2 * devicePixelRatio; c.setLineDash([7 * devicePixelRatio, 4 * devicePixelRatio]);
+    c.beginPath();
+    let begun = false;
+    for (let k = 0; k < one.times.length && one.times[k] <= shown; k++) {
+      if (!(one.left[k] > 0)) break;
+      const x = u.valToPos(one.times[k], "x", true), y = u.valToPos(one.left[k], "J", true);
+      begun ? c.lineTo(x, y) : c.moveTo(x, y); begun = true;
+    }
+    c.stroke(); c.restore();
+  }
+  let said = "";
+  function wordCost() {
+    const one = boundAt(shown), first = one && plans.find((p) => p.predicted > 0 && Math.abs(p.t - one.t) < 0.02);
+    const ratio = one?.cost > 0 && first ? `, first prediction ${short(first.predicted / one.cost)} ×` : "";
+    const words = one?.cost > 0 ? `best of all inputs ${short(one.cost)}${ratio}` : "";
+    if (words === said) return;
+    said = words;
+    costLegend(words);
+  }
   const limitOf = (channel) => controls.get(`limit ${channel.name}`)?.value ?? channel.limit;
   function makeCharts() {
     const units = [...new Set(hello.coordinates.map((c) => c.unit))];
@@ -416,7 +530,7 @@
         if (low == null || !(high > 0)) return [0.1, 1];
         const top = 10 ** Math.ceil(Math.log10(1.001 * high));
         return [Math.max(10 ** Math.floor(Math.log10(Math.max(low, 1e-12))), top * 1e-6), top];
-      } } });
+      } } }, { draw: [drawBound] });
     chart("ms", [line(0, "ms", { paths: uPlot.paths.bars({ size: [0.6, 9], align: 0 }), fill: () => colour("--blue"), width: 0 })], [axisOf("ms", "", 3, (u, k, low, high) => [0, nice(0.9 * high)])],
       { ms: { range: (u, low, high) => [0, 1.15 * Math.max(high ?? 0, 5)] } });
   }
@@ -432,12 +546,21 @@
     $("legend-states").replaceChildren(...hello.coordinates.map((c, k) => entry(k, `${c.name}, ${c.unit}`)));
     $("legend-input").replaceChildren(...hello.inputs.map((one, k) => entry(k, one.unit ? `${one.name}, ${one.unit}` : one.name)), hello.inputs.some((one) => one.limit != null) ? "- - limit" : "");
     $("legend-s").replaceChildren(...(hello.inputs.length > 1 ? hello.inputs.map((_, k) => entry(k, `s${k + 1}`)) : []), "- - layer ±ε");
-    $("legend-cost").replaceChildren(entry(0, "predicted less spent"), "● predicted");
+    costLegend = (words) => {
+      const dot = document.createElement("span"), own = [entry(0, "predicted less spent"), dot];
+      dot.textContent = "● predicted"; dot.style.color = "var(--red)";
+      if (words) own.push(entry(2, words));
+      $("legend-cost").replaceChildren(...own);
+    };
+    costLegend(said);
+    const mark = (text, name) => { const one = document.createElement("span"); one.textContent = text; one.style.color = `var(${name})`; return one; };
+    $("legend-plausible").replaceChildren(mark("| ensemble", "--blue"), mark("● estimate", "--blue"), ...(live && !watched ? [mark("◆ true plant", "--orange")] : []));
   }
+  let costLegend = () => {};
   function drawCharts() {
     const from = before(frames, shown - WINDOW), to = before(frames, shown);
-    const some = frames.slice(from, to + 1), t = some.map((f) => f.t), low = Math.max(shown - WINDOW, frames.length ? Math.min(frames[0].t, shown - 1) : 0);
-    const x = { min: Math.min(low, shown - 0.5), max: Math.max(shown, low + 0.5) };
+    const some = frames.slice(from, to + 1), t = some.map((f) => f.t), low = Math.max(shown - WINDOW, frames.length ? frames[0].t : 0);
+    const x = { min: low, max: Math.max(shown, low + 1) };
     const set = (id, data) => { charts[id].setData(data, false); charts[id].setScale("x", x); };
     set("states", [t, ...hello.coordinates.map((c, k) => some.map((f, j) => (j && turned(from + j, k) ? null : f.x[k] * c.factor)))]);
     set("input", [t, ...hello.inputs.map((_, k) => some.map((f) => f.u[k]))]);
@@ -447,14 +570,38 @@
     for (const f of some) at.set(f.t, [above(f.left), null]);
     for (const p of decided) at.set(p.t, [at.get(p.t)?.[0] ?? null, above(p.predicted)]);
     const all = [...at.keys()].sort((a, b) => a - b);
+    wordCost();
     set("cost", [all, all.map((v) => at.get(v)[0] ?? undefined), all.map((v) => at.get(v)[1])]);
     const timed = decided.filter((p) => p.ms != null && !p.first), times = new Map(timed.map((p) => [p.t, p.ms]));
     set("ms", [[...times.keys()], [...times.values()]]);
   }
+  const took = (p) => (p.ms < 1000 ? `${short(p.ms)} ms` : `${short(p.ms / 1000, 2)} s`);
   let learnt = {};
   function drawLearnt() {  // what the controller takes the plant's parameters to be by now
     learnt = planAt(shown)?.learnt ?? {};
     for (const name of Object.keys(learnt)) if (controls.has(`plant ${name}`)) put(controls.get(`plant ${name}`));
+  }
+  function drawPlausible(plan) {  // the ensemble thins as it learns: its members close in on the estimate
+    const rows = plan?.plausible ?? [], box = $("plausible-box"), canvas = $("plausible");
+    if (box.hidden !== !rows.length) box.hidden = !rows.length;
+    if (!rows.length) return;
+    const tall = 20, height = `${tall * rows.length}px`;
+    if (canvas.style.height !== height) canvas.style.height = height;
+    const [c, w] = fit(canvas), from = 0.24 * w, to = w - 74;
+    c.font = "12px system-ui, sans-serif"; c.textBaseline = "middle"; c.setLineDash([]);
+    rows.forEach((row, k) => {
+      const y = tall * (k + 0.5), middle = 0.5 * (row.low + row.high), half = row.high - middle;
+      const at = (v) => clamp(from + ((v - middle) / (2 * half) + 0.5) * (to - from), from, to);  // twice the tolerance
+      c.fillStyle = colour("--soft"); c.textAlign = "right"; c.fillText(row.name, from - 10, y);
+      c.textAlign = "left"; c.fillText(short(row.estimate), to + 10, y);
+      c.fillStyle = colour("--grid"); c.fillRect(at(row.low), y - 6, at(row.high) - at(row.low), 12);
+      c.strokeStyle = colour("--blue"); c.lineWidth = 2; c.globalAlpha = 0.55; c.beginPath();
+      for (const v of row.members) { c.moveTo(at(v), y - 6); c.lineTo(at(v), y + 6); }
+      c.stroke(); c.globalAlpha = 1;
+      c.fillStyle = colour("--blue"); c.beginPath(); c.arc(at(row.estimate), y, 4, 0, 7); c.fill();
+      const truth = controls.get(`plant ${row.name}`)?.value;
+      if (truth != null) { c.fillStyle = colour("--orange"); const x = at(truth); c.beginPath(); c.moveTo(x, y - 7); c.lineTo(x + 5, y); c.lineTo(x, y + 7); c.lineTo(x - 5, y); c.fill(); }
+    });
   }
   function drawPlans() {
     const until = plans.filter((p) => p.t <= shown + 1e-6).slice(-14).reverse();
@@ -465,13 +612,13 @@
     $("plans").replaceChildren(...until.map((p) => {
       const item = document.createElement("li"), head = document.createElement("b"), why = document.createElement("span");
       item.className = p.kind === "event" ? "" : p.accepted ? "yes" : "no";
-      head.textContent = `${p.t.toFixed(2)} s${p.ms != null ? `, ${short(p.ms)} ms` : ""}`;
+      head.textContent = `${p.t.toFixed(2)} s${p.ms != null ? `, ${took(p)}` : ""}`;
       why.textContent = p.why;
       item.append(head, why);
       return item;
     }));
     const last = until.find((p) => p.ms != null);
-    $("took").textContent = last ? `${short(last.ms)} ms` : "";
+    $("took").textContent = last ? took(last) : "";
   }
 
   // -- words -----------------------------------------------------------------------------------
@@ -530,7 +677,7 @@
     if (!live) $("time").value = shown;
     const frame = frameAt(shown), plan = planAt(shown);
     drawScene(frame, plan);
-    if (now >= chartsDue && frames.length) { chartsDue = now + 45; drawPhase(frame, plan); drawCharts(); drawPlans(); drawWords(frame); }
+    if (now >= chartsDue && frames.length) { chartsDue = now + 45; drawPhase(frame, plan); drawCharts(); drawPlans(); drawPlausible(plan); drawWords(frame); }
     else if (!frames.length) drawWords(frame);
     drawn += 1;
   }
@@ -540,6 +687,8 @@
   window.undertow = {
     get state() { return { ...state, live, watched, shown, playing, fps, connected: socket?.readyState === 1, note: performance.now() < noteUntil ? note : "" }; },
     get frame() { return frameAt(shown); },
+    get window() { const x = charts.states.scales.x; return { min: x.min, max: x.max }; },
+    get bounds() { return bounds; }, get region() { return region; },
     get frames() { return frames; }, get plans() { return plans; }, get hello() { return hello; },
     get controls() { return Object.fromEntries(controls); },
     pixel: (x, y) => { const b = $("scene").getBoundingClientRect(), m = mapping(b.width, b.height); return [b.left + m.x(x), b.top + m.y(y)]; },
