@@ -139,9 +139,7 @@ class _Case:
         return [
             s
             for s in self.sets
-            if s.surface == self.surface
-            and s.reaching == self.law
-            and getattr(s, "model", "") in own
+            if s.surface == self.surface and s.reaching == self.law and s.model in own
         ]
 
     def proved_at(self, x: FloatArray) -> tuple[float, str] | None:

@@ -29,8 +29,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from undertow.base.artefacts import write_file
 from undertow.base.errors import CertificateError, UndertowError
 from undertow.base.files import check_file, parse_json, read_file
@@ -355,7 +353,7 @@ def _checksum(document: Mapping[str, Any]) -> str:
 
 def _subject_data(subject: Subject) -> dict[str, Any]:
     surface, law = subject.surface, subject.reaching
-    eta, layer = np.split(law.vector(surface.m), 2)
+    eta, layer = law.per_surface(surface.m)
     return {
         "surface": {name: getattr(surface, name).tolist() for name in _BLOCKS},
         "reaching": {"eta": eta.tolist(), "layer": layer.tolist(), "switching": law.switching},

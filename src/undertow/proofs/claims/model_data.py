@@ -12,7 +12,6 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import sympy as sp
 
 from undertow.base.errors import CertificateError, ModelError
@@ -226,7 +225,7 @@ def law_data(mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> dict[s
     def rows(block: Any) -> Any:
         return [[number_text(float(v)) for v in row] for row in block]
 
-    eta, layer = np.split(law.vector(surface.m), 2)
+    eta, layer = law.per_surface(surface.m)
     return {
         **{k: rows(getattr(surface, k)) for k in ("alpha_a", "lambda_a", "alpha_u", "lambda_u")},
         "eta": [number_text(float(v)) for v in eta],

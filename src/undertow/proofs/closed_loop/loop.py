@@ -145,8 +145,7 @@ class LoopMotion:
     @cached_property
     def gains(self) -> tuple[FloatArray, FloatArray]:
         """K and ε, (m,) each."""
-        eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
-        return eta, layer
+        return self.reaching.per_surface(self.mechanism.m)
 
     @cached_property
     def odd(self) -> bool:

@@ -87,7 +87,7 @@ def follow(
         States (K + 1, L, 2n), every so many steps, and times (K + 1,), s.
     """
     n = law.mechanism.n
-    eta, layer = np.split(law.reaching.vector(law.mechanism.m), 2)
+    eta, layer = law.reaching.per_surface(law.mechanism.m)
     step = float(min(0.005, np.min(layer / eta)))
 
     def rate(x: FloatArray) -> FloatArray:
