@@ -42,7 +42,7 @@ from undertow.proofs.claims.stability import StabilityClaim, hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import match, proved_sets, verify
 from undertow.proofs.closed_loop.loop import LoopMotion
-from undertow.proofs.closed_loop.terminal import TerminalSet
+from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.gate import Policy, assess
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion

@@ -23,7 +23,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,11 +35,9 @@ from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Claim, floats_of
-from undertow.proofs.claims.document import law_objects, read_document
+from undertow.proofs.claims.document import json_bytes, law_objects, read_document
 from undertow.proofs.kernel.claims import read_claim
 from undertow.proofs.kernel.reader import Document
-
-__all__ = ["Certificate", "StatedClaim", "Subject", "read_certificate"]
 
 FORMAT, VERSION = "undertow-certificate", 1
 
@@ -204,10 +201,7 @@ class Certificate:
             "versions": dict(self.versions),
         }
         document["checksum"] = _checksum(document)
-        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
-        # A line for each innermost list; no string of JSON has a line break inside.
-        text = re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", _on_one_line, text)
-        return (text + "\n").encode()
+        return json_bytes(document)
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
@@ -333,10 +327,6 @@ def _name(text: Any) -> str:
 def _printable(text: str) -> str:
     """Return a text on one line without what cannot be printed."""
     return "".join(c for c in " ".join(text.split()) if c.isprintable())
-
-
-def _on_one_line(found: re.Match[str]) -> str:
-    return "[" + re.sub(r"\n\s+", " ", found[1]) + "]"
 
 
 def _checksum(document: Mapping[str, Any]) -> str:

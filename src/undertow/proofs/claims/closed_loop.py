@@ -17,8 +17,6 @@ from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Model
 
-__all__ = ["LoopClaim", "Starts"]
-
 
 @dataclass(frozen=True, eq=False)
 class LoopClaim(Claim):

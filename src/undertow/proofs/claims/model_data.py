@@ -22,8 +22,6 @@ from undertow.proofs.intervals.require import require_autonomous
 from undertow.proofs.kernel.model import Law, Model
 from undertow.proofs.kernel.reader import Refused, number_text, read_law, read_model
 
-__all__ = ["law_data", "law_of", "model_data", "model_of"]
-
 _PLAIN = {sp.sin: "sin", sp.cos: "cos", sp.exp: "exp", sp.log: "log", sp.tanh: "tanh"}
 
 #: Functions that are written in terms of others.

@@ -50,8 +50,6 @@ from undertow.symbolic import Tape
 #: Of one ball per coordinate.
 BallFunctions = Callable[[list[Any]], list[Any]]
 
-__all__ = ["DisturbanceBound", "ReachingCertificate", "ReachingClaim", "reaching"]
-
 
 @dataclass(frozen=True)
 class DisturbanceBound:

@@ -31,12 +31,6 @@ from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.graph import Span
 from undertow.proofs.kernel.model import System
 
-__all__ = [
-    "ClosedLoopProgram",
-    "TerminalEllipsoid",
-    "limits_in_words",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class TerminalEllipsoid(Claim):

@@ -36,8 +36,6 @@ from undertow.proofs.intervals.exact_model import exact_mechanism, is_odd, vanis
 from undertow.proofs.intervals.require import require, require_autonomous
 from undertow.proofs.region.motion import unused
 
-__all__ = ["LoopMotion", "LoopRates"]
-
 
 class LoopRates(NamedTuple):
     """The closed loop over boxes; the last axis counts boxes.

@@ -25,8 +25,6 @@ from undertow.proofs.kernel.claims import ClosedLoop
 from undertow.proofs.kernel.loop import Loop
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
-__all__ = ["ProvedLoop", "follow", "prove_loop"]
-
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.
 MOTIONS, THINNEST = 24, 2.0**-13
 

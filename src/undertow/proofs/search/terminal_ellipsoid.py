@@ -22,8 +22,6 @@ from undertow.proofs.claims.terminal_ellipsoid import (
     prove,
 )
 
-__all__ = ["EllipsoidSearch", "search_for", "terminal_sets"]
-
 #: Smallest semi-axes, relative to the largest, that are tried first.
 FLOORS = (0.02, 0.005, 0.001)
 
