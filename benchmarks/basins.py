@@ -234,9 +234,9 @@ class Task:
             if left <= 0:
                 raise _SpentError
             left -= len(z)
-            vectors, gains = self.space.decode(np.asarray(z, dtype=float))
-            batch = self.loop.batch(self.x0, vectors, reaching=gains, stable_only=True)
-            f = batch.score(self.loop.objective.horizon)
+            z = np.asarray(z, dtype=float)
+            batch = self.space.batch(self.x0, z, stable_only=True)
+            f = np.asarray(batch.score(self.loop.objective.horizon))
             if f.min() < best:
                 best, best_z = float(f.min()), np.array(z[int(f.argmin())], dtype=float)
             return f
@@ -248,8 +248,7 @@ class Task:
                     routine(cost, rng)
             except _SpentError:
                 pass
-        vectors, gains = self.space.decode(best_z[None])
-        yield self.space.plan(vectors[0], None if gains is None else gains[0])
+        yield self.space.plan(best_z)
 
 
 class _SpentError(Exception):

@@ -18,7 +18,7 @@ import numpy as np
 
 import undertow as ut
 from undertow.mechanisms import LIBRARY
-from undertow.optimiser import task
+from undertow.optimiser import search
 
 #: The quick ones.
 FEW = ("rotary_pendulum", "cart_pendulum")
@@ -26,8 +26,8 @@ FEW = ("rotary_pendulum", "cart_pendulum")
 
 def cascade_with(mechanism: ut.Mechanism, model: bool, seed: int) -> tuple[float, list[ut.Update]]:
     """Return the cost of one cascade and its re-optimisations."""
-    size = task.MODEL_SIZE if model else -1
-    with mock.patch.object(task, "MODEL_SIZE", size):
+    size = search.MODEL_SIZE if model else -1
+    with mock.patch.object(search, "MODEL_SIZE", size):
         run = ut.Cascade(
             mechanism, ut.objective_for(mechanism, "energy"), seed=seed, belief="exact"
         ).simulate(mechanism.usual_start)
@@ -48,7 +48,7 @@ def main() -> int:
         size = ut.Cascade(
             mechanism, ut.objective_for(mechanism, "energy"), belief="exact"
         ).optimiser.space.size
-        if size > task.MODEL_SIZE:
+        if size > search.MODEL_SIZE:
             continue
         cost: dict[bool, list[float]] = {True: [], False: []}
         spent: dict[bool, list[tuple[int, float]]] = {True: [], False: []}

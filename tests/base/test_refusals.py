@@ -14,7 +14,7 @@ from support import interpreted
 from undertow.base import InvalidInputError, UndertowError, UnstableSurfaceError
 from undertow.cascade import Update
 from undertow.models import TIME
-from undertow.optimiser.task import POLISH
+from undertow.optimiser.search import POLISH
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -31,7 +31,7 @@ from undertow.cascade.swing_up.search import (
 from undertow.estimators import Measured
 from undertow.plants import Bench, Push, RealisticRig, srv02_rig
 from undertow.proofs import terminal_sets
-from undertow.proofs.claims.terminal_ellipsoid import ProvedEllipsoid
+from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.studies.trials.trial import trial
 from undertow.studies.trials.upright import SWINGING, swing_trial
 
@@ -105,9 +105,9 @@ def test_a_proved_set_catches_without_a_prediction(
     rng = np.random.default_rng(0)
     starts = []
     for known in region.proved:
-        assert isinstance(known, ProvedEllipsoid)
+        assert isinstance(known.region, TerminalEllipsoid)
         x = rng.standard_normal(4)
-        x *= 0.999 / float(known.ellipsoid.level(x))
+        x *= 0.999 / float(known.region.level(x))
         assert region.loop.batch(x, known.surface).reached[0]
         outside = 1.01 * x
         assert not known.contains(outside)

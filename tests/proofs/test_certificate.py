@@ -33,7 +33,7 @@ from undertow.proofs.claims.certificate import (
     _checksum,
     read_certificate,
 )
-from undertow.proofs.claims.closed_loop import LoopClaim, ProvedStarts
+from undertow.proofs.claims.closed_loop import LoopClaim, Starts
 from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.claims.nonsingular import nonsingular
 from undertow.proofs.claims.reaching import reaching
@@ -42,7 +42,7 @@ from undertow.proofs.claims.stability import StabilityClaim, hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import match, proved_sets, verify
 from undertow.proofs.closed_loop.loop import LoopMotion
-from undertow.proofs.closed_loop.terminal import TerminalSet
+from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.gate import Policy, assess
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
@@ -382,7 +382,7 @@ def test_a_claim_of_a_held_input_is_no_set_of_the_continuous_loop(written: bytes
 
 def test_starts_at_rest_are_a_set() -> None:
     box = np.array([[0.0, 0.0], [-0.3, 0.3], [0.0, 0.0], [0.0, 0.0]])
-    starts = ProvedStarts(SURFACE, ut.ReachingLaw(), box)
+    starts = Starts(box)
     assert starts.contains(RIG.state(phi=-0.3))
     assert not starts.contains(RIG.state(phi=0.31))
     assert not starts.contains(RIG.state(phi=0.1, phi_dot=1e-9))

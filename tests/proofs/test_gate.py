@@ -14,7 +14,7 @@ import pytest
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cascade import Admission, cost_gate
-from undertow.law import Plan
+from undertow.law import Plan, ProvedSet
 from undertow.law.sliding import singularity
 from undertow.models import FloatArray
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
@@ -197,10 +197,8 @@ def test_nearby_states_that_fail_are_counted() -> None:
 
 @dataclass
 class Known:
-    """A set that was proved before."""
+    """States of a set that was proved before."""
 
-    surface: ut.Surface
-    reaching: ut.ReachingLaw
     inside: Callable[[FloatArray], bool]
 
     def contains(self, x: FloatArray) -> bool:
@@ -209,8 +207,8 @@ class Known:
 
 def test_sets_that_were_proved_before_are_used() -> None:
     """For the same surface and law alone."""
-    here = Known(GOOD, ut.ReachingLaw(), lambda x: bool(abs(x[1]) < 0.4))
-    other = Known(SLOW, ut.ReachingLaw(), lambda x: True)
+    here = ProvedSet(GOOD, ut.ReachingLaw(), Known(lambda x: bool(abs(x[1]) < 0.4)))
+    other = ProvedSet(SLOW, ut.ReachingLaw(), Known(lambda x: True))
     only = Policy(("region",))
     assert assess(LOOP, Plan.of(GOOD), FAR, 20.0, only, [other]).kind == "undecided"
     assert assess(LOOP, Plan.of(GOOD), FAR, 20.0, only, [other, here]).kind == "proved"

@@ -13,11 +13,11 @@ import sympy as sp
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 
-from undertow.base import InvalidInputError, ModelError
+from undertow.base import InvalidInputError
 from undertow.proofs.closed_loop.terminal_set import TerminalSet, exact_inverse, negative_by
 from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.intervals.branch import minimise_proved
-from undertow.proofs.intervals.exact_model import exact_rates, is_odd, vanishes
+from undertow.proofs.intervals.exact_model import is_odd, vanishes
 
 INF = math.inf
 
@@ -199,17 +199,6 @@ def test_a_terminal_set_is_an_ellipsoid_with_a_band() -> None:
 
 
 # -- exact models -----------------------------------------------------------------------------
-
-
-def test_fields_must_be_smooth_everywhere_and_at_rest() -> None:
-    """Twice: |x|x³ has its corner at 0 smoothed away, |x − 1| has one elsewhere."""
-    x, p = sp.symbols("x p", real=True)
-    assert exact_rates([0.5 * x - x**3], [x], {}) == (x / 2 - x**3,)
-    for rate, values in ((-x + sp.Abs(x - 1), {}), (-x - sp.Abs(x), {}),
-                         (-x * sp.sqrt(x**2 + p), {p: 0.0})):  # fmt: skip
-        with pytest.raises(ModelError, match="vector field"):
-            exact_rates([rate], [x], values)
-    assert exact_rates([-x * sp.sqrt(x**2 + p)], [x], {p: 1.0})
 
 
 def test_parity_and_zeros_are_shown_symbolically() -> None:

@@ -21,7 +21,8 @@ from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.run import run_tubes, start_tubes
 from undertow.proofs.closed_loop.sampled_data import SampledDataLoop
-from undertow.proofs.closed_loop.terminal import TerminalSet, verify_terminal
+from undertow.proofs.closed_loop.terminal import verify_terminal
+from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.closed_loop.tube import bracket
 from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.sampled import (

@@ -28,7 +28,7 @@ from undertow.models import FloatArray
 from undertow.proofs.claims.region import reaches
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.run import _inside
-from undertow.proofs.closed_loop.terminal import TerminalSet
+from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.region.lyapunov import (
     LyapunovFunction,

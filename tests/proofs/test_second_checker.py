@@ -25,6 +25,7 @@ pytest.importorskip("flint", reason="the search for claims is the extra undertow
 import undertow as ut
 from undertow.cli import app
 from undertow.proofs.claims.document import document_bytes
+from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import check
 from undertow.proofs.kernel.reader import Refused, read
@@ -568,7 +569,8 @@ def test_mechanisms_are_decided_alike(
         claims = [kernel.Stability(Fraction(0))]
         surface, law = ut.first_surface(rig), ut.ReachingLaw(eta=5.0)
         document = json.loads(document_bytes(rig, [(surface, law, claims)], {}))
-        found = terminal_sets(rig, [surface], law)[0].ellipsoid
+        found = terminal_sets(rig, [surface], law)[0].region
+        assert isinstance(found, TerminalEllipsoid)
         near = copy.deepcopy(document["subjects"][0])
         near["claims"] = [
             {

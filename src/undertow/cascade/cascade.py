@@ -358,7 +358,7 @@ class Cascade:
         """Return a predicted closed loop as the optimiser integrates it."""
         end = loop.linear_end
         smooth = end is not None and end.counts_cost and not self.freedom.reaching
-        eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
+        eta, layer = self.reaching.per_surface(self.mechanism.m)
         slow = 2 * self.step * float((eta / layer).max()) <= RESOLVED
         even = all(round(t / self.step) % 2 == 0 for t in self.freedom.times)
         larger = smooth and slow and even and not any(self.mechanism.disturbance_bounds)
@@ -393,7 +393,7 @@ class Cascade:
         It bears what it was designed for, and a large s brings its law to the limits of the input
         at once, where the cascade's own reaching law is content with η.
         """
-        eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
+        eta, layer = self.reaching.per_surface(self.mechanism.m)
         laws = [
             replace(self.reaching, eta=tuple(c * eta), layer=tuple(c * layer)) for c in STRONGER
         ]
@@ -409,13 +409,32 @@ class Cascade:
         if loop.ensemble is None:
             return plan
         sticks = self._sticks(state, loop, plan) > 0
-        if not sticks and loop.batch(error, plan, duration=span).score(span)[0] < INADMISSIBLE:
-            return plan
-        plans = [plan, *self.reserve]
-        scores = loop.batch(error, plans, duration=span).score(span)
-        ranks = [(score >= INADMISSIBLE, False, score) for score in scores]
-        ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
-        return plans[min(range(len(plans)), key=ranks.__getitem__)]
+        better = self._better_in_reserve(loop, plan, error.tobytes(), span, sticks)
+        return plan if better is None else better
+
+    @cached_property
+    def _better_in_reserve(
+        self,
+    ) -> Callable[[ClosedLoop, Plan, bytes, float, bool], Plan | None]:
+        """The plan in reserve that is better than one in use, which may stick; ``None``: none is.
+
+        A decision asks twice, for the search and for the gate: the latest answers are kept.
+        """
+
+        @lru_cache(maxsize=2)
+        def better(
+            loop: ClosedLoop, plan: Plan, error: bytes, span: float, sticks: bool
+        ) -> Plan | None:
+            x = np.frombuffer(error).reshape(-1, 2 * self.mechanism.n)
+            if not sticks and loop.batch(x, plan, duration=span).score(span)[0] < INADMISSIBLE:
+                return None
+            scores = loop.batch(x, [plan, *self.reserve], duration=span).score(span)
+            ranks = [(score >= INADMISSIBLE, False, score) for score in scores]
+            ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
+            best = min(range(len(ranks)), key=ranks.__getitem__)
+            return self.reserve[best - 1] if best else None
+
+        return better
 
     def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
         """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
@@ -638,11 +657,6 @@ class Cascade:
         it.  Of a target that moves, the search leaves the motion out: it sees the error, and the
         target at rest where it is at the time t.  :meth:`apply_gate` sees the motion.
         """
-        return self._propose(state, x, t, horizon)
-
-    def _propose(
-        self, state: CascadeState, x: ArrayLike, t: float, horizon: float | None
-    ) -> Proposal:
         sequence = state.sequence + 1
         try:
             planner = self._planner(self._loops(state.estimate), state.target, t)
@@ -837,7 +851,7 @@ class Cascade:
                 left = leg.longest - (t - since)
                 if left <= 0.5 * self.step:  # a disturbed plant came too late: a new horizon
                     since, left = t, leg.longest
-                proposal = self._propose(memory, x, t, left)
+                proposal = self.propose(memory, x, t, left)
                 memory, admission = self.apply_gate(memory, proposal, x, left)
             if proposal is not None:
                 task += t == leg.begin or arrived  # left what was reached: another task

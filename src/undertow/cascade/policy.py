@@ -227,15 +227,7 @@ def policy(
             remedy="ut.policy(loop, surface), or ut.policy(cascade)",
         )
     mechanism = controller.mechanism
-    eta, layer = np.split(controller.reaching.vector(mechanism.m), 2)
-    most = float(np.min(2 * layer / eta))
-    if controller.reaching.switching != "sign" and period >= most:
-        raise InvalidInputError(
-            "period of a policy",
-            value=f"{period:g} s",
-            limit=f"below 2 ε/η = {most:g} s",
-            remedy="Use a shorter period, a thicker boundary layer or a smaller η",
-        )
+    controller.reaching.check_period("period of a policy", period, mechanism.m)
     if cascade is not None:
         count = cascade.period / period
         if abs(count - round(count)) > 1e-6:

@@ -20,7 +20,7 @@ import numpy as np
 from undertow.base import InvalidInputError
 from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
 from undertow.closed_loop.gate import Admission, cost_gate, gate_words
-from undertow.law import InnerLoop, Plan, ReachingLaw, Surface
+from undertow.law import Plan, ReachingLaw, Surface, feedback_at_target
 from undertow.models import FloatArray, Mechanism, linearise
 
 
@@ -106,7 +106,7 @@ def delay_margin(
             limit="0 < period, 0 ≤ longest ≤ 1000 periods",
         )
     A, B = _sampled(mechanism, period)
-    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+    k = feedback_at_target(mechanism, surface, reaching)
     late = 0
     while late * period <= longest and _stable(A, B, k, late):
         late += 1
@@ -140,7 +140,7 @@ def noise_share(
     >>> noise_share(rig, ut.first_surface(rig), np.zeros((4, 4)))
     0.0
     """
-    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+    k = feedback_at_target(mechanism, surface, reaching)
     variances = np.einsum("ij,jk,ik->i", k, covariance, k)
     return float((np.sqrt(np.maximum(variances, 0.0)) / mechanism.input_limits).max())
 
@@ -184,7 +184,7 @@ def sticking_distance(
         )
     if not sizes.any():
         return 0.0
-    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+    k = feedback_at_target(mechanism, surface, reaching)
     gains = np.linalg.norm(k[:, mechanism.m : mechanism.n], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.where(sizes > 0, 2.0 * sizes / gains, 0.0).max())

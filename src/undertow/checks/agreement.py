@@ -126,7 +126,7 @@ class Subject:
     def _layer_edge(self) -> FloatArray:
         """States with |s_i| = ε_i, a rounding off on either side."""
         C, m = self.surface.matrix, self.mechanism.m
-        edge = self.reaching.vector(m)[m:] * self._rng.choice([-1.0, 1.0], (self._count, m))
+        edge = self.reaching.per_surface(m)[1] * self._rng.choice([-1.0, 1.0], (self._count, m))
         x = self._spread(0.1)
         return np.asarray(x + np.linalg.lstsq(C, (edge - x @ C.T).T, rcond=None)[0].T)
 
@@ -274,7 +274,7 @@ def proof_programme(subject: Subject) -> Iterator[Difference]:
         *(f"q̈ of {c.name}" for c in mechanism.coordinates),
         *(f"demand of {i.name}" for i in mechanism.inputs),
     ]
-    layer = subject.reaching.vector(m)[m:]
+    layer = subject.reaching.per_surface(m)[1]
     rows = []
     for x, state, law in zip(subject.states, subject.numbers, subject.laws, strict=True):
         if all(abs(float(s)) < e for s, e in zip(law.s, layer, strict=True)):

@@ -361,7 +361,7 @@ class ExactModel:
         M, f, B = self.matrices(0.0, x)
         position, velocity = _numbers(surface.position_row), _numbers(surface.velocity_row)
         s = product(position, x[:n]) + product(velocity, x[n:])
-        eta, layer = np.split(_numbers(reaching.vector(m)), 2)
+        eta, layer = (_numbers(v) for v in reaching.per_surface(m))
         gains = self._gains(surface, M, eta)
         pushes = np.vstack([B, _numbers(np.zeros((n - m, m)))])
         moves = solve(M, np.column_stack([f, pushes]))

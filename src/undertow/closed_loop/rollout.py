@@ -157,18 +157,11 @@ class ClosedLoop:
             at_least(f"{name} of a closed loop", getattr(self, name), 0, remedy)
         at_least("threads of a closed loop", self.threads, 1, "1 is the calling thread alone")
         positive("rollout step, s", self.step)
-        vector = self.reaching.vector(self.mechanism.m)
-        if self.reaching.switching != "sign":
-            eta, layer = np.split(vector, 2)
-            period = self.step * max(1, self.zoh_steps)
-            limit = float(np.min(2 * layer / eta))
-            if period >= limit:
-                raise InvalidInputError(
-                    "sample period of the inner loop" if self.zoh_steps else "rollout step",
-                    value=f"{period:g} s",
-                    limit=f"below 2 ε/η = {limit:g} s",
-                    remedy="Use a shorter step, a thicker boundary layer or a smaller η",
-                )
+        self.reaching.check_period(
+            "sample period of the inner loop" if self.zoh_steps else "rollout step",
+            self.step * max(1, self.zoh_steps),
+            self.mechanism.m,
+        )
         if self.plant is not None and self.ensemble is not None:
             raise InvalidInputError(
                 "plant of a closed loop",

@@ -13,7 +13,14 @@ import numpy as np
 
 from undertow.base import InvalidInputError, check_fields, checked, one_of, require_extra
 from undertow.closed_loop import ClosedLoop
-from undertow.law import InnerLoop, Plan, ReachingLaw, Surface, check_surface
+from undertow.law import (
+    InnerLoop,
+    Plan,
+    ReachingLaw,
+    Surface,
+    check_surface,
+    feedback_at_target,
+)
 from undertow.models import FloatArray, Mechanism, linearise
 
 #: Frequencies at which disk margins are looked for: this many, and so far about the eigenvalues.
@@ -189,7 +196,7 @@ def loop_transfer(
     check_surface(mechanism, surface)
     control = _control("loops")
     lin = linearise(mechanism)
-    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+    k = feedback_at_target(mechanism, surface, reaching)
     others = [i for i in range(mechanism.m) if i != place]
     A = lin.A + lin.input[:, others] @ k[others]
     return control.ss(

@@ -1,6 +1,12 @@
 """The control law: surfaces and their schedule, reaching law, stability margins."""
 
-from undertow.law.inner_loop import LAYOUT, InnerLoop, law_module, pack_law_parameters
+from undertow.law.inner_loop import (
+    LAYOUT,
+    InnerLoop,
+    feedback_at_target,
+    law_module,
+    pack_law_parameters,
+)
 from undertow.law.reference import Reference, ReferenceMotion, SetPoints, Target, target_of
 from undertow.law.schedule import Plan, rising_from_zero
 from undertow.law.sliding import (
@@ -46,6 +52,7 @@ __all__ = [
     "check_surface",
     "check_surface_shape",
     "coupling",
+    "feedback_at_target",
     "first_surface",
     "gains_at_target",
     "gamma_determinant",

@@ -116,6 +116,14 @@ class InnerLoop:
         return self.u  # type: ignore[no-any-return]
 
 
+@lru_cache(maxsize=8)
+def feedback_at_target(
+    mechanism: Mechanism, surface: Surface, reaching: ReachingLaw | None = None
+) -> FloatArray:
+    """Return k, (m, 2n), with u = k x near the target; the paper's gains by default."""
+    return InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+
+
 def law_memory(mechanism: Mechanism, limits: FloatArray | None = None) -> Workspace:
     """Return what a step of a law works on: u, demand, s, margin; limits may be narrower."""
     memory = Workspace(LAYOUT, p=len(mechanism.parameters), m=mechanism.m)

@@ -15,8 +15,9 @@ from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_designs
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
+from undertow.optimiser.search import FINE, global_search, local_search, search_earlier
 from undertow.optimiser.search_space import DecisionVariables, SearchSpace
-from undertow.optimiser.task import FINE, Optimisation
+from undertow.optimiser.task import Optimisation
 
 #: Quadratic designs that a global search begins with.
 DESIGNS = 31
@@ -180,11 +181,11 @@ class Optimiser:
         longest = self.loop.objective.horizon if horizon is None else horizon
         task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
         if incumbent is None:
-            *_, converged = task.global_search()
+            *_, converged = global_search(task)
         elif self.counts_time:
-            converged = task.search_earlier(Plan.of(incumbent))
+            converged = search_earlier(task, Plan.of(incumbent))
         else:
-            converged = task.local_search(Plan.of(incumbent))
+            converged = local_search(task, Plan.of(incumbent))
         if warm and self.loop.ensemble is not None:
             task.fall_back()
         return task.answer(converged, computed_for)
@@ -210,7 +211,7 @@ class Optimiser:
         at_least("sequence of a proposal", sequence, 0)
         longest = self.loop.objective.horizon
         task = self._task(x, longest, budget or self._budget(False), 0.0, sequence, False)
-        return (task.answer(done, 0.0, judged=False) for done in task.global_search())
+        return (task.answer(done, 0.0, judged=False) for done in global_search(task))
 
     def _task(
         self, x: ArrayLike, horizon: float, budget: Budget, resolution: float, sequence: int,

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from undertow.base import InvalidInputError, check_fields, positive
 from undertow.closed_loop import ClosedLoop
+from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray
 from undertow.symbolic import compiled
@@ -130,7 +132,7 @@ class SearchSpace:
             surface, law = plan.at(t)
             parts.append(np.arcsinh(surface.normalised().vector[self._free] / self._width))
             if self.freedom.reaching:
-                eta, layer = np.split((law or self.loop.reaching).vector(self.m), 2)
+                eta, layer = (law or self.loop.reaching).per_surface(self.m)
                 part = np.clip((eta / layer - 1.0) / (self._fastest - 1.0), 1e-6, 1 - 1e-6)
                 parts += [np.log(eta), np.log(part / (1 - part))]
         return np.concatenate(parts)
@@ -143,16 +145,23 @@ class SearchSpace:
         _decode(rows, self._base, self._places, self._width, self._fastest, vectors, gains)
         return vectors, gains if self.freedom.reaching else None
 
-    def plan(self, vectors: FloatArray, gains: FloatArray | None) -> Plan:
-        """Return the plan of one decoded row: (S, 2mn) and (S, 2m)."""
-        surfaces = tuple(Surface.from_vector(v, self.n, self.m) for v in vectors)
+    def plan(self, z: FloatArray) -> Plan:
+        """Return the plan at some coordinates, (d,)."""
+        vectors, gains = self.decode(z[None])
+        surfaces = tuple(Surface.from_vector(v, self.n, self.m) for v in vectors[0])
         laws = None
         if gains is not None:
             switching = self.loop.reaching.switching
             laws = tuple(
-                ReachingLaw(tuple(row[: self.m]), tuple(row[self.m :]), switching) for row in gains
+                ReachingLaw(tuple(row[: self.m]), tuple(row[self.m :]), switching)
+                for row in gains[0]
             )
         return Plan(surfaces, self.freedom.times, laws)
+
+    def batch(self, x: FloatArray, z: FloatArray, **how: Any) -> Batch:
+        """Roll out the plans at coordinates (N, d) from a state, see ``ClosedLoop.batch``."""
+        vectors, gains = self.decode(z)
+        return self.loop.batch(x, vectors, reaching=gains, switch_times=self.freedom.times, **how)
 
 
 @compiled()

@@ -39,8 +39,6 @@ from undertow.models.mechanism import FloatArray
 from undertow.proofs.intervals.require import require
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
-__all__ = ["CertifiedGate", "Evidence", "Policy", "assess", "certified_gate"]
-
 Evidence = Literal["region", "dual", "sampled", "local"]
 #: When a prediction is first looked at, s; then after half the time again, and so on.
 FIRST_LOOK = 1.0
@@ -139,9 +137,7 @@ class _Case:
         return [
             s
             for s in self.sets
-            if s.surface == self.surface
-            and s.reaching == self.law
-            and getattr(s, "model", "") in own
+            if s.surface == self.surface and s.reaching == self.law and s.model in own
         ]
 
     def proved_at(self, x: FloatArray) -> tuple[float, str] | None:

@@ -19,8 +19,6 @@ from undertow.law import Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.intervals.require import require
 
-__all__ = ["box_starts", "failure_bound", "sampled_extent", "sampled_region"]
-
 #: Draws starts x0, (N, 2n), from a generator.
 Sampler = Callable[[np.random.Generator, int], FloatArray]
 

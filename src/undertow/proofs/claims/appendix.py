@@ -38,21 +38,6 @@ from undertow.proofs.claims.claim import Claim, Readers
 from undertow.proofs.claims.stability import exact_linearisation
 from undertow.proofs.intervals.interval import ball, flint, lower_float, upper_float
 
-__all__ = [
-    "CASES",
-    "PRINTED",
-    "AppendixCase",
-    "AppendixClaim",
-    "Constants",
-    "Lyapunov",
-    "Reduced",
-    "decay_rate",
-    "false_bound",
-    "largest_interval",
-    "paper_rate",
-    "two_vertex",
-]
-
 Matrix = list[list[Any]]
 BallMatrix = NDArray[np.object_]
 
@@ -69,12 +54,13 @@ class Constants(NamedTuple):
     @classmethod
     def of(cls, mechanism: Mechanism) -> Constants:
         """Read b = −M_au, c = M_uu and d = ∂f_u/∂φ off a pendulum at its target, exactly."""
-        rows, exact = exact_linearisation(mechanism)
+        rows = exact_linearisation(mechanism)
+        exact = all(v.exact for row in rows for v in row)
         if (mechanism.n, mechanism.m) != (2, 1) or not exact:
             raise InvalidInputError(
                 "appendix constants", value=mechanism.name, limit="a pendulum, n = 2, m = 1"
             )
-        M_au, M_uu, _, F_u = (Fraction(int(v.p), int(v.q)) for v in rows[1][:4])
+        M_au, M_uu, _, F_u = (v.low for v in rows[1][:4])
         return cls(-M_au, M_uu, F_u)
 
 

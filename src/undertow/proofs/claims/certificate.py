@@ -23,13 +23,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
-
-import numpy as np
 
 from undertow.base.artefacts import write_file
 from undertow.base.errors import CertificateError, UndertowError
@@ -38,11 +35,9 @@ from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Claim, floats_of
-from undertow.proofs.claims.document import law_objects, read_document
+from undertow.proofs.claims.document import json_bytes, law_objects, read_document
 from undertow.proofs.kernel.claims import read_claim
 from undertow.proofs.kernel.reader import Document
-
-__all__ = ["Certificate", "StatedClaim", "Subject", "read_certificate"]
 
 FORMAT, VERSION = "undertow-certificate", 1
 
@@ -206,10 +201,7 @@ class Certificate:
             "versions": dict(self.versions),
         }
         document["checksum"] = _checksum(document)
-        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
-        # A line for each innermost list; no string of JSON has a line break inside.
-        text = re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", _on_one_line, text)
-        return (text + "\n").encode()
+        return json_bytes(document)
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
@@ -337,10 +329,6 @@ def _printable(text: str) -> str:
     return "".join(c for c in " ".join(text.split()) if c.isprintable())
 
 
-def _on_one_line(found: re.Match[str]) -> str:
-    return "[" + re.sub(r"\n\s+", " ", found[1]) + "]"
-
-
 def _checksum(document: Mapping[str, Any]) -> str:
     """SHA-256 of the canonical JSON of everything but the checksum."""
     rest = {k: v for k, v in document.items() if k != "checksum"}
@@ -355,7 +343,7 @@ def _checksum(document: Mapping[str, Any]) -> str:
 
 def _subject_data(subject: Subject) -> dict[str, Any]:
     surface, law = subject.surface, subject.reaching
-    eta, layer = np.split(law.vector(surface.m), 2)
+    eta, layer = law.per_surface(surface.m)
     return {
         "surface": {name: getattr(surface, name).tolist() for name in _BLOCKS},
         "reaching": {"eta": eta.tolist(), "layer": layer.tolist(), "switching": law.switching},

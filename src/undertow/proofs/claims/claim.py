@@ -19,8 +19,6 @@ from undertow.law.surface import ProvedSet
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.kernel import claims as kernel
 
-__all__ = ["Box", "Claim", "Readers", "box_of", "floats_of", "matrix_of"]
-
 #: Names of positions or parameters to (low, high), SI units.
 Box = Mapping[str, tuple[float, float]]
 Readers = Mapping[str, Callable[[Any], Any]]

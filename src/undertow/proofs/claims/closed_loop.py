@@ -10,14 +10,12 @@ import numpy as np
 
 from undertow.base.errors import InvalidInputError
 from undertow.base.verdict import Kind, Verdict
-from undertow.law import ReachingLaw, Surface
+from undertow.law import ProvedSet, ReachingLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Model
-
-__all__ = ["LoopClaim", "ProvedStarts"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,25 +92,19 @@ class LoopClaim(Claim):
 
     def proved_set(
         self, mechanism: Mechanism, surface: Surface, law: ReachingLaw
-    ) -> ProvedStarts | None:
+    ) -> ProvedSet | None:
         """Return its starts; a held input, another plant or a force is not the gate's loop."""
         own = self._own(model_of(mechanism))
         if own.period or own.plant or any(own.disturbance):
             return None
-        return ProvedStarts(surface, law, self.box(mechanism), mechanism.fingerprint)
+        return ProvedSet(surface, law, Starts(self.box(mechanism)), mechanism.fingerprint)
 
 
 @dataclass(frozen=True)
-class ProvedStarts:
-    """Starts of a closed loop, a box of states (2n, 2), SI units.
+class Starts:
+    """Starts of a closed loop, a box of states (2n, 2), SI units."""
 
-    ``model`` is the mechanism's fingerprint; empty where nobody said it.
-    """
-
-    surface: Surface
-    reaching: ReachingLaw
     box: FloatArray
-    model: str = ""
 
     def contains(self, x: FloatArray) -> bool:
         """Whether the state is one of them."""

@@ -19,10 +19,6 @@ from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Law
 from undertow.proofs.kernel.reader import FORMAT, VERSION, Document, Refused, digest, read
 
-__all__ = ["decide_document", "document_bytes", "law_objects", "match_document", "read_document"]
-
-AGAIN = "The model has changed since: certify again"
-
 
 def document_bytes(
     mechanism: Mechanism,
@@ -52,16 +48,22 @@ def document_bytes(
         "made_with": {k: v if v is None else v[:64] for k, v in versions.items()},
     }
     document["checksum"] = digest(document)
-    text = json.dumps(document, indent=1, ensure_ascii=False)
-    # A line for each innermost list; no text of a certificate has a bracket's line break inside.
-    text = re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", _on_one_line, text)
-    content = (text + "\n").encode()
+    content = json_bytes(document)
     read_document(content)
     return content
 
 
-def _on_one_line(found: re.Match[str]) -> str:
-    return "[" + re.sub(r"\n\s+", " ", found[1]) + "]"
+def json_bytes(document: Mapping[str, Any]) -> bytes:
+    """Return the text of a certificate: a line for each innermost list.
+
+    No text of a certificate has a bracket's line break inside.
+    """
+
+    def on_one_line(found: re.Match[str]) -> str:
+        return "[" + re.sub(r"\n\s+", " ", found[1]) + "]"
+
+    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+    return (re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", on_one_line, text) + "\n").encode()
 
 
 def read_document(content: bytes) -> Document:
@@ -98,47 +100,6 @@ def law_objects(law: Law) -> tuple[Surface, ReachingLaw]:
     return surface, ReachingLaw(
         eta[0] if one else eta, layer[0] if one else layer, cast(Any, law.switching)
     )
-
-
-def match_document(document: Document, mechanism: Mechanism, own_parameters: bool) -> None:
-    """Refuse a file about another mechanism: the equations of this one are made again and compared.
-
-    Parameters
-    ----------
-    own_parameters
-        The mechanism's parameters count, and must be the file's.
-
-    Raises
-    ------
-    CertificateError
-        With what differs.
-    """
-    given = document.model
-    mine = {p.name: p.value for p in mechanism.parameters}
-    theirs = {p.name: float(p.value or 0) for p in given.parameters}
-
-    def require(good: bool, what: str, value: object, limit: object, remedy: str = AGAIN) -> None:
-        if not good:
-            raise CertificateError(what, value=value, limit=limit, remedy=remedy)
-
-    name = mechanism.name
-    about = "certificate of another mechanism"
-    require(
-        given.name == name, about, repr(given.name), f"'{name}'", "Name the one that it is about"
-    )
-    alike = f"parameters of '{name}'"
-    require(set(mine) == set(theirs), alike, ", ".join(sorted(mine)), ", ".join(sorted(theirs)))
-    for key, value in theirs.items() if own_parameters else ():
-        what, limit = f"parameter '{key}' of '{name}'", f"{value:.17g}, the certificate's"
-        again = "The proof is for that value: certify again with --set"
-        require(mine[key] == value, what, f"{mine[key]:.17g}", limit, again)
-    here = model_data(mechanism.with_parameters(**theirs))
-    limits = tuple(i.limit for i in mechanism.inputs)
-    wanted = tuple(float("inf") if i.value is None else float(i.value) for i in given.inputs)
-    require(limits == wanted, f"input limits of '{name}'", limits, f"{wanted}, the certificate's")
-    own = digest(here)
-    shown = f"{document.model_hash[:12]}…, those of the certificate"
-    require(own == document.model_hash, f"equations of '{name}'", f"hash {own[:12]}…", shown)
 
 
 def decide_document(

@@ -26,10 +26,9 @@ from undertow.proofs.claims.claim import Box, Claim, Readers, box_of, floats_of
 from undertow.proofs.claims.terminal_ellipsoid import limits_in_words
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.run import run_tubes, start_tubes
-from undertow.proofs.closed_loop.terminal import TerminalSet, verify_terminal
+from undertow.proofs.closed_loop.terminal import verify_terminal
+from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.intervals.require import require
-
-__all__ = ["LoopDraft"]
 
 #: Edges that a claim may have: some kilobytes of memory for each.
 MOST_EDGES = 20_000

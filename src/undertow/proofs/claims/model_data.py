@@ -12,7 +12,6 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import sympy as sp
 
 from undertow.base.errors import CertificateError, ModelError
@@ -22,8 +21,6 @@ from undertow.proofs.intervals.exact_model import exact_mechanism, exact_number
 from undertow.proofs.intervals.require import require_autonomous
 from undertow.proofs.kernel.model import Law, Model
 from undertow.proofs.kernel.reader import Refused, number_text, read_law, read_model
-
-__all__ = ["law_data", "law_of", "model_data", "model_of"]
 
 _PLAIN = {sp.sin: "sin", sp.cos: "cos", sp.exp: "exp", sp.log: "log", sp.tanh: "tanh"}
 
@@ -226,7 +223,7 @@ def law_data(mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> dict[s
     def rows(block: Any) -> Any:
         return [[number_text(float(v)) for v in row] for row in block]
 
-    eta, layer = np.split(law.vector(surface.m), 2)
+    eta, layer = law.per_surface(surface.m)
     return {
         **{k: rows(getattr(surface, k)) for k in ("alpha_a", "lambda_a", "alpha_u", "lambda_u")},
         "eta": [number_text(float(v)) for v in eta],

@@ -24,15 +24,6 @@ from undertow.proofs.intervals.require import require
 from undertow.proofs.kernel import claims as kernel
 from undertow.symbolic import Tape
 
-__all__ = [
-    "NonsingularClaim",
-    "exact_box",
-    "nonsingular",
-    "region_box",
-    "region_words",
-    "singular_distance",
-]
-
 
 def region_box(mechanism: Mechanism, region: Box) -> list[tuple[float, float]]:
     """Return the box of positions, one (low, high) per coordinate.

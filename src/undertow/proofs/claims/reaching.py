@@ -50,8 +50,6 @@ from undertow.symbolic import Tape
 #: Of one ball per coordinate.
 BallFunctions = Callable[[list[Any]], list[Any]]
 
-__all__ = ["DisturbanceBound", "ReachingCertificate", "ReachingClaim", "reaching"]
-
 
 @dataclass(frozen=True)
 class DisturbanceBound:
@@ -261,7 +259,7 @@ class _Balance:
         fixed = [ball(float(v)) for v in (*surface.vector, *mechanism.parameter_values)]
         run_w = compile_outward(tape, inputs, list(sp.Matrix.hstack(W_a, W_u)))
         if gains is None or isinstance(gains, ReachingLaw):
-            own = (ReachingLaw() if gains is None else gains).vector(m)[:m]
+            own = (ReachingLaw() if gains is None else gains).per_surface(m)[0]
             run_k = compile_outward(tape, [*inputs, *symbols.eta], law.gains)
             more = [*fixed, *(ball(float(v)) for v in own)]
         else:

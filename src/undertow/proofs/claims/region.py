@@ -25,8 +25,6 @@ from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
 
-__all__ = ["RegionClaim", "reaches", "verify_region"]
-
 #: Functions of one region that are read.
 LONGEST_CHAIN = 200
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,20 +20,16 @@ from undertow.models.mechanism import TIME, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.intervals.exact_model import exact_mechanism
-from undertow.proofs.intervals.interval import flint
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.graph import Span
 from undertow.proofs.kernel.model import System
 
-__all__ = ["StabilityClaim", "exact_linearisation", "hurwitz"]
 
+def exact_linearisation(mechanism: Mechanism) -> list[list[Span]]:
+    """Return [M | F | D] at the target, n rows of 3n numbers.
 
-def exact_linearisation(mechanism: Mechanism) -> tuple[list[list[Any]], bool]:
-    """Return [M | F | D] at the target, n rows of 3n numbers, and whether they are exact.
-
-    ``M q̈ = F q + D q̇`` near x = 0; entries are rationals (fmpq) where the model is rational
-    at the target with its float parameters taken as the binary numbers that they are, else
-    all are balls (arb).
+    ``M q̈ = F q + D q̇`` near x = 0; entries are exact where the model is rational at the target
+    with its float parameters taken as the binary numbers that they are.
 
     Raises
     ------
@@ -45,15 +41,7 @@ def exact_linearisation(mechanism: Mechanism) -> tuple[list[list[Any]], bool]:
     own = System(model_of(mechanism), law_of(mechanism, Surface(*blocks), ReachingLaw()))
     graph, one = own.graph, own.graph.number(1)
     slopes = [graph.tangents(own.f, {x: one}) for x in graph.inputs[: 2 * n]]
-    rows = [graph.exact([*own.M[i], *(d[i] for d in slopes)], own.origin()) for i in range(n)]
-    exact = all(v.exact for row in rows for v in row)
-    module = flint()
-
-    def ball(v: Span) -> Any:
-        low, high = (module.fmpq(e.numerator, e.denominator) for e in (v.low, v.high))
-        return low if exact else module.arb(low).union(module.arb(high))
-
-    return [[ball(v) for v in row] for row in rows], exact
+    return [graph.exact([*own.M[i], *(d[i] for d in slopes)], own.origin()) for i in range(n)]
 
 
 def _slowest_mode(mechanism: Mechanism, surface: Surface) -> tuple[complex, dict[str, float]]:

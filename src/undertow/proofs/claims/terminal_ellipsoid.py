@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from undertow.base.verdict import Kind, Verdict, inward
 from undertow.law import (
     LawLayout,
+    ProvedSet,
     ReachingLaw,
     Surface,
     check_surface_shape,
@@ -29,13 +30,6 @@ from undertow.proofs.intervals.require import require, require_autonomous
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.graph import Span
 from undertow.proofs.kernel.model import System
-
-__all__ = [
-    "ClosedLoopProgram",
-    "ProvedEllipsoid",
-    "TerminalEllipsoid",
-    "limits_in_words",
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,28 +116,9 @@ class TerminalEllipsoid(Claim):
         W = tuple(tuple(Fraction(float(v)) for v in row) for row in self.W)
         return kernel.TerminalEllipsoid(W, Fraction(self.radius))
 
-    def proved_set(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw
-    ) -> ProvedEllipsoid:
+    def proved_set(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> ProvedSet:
         """Return it with the closed loop that it is of."""
-        return ProvedEllipsoid(surface, law, self, mechanism.fingerprint)
-
-
-@dataclass(frozen=True)
-class ProvedEllipsoid:
-    """A terminal ellipsoid, proved, and the closed loop that it is of.
-
-    ``model`` is the mechanism's fingerprint; empty where nobody said it.
-    """
-
-    surface: Surface
-    reaching: ReachingLaw
-    ellipsoid: TerminalEllipsoid
-    model: str = ""
-
-    def contains(self, x: ArrayLike) -> bool:
-        """Whether the state is inside for certain."""
-        return self.ellipsoid.contains(x)
+        return ProvedSet(surface, law, self, mechanism.fingerprint)
 
 
 def limits_in_words(mechanism: Mechanism) -> str:

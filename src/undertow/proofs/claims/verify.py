@@ -22,16 +22,16 @@ from undertow.proofs.claims.appendix import AppendixClaim
 from undertow.proofs.claims.certificate import Certificate, StatedClaim, Subject
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.closed_loop import LoopClaim
-from undertow.proofs.claims.document import decide_document, match_document
+from undertow.proofs.claims.document import decide_document
 from undertow.proofs.claims.loop_draft import LoopDraft
+from undertow.proofs.claims.model_data import model_data
 from undertow.proofs.claims.nonsingular import NonsingularClaim
 from undertow.proofs.claims.reaching import ReachingClaim
 from undertow.proofs.claims.region import RegionClaim
 from undertow.proofs.claims.stability import StabilityClaim
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.intervals.exact_model import exact_mechanism
-
-__all__ = ["CLAIMS", "Checked", "check_settings", "match", "proved_sets", "verify"]
+from undertow.proofs.kernel.reader import digest
 
 #: Every kind of claim, by its name in a certificate.
 CLAIMS: Mapping[str, type[Claim]] = {
@@ -97,20 +97,12 @@ def match(
         For other equations, parameters or input limits.
     """
     own, name = certificate, mechanism.name
-    known = str(own.versions.get("sympy"))[:12]
     _require(
         own.name == name,
         "certificate of another mechanism",
         repr(own.name),
         f"'{name}'",
         "Name the mechanism that it is about",
-    )
-    _require(
-        own.structure == mechanism.structure,
-        f"equations of '{name}'",
-        f"hash {mechanism.structure[:12]}…",
-        f"{own.structure[:12]}…, those of the certificate (SymPy {known!r})",
-        "The model has changed since: certify again",
     )
     present = {p.name: p.value for p in mechanism.parameters}
     wanted = ", ".join(repr(key) for key in sorted(own.parameters))
@@ -124,11 +116,21 @@ def match(
     wanted = f"{own.input_limits}, the certificate's"
     _require(limits == own.input_limits, f"input limits of '{name}'", limits, wanted)
     try:
-        return mechanism.with_parameters(**changed)
+        matched = mechanism.with_parameters(**changed)
     except UndertowError as error:
         raise CertificateError(
             "parameters of a certificate", value=str(error), limit="physical"
         ) from error
+    structure = matched.structure if own.document is None else digest(model_data(matched))
+    _require(
+        own.structure == structure,
+        f"equations of '{name}'",
+        f"hash {structure[:12]}…",
+        f"{own.structure[:12]}…, those of the certificate "
+        f"(SymPy {str(own.versions.get('sympy'))[:12]!r})",
+        "The model has changed since: certify again",
+    )
+    return matched
 
 
 AGAIN = "The proof is for that value: certify again with --set"
@@ -224,8 +226,7 @@ def _verify_document(
     document, model = certificate.document, certificate.structure
     assert document is not None
     if mechanism is not None:
-        match_document(document, mechanism, own_parameters)
-        model = mechanism.with_parameters(**certificate.parameters).fingerprint
+        model = match(certificate, mechanism, own_parameters=own_parameters).fingerprint
     subjects = [s for s in certificate.subjects for _ in s.claims]
     stated = [c for s in certificate.subjects for c in s.claims]
     decided = decide_document(document, progress)

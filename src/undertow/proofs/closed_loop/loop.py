@@ -36,8 +36,6 @@ from undertow.proofs.intervals.exact_model import exact_mechanism, is_odd, vanis
 from undertow.proofs.intervals.require import require, require_autonomous
 from undertow.proofs.region.motion import unused
 
-__all__ = ["LoopMotion", "LoopRates"]
-
 
 class LoopRates(NamedTuple):
     """The closed loop over boxes; the last axis counts boxes.
@@ -145,8 +143,7 @@ class LoopMotion:
     @cached_property
     def gains(self) -> tuple[FloatArray, FloatArray]:
         """K and ε, (m,) each."""
-        eta, layer = np.split(self.reaching.vector(self.mechanism.m), 2)
-        return eta, layer
+        return self.reaching.per_surface(self.mechanism.m)
 
     @cached_property
     def odd(self) -> bool:

@@ -20,8 +20,6 @@ from undertow.proofs.closed_loop.tube import Paths, matmul
 from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.intervals.interval import OutwardFunction
 
-__all__ = ["LoopEquations", "LoopParts"]
-
 
 class LoopParts(NamedTuple):
     """What the equations are made of, over boxes, with slopes in z and in k parameters.

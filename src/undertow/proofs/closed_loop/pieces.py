@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.intervals.batch import Interval
 
-__all__ = ["Reader", "excess", "put_boxes", "saturation", "stacked", "through_switch"]
-
 _T = TypeVar("_T")
 
 

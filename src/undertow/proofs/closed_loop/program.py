@@ -20,8 +20,6 @@ from undertow.proofs.intervals.exact_model import exact_matrix, exact_number
 from undertow.proofs.intervals.interval import OutwardFunction, compile_outward, derivative_tape
 from undertow.symbolic import Tape, compile_numpy
 
-__all__ = ["LoopFunctions"]
-
 
 @dataclass(frozen=True, eq=False)
 class _Equations:

@@ -14,11 +14,9 @@ from undertow.base.arguments import one_of
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.closed_loop.loop import LoopMotion, LoopRates
 from undertow.proofs.closed_loop.sampled_data import SampledDataLoop
-from undertow.proofs.closed_loop.terminal import TerminalSet, exact_inverse
+from undertow.proofs.closed_loop.terminal_set import TerminalSet, exact_inverse
 from undertow.proofs.closed_loop.tube import Tubes, bracket
 from undertow.proofs.intervals.batch import Interval
-
-__all__ = ["TubeEnd", "run_tubes", "start_tubes"]
 
 
 class TubeEnd(NamedTuple):

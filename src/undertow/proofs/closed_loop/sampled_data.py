@@ -25,8 +25,6 @@ from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.tube import Paths, Tubes, stack
 from undertow.proofs.intervals.batch import Interval
 
-__all__ = ["HeldRates", "SampledDataLoop"]
-
 
 class HeldRates(NamedTuple):
     """The loop between samples over boxes; see :class:`undertow.proofs.closed_loop.tube.Rates`."""

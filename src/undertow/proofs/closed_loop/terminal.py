@@ -42,8 +42,6 @@ from undertow.proofs.closed_loop.terminal_set import TerminalSet, exact_inverse,
 from undertow.proofs.closed_loop.tube import matmul
 from undertow.proofs.intervals.batch import Interval, bisected
 
-__all__ = ["TerminalSet", "exact_inverse", "verify_terminal"]
-
 #: Part of the pull k sat(σ r/ε) left to a held input where the plant is uncertain too.
 HOLD_SHARE = 0.7
 

@@ -18,8 +18,6 @@ from undertow.models.mechanism import FloatArray
 from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.intervals.require import require
 
-__all__ = ["TerminalSet", "exact_inverse", "negative_by"]
-
 
 @dataclass(frozen=True, eq=False)
 class TerminalSet:

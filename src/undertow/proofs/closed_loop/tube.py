@@ -39,8 +39,6 @@ from undertow.models.mechanism import FloatArray
 from undertow.proofs.closed_loop.pieces import put_boxes
 from undertow.proofs.intervals.batch import Interval
 
-__all__ = ["Field", "Rates", "Tubes", "bracket", "matmul", "stack"]
-
 Mask = NDArray[np.bool_]
 
 #: Terms of the series; its tail is bounded.

@@ -25,8 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from undertow.models.mechanism import FloatArray
 
-__all__ = ["Interval", "IntervalArithmetic", "bisected"]
-
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _STEP = 2.0**-52

@@ -12,8 +12,6 @@ from typing import Any
 from undertow.base.verdict import Kind, Verdict
 from undertow.proofs.intervals.interval import ball, lower_float, upper_float
 
-__all__ = ["Minimum", "minimise_proved"]
-
 #: A function of one ball per variable; NaN where it is undefined on some of the box.
 BallFunction = Callable[[list[Any]], Any]
 

@@ -7,7 +7,7 @@ is made exact, and what is not smooth is refused, before anything symbolic is do
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -18,16 +18,6 @@ from numpy.typing import ArrayLike
 from undertow.models.mechanism import TIME, Mechanism
 from undertow.models.validity import require_smooth
 from undertow.proofs.intervals.interval import exact_fraction
-
-__all__ = [
-    "exact_expression",
-    "exact_matrix",
-    "exact_mechanism",
-    "exact_number",
-    "exact_rates",
-    "is_odd",
-    "vanishes",
-]
 
 
 def exact_number(value: float) -> sp.Rational:
@@ -67,23 +57,6 @@ def exact_mechanism(mechanism: Mechanism) -> Mechanism:
         require_smooth(what, matrix, mechanism.x, at=target, orders=2)
     changed = {k: v for k, v in exact.items() if v != getattr(mechanism, k)}
     return replace(mechanism, **changed) if changed else mechanism
-
-
-def exact_rates(
-    rates: Sequence[sp.Expr], states: Sequence[sp.Symbol], values: dict[sp.Symbol, float]
-) -> tuple[sp.Expr, ...]:
-    """Return the expressions of a vector field made exact; ``values`` are its parameters'.
-
-    Raises
-    ------
-    ModelError
-        For expressions that are not smooth, everywhere or at 0.
-    """
-    exact = tuple(exact_expression(sp.sympify(e)) for e in rates)
-    require_smooth("vector field", exact, states, orders=2)
-    target = dict.fromkeys(states, 0.0) | values
-    require_smooth("vector field", exact, states, at=target, orders=2)
-    return exact
 
 
 def is_odd(

@@ -21,17 +21,6 @@ from undertow.base.errors import InvalidInputError, MissingExtraError
 from undertow.symbolic import Tape
 from undertow.symbolic.tape import Assignment
 
-__all__ = [
-    "Arithmetic",
-    "ball",
-    "compile_outward",
-    "derivative_tape",
-    "exact_fraction",
-    "flint",
-    "lower_float",
-    "upper_float",
-]
-
 #: One call's arguments and results: arb balls, or Intervals.
 OutwardFunction = Callable[..., list[Any]]
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from undertow.base.errors import InvalidInputError
 from undertow.models.mechanism import TIME, Mechanism
 
-__all__ = ["require", "require_autonomous"]
-
 
 def require(
     good: object, what: str, value: object = None, limit: object = None, remedy: str = ""

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import FloatArray, Program, hull
 
-__all__ = ["Goal", "Settled", "halved", "over_boxes", "settle"]
-
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
 CHUNK, TRIED = 512, 16
 

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
 
-__all__ = ["Graph", "Program", "Span", "hull"]
-
 _NOWHERE: Mapping[int, int] = {}
 _NONE = np.empty(0, dtype=np.int64)
 

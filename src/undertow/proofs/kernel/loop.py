@@ -15,8 +15,6 @@ from undertow.proofs.kernel.graph import FloatArray, hull
 from undertow.proofs.kernel.model import Law, Matrix, Model, System, system
 from undertow.proofs.kernel.tube import Field, Tube
 
-__all__ = ["Arrival", "Loop"]
-
 #: Steps of one tube, and of all before the checker gives up; the thinnest part of the starts.
 LONGEST, MOST_STEPS, THINNEST = 2000, 500_000, 2.0**-16
 

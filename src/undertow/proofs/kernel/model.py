@@ -15,8 +15,6 @@ import numpy as np
 
 from undertow.proofs.kernel.graph import FloatArray, Graph, Span, hull
 
-__all__ = ["Algebra", "Law", "Model", "Nodes", "Quantity", "Sliding", "System"]
-
 Matrix = tuple[tuple[Fraction, ...], ...]
 Nodes = list[list[int]]
 

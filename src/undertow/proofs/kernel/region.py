@@ -20,8 +20,6 @@ from undertow.proofs.kernel.bound import Goal, Settled, halved, settle
 from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
 from undertow.proofs.kernel.model import Algebra, Law, Matrix, Model, Nodes, Sliding
 
-__all__ = ["Function", "Stage", "Stretch", "on_the_line"]
-
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
 CHUNK, TRIED = 4096, 16
 

@@ -17,8 +17,6 @@ import numpy as np
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import FloatArray, Graph, Program
 
-__all__ = ["Field", "Tube"]
-
 #: Coefficients of a step, the part of a step that may have a corner inside, and the shortest.
 ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
 

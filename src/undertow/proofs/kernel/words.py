@@ -8,8 +8,6 @@ from fractions import Fraction
 
 from undertow.proofs.kernel.model import Model, Quantity
 
-__all__ = ["inward", "limits", "region", "within"]
-
 Region = Mapping[str, tuple[Fraction, Fraction]]
 
 

@@ -25,8 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.intervals.require import require
 
-__all__ = ["LyapunovFunction", "directions", "extent", "first_crossing", "unit"]
-
 
 @dataclass(frozen=True)
 class LyapunovFunction:

@@ -21,8 +21,6 @@ from undertow.proofs.intervals.exact_model import (
 from undertow.proofs.intervals.require import require, require_autonomous
 from undertow.symbolic import Tape, compile_numpy
 
-__all__ = ["SurfaceMotion"]
-
 
 def unused(names: Iterable[str], taken: Collection[str]) -> list[str]:
     """Return made-up names, each with underscores after it until nothing else has it.

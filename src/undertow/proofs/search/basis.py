@@ -12,8 +12,6 @@ from undertow.models.mechanism import FloatArray
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
 
-__all__ = ["CLEARANCE", "POLE_PART", "Basis", "linear_part", "slowest_rate"]
-
 #: Candidate sets keep det f / det f(0) above this, and |y_0| below this part of the pole.
 CLEARANCE, POLE_PART = 0.01, 0.985
 

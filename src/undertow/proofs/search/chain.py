@@ -26,8 +26,6 @@ from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
 from undertow.proofs.search.linear_program import minimise_linear
 
-__all__ = ["SearchBudget", "grow"]
-
 Progress = Callable[[str], None]
 
 #: V where the ring begins; how far that edge may come in; t over the slowest rate.

@@ -18,8 +18,6 @@ from scipy.optimize import nnls
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.region.motion import SurfaceMotion
 
-__all__ = ["natural_stretch", "singular_distance_on_axis"]
-
 
 def singular_distance_on_axis(motion: SurfaceMotion, limit: float) -> float:
     """Return the smallest |y_0| ≤ limit at which the motion is singular, other y at 0."""

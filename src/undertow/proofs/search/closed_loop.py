@@ -25,8 +25,6 @@ from undertow.proofs.kernel.claims import ClosedLoop
 from undertow.proofs.kernel.loop import Loop
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
-__all__ = ["ProvedLoop", "follow", "prove_loop"]
-
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.
 MOTIONS, THINNEST = 24, 2.0**-13
 
@@ -87,7 +85,7 @@ def follow(
         States (K + 1, L, 2n), every so many steps, and times (K + 1,), s.
     """
     n = law.mechanism.n
-    eta, layer = np.split(law.reaching.vector(law.mechanism.m), 2)
+    eta, layer = law.reaching.per_surface(law.mechanism.m)
     step = float(min(0.005, np.min(layer / eta)))
 
     def rate(x: FloatArray) -> FloatArray:

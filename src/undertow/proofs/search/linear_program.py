@@ -12,8 +12,6 @@ import scipy.linalg
 
 from undertow.models.mechanism import FloatArray
 
-__all__ = ["minimise_linear"]
-
 
 def minimise_linear(
     c: FloatArray, A: FloatArray, b: FloatArray, *, iterations: int = 60, tolerance: float = 1e-8

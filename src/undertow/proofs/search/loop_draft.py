@@ -22,12 +22,10 @@ from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.closed_loop.loop import LoopMotion
 from undertow.proofs.closed_loop.run import run_tubes, start_tubes
-from undertow.proofs.closed_loop.terminal import TerminalSet
+from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.intervals.require import require
 from undertow.proofs.search.closed_loop import runge_kutta
 from undertow.proofs.search.terminal_set import jacobian, search_terminal
-
-__all__ = ["DraftedLoop", "draft_loop", "follow"]
 
 Progress = Callable[[str], None] | None
 

@@ -13,8 +13,6 @@ from undertow.proofs.region.lyapunov import LyapunovFunction, directions
 from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.basis import CLEARANCE, POLE_PART, slowest_rate
 
-__all__ = ["Start", "quadratic"]
-
 Start = Literal["far", "round", "balanced"]
 
 

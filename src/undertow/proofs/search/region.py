@@ -26,8 +26,6 @@ from undertow.proofs.search.chain import Progress, SearchBudget, grow
 from undertow.proofs.search.chart import natural_stretch
 from undertow.proofs.search.quadratic import Start, quadratic
 
-__all__ = ["ProvedRegion", "prove_region", "search_region"]
-
 Chain = tuple[LyapunovFunction, ...]
 
 #: How close to the largest level that the checker proves; the first step on the way there.

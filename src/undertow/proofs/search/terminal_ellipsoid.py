@@ -14,16 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base.errors import ModelError
-from undertow.law import ReachingLaw, Surface
+from undertow.law import ProvedSet, ReachingLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.terminal_ellipsoid import (
     ClosedLoopProgram,
-    ProvedEllipsoid,
     TerminalEllipsoid,
     prove,
 )
-
-__all__ = ["EllipsoidSearch", "search_for", "terminal_sets"]
 
 #: Smallest semi-axes, relative to the largest, that are tried first.
 FLOORS = (0.02, 0.005, 0.001)
@@ -229,7 +226,7 @@ def search_for(
 
 def terminal_sets(
     mechanism: Mechanism, surfaces: Iterable[Surface], reaching: ReachingLaw
-) -> tuple[ProvedEllipsoid, ...]:
+) -> tuple[ProvedSet, ...]:
     """Return the terminal sets of surfaces, one for each that a proof is found for.
 
     Raises
@@ -244,5 +241,5 @@ def terminal_sets(
         search = search_for(mechanism, surface, reaching)
         ellipsoid = None if search is None else search.largest()
         if ellipsoid is not None:
-            found.append(ProvedEllipsoid(surface, reaching, ellipsoid, mechanism.fingerprint))
+            found.append(ProvedSet(surface, reaching, ellipsoid, mechanism.fingerprint))
     return tuple(found)

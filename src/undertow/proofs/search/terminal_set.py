@@ -18,11 +18,10 @@ from undertow.base.errors import InfeasibleError, UnstableSurfaceError
 from undertow.base.verdict import Verdict
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.closed_loop.loop import LoopMotion
-from undertow.proofs.closed_loop.terminal import HOLD_SHARE, TerminalSet, verify_terminal
+from undertow.proofs.closed_loop.terminal import HOLD_SHARE, verify_terminal
+from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.region.lyapunov import directions, unit
-
-__all__ = ["jacobian", "search_terminal"]
 
 Progress = Callable[[str], None] | None
 

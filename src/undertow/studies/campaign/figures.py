@@ -16,7 +16,7 @@ from undertow.base import InvalidInputError
 from undertow.closed_loop.figures import COLOURS, display, figure_bytes, style
 from undertow.models import FloatArray
 from undertow.proofs.claims.certificate import read_certificate
-from undertow.proofs.claims.document import match_document
+from undertow.proofs.claims.verify import match
 from undertow.proofs.kernel.claims import SurfaceRegion, read_claim
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.studies.campaign.region_map import EVENTS, RegionMap
@@ -195,9 +195,10 @@ def proved_set(study: RegionMap, path: Path) -> LyapunovFunction:
     ArtefactError, CertificateError
         When it cannot be read, or is about another mechanism.
     """
-    document = read_certificate(path).document
+    certificate = read_certificate(path)
+    document = certificate.document
     if document is not None:
-        match_document(document, study.mechanism, own_parameters=True)
+        match(certificate, study.mechanism, own_parameters=True)
         for subject in document.subjects:
             law = np.array([float(v) for v in subject.law.numbers])
             if not np.array_equal(law[: len(study.surface.vector)], study.surface.vector):

@@ -1,0 +1,283 @@
+"""The searches for a plan: global from nothing, local from a plan in use.
+
+A global search first improves the best of some quadratic designs, which is an answer already, and
+then looks elsewhere: for a smooth cost by descents from the best of many draws, for the time of
+arrival by :mod:`undertow.optimiser.arrival`.  Of a smooth cost the best single surface comes first,
+where there may be several one after another: its copies are what they are improved from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from undertow.closed_loop import INADMISSIBLE, LANES
+from undertow.law import Plan, stability_margin
+from undertow.models import FloatArray
+from undertow.optimiser.arrival import SHORTER, ArrivalSearch
+from undertow.optimiser.cma_es import CMAES, minimise
+from undertow.optimiser.schedules import WIDE, WORTHWHILE, follow_earliest, lead_back
+from undertow.optimiser.task import Optimisation
+from undertow.optimiser.trust_region import TrustRegion
+
+#: Largest number of coordinates for a model search: its model has 55 terms then.
+MODEL_SIZE = 9
+
+#: Fruitless looks around that end a re-optimisation.
+LOOKS = 2
+
+#: Generations that end a search along a ridge, where gains come in jumps, unless together they
+#: gain this part of the time.
+PATIENCE, GAIN = 8, 3e-3
+
+#: Widest spread of a first population along a ridge.
+FAR = 0.25
+
+#: Evaluations at most that improve a plan along its ridge: of a first answer, and where searches
+#: for an earlier arrival lead nowhere.
+POLISH = 512
+
+#: A search for arrivals far and wide: its members, draws for each of them, and between which parts
+#: of the best time it begins: what arrives late may lead to what arrives early.
+CROWD, DRAWS, BEGINS = 96, 16, (1.0, 2.0)
+
+#: The same around the best plan: the spread is between two powers of ten; and how many of these
+#: searches in turn may lead nowhere before the next one far and wide.  With few parameters arrivals
+#: are isolated, and one is enough.
+FEW, AROUND, NEAR_AND_FAR, FRUITLESS = 24, 8, (-1.5, 0.3), 6
+
+#: A single surface is divided into so many, the first but one of which takes over after this part
+#: of the time in which nearly all of the cost, this part, is spent, each later one after twice the
+#: time; and the evaluations that improving them may take, per coordinate of a single one.
+DIVIDED, SOON, NEARLY_ALL, FINE = 5, 1 / 8, 0.95, 10240
+
+#: Evaluations for a single surface where no schedule arrives; twice as many without any plan.
+ALONE = 1024
+
+#: Time constants of the first surface after which, without any plan, an arrival is looked for.
+LONG = 10.0
+
+
+def _descend(
+    task: Optimisation, z: FloatArray, sigma: float, evaluations: int, tolerance: float
+) -> bool:
+    search = CMAES(z, sigma, task.optimiser.population, task.rng)
+    minimise(
+        search,
+        task.cost,
+        evaluations=min(evaluations, task.left),
+        tolerance=tolerance,
+        # Times of arrival improve in jumps: a pause is no sign that the search is done.
+        resolution=0.0 if task.optimiser.counts_time else task.resolution,
+        stop=lambda: task.left < search.population or task.late(),
+    )
+    return search.converged
+
+
+def global_search(task: Optimisation) -> Iterator[bool]:
+    """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
+    several = len(task.space.freedom.times) > 1 or task.optimiser.freedom.schedule > 0
+    several &= not task.optimiser.counts_time
+    if several:
+        task.switch_at((0.0,))
+        task.kept = min(FINE * task.space.size, 3 * task.left // 4)
+    z = task.firsts[: max(1, task.left)]
+    scores = task.cost(z)
+    if task.optimiser.counts_time:
+        yield _along_ridge(task, min(POLISH, task.left))
+        again, done = task.optimiser.freedom.schedule > 0, False
+        if again:
+            for done in follow_earliest(task, task.left // 2):
+                yield done
+        if done:
+            return
+        _arrive_earlier(task, wide=True, keep=POLISH + again * (task.left // 2))
+        yield _along_ridge(task, POLISH if again else task.left)
+        if again:
+            yield from follow_earliest(task)
+        return
+    if task.centre.size <= MODEL_SIZE:
+        _model_search(task, task.centre)
+        yield False
+    optimiser, rng, total = task.optimiser, task.rng, task.evaluations + task.left
+    draws = max(optimiser.population, total // 6)
+    drawn = task.firsts[0] + task.space.steps(rng, np.ones(draws))
+    drawn = drawn[: max(1, task.left)]
+    z, scores = np.vstack([z, drawn]), np.concatenate([scores, task.cost(drawn)])
+    starts = z[np.argsort(scores, kind="stable")[:3]]
+    share = (total - len(z)) // 4
+    for start in starts:
+        _descend(task, start, 0.3, share, 3e-3)
+    converged = _descend(task, task.centre, 0.03, share, 1e-4)
+    while task.left >= optimiser.population and not task.late():
+        start = task.centre + task.space.steps(rng, np.ones(1))[0]
+        _descend(task, start, 0.3, task.left, 3e-3)
+    yield converged
+    if several:
+        task.kept = 0
+        task.switch_at(_division(task))
+        yield _descend(task, task.centre, 0.1, task.left, 1e-4)
+
+
+def _division(task: Optimisation) -> tuple[float, ...]:
+    """When each of several surfaces is to take over from the best single one, s."""
+    period, best = task.optimiser.freedom.schedule, task.best
+    if not period:
+        return task.optimiser.freedom.times
+    assert best is not None  # cost() has run before
+    motion = task.loop.simulate(task.x, best, duration=task.horizon)
+    spent = np.searchsorted(motion.accumulated_cost, NEARLY_ALL * motion.cost)
+    first = period * max(1, round(SOON * float(motion.t[spent]) / period))
+    times = (round(first * 2**k, 9) for k in range(DIVIDED - 1))
+    return (0.0, *(t for t in times if t < task.horizon))
+
+
+def local_search(task: Optimisation, incumbent: Plan) -> bool:
+    """Start from the incumbent; look further away where that gains nothing."""
+    if task.optimiser.freedom.schedule:
+        task.switch_at(incumbent.times)
+    here = task.begin(incumbent)
+    if task.left < 2 * LANES or task.late():
+        task.score_incumbent(here)
+    if here.size > MODEL_SIZE:
+        task.score_incumbent(here)
+        _look_around(task, here)
+        return _descend(task, task.centre, 0.1, task.left, 1e-3)
+    search = _model_search(task, here)
+    if not task.best_cost < INADMISSIBLE:
+        _look_around(task, here)
+        return _descend(task, task.centre, 0.3, task.left, 1e-3)
+    # Look further away, and go where that leads, until it leads nowhere any more.
+    fruitless = 0
+    while fruitless < LOOKS and task.left >= LANES and not task.late():
+        before = task.best_cost
+        _look_around(task, task.centre)
+        fruitless += 1
+        if task.best_cost < (1.0 - WORTHWHILE) * before - task.resolution:
+            search = _model_search(task, task.centre)
+            fruitless = 0
+    return fruitless == LOOKS or search.converged
+
+
+def _model_search(task: Optimisation, here: FloatArray) -> TrustRegion:
+    """Follow a quadratic model of the cost from some coordinates on."""
+    search = TrustRegion(here, 0.1, LANES, task.rng)
+    minimise(
+        search,
+        task.cost,
+        evaluations=task.left,
+        tolerance=1e-4,
+        resolution=task.resolution,
+        relative=WORTHWHILE,
+        patience=2,
+        stop=task.late,
+    )
+    task.score_incumbent(here)  # where there was no time for a single generation
+    return search
+
+
+def search_earlier(task: Optimisation, incumbent: Plan) -> bool:
+    """Search for an earlier arrival along the thin set of plans that arrive directly.
+
+    Across that set the closest approach moves away from 0 at once, along it hardly: the
+    first population is shaped by ∂(closest state)/∂z.
+    """
+    here = task.begin(incumbent)
+    task.score_incumbent(here)
+    if task.optimiser.freedom.schedule:
+        if lead_back(task, incumbent):
+            return True
+        alone = ALONE if task.best_cost < INADMISSIBLE else 2 * ALONE
+        _arrive_earlier(task, keep=max(0, task.left - alone))
+        found = task.best
+        return found is not None and found is not incumbent and lead_back(task, found)
+    if not task.best_cost < INADMISSIBLE:
+        _look_around(task, here)
+    if not task.optimiser.aims:
+        return _along_ridge(task, task.left)
+    _along_ridge(task, min(POLISH, task.left))
+    return _arrive_earlier(task)
+
+
+def _along_ridge(task: Optimisation, most: int) -> bool:
+    """Search from the best plan along its ridge, with so many evaluations at most."""
+    here = task.centre
+    if not task.best_cost < INADMISSIBLE:
+        return _descend(task, here, 0.1, most, 1e-3)
+    d, loop = here.size, task.loop
+    if task.best_cost <= loop.step:  # all but there
+        return True
+    if most < 2 * d + LANES or task.late():
+        return False
+    probes = here + 1e-4 * np.vstack([np.eye(d), -np.eye(d)])
+    task.evaluations += len(probes)
+    near = task.space.batch(
+        task.x, probes, duration=1.05 * task.best_cost, terminal=0.0, seek=True
+    ).closest_x
+    slope = (near[:d] - near[d:]) / 2e-4
+    if not np.isfinite(slope).all():
+        return _descend(task, here, 0.1, most, 1e-3)
+    across, steepness, _ = np.linalg.svd(slope)
+    spread = np.full(d, FAR)
+    tight = loop.objective.terminal_radius / np.maximum(steepness, 1e-12)
+    spread[: len(tight)] = np.minimum(tight, FAR)
+    search = CMAES(here, 1.0, LANES, task.rng, (across * spread**2) @ across.T)
+    minimise(
+        search,
+        task.cost,
+        evaluations=min(most, task.left),
+        tolerance=1e-4,
+        relative=GAIN,
+        patience=PATIENCE,
+        stop=lambda: task.left < search.population or task.late(),
+    )
+    return search.converged
+
+
+def _look_around(task: Optimisation, here: FloatArray) -> None:
+    wide = min(task.left, LANES)
+    if wide > 0:
+        around = here + task.space.steps(task.rng, np.geomspace(0.1, 1.0, wide))
+        task.cost(around, hopeless=1.0)
+
+
+def _arrive_earlier(task: Optimisation, wide: bool = False, keep: int = 0) -> bool:
+    """Search for earlier arrivals around the best plan, or first far and wide.
+
+    And far and wide again when that leads nowhere any more; so many evaluations are left over.
+    """
+    rng, space, spent = task.rng, task.space, -1
+    search = ArrivalSearch(
+        task.states,
+        lambda z: task.cost(z) < INADMISSIBLE,  # those that arrive did so on the first plant
+        0.9 * task.loop.objective.terminal_radius,
+        lambda evaluations: task.left < evaluations + keep or task.late(),
+    )
+    most = FRUITLESS if task.optimiser.aims else 1
+    fruitless = most if wide else 0
+    while task.left > keep and not task.late() and task.evaluations > spent:
+        before, spent = task.best_cost, task.evaluations
+        if before <= task.loop.step:  # all but there
+            return True
+        if not before < INADMISSIBLE or fruitless == most:
+            z = task.firsts[0] + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
+            known = before < INADMISSIBLE
+            search.run(z, rng.uniform(*BEGINS) * before if known else _long(task), CROWD)
+            fruitless = 0
+            continue
+        spread = 10.0 ** rng.uniform(*NEAR_AND_FAR, FEW * AROUND)
+        search.run(task.centre + space.steps(rng, spread), SHORTER * before, FEW)
+        fruitless += 1
+        if task.best_cost < (1.0 - WORTHWHILE) * before:
+            fruitless = 0
+        elif fruitless == 1:
+            _along_ridge(task, min(POLISH, task.left - keep))
+    return False
+
+
+def _long(task: Optimisation) -> float:
+    """A time, s, in which something should have arrived."""
+    anchor = task.optimiser.anchor
+    rate = float(stability_margin(task.loop.mechanism, anchor.vector[None])[0])
+    return min(task.horizon, LONG / max(rate, LONG / task.horizon))
