@@ -366,3 +366,38 @@ def test_ten_frames_lie_between_simulate_and_the_kernel(
     outside = sum(1 for _ in traceback.walk_stack(sys._getframe()))
     cascade.simulate(phi=ut.deg(20))
     assert 5 < max(depths) <= 10
+
+
+def test_a_run_that_ends_early_is_planned_to_arrive_by_then(rig: ut.Mechanism) -> None:
+    """The first plan looks no farther than the run: as if the horizon were as short."""
+    given: Any = {"cold": ut.Budget(600), "warm": ut.Budget(96), "belief": "exact"}
+    x = rig.state(phi=ut.deg(30))
+    run = ut.Cascade(rig, ut.MinimumEnergy(horizon=10.0), **given).simulate(x, duration=1.5)
+    by_horizon = ut.Cascade(rig, ut.MinimumEnergy(horizon=1.5), **given).simulate(x)
+    assert run.reached
+    assert run.updates[0].admission.reason == "first optimum"
+    assert run.updates[0].predicted == by_horizon.updates[0].predicted
+    assert run.cost == pytest.approx(by_horizon.cost, rel=1e-3)
+    assert np.nanmin(run.lemma3_slack) > -1e-6
+    assert np.isfinite(run.lemma3_slack).all()
+
+
+def test_a_run_that_ends_before_anything_can_arrive_begins_all_the_same(
+    cascade: ut.Cascade,
+) -> None:
+    run = cascade.simulate(phi=ut.deg(30), duration=0.2)
+    assert run.time == pytest.approx(0.2)
+    assert run.trajectory.event.name == "HORIZON"
+    with pytest.raises(InvalidInputError, match="duration of a run"):
+        cascade.simulate(phi=ut.deg(30), duration=1e-4)
+
+
+def test_a_target_that_the_inputs_cannot_hold_is_named(rig: ut.Mechanism) -> None:
+    """No search finds a surface then; to start closer, as other refusals advise, would not help."""
+    pushed = rig.disturbed({"theta": 0.5})
+    need = float(abs(ut.modelling.holding_input(pushed)[0]))
+    weak = pushed.with_input_limit(0.9 * need)
+    cascade = ut.Cascade(weak, ut.MinimumTime(horizon=2.0), cold=ut.Budget(64), belief="exact")
+    with pytest.raises(InfeasibleError) as caught:
+        cascade.simulate(phi=0.1)
+    assert f"voltage of {need:.3g} V, and its limit is {0.9 * need:.3g}" in caught.value.remedy

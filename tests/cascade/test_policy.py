@@ -13,6 +13,7 @@ from undertow.base import InvalidInputError
 RIG = ut.mechanisms.rotary_pendulum()
 GOAL = ut.objective_for(RIG, "bench-energy", horizon=10.0)
 SURFACE = ut.first_surface(RIG)
+FREE = RIG.with_input_limit(np.inf)
 
 
 def play(policy: ut.Policy, env: Any, **start: float) -> tuple[float, float, str]:
@@ -108,6 +109,8 @@ def test_stable_baselines3_s_loop_over_a_vector_balances() -> None:
         (lambda: ut.policy(ut.ClosedLoop(RIG), SURFACE, period=0.01), "below 2 ε/η = 0.01"),
         (lambda: ut.policy(ut.Cascade(RIG), period=0.003), "a whole part of the cascade's"),
         (lambda: ut.policy(ut.ClosedLoop(RIG), SURFACE).predict(np.zeros((2, 4)), ()), "episodes"),
+        # Its actions, inputs over their limits, were all 0.
+        (lambda: ut.policy(ut.ClosedLoop(FREE), SURFACE), "an action of 1 is the whole input"),
     ],
 )
 def test_bad_arguments_are_refused(made: Any, said: str) -> None:

@@ -399,6 +399,8 @@ def test_surface_words_of_several_inputs() -> None:
     np.testing.assert_array_equal(surface.alpha_a, -np.eye(2))
     with pytest.raises(InvalidInputError, match="equal length"):
         parse_surface(pair, "lambda_a=-2,0.5;0 alpha_u=1;2 lambda_u=4;5")
+    with pytest.raises(InvalidInputError, match="'lambda_a' twice"):
+        parse_surface(pair, f"{text} lambda_a=-1,0;0,-1")
 
 
 @pytest.mark.slow

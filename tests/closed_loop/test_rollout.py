@@ -23,10 +23,11 @@ from support import (
     runge_kutta,
 )
 from undertow.base import InvalidInputError
-from undertow.closed_loop import INADMISSIBLE, UNSTABLE, Event
+from undertow.closed_loop import INADMISSIBLE, UNSTABLE, Event, simulate_along
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import Plan
 from undertow.models import TIME, FloatArray
+from undertow.plants import IdealRig
 
 PUSH = ut.Parameter("push", 0.05, "N m", "size of the disturbance")
 
@@ -794,7 +795,7 @@ def refusals(rig: ut.Mechanism, s: ut.Surface) -> dict[str, tuple[Callable[[], o
         "negative hold": (lambda: ut.ClosedLoop(rig, zoh_steps=-1), "zoh_steps.*-1"),
         "plant": (
             lambda: ut.ClosedLoop(rig, plant=random_mechanism(3, 1)),
-            "n = 3, m = 1.*n = 2, m = 1",
+            r"theta \(rad\), phi \(rad\), voltage \(V\), in this order",
         ),
         "NaN state": (lambda: loop.simulate([0.0, math.nan, 0.0, 0.0], s), "phi.*nan"),
         "surface": (lambda: loop.simulate(x0, random_surface(3, 1)), "n = 3, m = 1"),
@@ -868,3 +869,41 @@ def test_bad_input_is_refused_with_value_and_limit(rig: ut.Mechanism, quick: ut.
         assert re.search(message, str(caught.value)), (what, str(caught.value))
         assert caught.value.value is not None, what
         assert caught.value.limit is not None, what
+
+
+@pytest.mark.parametrize("rtol", [0.0, 1e-9])
+def test_a_controller_asks_for_no_more_than_it_believes_the_motor_can_give(
+    rig: ut.Mechanism, quick: ut.Surface, rtol: float
+) -> None:
+    """The law clips at the belief's limit, the plant's motor at its own: what the belief allows."""
+    x, weak, goal = rig.state(phi=0.3), rig.with_input_limit(3.0), ut.MinimumTime(horizon=10.0)
+    alone = ut.ClosedLoop(weak, goal, rtol=rtol).simulate(x, quick)
+    strong = ut.ClosedLoop(weak, goal, plant=rig, rtol=rtol).simulate(x, quick)
+    assert abs(alone.u).max() == abs(strong.u).max() == 3.0
+    np.testing.assert_array_equal(strong.x, alone.x)
+    deceived = ut.ClosedLoop(rig, goal, plant=weak, rtol=rtol).simulate(x, quick)
+    np.testing.assert_array_equal(deceived.x, alone.x)
+    batch = ut.ClosedLoop(weak, goal, plant=rig, rtol=rtol).batch(x, quick)
+    assert batch.time[0] == pytest.approx(alone.time, rel=1e-4)
+
+
+def test_along_a_reference_a_controller_keeps_to_its_belief_s_limit(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    ((_, motion),) = ut.Reference.sine(0.5, theta=0.8).legs(rig, 2.0)
+    loop = ut.ClosedLoop(rig.with_input_limit(3.0), plant=rig)
+    moved = simulate_along(loop, rig.state(phi=0.2), Plan.of(quick), motion, duration=1.0)
+    assert abs(moved.u).max() == 3.0
+
+
+@pytest.mark.parametrize("other", ["cart_pendulum", "acrobot", "ball_and_beam"])
+def test_a_plant_that_is_another_mechanism_is_refused(rig: ut.Mechanism, other: str) -> None:
+    """Two coordinates and one input, too: a law for the one does nothing sensible to the other."""
+    plant = getattr(ut.mechanisms, other)()
+    for made in (
+        lambda: ut.ClosedLoop(rig, plant=plant),
+        lambda: ut.compare(rig, [ut.lqr(rig)], plants=[plant], phi=0.1),
+        lambda: ut.run(ut.Cascade(rig), IdealRig(plant), phi=0.1, simulated=True),
+    ):
+        with pytest.raises(InvalidInputError, match=r"must be theta .rad., phi .rad., voltage"):
+            made()

@@ -178,3 +178,25 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(MissingExtraError, match=r"undertow\[gym\]"):
         ut.environment(RIG)
+
+
+def test_episodes_begin_within_the_travel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The usual start may be mirrored only where that is inside, too: travel need not be even."""
+    cart = ut.mechanisms.cart_pendulum()
+    track = replace(cart.coordinates[0], low=-0.1, high=1.5)
+    uneven = replace(cart, coordinates=(track, cart.coordinates[1]), start={"x": 0.5, "phi": 0.1})
+    task = ut.export.BalancingTask(uneven)
+    rng = np.random.default_rng(0)
+    begins = np.array([task.start(rng) for _ in range(200)])
+    assert begins[:, 0].min() >= 0.25
+    assert begins[:, 0].max() <= 0.5
+    even = ut.export.BalancingTask(replace(cart, start={"x": 0.5, "phi": 0.1}))
+    assert (np.array([even.start(rng)[0] for _ in range(20)]) < 0).any()
+
+
+def test_what_does_not_end_an_episode_is_observed_as_it_is() -> None:
+    """Without travel among the constraints, positions beyond it are not cut off."""
+    cart = ut.mechanisms.cart_pendulum()
+    kept, free = (ut.export.BalancingTask(cart, ut.MinimumTime(travel=t)) for t in (True, False))
+    assert kept.box[1][0] == 1.5
+    assert free.box[1][0] == free.escape

@@ -146,3 +146,14 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for call in (lambda: ut.nlsys(RIG), lambda: ut.loop_margins(RIG, SURFACE)):
         with pytest.raises(MissingExtraError, match=r"undertow\[interop\]"):
             call()
+
+
+def test_a_loop_as_a_system_keeps_to_the_smaller_limit() -> None:
+    """A plant with a weaker motor than the law believes: what moves is what our loop moves."""
+    weak = RIG.with_input_limit(2.0)
+    for belief, plant in ((RIG, weak), (weak, RIG)):
+        loop = ut.ClosedLoop(belief, ut.MinimumTime(), plant=plant)
+        run = loop.simulate(RIG.state(phi=0.2), SURFACE, duration=0.5)
+        assert abs(run.u).max() == 2.0
+        found = moved(ut.nlsys(loop, SURFACE), run.t, run.x[0])
+        np.testing.assert_allclose(found.states.T, run.x, atol=1e-6, rtol=0)

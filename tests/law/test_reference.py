@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -182,3 +183,11 @@ def test_a_function_of_ones_own_is_differentiated_twice() -> None:
         assert r == pytest.approx(0.3 * np.sin(t))
         assert v == pytest.approx(0.3 * np.cos(t), abs=1e-6)
         assert a == pytest.approx(-0.3 * np.sin(t), abs=1e-6)
+
+
+def test_a_ramp_takes_its_ends_as_any_pair() -> None:
+    pairs: list[Any] = [(0.2, 1.0), [0.2, 1.0], np.array([0.2, 1.0])]
+    first, *others = (motion(RIG, ut.Reference.ramp(1.0, theta=ends), 2.0).q for ends in pairs)
+    assert first[0, 0] == pytest.approx(0.2)
+    for other in others:
+        np.testing.assert_array_equal(other, first)

@@ -24,7 +24,7 @@ from support import (
     runge_kutta,
 )
 from undertow.base import InvalidInputError, ModelError, UndertowError
-from undertow.models import TIME, FloatArray
+from undertow.models import TIME, FloatArray, controllability
 from undertow.symbolic import Tape
 
 shapes = pytest.mark.parametrize(("n", "m"), SHAPES)
@@ -478,3 +478,50 @@ def test_bad_input_is_refused_with_value_limit_and_remedy(what: str) -> None:
     assert error.remedy, str(error)
     assert error.remedy in str(error)
     assert isinstance(error, UndertowError)
+
+
+# -- scales ----------------------------------------------------------------------------------
+
+
+def scaled(mass: float, length: float, lean: float) -> ut.Mechanism:
+    """A cart with a uniform rod of this mass and half-length, whose upright is at phi = −lean."""
+    x, phi = ut.Coordinate("x", "m"), ut.Coordinate("phi")
+    v, a, w = x.velocity, phi.symbol + lean, phi.velocity
+    return ut.Mechanism.from_energies(
+        "scaled",
+        [x, phi],
+        [ut.Input("force", "N", 25 * mass * 9.81)],
+        kinetic=3 * mass * v**2 + mass * length * sp.cos(a) * v * w + mass * length**2 * w**2,
+        potential=mass * 9.81 * length * sp.cos(a),
+        dissipation=mass * v**2,
+    )
+
+
+@pytest.mark.parametrize(
+    ("mass", "length"), [(2e-8, 1e-3), (0.1, 0.3), (3e3, 10.0)], ids=["20 µg", "100 g", "3 t"]
+)
+def test_what_rests_at_its_target_is_a_matter_of_no_scale(mass: float, length: float) -> None:
+    """0.001 rad off the upright is no equilibrium, of 20 µg neither; the upright is one, of 3 t."""
+    upright = scaled(mass, length, 0.0)
+    assert ut.check_mechanism(upright, compiled=False).passed
+    modes = np.sort(upright.linearise().A.real.ravel())
+    assert np.isfinite(modes).all()
+    leaning = scaled(mass, length, 1e-3)
+    with pytest.raises(ModelError, match=r"phi=-0\.00"):
+        ut.first_surface(leaning)
+    failed = ut.check_mechanism(leaning, compiled=False).failures
+    assert [check.name for check in failed] == [
+        "target x = 0 is an equilibrium of the free coordinates, |f_u(0, 0)|"
+    ]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
+def test_how_controllable_a_mechanism_is_does_not_depend_on_the_unit_of_its_input(
+    unit: float,
+) -> None:
+    cart = ut.mechanisms.cart_pendulum()
+    other = ut.Mechanism(
+        "other", cart.coordinates, cart.inputs, cart.mass_matrix, cart.force,
+        sp.ImmutableDenseMatrix(cart.input_matrix * unit), parameters=cart.parameters,
+    )  # fmt: skip
+    assert controllability(other) == pytest.approx(controllability(cart), rel=1e-9)

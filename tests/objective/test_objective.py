@@ -196,3 +196,26 @@ def test_bad_objectives_are_refused_with_value_limit_and_remedy(
     assert caught.value.value is not None
     assert caught.value.limit is not None
     assert caught.value.remedy
+
+
+def test_a_constraint_of_one_s_own_may_say_where_it_comes_from(rig: ut.Mechanism) -> None:
+    """Whatever has a source was taken for declared travel, and dropped in silence."""
+    cart = ut.mechanisms.cart_pendulum()
+    mine = ut.Constraint("slow", lambda v: v.x_dot**2 - 4, source="data sheet, page 3")
+    goal = ut.MinimumTime(constraints=(mine,))
+    for once in (goal.on(cart), goal.on(cart).on(cart), ut.ClosedLoop(cart, goal).objective):
+        assert once.constraints[0] is mine
+        assert [c.name for c in once.constraints] == ["slow", "|x| ≤ 1.425 m"]
+    assert goal.on(rig).constraints == (mine,)
+    assert "slow: data sheet, page 3" in goal.meaning(cart)
+
+
+@pytest.mark.parametrize("field", ["hard_input", "travel", "unit", "name"])
+def test_every_field_of_an_objective_is_checked(field: str) -> None:
+    """``hard_input="no"`` counted as yes, but for least energy, which checked all of its fields."""
+    wrong = 3 if field in ("unit", "name") else "no"
+    with pytest.raises(InvalidInputError, match=f"{field} of (Objective|MinimumTime)"):
+        ut.MinimumTime(**{field: wrong})  # type: ignore[arg-type]
+    given = {"name": "mine", "stage": lambda v: v.phi**2} | {field: wrong}
+    with pytest.raises(InvalidInputError, match=f"{field} of Objective"):
+        ut.Objective(**given)  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -125,9 +126,12 @@ def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path:
     ]  # fmt: skip
     assert report.stopped_by == "operator: stop"
     assert math.cos(end[1]) > 0.999
-    again = replay(tmp_path / "run.db")
+    again = replay(str(tmp_path / "run.db"))
     assert again.identical
     assert again.judged > 10
+    assert re.fullmatch(
+        r"Replay\(run.db, \d+ steps, 0 differ, \d+ answers, 0 judged.*", repr(again)
+    )
 
 
 def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early() -> None:

@@ -240,3 +240,20 @@ def test_the_cascade_bears_dry_friction_that_its_soft_surfaces_do_not() -> None:
     assert np.abs(outcome.record.truth[last, 0]).max() < math.radians(20)
     assert estimator.learnt is not None
     assert np.abs(estimator.learnt.offset).max() < 1.0
+
+
+def test_a_regulator_acts_about_the_input_that_holds_the_target(arm: ut.Mechanism) -> None:
+    """Where something pushes at the target u = k x stays off it; and an input may have no limit."""
+    pushed = arm.disturbed({"theta": 0.2})
+    held = ut.modelling.holding_input(pushed)
+    assert abs(held[0]) > 0.5
+    regulator = clipped_regulator(pushed)(np.zeros(4))
+    assert regulator(0.0, np.zeros(4)) == pytest.approx(held)
+    x, h = pushed.state(phi=0.05), 1e-3
+    for _ in range(8000):  # sampled, each sample by the midpoint rule
+        u = regulator(0.0, x)
+        ahead = x + h / 2 * np.concatenate([x[2:], pushed.accelerations(0.0, x, u)])
+        x = x + h * np.concatenate([ahead[2:], pushed.accelerations(0.0, ahead, u)])
+    assert np.linalg.norm(x) < 1e-3
+    free = clipped_regulator(arm.with_input_limit(math.inf))(np.zeros(4))
+    assert np.isfinite(free(0.0, arm.state(phi=0.1))).all()

@@ -524,8 +524,15 @@ class Cascade:
         target: ReferenceMotion | None = None,
         t: float = 0.0,
         before: CascadeState | None = None,
+        longest: float = math.inf,
     ) -> tuple[CascadeState, Proposal]:
-        """:meth:`start`, or :meth:`retarget` from ``before``, to a leg that was checked before."""
+        """:meth:`start`, or :meth:`retarget` from ``before``, to a leg that was checked before.
+
+        The first plan is to arrive within ``longest``, s, where one does, else within the
+        objective's horizon.
+        """
+        absolute, horizon = x, min(longest, self.objective.horizon)
+        short = horizon < self.objective.horizon
         if target is not None:
             x = self.mechanism.check_state(x) - target.state(t)
         number, known = 0, None if self.known is None else self.known.prior
@@ -548,9 +555,10 @@ class Cascade:
             if fixed is not None:
                 planner = self.optimiser.on(self.about(fixed, target, t))
             proposal = planner.propose(
-                x, incumbent=None, horizon=None, sequence=0, computed_for=t, resolution=0.0
-            )
-            plan, horizon = proposal.plan, self.objective.horizon
+                x, incumbent=None, horizon=horizon if short else None, sequence=0, computed_for=t,
+                resolution=0.0,
+            )  # fmt: skip
+            plan = proposal.plan
             if plan is None:
                 tries.append(FirstTry(3, math.inf, proposal))
                 continue
@@ -565,20 +573,23 @@ class Cascade:
             if good:
                 break
         best = min(tries, key=lambda one: (one.rank, one.cost))
+        if best.proposal.plan is None and short:
+            return self.start_to(absolute, target, t, before)
         cost, proposal = best.cost, best.proposal
         plan = proposal.required(here).plan
         assert plan is not None  # required
         if target is not None and target.moves:
-            plan, cost = self._first_along(whole, plan, x, target, t)
+            plan, cost = self._first_along(whole, plan, x, target, t, horizon)
         begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
         return begun, replace(proposal, sequence=number)
 
     def _first_along(
-        self, loop: ClosedLoop, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float
-    ) -> tuple[Plan, float]:
+        self, loop: ClosedLoop, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float,
+        horizon: float,
+    ) -> tuple[Plan, float]:  # fmt: skip
         """The first plan, or the designed surface where that is better along a reference."""
         plans = [plan, Plan.of(self.optimiser.anchor)]
-        costs = _costs_along(loop, error, plans, target, t, self.objective.horizon)
+        costs = _costs_along(loop, error, plans, target, t, horizon)
         best = int(np.argmin(costs))
         return plans[best], costs[best]
 
@@ -812,7 +823,8 @@ class Cascade:
             The truth; the belief by default.  One that changes while it runs is a mapping from the
             time, s, to what the plant is from then on.
         duration
-            Longest run, s; the objective's horizon by default.  Predictions end there too.
+            Longest run, s; the objective's horizon by default.  Predictions end there too, but
+            for a first plan where none arrives so soon.
         target
             Where to, x = 0 by default: a mapping of coordinates to positions, rad or m;
             :class:`undertow.SetPoints`, which jump; or a :class:`undertow.Reference`, which moves.
@@ -843,7 +855,7 @@ class Cascade:
             proposal: Proposal | None = None
             if memory is None or t == leg.begin:
                 since = t
-                memory, proposal = self.start_to(x, leg.target, t, memory)
+                memory, proposal = self.start_to(x, leg.target, t, memory, leg.longest)
                 admission = self.first_admission(memory, x, leg.longest)
             elif np.linalg.norm(memory.error(t, x)) <= self.objective.terminal_radius:
                 since = t

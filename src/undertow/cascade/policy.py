@@ -6,6 +6,7 @@ goes in and out as ``state``, one entry for each episode, as that of a recurrent
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -205,8 +206,8 @@ def policy(
     Raises
     ------
     InvalidInputError
-        For a loop without a surface, a cascade with one, and a period that the law cannot bear or
-        that does not divide the cascade's.
+        For a loop without a surface, a cascade with one, an input without a limit, and a period
+        that the law cannot bear or that does not divide the cascade's.
 
     Examples
     --------
@@ -227,6 +228,14 @@ def policy(
             remedy="ut.policy(loop, surface), or ut.policy(cascade)",
         )
     mechanism = controller.mechanism
+    for given in mechanism.inputs:
+        if not math.isfinite(given.limit):
+            raise InvalidInputError(
+                f"limit of input '{given.name}' of '{mechanism.name}'",
+                value=given.limit,
+                limit="finite: an action of 1 is the whole input",
+                remedy=f"Give the mechanism an Input({given.name!r}, limit=…)",
+            )
     controller.reaching.check_period("period of a policy", period, mechanism.m)
     if cascade is not None:
         count = cascade.period / period

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from undertow.base import InvalidInputError, Verdict, checked, positive, write_file
+from undertow.base import InvalidInputError, Verdict, at_least, checked, positive, write_file
 from undertow.cascade.targets import legs_of
 from undertow.closed_loop import ClosedLoop, Event, Trajectory, simulate_along
 from undertow.closed_loop.gate import Admission
@@ -219,6 +219,7 @@ def legs_to(
     last = goal.times[-1] if isinstance(goal, SetPoints) else 0.0
     total = last + cascade.objective.horizon if duration is None else duration
     positive("duration of a run, s", total, "Leave it out for the objective's horizon")
+    at_least("duration of a run, s", total, cascade.step, "Shorter than a step nothing moves")
     if goal is None:
         return [Leg(0.0, total, total)]
     motions = legs_of(cascade.mechanism, cascade.objective, goal, total)

@@ -15,7 +15,14 @@ import numpy as np
 import sympy as sp
 
 from undertow.base import ModelError, at_least, checked
-from undertow.models import FloatArray, Mechanism, controllability, has_linear_model, linearise
+from undertow.models import (
+    FloatArray,
+    Mechanism,
+    controllability,
+    force_scale,
+    has_linear_model,
+    linearise,
+)
 from undertow.models.importers.equations import nearest_equilibrium
 from undertow.symbolic import Tape, compile_numpy
 
@@ -325,7 +332,7 @@ def _target(mechanism: Mechanism) -> tuple[Check, ...]:
     n, m = mechanism.n, mechanism.m
     rest = mechanism.f(np.zeros(2 * n))
     outside = [c.name for c in mechanism.coordinates if not c.low <= 0 <= c.high]
-    left = float(np.abs(rest[m:]).max())
+    left = float(np.abs(rest[m:]).max()) / force_scale(mechanism)
     B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=np.float64)
     effort = float(np.max(np.abs(np.linalg.solve(B, rest[:m])) / mechanism.input_limits))
     checks = [
@@ -337,7 +344,7 @@ def _target(mechanism: Mechanism) -> tuple[Check, ...]:
         _small(
             "target x = 0 is an equilibrium of the free coordinates, |f_u(0, 0)|",
             left,
-            "N m or N",
+            "of |f| at rest",
             ("" if left <= _ROUNDING else f"{nearest_equilibrium(mechanism)}. ")
             + "Shift the coordinates: undertow.models.importers.find_equilibrium and move_target",
         ),

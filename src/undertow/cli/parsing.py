@@ -356,8 +356,7 @@ def parse_surface(mechanism: Mechanism, text: str) -> Surface:
     blocks: dict[str, FloatArray] = {"alpha_a": -np.eye(mechanism.m)}
     names = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
     example = "lambda_a=-0.5 alpha_u=5 lambda_u=10"
-    for word in text.split():
-        name, value = _split(word, example)
+    for name, value in _pairs(text.split(), example).items():
         one_of("surface block", name, names)
         rows = [
             [_number(v, f"surface block {name}") for v in r.split(",")] for r in value.split(";")

@@ -174,7 +174,7 @@ def simulate_along(
     rows, code = _module(loop).along(
         np.array(x, dtype=float), motion.rows(halves), lanes, segments,
         np.append(plain.parameter_values, np.zeros(3 * plain.n)), plant.parameter_values,
-        plant.input_limits, start, loop.step, steps, loop.zoh_steps,
+        loop.input_limits, start, loop.step, steps, loop.zoh_steps,
         loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, record,
     )  # fmt: skip
     t = start + np.arange(rows) * loop.step

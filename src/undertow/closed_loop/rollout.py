@@ -92,7 +92,8 @@ class ClosedLoop:
     reaching
         Reaching law; its gains can be overridden for each rollout.
     plant
-        The truth.  The belief itself by default; must have as many coordinates and inputs.
+        The truth.  The belief itself by default; must have the same coordinates and inputs.  Its
+        motors may be weaker than the belief says; stronger ones are not asked for more.
     step
         Runge-Kutta step of batches, and between the rows of a recorded motion, s.
     zoh_steps
@@ -145,7 +146,7 @@ class ClosedLoop:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse steps that the boundary layer cannot bear and plants of another shape."""
+        """Refuse steps that the boundary layer cannot bear and plants of another mechanism."""
         check_fields(self)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         for name, remedy in (
@@ -169,13 +170,7 @@ class ClosedLoop:
                 limit="one plant, or an ensemble",
                 remedy="Leave one of them out",
             )
-        plant = self.truth
-        if (plant.n, plant.m) != (self.mechanism.n, self.mechanism.m):
-            raise InvalidInputError(
-                f"plant '{plant.name}'",
-                value=f"n = {plant.n}, m = {plant.m}",
-                limit=f"n = {self.mechanism.n}, m = {self.mechanism.m} like the belief",
-            )
+        self.mechanism.check_plant(self.truth)
 
     def __repr__(self) -> str:
         """Show belief, truth where it is another one, and objective."""
@@ -193,6 +188,14 @@ class ClosedLoop:
     def truth(self) -> Mechanism:
         """The plant that moves; of an ensemble its structure."""
         return self._given or self.mechanism
+
+    @property
+    def input_limits(self) -> FloatArray:
+        """What can reach the plant, (m,): the law keeps to the belief's limits, a motor to its own.
+
+        ``hard_input`` asks that the law demands no more than this.
+        """
+        return np.minimum(self.mechanism.input_limits, self.truth.input_limits)
 
     @property
     def _given(self) -> Mechanism | None:
@@ -221,7 +224,7 @@ class ClosedLoop:
         return LoopNumbers(
             truth.parameter_values,
             belief.parameter_values,
-            truth.input_limits,
+            self.input_limits,
             self.reaching.vector(belief.m),
             coupling(belief, np.zeros(belief.n)),
         )

@@ -36,7 +36,14 @@ from undertow.base import (
 )
 from undertow.closed_loop import Ensemble, Risk
 from undertow.law import LawLayout
-from undertow.models import AT_REST, FloatArray, Mechanism, linear_accelerations, number_of
+from undertow.models import (
+    AT_REST,
+    FloatArray,
+    Mechanism,
+    force_scale,
+    linear_accelerations,
+    number_of,
+)
 
 #: Standard deviation of what is evenly spread over ± a tolerance, as a part of it.
 EVEN = 1.0 / math.sqrt(3.0)
@@ -123,7 +130,7 @@ def _moves_target(mechanism: Mechanism, place: int, change: float) -> bool:
     values = mechanism.parameter_values.copy()
     values[place] += change
     force = mechanism.function("force")(0.0, *np.zeros(2 * mechanism.n), *values)
-    return max(abs(float(f)) for f in force[mechanism.m :]) > AT_REST
+    return max(abs(float(f)) for f in force[mechanism.m :]) > AT_REST * force_scale(mechanism)
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,17 +133,30 @@ class BalancingTask:
 
     @cached_property
     def box(self) -> tuple[FloatArray, FloatArray]:
-        """Bounds of what is observed, (2n,) each: the travel, elsewhere ``escape``."""
+        """Bounds of what is observed, (2n,) each: travel that ends an episode, else ``escape``."""
         low = np.full(2 * self.mechanism.n, -self.escape)
         high = -low
-        for i, c in enumerate(self.mechanism.coordinates):
+        for i, c in enumerate(self.mechanism.coordinates if self.problem.travel else ()):
             low[i], high[i] = max(low[i], c.low), min(high[i], c.high)
         return low, high
 
     def start(self, rng: np.random.Generator) -> FloatArray:
-        """Draw an initial state, (2n,): the usual one times r, ½ ≤ |r| ≤ 1, of either sign."""
+        """Draw an initial state, (2n,): the usual one times r, ½ ≤ |r| ≤ 1.
+
+        Of either sign, where the constraints allow both.
+        """
         r = rng.uniform(-0.5, 0.5)
-        return np.asarray(self.mechanism.usual_start * (r + math.copysign(0.5, r)))
+        r += math.copysign(0.5, r)
+        return np.asarray(self.mechanism.usual_start * (r if self._mirrors else abs(r)))
+
+    @cached_property
+    def _mirrors(self) -> bool:
+        """Whether an episode may begin at the mirror image of the usual start."""
+        try:
+            self.problem.check_start(self.mechanism, -self.mechanism.usual_start)
+        except InvalidInputError:
+            return False
+        return True
 
     def inputs(self, actions: NDArray[Any]) -> FloatArray:
         """Return the inputs of actions in [−1, 1], (…, m), in the units of the inputs."""

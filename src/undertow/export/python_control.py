@@ -89,11 +89,11 @@ def nlsys(what: Mechanism | ClosedLoop, surfaces: Surface | Plan | None = None) 
         InnerLoop(loop.mechanism, surface, law)
         for surface, law in zip(plan.surfaces, plan.laws(loop.reaching), strict=True)
     ]
-    times, flow = np.array(plan.times), _flow(loop.truth)
+    times, flow, limits = np.array(plan.times), _flow(loop.truth), loop.input_limits
 
     def decided(t: float, x: FloatArray) -> FloatArray:
         law = laws[int(np.searchsorted(times, t, side="right")) - 1] if t > 0 else laws[0]
-        return law(np.ascontiguousarray(x))
+        return np.clip(law(np.ascontiguousarray(x)), -limits, limits)
 
     return control.nlsys(
         lambda t, x, d, _params: flow(t, x, decided(t, x) + d),

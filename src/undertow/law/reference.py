@@ -428,7 +428,7 @@ class Reference:
         positive("length of a ramp, s", seconds)
         paths = {}
         for name, end in by_names("ends of a ramp", ends).items():
-            low, high = end if isinstance(end, tuple) else (0.0, end)
+            low, high = end if isinstance(end, Sequence | np.ndarray) else (0.0, end)
             paths[name] = Ramp(low, high, start, seconds)
         return cls(paths)
 

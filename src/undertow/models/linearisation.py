@@ -17,7 +17,7 @@ from undertow.models.partition import compiled
 from undertow.models.quantities import TIME, FloatArray, numbers
 from undertow.models.validity import kinks, require_smooth, shortened
 
-#: Largest |f_u| at a target, N m or N.
+#: Largest |f_u| at a target, as a part of :func:`force_scale`.
 AT_REST = 1e-9
 
 
@@ -99,7 +99,7 @@ def linearise(mechanism: Mechanism) -> Linearisation:
             limit="finite, with its slopes",
             remedy="Something is divided by zero there: rewrite the expression",
         )
-    if np.abs(rest[mechanism.m :]).max() > AT_REST:
+    if not np.abs(rest[mechanism.m :]).max() <= AT_REST * force_scale(mechanism):
         from undertow.models.importers.equations import nearest_equilibrium
 
         raise ModelError(
@@ -116,6 +116,14 @@ def linearise(mechanism: Mechanism) -> Linearisation:
         states=mechanism.state_names,
         inputs=tuple(i.name for i in mechanism.inputs),
     )
+
+
+def force_scale(mechanism: Mechanism) -> float:
+    """Largest force at rest over random positions, N m or N; 1 where there is none."""
+    q = np.random.default_rng(0).uniform(-1, 1, (64, mechanism.n))
+    with np.errstate(all="ignore"):  # some may lie outside the domain of f
+        forces = mechanism.f(np.hstack([q, np.zeros_like(q)]))
+    return float(np.abs(forces[np.isfinite(forces)]).max(initial=0.0)) or 1.0
 
 
 @lru_cache(maxsize=128)
@@ -236,10 +244,12 @@ def controllability(mechanism: Mechanism) -> float:
     """Distance of (A, B) at the target from an uncontrollable pair, relative, ≥ 0.
 
     The smallest singular value of [λI − A, B] over the eigenvalues λ of A (Hautus test),
-    over ‖[A, B]‖₂; zero means that no linear surface can stabilise.
+    over ‖[A, B]‖₂; zero means that no linear surface can stabilise.  Inputs are in units in which
+    their columns of B are as long as A: whether N or µN does not count.
     """
     lin = linearise(mechanism)
-    A, B = lin.A, lin.input
+    A = lin.A
+    B = lin.input * np.linalg.norm(A, 2) / np.linalg.norm(lin.input, axis=0)
     scale = float(np.linalg.norm(np.hstack([A, B]), 2))
     tests = [
         np.linalg.svd(np.hstack([eigenvalue * np.eye(len(A)) - A, B]), compute_uv=False)[-1]

@@ -571,6 +571,30 @@ class Mechanism:
             )
         return x
 
+    def check_plant(self, plant: Mechanism) -> None:
+        """Refuse a plant for this belief whose coordinates or inputs are not the belief's own.
+
+        Raises
+        ------
+        InvalidInputError
+            With the names and units of both.
+        """
+        has, wanted = (
+            ", ".join(
+                [f"{c.name} ({c.unit})" for c in who.coordinates]
+                + [f"{i.name} ({i.unit})" for i in who.inputs]
+            )
+            for who in (plant, self)
+        )
+        if (plant.n, plant.m, has) != (self.n, self.m, wanted):
+            raise InvalidInputError(
+                f"plant '{plant.name}' of the belief '{self.name}'",
+                value=has,
+                limit=f"{wanted}, in this order",
+                remedy="A law for one mechanism means nothing to another: name the coordinates "
+                "and inputs of a model of the plant as the belief does",
+            )
+
     def check_state(self, x: ArrayLike) -> FloatArray:
         """Return ``x`` as a float array (…, 2n), refusing wrong lengths and NaN.
 

@@ -113,7 +113,7 @@ class Constraint:
     state
         Name of the state that it bounds, where it is one's range.
     source
-        Where it comes from, where it is not the user's own.
+        Where it comes from, in words.
 
     Notes
     -----
@@ -276,6 +276,12 @@ def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constrai
     return tuple(found)
 
 
+def _is_travel(constraint: Constraint) -> bool:
+    """Whether a constraint is one of :func:`travel_box`: they know coordinates by number."""
+    within = constraint.formula
+    return isinstance(within, _Within) and isinstance(within.state, int)
+
+
 def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown: str) -> None:
     """Refuse a box, ``shown`` in words, that reaches beyond the travel of its coordinate.
 
@@ -351,7 +357,8 @@ class Objective:
                 limit="a function of the mechanism's names that returns an expression",
                 remedy="Write lambda v: v.inputs[0]**2, or lambda v: 1 for a constant",
             )
-        check_fields(self, "constraints")
+        words = ("name", "unit", "constraints", "hard_input", "travel", "formula")
+        check_fields(self, *words)
         object.__setattr__(self, "constraints", tuple(self.constraints))
         for field in ("horizon", "terminal_radius"):
             value = number_of(f"{field} of objective '{self.name}'", getattr(self, field))
@@ -370,7 +377,7 @@ class Objective:
             For a declared range that does not hold the target, and for a :func:`state_box` that
             reaches beyond one.
         """
-        own = tuple(c for c in self.constraints if not c.source)
+        own = tuple(c for c in self.constraints if not _is_travel(c))
         boxes = {c.state: c for c in own if isinstance(c.formula, _Within)}
         declared = travel_box(mechanism, boxes) if self.travel else ()
         for state, box in boxes.items() if self.travel else ():

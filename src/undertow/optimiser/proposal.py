@@ -12,6 +12,7 @@ from undertow.base import InfeasibleError, InvalidInputError, SingularSurfaceErr
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Margin, Plan, Surface, surface_margins
 from undertow.models import FloatArray
+from undertow.models.importers import holding_input
 
 Status = Literal["converged", "budget spent", "infeasible", "failed"]
 
@@ -112,9 +113,22 @@ class Proposal:
                 value=self.message,
                 limit="every margin ≥ 0 and the terminal set reached within "
                 f"{loop.objective.horizon:g} s",
-                remedy=self.remedy,
+                remedy=_too_weak(loop) or self.remedy,
             )
         return self
+
+
+def _too_weak(loop: ClosedLoop) -> str:
+    """What to do where the inputs cannot hold the mechanism at the target; empty where they can."""
+    if np.abs(loop.mechanism.f(np.zeros(2 * loop.mechanism.n))).max() == 0:
+        return ""
+    held = np.abs(holding_input(loop.mechanism))
+    weak = [
+        f"{given.name} of {u:.3g} {given.unit}, and its limit is {limit:.3g}"
+        for given, u, limit in zip(loop.mechanism.inputs, held, loop.input_limits, strict=True)
+        if u >= limit
+    ]
+    return f"The target is held by {'; '.join(weak)}: no start comes home" if weak else ""
 
 
 def motion_margins(

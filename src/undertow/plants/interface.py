@@ -194,7 +194,8 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
     ArtefactError
         When it cannot be read.
     InvalidInputError
-        When it has not what a rig has, see :class:`undertow.plants.Rig`.
+        When it has not what a rig has, see :class:`undertow.plants.Rig`; when it simulates another
+        mechanism.
     """
     lacking = [part for part in ("read", "write", "close") if not callable(getattr(rig, part, 0))]
     period = getattr(rig, "period", None)
@@ -207,6 +208,9 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
             limit="read(), write(u), close() and a period",
             remedy="See undertow.plants.Rig and examples/serial_rig.py",
         )
+    modelled = getattr(rig, "mechanism", None)
+    if isinstance(modelled, Mechanism):
+        mechanism.check_plant(modelled)
     try:
         measurement: Any = rig.read()
     except Exception as error:  # a driver may do anything

@@ -60,6 +60,13 @@ class Replay:
     build: Mapping[str, tuple[Any, Any]]
     remarks: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        """Show whose run it was, and what came of it."""
+        return (
+            f"Replay({self.recording.path.name}, {self.steps} steps, {self.differing} differ, "
+            f"{self.judged} answers, {self.misjudged} judged otherwise)"
+        )
+
     @property
     def identical(self) -> bool:
         """Whether everything that was made again is as it was, bit for bit."""
@@ -98,7 +105,7 @@ def build() -> dict[str, str | None]:
 
 @checked
 def replay(
-    path: Path, *, mechanism: str | Mechanism | None = None, decisions: bool = True
+    path: str | Path, *, mechanism: str | Mechanism | None = None, decisions: bool = True
 ) -> Replay:
     """Replay a log that carries its recipe.
 

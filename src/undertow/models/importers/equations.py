@@ -18,6 +18,7 @@ import sympy as sp
 from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.coordinates import actuate, exact_angle, tidy
 from undertow.models.lagrange import quadratic_form
+from undertow.models.linearisation import AT_REST, force_scale
 from undertow.models.mechanism import (
     TIME,
     Coordinate,
@@ -31,9 +32,6 @@ from undertow.models.mechanism import (
 from undertow.models.quantities import number_of
 from undertow.models.validity import by_names, check_parts, check_symbols, expression_of, vocabulary
 from undertow.symbolic import Tape, compile_numpy
-
-#: |f_u| at an equilibrium, relative to the largest force that gravity and springs exert.
-BALANCE = 1e-9
 
 #: How far an equilibrium may be from a target and still be the one that was meant, rad or m.
 NEAR = 0.5
@@ -156,7 +154,7 @@ def check_balanced(mechanism: Mechanism) -> None:
     """
     n, m = mechanism.n, mechanism.m
     residual = np.abs(mechanism.f(np.zeros(2 * n))[m:])
-    limit = BALANCE * force_scale(mechanism)
+    limit = AT_REST * force_scale(mechanism)
     if not residual.max() <= limit:
         worst = mechanism.coordinates[m + int(np.argmax(residual))].name
         raise ModelError(
@@ -173,7 +171,7 @@ def nearest_equilibrium(mechanism: Mechanism) -> str:
     Values are errors from the target, in the mechanism's own coordinates.
     """
     q, left = _newton(mechanism)
-    if not (left <= BALANCE and np.abs(q).max() <= NEAR):
+    if not (left <= AT_REST and np.abs(q).max() <= NEAR):
         return (
             f"No equilibrium was found within {NEAR} rad or m: give a guess to "
             "undertow.models.importers.find_equilibrium(mechanism, ...)"
@@ -206,13 +204,6 @@ def _newton(mechanism: Mechanism) -> tuple[FloatArray, float]:
         return x[:n], float(np.abs(mechanism.f(x)[m:] / scale).max())
     except (InvalidInputError, np.linalg.LinAlgError):  # the iteration left the domain of f
         return x[:n], math.inf
-
-
-def force_scale(mechanism: Mechanism) -> float:
-    """Largest force at rest over random positions, N m or N; 1 where there is none."""
-    q = np.random.default_rng(0).uniform(-1, 1, (64, mechanism.n))
-    forces = mechanism.f(np.hstack([q, np.zeros_like(q)]))
-    return float(np.abs(forces).max()) or 1.0
 
 
 @checked

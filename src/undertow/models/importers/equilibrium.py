@@ -11,9 +11,9 @@ import numpy as np
 import sympy as sp
 
 from undertow.base import InvalidInputError, ModelError, checked, floats, one_of
-from undertow.models.importers.equations import BALANCE, check_balanced, force_scale, shifted
+from undertow.models.importers.equations import check_balanced, shifted
 from undertow.models.importers.tree import LARGEST
-from undertow.models.linearisation import controllability, linearise
+from undertow.models.linearisation import AT_REST, controllability, force_scale, linearise
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.models.quantities import number_of
 from undertow.models.validity import by_names
@@ -68,12 +68,12 @@ def find_equilibrium(mechanism: Mechanism, /, **guess: float) -> dict[str, float
     3.141593
     """
     q, relative = _solved(mechanism, _positions(mechanism, guess))
-    if not relative <= BALANCE:
+    if not relative <= AT_REST:
         scale = force_scale(mechanism)
         raise ModelError(
             f"equilibrium of '{mechanism.name}' near {dict(guess)}",
             value=f"|f_u| = {scale * relative:.3g} left",
-            limit=f"below {BALANCE * scale:.3g}",
+            limit=f"below {AT_REST * scale:.3g}",
             remedy="Start from another guess, or hold the actuated coordinates elsewhere",
         )
     names = [c.name for c in mechanism.coordinates]
@@ -203,7 +203,7 @@ class _Equilibrium:
 def _rests(mechanism: Mechanism) -> bool:
     """Whether zero is an equilibrium of the free coordinates."""
     residual = np.abs(mechanism.f(np.zeros(2 * mechanism.n))[mechanism.m :]).max()
-    return bool(residual <= BALANCE * force_scale(mechanism))
+    return bool(residual <= AT_REST * force_scale(mechanism))
 
 
 def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
@@ -234,10 +234,10 @@ def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
             q,
         )
         turned[np.abs(turned) < 1e-12] = 0.0
-        if left <= BALANCE and _residual(mechanism, turned) <= BALANCE:
+        if left <= AT_REST and _residual(mechanism, turned) <= AT_REST:
             q = turned
         inside = bool(np.all((q > low) & (q < high)))
-        if not (left <= BALANCE and inside):
+        if not (left <= AT_REST and inside):
             continue
         held = np.abs(holding_input(mechanism, q)) <= mechanism.input_limits
         if held.all() and not any(np.abs(q - other).max() < 1e-6 for other in found):

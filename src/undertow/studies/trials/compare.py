@@ -34,7 +34,8 @@ def lqr(mechanism: Mechanism) -> MakeController:
     """Return a linear-quadratic regulator at the target, its output clipped, to compare with.
 
     Q is 1 on q_a, 10 on q_u and 0.1 on the velocities, R is 1/u_max²: what
-    :func:`undertow.first_surface` is designed by.
+    :func:`undertow.first_surface` is designed by.  Where gravity or a spring is to be held at the
+    target, it acts about the input that does.
     """
     return clipped_regulator(mechanism)
 
@@ -200,6 +201,7 @@ def compare(
         make = _maker(mechanism, controller, start)
         for place, plant in meets.items():
             bench = undisturbed(plant) if isinstance(plant, Mechanism) else plant
+            mechanism.check_plant(bench.mechanism)
             known = controller.known if isinstance(controller, Cascade) else Belief.usual(mechanism)
             outcomes[name, place] = trial(
                 mechanism, bench, make, start, seconds, seed,

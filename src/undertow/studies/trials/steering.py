@@ -22,7 +22,8 @@ from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, KalmanFilter, StateFeedback
 from undertow.law import InnerLoop
 from undertow.models import FloatArray, Mechanism, linearise, require_smooth
-from undertow.objective import Objective
+from undertow.models.importers import holding_input
+from undertow.objective import Objective, finite_limits
 from undertow.optimiser import Proposal
 from undertow.runtime import Settings
 from undertow.studies.trials.trial import MakeController
@@ -226,18 +227,18 @@ def predictive(belief: Mechanism, objective: Objective, **settings: Any) -> Make
 def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
     """Return a linear-quadratic regulator, its output clipped: Q of the first surface.
 
-    ``free`` is the weight of the free coordinates.
+    It acts about the input that holds the target.  ``free`` is the weight of the free coordinates.
     """
-    lin = linearise(belief)
+    lin, rest = linearise(belief), holding_input(belief)
     n, m = belief.n, belief.m
     limit = belief.input_limits
     Q = np.diag([1.0] * m + [free] * (n - m) + [0.1] * n)
-    R = np.diag(1.0 / limit**2)
+    R = np.diag(1.0 / finite_limits(belief) ** 2)
     P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
     k = -np.linalg.solve(R, lin.input.T @ P)
 
     def make(_start: FloatArray) -> StateFeedback:
-        return lambda t, x: np.clip(k @ x, -limit, limit)
+        return lambda t, x: np.clip(rest + k @ x, -limit, limit)
 
     make.__name__ = "LQR, clipped"
     return make
