@@ -20,6 +20,7 @@ from runs import run
 from undertow.base import InvalidInputError
 from undertow.cli import app
 from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
+from undertow.cli.terminal import progress_bar
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
@@ -409,3 +410,15 @@ def test_quick_reproduction_end_to_end(tmp_path: Path) -> None:
     assert "Table 2" in out
     names = {path.name for path in tmp_path.iterdir()}
     assert {"tables.csv", "manifest.json", "figure-3-repeats.png", "figure-5-phase.png"} <= names
+
+
+def test_progress_says_how_much_time_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By what was done since it was first told: what a resumed run had already counts not."""
+    clock = iter((100.0, 110.0, 111.0, 130.0))
+    monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
+    with progress_bar() as tell:
+        for what, part in (("a", 0.2), ("b", 0.4), ("b", 0.41), ("c", 1.0)):
+            tell(what, part)
+    assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
