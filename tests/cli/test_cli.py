@@ -21,6 +21,7 @@ from runs import run
 from undertow.base import InvalidInputError
 from undertow.cli import app
 from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
+from undertow.cli.terminal import progress_bar
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
@@ -465,3 +466,15 @@ def test_without_arguments_it_says_what_to_try() -> None:
     assert len(tried) >= 4
     assert {words[1] for words in tried} <= {path[0] for path in COMMANDS}
     assert "doctor" in {words[1] for words in tried}
+
+
+def test_progress_says_how_much_time_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By what was done since it was first told: what a resumed run had already counts not."""
+    clock = iter((100.0, 110.0, 111.0, 130.0))
+    monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
+    with progress_bar() as tell:
+        for what, part in (("a", 0.2), ("b", 0.4), ("b", 0.41), ("c", 1.0)):
+            tell(what, part)
+    assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]

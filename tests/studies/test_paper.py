@@ -34,7 +34,9 @@ AS_PRINTED = ut.mechanisms.rotary_pendulum()
 @pytest.fixture(scope="module")
 def result() -> paper.Reproduction:
     """A run of one condition with searches just long enough to find something."""
-    effort = paper.Effort(ut.Budget(400), ut.Budget(33), bounds=False, conditions=("matched",))
+    effort = paper.Effort(
+        ut.Budget(400), ut.Budget(33), bounds=False, appendix=False, conditions=("matched",)
+    )
     return paper.reproduce(effort=effort)
 
 

@@ -181,8 +181,6 @@ def progress_bar() -> Iterator[Progress]:
         bars.SpinnerColumn(),
         bars.BarColumn(),
         bars.TimeElapsedColumn(),
-        bars.TextColumn("left"),
-        bars.TimeRemainingColumn(compact=True),
         bars.TextColumn("{task.description}"),
     )
     with bars.Progress(*columns, console=console, transient=True) as bar:
