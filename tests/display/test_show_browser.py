@@ -173,7 +173,7 @@ def test_every_control_does_what_it_says(page: Any) -> None:
     slide(page, "target theta", 40.0)
     until(page, "Math.abs(undertow.plans.at(-1)?.goal[0] - 0.698) < 1e-3")
     page.select_option('.control[data-name="objective"] select', "energy")
-    until(page, "undertow.plans.at(-1)?.objective === 'energy'", 60)
+    until(page, "undertow.plans.at(-1)?.objective === 'energy'", 180)
     slide(page, "limit voltage", 5.0)
     slide(page, "push", 2.0)
     page.click("#left")
@@ -255,7 +255,9 @@ def test_bound_map_and_ensemble_stand_beside_the_motion(page: Any) -> None:
     until(page, "undertow.region?.axis === 1", 120)
     until(page, "/home|proved/.test(document.getElementById('region').innerText)")
     cells = page.evaluate("undertow.region.cells")
-    assert {"0", "2"} <= set(cells)
+    assert len(cells) == page.evaluate("undertow.region.side ** 2")
+    assert set(cells) <= {"0", "1", "2"}
+    assert cells[len(cells) // 2] == "2"  # the target itself
     assert page.evaluate("undertow.region.proved.length") == 4
     page.select_option("#axis", "0")
     until(page, "undertow.region?.axis === 0", 60)

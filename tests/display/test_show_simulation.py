@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import undertow as ut
 from undertow.base import InvalidInputError
@@ -88,6 +89,34 @@ def test_the_pendulum_is_brought_upright_and_its_cost_falls(simulation: Simulati
     assert frames[-1]["t"] == pytest.approx(3.0, abs=3 * TICK)
     ahead = [f["left"] for f in frames if 1.0 < f["t"] < 3.0]
     assert all(value > 0 for value in ahead)
+
+
+def test_the_first_prediction_is_for_where_it_starts(simulation: Simulation) -> None:
+    """J̃₀ is what SciPy's integrator pays from the start with the first surface: nothing moves
+    before there is one, and nothing is paid beforehand."""
+    first = plans(go(simulation, 0.2))[0]
+    surface = ut.Surface.from_vector(surface_of(first), 2, 1)
+    law = ut.SlidingModeLaw(RIG, surface, simulation.law.reaching)
+
+    def rate(t: float, z: np.ndarray) -> np.ndarray:
+        x, u = z[:4], law(t, z[:4]).u
+        paid = float(u @ u) + 0.05 * float(x @ x)
+        return np.concatenate([x[2:], RIG.accelerations(t, x, u), [paid]])
+
+    def arrives(t: float, z: np.ndarray) -> float:
+        return float(np.linalg.norm(z[:4])) - 0.05
+
+    arrives.terminal = True  # type: ignore[attr-defined]
+    begin = np.append(RIG.usual_start, 0.0)
+    found = solve_ivp(rate, (0, 20), begin, "LSODA", rtol=1e-7, atol=1e-9, events=arrives)
+    assert found.status == 1
+    assert first["predicted"] == pytest.approx(found.y[-1, -1], rel=5e-3)
+
+
+def surface_of(plan: Message) -> np.ndarray:
+    """The entries of a plan's surface, α_a, λ_a, α_u, λ_u, from its row over (q, q̇)."""
+    (row,) = plan["rows"]
+    return np.array([row[2], row[0], row[3], row[1]])
 
 
 def test_time_stops_steps_and_slows(simulation: Simulation) -> None:

@@ -207,6 +207,8 @@ def judge(
 def _predicted(cascade: Cascade, request: Request) -> FloatArray:
     memory, plan, span = request.memory, request.memory.at(request.t), request.use - request.t
     target = memory.target
+    if span == 0.0:
+        return request.x.copy()
     try:
         if target is not None and target.moves:
             still = cascade.loop_at(replace(memory, target=None))

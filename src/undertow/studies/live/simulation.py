@@ -435,8 +435,8 @@ class Simulation:
         if not new and (self.paused or self.t < self._due or self._at_target):
             return
         x = self.rig.truth
-        # Predictions go in steps of 2 ms.
-        lead = 2 * STEP if first else max(STEP, math.ceil(self._lead * self.speed / STEP) * STEP)
+        # Before there is a first plan nothing moves, so that is for this very state.
+        lead = 0.0 if first else max(STEP, math.ceil(self._lead * self.speed / STEP) * STEP)
         use = round((self.t + lead) / STEP) * STEP
         memory = self._idle if first else self.memory
         assert memory is not None  # idle is one
