@@ -316,8 +316,7 @@ def _inverse(
     u = rng.uniform(-1, 1, (len(q), mechanism.m)) * limits
     x = np.hstack([q, qd])
     forces = mechanism.forces(0.0, x, mechanism.accelerations(0.0, x, u))
-    B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=np.float64)
-    wanted = np.hstack([u @ B.T, np.zeros((len(q), mechanism.n - mechanism.m))])
+    wanted = np.hstack([u @ mechanism.B.T, np.zeros((len(q), mechanism.n - mechanism.m))])
     scale = float(np.abs(forces).max() + np.abs(mechanism.f(x)).max()) or 1.0
     residual = float(np.abs(forces - wanted).max()) / scale
     return _small(
@@ -333,8 +332,7 @@ def _target(mechanism: Mechanism) -> tuple[Check, ...]:
     rest = mechanism.f(np.zeros(2 * n))
     outside = [c.name for c in mechanism.coordinates if not c.low <= 0 <= c.high]
     left = float(np.abs(rest[m:]).max()) / force_scale(mechanism)
-    B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=np.float64)
-    effort = float(np.max(np.abs(np.linalg.solve(B, rest[:m])) / mechanism.input_limits))
+    effort = float(np.max(np.abs(np.linalg.solve(mechanism.B, rest[:m])) / mechanism.input_limits))
     checks = [
         _none(
             "target x = 0 lies within the ranges, coordinates outside",

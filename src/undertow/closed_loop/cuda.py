@@ -115,8 +115,8 @@ class CudaText:
 class _Host:
     """The text as a library of this machine's own."""
 
-    def __init__(self, text: CudaText, compiler: str = "c++") -> None:
-        found = which(compiler) or which("g++") or which("clang++")
+    def __init__(self, text: CudaText) -> None:
+        found = which("c++") or which("g++") or which("clang++")
         if found is None:
             raise MissingExtraError(
                 "CUDA text on the host", remedy="Install a C++17 compiler: c++, g++ or clang++"

@@ -362,14 +362,8 @@ class ClosedLoop:
         where: NDArray[np.intp] | slice = slice(buffers.count)
         while True:
             live, out = part.live, part.out
-            live.fill(1.0)
-            self._check_gains(part.lanes, live, stable_only)
             goes_on = calm_from < steps
-            prepared = None
-            if goes_on or stable_only or (noisy and part is buffers):
-                prepared = self._linearised(part)
-            if prepared is not None and stable_only:
-                live *= prepared.stable
+            prepared = self._begun(part, stable_only, goes_on or (noisy and part is buffers))
             integrate = shared(self._kernels.rollout, self.threads, part.padded, steps)
             integrate(
                 0, part.padded, part.states, live, part.lanes, switches, numbers.plant,
@@ -407,12 +401,8 @@ class ClosedLoop:
     ) -> Batch:  # fmt: skip
         """Do what :meth:`roll_out` does to the tolerance of the loop, motion by motion."""
         live, numbers, look = buffers.live, self.numbers, self._look
-        live.fill(1.0)
-        self._check_gains(buffers.lanes, live, stable_only)
         noisy = self.covariance is not None and self.linear_end is not None
-        prepared = self._linearised(buffers) if stable_only or noisy else None
-        if prepared is not None and stable_only:
-            live *= prepared.stable
+        self._begun(buffers, stable_only, noisy)
         m, nu = self.mechanism.m, self.objective.terminal_radius
         _, seen = self._looked(buffers.lanes[0, 0], np.zeros(2 * self.mechanism.n + 1), start)
         least = -ALLOWED * np.maximum(np.nan_to_num(seen[2 * m :]), 0.0)
@@ -446,15 +436,26 @@ class ClosedLoop:
         rate = self.linear_end.noise_cost(buffers.ends, self.covariance)
         buffers.out[:, 0] += NEAR * rate * (buffers.out[:, 1] - start)
 
-    def _linearised(self, buffers: RolloutBuffers) -> Prepared | None:
-        """Linearise the last surface of every lane."""
-        if self.linear_end is None or buffers.ends is None:
+    def _begun(
+        self, buffers: RolloutBuffers, stable_only: bool, linearised: bool
+    ) -> Prepared | None:
+        """Switch lanes on, but for those that are ruled out; linearise the last surface of each.
+
+        The latter where that is asked for, or where it tells which lanes are stable.
+        """
+        live = buffers.live
+        live.fill(1.0)
+        self._check_gains(buffers.lanes, live, stable_only)
+        needless = not (linearised or stable_only)
+        if needless or self.linear_end is None or buffers.ends is None:
             return None
         gains = None
         if any(self.mechanism.disturbance_bounds):
             last, layout = buffers.lanes[:, -1], buffers.layout
             gains = gains_at_target(self.mechanism, last[:, layout.surface], last[:, layout.eta])
         self.linear_end.prepare(buffers.lanes, gains, buffers.ends, buffers.member)
+        if stable_only:
+            live *= buffers.ends.stable
         return buffers.ends
 
     def _check_gains(self, lanes: FloatArray, live: FloatArray, stable_only: bool) -> None:

@@ -207,11 +207,10 @@ class Mechanism:
             check_symbols(what, [self.potential], places | {TIME: "undertow.models.mechanism.TIME"})
         check_symmetric(f"mass_matrix of '{self.name}'", self.mass_matrix)
         check_definite(f"mass_matrix of '{self.name}'", self.coordinates, self.M)
-        gain = numbers(self.input_matrix.subs(self.substitution))
-        if not abs(np.linalg.det(gain)) > 0:
+        if not abs(np.linalg.det(self.B)) > 0:
             raise ModelError(
                 f"input_matrix of '{self.name}'",
-                value=gain.tolist(),
+                value=self.B.tolist(),
                 limit="invertible",
                 remedy="Each input must act on an actuated coordinate of its own",
             )
@@ -661,6 +660,11 @@ class Mechanism:
             return _compiled_dynamics(self)
         matrix = self.mass_matrix if which == "mass" else self.force
         return compiled(matrix, (*states, *self.parameter_symbols))
+
+    @property
+    def B(self) -> FloatArray:
+        """Input matrix at the values of the parameters, (m, m)."""
+        return numbers(self.input_matrix.subs(self.substitution))
 
     def M(self, q: ArrayLike) -> FloatArray:
         """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like.

@@ -32,8 +32,7 @@ def holding_input(mechanism: Mechanism, q: FloatArray | None = None) -> FloatArr
     x = np.zeros(2 * n)
     if q is not None:
         x = mechanism.check_state(np.append(floats("positions", q), np.zeros(n)))
-    B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=np.float64)
-    return np.asarray(-np.linalg.solve(B, mechanism.f(x)[:m]))
+    return np.asarray(-np.linalg.solve(mechanism.B, mechanism.f(x)[:m]))
 
 
 @checked

@@ -49,7 +49,6 @@ def mechanism_from_tree(
     equilibrium: Mapping[str, float] | None = None,
     start: Mapping[str, float] | None = None,
     effort: Mapping[str, float] | None = None,
-    description: str = "",
     source: str = "",
 ) -> Mechanism:
     """Derive M, f and B of a tree; masses, inertias, damping and gravity become parameters.
@@ -67,7 +66,7 @@ def mechanism_from_tree(
         A usual initial state, errors from the target, by state names.
     effort
         Joint name to actuator limit, N m or N, in place of the tree's (``actuated`` only).
-    description, source
+    source
         As for :class:`~undertow.models.Mechanism`.
 
     Raises
@@ -131,7 +130,7 @@ def mechanism_from_tree(
         equilibrium=dict(zip(_distinct(list(given)), given.values(), strict=True)),
         disturbance_bounds=friction if any(friction) else (),
         start=start,
-        description=description or f"rigid-body tree '{tree.name}'" + _unlimited(inputs),
+        description=f"rigid-body tree '{tree.name}'" + _unlimited(inputs),
         source=source,
     )
 

@@ -401,12 +401,12 @@ def _form(M: BallMatrix, v: Any) -> Any:
     return sum(M[i, j] * v[i] * v[j] for i in range(3) for j in range(3))
 
 
-def largest_interval(reduced: Reduced, P: Lyapunov, tolerance: float = 1e-9) -> tuple[float, float]:
+def largest_interval(reduced: Reduced, P: Lyapunov) -> tuple[float, float]:
     """Return half-widths of Ĩ, rad, for which R ≻ 0 is proved and refuted (0, 0 if never)."""
     low, high = 0.0, reduced.limit
     if not two_vertex(reduced, P, 0.0):
         return 0.0, 0.0
-    while high - low > tolerance:
+    while high - low > 1e-9:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if two_vertex(reduced, P, middle) else (low, middle)
     return low, high

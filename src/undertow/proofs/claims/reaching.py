@@ -313,7 +313,7 @@ class _Balance:
             proved, refuted, point = self.factor([float(k == j) for k in range(mechanism.n)])
         coordinate = mechanism.coordinates[j]
         as_input, input_unit = math.nan, ""
-        B = np.array(mechanism.input_matrix.subs(mechanism.substitution), dtype=float)
+        B = mechanism.B
         if j < mechanism.m and np.count_nonzero(B - np.diag(np.diag(B))) == 0:
             as_input, input_unit = proved / abs(float(B[j, j])), mechanism.inputs[j].unit
         names = (c.name for c in mechanism.coordinates)

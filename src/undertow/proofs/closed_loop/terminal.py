@@ -243,13 +243,15 @@ def _total_of(parts: Any) -> Interval:
     return total
 
 
+#: Boxes of one verification, at most, and of one step of it.
+MAX_BOXES, CHUNK = 4_000_000, 4096
+
+
 def verify_terminal(
     motion: LoopMotion,
     terminal: TerminalSet,
     *,
-    max_boxes: int = 4_000_000,
     max_seconds: float = 600.0,
-    chunk: int = 4096,
 ) -> Verdict:
     """Decide whether a set is invariant, unsaturated and attracted to the target.
 
@@ -259,7 +261,7 @@ def verify_terminal(
         The loop, with its uncertain parameters.
     terminal
         The set.
-    max_boxes, max_seconds
+    max_seconds
         Effort before giving up.
 
     Returns
@@ -304,8 +306,8 @@ def verify_terminal(
     if motion.odd:
         low[-1] = 0.0
     while low.shape[1]:
-        a, b = low[:, -chunk:], high[:, -chunk:]
-        low, high = low[:, :-chunk], high[:, :-chunk]
+        a, b = low[:, -CHUNK:], high[:, -CHUNK:]
+        low, high = low[:, :-CHUNK], high[:, :-CHUNK]
         count += a.shape[1]
         square, decrease, over, spare, weights = checker.over(a, b)
         near = np.all((np.abs(a) <= half) & (np.abs(b) <= half), axis=0)
@@ -315,7 +317,7 @@ def verify_terminal(
             continue
         a, b, weights, near = a[:, ~done], b[:, ~done], weights[:, ~done], near[~done]
         tiny = (b - a).max(axis=0) < 1e-6
-        spent = count > max_boxes or time.process_time() - started > max_seconds
+        spent = count > MAX_BOXES or time.process_time() - started > max_seconds
         index = np.flatnonzero(tiny)[:64] if tiny.any() else np.arange(min(64, a.shape[1]))
         wrong = _wrong(checker, 0.5 * (a[:, index] + b[:, index]))
         if wrong is not None:

@@ -414,11 +414,10 @@ class System:
         free = algebra.each("sub", y, algebra.times(self.X, w))
         return [row[0] for row in (*w, *free)], demand
 
-    def fixed(self, law: Law | None = None) -> FloatArray:
-        """Enclosures of all inputs but x: parameters, and a law's numbers where they are inputs."""
+    def fixed(self) -> FloatArray:
+        """Enclosures of the parameters."""
         values = [p.value for p in self.model.parameters]
-        numbers = [*values, *(law.numbers if law is not None else ())]
-        return np.array([hull(v, v) for v in numbers if v is not None]).reshape(-1, 2)
+        return np.array([hull(v, v) for v in values if v is not None]).reshape(-1, 2)
 
     def origin(self) -> list[Span]:
         """Exact inputs at x = 0."""

@@ -39,8 +39,12 @@ def singular_distance_on_axis(motion: SurfaceMotion, limit: float) -> float:
     return low
 
 
+#: J of a natural stretch, and the part of L that its fit covers.
+POWERS, FITTED = 2, 0.93
+
+
 def natural_stretch(
-    motion: SurfaceMotion, *, slow: bool = False, powers: int = 2, fitted_part: float = 0.93
+    motion: SurfaceMotion, *, slow: bool = False
 ) -> tuple[FloatArray, float] | None:
     """Return S, (J, 3, 3), and L for one unactuated and one actuated coordinate.
 
@@ -48,8 +52,6 @@ def natural_stretch(
     ----------
     slow
         Third coordinate η, not w: often better with |λ_a| large against the other rates.
-    powers, fitted_part
-        J, and the part of L that the fit covers.
 
     Returns
     -------
@@ -63,7 +65,7 @@ def natural_stretch(
     pole = singular_distance_on_axis(motion, far)
     if pole >= far:
         return None
-    q = np.linspace(0.0, fitted_part * pole, 2001)
+    q = np.linspace(0.0, FITTED * pole, 2001)
     h = 1e-2
     kappa = float(motion.slow[0, 0])
 
@@ -79,9 +81,9 @@ def natural_stretch(
         return None
     zeta = np.sqrt(2 * energy[1:] / stiffness) / q[1:]
     tau = (q**2 / (pole**2 - q**2))[1:]
-    S = np.zeros((powers, 3, 3))
+    S = np.zeros((POWERS, 3, 3))
     for i, shape in enumerate((zeta, np.sqrt(mu[1:]))):
-        columns = np.stack([tau**j for j in range(1, powers + 1)], axis=1) / shape[:, None]
+        columns = np.stack([tau**j for j in range(1, POWERS + 1)], axis=1) / shape[:, None]
         S[:, i, i] = nnls(columns, 1 - 1 / shape)[0]  # relative least squares, all ≥ 0
     if slow:  # c_2 − κ c_0 = w − κ q = η in c = y + Σ τ^j S_j y
         S[:, 2, 0] = kappa * S[:, 0, 0]

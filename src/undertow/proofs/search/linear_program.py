@@ -12,9 +12,13 @@ import scipy.linalg
 
 from undertow.models.mechanism import FloatArray
 
+#: Residuals and gap, relative, at which a solution is one.
+TOLERANCE = 1e-8
 
+
+@np.errstate(all="ignore")  # an infeasible program overflows, and ends as None
 def minimise_linear(
-    c: FloatArray, A: FloatArray, b: FloatArray, *, iterations: int = 60, tolerance: float = 1e-8
+    c: FloatArray, A: FloatArray, b: FloatArray, *, iterations: int = 60
 ) -> FloatArray | None:
     """Minimise c·x subject to A x ≤ b.
 
@@ -24,13 +28,6 @@ def minimise_linear(
         x, or ``None`` where no solution was reached (infeasible, unbounded, or too ill
         conditioned).  It feeds a search whose result is verified elsewhere.
     """
-    with np.errstate(all="ignore"):  # an infeasible program overflows, and ends as None
-        return _solve(c, A, b, iterations, tolerance)
-
-
-def _solve(
-    c: FloatArray, A: FloatArray, b: FloatArray, iterations: int, tolerance: float
-) -> FloatArray | None:
     rows = np.abs(A).max(axis=1)
     columns = np.abs(A).max(axis=0)
     columns[columns == 0] = 1.0
@@ -46,7 +43,7 @@ def _solve(
             np.abs(dual).max() / (1 + np.abs(c).max()),
             gap / (1 + abs(float(c @ x))),
         )
-        if error < tolerance:
+        if error < TOLERANCE:
             return np.asarray(x / columns)
         H = (A * (z / s)[:, None]).T @ A
         H[np.diag_indices(n)] += 1e-13 * np.trace(H) / n

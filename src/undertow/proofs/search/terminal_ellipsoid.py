@@ -28,6 +28,9 @@ FLOORS = (0.02, 0.005, 0.001)
 #: Margin from which no search for weights comes back.
 HOPELESS = -2.0
 
+#: Proofs that are tried around a state, some ten microseconds each.
+EFFORT = 60
+
 
 @dataclass(frozen=True, eq=False)
 class EllipsoidSearch:
@@ -68,16 +71,8 @@ class EllipsoidSearch:
         code, margin, _ = prove(self.loop, self.numbers, rows, self.limits, candidate, self.centre)
         return margin if code == 0 else min(margin, 0.0)
 
-    def around(self, x: ArrayLike, effort: int = 60) -> TerminalEllipsoid | None:
-        """Return a proved terminal set that contains the state x, or ``None``.
-
-        Parameters
-        ----------
-        x
-            State, (2n,).
-        effort
-            Proofs that may be tried, some ten microseconds each.
-        """
+    def around(self, x: ArrayLike) -> TerminalEllipsoid | None:
+        """Return a proved terminal set that contains the state x, (2n,), or ``None``."""
         state = np.asarray(x, dtype=float)
         if not np.any(state):
             return self.largest()
@@ -103,7 +98,7 @@ class EllipsoidSearch:
             if margin > best:
                 weights, best = trial, margin
         tried, step = 0, 1.0
-        while best > HOPELESS and tried < effort and step > 0.1:
+        while best > HOPELESS and tried < EFFORT and step > 0.1:
             before = best
             for j, sign in ((j, s) for j in range(len(weights)) for s in (1, -1)):
                 trial = weights.copy()
