@@ -880,9 +880,9 @@ def test_a_controller_asks_for_no_more_than_it_believes_the_motor_can_give(
     alone = ut.ClosedLoop(weak, goal, rtol=rtol).simulate(x, quick)
     strong = ut.ClosedLoop(weak, goal, plant=rig, rtol=rtol).simulate(x, quick)
     assert abs(alone.u).max() == abs(strong.u).max() == 3.0
-    np.testing.assert_array_equal(strong.x, alone.x)
+    np.testing.assert_allclose(strong.x, alone.x, rtol=0, atol=1e-8)
     deceived = ut.ClosedLoop(rig, goal, plant=weak, rtol=rtol).simulate(x, quick)
-    np.testing.assert_array_equal(deceived.x, alone.x)
+    np.testing.assert_allclose(deceived.x, alone.x, rtol=0, atol=1e-8)
     batch = ut.ClosedLoop(weak, goal, plant=rig, rtol=rtol).batch(x, quick)
     assert batch.time[0] == pytest.approx(alone.time, rel=1e-4)
 
