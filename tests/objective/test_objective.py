@@ -219,3 +219,17 @@ def test_every_field_of_an_objective_is_checked(field: str) -> None:
     given = {"name": "mine", "stage": lambda v: v.phi**2} | {field: wrong}
     with pytest.raises(InvalidInputError, match=f"{field} of Objective"):
         ut.Objective(**given)  # type: ignore[arg-type]
+
+
+def test_energy_has_the_unit_of_the_inputs_that_it_is_of(rig: ut.Mechanism) -> None:
+    """A cart's newtons were shown as V² s in titles, tables and reports, unless told otherwise."""
+    cart = ut.mechanisms.cart_pendulum()
+    for mechanism, unit in ((rig, "V² s"), (cart, "N² s"), (ut.mechanisms.acrobot(), "(N m)² s")):
+        goal = ut.MinimumEnergy()
+        assert goal.on(mechanism).unit == ut.ClosedLoop(mechanism).objective.unit == unit
+        assert ut.objective_for(mechanism, "energy").unit == unit
+        assert f"dt, {unit}, to" in goal.meaning(mechanism)
+        assert goal.on(mechanism).on(cart).unit == unit
+    assert ut.MinimumEnergy(unit="J").on(cart).unit == "J"
+    motion = ut.ClosedLoop(cart).simulate(cart.state(phi=0.1), ut.first_surface(cart), duration=0.1)
+    assert motion.cost_unit == motion.columns["cost"][1] == "N² s"

@@ -59,13 +59,6 @@ class _Effort:
         return self.time + weighed + error
 
 
-def _energy_unit(mechanism: Mechanism) -> str:
-    """Return the unit of ∫uᵀu dt."""
-    units = {channel.unit for channel in mechanism.inputs}
-    unit = units.pop() if len(units) == 1 else "mixed units"
-    return f"({unit})² s" if " " in unit else f"{unit}² s"
-
-
 @checked
 def objective_for(
     mechanism: Mechanism,
@@ -111,7 +104,7 @@ def objective_for(
     """
     one_of("objective", word, get_args(Goal))
     limits = tuple(finite_limits(mechanism).tolist())
-    energy = MinimumEnergy(unit=_energy_unit(mechanism))
+    energy = MinimumEnergy()
     time = Objective(
         word,
         _Effort(limits, 1, ENERGY_PRICE, 0.0),

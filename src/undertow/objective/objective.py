@@ -436,13 +436,13 @@ class Objective:
         Examples
         --------
         >>> import undertow as ut
-        >>> ut.MinimumEnergy(unit="N² s").meaning(ut.mechanisms.cart_pendulum())
+        >>> ut.MinimumEnergy().meaning(ut.mechanisms.cart_pendulum())
         ... # doctest: +NORMALIZE_WHITESPACE
         'energy: ∫ uᵀu dt, N² s, to ‖x‖ ≤ 0.01 within 60 s;
          |x| ≤ 1.425 m: 95 % of the travel that cart_pendulum declares'
         """
         problem = self.on(mechanism)
-        unit = f", {self.unit}" if self.unit else ""
+        unit = f", {problem.unit}" if problem.unit else ""
         bounds = [c.words for c in problem.constraints]
         if self.hard_input:
             bounds += [
@@ -645,6 +645,13 @@ def _importable(formula: Formula) -> bool:
     return True
 
 
+def _energy_unit(mechanism: Mechanism) -> str:
+    """Return the unit of ∫uᵀu dt."""
+    units = {channel.unit for channel in mechanism.inputs}
+    unit = units.pop() if len(units) == 1 else "mixed units"
+    return f"({unit})² s" if " " in unit else f"{unit}² s"
+
+
 def _squares(v: Names) -> sp.Expr:
     """Return uᵀu."""
     return (v.inputs.T * v.inputs)[0]
@@ -661,12 +668,12 @@ class MinimumEnergy(Objective):
 
     The paper's Φ = u² is zero wherever u = 0 and so breaks (27)-(28): Theorem 1 does not
     cover it.  With ``state_weight`` > 0, Φ = uᵀu + w xᵀx, and the theorem applies.
-    ``unit`` is that of voltage inputs; pass another one for forces or torques.
+    ``unit`` is the square of the inputs' by default, times s, once it is known of what mechanism.
     """
 
     name: str = "energy"
     stage: Formula = _squares
-    unit: str = "V² s"
+    unit: str = ""
     state_weight: float = 0.0
 
     def __post_init__(self) -> None:
@@ -679,6 +686,12 @@ class MinimumEnergy(Objective):
             "Theorem 1 wants a small positive one; the paper has 0",
             zero=True,
         )
+
+    @checked
+    def on(self, mechanism: Mechanism) -> Self:
+        """Return the problem as it is for a mechanism: with its travel, and the unit of uᵀu."""
+        whole = super().on(mechanism)
+        return whole if whole.unit else replace(whole, unit=_energy_unit(mechanism))
 
     @checked
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:

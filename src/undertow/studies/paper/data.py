@@ -67,7 +67,7 @@ CONDITIONS: Mapping[str, Condition] = MappingProxyType(
 
 #: (40) and (41) with the paper's ν = 0.01; its 17 s horizon cannot be kept (see above), 60 s can.
 OBJECTIVES: Mapping[str, Objective] = MappingProxyType(
-    {"energy": MinimumEnergy(), "time": MinimumTime()}
+    {"energy": MinimumEnergy(unit="V² s"), "time": MinimumTime()}
 )
 
 

@@ -207,7 +207,7 @@ def compare(
                 mechanism, bench, make, start, seconds, seed,
                 objective=objective, estimator=estimator_for(mechanism, bench, known=known),
             )  # fmt: skip
-    return Comparison(outcomes, "" if objective is None else objective.unit)
+    return Comparison(outcomes, "" if objective is None else objective.on(mechanism).unit)
 
 
 def _maker(
