@@ -668,6 +668,11 @@ class Cascade:
         it.  Of a target that moves, the search leaves the motion out: it sees the error, and the
         target at rest where it is at the time t.  :meth:`apply_gate` sees the motion.
         """
+        return self._propose(state, x, t, horizon)
+
+    def _propose(
+        self, state: CascadeState, x: ArrayLike, t: float, horizon: float | None
+    ) -> Proposal:
         sequence = state.sequence + 1
         try:
             planner = self._planner(self._loops(state.estimate), state.target, t)
@@ -863,7 +868,7 @@ class Cascade:
                 left = leg.longest - (t - since)
                 if left <= 0.5 * self.step:  # a disturbed plant came too late: a new horizon
                     since, left = t, leg.longest
-                proposal = self.propose(memory, x, t, left)
+                proposal = self._propose(memory, x, t, left)
                 memory, admission = self.apply_gate(memory, proposal, x, left)
             if proposal is not None:
                 task += t == leg.begin or arrived  # left what was reached: another task

@@ -212,9 +212,11 @@ def _along_ridge(task: Optimisation, most: int) -> bool:
         return False
     probes = here + 1e-4 * np.vstack([np.eye(d), -np.eye(d)])
     task.evaluations += len(probes)
-    near = task.space.batch(
-        task.x, probes, duration=1.05 * task.best_cost, terminal=0.0, seek=True
-    ).closest_x
+    vectors, gains = task.space.decode(probes)
+    near = loop.batch(
+        task.x, vectors, reaching=gains, switch_times=task.space.freedom.times,
+        duration=1.05 * task.best_cost, terminal=0.0, seek=True,
+    ).closest_x  # fmt: skip
     slope = (near[:d] - near[d:]) / 2e-4
     if not np.isfinite(slope).all():
         return _descend(task, here, 0.1, most, 1e-3)
