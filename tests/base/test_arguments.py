@@ -164,6 +164,7 @@ ELSEWHERE: dict[str, Callable[[], Any]] = {
     "Belief.learn.x": lambda: np.zeros((2, 4)),
     "Belief.learn.u": lambda: np.zeros((2, 1)),
     "Mechanism.disturbed.force": lambda: {"phi": 0.1},
+    "Mechanism.check_plant.plant": lambda: parts()["mechanism"],
     "Mechanism.input_matrix": lambda: sp.Matrix([1]),
     "Mechanism.from_energies.input_matrix": lambda: sp.Matrix([1]),
     "Optimiser.horizon": lambda: None,

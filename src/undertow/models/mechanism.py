@@ -570,6 +570,7 @@ class Mechanism:
             )
         return x
 
+    @checked
     def check_plant(self, plant: Mechanism) -> None:
         """Refuse a plant for this belief whose coordinates or inputs are not the belief's own.
 
