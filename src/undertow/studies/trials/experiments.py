@@ -91,7 +91,7 @@ def experiment(
     return Experiment(
         what, line, {(name,): partial(task, name, **given) for name in names}, given,
         lambda rows: [shown(rows)],
-        lambda rows: {f"{what}.txt": as_text(shown(rows))} | _gains(rows),
+        lambda rows: _gains(rows) | {f"{what}.txt": as_text(shown(rows))},
     )  # fmt: skip
 
 
