@@ -3,6 +3,7 @@
 
 PYTHON  ?= python3
 WORKERS ?= 2
+DRAW    ?= 1
 
 VENV  := .venv
 BIN   := $(VENV)/bin
@@ -27,10 +28,10 @@ demo: $(STAMP) ## repeat the paper's experiment, tables and figures into results
 test: $(STAMP) ## run the tests, but for the slow ones
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-# With MINUTES=25, say, so much of them as fits, their files in an order that the source draws.
+# With MINUTES=20, say, so much of them as fits, their files in the order that DRAW draws.
 slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow $(if $(MINUTES),--minutes=$(MINUTES) \
-	    --draw=$$(git rev-parse HEAD:src 2>/dev/null)) || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow \
+	    $(if $(MINUTES),--minutes=$(MINUTES) --draw=$(DRAW)) || [ $$? -eq 5 ]
 
 check: $(STAMP) ## formatting, lint, types, direction of imports
 	$(BIN)/ruff format --check .

@@ -26,7 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Let a run have so many minutes, for a part of the tests that a word draws."""
     group = parser.getgroup("undertow")
     group.addoption("--minutes", type=float, help="start no test later; its files in a drawn order")
-    group.addoption("--draw", default="", help="what draws the order, such as a hash of the source")
+    group.addoption("--draw", default="", help="a word that draws the order")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

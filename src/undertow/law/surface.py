@@ -322,6 +322,7 @@ class ReachingLaw:
         eta, layer = np.split(self.vector(m), 2)
         return eta, layer
 
+    @checked
     def check_period(self, name: str, period: float, m: int) -> None:
         """Refuse a time between two inputs, s, in which s would cross its layer.
 
@@ -332,7 +333,7 @@ class ReachingLaw:
         """
         eta, layer = self.per_surface(m)
         longest = float(np.min(2 * layer / eta))
-        if self.switching != "sign" and period >= longest:
+        if self.switching != "sign" and not period < longest:
             raise InvalidInputError(
                 name,
                 value=f"{period:g} s",
