@@ -661,7 +661,7 @@ def test_an_interrupted_survey_keeps_its_rows(
 def test_interrupted_trials_keep_their_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from undertow.studies.trials import library
+    from undertow.studies.trials import experiments
     from undertow.studies.trials.library import LibraryRow
 
     def some(name: str, **_: Any) -> LibraryRow:
@@ -669,7 +669,8 @@ def test_interrupted_trials_keep_their_rows(
             raise KeyboardInterrupt
         return LibraryRow("tora", 1, 0.1, 1, 1, {}, 3.0, 0.5)
 
-    monkeypatch.setattr(library, "through_the_runtime", some)
+    line, _, names, shown = experiments.ROWS["library"]
+    monkeypatch.setitem(experiments.ROWS, "library", (line, some, names, shown))
     result = CliRunner().invoke(app, ["trials", "library", "--out", str(tmp_path)])
     assert result.exit_code == 130
     assert "tora" in result.stdout
