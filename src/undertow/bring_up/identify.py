@@ -80,7 +80,7 @@ def identify(
         (:func:`undertow.bring_up.fit.readings`), with 95 % confidence intervals from the
         Jacobian, corrected for residuals that are correlated in time (Newey and West,
         *Econometrica* 55(3), 1987), and no narrower than what the counting of the encoders
-        alone would make them.
+        alone would make them.  What leaves no trace in the record is held at the model's value.
 
     Raises
     ------
@@ -97,10 +97,10 @@ def identify(
     )
     quantile = float(scipy.stats.norm.ppf(0.975))
     estimates = {}
-    alone = 1.0 / np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))  # of each column, the rest fitted
+    spread = np.diag(np.linalg.pinv(J.T @ J))  # 0 of what leaves no trace in the record
     motion = float(np.linalg.norm((fit.moved - fit.moved.mean(axis=0)) / np.sqrt(fit.variance)))
-    for v, scaled, variance, size in zip(free, z, variances, alone, strict=True):
-        if v.name.startswith("_"):
+    for v, scaled, variance, share in zip(free, z, variances, spread, strict=True):
+        if v.name.startswith("_") or not share > 0.0:
             continue
         value, error = float(scaled * v.scale), float(math.sqrt(variance) * v.scale)
         estimates[v.name] = Estimate(
@@ -112,7 +112,7 @@ def identify(
             value - quantile * error,
             value + quantile * error,
             v.nominal,
-            abs(value - v.nominal) / v.scale * float(size) / motion,
+            abs(value - v.nominal) / v.scale / math.sqrt(share) / motion,
         )
     known = {p.name for p in mechanism.parameters}
     changed = {k: e.value for k, e in estimates.items() if k in known}
