@@ -187,3 +187,11 @@ def test_references_past_the_travel_are_refused(cascade: ut.Cascade) -> None:
     """With where and when they first do so most."""
     with pytest.raises(InvalidInputError, match=r"at 1.2\d? s: got x = 1.6 m, must be .x."):
         cascade.simulate(CRANE.state(), target=ut.Reference.sine(0.2, x=1.6), duration=5.0)
+
+
+def test_the_travel_is_a_constraint_about_a_target_too() -> None:
+    """Where it ends is as far from the target as it was from zero, less the target."""
+    cascade = ut.Cascade(CRANE, ut.MinimumEnergy(horizon=8.0), belief="exact")
+    (leg,) = legs_to(cascade, ut.SetPoints({"x": 1.0}), 8.0)
+    (travel,) = cascade.about(cascade.loop, leg.target, 0.0).objective.constraints
+    assert "1.425 m" in travel.name

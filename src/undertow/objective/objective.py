@@ -277,9 +277,12 @@ def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constrai
 
 
 def _is_travel(constraint: Constraint) -> bool:
-    """Whether a constraint is one of :func:`travel_box`: they know coordinates by number."""
+    """Whether a constraint is one of :func:`travel_box`, not yet seen from a target.
+
+    They know coordinates by number, and say where they come from.
+    """
     within = constraint.formula
-    return isinstance(within, _Within) and isinstance(within.state, int)
+    return bool(constraint.source) and isinstance(within, _Within) and isinstance(within.state, int)
 
 
 def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown: str) -> None:
