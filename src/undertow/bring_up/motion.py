@@ -62,8 +62,7 @@ def _growth(mechanism: Mechanism, x: FloatArray) -> float:
 
 def input_gains(mechanism: Mechanism) -> FloatArray:
     """Return |B| with the model's parameters, (m, m): what the inputs do to the driven joints."""
-    B = mechanism.input_matrix.subs(mechanism.substitution)
-    return np.asarray(np.abs(np.array(B, dtype=float)))
+    return np.asarray(np.abs(mechanism.B))
 
 
 class GuardError(UndertowError):

@@ -118,6 +118,7 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     )
 
 
+@lru_cache(maxsize=128)
 def force_scale(mechanism: Mechanism) -> float:
     """Largest force at rest over random positions, N m or N; 1 where there is none."""
     q = np.random.default_rng(0).uniform(-1, 1, (64, mechanism.n))
