@@ -1,4 +1,10 @@
-"""Bring-up of a rig: what is wired wrongly, how late it is, what its parameters are."""
+"""Bring-up of a rig: what is wired wrongly, how late it is, what its parameters are.
+
+:mod:`.wizard` goes through the steps, as ``undertow bench`` shows them: small motions
+(:mod:`.motion`), signs and scales (:mod:`.wiring`), then parameters with confidence intervals
+(:mod:`.identify`, by the least squares of :mod:`.fit`). :mod:`.faults` wires a simulated rig
+wrongly.
+"""
 
 from undertow.bring_up.faults import Miswired, miswired, rubbing
 from undertow.bring_up.identify import Estimate, Identification, identify

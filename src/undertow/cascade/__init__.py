@@ -1,4 +1,9 @@
-"""The controller: law, optimiser and gate at two rates; robustness; swing-up and catch."""
+"""The cascade: the law inside, the optimiser outside, a gate between; and swing-up before it.
+
+Begin at :class:`Cascade` (:mod:`.cascade`). A simulated run of it is :mod:`.simulation`'s,
+targets that lie elsewhere are :mod:`.targets`'; :mod:`.robustness` asks what delay and noise a
+surface bears, :mod:`.swing_up` brings the mechanism up first.
+"""
 
 from undertow.cascade.cascade import Cascade, CascadeState
 from undertow.cascade.policy import Policy, policy

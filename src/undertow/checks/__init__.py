@@ -1,4 +1,8 @@
-"""Checks of a mechanism: of its model, and of the compiled code against that model."""
+"""Checks of a mechanism: identities of every model, and compiled code against its formulas.
+
+:mod:`.check` tests the model; :mod:`.agreement` compares what is compiled with :mod:`.exact`
+arithmetic on the same expressions. In Python: ``ut.check_mechanism(mechanism)``.
+"""
 
 from undertow.checks.check import MechanismReport, check_mechanism
 

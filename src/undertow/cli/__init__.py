@@ -1,4 +1,9 @@
-"""The command line: parse and dispatch only, one file for each group of commands."""
+"""The command line: parse and dispatch only, one file for each group of commands.
+
+A command is a function under ``@command`` (:mod:`.terminal`); options that several share are in
+:mod:`.options`, words of users become values in :mod:`.parsing`. The work is done in
+:mod:`undertow.studies` and below.
+"""
 
 from __future__ import annotations
 

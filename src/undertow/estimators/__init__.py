@@ -1,4 +1,9 @@
-"""Estimators: states from measured positions, parameters from motions."""
+"""Estimators: states from measured positions, parameters from motions.
+
+:mod:`.interface` says what an estimator is and has those without a model; :mod:`.kalman` is the
+extended Kalman filter that runs take. :mod:`.belief` is what is known of the parameters, and how
+a motion narrows it; :mod:`.recorded_run` tries an estimator in simulated time.
+"""
 
 from undertow.estimators.belief import Belief, ParameterEstimate
 from undertow.estimators.interface import Estimator, FilteredDerivative, Measured, SuperTwisting

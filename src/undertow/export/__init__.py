@@ -1,6 +1,10 @@
 """For other tools: heap-free C99 and what carries it on, Gymnasium's environments, python-control.
 
-The classes of Gymnasium are in :mod:`undertow.export.gym`, which is imported where it is needed.
+Begin at :class:`EmbeddedController` (:mod:`.controller`), whose C :mod:`.sources` writes from the
+templates; :mod:`.carriers` packs it for FMI, ROS 2 and Simulink, :mod:`.twin` is its step in
+Python. The task of balancing is :mod:`.balancing`'s; Gymnasium's classes are in
+:mod:`undertow.export.gym`, which is imported where it is needed. Systems of python-control are
+:mod:`.python_control`'s.
 """
 
 from undertow.export.balancing import BalancingTask, environment, vector_environment

@@ -1,4 +1,10 @@
-"""The control law: surfaces and their schedule, reaching law, stability margins."""
+"""The control law: sliding surfaces, how the state reaches them, and whether they are stable.
+
+:mod:`.sliding` writes the law (3)-(16) down; its numbers are a :class:`Surface` and a
+:class:`ReachingLaw` (:mod:`.surface`), one of each or a schedule of them (:mod:`.schedule`).
+:mod:`.stability` designs a first surface and judges any; :mod:`.reference` says where the
+mechanism is to be; :mod:`.inner_loop` is the whole law as one compiled step, for the fast loop.
+"""
 
 from undertow.law.inner_loop import (
     LAYOUT,

@@ -1,4 +1,9 @@
-"""What moves: a mechanism, its physical parameters, and whether its model is valid."""
+"""The mechanism: from energies, or M, f and B, to a model that is checked and can be linearised.
+
+Begin at :class:`Mechanism` (:mod:`.mechanism`), made of named :mod:`.quantities` and checked by
+:mod:`.validity`; :mod:`.lagrange` derives its equations, :mod:`.partition` prepares them for the
+law, :mod:`.linearisation` judges them at the target. :mod:`.importers` reads other forms.
+"""
 
 from undertow.models.error_dynamics import (
     error_dynamics,

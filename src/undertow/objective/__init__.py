@@ -1,4 +1,8 @@
-"""What is best: cost, horizon, terminal set and constraints; and the word for each problem."""
+"""What is best: stage cost, horizon, terminal set and constraints; a word for each usual problem.
+
+:class:`Objective` (:mod:`.objective`) takes a cost of your own; :mod:`.named` gives words a
+meaning.
+"""
 
 from undertow.objective.named import USUAL, Goal, finite_limits, objective_for
 from undertow.objective.objective import (

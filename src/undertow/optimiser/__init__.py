@@ -1,4 +1,11 @@
-"""The search for a surface: decision variables, CMA-ES, trust region, task and result."""
+"""The search for the best plan from a state: what it may choose, and how it looks for it.
+
+Begin at :class:`Optimiser` (:mod:`.optimiser`): global the first time, warm-started afterwards.
+:mod:`.task` is one search that can be asked at any moment, :mod:`.search` composes it of methods
+(:mod:`.cma_es`, :mod:`.trust_region`, both ask/tell; :mod:`.arrival` for least time) in the
+coordinates of :mod:`.search_space`. :mod:`.schedules` looks for several surfaces in turn, which
+follow the earliest motion of :mod:`.open_loop`.
+"""
 
 from undertow.optimiser.cma_es import CMAES
 from undertow.optimiser.optimiser import Optimiser, Planner

@@ -1,4 +1,9 @@
-"""Rigs, plants to meet: the ideal model, a realistic bench, MuJoCo, hardware of one's own."""
+"""Rigs, what a controller meets: read, write, close.
+
+:mod:`.interface` says what a rig is; hardware of one's own implements it. :mod:`.simulated` has
+the ideal model and the realistic bench, whose imperfections are the data of :mod:`.bench`;
+:mod:`.mujoco_rig` moves the scenes of :mod:`.scenes` in MuJoCo.
+"""
 
 from undertow.plants.bench import (
     Amplifier,

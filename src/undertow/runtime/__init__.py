@@ -1,4 +1,13 @@
-"""The runtime: the controller against the clock, the log of a run and its replay."""
+"""The runtime: the cascade against the clock, the log of a run, and its replay.
+
+A run is data (:mod:`.recipe`), and :mod:`.session` carries it out. The fast loop (:mod:`.loop`)
+reads, asks the :mod:`.controller` what to do, writes and logs; the controller, a pure state
+machine, checks its readings (:mod:`.sensors`), steps (:mod:`.steps`, :mod:`.modes`) and looks at
+each plan before it uses it (:mod:`.plan_check`). The slow loop (:mod:`.slow_loop`) selects plans,
+in a thread or in processes (:mod:`.workers`). :mod:`.supervisor` outlives them all. What was
+logged (:mod:`.log`, columns in :mod:`.encoding`) is read by :mod:`.recording` and run again, bit
+for bit, by :mod:`.replay`.
+"""
 
 from undertow.runtime.clock import Histogram, SimulatedClock, WallClock
 from undertow.runtime.controller import Controller, Inputs

@@ -1,4 +1,10 @@
-"""Expressions to running code: the tape, its linear algebra, the printers, and the cache."""
+"""Expressions to running code: SymPy in; NumPy, numba, C99 or CUDA out; and the cache of all that.
+
+Formulas become a :class:`~undertow.symbolic.tape.Tape`, a straight-line program of small
+assignments with its linear algebra unrolled. The printers make code of it: :mod:`.function` and
+:mod:`.vector` for Python, :mod:`.scalar` for the kernels' loops, :mod:`.c99`, :mod:`.cuda`.
+:mod:`.store` keeps what was generated, :mod:`.machine` sets numba up.
+"""
 
 from undertow.symbolic.c99 import C99Emitter, Real, literal
 from undertow.symbolic.expressions import parse_expression
