@@ -58,7 +58,7 @@ def floats(what: str, values: ArrayLike) -> np.typing.NDArray[np.float64]:
     InvalidInputError
         With what was given instead.
     """
-    if _fits(values, _ARRAY):
+    if _is_array(values):
         return np.asarray(values, dtype=np.float64)
     raise InvalidInputError(
         what,
@@ -87,31 +87,25 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     undertow.base.errors.InvalidInputError: length of half: got 'a', a str, must be a number. \
 Give a number in SI units: undertow.deg(10) for an angle of 10°
     """
-    signature = inspect.signature(function)
-    starred = {
-        p.name: p.kind is p.VAR_KEYWORD
-        for p in signature.parameters.values()
-        if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
-    }
-    name = function.__qualname__
+    parameters = inspect.signature(function).parameters.values()
+    # What stands behind * or ** is checked one by one, by its place or its own name.
+    more = {p.kind: p.name for p in parameters if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    rest = more.get(inspect.Parameter.VAR_POSITIONAL)
+    others = more.get(inspect.Parameter.VAR_KEYWORD)
+    places = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        hints = _hints(function)
-        try:
-            given = signature.bind(*args, **kwargs).arguments
-        except TypeError:  # a missing or an unknown name: Python's own message is the best
-            return function(*args, **kwargs)
-        for argument, value in given.items():
-            if argument not in hints:
-                continue
-            if argument not in starred:
-                _check(f"{argument} of {name}", value, hints[argument])
-                continue
-            named = starred[argument]
-            for key, one in value.items() if named else enumerate(value):
-                _check(f"{key if named else argument} of {name}", one, hints[argument])
-        return function(*args, **kwargs)
+        tests, last = _tests(function), len(places)
+        for k, value in enumerate(args):
+            test = tests.get(places[k] if k < last else rest)
+            if test is not None and not test(value):
+                _refuse(function, places[k] if k < last else f"{k - last}", value, rest)
+        for name, value in kwargs.items():
+            test = tests.get(name) or tests.get(others)
+            if test is not None and not test(value):
+                _refuse(function, name, value, others)
+        return function(*args, **kwargs)  # of a missing or an unknown name Python itself tells
 
     return call
 
@@ -229,10 +223,16 @@ def check_fields(instance: Any, *names: str) -> None:
         For a field of another type, by name.
     """
     owner: Any = type(instance)
-    for field in owner.__dataclass_fields__.values():
-        if field.init and field.name in (names or owner.__dataclass_fields__):
-            what = f"{field.name} of {owner.__name__}"
-            _check(what, getattr(instance, field.name), _hints(owner)[field.name])
+    tests = _tests(owner)
+    for name in names or _fields(owner):
+        value = getattr(instance, name)
+        if not tests[name](value):
+            _refuse(owner, name, value)
+
+
+@cache
+def _fields(owner: Any) -> tuple[str, ...]:
+    return tuple(f.name for f in owner.__dataclass_fields__.values() if f.init)
 
 
 @cache
@@ -248,14 +248,21 @@ def _hints(of: Any) -> dict[str, Any]:
         return found
 
 
-def _check(what: str, value: object, hint: Any) -> None:
-    if _fits(value, hint):
-        return
+@cache
+def _tests(of: Any) -> dict[str | None, Callable[[Any], bool]]:
+    """Return the test of each annotation, by the name of what it annotates."""
+    return {name: _test(hint) for name, hint in _hints(of).items()}
+
+
+def _refuse(of: Any, name: str, value: object, starred: str | None = None) -> None:
+    """Raise with what an argument or a field is, and what its annotation asks for."""
+    hints = _hints(of)
+    hint = hints.get(name) or hints[starred or name]
     members = [m for m in _members(hint) if m is not types.NoneType]
     names = (_name(m) for member in members for m in (member, *get_args(member)))
     remedies = (REMEDIES.get(name) for name in names)
     raise InvalidInputError(
-        what,
+        f"{name} of {of.__qualname__}",
         value=_shown(value),
         limit=" or ".join(_words(m) for m in members),
         remedy=next((r for r in remedies if r), "Its documentation shows what it takes"),
@@ -318,30 +325,34 @@ def _several(hint: Any) -> str:
     return " or ".join(plain.get(m) or _words(m).removeprefix("an ") for m in members)
 
 
-def _fits(value: Any, hint: Any) -> bool:
-    """Tell whether a value is of a type, with numbers and sequences as users write them."""
-    if isinstance(hint, list) or get_origin(hint) in (Union, types.UnionType) or hint is ArrayLike:
-        return any(_fits(value, member) for member in _members(hint))
+@cache
+def _test(hint: Any) -> Callable[[Any], bool]:
+    """Return the test of whether a value is of a type, written as users write it."""
     origin, inner = get_origin(hint), get_args(hint)
     if hint is _ARRAY or origin is np.ndarray:
-        return _is_array(value)
+        return _is_array
+    if hint is ArrayLike or origin in (Union, types.UnionType):
+        tests = [_test(member) for member in _members(hint)]
+        return lambda value: any(test(value) for test in tests)
     if origin is Literal:
-        return any(type(value) is type(one) and value == one for one in inner)
+        return lambda value: any(type(value) is type(one) and value == one for one in inner)
     if origin is Callable:
-        return callable(value)
+        return callable
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        return isinstance(value, Mapping) and all(_fits(v, inner[1]) for v in value.values())
+        of_value = _test(inner[1])
+        return lambda value: isinstance(value, Mapping) and all(map(of_value, value.values()))
     if isinstance(origin, type) and issubclass(origin, Iterable):
-        return _is_sequence(value, inner)
+        parts = tuple(_test(one) for one in inner if one is not Ellipsis)
+        return lambda value: _is_sequence(value, parts)
     if hint in (float, int, complex):
-        return _is_number(value, hint)
+        return lambda value: _is_number(value, hint)
     if hint is bool:
-        return isinstance(value, bool | np.bool_)
+        return lambda value: isinstance(value, bool | np.bool_)
     if hint is Any or not isinstance(hint, type) or hint.__module__.startswith("sympy"):
-        return True  # expressions are for those who know the symbols
+        return lambda _: True  # expressions are for those who know the symbols
     if getattr(hint, "_is_protocol", False):
-        return True
-    return isinstance(value, hint)
+        return lambda _: True
+    return lambda value: isinstance(value, hint)
 
 
 def _is_array(value: Any) -> bool:
@@ -353,16 +364,18 @@ def _is_array(value: Any) -> bool:
         return False
 
 
-def _is_sequence(value: Any, inner: tuple[Any, ...]) -> bool:
+def _is_sequence(value: Any, parts: tuple[Callable[[Any], bool], ...]) -> bool:
     if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
         return False
     if isinstance(value, np.ndarray) and value.ndim == 0:
         return False
     if not isinstance(value, Collection):
         return True  # looking at the parts would use them up
-    if len(inner) > 1 and inner[1] is not Ellipsis:
-        return len(value) == len(inner) and all(map(_fits, value, inner))
-    return all(_fits(one, inner[0]) for one in value)
+    if len(parts) > 1:
+        return len(value) == len(parts) and all(
+            test(one) for test, one in zip(parts, value, strict=True)
+        )
+    return all(map(parts[0], value))
 
 
 def _is_number(value: Any, hint: type) -> bool:

@@ -9,6 +9,7 @@ where there may be several one after another: its copies are what they are impro
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 
@@ -237,10 +238,15 @@ def _along_ridge(task: Optimisation, most: int) -> bool:
     return search.converged
 
 
+@cache
+def _reaches(count: int) -> FloatArray:
+    return np.geomspace(0.1, 1.0, count)
+
+
 def _look_around(task: Optimisation, here: FloatArray) -> None:
     wide = min(task.left, LANES)
     if wide > 0:
-        around = here + task.space.steps(task.rng, np.geomspace(0.1, 1.0, wide))
+        around = here + task.space.steps(task.rng, _reaches(wide))
         task.cost(around, hopeless=1.0)
 
 
