@@ -1,10 +1,10 @@
 """The earliest arrival, for many plans at once; knows nothing of control.
 
 The first time at which a motion touches the terminal set is a discontinuous function of the
-parameters, and a population search gets stuck on its steps.  The state at a *fixed* time T is
-smooth.  So: bring the states at T of a population to zero by Levenberg-Marquardt, all in one batch;
-where one arrives, at T or before, shorten T, drop those that are farthest, and go on until none
-follows.
+parameters, and a population search gets stuck on its steps.  Where it comes *closest* until a fixed
+time T is smooth, but for jumps from one approach to another.  So: bring the closest states of a
+population to zero by Levenberg-Marquardt, all in one batch; where one arrives, shorten T, drop
+those that are farthest, and go on until none follows.
 
 Plans that arrive without sliding in at a decaying rate are isolated, or lie on thin sets: that is
 why the population is wide at first and many of its members lead nowhere.
@@ -42,7 +42,7 @@ class States(Protocol):
     """See :class:`ArrivalSearch`."""
 
     def __call__(self, z: FloatArray, T: float) -> tuple[FloatArray, FloatArray]:
-        """Return states at T, and when they are reached."""
+        """Return the states that are closest to zero until T, and when they are reached."""
         ...
 
 
@@ -53,8 +53,8 @@ class ArrivalSearch:
     Parameters
     ----------
     states
-        States at T, s, for parameters (N, d): (N, k), infinite for a motion that broke off; and
-        when that is, (N,): a motion that arrives before T is told there and then.
+        The closest states until T, s, for parameters (N, d): (N, k), infinite for a motion that
+        broke off before; and when that is, (N,).
     admits
         Whether parameters (N, d) whose motions arrive are admissible, (N,).
     radius
@@ -73,7 +73,7 @@ class ArrivalSearch:
     fewest: int = FEWEST
 
     def run(self, z: FloatArray, T: float, members: int) -> None:
-        """Search from those of some parameters (N, d) that are nearest at T, s."""
+        """Search from those of some parameters (N, d) that come nearest until T, s."""
         if self.without(len(z)):
             return
         z, x, t = nearest(z, *self.states(z, T), members)

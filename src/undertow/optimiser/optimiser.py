@@ -135,7 +135,7 @@ class Optimiser:
         if warm:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
         if self.counts_time:
-            return Budget((2 if schedule else 1) * 8192 * size)
+            return Budget(16384 * size)
         size //= self.space.segments
         divided = FINE * size if schedule or self.space.segments > 1 else 0
         # 6144 for the three of n = 2; a covariance takes as long to learn as it has entries.

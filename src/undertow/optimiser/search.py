@@ -40,8 +40,8 @@ FAR = 0.25
 POLISH = 512
 
 #: A search for arrivals far and wide: its members, draws for each of them, and between which parts
-#: of the best time it begins: what arrives late may lead to what arrives early.
-CROWD, DRAWS, BEGINS = 96, 16, (1.0, 2.0)
+#: of the best time it begins: what arrives a little later may lead to what arrives earlier.
+CROWD, DRAWS, BEGINS = 48, 64, (0.95, 1.3)
 
 #: The same around the best plan: the spread is between two powers of ten; and how many of these
 #: searches in turn may lead nowhere before the next one far and wide.  With few parameters arrivals

@@ -43,6 +43,9 @@ ANSWERING = 1e-4
 #: What a motion integrated to the tolerance counts as, in evaluations: it takes as long.
 EXACT = 16
 
+#: From which part of a time on an approach counts: the start may be closer than any of them.
+LATER = 0.3
+
 #: Plans of one batch, at most, that are scored again where they promise an earlier arrival; and
 #: the part of a promised time by which a motion is late that does not arrive then at all.
 DOUBTED, GRAZES = 4, 0.01
@@ -275,9 +278,9 @@ class Optimisation:
     def states(
         self, z: FloatArray, T: float, space: SearchSpace | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """States at T, (N, 2n), or where a motion came closest, if it arrived before; and when.
+        """States where motions come closest until T, (N, 2n), and when; at T if that is too early.
 
-        They are infinite where a motion broke off.  An ensemble's first member stands for all.
+        They are infinite where one broke off before.  An ensemble's first member stands for all.
         """
         loop, space = self.loop, space or self.space
         T = max(T, loop.step)
@@ -288,7 +291,8 @@ class Optimisation:
         buffers.fill(self.x, *space.decode(z))
         batch = loop.roll_out(buffers, space.freedom.times, T, terminal=0.0, seek=True)
         x = ends(batch)
-        early = np.isfinite(x[:, 0]) & (batch.closest < loop.objective.terminal_radius)
+        there = batch.closest < loop.objective.terminal_radius
+        early = np.isfinite(batch.closest_x[:, 0]) & (there | (batch.closest_time > LATER * T))
         x = np.where(early[:, None], batch.closest_x, x)
         return x, np.where(early, batch.closest_time, T)
 
