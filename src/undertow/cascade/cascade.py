@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,8 +49,11 @@ from undertow.law import (
     check_surface,
 )
 from undertow.models import TIME, FloatArray, Mechanism, number_of
-from undertow.objective import MinimumEnergy, Objective
+from undertow.objective import Objective, objective_for
 from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Proposal
+
+#: Stands for the objective that is meant where nobody says, until the mechanism is known.
+_USUAL = cast(Objective, None)
 
 #: Relative tolerance of the linear tail in the optimiser's rollouts.
 TAIL_RTOL = 2e-3
@@ -134,7 +137,9 @@ class Cascade:
     mechanism
         The controller's belief.
     objective
-        What is best; the travel that the mechanism declares joins its constraints, see
+        What is best; by default ``effort`` of :func:`undertow.objective_for`, as on the command
+        line: it means the same for every mechanism, and it arrives, where least energy puts that
+        off.  The travel that the mechanism declares joins its constraints, see
         :meth:`undertow.Objective.on`.
     reaching
         Reaching law of the inner loop.
@@ -194,7 +199,7 @@ class Cascade:
     """
 
     mechanism: Mechanism
-    objective: Objective = MinimumEnergy()
+    objective: Objective = _USUAL
     reaching: ReachingLaw = ReachingLaw()
     period: float = 0.1
     first: Surface | None = None
@@ -213,6 +218,9 @@ class Cascade:
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
+        if self.objective is None:
+            check_fields(self, "mechanism")
+            object.__setattr__(self, "objective", objective_for(self.mechanism))
         check_fields(self)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         if TIME in self.mechanism.force.free_symbols:

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import (
     InvalidInputError,
+    ModelError,
     check_fields,
     checked,
     floats,
@@ -40,6 +41,7 @@ from undertow.models import (
     AT_REST,
     FloatArray,
     Mechanism,
+    Parameter,
     force_scale,
     linear_accelerations,
     number_of,
@@ -164,7 +166,8 @@ class Belief:
     ------
     InvalidInputError
         For unknown parameters, and for tolerances that are not positive or reach beyond what makes
-        physical sense; for a noise or a bound that is not positive.
+        physical sense, where M is not positive definite for instance; for a noise or a bound that
+        is not positive.
 
     Examples
     --------
@@ -202,9 +205,27 @@ class Belief:
                     f"{parameter.value:g} leaves",
                     remedy="Leave certain parameters out",
                 )
+            self._check_plants(parameter, tolerance)
         for name, most in (("noise", self.noise), ("bound", self.bound)):
             if most is not None:
                 one_for_each(f"{name} of a belief", most, self.mechanism.n)
+
+    def _check_plants(self, parameter: Parameter, tolerance: float) -> None:
+        """Refuse a tolerance at one of whose ends there is no mechanism: a negative mass, say."""
+        place = [p.name for p in self.mechanism.parameters].index(parameter.name)
+        for change in (-tolerance, tolerance):
+            values = self.mechanism.parameter_values
+            values[place] += change
+            try:
+                self.mechanism.with_values(values)
+            except ModelError as error:
+                raise InvalidInputError(
+                    f"tolerance of parameter '{parameter.name}'",
+                    value=f"{tolerance:g} {parameter.unit}".rstrip(),
+                    limit="one that leaves M(q) positive definite: with "
+                    f"{parameter.name} = {values[place]:g} it has the {error.value}",
+                    remedy="Give a smaller one; Parameter(low=0.0) says what must stay positive",
+                ) from error
 
     @classmethod
     @checked

@@ -8,6 +8,7 @@ from undertow.models.error_dynamics import (
 )
 from undertow.models.linearisation import (
     AT_REST,
+    UNCONTROLLABLE,
     Linearisation,
     controllability,
     force_scale,
@@ -15,6 +16,7 @@ from undertow.models.linearisation import (
     linear_accelerations,
     linear_numbers,
     linearise,
+    uncontrollable,
 )
 from undertow.models.mechanism import Mechanism
 from undertow.models.partition import Partition
@@ -24,6 +26,7 @@ from undertow.models.quantities import (
     FloatArray,
     Input,
     Parameter,
+    deg,
     normal_name,
     number_of,
     numbers,
@@ -42,6 +45,7 @@ from undertow.models.validity import (
 __all__ = [
     "AT_REST",
     "TIME",
+    "UNCONTROLLABLE",
     "Coordinate",
     "FloatArray",
     "Input",
@@ -52,6 +56,7 @@ __all__ = [
     "by_names",
     "check_symbols",
     "controllability",
+    "deg",
     "error_dynamics",
     "expression_of",
     "force_scale",
@@ -68,6 +73,7 @@ __all__ = [
     "reference_names",
     "require_smooth",
     "shortened",
+    "uncontrollable",
     "vocabulary",
     "with_positions",
 ]

@@ -697,13 +697,16 @@ class Mechanism:
             Inputs, (…, m), not clipped here.
         """
         state = self.check_state(x)
-        inputs = self._columns("inputs", u, [i.name for i in self.inputs])
+        inputs = self._columns(
+            "inputs", u, [i.name for i in self.inputs], "Give one number for each input, in a list"
+        )
         return self._evaluate("dynamics", floats("time", t), state, *np.moveaxis(inputs, -1, 0))
 
     def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
         """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
         state = self.check_state(x)
-        qdd = self._columns("accelerations", qdd, [c.name for c in self.coordinates])
+        names = [c.name for c in self.coordinates]
+        qdd = self._columns("accelerations", qdd, names, "Give one number for each coordinate")
         inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), qdd)
         return np.asarray(inertial - self.f(state, t))
 
