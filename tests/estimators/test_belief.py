@@ -247,3 +247,20 @@ def test_a_tolerance_that_leaves_no_mechanism_is_refused(
     with pytest.raises(InvalidInputError, match=r"tolerance of parameter 'm'.*with m = -4\.8"):
         make(rig)
     assert ut.Belief(rig, {"m": 0.1}).tolerances == {"m": 0.1}
+
+
+def test_errors_of_state_are_small_beside_the_travel() -> None:
+    """The usual 0.2 mm would put every plausible motion of a small cart beyond its ends."""
+    cart = ut.mechanisms.cart_pendulum()
+
+    def slips(low: float, high: float) -> FloatArray:
+        rail = replace(cart.coordinates[0], low=low, high=high)
+        moved = replace(cart, coordinates=(rail, cart.coordinates[1]))
+        belief = Belief.usual(moved)
+        errors = belief.ensemble(belief.prior).state_errors
+
+        return np.abs(errors).max(axis=0)
+
+    np.testing.assert_allclose(slips(-1.5, 1.5)[:2], [2e-4, 2e-3])
+    np.testing.assert_allclose(slips(-1e-4, 3e-4)[:2], [1e-6, 2e-3])
+    np.testing.assert_allclose(slips(0.0, 3e-4)[:2], [3e-6, 2e-3])

@@ -103,7 +103,8 @@ class ClosedLoop:
         The controller's belief, from which the law is derived.
     objective
         Stage cost, terminal set, constraints; the travel that the belief declares joins them, see
-        :meth:`undertow.Objective.on`.
+        :meth:`undertow.Objective.on`.  Nothing is optimised here: by default the paper's control
+        energy is counted.
     reaching
         Reaching law; its gains can be overridden for each rollout.
     plant

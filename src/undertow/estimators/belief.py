@@ -63,10 +63,11 @@ OTHERS, EXACT = 0.1, ("", "m/s²")
 AXES = 7
 
 #: Members with small errors of state and surface; the errors, as a part of a surface's entries,
-#: and of positions, rad and m.
+#: and of positions, rad and m, but this part of the travel on either side where that is less: a
+#: mechanism may be smaller than the usual error.
 SLIPS = 16
 SLIP_OF_SURFACE = 1e-3
-SLIP_OF_STATE = {"rad": 2e-3, "m": 2e-4}
+SLIP_OF_STATE, SLIP_OF_TRAVEL = {"rad": 2e-3, "m": 2e-4}, 0.01
 #: Half a percent of the change of velocity over 2 ms at full inputs, s, is noise; and the noise of
 #: what no input moves at the target, rad/s or m/s.
 SMALL, UNDRIVEN = 0.005 * 0.002, 0.004
@@ -370,7 +371,13 @@ class Belief:
         """
         mechanism, rng = self.mechanism, np.random.default_rng(0)
         n, m = mechanism.n, mechanism.m
-        scale = [SLIP_OF_STATE[c.unit] for c in mechanism.coordinates]
+        scale = [
+            min(
+                SLIP_OF_STATE[c.unit],
+                *(SLIP_OF_TRAVEL * abs(end) for end in (c.low, c.high) if end),
+            )
+            for c in mechanism.coordinates
+        ]
         surface_errors = np.zeros((len(values), 2 * m * n))
         state_errors = np.zeros((len(values), 2 * n))
         half = SLIPS // 2  # then the same with the other sign

@@ -232,7 +232,9 @@ def first_surface(
     ----------
     weights
         Diagonal of Q, (2n,), positive; by default 1 on q_a, 10 on q_u and 0.1 on the
-        velocities.
+        velocities, in SI units: for what is of the size of a bench.  Of a long crane they ask for
+        the trolley's place and hardly for the swing: give ``rate``, or weights 1/x_max² of what is
+        large there.
     rate
         Convergence rate asked for, 1/s: all eigenvalues left of −rate.
 

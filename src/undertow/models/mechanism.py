@@ -195,6 +195,30 @@ class Mechanism:
     def _check(self) -> None:
         data = vocabulary(parameters=self.parameters, time=False)
         places = vocabulary(self.coordinates, velocities=False, time=False) | data
+        everything = vocabulary(self.coordinates, self.inputs, self.parameters)
+        for what, allowed, holds, remedy in (
+            (
+                "mass_matrix",
+                places,
+                "positions and parameters alone",
+                "What depends on velocities or the time is a force: it belongs to f",
+            ),
+            (
+                "input_matrix",
+                data,
+                "parameters alone: B is constant",
+                "Take inputs that act alike everywhere, the forces and torques of the joints; of a "
+                "constant (n, m) matrix undertow.modelling.from_matrices finds the coordinates",
+            ),
+        ):
+            odd = getattr(self, what).free_symbols & set(everything) - set(allowed)
+            if odd:
+                raise ModelError(
+                    f"{what} of '{self.name}'",
+                    value=f"made of {', '.join(sorted(map(str, odd)))}",
+                    limit=f"made of {holds}",
+                    remedy=remedy,
+                )
         for what, known in (
             ("mass_matrix", places),
             ("input_matrix", data),
