@@ -257,9 +257,8 @@ def test_errors_of_state_are_small_beside_the_travel() -> None:
         rail = replace(cart.coordinates[0], low=low, high=high)
         moved = replace(cart, coordinates=(rail, cart.coordinates[1]))
         belief = Belief.usual(moved)
-        errors = belief.ensemble(belief.prior).state_errors
-
-        return np.abs(errors).max(axis=0)
+        most: FloatArray = np.abs(belief.ensemble(belief.prior).state_errors).max(axis=0)
+        return most
 
     np.testing.assert_allclose(slips(-1.5, 1.5)[:2], [2e-4, 2e-3])
     np.testing.assert_allclose(slips(-1e-4, 3e-4)[:2], [1e-6, 2e-3])

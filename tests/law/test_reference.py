@@ -247,7 +247,7 @@ def test_a_function_of_time_begins_at_zero(cart: ut.Mechanism) -> None:
     """One that is not defined before is differentiated from its beginning on: here t²."""
     asked: list[float] = []
 
-    def r(t: float) -> float:
+    def r(t: Any) -> float:  # of one time
         root = math.sqrt(t)
         asked.append(t)
         return 0.1 * root**4

@@ -274,3 +274,10 @@ def test_a_box_of_more_than_a_turn_is_asked_about(rig: ut.Mechanism) -> None:
     with pytest.warns(UserWarning, match=r"45 rad, 2578°: write undertow.deg\(45\)"):
         box.on(rig)
     ut.MinimumTime(constraints=ut.state_box(theta=ut.deg(300), phi_dot=45)).on(rig)
+
+
+def test_a_cost_is_asked_for_at_the_target(rig: ut.Mechanism) -> None:
+    """Where most are least: one that is negative there alone passed at random places."""
+    dent = ut.Objective("dent", lambda v: v.voltage**2 + v.phi**2 - 1e-6)
+    with pytest.raises(InvalidInputError, match=r"stage cost of 'dent': got -1e-06"):
+        dent.stage_cost(rig)

@@ -632,7 +632,7 @@ class ClosedLoop:
         surfaces
             A plan, a surface, or one surface for each of ``switch_times``.
         switch_times
-            When each takes over, s after the start; the first is 0.
+            When each takes over, s after the start, at the nearest step; the first is 0.
         duration
             Length, s; the objective's horizon by default.  The motion ends then, also where that is
             no whole number of steps: with ``rtol=0`` all of them are a little shorter.

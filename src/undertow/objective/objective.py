@@ -564,8 +564,8 @@ class Objective:
         Raises
         ------
         InvalidInputError
-            For unknown names, and where Φ is negative or no number at one of 256 random
-            states and inputs.
+            For unknown names, and where Φ is negative or no number at the target or at one of
+            255 random states and inputs.
         """
         what = f"stage cost of '{self.name}'"
         stage = self._expression(mechanism, what, self.stage)
@@ -774,12 +774,16 @@ def _failed(what: str, error: Exception) -> InvalidInputError:
 
 
 def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
-    """Return the smallest of 256 random values of a stage cost; NaN where one is no number."""
+    """Return the smallest of a stage cost's values at the target and at 255 random places.
+
+    NaN where one is no number.
+    """
     rng = np.random.default_rng(0)
     symbols = [*mechanism.x, *mechanism.u]
     function = compile_expressions(symbols, [stage.subs(mechanism.substitution)])
     reach = np.ones(len(symbols)) * math.pi
     reach[2 * mechanism.n :] = np.minimum(mechanism.input_limits, 100.0)
     samples = rng.uniform(-1, 1, (256, len(symbols))) * reach
+    samples[0] = 0.0  # where most costs are least
     with np.errstate(all="ignore"):
         return float(np.min(np.real_if_close(function(*samples.T)[0])))
