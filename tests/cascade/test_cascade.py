@@ -419,3 +419,13 @@ def test_a_run_ends_when_it_was_asked_to(rig: ut.Mechanism, duration: float) -> 
     run = cascade.simulate(phi=0.3, duration=duration)
     assert run.time == pytest.approx(duration, abs=1e-15)
     assert len(run.trajectory.t) == 18 if duration > 0.033 else 17
+
+
+def test_what_is_no_planner_or_no_verdict_of_a_gate_is_refused(rig: ut.Mechanism) -> None:
+    """By name, and not as a missing attribute of None after the first search."""
+    with pytest.raises(InvalidInputError, match=r"planner of the cascade.*the method propose"):
+        ut.Cascade(rig, planner=lambda _x: None)  # type: ignore[arg-type]
+    silent: Any = lambda *_: None  # noqa: E731
+    cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact", gate=silent, cold=Budget(32))
+    with pytest.raises(InvalidInputError, match=r"gate of the cascade returned.*None.*Admission"):
+        cascade.simulate(phi=0.2, duration=0.1)

@@ -294,3 +294,19 @@ def test_what_is_no_covariance_is_refused(
         with pytest.raises(InvalidInputError, match=f"covariance.*{word}"):
             make(rig, covariance=covariance)
     assert ut.ClosedLoop(rig, covariance=np.zeros((4, 4))).covariance is not None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        ({"terminal": -1.0}, "terminal of a motion"),
+        ({"terminal": math.nan}, "terminal of a motion"),
+        ({"start": math.nan}, "start of a motion"),
+    ],
+)
+def test_a_motion_with_no_clock_or_radius_is_refused(
+    rig: ut.Mechanism, wrong: dict[str, float], word: str
+) -> None:
+    """It went on past the target, or had NaN for its times."""
+    with pytest.raises(InvalidInputError, match=word):
+        ut.ClosedLoop(rig).simulate(rig.state(phi=0.3), PASSING, **wrong)  # type: ignore[arg-type]

@@ -263,6 +263,13 @@ class Cascade:
                 limit=f"a multiple or a whole part of the period, {self.period:g} s",
                 remedy="Then what is left of a plan is a plan again",
             )
+        if self.planner is not None and not callable(getattr(self.planner, "propose", None)):
+            raise InvalidInputError(
+                "planner of the cascade",
+                value=f"{self.planner!r}, a {type(self.planner).__name__}",
+                limit="an object with the method propose, as undertow.Optimiser has it",
+                remedy="Leave it out for the library's optimiser",
+            )
         if self.first is not None:
             check_surface(self.mechanism, self.first)
         known = self.known
@@ -624,6 +631,20 @@ class Cascade:
             (loop, fixed) for loop in loops for fixed in (None, small if loop is whole else loop)
         ]
 
+    def _judged(
+        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, span: float
+    ) -> Admission:
+        """What the gate says of a plan, in the place of an old one."""
+        said = self.gate(loop, old, new, x, span)
+        if not isinstance(said, Admission):
+            raise InvalidInputError(
+                "what the gate of the cascade returned",
+                value=f"{said!r}, a {type(said).__name__}",
+                limit="an undertow.cascade.Admission",
+                remedy="Return one: of undertow.cascade.cost_gate, with conditions of your own",
+            )
+        return said
+
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
         """Put the first plan before the gate: there is no other, so it is used all the same.
@@ -631,7 +652,7 @@ class Cascade:
         The admission says what the gate would have said; ``accepted`` is always true.
         """
         current = state.error(state.since, self.mechanism.check_state(x))
-        asked = self.gate(self.loop_at(state), state.plan, state.plan, current, horizon)
+        asked = self._judged(self.loop_at(state), state.plan, state.plan, current, horizon)
         reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
         return Admission(True, reason, state.predicted, asked.verdict)
 
@@ -735,14 +756,14 @@ class Cascade:
         old = self._standing(state, loop, used, current, span)
         state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
         if proposal.plan is None:
-            kept = self.gate(loop, old, old, current, span)
+            kept = self._judged(loop, old, old, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
             admission = replace(kept, accepted=False, reason=reason)
             return replace(state, predicted=kept.cost), _reserved(admission, old, used)
-        admission = self.gate(loop, old, proposal.plan, current, span)
+        admission = self._judged(loop, old, proposal.plan, current, span)
         off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
         if off > self._sticks(state, loop, old):
-            cost = self.gate(loop, old, old, current, span).cost
+            cost = self._judged(loop, old, old, current, span).cost
             most = f"{self.objective.terminal_radius:g} at most"
             words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
             admission = Admission(False, words, cost)

@@ -648,6 +648,8 @@ class ClosedLoop:
         """
         self._check_duration(duration)
         at_least("every", every, 1, "Record each step: 1")
+        at_least("terminal of a motion", terminal or 0.0, 0, "0 never ends")
+        positive("start of a motion, s", abs(start), "0 is the usual clock", zero=True)
         if self.ensemble is not None:
             return self._alone.simulate(
                 x0, surfaces, switch_times=switch_times, duration=duration, start=start,
