@@ -189,6 +189,14 @@ class Cascade:
     UnstableSurfaceError, SingularSurfaceError
         For a first surface that cannot be used.
 
+    Notes
+    -----
+    The defaults of ``step``, ``period`` and ``reaching`` are for mechanisms whose motions take
+    tenths of seconds or more, the fastest of whose modes (``mechanism.linearise()`` shows them) is
+    some 10 1/s.  One that is c times as fast, a pendulum of a millimetre, is balanced with them,
+    but later than it could be: divide ``step`` and ``period`` by c, and give a ``reaching`` law
+    with c times the η.
+
     Examples
     --------
     >>> import undertow as ut
