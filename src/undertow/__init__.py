@@ -15,7 +15,6 @@ import undertow.base  # noqa: F401 - first: Ctrl-C ends what follows, which take
 
 # isort: on
 from importlib import import_module
-from math import radians as deg
 from typing import TYPE_CHECKING, Any
 
 from undertow import mechanisms
@@ -35,7 +34,7 @@ from undertow.law import (
     placed_surface,
     surface_margins,
 )
-from undertow.models import Coordinate, Input, Mechanism, Parameter
+from undertow.models import Coordinate, Input, Mechanism, Parameter, deg
 from undertow.models import importers as modelling
 from undertow.objective import (
     Constraint,

@@ -21,7 +21,7 @@ import sympy as sp
 from sympy.physics import mechanics
 
 import undertow as ut
-from undertow.base import ModelError, UndertowError
+from undertow.base import InvalidInputError, ModelError, UndertowError
 
 #: What is given instead of each argument.
 WRONG: tuple[Any, ...] = (None, "a", math.nan, math.inf, -1, [], [[]], {}, object(), True)
@@ -299,3 +299,20 @@ def test_a_force_with_sinc_is_computed(rig: ut.Mechanism) -> None:
         [rig.state(), rig.state(phi=0.3)]
     )
     np.testing.assert_allclose(difference[:, 0], np.sinc(np.array([0.0, 0.3]) / np.pi), rtol=1e-14)
+
+
+@pytest.mark.parametrize("angle", ["10", None, True, [10.0]])
+def test_degrees_are_a_number(angle: Any) -> None:
+    with pytest.raises(InvalidInputError, match=r"angle: got .*number, in degrees.*deg\(10\)"):
+        ut.deg(angle)
+    assert ut.deg(180) == math.pi
+
+
+def test_a_mapping_is_told_by_its_keys_and_values(rig: ut.Mechanism) -> None:
+    """Plants by time are no names; a target is not to be written as text."""
+    cascade = ut.Cascade(rig)
+    with pytest.raises(InvalidInputError, match=r"a mapping of numbers to undertow\.Mechanism"):
+        cascade.simulate(plant={0.0: None})  # type: ignore[dict-item]
+    with pytest.raises(InvalidInputError, match=r"a mapping of names to numbers.*SetPoints") as e:
+        cascade.simulate(target="theta=1")  # type: ignore[arg-type]
+    assert "in quotes" not in str(e.value)

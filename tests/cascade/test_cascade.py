@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 import sys
 import traceback
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from undertow.base import (
 from undertow.cascade import CascadeState, cost_gate
 from undertow.closed_loop import kernel, rollout
 from undertow.law import Plan
-from undertow.optimiser import Proposal
+from undertow.optimiser import Budget, Proposal
 from undertow.studies.paper import CASES
 
 GOOD = CASES["4 one-time, time"]
@@ -401,3 +402,30 @@ def test_a_target_that_the_inputs_cannot_hold_is_named(rig: ut.Mechanism) -> Non
     with pytest.raises(InfeasibleError) as caught:
         cascade.simulate(phi=0.1)
     assert f"voltage of {need:.3g} V, and its limit is {0.9 * need:.3g}" in caught.value.remedy
+
+
+def test_a_cascade_is_for_the_usual_objective_where_nobody_says(rig: ut.Mechanism) -> None:
+    """In Python as on the command line."""
+    usual, stated = ut.Cascade(rig).objective, ut.objective_for(rig)
+    assert (usual, usual.name) == (stated, "effort")
+    assert pickle.loads(pickle.dumps(ut.Cascade(rig))).objective == usual
+    with pytest.raises(InvalidInputError, match="mechanism of Cascade"):
+        ut.Cascade("rotary_pendulum")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("duration", [0.0335, 0.0301])
+def test_a_run_ends_when_it_was_asked_to(rig: ut.Mechanism, duration: float) -> None:
+    cascade = ut.Cascade(rig, belief="exact", cold=Budget(32), warm=Budget(8))
+    run = cascade.simulate(phi=0.3, duration=duration)
+    assert run.time == pytest.approx(duration, abs=1e-15)
+    assert len(run.trajectory.t) == 18 if duration > 0.033 else 17
+
+
+def test_what_is_no_planner_or_no_verdict_of_a_gate_is_refused(rig: ut.Mechanism) -> None:
+    """By name, and not as a missing attribute of None after the first search."""
+    with pytest.raises(InvalidInputError, match=r"planner of the cascade.*the method propose"):
+        ut.Cascade(rig, planner=lambda _x: None)  # type: ignore[arg-type]
+    silent: Any = lambda *_: None  # noqa: E731
+    cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact", gate=silent, cold=Budget(32))
+    with pytest.raises(InvalidInputError, match=r"gate of the cascade returned.*None.*Admission"):
+        cascade.simulate(phi=0.2, duration=0.1)

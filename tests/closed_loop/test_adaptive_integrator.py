@@ -16,6 +16,7 @@ import undertow as ut
 from support import derivative, interpreted
 from undertow.base import InvalidInputError
 from undertow.closed_loop import Event
+from undertow.closed_loop.adaptive_integrator import LEAST
 from undertow.law import Plan
 from undertow.mechanisms import LIBRARY
 from undertow.objective import objective_for
@@ -223,3 +224,91 @@ def test_a_first_plan_does_what_it_promises(accuracy: ModuleType, name: str) -> 
         assert exact.reached
         assert exact.cost == pytest.approx(promised, rel=1e-5)
         assert exact.cost <= 1.01 * proposal.cost
+
+
+@pytest.mark.parametrize("settings", [{}, {"rtol": 0.0}, {"zoh_steps": 3}])
+@pytest.mark.parametrize("duration", [0.0335, 0.0007, 0.02 + 0.01])
+def test_a_motion_ends_when_it_was_asked_to(
+    rig: ut.Mechanism, settings: dict[str, float], duration: float
+) -> None:
+    """Not at the last whole step; beside SciPy on the formulas, held inputs sample by sample."""
+    loop = ut.ClosedLoop(rig, **settings)  # type: ignore[arg-type]
+    loop = loop if loop.adapts else interpreted(loop)
+    x = rig.state(phi=0.4, theta_dot=-1.0)
+    run = loop.simulate(x, PASSING, duration=duration, terminal=0.0)
+    assert run.time == pytest.approx(duration, abs=1e-15)
+    assert (np.diff(run.t) > 1e-9).all()
+    law, held = ut.SlidingModeLaw(rig, PASSING), 0.002 * loop.zoh_steps
+    begins = np.arange(0.0, duration - 1e-9, held) if held else [0.0]
+    for begin in begins:
+        end = min(begin + held, duration) if held else duration
+        u = law(0.0, x).u
+
+        def rate(t: float, x: np.ndarray, u: np.ndarray = u) -> np.ndarray:
+            return derivative(rig, t, x, u if held else law(t, x).u)
+
+        x = solve_ivp(rate, (begin, end), x, "DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+    tolerance = 1e-8 if loop.adapts else 1e-5  # steps of one length see no corner
+    np.testing.assert_allclose(run.x[-1], x, atol=tolerance)
+
+
+def test_a_duration_near_a_whole_number_of_steps_is_one(rig: ut.Mechanism) -> None:
+    """Rounding makes no step of its own; a part of a step does, and shortens all where they are
+    equal."""
+    loop = ut.ClosedLoop(rig)
+    assert loop.equal_steps(0.1 + 0.2) == (150, 0.002)
+    assert loop.equal_steps(0.0) == (0, 0.002)
+    count, step = loop.equal_steps(0.333)
+    assert count == 167
+    assert count * step == pytest.approx(0.333, abs=1e-15)
+
+
+@pytest.mark.parametrize("rtol", [1e-300, 1e-14, 0.1, math.inf, math.nan, -1e-9])
+def test_tolerances_that_no_step_can_keep_are_refused(rig: ut.Mechanism, rtol: float) -> None:
+    """Below rounding the first motion never ended; at 1 it went through what it was to see."""
+    with pytest.raises(InvalidInputError, match=r"rtol of a closed loop.*1e-13 to 0\.01"):
+        ut.ClosedLoop(rig, rtol=rtol)
+
+
+def test_no_step_is_shorter_than_a_part_of_the_loops(rig: ut.Mechanism) -> None:
+    """Whatever is asked for: below rounding each step would be a part of the one before."""
+    loop = ut.ClosedLoop(rig)
+    object.__setattr__(loop, "rtol", 1e-20)
+    run = loop.batch(rig.state(phi=0.4), PASSING, duration=0.004, terminal=0.0, precise=True)
+    assert run.time == 0.004
+    assert run.steps[0] <= 2 / LEAST + 16  # two steps of the loop, and what was tried at first
+
+
+@pytest.mark.parametrize(
+    ("covariance", "word"),
+    [
+        (np.eye(3), "shape"),
+        (-np.eye(4), "eigenvalue -1"),
+        (np.triu(np.ones((4, 4))), "not symmetric"),
+        (np.diag([1.0, 1.0, 1.0, math.nan]), "NaN"),
+    ],
+)
+def test_what_is_no_covariance_is_refused(
+    rig: ut.Mechanism, covariance: np.ndarray, word: str
+) -> None:
+    """A negative one made costs negative, one of another shape broke off within a search."""
+    for make in (ut.ClosedLoop, ut.Cascade):
+        with pytest.raises(InvalidInputError, match=f"covariance.*{word}"):
+            make(rig, covariance=covariance)
+    assert ut.ClosedLoop(rig, covariance=np.zeros((4, 4))).covariance is not None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        ({"terminal": -1.0}, "terminal of a motion"),
+        ({"terminal": math.nan}, "terminal of a motion"),
+        ({"start": math.nan}, "start of a motion"),
+    ],
+)
+def test_a_motion_with_no_clock_or_radius_is_refused(
+    rig: ut.Mechanism, wrong: dict[str, float], word: str
+) -> None:
+    """It went on past the target, or had NaN for its times."""
+    with pytest.raises(InvalidInputError, match=word):
+        ut.ClosedLoop(rig).simulate(rig.state(phi=0.3), PASSING, **wrong)  # type: ignore[arg-type]

@@ -646,7 +646,7 @@ def test_the_shortest_motions_have_a_beginning_and_an_end(
     assert run.event == (Event.REACHED if duration is None else Event.HORIZON)
     np.testing.assert_array_equal(run.x[0], x0)
     assert (run.t[0], run.accumulated_cost[0]) == (0.0, 0.0)
-    assert run.time == pytest.approx(0.002 if duration else 0.0)
+    assert run.time == (duration or 0.0)
     assert (run.cost > 0.0) == bool(duration)
     for row in run.x[1:] if not duration else ():
         np.testing.assert_array_equal(row, x0)

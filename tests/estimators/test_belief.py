@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.integrate import solve_ivp
 
 import undertow as ut
@@ -225,3 +227,39 @@ def test_an_input_without_a_limit_counts_as_one_unit() -> None:
     one, unlimited = (Belief.usual(cart.with_input_limit(v)) for v in (1.0, math.inf))
     np.testing.assert_allclose(unlimited.full_accelerations, one.full_accelerations)
     np.testing.assert_allclose(unlimited.deviations, one.deviations)
+
+
+@pytest.mark.parametrize("make", [lambda m: ut.Belief(m, {"m": 5.0}), ut.Belief.usual])
+def test_a_tolerance_that_leaves_no_mechanism_is_refused(
+    make: Callable[[ut.Mechanism], ut.Belief],
+) -> None:
+    """A negative mass was one of the plausible plants where a parameter has no interval."""
+    x, p = ut.Coordinate("x", "m"), ut.Coordinate("p")
+    mass = ut.Parameter("m", 0.2, "kg", tolerance=5.0)
+    kinetic = x.velocity**2 + mass.symbol * (
+        (x.velocity + 0.5 * sp.cos(p.symbol) * p.velocity) ** 2
+        + (0.5 * sp.sin(p.symbol) * p.velocity) ** 2
+    )
+    rig = ut.Mechanism.from_energies(
+        "cart", [x, p], [ut.Input("force", "N", 10.0)], kinetic,
+        5 * mass.symbol * sp.cos(p.symbol), parameters=[mass],
+    )  # fmt: skip
+    with pytest.raises(InvalidInputError, match=r"tolerance of parameter 'm'.*with m = -4\.8"):
+        make(rig)
+    assert ut.Belief(rig, {"m": 0.1}).tolerances == {"m": 0.1}
+
+
+def test_errors_of_state_are_small_beside_the_travel() -> None:
+    """The usual 0.2 mm would put every plausible motion of a small cart beyond its ends."""
+    cart = ut.mechanisms.cart_pendulum()
+
+    def slips(low: float, high: float) -> FloatArray:
+        rail = replace(cart.coordinates[0], low=low, high=high)
+        moved = replace(cart, coordinates=(rail, cart.coordinates[1]))
+        belief = Belief.usual(moved)
+        most: FloatArray = np.abs(belief.ensemble(belief.prior).state_errors).max(axis=0)
+        return most
+
+    np.testing.assert_allclose(slips(-1.5, 1.5)[:2], [2e-4, 2e-3])
+    np.testing.assert_allclose(slips(-1e-4, 3e-4)[:2], [1e-6, 2e-3])
+    np.testing.assert_allclose(slips(0.0, 3e-4)[:2], [3e-6, 2e-3])

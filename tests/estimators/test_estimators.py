@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from undertow.estimators import (
     KalmanFilter,
     Measured,
     SuperTwisting,
+    compensated,
     run_recorded,
 )
 from undertow.law import InnerLoop
@@ -189,3 +192,24 @@ def test_senseless_settings_are_refused(arm: ut.Mechanism) -> None:
     ):
         with pytest.raises(InvalidInputError):
             make()
+
+
+#: An estimator that knows of half a unit of disturbance.
+STILL: Any = SimpleNamespace(disturbance=np.array([0.5]))
+
+
+@pytest.mark.parametrize("output", [[1.5], 1.5, np.array([[1.5]]), (1.5,)])
+def test_a_controller_of_ones_own_returns_its_numbers_in_any_form(output: Any) -> None:
+    """A list was an error of the compiler that was to take the disturbance off it."""
+    steer = compensated(lambda _t, _x: output, STILL, np.array([10.0]))
+    assert steer(0.0, np.zeros(4)).tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("output", "word"),
+    [([1.0, 2.0], r"2\.0\]"), ([math.nan], "nan"), (None, "None"), ("1", "'1'")],
+)
+def test_an_output_that_is_not_m_finite_numbers_is_refused(output: Any, word: str) -> None:
+    steer = compensated(lambda _t, _x: output, STILL, np.array([10.0]))
+    with pytest.raises(InvalidInputError, match=rf"output of a controller.*{word}"):
+        steer(0.25, np.zeros(4))

@@ -9,7 +9,7 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
-from undertow.law import InnerLoop, LawLayout, pack_law_parameters
+from undertow.law import InnerLoop, LawLayout, feedback_at_target, pack_law_parameters
 from undertow.law.inner_loop import law_memory
 
 
@@ -105,3 +105,10 @@ def test_parameters_with_which_the_input_would_turn_are_not_taken_over() -> None
     np.testing.assert_array_equal(law.parameters, learnt)
     law.parameters[:] = rig.parameter_values
     assert law.believe(learnt, rig.state(phi=ut.deg(60)))  # singular in any case
+
+
+def test_what_is_kept_for_all_is_read_only(rig: ut.Mechanism, base: ut.Surface) -> None:
+    """A caller who writes into the feedback would change it for every other."""
+    k = feedback_at_target(rig, base)
+    with pytest.raises(ValueError, match="read-only"):
+        k[0, 0] = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -191,3 +192,86 @@ def test_a_ramp_takes_its_ends_as_any_pair() -> None:
     assert first[0, 0] == pytest.approx(0.2)
     for other in others:
         np.testing.assert_array_equal(other, first)
+
+
+@pytest.fixture
+def cart() -> ut.Mechanism:
+    """One coordinate in m that targets move along, one in rad."""
+    return ut.mechanisms.cart_pendulum()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_set_point_that_is_no_number_says_so(value: float) -> None:
+    """Not that it were to be moved along the very coordinate that it names."""
+    with pytest.raises(InvalidInputError, match=r"set-point of 'x'.*a finite number"):
+        ut.SetPoints({"x": value})
+
+
+@pytest.mark.parametrize(
+    ("reference", "seconds"),
+    [
+        (ut.Reference.sine(1e-6, x=0.1), 3.0),
+        (ut.Reference.sine(1e9, x=0.1), 3.0),
+        (ut.Reference.ramp(1.0, x=0.1), 1e9),
+    ],
+)
+def test_a_reference_whose_grid_fills_the_memory_is_refused(
+    cart: ut.Mechanism, reference: ut.Reference, seconds: float
+) -> None:
+    with pytest.raises(InvalidInputError, match="at most 1048576 rows"):
+        reference.legs(cart, seconds)
+
+
+@pytest.mark.parametrize(
+    ("path", "word"),
+    [
+        (lambda t: 1 / 0, "ZeroDivisionError: division by zero, .*test_reference.py line"),
+        (lambda t: "far", "ValueError"),
+        (lambda t: np.ones((len(t), 2)), "ValueError"),
+        (lambda t: -np.sqrt(t - 1), "NaN"),
+    ],
+)
+def test_a_function_of_ones_own_that_fails_says_where(
+    cart: ut.Mechanism, path: Any, word: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=f"(?s)reference of 'x'.*{word}"):
+        ut.Reference.of(x=path).legs(cart, 2.0)
+
+
+def test_a_path_without_its_derivatives_is_refused(cart: ut.Mechanism) -> None:
+    with pytest.raises(InvalidInputError, match=r"returns 2 rows.*Reference.of\(x=function\)"):
+        ut.Reference({"x": lambda t: (t, t)}).legs(cart, 2.0)  # type: ignore[dict-item, return-value]
+
+
+def test_a_function_of_time_begins_at_zero(cart: ut.Mechanism) -> None:
+    """One that is not defined before is differentiated from its beginning on: here t²."""
+    asked: list[float] = []
+
+    def r(t: Any) -> float:  # of one time
+        root = math.sqrt(t)
+        asked.append(t)
+        return 0.1 * root**4
+
+    ((_, motion),) = ut.Reference.of(x=r).legs(cart, 1.0)
+    assert min(asked) == 0.0
+    at = (motion.t >= 0) & (motion.t < 1.0)
+    np.testing.assert_allclose(motion.v[at, 0], 0.2 * motion.t[at], atol=1e-9)
+    np.testing.assert_allclose(motion.a[at, 0], 0.2, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("head", "word"),
+    [
+        ("t (s),x (deg)", "reference of 'x': got in rad, must be in m"),
+        ("t (m),x (m)", "column 't .m.'.*one of s, ms"),
+        ("t (s),x (s)", "column 'x .s.'.*one of m, cm, mm, rad, deg"),
+    ],
+)
+def test_units_of_a_file_are_those_of_its_quantities(
+    cart: ut.Mechanism, tmp_path: Path, head: str, word: str
+) -> None:
+    """50° were 0.87 m."""
+    path = tmp_path / "reference.csv"
+    path.write_text(f"{head}\n0,0\n1,0.5\n")
+    with pytest.raises(InvalidInputError, match=word):
+        ut.Reference.read(path).legs(cart, 2.0)

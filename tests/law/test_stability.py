@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -493,3 +494,48 @@ def test_unusable_poles_are_refused(rig: ut.Mechanism, poles: list[complex]) -> 
     """Wrong number, or not left of the imaginary axis."""
     with pytest.raises(InvalidInputError, match="poles"):
         ut.placed_surface(rig, poles)
+
+
+def twin_pendulums(*, coupled: bool = True, damping: float = 0.0) -> ut.Mechanism:
+    """Two equal pendulums on a cart, which its force cannot tell apart; or one that none moves."""
+    names = ("p", "r") if coupled else ("p",)
+    x, *swings = ut.Coordinate("x", "m"), *(ut.Coordinate(name) for name in names)
+    kinetic = 2 * x.velocity**2 + sum(0.05 * c.velocity**2 for c in swings)
+    for c in swings if coupled else ():
+        kinetic += 0.2 * sp.cos(c.symbol) * x.velocity * c.velocity
+    potential = sum(sp.cos(c.symbol) for c in swings) * (1 if coupled else -1)
+    drag = damping * sum(c.velocity**2 for c in swings) / 2
+    return ut.Mechanism.from_energies(
+        "twins", [x, *swings], [ut.Input("force", "N", 10.0)], kinetic, potential, dissipation=drag
+    )
+
+
+@pytest.mark.parametrize("coupled", [True, False])
+def test_designs_say_that_no_linear_feedback_can_do_it(coupled: bool) -> None:
+    """Not that α_a is singular, nor to start from the design that has just failed."""
+    twins = twin_pendulums(coupled=coupled)
+    poles = -1.0 - np.arange(2 * twins.n - 1)
+    for design in (
+        lambda: ut.first_surface(twins),
+        lambda: ut.placed_surface(twins, poles.tolist()),
+        lambda: ut.lqr(twins),
+    ):
+        with pytest.raises(ModelError, match="uncontrollable pair"):
+            design()
+
+
+def test_what_rests_by_itself_need_not_be_controllable() -> None:
+    """A hanging pendulum with friction comes to rest whatever the cart does."""
+    hanging = twin_pendulums(coupled=False, damping=0.05)
+    assert controllability(hanging) < 1e-9
+    assert ut.surface_margins(hanging, ut.first_surface(hanging))[-2].value > 0
+
+
+def test_weights_that_no_riccati_equation_bears_are_refused(rig: ut.Mechanism) -> None:
+    with pytest.raises(InvalidInputError, match=r"weights of the quadratic design.*is a design"):
+        ut.first_surface(rig, [1e300] * 4)
+
+
+def test_poles_are_finite(rig: ut.Mechanism) -> None:
+    with pytest.raises(InvalidInputError, match="3 finite numbers"):
+        ut.placed_surface(rig, [-1.0, -2.0, -math.inf])

@@ -525,3 +525,17 @@ def test_how_controllable_a_mechanism_is_does_not_depend_on_the_unit_of_its_inpu
         sp.ImmutableDenseMatrix(cart.input_matrix * unit), parameters=cart.parameters,
     )  # fmt: skip
     assert controllability(other) == pytest.approx(controllability(cart), rel=1e-9)
+
+
+def test_a_matrix_of_what_it_may_not_hold_says_what_it_may() -> None:
+    """Not to declare a coordinate as a coordinate."""
+    x, p = ut.Coordinate("x", "m"), ut.Coordinate("phi")
+    force, mass = ut.Input("force", "N", 10.0), sp.Matrix([[2, 0.3], [0.3, 0.5]])
+    f = sp.Matrix([0, -p.symbol])
+    for matrix, word in (
+        ({"input_matrix": sp.Matrix([[sp.cos(p.symbol)]])}, "made of phi.*B is constant"),
+        ({"mass_matrix": mass * (1 + p.velocity**2)}, "made of phi_dot.*belongs to f"),
+        ({"mass_matrix": mass * (1 + TIME**2)}, "made of t, must be made of positions"),
+    ):
+        with pytest.raises(ModelError, match=word):
+            ut.Mechanism("own", (x, p), (force,), **{"mass_matrix": mass, "force": f} | matrix)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import sympy as sp
 import undertow as ut
 from support import interpreted, random_mechanism
 from undertow.base import InvalidInputError
-from undertow.objective.objective import Names
+from undertow.objective.objective import Names, travel_box
 
 
 def test_minimum_energy_is_the_sum_of_squared_inputs(rig: ut.Mechanism) -> None:
@@ -233,3 +234,50 @@ def test_energy_has_the_unit_of_the_inputs_that_it_is_of(rig: ut.Mechanism) -> N
     assert ut.MinimumEnergy(unit="J").on(cart).unit == "J"
     motion = ut.ClosedLoop(cart).simulate(cart.state(phi=0.1), ut.first_surface(cart), duration=0.1)
     assert motion.cost_unit == motion.columns["cost"][1] == "N² s"
+
+
+def test_only_declared_travel_is_put_anew(rig: ut.Mechanism) -> None:
+    """A constraint of one's own stays, though it is a box with a source that knows its state by
+    number; travel of another mechanism goes."""
+    cart = ut.mechanisms.cart_pendulum()
+    (travel,) = travel_box(cart)
+    own = replace(travel, declared=False)
+    kept = ut.MinimumTime(constraints=(own,), travel=False).on(cart)
+    assert kept.constraints == (own,)
+    assert ut.MinimumTime(constraints=(travel,)).on(rig).constraints == ()
+
+
+def test_a_terminal_set_wider_than_the_range_is_refused() -> None:
+    """Of a cart with 0.1 mm of travel any place counted as the target."""
+    cart = ut.mechanisms.cart_pendulum()
+    rail = replace(cart.coordinates[0], low=-1e-4, high=1e-4)
+    small = replace(cart, coordinates=(rail, cart.coordinates[1]))
+    with pytest.raises(InvalidInputError, match=r"terminal_radius.*at most 9\.5e-05"):
+        ut.MinimumTime().on(small)
+    assert ut.MinimumTime(terminal_radius=1e-5).on(small).constraints
+    one_sided = replace(rail, low=0.0, high=1.0)  # the target is at its end: that is no fault
+    assert ut.MinimumTime().on(replace(cart, coordinates=(one_sided, cart.coordinates[1])))
+
+
+def test_a_constraint_that_excludes_the_target_is_refused_before_the_search(
+    rig: ut.Mechanism,
+) -> None:
+    away = ut.Constraint("away", lambda v: 0.1 - v.theta, "rad")
+    goal = ut.MinimumTime(constraints=(away,))
+    with pytest.raises(InvalidInputError, match=r"target x = 0.*'away'.*margin -0\.1 rad"):
+        goal.check_start(rig, rig.state(theta=0.3))
+
+
+def test_a_box_of_more_than_a_turn_is_asked_about(rig: ut.Mechanism) -> None:
+    """45 were 45 rad without a word; of lengths, velocities and wheels' turns nobody is asked."""
+    box = ut.MinimumTime(constraints=ut.state_box(theta=45))
+    with pytest.warns(UserWarning, match=r"45 rad, 2578°: write undertow.deg\(45\)"):
+        box.on(rig)
+    ut.MinimumTime(constraints=ut.state_box(theta=ut.deg(300), phi_dot=45)).on(rig)
+
+
+def test_a_cost_is_asked_for_at_the_target(rig: ut.Mechanism) -> None:
+    """Where most are least: one that is negative there alone passed at random places."""
+    dent = ut.Objective("dent", lambda v: v.voltage**2 + v.phi**2 - 1e-6)
+    with pytest.raises(InvalidInputError, match=r"stage cost of 'dent': got -1e-06"):
+        dent.stage_cost(rig)

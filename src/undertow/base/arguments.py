@@ -38,6 +38,8 @@ REMEDIES = {
     "ReachingLaw": "Write undertow.ReachingLaw(eta=20.0, layer=0.1)",
     "Budget": "Write undertow.Budget(1024)",
     "DecisionVariables": "Write undertow.DecisionVariables(times=(0.0, 0.1))",
+    "SetPoints": 'Write {"x": 0.5}, undertow.SetPoints([(0, {"x": 0.5}), (2, {"x": -0.5})]), or an '
+    "undertow.Reference",
     "Plan": "Write undertow.Plan((surface,)), or take the plan of a proposal",
     "CascadeState": "Take the one that Cascade.start returned",
     "Proposal": "Take the one that Cascade.propose returned",
@@ -259,7 +261,7 @@ def _refuse(of: Any, name: str, value: object, starred: str | None = None) -> No
     hints = _hints(of)
     hint = hints.get(name) or hints[starred or name]
     members = [m for m in _members(hint) if m is not types.NoneType]
-    names = (_name(m) for member in members for m in (member, *get_args(member)))
+    names = (_name(m) for member in members for m in (member, *_contents(member)))
     remedies = (REMEDIES.get(name) for name in names)
     raise InvalidInputError(
         f"{name} of {of.__qualname__}",
@@ -287,6 +289,12 @@ def _members(hint: Any) -> list[Any]:
     return members
 
 
+def _contents(hint: Any) -> tuple[Any, ...]:
+    """Return what a container is of; of a mapping the values."""
+    origin, inner = get_origin(hint), get_args(hint)
+    return inner[1:] if isinstance(origin, type) and issubclass(origin, Mapping) else inner
+
+
 def _name(hint: Any) -> str:
     return getattr(hint, "__name__", "")
 
@@ -299,7 +307,7 @@ def _words(hint: Any) -> str:
     if origin is Literal:
         return " or ".join(map(repr, inner))
     if origin is not None and issubclass(origin, Mapping):
-        return f"a mapping of names to {_several(inner[1])}"
+        return f"a mapping of {_several(inner[0])} to {_several(inner[1])}"
     if origin is not None and issubclass(origin, Iterable):
         return f"a sequence of {_several(inner[0])}"
     if origin is Callable or callable is hint:

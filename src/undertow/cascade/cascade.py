@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,8 +49,11 @@ from undertow.law import (
     check_surface,
 )
 from undertow.models import TIME, FloatArray, Mechanism, number_of
-from undertow.objective import MinimumEnergy, Objective
+from undertow.objective import Objective, objective_for
 from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Proposal
+
+#: Stands for the objective that is meant where nobody says, until the mechanism is known.
+_USUAL = cast(Objective, None)
 
 #: Relative tolerance of the linear tail in the optimiser's rollouts.
 TAIL_RTOL = 2e-3
@@ -134,7 +137,9 @@ class Cascade:
     mechanism
         The controller's belief.
     objective
-        What is best; the travel that the mechanism declares joins its constraints, see
+        What is best; by default ``effort`` of :func:`undertow.objective_for`, as on the command
+        line: it means the same for every mechanism, and it arrives, where least energy puts that
+        off.  The travel that the mechanism declares joins its constraints, see
         :meth:`undertow.Objective.on`.
     reaching
         Reaching law of the inner loop.
@@ -184,6 +189,14 @@ class Cascade:
     UnstableSurfaceError, SingularSurfaceError
         For a first surface that cannot be used.
 
+    Notes
+    -----
+    The defaults of ``step``, ``period`` and ``reaching`` are for mechanisms whose motions take
+    tenths of seconds or more, the fastest of whose modes (``mechanism.linearise()`` shows them) is
+    some 10 1/s.  One that is c times as fast, a pendulum of a millimetre, is balanced with them,
+    but later than it could be: divide ``step`` and ``period`` by c, and give a ``reaching`` law
+    with c times the η.
+
     Examples
     --------
     >>> import undertow as ut
@@ -194,7 +207,7 @@ class Cascade:
     """
 
     mechanism: Mechanism
-    objective: Objective = MinimumEnergy()
+    objective: Objective = _USUAL
     reaching: ReachingLaw = ReachingLaw()
     period: float = 0.1
     first: Surface | None = None
@@ -213,6 +226,9 @@ class Cascade:
 
     def __post_init__(self) -> None:
         """Check all settings before any work starts."""
+        if self.objective is None:
+            check_fields(self, "mechanism")
+            object.__setattr__(self, "objective", objective_for(self.mechanism))
         check_fields(self)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         if TIME in self.mechanism.force.free_symbols:
@@ -254,6 +270,13 @@ class Cascade:
                 value=f"{self.freedom.schedule:g} s",
                 limit=f"a multiple or a whole part of the period, {self.period:g} s",
                 remedy="Then what is left of a plan is a plan again",
+            )
+        if self.planner is not None and not callable(getattr(self.planner, "propose", None)):
+            raise InvalidInputError(
+                "planner of the cascade",
+                value=f"{self.planner!r}, a {type(self.planner).__name__}",
+                limit="an object with the method propose, as undertow.Optimiser has it",
+                remedy="Leave it out for the library's optimiser",
             )
         if self.first is not None:
             check_surface(self.mechanism, self.first)
@@ -616,6 +639,20 @@ class Cascade:
             (loop, fixed) for loop in loops for fixed in (None, small if loop is whole else loop)
         ]
 
+    def _judged(
+        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, span: float
+    ) -> Admission:
+        """What the gate says of a plan, in the place of an old one."""
+        said = self.gate(loop, old, new, x, span)
+        if not isinstance(said, Admission):
+            raise InvalidInputError(
+                "what the gate of the cascade returned",
+                value=f"{said!r}, a {type(said).__name__}",
+                limit="an undertow.cascade.Admission",
+                remedy="Return one: of undertow.cascade.cost_gate, with conditions of your own",
+            )
+        return said
+
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
         """Put the first plan before the gate: there is no other, so it is used all the same.
@@ -623,7 +660,7 @@ class Cascade:
         The admission says what the gate would have said; ``accepted`` is always true.
         """
         current = state.error(state.since, self.mechanism.check_state(x))
-        asked = self.gate(self.loop_at(state), state.plan, state.plan, current, horizon)
+        asked = self._judged(self.loop_at(state), state.plan, state.plan, current, horizon)
         reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
         return Admission(True, reason, state.predicted, asked.verdict)
 
@@ -727,14 +764,14 @@ class Cascade:
         old = self._standing(state, loop, used, current, span)
         state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
         if proposal.plan is None:
-            kept = self.gate(loop, old, old, current, span)
+            kept = self._judged(loop, old, old, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
             admission = replace(kept, accepted=False, reason=reason)
             return replace(state, predicted=kept.cost), _reserved(admission, old, used)
-        admission = self.gate(loop, old, proposal.plan, current, span)
+        admission = self._judged(loop, old, proposal.plan, current, span)
         off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
         if off > self._sticks(state, loop, old):
-            cost = self.gate(loop, old, old, current, span).cost
+            cost = self._judged(loop, old, old, current, span).cost
             most = f"{self.objective.terminal_radius:g} at most"
             words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
             admission = Admission(False, words, cost)

@@ -21,7 +21,7 @@ import numpy as np
 
 from undertow.base import InvalidInputError, Verdict, at_least, checked, positive, write_file
 from undertow.cascade.targets import legs_of
-from undertow.closed_loop import ClosedLoop, Event, Trajectory, simulate_along
+from undertow.closed_loop import ROUNDING, ClosedLoop, Event, Trajectory, simulate_along
 from undertow.closed_loop.gate import Admission
 from undertow.estimators import ParameterEstimate
 from undertow.law import Plan, ReferenceMotion, SetPoints, Surface, Target, target_of
@@ -272,7 +272,7 @@ def moments(
             for part, after in itertools.pairwise([*sorted(within), strides]):
                 t = leg.begin + k * period + part * stride
                 span = period if after - part == strides else (after - part) * stride
-                if leg.end - t > 0.5 * cascade.step:
+                if leg.end - t > ROUNDING * cascade.step:
                     yield leg, t, min(span, leg.end - t), part == 0
 
 

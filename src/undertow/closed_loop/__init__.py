@@ -11,13 +11,14 @@ from undertow.closed_loop.buffers import RolloutBuffers
 from undertow.closed_loop.cuda import on_gpu
 from undertow.closed_loop.ensemble import Ensemble, Risk
 from undertow.closed_loop.kernel import compile_loop
-from undertow.closed_loop.rollout import RTOL, ClosedLoop
+from undertow.closed_loop.rollout import ROUNDING, RTOL, ClosedLoop
 from undertow.closed_loop.trajectory import INADMISSIBLE, UNSTABLE, Event, Trajectory
 from undertow.closed_loop.work_array import LANES
 
 __all__ = [
     "INADMISSIBLE",
     "LANES",
+    "ROUNDING",
     "RTOL",
     "UNSTABLE",
     "ClosedLoop",

@@ -57,6 +57,8 @@ BETWEEN = np.array([
 CORNER = 1e-10
 #: No step is shortened for its error to less than this part of a step of the loop.
 LEAST = 1 / 256
+#: What a length may exceed a whole number of steps by, for rounding, as a part of it.
+WHOLE = 1e-12
 #: Steps of the loop after which constraints are looked at where nothing is recorded.
 PACE = 2
 
@@ -169,10 +171,14 @@ def _dip(x, slopes, new, size, terminal, at):  # type: ignore[no-untyped-def]
 
 
 def _follow(  # type: ignore[no-untyped-def]
-    look, decide, count, x0, live, lanes, switch, plant, belief, limits, noise, start, step, steps,
+    look, decide, count, x0, live, lanes, switch, plant, belief, limits, noise, start, step, length,
     zoh_steps, least, nu, terminal, escape, cap, rtol, every, record, out,
 ):  # fmt: skip
-    """Integrate lanes one after the other; arguments and results are those of a rollout kernel."""
+    """Integrate lanes one after the other; arguments and results are those of a rollout kernel.
+
+    But for ``length``, s, in the place of a number of steps: the last one may be a part of one.
+    """
+    steps = math.ceil(length / step * (1.0 - WHOLE))
     size_x, m = x0.shape[1], len(limits)
     paths = out.shape[1] - 9 - 2 * size_x
     x, new, at, rates = (
@@ -206,7 +212,7 @@ def _follow(  # type: ignore[no-untyped-def]
                     decide(start + t, at, lane, plant, belief, limits, u, seen, rates)
                 until = min(until, tick - tick % zoh_steps + zoh_steps)
             layers = lane[m * size_x + m : m * size_x + 2 * m]
-            stop, fresh = until * step, True
+            stop, fresh = min(until * step, length), True
             while code == _HORIZON and t < stop:
                 size = usual if t + 1.1 * usual < stop else stop - t
                 before, beyond = 0.0, math.inf  # lengths with a corner between, if there is one
@@ -271,6 +277,7 @@ def _follow(  # type: ignore[no-untyped-def]
                         continue
                     if beyond == math.inf:
                         longer = size * min(5.0, 0.9 * max(off, 1e-10) ** -0.2)
+                        longer = longer if longer >= LEAST * step else LEAST * step
                         usual = longer if size >= usual else max(usual, longer)
                     row, held, code, radius = instant, now, ends, outer
                     t = stop if size >= stop - t else t + size
@@ -295,15 +302,15 @@ def follow() -> Any:
     """Return the integrator, compiled for any mechanism: it calls what it is given.
 
     Its arguments are those of a rollout kernel, behind the mechanism's ``look`` and ``decide`` and
-    the number of lanes; ``zoh_steps`` is 0 for a continuous loop, ``least`` the margins of (37), a
-    hard input limit and the path below which a motion has broken them, and ``nu`` the objective's
-    terminal radius.
+    the number of lanes, but for ``length``, s; ``zoh_steps`` is 0 for a continuous loop, ``least``
+    the margins of (37), a hard input limit and the path below which a motion has broken them, and
+    ``nu`` the objective's terminal radius.
     """
     whole, real, look = numba.int64, numba.float64, numba.types.FunctionType(LOOK)
     table, block = numba.float64[:, ::1], numba.float64[:, :, ::1]
     signature = numba.void(
         look, look, whole, table, _ROW, block, numba.int64[::1], _ROW, _ROW, _ROW, block, real,
-        real, whole, whole, _ROW, *[real] * 5, whole, block, table,
+        real, real, whole, _ROW, *[real] * 5, whole, block, table,
     )  # fmt: skip
     return compiled(signature)(_follow)
 

@@ -163,19 +163,19 @@ def simulate_along(
         counts while it is outside.
     """
     loop = loop if loop.ensemble is None else replace(loop, ensemble=None)
-    steps = max(1, round(duration / loop.step))
+    steps, step = loop.equal_steps(duration)
     plain, plant, m = loop.mechanism, loop.truth, loop.mechanism.m
     laws = zip(plan.surfaces, plan.laws(loop.reaching), strict=True)
     lanes = np.stack([pack_law_parameters(SlidingModeLaw(plain, s, law)) for s, law in laws])
-    times = np.arange(steps) * loop.step
+    times = np.arange(steps) * step
     segments = np.searchsorted(plan.times, times + 1e-9, side="right") - 1
-    halves = start + np.arange(2 * steps + 1) * (0.5 * loop.step)
+    halves = start + np.arange(2 * steps + 1) * (0.5 * step)
     record = np.empty((steps + 1, 2 * plain.n + 2 * m + 2))
     rows, code = _module(loop).along(
         np.array(x, dtype=float), motion.rows(halves), lanes, segments,
         np.append(plain.parameter_values, np.zeros(3 * plain.n)), plant.parameter_values,
-        loop.input_limits, start, loop.step, steps, loop.zoh_steps,
+        loop.input_limits, start, step, steps, loop.zoh_steps,
         loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, record,
     )  # fmt: skip
-    t = start + np.arange(rows) * loop.step
+    t = start + np.arange(rows) * step
     return recorded(plant, t, record[:rows], code, loop.objective.unit)

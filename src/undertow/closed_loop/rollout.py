@@ -21,7 +21,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.base import InvalidInputError, at_least, check_fields, checked, floats, positive
+from undertow.base import (
+    InvalidInputError,
+    at_least,
+    between,
+    check_fields,
+    checked,
+    floats,
+    positive,
+)
 from undertow.closed_loop.adaptive_integrator import follow
 from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
 from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
@@ -46,12 +54,19 @@ from undertow.objective import MinimumEnergy, Objective
 #: Relative tolerance of motions that are shown, and that decide.
 RTOL = 1e-9
 
+#: The least and the largest that may be asked for: below rounding no step is short enough, and a
+#: coarse one sees neither corner nor constraint.
+TOLERANCES = 1e-13, 1e-2
+
 #: By how much of its margin at the target a constraint may be passed in such a motion: about what
 #: the steps of a search, which goes up to its bounds, place a motion wrongly by.
 ALLOWED = 1e-4
 
 #: Longest rollout, in steps.
 MOST_STEPS = 10_000_000
+
+#: By how much of a step a duration may miss a whole number of them, for rounding.
+ROUNDING = 1e-6
 
 #: Small steps before large ones are tried again, s; each time as long again as all before.
 CALMER = 0.5
@@ -88,7 +103,8 @@ class ClosedLoop:
         The controller's belief, from which the law is derived.
     objective
         Stage cost, terminal set, constraints; the travel that the belief declares joins them, see
-        :meth:`undertow.Objective.on`.
+        :meth:`undertow.Objective.on`.  Nothing is optimised here: by default the paper's control
+        energy is counted.
     reaching
         Reaching law; its gains can be overridden for each rollout.
     plant
@@ -152,10 +168,15 @@ class ClosedLoop:
         for name, remedy in (
             ("escape", "Leave it out for the usual value"),
             ("tail_rtol", "Leave it out for the usual value"),
-            ("rtol", "0 is steps of one length; leave it out for the usual value"),
             ("zoh_steps", "0 is the continuous law"),
         ):
             at_least(f"{name} of a closed loop", getattr(self, name), 0, remedy)
+        if self.rtol:
+            remedy = "0 is steps of one length; leave it out for the usual value"
+            between("rtol of a closed loop", self.rtol, *TOLERANCES, remedy=remedy)
+        if self.covariance is not None:
+            covariance = _covariance(self.covariance, 2 * self.mechanism.n)
+            object.__setattr__(self, "covariance", covariance)
         at_least("threads of a closed loop", self.threads, 1, "1 is the calling thread alone")
         positive("rollout step, s", self.step)
         self.reaching.check_period(
@@ -410,9 +431,9 @@ class ClosedLoop:
         follow()(
             look.look, look.decide, buffers.count, buffers.states, live, buffers.lanes,
             self._switch_steps(switch_times), numbers.plant, numbers.belief, numbers.limits,
-            buffers.quiet if noise is None else noise, start, self.step, self._steps(duration),
-            self.zoh_steps, least, nu, nu if terminal is None else terminal, self.escape, cap,
-            self.rtol, every, record, buffers.out,
+            buffers.quiet if noise is None else noise, start, self.step,
+            self._length(duration), self.zoh_steps, least, nu, nu if terminal is None else terminal,
+            self.escape, cap, self.rtol, every, record, buffers.out,
         )  # fmt: skip
         if noisy and self.linear_end is not None and self.linear_end.counts_cost:
             self._count_noise(buffers, start)
@@ -507,7 +528,8 @@ class ClosedLoop:
         switch_times
             With vectors: S times, s, the first 0.
         duration
-            Length, s; the objective's horizon by default.
+            Length, s; the objective's horizon by default.  Steps of one length end at the nearest
+            whole number of them.
         terminal
             Terminal radius; the objective's by default; 0 never ends.
         cap
@@ -610,9 +632,10 @@ class ClosedLoop:
         surfaces
             A plan, a surface, or one surface for each of ``switch_times``.
         switch_times
-            When each takes over, s after the start; the first is 0.
+            When each takes over, s after the start, at the nearest step; the first is 0.
         duration
-            Length, s; the objective's horizon by default.
+            Length, s; the objective's horizon by default.  The motion ends then, also where that is
+            no whole number of steps: with ``rtol=0`` all of them are a little shorter.
         start
             Clock at the start, s (for time-dependent disturbances).
         terminal
@@ -625,6 +648,8 @@ class ClosedLoop:
         """
         self._check_duration(duration)
         at_least("every", every, 1, "Record each step: 1")
+        at_least("terminal of a motion", terminal or 0.0, 0, "0 never ends")
+        positive("start of a motion, s", abs(start), "0 is the usual clock", zero=True)
         if self.ensemble is not None:
             return self._alone.simulate(
                 x0, surfaces, switch_times=switch_times, duration=duration, start=start,
@@ -651,8 +676,14 @@ class ClosedLoop:
             noise = np.repeat(self.mechanism.check_state(noise)[:, None, :], LANES, axis=1)
         x0 = self.mechanism.initial_state(x0, {})
         span = self.objective.horizon if duration is None else duration
+        step = self.equal_steps(span)[1]
+        if step != self.step and not self.adapts:
+            return self.with_steps(step, self.tail_rtol).simulate(
+                x0, plan, duration=duration, start=start, terminal=terminal, every=every,
+                noise=None if noise is None else noise[:, 0],
+            )  # fmt: skip
         buffers = RolloutBuffers(self, 1, len(plan.times))
-        record = self._record(buffers, -(-self._steps(span) // every))
+        record = self._record(buffers, -(-self.equal_steps(span)[0] // every))
         batch = (self._follow if self.adapts else self.roll_out)(
             buffers.fill(x0, plan.vectors, plan.gains(self.reaching)),
             plan.times,
@@ -683,6 +714,24 @@ class ClosedLoop:
                 remedy="Change the horizon, or the step",
             )
         return steps
+
+    def _length(self, duration: float) -> float:
+        """Return the length of a motion that is integrated to the tolerance, s."""
+        count, step = self.equal_steps(duration)
+        return count * step if step == self.step else duration
+
+    @checked
+    def equal_steps(self, duration: float) -> tuple[int, float]:
+        """Return how many equal steps make up a duration, s, and how long each is, s.
+
+        That is ``step``, or a little less where the duration is no whole number of them.
+        """
+        self._check_duration(duration)
+        if duration / self.step > MOST_STEPS:
+            self._steps(duration)  # says so
+        count = math.ceil(duration / self.step - ROUNDING)
+        whole = count - duration / self.step <= ROUNDING
+        return count, self.step if whole else duration / count
 
     def _check_duration(self, duration: float | None) -> None:
         if duration is not None:
@@ -725,6 +774,26 @@ class ClosedLoop:
         t = np.append(times[: len(rows) - 1], end)
         ended, unit = int(batch.event[0]), self.objective.unit
         return recorded(self.truth, t + start, rows, ended, unit)
+
+
+def _covariance(given: FloatArray, size: int) -> FloatArray:
+    """Return a covariance, (2n, 2n), or refuse what is none."""
+    P = floats("covariance of a closed loop", given)
+    square = P.shape == (size, size)
+    if not (square and np.isfinite(P).all()):
+        value = f"shape {P.shape}" if not square else "NaN or infinity"
+    elif np.abs(P - P.T).max() > 1e-6 * np.abs(P).max():
+        value = "a matrix that is not symmetric"
+    elif (least := float(np.linalg.eigvalsh(P).min())) < -1e-9 * np.abs(P).max():
+        value = f"an eigenvalue {least:.3g}"
+    else:
+        return P
+    raise InvalidInputError(
+        "covariance of a closed loop",
+        value=value,
+        limit=f"({size}, {size}), finite, symmetric, without a negative eigenvalue",
+        remedy="Take KalmanFilter.noise_covariance, or a diagonal of variances; None is exact",
+    )
 
 
 def _plans(what: object) -> list[Plan]:

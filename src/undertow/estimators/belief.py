@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import (
     InvalidInputError,
+    ModelError,
     check_fields,
     checked,
     floats,
@@ -40,6 +41,7 @@ from undertow.models import (
     AT_REST,
     FloatArray,
     Mechanism,
+    Parameter,
     force_scale,
     linear_accelerations,
     number_of,
@@ -61,10 +63,11 @@ OTHERS, EXACT = 0.1, ("", "m/s²")
 AXES = 7
 
 #: Members with small errors of state and surface; the errors, as a part of a surface's entries,
-#: and of positions, rad and m.
+#: and of positions, rad and m, but this part of the travel on either side where that is less: a
+#: mechanism may be smaller than the usual error.
 SLIPS = 16
 SLIP_OF_SURFACE = 1e-3
-SLIP_OF_STATE = {"rad": 2e-3, "m": 2e-4}
+SLIP_OF_STATE, SLIP_OF_TRAVEL = {"rad": 2e-3, "m": 2e-4}, 0.01
 #: Half a percent of the change of velocity over 2 ms at full inputs, s, is noise; and the noise of
 #: what no input moves at the target, rad/s or m/s.
 SMALL, UNDRIVEN = 0.005 * 0.002, 0.004
@@ -164,7 +167,8 @@ class Belief:
     ------
     InvalidInputError
         For unknown parameters, and for tolerances that are not positive or reach beyond what makes
-        physical sense; for a noise or a bound that is not positive.
+        physical sense, where M is not positive definite for instance; for a noise or a bound that
+        is not positive.
 
     Examples
     --------
@@ -202,9 +206,27 @@ class Belief:
                     f"{parameter.value:g} leaves",
                     remedy="Leave certain parameters out",
                 )
+            self._check_plants(parameter, tolerance)
         for name, most in (("noise", self.noise), ("bound", self.bound)):
             if most is not None:
                 one_for_each(f"{name} of a belief", most, self.mechanism.n)
+
+    def _check_plants(self, parameter: Parameter, tolerance: float) -> None:
+        """Refuse a tolerance at one of whose ends there is no mechanism: a negative mass, say."""
+        place = [p.name for p in self.mechanism.parameters].index(parameter.name)
+        for change in (-tolerance, tolerance):
+            values = self.mechanism.parameter_values
+            values[place] += change
+            try:
+                self.mechanism.with_values(values)
+            except ModelError as error:
+                raise InvalidInputError(
+                    f"tolerance of parameter '{parameter.name}'",
+                    value=f"{tolerance:g} {parameter.unit}".rstrip(),
+                    limit="one that leaves M(q) positive definite: with "
+                    f"{parameter.name} = {values[place]:g} it has the {error.value}",
+                    remedy="Give a smaller one; Parameter(low=0.0) says what must stay positive",
+                ) from error
 
     @classmethod
     @checked
@@ -349,7 +371,13 @@ class Belief:
         """
         mechanism, rng = self.mechanism, np.random.default_rng(0)
         n, m = mechanism.n, mechanism.m
-        scale = [SLIP_OF_STATE[c.unit] for c in mechanism.coordinates]
+        scale = [
+            min(
+                SLIP_OF_STATE[c.unit],
+                *(SLIP_OF_TRAVEL * abs(end) for end in (c.low, c.high) if end),
+            )
+            for c in mechanism.coordinates
+        ]
         surface_errors = np.zeros((len(values), 2 * m * n))
         state_errors = np.zeros((len(values), 2 * n))
         half = SLIPS // 2  # then the same with the other sign

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import between
+from undertow.base import InvalidInputError, between, floats
 from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, control_loop
@@ -109,11 +109,23 @@ def compensated(
 
     ``limits`` are the largest |u_i|, (m,); ``when`` is asked after each step of the controller:
     whether its output shall lack it.
+
+    Raises
+    ------
+    InvalidInputError
+        At a step, for an output that is not m finite numbers.
     """
     out = np.zeros_like(limits)
 
     def both(t: float, x: FloatArray) -> FloatArray:
-        u = controller(t, x)
+        u = floats("output of a controller", controller(t, x)).ravel()
+        if u.shape != limits.shape or not np.isfinite(u).all():
+            raise InvalidInputError(
+                f"output of a controller at {t:g} s",
+                value=u.tolist(),
+                limit=f"{len(limits)} finite, one for each input",
+                remedy="Return numpy.array([...]) whatever the state is",
+            )
         if not when():
             return u
         subtract_disturbance(u, estimator.disturbance, limits, out)

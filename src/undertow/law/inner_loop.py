@@ -120,8 +120,13 @@ class InnerLoop:
 def feedback_at_target(
     mechanism: Mechanism, surface: Surface, reaching: ReachingLaw | None = None
 ) -> FloatArray:
-    """Return k, (m, 2n), with u = k x near the target; the paper's gains by default."""
-    return InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+    """Return k, (m, 2n), with u = k x near the target; the paper's gains by default.
+
+    It is kept, and read-only.
+    """
+    k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
+    k.flags.writeable = False
+    return k
 
 
 def law_memory(mechanism: Mechanism, limits: FloatArray | None = None) -> Workspace:

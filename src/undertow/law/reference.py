@@ -28,7 +28,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -37,11 +37,13 @@ from numpy.typing import ArrayLike
 
 from undertow.base import (
     InvalidInputError,
+    UndertowError,
     check_fields,
     checked,
     floats,
     one_of,
     positive,
+    raised_at,
     read_file,
 )
 from undertow.models import (
@@ -67,9 +69,13 @@ ROUNDS, ENOUGH = 60, 1e-9
 #: Largest file with a reference, bytes.
 LARGEST = 1 << 24
 
-#: Units that a file's header may have, to SI.
+#: Most rows of a reference's grid.
+MOST_ROWS = 1 << 20
+
+#: Units that a file's header may have: each in SI units, and which.
 FILE_UNITS = {
-    "s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180,
+    "s": (1.0, "s"), "ms": (1e-3, "s"), "m": (1.0, "m"), "cm": (1e-2, "m"), "mm": (1e-3, "m"),
+    "rad": (1.0, "rad"), "deg": (math.pi / 180, "rad"),
 }  # fmt: skip
 
 #: r at the times t, (N,) to (N,).
@@ -197,7 +203,7 @@ class SetPoints:
                 remedy="Put them in order",
             )
         points = [
-            (t, {normal_name(str(k)): number_of(f"set-point of '{k}'", v) for k, v in p.items()})
+            (t, {normal_name(str(k)): _position(k, v) for k, v in p.items()})
             for t, (_, p) in zip(times, pairs, strict=True)
         ]
         object.__setattr__(self, "points", tuple(points))
@@ -242,6 +248,19 @@ class SetPoints:
         return tuple(found)
 
 
+def _position(name: str, value: object) -> float:
+    what = f"set-point of '{name}'"
+    position = number_of(what, value)
+    if not math.isfinite(position):
+        raise InvalidInputError(
+            what,
+            value=f"{position:g}",
+            limit="a finite number, in m or rad",
+            remedy="An earlier computation gave NaN or infinity",
+        )
+    return position
+
+
 def _refuse_velocity(mechanism: Mechanism, name: str, value: float) -> None:
     if value != 0:
         raise InvalidInputError(
@@ -255,7 +274,7 @@ def _refuse_velocity(mechanism: Mechanism, name: str, value: float) -> None:
 def _check_invariant(mechanism: Mechanism, name: str, value: float) -> None:
     """Refuse to move the target along a coordinate on which the equations depend."""
     free = invariant_coordinates(mechanism)
-    if name not in free or not math.isfinite(value):
+    if name not in free:
         raise InvalidInputError(
             f"target of '{mechanism.name}'",
             value=f"{name} = {value:g}",
@@ -330,7 +349,11 @@ ReferencePath = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class Differentiated:
-    """A function r(t) of one's own; its derivatives are central differences over 1 ms."""
+    """A function r(t) of one's own, for t ≥ 0; its derivatives are differences over 1 ms.
+
+    Central ones; in the first millisecond what those of the next two say for it: a function of time
+    need not be defined before 0.
+    """
 
     function: Function
 
@@ -345,8 +368,16 @@ class Differentiated:
                 values = np.array([self.function(one) for one in at], dtype=float)
             return np.broadcast_to(values, at.shape).astype(float)
 
-        before, now, after = r(t - h), r(t), r(t + h)
-        return now, (after - before) / (2 * h), (after - 2 * now + before) / h**2
+        def slopes(at: FloatArray) -> FloatArray:
+            before, now, after = r(at - h), r(at), r(at + h)
+            return np.array([(after - before) / (2 * h), (after - 2 * now + before) / h**2])
+
+        centre, early = np.maximum(t, h), t < h
+        found = slopes(centre)
+        if early.any():
+            later = slopes(centre[early] + h)
+            found[:, early] += (t - centre)[early] / h * (later - found[:, early])
+        return r(t), *found
 
 
 @dataclass(frozen=True)
@@ -360,6 +391,9 @@ class Reference:
         SI units.  Other actuated coordinates stay at 0.
     period
         After which it repeats itself, s; 0: never.
+    units
+        Coordinate name to the unit that its path is in, ``"rad"`` or ``"m"``, where that is known:
+        of a file.
 
     See Also
     --------
@@ -377,6 +411,7 @@ class Reference:
 
     paths: Mapping[str, ReferencePath]
     period: float = 0.0
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse what is no function of time."""
@@ -463,7 +498,8 @@ class Reference:
             raise InvalidInputError(
                 f"reference '{path}'", value="no UTF-8 text", limit="comma-separated values"
             ) from error
-        return cls.through(**_columns(path, text))
+        times, values, units = _columns(path, text)
+        return cls(cls.through(times, **values).paths, units=units)
 
     def __repr__(self) -> str:
         """Show what moves."""
@@ -480,11 +516,20 @@ class Reference:
         Raises
         ------
         InvalidInputError
-            For a coordinate that is not actuated, or that the equations depend on; for values that
-            are no finite numbers; and where the unactuated coordinates have no bounded motion.
+            For a coordinate that is not actuated, that is measured in another unit, or that the
+            equations depend on; for values that are no finite numbers; for a length or a period
+            whose grid is too large; and where the unactuated coordinates have no bounded motion.
         """
         positive("length of a reference, s", seconds, "Give duration=")
         window = self.period if self.period else seconds + 2 * REST
+        times = math.ceil(seconds / self.period) + 1 if self.period else 1
+        if not times * max(64.0, window / GRID) <= MOST_ROWS:
+            raise InvalidInputError(
+                f"reference of '{mechanism.name}'",
+                value=f"{seconds:g} s" + f" with a period of {self.period:g} s" * bool(self.period),
+                limit=f"at most {MOST_ROWS} rows, {GRID:g} s apart or 64 in a period",
+                remedy="Shorten the run; a slower reference is one without a period, Reference.of",
+            )
         count = max(64, math.ceil(window / GRID))
         count += count % 2
         before = 0.0 if self.period else REST
@@ -496,7 +541,9 @@ class Reference:
             one_of(f"reference of '{mechanism.name}'", name, names[: mechanism.m])
             _check_invariant(mechanism, name, 0.0)
             k = names.index(name)
-            q[:, k], v[:, k], a[:, k] = path(t if self.period else np.clip(t, 0.0, seconds))
+            self._check_unit(mechanism, k)
+            at = t if self.period else np.clip(t, 0.0, seconds)
+            q[:, k], v[:, k], a[:, k] = _asked(name, path, at)
             for part in (v, a):
                 part[~inside, k] = 0.0
             if not np.isfinite(q[:, k] + v[:, k] + a[:, k]).all():
@@ -505,30 +552,70 @@ class Reference:
                 )
         _stable_inversion(mechanism, window, q, v, a, periodic=self.period > 0)
         if self.period:
-            times = math.ceil(seconds / self.period) + 1
             t = np.linspace(0.0, times * window, times * count + 1)
             q, v, a = (np.vstack([*[part] * times, part[:1]]) for part in (q, v, a))
         keep = (t >= -GRID) & (t <= seconds + REST)
         return ((0.0, ReferenceMotion(t[keep], q[keep], v[keep], a[keep])),)
 
+    def _check_unit(self, mechanism: Mechanism, place: int) -> None:
+        coordinate = mechanism.coordinates[place]
+        unit = self.units.get(coordinate.name, coordinate.unit)
+        if unit != coordinate.unit:
+            raise InvalidInputError(
+                f"reference of '{coordinate.name}'",
+                value=f"in {unit}",
+                limit=f"in {coordinate.unit}, as '{mechanism.name}' measures it",
+                remedy="Correct the unit in the head of its column",
+            )
 
-def _columns(path: Path, text: str) -> dict[str, Any]:
-    """Return ``times`` and the columns of a file with a reference, by name, SI units."""
+
+def _asked(name: str, path: ReferencePath, t: FloatArray) -> FloatArray:
+    """Return what a path gives at the times t, (3, N)."""
+    what = f"reference of '{name}'"
+    try:
+        with np.errstate(all="ignore"):  # what is no number is refused
+            found = tuple(path(t))
+            rows = [np.broadcast_to(np.asarray(r, dtype=float), t.shape) for r in found]
+    except UndertowError:
+        raise
+    except Exception as error:  # a user's function may do anything
+        raise InvalidInputError(
+            what,
+            value=f"{type(error).__name__}: {error}{raised_at(error)}",
+            limit="a function of the time t ≥ 0, s, that returns a number for each",
+            remedy="Write it with NumPy's functions, or for one time",
+        ) from error
+    if len(rows) != 3:
+        raise InvalidInputError(
+            what,
+            value=f"a path that returns {len(rows)} rows of numbers",
+            limit="r, its velocity and its acceleration",
+            remedy=f"Reference.of({name}=function) differentiates one that returns r alone",
+        )
+    return np.array(rows)
+
+
+def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], dict[str, str]]:
+    """Return times, the other columns of a file by name, SI units, and the units of those."""
     lines = csv.reader(io.StringIO(text))
     head = [cell.strip() for cell in next(lines, [])]
     names: list[str] = []
     factors: list[float] = []
+    units: list[str] = []
     for cell in head:
         match = re.fullmatch(r"(\w+)\s*[(\[]\s*(\w+)\s*[)\]]", cell)
-        if match is None or match[2] not in FILE_UNITS:
+        allowed = [u for u, (_, si) in FILE_UNITS.items() if (si == "s") == (not names)]
+        if match is None or match[2] not in allowed:
             raise InvalidInputError(
                 f"column '{cell}' of '{path}'",
                 value=repr(cell),
-                limit=f"a name with its unit, one of {', '.join(FILE_UNITS)}",
+                limit=f"a name with its unit, one of {', '.join(allowed)}",
                 remedy="Write the first line like: t (s), x (m), theta (deg)",
             )
-        names.append("times" if not names else normal_name(match[1]))
-        factors.append(FILE_UNITS[match[2]])
+        factor, unit = FILE_UNITS[match[2]]
+        names.append(normal_name(match[1]))
+        factors.append(factor)
+        units.append(unit)
     if len(set(names)) < 2 or len(set(names)) < len(names):
         raise InvalidInputError(
             f"columns of '{path}'",
@@ -551,7 +638,8 @@ def _columns(path: Path, text: str) -> dict[str, Any]:
             )
         rows.append(row)
     table = np.array(rows).reshape(-1, len(names)) * factors
-    return dict(zip(names, table.T, strict=True))
+    columns = dict(zip(names[1:], table.T[1:], strict=True))
+    return table[:, 0], columns, dict(zip(names[1:], units[1:], strict=True))
 
 
 def _stable_inversion(

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,7 +21,6 @@ from numpy.typing import ArrayLike
 
 from undertow.base import (
     InvalidInputError,
-    ModelError,
     SingularSurfaceError,
     UndertowError,
     UnstableSurfaceError,
@@ -29,7 +29,14 @@ from undertow.base import (
 )
 from undertow.law.sliding import check_surface_shape, coupling, gamma_determinant, singularity
 from undertow.law.surface import LawLayout, Surface
-from undertow.models import FloatArray, Mechanism, controllability, linearise
+from undertow.models import (
+    UNCONTROLLABLE,
+    FloatArray,
+    Mechanism,
+    controllability,
+    linearise,
+    uncontrollable,
+)
 from undertow.symbolic import content_key, recall, remember
 
 
@@ -225,7 +232,9 @@ def first_surface(
     ----------
     weights
         Diagonal of Q, (2n,), positive; by default 1 on q_a, 10 on q_u and 0.1 on the
-        velocities.
+        velocities, in SI units: for what is of the size of a bench.  Of a long crane they ask for
+        the trolley's place and hardly for the swing: give ``rate``, or weights 1/x_max² of what is
+        large there.
     rate
         Convergence rate asked for, 1/s: all eigenvalues left of −rate.
 
@@ -303,7 +312,7 @@ def _quadratic(mechanism: Mechanism, diagonal: FloatArray, rate: float) -> Surfa
     A, T = _regular_form(mechanism)
     free = 2 * n - m
     Q = T @ np.diag(diagonal) @ T.T
-    try:
+    with _designing(mechanism, "weights of the quadratic design", diagonal.tolist()):
         P = scipy.linalg.solve_continuous_are(
             A[:free, :free] + rate * np.eye(free),
             A[:free, free:],
@@ -311,10 +320,24 @@ def _quadratic(mechanism: Mechanism, diagonal: FloatArray, rate: float) -> Surfa
             Q[free:, free:],
             s=Q[:free, free:],
         )
-    except np.linalg.LinAlgError as error:
-        raise _uncontrollable(mechanism) from error
-    K = np.linalg.solve(Q[free:, free:], A[:free, free:].T @ P + Q[:free, free:].T)
-    return _surface_of(mechanism, np.hstack([K, np.eye(m)]) @ T)
+        K = np.linalg.solve(Q[free:, free:], A[:free, free:].T @ P + Q[:free, free:].T)
+        surface = _surface_of(mechanism, np.hstack([K, np.eye(m)]) @ T)
+    return surface
+
+
+@contextmanager
+def _designing(mechanism: Mechanism, what: str, given: Sequence[object]) -> Iterator[None]:
+    """Say why there is no design: no linear feedback can do it, or what was asked for cannot be."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except (ValueError, SingularSurfaceError, UnstableSurfaceError) as error:
+        if controllability(mechanism) < UNCONTROLLABLE:
+            raise uncontrollable(mechanism) from error
+        if isinstance(error, UndertowError):
+            raise
+        limit = f"such that there is a design: {str(error).rstrip('.')}"
+        raise InvalidInputError(what, value=list(given), limit=limit) from error
 
 
 @checked
@@ -331,27 +354,22 @@ def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
     n, m = mechanism.n, mechanism.m
     free = 2 * n - m
     wanted = np.asarray(poles, dtype=complex)
-    if wanted.shape != (free,) or not (wanted.real < 0).all():
+    if wanted.shape != (free,) or not ((wanted.real < 0) & np.isfinite(wanted)).all():
         raise InvalidInputError(
             "poles of the sliding dynamics",
             value=list(poles),
-            limit=f"{free} numbers with negative real part",
+            limit=f"{free} finite numbers with negative real part",
         )
     import scipy.signal  # slow to import, and needed here alone
 
     A, T = _regular_form(mechanism)
-    try:
+    with _designing(mechanism, "poles of the sliding dynamics", poles):
         with warnings.catch_warnings():
             # The poles are placed; only the conditioning may not be the best there is.
             warnings.filterwarnings("ignore", "Convergence was not reached", UserWarning)
             placed = scipy.signal.place_poles(A[:free, :free], A[:free, free:], wanted)
-    except ValueError as error:
-        if controllability(mechanism) < 1e-9:
-            raise _uncontrollable(mechanism) from error
-        raise InvalidInputError(
-            "poles of the sliding dynamics", value=list(poles), limit=str(error)
-        ) from error
-    return _surface_of(mechanism, np.hstack([placed.gain_matrix, np.eye(m)]) @ T)
+        surface = _surface_of(mechanism, np.hstack([placed.gain_matrix, np.eye(m)]) @ T)
+    return surface
 
 
 def _regular_form(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
@@ -375,12 +393,3 @@ def _surface_of(mechanism: Mechanism, C: FloatArray) -> Surface:
     surface = Surface(C[:, n : n + m], C[:, :m], C[:, n + m :], C[:, m:n]).normalised()
     check_surface(mechanism, surface)
     return surface
-
-
-def _uncontrollable(mechanism: Mechanism) -> ModelError:
-    return ModelError(
-        f"linearisation of '{mechanism.name}' at the target",
-        value=f"relative distance to an uncontrollable pair {controllability(mechanism):.2e}",
-        limit="> 0",
-        remedy="No linear surface stabilises it: choose another target or actuate another joint",
-    )

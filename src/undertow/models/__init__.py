@@ -13,6 +13,7 @@ from undertow.models.error_dynamics import (
 )
 from undertow.models.linearisation import (
     AT_REST,
+    UNCONTROLLABLE,
     Linearisation,
     controllability,
     force_scale,
@@ -20,6 +21,7 @@ from undertow.models.linearisation import (
     linear_accelerations,
     linear_numbers,
     linearise,
+    uncontrollable,
 )
 from undertow.models.mechanism import Mechanism
 from undertow.models.partition import Partition
@@ -29,6 +31,7 @@ from undertow.models.quantities import (
     FloatArray,
     Input,
     Parameter,
+    deg,
     normal_name,
     number_of,
     numbers,
@@ -47,6 +50,7 @@ from undertow.models.validity import (
 __all__ = [
     "AT_REST",
     "TIME",
+    "UNCONTROLLABLE",
     "Coordinate",
     "FloatArray",
     "Input",
@@ -57,6 +61,7 @@ __all__ = [
     "by_names",
     "check_symbols",
     "controllability",
+    "deg",
     "error_dynamics",
     "expression_of",
     "force_scale",
@@ -73,6 +78,7 @@ __all__ = [
     "reference_names",
     "require_smooth",
     "shortened",
+    "uncontrollable",
     "vocabulary",
     "with_positions",
 ]

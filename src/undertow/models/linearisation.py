@@ -20,6 +20,9 @@ from undertow.models.validity import kinks, require_smooth, shortened
 #: Largest |f_u| at a target, as a part of :func:`force_scale`.
 AT_REST = 1e-9
 
+#: What counts as no distance from an uncontrollable pair, see :func:`controllability`.
+UNCONTROLLABLE = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
@@ -257,3 +260,14 @@ def controllability(mechanism: Mechanism) -> float:
         for eigenvalue in np.linalg.eigvals(A)
     ]
     return float(min(tests)) / scale
+
+
+def uncontrollable(mechanism: Mechanism) -> ModelError:
+    """Return the condition that no linear feedback stabilises a mechanism at its target."""
+    return ModelError(
+        f"linearisation of '{mechanism.name}' at the target",
+        value=f"relative distance to an uncontrollable pair {controllability(mechanism):.2e}",
+        limit="> 0",
+        remedy="No linear surface or feedback stabilises it: choose another target or actuate "
+        "another joint",
+    )

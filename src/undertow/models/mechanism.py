@@ -195,6 +195,30 @@ class Mechanism:
     def _check(self) -> None:
         data = vocabulary(parameters=self.parameters, time=False)
         places = vocabulary(self.coordinates, velocities=False, time=False) | data
+        everything = vocabulary(self.coordinates, self.inputs, self.parameters)
+        for what, allowed, holds, remedy in (
+            (
+                "mass_matrix",
+                places,
+                "positions and parameters alone",
+                "What depends on velocities or the time is a force: it belongs to f",
+            ),
+            (
+                "input_matrix",
+                data,
+                "parameters alone: B is constant",
+                "Take inputs that act alike everywhere, the forces and torques of the joints; of a "
+                "constant (n, m) matrix undertow.modelling.from_matrices finds the coordinates",
+            ),
+        ):
+            odd = getattr(self, what).free_symbols & set(everything) - set(allowed)
+            if odd:
+                raise ModelError(
+                    f"{what} of '{self.name}'",
+                    value=f"made of {', '.join(sorted(map(str, odd)))}",
+                    limit=f"made of {holds}",
+                    remedy=remedy,
+                )
         for what, known in (
             ("mass_matrix", places),
             ("input_matrix", data),
@@ -697,13 +721,16 @@ class Mechanism:
             Inputs, (…, m), not clipped here.
         """
         state = self.check_state(x)
-        inputs = self._columns("inputs", u, [i.name for i in self.inputs])
+        inputs = self._columns(
+            "inputs", u, [i.name for i in self.inputs], "Give one number for each input, in a list"
+        )
         return self._evaluate("dynamics", floats("time", t), state, *np.moveaxis(inputs, -1, 0))
 
     def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
         """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
         state = self.check_state(x)
-        qdd = self._columns("accelerations", qdd, [c.name for c in self.coordinates])
+        names = [c.name for c in self.coordinates]
+        qdd = self._columns("accelerations", qdd, names, "Give one number for each coordinate")
         inertial = np.einsum("...ij,...j->...i", self.M(state[..., : self.n]), qdd)
         return np.asarray(inertial - self.f(state, t))
 

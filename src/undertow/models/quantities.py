@@ -100,6 +100,23 @@ def number_of(what: str, value: object, *, limit: str = "a number", remedy: str 
     )
 
 
+def deg(angle: float) -> float:
+    """Return an angle in degrees in radians.
+
+    Raises
+    ------
+    InvalidInputError
+        For what is no number: text, None, an array.
+
+    Examples
+    --------
+    >>> deg(180)
+    3.141592653589793
+    """
+    remedy = "Write undertow.deg(10) for 10°; of an array numpy.radians takes each entry"
+    return math.radians(number_of("angle", angle, limit="a number, in degrees", remedy=remedy))
+
+
 class _Named:
     """What has a name in Python's own spelling, and a symbol of that name."""
 

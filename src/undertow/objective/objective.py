@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Container, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -114,6 +115,9 @@ class Constraint:
         Name of the state that it bounds, where it is one's range.
     source
         Where it comes from, in words.
+    declared
+        Whether it is travel that a mechanism declares: :meth:`Objective.on` puts that of the
+        mechanism at hand in its place.
 
     Notes
     -----
@@ -144,6 +148,7 @@ class Constraint:
     unit: str = ""
     state: str = ""
     source: str = ""
+    declared: bool = False
 
     @property
     def words(self) -> str:
@@ -272,17 +277,9 @@ def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constrai
             name = f"{ends[0]} ≤ " * math.isfinite(low) + c.name
             name += f" ≤ {ends[1]}" * math.isfinite(high)
         source = f"{100 * TRAVEL:g} % of the travel that {mechanism.name} declares"
-        found.append(Constraint(name, _Within(index, low, high), c.unit, c.name, source))
+        within = _Within(index, low, high)
+        found.append(Constraint(name, within, c.unit, c.name, source, declared=True))
     return tuple(found)
-
-
-def _is_travel(constraint: Constraint) -> bool:
-    """Whether a constraint is one of :func:`travel_box`, not yet seen from a target.
-
-    They know coordinates by number, and say where they come from.
-    """
-    within = constraint.formula
-    return bool(constraint.source) and isinstance(within, _Within) and isinstance(within.state, int)
 
 
 def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown: str) -> None:
@@ -303,6 +300,17 @@ def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown
                 remedy="A longer one is a mechanism of your own, with other ends: FILE.py:NAME; "
                 "in Python an objective with travel=False ignores what is declared",
             )
+
+
+def _warn_of_degrees(mechanism: Mechanism, state: str, most: float) -> None:
+    """Warn of a box of an angle that is wider than a turn: it may be meant, as of a wheel's."""
+    angles = [c.name for c in mechanism.coordinates if c.unit == "rad"]
+    if state in angles and 2 * math.pi < most < math.inf:
+        warnings.warn(
+            f"the box of '{state}' lets it turn by {most:g} rad, {math.degrees(most):.4g}°: write "
+            f"undertow.deg({most:g}) for {most:g}°",
+            stacklevel=2,
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -377,17 +385,47 @@ class Objective:
         Raises
         ------
         InvalidInputError
-            For a declared range that does not hold the target, and for a :func:`state_box` that
-            reaches beyond one.
+            For a declared range that does not hold the target, for a :func:`state_box` that reaches
+            beyond one, and for a range that lies within the terminal set.
+
+        Warns
+        -----
+        UserWarning
+            Of a :func:`state_box` that lets an angle turn more than once: degrees, probably.
         """
-        own = tuple(c for c in self.constraints if not _is_travel(c))
+        own = tuple(c for c in self.constraints if not c.declared)
         boxes = {c.state: c for c in own if isinstance(c.formula, _Within)}
         declared = travel_box(mechanism, boxes) if self.travel else ()
-        for state, box in boxes.items() if self.travel else ():
+        for state, box in boxes.items():
             ends: Any = box.formula
-            check_travel(mechanism, state, ends.low, ends.high, box.name)
+            if self.travel:
+                check_travel(mechanism, state, ends.low, ends.high, box.name)
+            _warn_of_degrees(mechanism, state, max(-ends.low, ends.high))
         constraints = own + declared
+        self._check_terminal_set(mechanism, constraints)
         return self if constraints == self.constraints else replace(self, constraints=constraints)
+
+    def _check_terminal_set(self, mechanism: Mechanism, constraints: Iterable[Constraint]) -> None:
+        """Refuse a terminal set beside which a range is small: all that is in it has arrived.
+
+        Raises
+        ------
+        InvalidInputError
+            With the range.
+        """
+        for c in constraints:
+            box: Any = c.formula
+            if isinstance(box, _Within) and not box.target:
+                most = max(-box.low, box.high)
+                if most < self.terminal_radius:
+                    raise InvalidInputError(
+                        f"terminal_radius of objective '{self.name}' for '{mechanism.name}'",
+                        value=f"{self.terminal_radius:g}",
+                        limit=f"at most {most:g}: a motion with {c.words} would have arrived "
+                        "wherever it is",
+                        remedy="Give a smaller terminal_radius, or lengths and times in units of "
+                        "the mechanism's own size",
+                    )
 
     @checked
     def about(self, mechanism: Mechanism, names: Sequence[str]) -> Self:
@@ -526,8 +564,8 @@ class Objective:
         Raises
         ------
         InvalidInputError
-            For unknown names, and where Φ is negative or no number at one of 256 random
-            states and inputs.
+            For unknown names, and where Φ is negative or no number at the target or at one of
+            255 random states and inputs.
         """
         what = f"stage cost of '{self.name}'"
         stage = self._expression(mechanism, what, self.stage)
@@ -568,6 +606,8 @@ class Objective:
     def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
         """Refuse an initial state that breaks a path constraint, whatever the input does.
 
+        So is one that the target breaks, but for constraints on the input.
+
         Parameters
         ----------
         mechanism
@@ -580,20 +620,23 @@ class Objective:
         InvalidInputError
             With the constraint and its margin.
         """
-        problem = self.on(mechanism)
-        values = mechanism.substitution | dict(
-            zip(mechanism.x, mechanism.check_state(x).tolist(), strict=True)
-        )
-        margins = zip(problem.constraints, problem.path_margins(mechanism), strict=True)
-        for constraint, margin in margins:
-            at_start = margin.subs(values)
-            if at_start.is_number and float(at_start) < 0:
-                raise InvalidInputError(
-                    f"initial state of '{mechanism.name}' breaks '{constraint.words}'",
-                    value=f"margin {float(at_start):.4g} {constraint.unit}".rstrip(),
-                    limit="≥ 0",
-                    remedy="Start inside the constraints, or widen them",
-                )
+        problem, start = self.on(mechanism), mechanism.check_state(x)
+        margins = [*zip(problem.constraints, problem.path_margins(mechanism), strict=True)]
+        apart = [(c, w) for c, w in margins if not w.free_symbols & {*mechanism.u}]
+        for state, asked, which, remedy in (
+            (start, margins, "initial state", "Start inside the constraints, or widen them"),
+            (0 * start, apart, "target x = 0", "No motion may end there: widen the constraint"),
+        ):
+            values = mechanism.substitution | dict(zip(mechanism.x, state.tolist(), strict=True))
+            for constraint, margin in asked:
+                found = margin.subs(values)
+                if found.is_number and float(found) < 0:
+                    raise InvalidInputError(
+                        f"{which} of '{mechanism.name}' breaks '{constraint.words}'",
+                        value=f"margin {float(found):.4g} {constraint.unit}".rstrip(),
+                        limit="≥ 0",
+                        remedy=remedy,
+                    )
 
     @staticmethod
     def _expression(mechanism: Mechanism, what: str, formula: Formula) -> sp.Expr:
@@ -731,12 +774,16 @@ def _failed(what: str, error: Exception) -> InvalidInputError:
 
 
 def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
-    """Return the smallest of 256 random values of a stage cost; NaN where one is no number."""
+    """Return the smallest of a stage cost's values at the target and at 255 random places.
+
+    NaN where one is no number.
+    """
     rng = np.random.default_rng(0)
     symbols = [*mechanism.x, *mechanism.u]
     function = compile_expressions(symbols, [stage.subs(mechanism.substitution)])
     reach = np.ones(len(symbols)) * math.pi
     reach[2 * mechanism.n :] = np.minimum(mechanism.input_limits, 100.0)
     samples = rng.uniform(-1, 1, (256, len(symbols))) * reach
+    samples[0] = 0.0  # where most costs are least
     with np.errstate(all="ignore"):
         return float(np.min(np.real_if_close(function(*samples.T)[0])))

@@ -21,7 +21,14 @@ from undertow.bounds.expressions import dynamics
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, KalmanFilter, StateFeedback
 from undertow.law import InnerLoop
-from undertow.models import FloatArray, Mechanism, linearise, require_smooth
+from undertow.models import (
+    UNCONTROLLABLE,
+    FloatArray,
+    Mechanism,
+    linearise,
+    require_smooth,
+    uncontrollable,
+)
 from undertow.models.importers import holding_input
 from undertow.objective import Objective, finite_limits
 from undertow.optimiser import Proposal
@@ -228,14 +235,25 @@ def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
     """Return a linear-quadratic regulator, its output clipped: Q of the first surface.
 
     It acts about the input that holds the target.  ``free`` is the weight of the free coordinates.
+
+    Raises
+    ------
+    ModelError
+        Where no linear feedback stabilises the mechanism.
     """
     lin, rest = linearise(belief), holding_input(belief)
     n, m = belief.n, belief.m
     limit = belief.input_limits
     Q = np.diag([1.0] * m + [free] * (n - m) + [0.1] * n)
     R = np.diag(1.0 / finite_limits(belief) ** 2)
-    P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
+    try:
+        P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
+    except np.linalg.LinAlgError as error:
+        raise uncontrollable(belief) from error
     k = -np.linalg.solve(R, lin.input.T @ P)
+    slowest = np.linalg.eigvals(lin.A + lin.input @ k).real.max()
+    if not slowest < -UNCONTROLLABLE * np.linalg.norm(lin.A, 2):  # a mode that k does not reach
+        raise uncontrollable(belief)
 
     def make(_start: FloatArray) -> StateFeedback:
         return lambda t, x: np.clip(rest + k @ x, -limit, limit)
