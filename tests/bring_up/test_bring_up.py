@@ -176,7 +176,7 @@ def test_wirings_found_one_behind_the_other_are_one_wiring() -> None:
         (("theta=4",), {("encoder scale", "theta")}),
         (("phi=0.25",), {("encoder scale", "phi")}),
         (("phi=57.29578",), {("encoder scale", "phi")}),
-        (("delay=0.0015",), {("delay", "the loop")}),
+        (("delay=0.002",), {("delay", "the loop")}),
         (("theta=-1", "phi=2"), {("encoder sign", "theta"), ("encoder scale", "phi")}),
         (("swap=theta,phi",), {("encoder order", "theta, phi")}),
     ],

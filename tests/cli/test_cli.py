@@ -19,7 +19,7 @@ from typer.main import get_command
 import undertow as ut
 from runs import run
 from undertow.base import InvalidInputError
-from undertow.cli import app
+from undertow.cli import _ORDER, _place, app
 from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
 from undertow.cli.terminal import progress_bar
 from undertow.studies.motion import ended
@@ -60,6 +60,13 @@ def test_long_examples_are_folded_for_a_terminal_of_80_columns() -> None:
     for command in COMMANDS.values():
         for line in command.epilog.splitlines():
             assert len(line) <= 78
+
+
+def test_help_shows_every_command_in_an_order_that_cannot_break() -> None:
+    """Every command has its place; one that is in no list comes last and breaks nothing."""
+    names = {path[0] for path in COMMANDS if len(path) == 1}
+    assert names == set(_ORDER)
+    assert _place("not in the list") == len(_ORDER) > _place("doctor")
 
 
 def test_flags_show_no_type() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from undertow.mechanisms.named import DataName, from_anywhere, named, origin
 from undertow.models import FloatArray, controllability
 from undertow.models import importers as modelling
 from undertow.models.importers import mjcf_document, mujoco_compiler
+from undertow.models.importers.formats import format_of
 from undertow.models.importers.mujoco_compiler import AGREEMENT, agreement
 from undertow.runtime import Recipe
 from undertow.runtime.session import rig_named
@@ -508,3 +510,18 @@ def test_a_file_is_simulated_without_another_word(pole: Path) -> None:
     assert "start          hinge = 5°" in out
     assert "reached the target" in out
     assert "95 % of the travel" in out.replace("\n", " ")
+
+
+@pytest.mark.parametrize("name", ["robot.sdf", "robot.sdf:hip@upright", "a.b/robot.txt"])
+def test_a_file_of_another_format_is_refused_with_the_list(name: str) -> None:
+    file = Path(name.partition(":")[0])
+    refusal = f"format of '{file.name}': got '{file.suffix}', must be one of .urdf, .xml, .mjcf"
+    with pytest.raises(InvalidInputError, match=re.escape(refusal)):
+        named(name)
+
+
+def test_the_end_of_a_name_counts_in_capitals_too(tmp_path: Path) -> None:
+    missing = tmp_path / "ROBOT.URDF"
+    assert format_of(missing).name == "URDF"
+    with pytest.raises(ArtefactError, match=r"ROBOT\.URDF.*no such file"):
+        named(f"{missing}:hip@upright")

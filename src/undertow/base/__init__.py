@@ -20,6 +20,7 @@ from undertow.base.arguments import (
 from undertow.base.artefacts import (
     as_text,
     check_folder,
+    check_replaces,
     facts,
     finite,
     manifest,
@@ -75,6 +76,7 @@ __all__ = [
     "check_fields",
     "check_file",
     "check_folder",
+    "check_replaces",
     "checked",
     "duration",
     "error_text",

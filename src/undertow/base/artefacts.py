@@ -201,17 +201,45 @@ def whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_file(path: Path, content: bytes) -> Path:
-    """Write one file in place of any earlier one, and return where it is.
+def check_replaces(path: Path, begins: bytes) -> None:
+    """Refuse to write over a file of another kind: one that does not begin as the new one does.
+
+    A log or a definition that is named by mistake is not lost.
 
     Raises
     ------
     ArtefactError
-        When it cannot be written.
+        Where there is one.
+    """
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        there = file.read(len(begins))
+    if there not in (b"", begins):
+        raise ArtefactError(
+            f"file '{path}'",
+            value="one of another kind, which is there already",
+            limit="a new file, or an earlier one of the same kind",
+            remedy="Choose another name",
+        )
+
+
+def write_file(path: Path, content: bytes) -> Path:
+    """Write one file, whole or not at all, in place of an earlier one; return where it is.
+
+    Raises
+    ------
+    ArtefactError
+        When it cannot be written, and where a file of another kind is there.
     """
     refusal = "a file that can be written", "Choose another folder or name"
     with or_refused(f"file '{path}'", *refusal):
-        path.write_bytes(content)
+        check_replaces(path, content[:4].rstrip())
+        if path.exists() and not path.is_file():  # a device or a pipe
+            path.write_bytes(content)
+        else:
+            with whole(path.resolve()) as temporary:
+                temporary.write_bytes(content)
     return path
 
 

@@ -33,8 +33,14 @@ _ORDER = (
     "reproduce", "doctor",
 )  # fmt: skip
 
+
+def _place(name: str) -> int:
+    """Where help shows a command; one that is not in the order comes last."""
+    return _ORDER.index(name) if name in _ORDER else len(_ORDER)
+
+
 app.registered_commands.sort(
-    key=lambda command: _ORDER.index(command.name or getattr(command.callback, "__name__", ""))
+    key=lambda command: _place(str(command.name or getattr(command.callback, "__name__", "")))
 )
 
 

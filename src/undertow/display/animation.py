@@ -40,6 +40,18 @@ _KINDS: dict[str, dict[str, Any]] = {
 }
 
 
+def check_film(*, longest: float, speed: float, fps: float = 25.0) -> None:
+    """Refuse a frame rate, a length, s, or a speed that no film has, before any long work.
+
+    Raises
+    ------
+    InvalidInputError
+        For one that is not positive.
+    """
+    for name, value in (("frame rate", fps), ("length", longest), ("speed", speed)):
+        positive(f"{name} of an animation", value)
+
+
 @dataclass(frozen=True, eq=False)
 class Film:
     """A motion ready for drawing.
@@ -93,8 +105,7 @@ class Film:
         InvalidInputError
             For a frame rate, length or speed that is not positive.
         """
-        for name, value in (("frame rate", fps), ("length", longest), ("speed", speed)):
-            positive(f"{name} of an animation", value)
+        check_film(fps=fps, longest=longest, speed=speed)
         mechanism = trajectory.mechanism
         drawn = sketch(mechanism) if figure is None else figure
         start = trajectory.t[0]

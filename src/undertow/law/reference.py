@@ -28,7 +28,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -67,9 +67,10 @@ ROUNDS, ENOUGH = 60, 1e-9
 #: Largest file with a reference, bytes.
 LARGEST = 1 << 24
 
-#: Units that a file's header may have, to SI.
+#: Units that a file's header may have: how much in SI, and in which unit of SI.
 FILE_UNITS = {
-    "s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180,
+    "s": (1.0, "s"), "ms": (1e-3, "s"), "m": (1.0, "m"), "cm": (1e-2, "m"), "mm": (1e-3, "m"),
+    "rad": (1.0, "rad"), "deg": (math.pi / 180, "rad"),
 }  # fmt: skip
 
 #: r at the times t, (N,) to (N,).
@@ -360,6 +361,8 @@ class Reference:
         SI units.  Other actuated coordinates stay at 0.
     period
         After which it repeats itself, s; 0: never.
+    units
+        SI units of the paths that a file states, by name: those of the coordinates they must be.
 
     See Also
     --------
@@ -377,6 +380,7 @@ class Reference:
 
     paths: Mapping[str, ReferencePath]
     period: float = 0.0
+    units: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         """Refuse what is no function of time."""
@@ -463,7 +467,8 @@ class Reference:
             raise InvalidInputError(
                 f"reference '{path}'", value="no UTF-8 text", limit="comma-separated values"
             ) from error
-        return cls.through(**_columns(path, text))
+        columns, units = _columns(path, text)
+        return replace(cls.through(**columns), units=units)
 
     def __repr__(self) -> str:
         """Show what moves."""
@@ -496,6 +501,14 @@ class Reference:
             one_of(f"reference of '{mechanism.name}'", name, names[: mechanism.m])
             _check_invariant(mechanism, name, 0.0)
             k = names.index(name)
+            unit = mechanism.coordinates[k].unit
+            if self.units.get(name, unit) != unit:
+                raise InvalidInputError(
+                    f"unit of '{name}' in a reference's file",
+                    value=f"one of {self.units[name]}",
+                    limit=f"one of {unit}, as the coordinate of '{mechanism.name}' is measured",
+                    remedy="Correct the first line of the file",
+                )
             q[:, k], v[:, k], a[:, k] = path(t if self.period else np.clip(t, 0.0, seconds))
             for part in (v, a):
                 part[~inside, k] = 0.0
@@ -512,12 +525,13 @@ class Reference:
         return ((0.0, ReferenceMotion(t[keep], q[keep], v[keep], a[keep])),)
 
 
-def _columns(path: Path, text: str) -> dict[str, Any]:
-    """Return ``times`` and the columns of a file with a reference, by name, SI units."""
+def _columns(path: Path, text: str) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return ``times`` and the columns of a file with a reference, by name; their SI units."""
     lines = csv.reader(io.StringIO(text))
     head = [cell.strip() for cell in next(lines, [])]
     names: list[str] = []
     factors: list[float] = []
+    units: dict[str, str] = {}
     for cell in head:
         match = re.fullmatch(r"(\w+)\s*[(\[]\s*(\w+)\s*[)\]]", cell)
         if match is None or match[2] not in FILE_UNITS:
@@ -527,8 +541,17 @@ def _columns(path: Path, text: str) -> dict[str, Any]:
                 limit=f"a name with its unit, one of {', '.join(FILE_UNITS)}",
                 remedy="Write the first line like: t (s), x (m), theta (deg)",
             )
-        names.append("times" if not names else normal_name(match[1]))
-        factors.append(FILE_UNITS[match[2]])
+        factor, unit = FILE_UNITS[match[2]]
+        if (unit == "s") != (not names):
+            raise InvalidInputError(
+                f"column '{cell}' of '{path}'",
+                value=f"a unit of {'time' if unit == 's' else 'length or angle'}",
+                limit="the time in the first column, s or ms, and in no other",
+                remedy="Write the first line like: t (s), x (m), theta (deg)",
+            )
+        names.append(normal_name(match[1]) if names else "times")
+        factors.append(factor)
+        units[names[-1]] = unit
     if len(set(names)) < 2 or len(set(names)) < len(names):
         raise InvalidInputError(
             f"columns of '{path}'",
@@ -551,7 +574,7 @@ def _columns(path: Path, text: str) -> dict[str, Any]:
             )
         rows.append(row)
     table = np.array(rows).reshape(-1, len(names)) * factors
-    return dict(zip(names, table.T, strict=True))
+    return dict(zip(names, table.T, strict=True)), units
 
 
 def _stable_inversion(

@@ -21,6 +21,7 @@ from undertow.base import (
     UndertowError,
     check_fields,
     checked,
+    error_text,
     near,
     positive,
     raised_at,
@@ -723,7 +724,7 @@ def _failed(what: str, error: Exception) -> InvalidInputError:
     """A formula of the user's that raised, with what it said and where."""
     return InvalidInputError(
         what,
-        value=f"{type(error).__name__}: {error}{raised_at(error)}",
+        value=f"{error_text(error)}{raised_at(error)}",
         limit="a function that returns a SymPy expression of its argument's names",
         remedy="Write it with SymPy's functions, sympy.sin(v.phi) for math.sin or numpy.sin, and "
         "sympy.Piecewise for conditions",

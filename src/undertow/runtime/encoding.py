@@ -20,8 +20,8 @@ from undertow.plants import Measurement
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.slow_loop import Answer
 
-#: Columns that are no floating-point numbers, with their types in SQL.
-_SQL = {"k": "INTEGER PRIMARY KEY", "mode": "INTEGER", "surface": "INTEGER"}
+#: Columns of whole numbers; the first one is the key of a row.
+WHOLE = ("k", "mode", "surface")
 
 #: What the names of columns are made of: measured states, demanded inputs, surface values.
 _MEASURED, _DEMAND, _SURFACE = "_measured", "_demand", "s_"
@@ -39,7 +39,9 @@ class Stamps(NamedTuple):
 
 def sql_type(name: str) -> str:
     """Return the type in SQL of a column."""
-    return _SQL.get(name, "REAL")
+    if name not in WHOLE:
+        return "REAL"
+    return "INTEGER PRIMARY KEY" if name == WHOLE[0] else "INTEGER"
 
 
 @dataclass(frozen=True)
