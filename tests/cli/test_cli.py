@@ -18,10 +18,11 @@ from typer.main import get_command
 
 import undertow as ut
 from runs import run
-from undertow.base import InvalidInputError
+from undertow.base import ArtefactError, InvalidInputError, write_file
 from undertow.cli import _ORDER, _place, app
 from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
 from undertow.cli.terminal import progress_bar
+from undertow.closed_loop import Event, Trajectory
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
@@ -136,6 +137,27 @@ def test_version_and_bare_call() -> None:
         (("simulate", CRANE, "--target", "x=1m", "--target", "x=.1m@2Hz"), "x=1m", "one frequency"),
         (("simulate", CRANE, "--target", "x=1m", "--control", "designed"), "designed", "cascade"),
         (("run", CRANE, "--simulated", "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
+        (("simulate", RIG, "--control", "designed", "--accept", "local"), "local", "the cascade"),
+        (("simulate", RIG, "--control", "one-time", "--belief", "usual"), "usual", "the cascade"),
+        (("animate", RIG, "--speed", "0"), "0.0", "> 0"),
+        (("animate", RIG, "--longest", "-1"), "-1.0", "> 0"),
+        (("derive", "robot.sdf"), "'.sdf'", ".urdf, .xml, .mjcf"),
+        (("bench", RIG, "--quick", "--delay", "0.002"), "0.002 s", "one of them"),
+        (("bench", RIG, "--delay", "-1"), "-1", "≥ 0"),
+        (("export", "c", RIG, "--check", "--objective", "speed"), "'speed'", "bench-time"),
+        (("export", "c", RIG, "--check", "--start", "psi=1deg"), "'psi'", "theta, phi"),
+        (("export", "c", RIG, "--check", "--velocity", "slow"), "'slow'", "derivative, super"),
+        (
+            ("export", "c", RIG, "--check", "--velocity", "kalman", "--time-constant", "0.1"),
+            "0.1, with --velocity kalman",
+            "--velocity derivative",
+        ),
+        (("export", "c", RIG, "--check", "--period", "0"), "0.0", "> 0, < 1 s"),
+        (
+            ("campaign", "none.toml", "--out", "s.zarr", "--proof", "p.json"),
+            "no --picture",
+            "shows",
+        ),
     ],
 )
 def test_bad_input_is_refused_with_value_and_limit(
@@ -159,6 +181,42 @@ def test_a_target_on_the_command_line() -> None:
     assert code == 0
     assert "theta=20deg, theta=0deg@0.5s" in out
     assert "begin another task" in " ".join(out.split())
+
+
+def test_a_file_of_another_kind_is_not_written_over(tmp_path: Path) -> None:
+    """A definition, a log or a driver that is named by mistake stays what it is."""
+    mine, page = tmp_path / "mine.py", tmp_path / "page.html"
+    mine.write_text("import undertow\n", encoding="utf-8")
+    with pytest.raises(ArtefactError, match="one of another kind, which is there already"):
+        write_file(mine, b"<!doctype html>")
+    assert mine.read_text(encoding="utf-8") == "import undertow\n"
+    for content in (b"<!doctype html>1", b"<!doctype html>2"):
+        assert write_file(page, content).read_bytes() == content
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.py", "page.html"]
+
+
+def _pushed(end: list[float], event: Event) -> Trajectory:
+    """A motion of a crane that ends there after 2 s."""
+    crane = ut.mechanisms.overhead_crane()
+    x = np.array([[0.0] * 4, end])
+    zero = np.zeros((2, 1))
+    return Trajectory(crane, np.array([0.0, 2.0]), x, zero, zero, np.zeros(2), np.ones(2), event)
+
+
+def test_how_far_a_motion_is_off_counts_from_its_target() -> None:
+    """Of a set-point at 1 m, 0.6 mm away is 0.0006, not ‖x‖ = 1; a reference is followed."""
+    goal, there = ut.MinimumTime(horizon=4.0), ut.SetPoints({"x": 1.0})
+    late = ended(_pushed([1.03, 0.0, 0.0, 0.0], Event.HORIZON), goal, there)
+    assert late.startswith("had not reached ‖x − x_r‖ ≤ 0.01 by the horizon: ‖x − x_r‖ = 0.03")
+    assert "reached the target, ‖x − x_r‖ ≤ 0.01" in ended(
+        _pushed([1.0006, 0.0, 0.0, 0.0], Event.REACHED), goal, there
+    )
+    sine = ut.Reference.sine(0.5, x=0.1)
+    ((_, leg),) = sine.legs(ut.mechanisms.overhead_crane(), 4.0)
+    followed = ended(_pushed(leg.state(2.0).tolist(), Event.REACHED), goal, sine)
+    assert followed == "followed the reference to the end, where ‖x − x_r‖ ≤ 0.01, at 2.000 s"
+    off = ended(_pushed([0.0, 0.0, 0.0, 0.0], Event.HORIZON), goal, sine)
+    assert f"‖x − x_r‖ = {np.linalg.norm(leg.state(2.0)):.3g}, not" in off
 
 
 def test_start_without_unit_is_told_what_to_write() -> None:

@@ -206,8 +206,10 @@ def test_a_ring_that_overflows_drops_and_counts_and_does_not_wait(tmp_path: Path
 
 
 def test_an_earlier_log_is_kept(tmp_path: Path) -> None:
-    for _ in range(3):
-        Log(tmp_path / "run.db", COLUMNS, {}, threaded=False).close()
+    for earlier in (None, tmp_path / "run.db.1", tmp_path / "run.db.2"):
+        log = Log(tmp_path / "run.db", COLUMNS, {}, threaded=False)
+        log.close()
+        assert log.earlier == earlier
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.db", "run.db.1", "run.db.2"]
 
 

@@ -22,9 +22,8 @@ from undertow.plants import (
 )
 from undertow.plants.bench import Bench, bench_for
 
-
-#: Longest delay that is put into a rig, s.
-LATEST = 1.0
+#: Longest delay that is put into a rig, s, and how many times its friction.
+LATEST, ROUGHEST = 1.0, 1000.0
 
 
 class Miswired(RigWrapper):
@@ -66,8 +65,8 @@ def miswired(rig: Rig, mechanism: Mechanism, faults: Sequence[str]) -> Rig:
     """Return a rig with faults given in words, ``part=value``.
 
     They are ``voltage=-1`` (factor of an input), ``theta=2`` (factor of an encoder; 0: cable off),
-    ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.002`` (s, besides the rig's own; whole periods).
-    Friction is the bench's: see :func:`rubbing`.
+    ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.002`` (s, besides the rig's own, whole
+    periods). Friction is the bench's: see :func:`rubbing`.
 
     Raises
     ------
@@ -115,7 +114,7 @@ def _read(mechanism: Mechanism, faults: Sequence[str]) -> tuple[dict[str, float]
     limit = f"part=number, the part one of {', '.join(factors)}, each once, or swap=" + (
         ",".join(names[:2]) if mechanism.n == 2 else "COORDINATE,COORDINATE"
     )
-    remedy = f"Write for instance --fault {names[0]}=-1; delay and friction are ≥ 0"
+    remedy = f"Write for instance --fault {names[0]}=-1; delay is ≥ 0, friction 0 to {ROUGHEST:g}"
     order, left = list(range(mechanism.n)), set(factors)
     for word in faults:
         part, _, value = word.partition("=")
@@ -129,7 +128,8 @@ def _read(mechanism: Mechanism, faults: Sequence[str]) -> tuple[dict[str, float]
         except ValueError:
             number = math.nan
         least = 0.0 if part in ("delay", "friction") else -math.inf
-        if part not in left or not (math.isfinite(number) and number >= least):
+        most = ROUGHEST if part == "friction" else math.inf
+        if part not in left or not (math.isfinite(number) and least <= number <= most):
             raise InvalidInputError("fault", value=repr(word), limit=limit, remedy=remedy)
         left.remove(part)
         factors[part] = number

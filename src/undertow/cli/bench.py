@@ -44,8 +44,8 @@ def bench(
         list[str] | None,
         option(
             "Wire the simulated rig wrongly: INPUT=-1 or COORDINATE=2 (a factor, 0: cable "
-            "off), swap=COORDINATE,COORDINATE (two encoders), delay=0.002 (s, besides its own; whole "
-            "periods), friction=12 (times the realistic rig's own). Each once. Repeatable.",
+            "off), swap=COORDINATE,COORDINATE (two encoders), delay=0.002 (s, besides its own, "
+            "whole periods), friction=12 (times the realistic rig's own). Each once. Repeatable.",
             metavar="PART=VALUE",
         ),
     ] = None,

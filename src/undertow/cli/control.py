@@ -114,10 +114,10 @@ def simulate(
             limit="cascade, which follows targets",
             remedy="Leave one of them out",
         )
-    for option, value in (("--accept", accept), ("--belief", known)):
+    for what, value in (("--accept", accept), ("--belief", known)):
         if value is not None and steering != "cascade":
             raise InvalidInputError(
-                option,
+                what,
                 value=f"{value if isinstance(value, str) else ', '.join(value)}, with one surface",
                 limit="the cascade, which decides by it",
                 remedy="Leave it out, or --control and --surface",

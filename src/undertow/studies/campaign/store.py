@@ -50,7 +50,10 @@ class Store:
         self.path = path
         if not (path / "zarr.json").is_file():
             raise ArtefactError(
-                f"store '{path}'", value="none", limit="a campaign's", remedy="Leave out --resume"
+                f"store '{path}'",
+                value="none",
+                limit="a campaign's",
+                remedy="Name that of an earlier campaign, or begin one without --resume",
             )
         try:
             self._group: Any = _zarr().open_group(str(path), mode="r+")
