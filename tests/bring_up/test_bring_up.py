@@ -313,6 +313,7 @@ def test_a_motion_that_tells_nothing_breaks_nothing() -> None:
     rig = IdealRig(belief, rest_state(belief))
     record = perform(rig, np.full((300, 1), 0.5), [1.0, 1.0])
     fit, none = Fit(belief, rest_state(belief), record), np.empty(0)
+    fit.weigh([], none)
     J, r = fit.jacobian([], none), fit.residual([], none)
     assert J.shape == (record.q.size, 0)
     assert correlated(J, r, belief.n).shape == (0,)

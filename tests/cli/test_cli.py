@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -543,3 +546,38 @@ def test_progress_says_how_much_time_is_left(
         for what, part in (("a", 0.2), ("b", 0.4), ("b", 0.41), ("c", 1.0)):
             tell(what, part)
     assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
+
+
+# -- where the output goes -----------------------------------------------------------------------
+
+
+def _typed(*words: str, **how: Any) -> subprocess.CompletedProcess[bytes]:
+    """Type a command in a process of its own, with standard streams of one's own."""
+    code = "import sys; from undertow.cli import main; sys.argv[0] = 'undertow'; main()"
+    command = [sys.executable, "-c", code, *words]
+    return subprocess.run(command, stderr=subprocess.PIPE, timeout=120, check=False, **how)
+
+
+def test_a_terminal_that_cannot_show_a_letter_costs_no_result() -> None:
+    """A result of minutes ended in UnicodeEncodeError on a terminal without ‖ or ≤."""
+    ended = _typed("simulate", RIG, "--help", stdout=subprocess.PIPE,
+                   env={**os.environ, "PYTHONIOENCODING": "ascii"})  # fmt: skip
+    assert ended.returncode == 0
+    assert ended.stderr == b""
+    assert b"?x?" in ended.stdout
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_behind_a_redirection_is_one_line() -> None:
+    with open("/dev/full", "wb") as full:
+        ended = _typed("mechanisms", stdout=full)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith(b"error: the output: got No space left on device")
+    assert ended.stderr.count(b"\n") == 1
+
+
+def test_no_output_at_all_is_none() -> None:
+    """`>&-`: nothing to write to, and nothing to flush."""
+    ended = _typed("--version", preexec_fn=lambda: os.close(1))
+    assert ended.returncode == 0
+    assert ended.stderr == b""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from contextlib import suppress
 from typing import Annotated
@@ -69,6 +70,9 @@ def root(
 
 def main() -> None:
     """Run the command line."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what a terminal cannot show costs no result
+            stream.reconfigure(errors="replace")
     try:
         by_exception()
         app(prog_name="undertow")
@@ -79,6 +83,6 @@ def main() -> None:
         # An interrupt that met somebody's exec() stays marked as unhandled, and Python would end
         # by the signal instead of the exit status.  The next exec unmarks it.
         exec("")
-        with suppress(OSError, ValueError):  # a pipe may be closed
+        with suppress(OSError, ValueError, AttributeError):  # it may be closed, or none at all
             sys.stdout.flush()
         at_once()

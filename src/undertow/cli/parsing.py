@@ -62,6 +62,10 @@ def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
     words = [word for word in target or () if word in WORDS]
     rest = [word for word in target or () if word not in WORDS]
     data = DataName.of(name)
+    if len(words) > 1:
+        raise InvalidInputError(
+            "target", value=" and ".join(words), limit="one equilibrium", remedy="Keep one of them"
+        )
     if data is None and words:
         raise InvalidInputError(
             "target",

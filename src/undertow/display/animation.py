@@ -91,7 +91,8 @@ class Film:
         trajectory
             A recorded motion.
         fps
-            Frames in a second.
+            Frames in a second, 50 at most; the nearest that a GIF can keep, whose frames last
+            whole hundredths of a second.
         longest
             Longest film, s.
         speed
@@ -106,6 +107,7 @@ class Film:
             For a frame rate, length or speed that is not positive.
         """
         check_film(fps=fps, longest=longest, speed=speed)
+        fps = 100.0 / max(2, round(100.0 / fps))
         mechanism = trajectory.mechanism
         drawn = sketch(mechanism) if figure is None else figure
         start = trajectory.t[0]

@@ -653,6 +653,8 @@ def _energy_unit(mechanism: Mechanism) -> str:
     """Return the unit of ∫uᵀu dt."""
     units = {channel.unit for channel in mechanism.inputs}
     unit = units.pop() if len(units) == 1 else "mixed units"
+    if not unit:  # of a motor of an MJCF file, whose input is a number
+        return "s"
     return f"({unit})² s" if " " in unit else f"{unit}² s"
 
 
