@@ -248,7 +248,7 @@ def _coordinates(mechanism: Mechanism) -> Section:
         f"  {plain(c.symbol)} ({c.unit}, {'actuated' if i < m else 'free'}): {c.description}"
         for i, c in enumerate(mechanism.coordinates)
     ]
-    lines += [f"  {plain(c.symbol)} ({c.unit}): input, |{plain(c.symbol)}| ≤ {c.limit:g}"
+    lines += [f"  {plain(c.symbol)} ({c.unit or 1}): input, |{plain(c.symbol)}| ≤ {c.limit:g}"
               for c in mechanism.inputs]  # fmt: skip
     lines += [
         f"  {plain(p.symbol)} = {f'{p.value:.6g} {p.unit}'.strip()}: {p.description}"

@@ -64,6 +64,7 @@ def column_units(recording: Recording) -> dict[str, str]:
     found = {}
     for column in recording.columns:
         plain = Columns.quantity(column)
+        plain = plain if plain in known else plain.rstrip("_")
         rate = known.get(plain.removesuffix("_dot"), "") if plain.endswith("_dot") else ""
         found[column] = known.get(plain) or (f"{rate}/s" if rate else _UNITS.get(column, ""))
     return found
