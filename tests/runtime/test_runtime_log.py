@@ -215,8 +215,8 @@ def test_names_that_a_log_has_itself_get_columns_of_their_own(tmp_path: Path) ->
     renamed = {sp.Symbol(k, real=True): sp.Symbol(v, real=True) for k, v in names.items()}
     mine = ut.Mechanism(
         "mine",
-        [ut.Coordinate("s_1", "m"), ut.Coordinate("K", "rad")],
-        [ut.Input("T", "N", 10.0)],
+        (ut.Coordinate("s_1", "m"), ut.Coordinate("K", "rad")),
+        (ut.Input("T", "N", 10.0),),
         cart.mass_matrix.subs(renamed),
         cart.force.subs(renamed),
         parameters=cart.parameters,

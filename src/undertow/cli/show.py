@@ -118,6 +118,14 @@ def show(
         raise InvalidInputError(
             "--mechanism", value=mechanism, limit="for a log, FILE.db", remedy="Leave it out"
         )
+    for what, given in (("--start", start), ("--set", setting), ("--limit", limit)):
+        if log and given:
+            raise InvalidInputError(
+                f"{what} with a log",
+                value=", ".join(given),
+                limit="for a mechanism: what a log shows has been",
+                remedy="Leave it out",
+            )
     shown: Show
     with progress_bar() as progress:
         if log:
