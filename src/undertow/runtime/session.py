@@ -82,7 +82,7 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
     raise InvalidInputError(
         "rig",
         value=repr(word),
-        limit="ideal, realistic, mujoco, FILE.xml or FILE.py:NAME",
+        limit="ideal, realistic, mujoco, FILE.xml, FILE.mjcf or FILE.py:NAME",
         remedy="A driver of your own: see examples/serial_rig.py",
     )
 
