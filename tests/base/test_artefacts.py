@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import RenderableType
 from rich.text import Text
@@ -64,6 +65,14 @@ def test_what_is_not_finite_is_a_dash_for_people_and_an_empty_cell_in_files() ->
 def test_markdown_columns_of_numbers_end_at_the_right() -> None:
     lines = markdown_table(("case", "x"), [(1, "2.5")], right=("x",))
     assert lines == ["| case | x |", "| --- | ---: |", "| 1 | 2.5 |"]
+
+
+def test_a_number_that_is_none_loses_no_result() -> None:
+    """A diverged motion's cost, an interval without end: null, where json.dumps raised."""
+    facts = {"cost": math.nan, "rows": [{"low": -math.inf, "high": np.float64(2.0)}]}
+    content = json.loads(manifest("undertow x", {"horizon": math.inf}, **facts))
+    assert (content["cost"], content["request"]) == (None, {"horizon": None})
+    assert content["rows"] == [{"low": None, "high": 2.0}]
 
 
 def test_a_manifest_says_what_was_run_with_which_versions() -> None:

@@ -61,10 +61,21 @@ def to_csv(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 def manifest(what: str, request: Mapping[str, object], **more: object) -> bytes:
     """Return as JSON what made a result: the command, its versions and request, and more facts.
 
-    Paths in the request are written as text.
+    Paths in the request are written as text; a number that is not finite is ``null``: no result is
+    lost because one of its numbers is none.
     """
     asked = {k: str(v) if isinstance(v, Path) else v for k, v in request.items()}
-    return to_json({"what": what, "versions": versions(), "request": asked, **more})
+    facts = _finite_only({"request": asked, **more})
+    return to_json({"what": what, "versions": versions(), **facts})
+
+
+def _finite_only(value: Any) -> Any:
+    """Return JSON values with ``None`` for every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {name: _finite_only(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite_only(entry) for entry in value]
+    return finite(value) if isinstance(value, float) else value
 
 
 def finite(value: float) -> float | None:
