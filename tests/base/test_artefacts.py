@@ -14,6 +14,7 @@ from rich.text import Text
 from undertow.base import (
     as_text,
     facts,
+    file_name,
     finite,
     manifest,
     markdown_table,
@@ -94,3 +95,10 @@ def test_an_unknown_name_is_refused_with_those_that_are_like_it() -> None:
     one_of("colour", "red", ["red", "green"])
     with pytest.raises(InvalidInputError, match=r"got 'gren', must be one of red, green. Did you"):
         one_of("colour", "gren", ["red", "green"])
+
+
+def test_a_name_of_somebodys_is_a_file_in_the_folder_that_is_named(tmp_path: Path) -> None:
+    """A mechanism called "../../cart" wrote its formulas two folders up."""
+    for name in ("../../cart", "a/b", "..", "tab\t", "x" * 300, "Wagen ü"):
+        write_files(tmp_path / name[:1].replace(".", "p"), {f"{file_name(name)}.txt": b"1"})
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["W", "a", "p", "t", "x"]

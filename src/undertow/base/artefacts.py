@@ -13,6 +13,7 @@ import json
 import math
 import os
 import platform
+import re
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -185,6 +186,16 @@ def markdown_table(
     """Return the lines of a Markdown table; ``right`` are the heads of columns of numbers."""
     rule = ["---:" if head in right else "---" for head in heads]
     return [f"| {' | '.join(map(str, row))} |" for row in (heads, rule, *rows)]
+
+
+def file_name(name: str) -> str:
+    """Return a name of somebody's as the beginning of a file's: no folder, no control character.
+
+    >>> file_name("../cart pole"), file_name("Wagen ü"), file_name("")
+    ('__cart pole', 'Wagen ü', '_')
+    """
+    plain = re.sub(r'[/\\:*?"<>|]|^\.+', "_", name)
+    return "".join(c if c.isprintable() else "_" for c in plain)[:100] or "_"
 
 
 def check_folder(folder: Path) -> None:

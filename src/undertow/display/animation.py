@@ -22,7 +22,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from undertow.base import manifest, positive
+from undertow.base import file_name, manifest, positive
 from undertow.closed_loop import Trajectory
 from undertow.closed_loop.figures import COLOURS, figure_bytes, style
 from undertow.display.sketches import Box, Disc, Label, Line, Sketch, projected, sketch
@@ -410,7 +410,7 @@ def film_files(film: Film, request: Mapping[str, object]) -> dict[str, bytes]:
         figure = Figure(figsize=(4.5, 4.5))
         still(figure.add_subplot(), film)
         picture = figure_bytes(figure)
-    name = film.mechanism.name
+    name = file_name(film.mechanism.name)
     return {
         f"{name}.gif": gif(film),
         f"{name}.png": picture,
