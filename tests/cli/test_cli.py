@@ -23,7 +23,14 @@ import undertow as ut
 from runs import run
 from undertow.base import ArtefactError, InvalidInputError, write_file
 from undertow.cli import _ORDER, _place, app
-from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
+from undertow.cli.parsing import (
+    aimed,
+    mechanism_named,
+    objective_named,
+    parse_start,
+    parse_surface,
+    parse_target,
+)
 from undertow.cli.terminal import progress_bar
 from undertow.closed_loop import Event, Trajectory
 from undertow.studies.motion import ended
@@ -220,6 +227,15 @@ def test_how_far_a_motion_is_off_counts_from_its_target() -> None:
     assert followed == "followed the reference to the end, where ‖x − x_r‖ ≤ 0.01, at 2.000 s"
     off = ended(_pushed([0.0, 0.0, 0.0, 0.0], Event.HORIZON), goal, sine)
     assert f"‖x − x_r‖ = {np.linalg.norm(leg.state(2.0)):.3g}, not" in off
+
+
+def test_a_path_may_have_an_equals_sign(tmp_path: Path) -> None:
+    way = tmp_path / "run=3" / "way.csv"
+    way.parent.mkdir()
+    way.write_text("t (s), x (m)\n0,0\n2,0.5\n", encoding="utf-8")
+    crane = ut.mechanisms.overhead_crane()
+    assert parse_target(crane, [str(way)]) == ut.Reference.through([0, 2], x=[0, 0.5])
+    assert aimed("crane.urdf", [str(way)]) == ("crane.urdf", [str(way)])
 
 
 def test_start_without_unit_is_told_what_to_write() -> None:

@@ -499,8 +499,10 @@ def test_a_folder_of_files(pole: Path, tmp_path: Path) -> None:
     code, out, _ = run("models", str(tmp_path), "--no-simulate")
     assert code == 0
     assert "6 files: 2 read" in out
-    with pytest.raises(ArtefactError, match="0 files"):
-        model_files(tmp_path / "nowhere")
+    for place, said in (("nowhere", "no such folder"), ("pole.xml", "a file"), ("none", "0 files")):
+        (tmp_path / "none").mkdir(exist_ok=True)
+        with pytest.raises(ArtefactError, match=f"got {said}, must be"):
+            model_files(tmp_path / place)
 
 
 @pytest.mark.slow  # kernels of its own
