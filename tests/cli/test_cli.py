@@ -203,6 +203,8 @@ def test_a_file_of_another_kind_is_not_written_over(tmp_path: Path) -> None:
     for content in (b"<!doctype html>1", b"<!doctype html>2"):
         assert write_file(page, content).read_bytes() == content
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.py", "page.html"]
+    page.write_bytes(b'{"compact": 1}')
+    assert write_file(page, b'{\n "laid": 2}').read_bytes().startswith(b"{\n")
 
 
 def _pushed(end: list[float], event: Event) -> Trajectory:
