@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import RenderableType
 from rich.text import Text
@@ -13,6 +14,7 @@ from rich.text import Text
 from undertow.base import (
     as_text,
     facts,
+    file_name,
     finite,
     manifest,
     markdown_table,
@@ -66,6 +68,14 @@ def test_markdown_columns_of_numbers_end_at_the_right() -> None:
     assert lines == ["| case | x |", "| --- | ---: |", "| 1 | 2.5 |"]
 
 
+def test_a_number_that_is_none_loses_no_result() -> None:
+    """A diverged motion's cost, an interval without end: null, where json.dumps raised."""
+    facts = {"cost": math.nan, "rows": [{"low": -math.inf, "high": np.float64(2.0)}]}
+    content = json.loads(manifest("undertow x", {"horizon": math.inf}, **facts))
+    assert (content["cost"], content["request"]) == (None, {"horizon": None})
+    assert content["rows"] == [{"low": None, "high": 2.0}]
+
+
 def test_a_manifest_says_what_was_run_with_which_versions() -> None:
     content = json.loads(manifest("undertow x", {"out": Path("a"), "seed": 1}, gap=None))
     assert content["what"] == "undertow x"
@@ -85,3 +95,10 @@ def test_an_unknown_name_is_refused_with_those_that_are_like_it() -> None:
     one_of("colour", "red", ["red", "green"])
     with pytest.raises(InvalidInputError, match=r"got 'gren', must be one of red, green. Did you"):
         one_of("colour", "gren", ["red", "green"])
+
+
+def test_a_name_of_somebodys_is_a_file_in_the_folder_that_is_named(tmp_path: Path) -> None:
+    """A mechanism called "../../cart" wrote its formulas two folders up."""
+    for name in ("../../cart", "a/b", "..", "tab\t", "x" * 300, "Wagen ü"):
+        write_files(tmp_path / name[:1].replace(".", "p"), {f"{file_name(name)}.txt": b"1"})
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["W", "a", "p", "t", "x"]

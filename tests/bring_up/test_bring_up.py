@@ -29,7 +29,7 @@ from undertow.bring_up import (
     rest_state,
     rubbing,
 )
-from undertow.bring_up.fit import counted, dwell, readings
+from undertow.bring_up.fit import Fit, correlated, counted, dwell, readings
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
 from undertow.plants import (
@@ -176,7 +176,7 @@ def test_wirings_found_one_behind_the_other_are_one_wiring() -> None:
         (("theta=4",), {("encoder scale", "theta")}),
         (("phi=0.25",), {("encoder scale", "phi")}),
         (("phi=57.29578",), {("encoder scale", "phi")}),
-        (("delay=0.0015",), {("delay", "the loop")}),
+        (("delay=0.002",), {("delay", "the loop")}),
         (("theta=-1", "phi=2"), {("encoder sign", "theta"), ("encoder scale", "phi")}),
         (("swap=theta,phi",), {("encoder order", "theta, phi")}),
     ],
@@ -307,6 +307,19 @@ def test_a_motion_without_motion_is_refused() -> None:
         identify(belief, rest_state(belief), replace(record, q=np.zeros_like(record.q)))
 
 
+def test_a_motion_that_tells_nothing_breaks_nothing() -> None:
+    """Where no quantity shows there is nothing to be uncertain of: empty tables, no traceback."""
+    belief = ut.mechanisms.rotary_pendulum()
+    rig = IdealRig(belief, rest_state(belief))
+    record = perform(rig, np.full((300, 1), 0.5), [1.0, 1.0])
+    fit, none = Fit(belief, rest_state(belief), record), np.empty(0)
+    fit.weigh([], none)
+    J, r = fit.jacobian([], none), fit.residual([], none)
+    assert J.shape == (record.q.size, 0)
+    assert correlated(J, r, belief.n).shape == (0,)
+    assert counted(fit.moved, fit.noise, fit.sigma, fit.variance, J).shape == (0,)
+
+
 # -- the command ------------------------------------------------
 
 
@@ -323,14 +336,37 @@ def test_command_says_what_is_wrong_and_keeps_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "fault", ["piano=2", "theta", "theta=x", "theta=nan", "swap=theta", "friction=-1"]
-)
+    "fault",
+    [
+        "piano=2", "theta", "theta=x", "theta=nan", "swap=theta", "friction=-1", "swap=phi,phi",
+        "voltage=nan",
+    ],
+)  # fmt: skip
 def test_command_refuses_faults_that_are_none(fault: str) -> None:
     """The parts that there are stand in the refusal."""
     result = CliRunner().invoke(app, ["bench", "rotary_pendulum", "--fault", fault])
     assert result.exit_code == 2
-    assert "voltage" in result.stderr
+    assert "one of voltage, theta, phi, delay, friction" in result.stderr
     assert result.stderr.startswith("error: ")
+
+
+@pytest.mark.parametrize(
+    ("words", "limit"),
+    [
+        (("--fault", "delay=0.0015"), "whole periods of the rig, 0.001 s each"),
+        (("--fault", "delay=1e9"), "1 s in all"),
+        (("--fault", "friction=1e300"), "0 to 1000"),
+        (("--fault", "theta=-1", "--fault", "theta=2"), "each once"),
+        (("--rig", "ideal", "--fault", "friction=12"), "the realistic rig, which has dry friction"),
+    ],
+)
+def test_a_fault_that_would_do_nothing_or_another_thing_is_refused(
+    words: tuple[str, ...], limit: str
+) -> None:
+    """1.5 ms became two periods; a second factor took the first one's place."""
+    result = CliRunner().invoke(app, ["bench", "rotary_pendulum", *words])
+    assert result.exit_code == 2
+    assert limit in result.stderr
 
 
 def test_a_count_that_stands_still_is_as_uncertain_as_its_zero() -> None:

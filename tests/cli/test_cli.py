@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,10 +21,18 @@ from typer.main import get_command
 
 import undertow as ut
 from runs import run
-from undertow.base import InvalidInputError
-from undertow.cli import app
-from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
+from undertow.base import ArtefactError, InvalidInputError, write_file
+from undertow.cli import _ORDER, _place, app
+from undertow.cli.parsing import (
+    aimed,
+    mechanism_named,
+    objective_named,
+    parse_start,
+    parse_surface,
+    parse_target,
+)
 from undertow.cli.terminal import progress_bar
+from undertow.closed_loop import Event, Trajectory
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
@@ -60,6 +71,13 @@ def test_long_examples_are_folded_for_a_terminal_of_80_columns() -> None:
     for command in COMMANDS.values():
         for line in command.epilog.splitlines():
             assert len(line) <= 78
+
+
+def test_help_shows_every_command_in_an_order_that_cannot_break() -> None:
+    """Every command has its place; one that is in no list comes last and breaks nothing."""
+    names = {path[0] for path in COMMANDS if len(path) == 1}
+    assert names == set(_ORDER)
+    assert _place("not in the list") == len(_ORDER) > _place("doctor")
 
 
 def test_flags_show_no_type() -> None:
@@ -129,6 +147,27 @@ def test_version_and_bare_call() -> None:
         (("simulate", CRANE, "--target", "x=1m", "--target", "x=.1m@2Hz"), "x=1m", "one frequency"),
         (("simulate", CRANE, "--target", "x=1m", "--control", "designed"), "designed", "cascade"),
         (("run", CRANE, "--simulated", "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
+        (("simulate", RIG, "--control", "designed", "--accept", "local"), "local", "the cascade"),
+        (("simulate", RIG, "--control", "one-time", "--belief", "usual"), "usual", "the cascade"),
+        (("animate", RIG, "--speed", "0"), "0.0", "> 0"),
+        (("animate", RIG, "--longest", "-1"), "-1.0", "> 0"),
+        (("derive", "robot.sdf"), "'.sdf'", ".urdf, .xml, .mjcf"),
+        (("bench", RIG, "--quick", "--delay", "0.002"), "0.002 s", "one of them"),
+        (("bench", RIG, "--delay", "-1"), "-1", "≥ 0"),
+        (("export", "c", RIG, "--check", "--objective", "speed"), "'speed'", "bench-time"),
+        (("export", "c", RIG, "--check", "--start", "psi=1deg"), "'psi'", "theta, phi"),
+        (("export", "c", RIG, "--check", "--velocity", "slow"), "'slow'", "derivative, super"),
+        (
+            ("export", "c", RIG, "--check", "--velocity", "kalman", "--time-constant", "0.1"),
+            "0.1, with --velocity kalman",
+            "--velocity derivative",
+        ),
+        (("export", "c", RIG, "--check", "--period", "0"), "0.0", "> 0, < 1 s"),
+        (
+            ("campaign", "none.toml", "--out", "s.zarr", "--proof", "p.json"),
+            "no --picture",
+            "shows",
+        ),
     ],
 )
 def test_bad_input_is_refused_with_value_and_limit(
@@ -152,6 +191,53 @@ def test_a_target_on_the_command_line() -> None:
     assert code == 0
     assert "theta=20deg, theta=0deg@0.5s" in out
     assert "begin another task" in " ".join(out.split())
+
+
+def test_a_file_of_another_kind_is_not_written_over(tmp_path: Path) -> None:
+    """A definition, a log or a driver that is named by mistake stays what it is."""
+    mine, page = tmp_path / "mine.py", tmp_path / "page.html"
+    mine.write_text("import undertow\n", encoding="utf-8")
+    with pytest.raises(ArtefactError, match="one of another kind, which is there already"):
+        write_file(mine, b"<!doctype html>")
+    assert mine.read_text(encoding="utf-8") == "import undertow\n"
+    for content in (b"<!doctype html>1", b"<!doctype html>2"):
+        assert write_file(page, content).read_bytes() == content
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.py", "page.html"]
+    page.write_bytes(b'{"compact": 1}')
+    assert write_file(page, b'{\n "laid": 2}').read_bytes().startswith(b"{\n")
+
+
+def _pushed(end: list[float], event: Event) -> Trajectory:
+    """A motion of a crane that ends there after 2 s."""
+    crane = ut.mechanisms.overhead_crane()
+    x = np.array([[0.0] * 4, end])
+    zero = np.zeros((2, 1))
+    return Trajectory(crane, np.array([0.0, 2.0]), x, zero, zero, np.zeros(2), np.ones(2), event)
+
+
+def test_how_far_a_motion_is_off_counts_from_its_target() -> None:
+    """Of a set-point at 1 m, 0.6 mm away is 0.0006, not ‖x‖ = 1; a reference is followed."""
+    goal, there = ut.MinimumTime(horizon=4.0), ut.SetPoints({"x": 1.0})
+    late = ended(_pushed([1.03, 0.0, 0.0, 0.0], Event.HORIZON), goal, there)
+    assert late.startswith("had not reached ‖x − x_r‖ ≤ 0.01 by the horizon: ‖x − x_r‖ = 0.03")
+    assert "reached the target, ‖x − x_r‖ ≤ 0.01" in ended(
+        _pushed([1.0006, 0.0, 0.0, 0.0], Event.REACHED), goal, there
+    )
+    sine = ut.Reference.sine(0.5, x=0.1)
+    ((_, leg),) = sine.legs(ut.mechanisms.overhead_crane(), 4.0)
+    followed = ended(_pushed(leg.state(2.0).tolist(), Event.REACHED), goal, sine)
+    assert followed == "followed the reference to the end, where ‖x − x_r‖ ≤ 0.01, at 2.000 s"
+    off = ended(_pushed([0.0, 0.0, 0.0, 0.0], Event.HORIZON), goal, sine)
+    assert f"‖x − x_r‖ = {np.linalg.norm(leg.state(2.0)):.3g}, not" in off
+
+
+def test_a_path_may_have_an_equals_sign(tmp_path: Path) -> None:
+    way = tmp_path / "run=3" / "way.csv"
+    way.parent.mkdir()
+    way.write_text("t (s), x (m)\n0,0\n2,0.5\n", encoding="utf-8")
+    crane = ut.mechanisms.overhead_crane()
+    assert parse_target(crane, [str(way)]) == ut.Reference.through([0, 2], x=[0, 0.5])
+    assert aimed("crane.urdf", [str(way)]) == ("crane.urdf", [str(way)])
 
 
 def test_start_without_unit_is_told_what_to_write() -> None:
@@ -478,3 +564,38 @@ def test_progress_says_how_much_time_is_left(
         for what, part in (("a", 0.2), ("b", 0.4), ("b", 0.41), ("c", 1.0)):
             tell(what, part)
     assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
+
+
+# -- where the output goes -----------------------------------------------------------------------
+
+
+def _typed(*words: str, **how: Any) -> subprocess.CompletedProcess[bytes]:
+    """Type a command in a process of its own, with standard streams of one's own."""
+    code = "import sys; from undertow.cli import main; sys.argv[0] = 'undertow'; main()"
+    command = [sys.executable, "-c", code, *words]
+    return subprocess.run(command, stderr=subprocess.PIPE, timeout=120, check=False, **how)
+
+
+def test_a_terminal_that_cannot_show_a_letter_costs_no_result() -> None:
+    """A result of minutes ended in UnicodeEncodeError on a terminal without ‖ or ≤."""
+    ended = _typed("simulate", RIG, "--help", stdout=subprocess.PIPE,
+                   env={**os.environ, "PYTHONIOENCODING": "ascii"})  # fmt: skip
+    assert ended.returncode == 0
+    assert ended.stderr == b""
+    assert b"?x?" in ended.stdout
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_behind_a_redirection_is_one_line() -> None:
+    with open("/dev/full", "wb") as full:
+        ended = _typed("mechanisms", stdout=full)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith(b"error: the output: got No space left on device")
+    assert ended.stderr.count(b"\n") == 1
+
+
+def test_no_output_at_all_is_none() -> None:
+    """`>&-`: nothing to write to, and nothing to flush."""
+    ended = _typed("--version", preexec_fn=lambda: os.close(1))
+    assert ended.returncode == 0
+    assert ended.stderr == b""

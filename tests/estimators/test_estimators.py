@@ -23,6 +23,7 @@ from undertow.estimators import (
 )
 from undertow.law import InnerLoop
 from undertow.plants import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
+from undertow.runtime import Recipe
 
 PERIOD = 1e-3
 
@@ -213,3 +214,58 @@ def test_an_output_that_is_not_m_finite_numbers_is_refused(output: Any, word: st
     steer = compensated(lambda _t, _x: output, STILL, np.array([10.0]))
     with pytest.raises(InvalidInputError, match=rf"output of a controller.*{word}"):
         steer(0.25, np.zeros(4))
+
+
+class _AlphaBeta(Estimator):
+    """A tracker of one's own, Benedict and Bordner's (1962): nothing of the library's but the face.
+
+    Its errors are stated, so that the gate and the boundary layer count with them.
+    """
+
+    def reset(self, x0: np.typing.ArrayLike) -> None:
+        self.x = np.array(x0, dtype=float)
+        self.calls = 0
+
+    def estimate(self, measurement: Measurement, u: np.ndarray) -> np.ndarray:
+        n, h, alpha, beta = self.mechanism.n, self.period, 0.5, 0.5**2 / 1.5
+        self.x[:n] += h * self.x[n:]
+        error = np.where(np.isnan(measurement.q), 0.0, measurement.q - self.x[:n])
+        self.x[:n] += alpha * error
+        self.x[n:] += beta / h * error
+        self.calls += 1
+        return self.x
+
+    def steady_covariance(self) -> np.ndarray:
+        return np.diag([1e-12] * 2 + [1e-6] * 2)
+
+    noise_covariance = steady_covariance
+
+
+def test_an_estimator_of_ones_own_runs_on_a_rig_end_to_end(arm: ut.Mechanism) -> None:
+    """It is all that a run asks for: first optimum, gate, slow loop, balance, verdict."""
+    made: list[_AlphaBeta] = []
+
+    def make(mechanism: ut.Mechanism, bench: Bench) -> Estimator:
+        made.append(_AlphaBeta(mechanism, bench.timing.period))
+        return made[-1]
+
+    cascade = ut.Cascade(arm, ut.objective_for(arm, "bench-energy"), warm=ut.Budget(64))
+    rig = IdealRig(arm, arm.state(phi=0.2), PERIOD)
+    report = ut.run(cascade, rig, seconds=1.5, simulated=True, estimator=make, phi=0.2)
+    assert str(report.verdict).startswith("balanced")
+    assert max(one.calls for one in made if hasattr(one, "calls")) > 1000
+    assert report.answers["applied"] > 5
+
+
+def test_what_is_no_estimator_is_refused_at_the_door(arm: ut.Mechanism) -> None:
+    class Alike:
+        disturbance = np.zeros(1)
+
+        def reset(self, x0: object) -> None: ...
+
+        def estimate(self, measurement: Measurement, u: np.ndarray) -> np.ndarray:
+            return np.zeros(4)
+
+    for made in (Alike, lambda: _AlphaBeta.__new__(_AlphaBeta)):
+        with pytest.raises(InvalidInputError, match=r"estimator of a run.*Derive your own"):
+            Recipe(arm, start=(0, 0.1, 0, 0), estimator=lambda *_, made=made: made()).cascade  # noqa: B018

@@ -1156,7 +1156,7 @@ def test_bad_requests_are_refused_with_value_and_limit() -> None:
     requests: tuple[tuple[Callable[[], object], str], ...] = (
         (lambda: EmbeddedController(free, s), "with_input_limit"),
         (lambda: EmbeddedController(rig, s, period=0.02), "below 2 ε/k"),
-        (lambda: EmbeddedController(rig, s, period=math.nan), "0 to 1 s"),
+        (lambda: EmbeddedController(rig, s, period=math.nan), "> 0, < 1 s"),
         (lambda: EmbeddedController(rig, s, slew=-1.0), "slew rate"),
         (lambda: EmbeddedController(rig, s, prefix="2x"), "a C name"),
         (lambda: EmbeddedController(rig, s, missed=-1), "0 or more"),

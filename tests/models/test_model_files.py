@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,8 @@ from undertow.estimators import Belief
 from undertow.mechanisms.named import DataName, from_anywhere, named, origin
 from undertow.models import FloatArray, controllability
 from undertow.models import importers as modelling
-from undertow.models.importers import mjcf_document, mujoco_compiler
+from undertow.models.importers import equilibrium, mjcf_document, mujoco_compiler
+from undertow.models.importers.formats import format_of
 from undertow.models.importers.mujoco_compiler import AGREEMENT, agreement
 from undertow.runtime import Recipe
 from undertow.runtime.session import rig_named
@@ -496,8 +499,10 @@ def test_a_folder_of_files(pole: Path, tmp_path: Path) -> None:
     code, out, _ = run("models", str(tmp_path), "--no-simulate")
     assert code == 0
     assert "6 files: 2 read" in out
-    with pytest.raises(ArtefactError, match="0 files"):
-        model_files(tmp_path / "nowhere")
+    for place, said in (("nowhere", "no such folder"), ("pole.xml", "a file"), ("none", "0 files")):
+        (tmp_path / "none").mkdir(exist_ok=True)
+        with pytest.raises(ArtefactError, match=f"got {said}, must be"):
+            model_files(tmp_path / place)
 
 
 @pytest.mark.slow  # kernels of its own
@@ -508,3 +513,48 @@ def test_a_file_is_simulated_without_another_word(pole: Path) -> None:
     assert "start          hinge = 5°" in out
     assert "reached the target" in out
     assert "95 % of the travel" in out.replace("\n", " ")
+
+
+@pytest.mark.parametrize("name", ["robot.sdf", "robot.sdf:hip@upright", "a.b/robot.txt"])
+def test_a_file_of_another_format_is_refused_with_the_list(name: str) -> None:
+    file = Path(name.partition(":")[0])
+    refusal = f"format of '{file.name}': got '{file.suffix}', must be one of .urdf, .xml, .mjcf"
+    with pytest.raises(InvalidInputError, match=re.escape(refusal)):
+        named(name)
+
+
+def test_two_equilibria_are_refused_with_both() -> None:
+    with pytest.raises(InvalidInputError, match="hanging and upright, must be one equilibrium"):
+        aimed("robot.urdf", ["hanging", "upright"])
+
+
+def test_an_equilibrium_is_named_without_whole_turns() -> None:
+    """From 90° Newton's step goes 13 half turns away, and 2340° was the target's name."""
+    link = """<link name="l{0}"><inertial><origin xyz="0 0 0.25"/><mass value="{1}"/>
+        <inertia ixx="0.02" iyy="0.02" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+    joint = """<joint name="j{0}" type="continuous"><parent link="{1}"/><child link="l{0}"/>
+        <axis xyz="0 1 0"/><origin xyz="0 0 {2}"/></joint>"""
+    parts = link.format(1, 1.0), link.format(2, 0.5), joint.format(1, "base", 0.0)
+    text = (
+        f"<robot name='arm'><link name='base'/>{''.join(parts)}{joint.format(2, 'l1', 0.5)}</robot>"
+    )
+    arm = modelling.from_urdf(text, actuated=["j1"])
+    guess = {"j1": 0.0, "j2": math.pi / 2}
+    assert abs(modelling.find_equilibrium(arm, **guess)["j2"]) > 2 * math.pi
+    at, _ = equilibrium.where(arm, guess)
+    assert abs(at["j2"] - math.pi / 2) <= math.pi
+    assert np.abs(arm.f(np.array([*at.values(), 0, 0]))[arm.m :]).max() < 1e-9
+
+
+def test_an_input_without_a_unit_has_a_cost_without_one() -> None:
+    """An MJCF motor's input is a number; ∫ u² dt was in "² s"."""
+    cart = ut.mechanisms.cart_pendulum()
+    bare = replace(cart, inputs=(replace(cart.inputs[0], unit=""),))
+    assert ut.MinimumEnergy().on(bare).unit == "s"
+
+
+def test_the_end_of_a_name_counts_in_capitals_too(tmp_path: Path) -> None:
+    missing = tmp_path / "ROBOT.URDF"
+    assert format_of(missing).name == "URDF"
+    with pytest.raises(ArtefactError, match=r"ROBOT\.URDF.*no such file"):
+        named(f"{missing}:hip@upright")

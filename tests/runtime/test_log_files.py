@@ -14,7 +14,7 @@ import pytest
 
 import undertow as ut
 from runs import run as typed
-from undertow.base import ArtefactError, MissingExtraError
+from undertow.base import ArtefactError, MissingExtraError, write_file
 from undertow.plants import IdealRig
 from undertow.runtime import Recording, column_units, read_log, to_mcap, to_parquet
 
@@ -41,6 +41,17 @@ def test_units_are_those_of_the_mechanism(recording: Recording) -> None:
     assert column_units(replace(recording, meta=older)) == units
     unknown = column_units(replace(recording, meta=older | {"mechanism": "mine"}))
     assert (unknown["theta"], unknown["theta_dot"], unknown["voltage"]) == ("", "", "V")
+
+
+def test_a_log_is_not_written_over(recording: Recording) -> None:
+    """`undertow export log run.db --mcap run.db` took the log away, and so did `show --save`."""
+    before = recording.path.read_bytes()
+    for write_to in (to_mcap, to_parquet):
+        with pytest.raises(ArtefactError, match="one of another kind, which is there already"):
+            write_to(recording, recording.path)
+    with pytest.raises(ArtefactError, match="one of another kind"):
+        write_file(recording.path, b"<!doctype html>")
+    assert recording.path.read_bytes() == before
 
 
 def test_pandas_reads_the_parquet_file_to_the_last_bit(

@@ -15,10 +15,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import undertow as ut
 from undertow.base import ArtefactError, ResourceError, UndertowError
@@ -33,6 +35,7 @@ from undertow.runtime import (
     Runtime,
     SimulatedClock,
     about,
+    column_units,
     read_log,
     replay,
     replay_controller,
@@ -205,9 +208,39 @@ def test_a_ring_that_overflows_drops_and_counts_and_does_not_wait(tmp_path: Path
     assert len(read_log(tmp_path / "ring.db").steps) == 8192
 
 
+def test_names_that_a_log_has_itself_get_columns_of_their_own(tmp_path: Path) -> None:
+    """An input T was the column t to SQLite, and a state s_1 a surface value to figures."""
+    names = {"x": "s_1", "x_dot": "s_1_dot", "phi": "K", "phi_dot": "K_dot"}
+    cart = ut.mechanisms.cart_pendulum()
+    renamed = {sp.Symbol(k, real=True): sp.Symbol(v, real=True) for k, v in names.items()}
+    mine = ut.Mechanism(
+        "mine",
+        (ut.Coordinate("s_1", "m"), ut.Coordinate("K", "rad")),
+        (ut.Input("T", "N", 10.0),),
+        cart.mass_matrix.subs(renamed),
+        cart.force.subs(renamed),
+        parameters=cart.parameters,
+    )
+    columns = Columns.of(mine)
+    assert len({name.lower() for name in columns.names}) == len(columns.names)
+    Log(tmp_path / "run.db", columns, {}, threaded=False).close()
+    groups = Columns.groups(columns.names)
+    assert groups["state"] == ["s_1", "K_", "s_1_dot", "K_dot"]
+    assert groups["input"] == ["T_"]
+    assert groups["surface"] == ["s_0", "margin", "surface"]
+    recording = replace(read_log(tmp_path / "run.db"), meta={
+        "coordinates": {"s_1": "m", "K": "rad"}, "units": {"T": "N"},
+    })  # fmt: skip
+    units = column_units(recording)
+    assert (units["T_"], units["K_"], units["K_dot"], units["s_1"]) == ("N", "rad", "rad/s", "m")
+    assert Columns.of(cart).names[6:8] == ("x_measured", "phi_measured")
+
+
 def test_an_earlier_log_is_kept(tmp_path: Path) -> None:
-    for _ in range(3):
-        Log(tmp_path / "run.db", COLUMNS, {}, threaded=False).close()
+    for earlier in (None, tmp_path / "run.db.1", tmp_path / "run.db.2"):
+        log = Log(tmp_path / "run.db", COLUMNS, {}, threaded=False)
+        log.close()
+        assert log.earlier == earlier
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.db", "run.db.1", "run.db.2"]
 
 

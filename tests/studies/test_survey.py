@@ -188,3 +188,15 @@ def test_unknown_names_are_refused_before_any_work() -> None:
     """Claim: a wrong name ends the survey at once."""
     with pytest.raises(InvalidInputError, match="'piano'"):
         survey.survey(["rotary_pendulum", "piano"])
+
+
+def test_mechanisms_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    """Two files whose mechanisms have one name: the second one took the first one's line."""
+    text = "import undertow as ut\nrig = ut.mechanisms.cart_pendulum(){}\n"
+    (tmp_path / "a.py").write_text(text.format(""), encoding="utf-8")
+    (tmp_path / "b.py").write_text(text.format(".with_parameters(m_p=0.2)"), encoding="utf-8")
+    given = [str(tmp_path / "a.py:rig"), str(tmp_path / "b.py:rig"), "acrobot"]
+    both = survey.survey(given, goals=["time"], bounds=False)
+    assert [name for name, _ in both.tasks] == given
+    alone = survey.survey(given[1:], goals=["time"], bounds=False)
+    assert [name for name, _ in alone.tasks] == ["cart_pendulum", "acrobot"]

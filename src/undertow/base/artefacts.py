@@ -13,6 +13,7 @@ import json
 import math
 import os
 import platform
+import re
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -61,10 +62,21 @@ def to_csv(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 def manifest(what: str, request: Mapping[str, object], **more: object) -> bytes:
     """Return as JSON what made a result: the command, its versions and request, and more facts.
 
-    Paths in the request are written as text.
+    Paths in the request are written as text; a number that is not finite is ``null``: no result is
+    lost because one of its numbers is none.
     """
     asked = {k: str(v) if isinstance(v, Path) else v for k, v in request.items()}
-    return to_json({"what": what, "versions": versions(), "request": asked, **more})
+    facts = _finite_only({"request": asked, **more})
+    return to_json({"what": what, "versions": versions(), **facts})
+
+
+def _finite_only(value: Any) -> Any:
+    """Return JSON values with ``None`` for every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {name: _finite_only(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite_only(entry) for entry in value]
+    return finite(value) if isinstance(value, float) else value
 
 
 def finite(value: float) -> float | None:
@@ -176,6 +188,16 @@ def markdown_table(
     return [f"| {' | '.join(map(str, row))} |" for row in (heads, rule, *rows)]
 
 
+def file_name(name: str) -> str:
+    """Return a name of somebody's as the beginning of a file's: no folder, no control character.
+
+    >>> file_name("../cart pole"), file_name("Wagen ü"), file_name("")
+    ('__cart pole', 'Wagen ü', '_')
+    """
+    plain = re.sub(r'[/\\:*?"<>|]|^\.+', "_", name)
+    return "".join(c if c.isprintable() else "_" for c in plain)[:100] or "_"
+
+
 def check_folder(folder: Path) -> None:
     """Make the folder and prove that it can be written, before any long work.
 
@@ -201,17 +223,47 @@ def whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_file(path: Path, content: bytes) -> Path:
-    """Write one file in place of any earlier one, and return where it is.
+def check_replaces(path: Path, begins: bytes) -> None:
+    """Refuse to write over a file of another kind: one that does not begin as the new one does.
+
+    A log or a definition that is named by mistake is not lost.
 
     Raises
     ------
     ArtefactError
-        When it cannot be written.
+        Where there is one.
+    """
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        there = file.read(len(begins))
+    if there not in (b"", begins):
+        raise ArtefactError(
+            f"file '{path}'",
+            value="one of another kind, which is there already",
+            limit="a new file, or an earlier one of the same kind",
+            remedy="Choose another name",
+        )
+
+
+def write_file(path: Path, content: bytes) -> Path:
+    """Write one file, whole or not at all, in place of an earlier one; return where it is.
+
+    Raises
+    ------
+    ArtefactError
+        When it cannot be written, and where a file of another kind is there.
     """
     refusal = "a file that can be written", "Choose another folder or name"
     with or_refused(f"file '{path}'", *refusal):
-        path.write_bytes(content)
+        check_replaces(
+            path, b"{" if content.startswith(b"{") else content[:4]
+        )  # JSON, however laid
+        if path.exists() and not path.is_file():  # a device or a pipe
+            path.write_bytes(content)
+        else:
+            with whole(path.resolve()) as temporary:
+                temporary.write_bytes(content)
     return path
 
 

@@ -22,6 +22,9 @@ from undertow.plants import (
 )
 from undertow.plants.bench import Bench, bench_for
 
+#: Longest delay that is put into a rig, s, and how many times its friction.
+LATEST, ROUGHEST = 1.0, 1000.0
+
 
 class Miswired(RigWrapper):
     """A rig with factors on its inputs and encoders, in another order, and late.
@@ -62,15 +65,24 @@ def miswired(rig: Rig, mechanism: Mechanism, faults: Sequence[str]) -> Rig:
     """Return a rig with faults given in words, ``part=value``.
 
     They are ``voltage=-1`` (factor of an input), ``theta=2`` (factor of an encoder; 0: cable off),
-    ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.0015`` (s, besides the rig's own).
-    Friction is the bench's: see :func:`rubbing`.
+    ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.002`` (s, besides the rig's own, whole
+    periods). Friction is the bench's: see :func:`rubbing`.
 
     Raises
     ------
     InvalidInputError
-        For a part that the mechanism does not have, or what is no number.
+        For a part that the mechanism does not have or that is named twice, for what is no number,
+        and for a delay that is not so many periods of the rig.
     """
     factors, order = _read(mechanism, faults)
+    late = factors["delay"] / rig.period
+    if late > LATEST / rig.period or abs(late - round(late)) > 1e-6:
+        raise InvalidInputError(
+            "fault",
+            value=f"delay={factors['delay']:g}",
+            limit=f"whole periods of the rig, {rig.period:g} s each, {LATEST:g} s in all",
+            remedy=f"Write for instance --fault delay={2 * rig.period:g}",
+        )
     if all(word.startswith("friction=") for word in faults):
         return rig
     return Miswired(
@@ -99,27 +111,28 @@ def _read(mechanism: Mechanism, faults: Sequence[str]) -> tuple[dict[str, float]
     names = [c.name for c in mechanism.coordinates]
     factors = dict.fromkeys([*(i.name for i in mechanism.inputs), *names], 1.0)
     factors |= {"delay": 0.0, "friction": 1.0}
-    order = list(range(mechanism.n))
+    limit = f"part=number, the part one of {', '.join(factors)}, each once, or swap=" + (
+        ",".join(names[:2]) if mechanism.n == 2 else "COORDINATE,COORDINATE"
+    )
+    remedy = f"Write for instance --fault {names[0]}=-1; delay is ≥ 0, friction 0 to {ROUGHEST:g}"
+    order, left = list(range(mechanism.n)), set(factors)
     for word in faults:
         part, _, value = word.partition("=")
         plugs = value.split(",")
-        if part == "swap" and len(plugs) == 2 and set(plugs) <= set(names):
+        if part == "swap" and len(set(plugs)) == len(plugs) == 2 and set(plugs) <= set(names):
             i, k = map(names.index, plugs)
             order[i], order[k] = order[k], order[i]
             continue
         try:
-            factors[part] = float(value) if part in factors else math.nan
+            number = float(value)
         except ValueError:
-            factors[part] = math.nan
+            number = math.nan
         least = 0.0 if part in ("delay", "friction") else -math.inf
-        if not (math.isfinite(factors[part]) and factors[part] >= least):
-            raise InvalidInputError(
-                "fault",
-                value=repr(word),
-                limit=f"part=number, the part one of {', '.join(f for f in factors if f != part)}"
-                ", or swap=COORDINATE,COORDINATE",
-                remedy="Write for instance --fault theta=-1",
-            )
+        most = ROUGHEST if part == "friction" else math.inf
+        if part not in left or not (math.isfinite(number) and least <= number <= most):
+            raise InvalidInputError("fault", value=repr(word), limit=limit, remedy=remedy)
+        left.remove(part)
+        factors[part] = number
     return factors, order
 
 
@@ -140,7 +153,7 @@ def rig_named(
     Raises
     ------
     InvalidInputError
-        For another word, and for faults on a rig of one's own.
+        For another word, for faults on a rig of one's own, and for friction on the ideal one.
     """
     if in_a_file(word):
         if faults:
@@ -154,6 +167,13 @@ def rig_named(
     if word == "realistic":
         return RealisticRig(rubbing(bench_for(truth), faults), rest, seed)
     if word == "ideal":
+        if any(fault.startswith("friction=") for fault in faults):
+            raise InvalidInputError(
+                "--fault friction",
+                value="the ideal rig",
+                limit="the realistic rig, which has dry friction",
+                remedy="Leave --rig out",
+            )
         return IdealRig(truth, rest)
     raise InvalidInputError(
         "rig",

@@ -328,7 +328,9 @@ class Fit:
                 continue
             behind[k] = max(z[k] - STEP, v.low / v.scale + 1e-12)
             columns.append((up - self.residual(free, behind)) / (ahead[k] - behind[k]))
-        return np.array(columns).T
+        return (
+            np.array(columns).reshape(len(free), -1).T if free else np.empty((self.moved.size, 0))
+        )
 
     def _start(self, variables: list[Quantity], values: Mapping[str, float]) -> FloatArray:
         start = [values.get(v.name, v.start) / v.scale for v in variables]

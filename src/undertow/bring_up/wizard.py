@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from undertow.base import Progress, no_progress
+from undertow.base import Progress, no_progress, positive
 from undertow.bring_up.identify import Identification, identify
 from undertow.bring_up.motion import (
     GuardError,
@@ -110,7 +110,11 @@ def bring_up(
     ------
     InfeasibleError
         When the model has no rest to start from.
+    InvalidInputError
+        For a delay that is negative or no number.
     """
+    if delay is not None:
+        positive("delay of the loop as it should be, s", delay, "0.002 is 2 ms", zero=True)
     wizard = _Wizard(rig, belief, rest_state(belief) if rest is None else rest)
     progress("listening", 0.0)
     if not wizard.listen():
@@ -356,10 +360,10 @@ class _Wizard:
         if late is not None and delay is not None:
             room = max(0.4 * delay, 0.5 * self.rig.period, 2 * (late.high - late.value))
             good = abs(late.value - delay) <= room
+            times = f"{late.value / delay:.1f} times what" if delay > 0 else "more than"
             self._add(
                 "delay", "the loop", f"{1e3 * late.value:.2f} ms", f"{1e3 * delay:.2f} ms", good,
-                f"It is {late.value / delay:.1f} times what is expected: look for a buffer, a "
-                "filter, a slower bus",
+                f"It is {times} is expected: look for a buffer, a filter, a slower bus",
             )  # fmt: skip
         for c, part in zip(self.belief.coordinates, found.explained, strict=True):
             self._add(

@@ -21,6 +21,7 @@ from undertow.base import (
     at_least,
     check_fields,
     checked,
+    error_text,
     one_of,
     positive,
 )
@@ -724,8 +725,8 @@ class Cascade:
                 resolution=self.resolution * state.scale,
             )
         except Exception as error:  # the inner loop must survive whatever the outer loop does
-            message = f"{type(error).__name__}: {error}"
-            return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, message)
+            said = error_text(error)
+            return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
 
     @checked
     def apply_gate(

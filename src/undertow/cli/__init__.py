@@ -7,6 +7,7 @@ A command is a function under ``@command`` (:mod:`.terminal`); options that seve
 
 from __future__ import annotations
 
+import io
 import sys
 from contextlib import suppress
 from typing import Annotated
@@ -38,8 +39,14 @@ _ORDER = (
     "reproduce", "doctor",
 )  # fmt: skip
 
+
+def _place(name: str) -> int:
+    """Where help shows a command; one that is not in the order comes last."""
+    return _ORDER.index(name) if name in _ORDER else len(_ORDER)
+
+
 app.registered_commands.sort(
-    key=lambda command: _ORDER.index(command.name or getattr(command.callback, "__name__", ""))
+    key=lambda command: _place(str(command.name or getattr(command.callback, "__name__", "")))
 )
 
 
@@ -68,6 +75,9 @@ def root(
 
 def main() -> None:
     """Run the command line."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what a terminal cannot show costs no result
+            stream.reconfigure(errors="replace")
     try:
         by_exception()
         app(prog_name="undertow")
@@ -78,6 +88,6 @@ def main() -> None:
         # An interrupt that met somebody's exec() stays marked as unhandled, and Python would end
         # by the signal instead of the exit status.  The next exec unmarks it.
         exec("")
-        with suppress(OSError, ValueError):  # a pipe may be closed
+        with suppress(OSError, ValueError, AttributeError):  # it may be closed, or none at all
             sys.stdout.flush()
         at_once()

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from rich.console import Group
 
+from undertow.base import InvalidInputError
 from undertow.cli import options
 from undertow.cli.options import folder, option
 from undertow.cli.parsing import mechanism_named
@@ -43,8 +44,8 @@ def bench(
         list[str] | None,
         option(
             "Wire the simulated rig wrongly: INPUT=-1 or COORDINATE=2 (a factor, 0: cable "
-            "off), swap=COORDINATE,COORDINATE (two encoders), delay=0.0015 (s, besides its own), "
-            "friction=12 (times its own). Repeatable.",
+            "off), swap=COORDINATE,COORDINATE (two encoders), delay=0.002 (s, besides its own, "
+            "whole periods), friction=12 (times the realistic rig's own). Each once. Repeatable.",
             metavar="PART=VALUE",
         ),
     ] = None,
@@ -67,6 +68,13 @@ def bench(
     from undertow.plants import RealisticRig
     from undertow.studies.rigs.bring_up import files, findings_table, parameter_table, summary
 
+    if quick and delay is not None:
+        raise InvalidInputError(
+            "--delay with --quick",
+            value=f"{delay:g} s",
+            limit="one of them: a quick check does not measure the delay",
+            remedy="Leave --quick out",
+        )
     request = {"mechanism": name, "rig": rig, "fault": fault or [], "seed": seed}
     belief = mechanism_named(name, setting)
     rest, faults = rest_state(belief), fault or ()

@@ -88,6 +88,11 @@ def campaign(
             limit="workers",
             remedy="A thread cannot be ended: add --workers 1",
         )
+    if proof is not None and picture is None:
+        raise InvalidInputError(
+            "--proof", value="no --picture", limit="a picture that shows it",
+            remedy="Add --picture map.png",
+        )  # fmt: skip
     task = Campaign(Definition.read(file, mechanism, entrant or ()), out)
     if picture is not None:
         from undertow.studies.campaign.figures import picture_file

@@ -114,6 +114,14 @@ def simulate(
             limit="cascade, which follows targets",
             remedy="Leave one of them out",
         )
+    for what, value in (("--accept", accept), ("--belief", known)):
+        if value is not None and steering != "cascade":
+            raise InvalidInputError(
+                what,
+                value=f"{value if isinstance(value, str) else ', '.join(value)}, with one surface",
+                limit="the cascade, which decides by it",
+                remedy="Leave it out, or --control and --surface",
+            )
     if schedule and (steering != "cascade" or known == "usual"):
         raise InvalidInputError(
             "--schedule",
@@ -148,7 +156,8 @@ def simulate(
         motion, surfaces = ClosedLoop(belief, goal, plant=truth).simulate(x0, given), (given,)
     written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run))
     words = ", ".join(target or ())
-    show(motion_report(belief, goal, x0, motion, surfaces[0], run, cascade, words), *written)
+    said = motion_report(belief, goal, x0, motion, surfaces[0], run, cascade, goes_to, words)
+    show(said, *written)
     exit_unless(motion.event.name == "REACHED")
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import tempfile
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import typer
 from rich.text import Text
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, one_of
 from undertow.cli import options
 from undertow.cli.options import folder, option
 from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
@@ -25,19 +25,13 @@ from undertow.cli.terminal import (
     write,
 )
 from undertow.closed_loop import ClosedLoop
-from undertow.export import (
-    DerivativeStep,
-    EmbeddedController,
-    KalmanStep,
-    SuperTwistingStep,
-    carriers,
-    files,
-)
-from undertow.export.estimate import EstimatorStep
+from undertow.export import EmbeddedController, KalmanStep, carriers, files
+from undertow.export.estimate import STEPS, EstimatorStep
 from undertow.export.host import Build
 from undertow.law import ReachingLaw, Surface, check_surface, first_surface
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
+from undertow.objective import Goal
 from undertow.optimiser import Optimiser
 from undertow.plants.bench import bench_for
 from undertow.studies.rigs.export import upsets_table
@@ -110,17 +104,23 @@ def export_c(
     real: Annotated[Literal["double", "float"], option("Floating-point type of the C.")] = "double",
     period: Annotated[float, option("Sample period, s.")] = 0.001,
     velocity: Annotated[
-        Literal["derivative", "super-twisting", "kalman"],
+        str,
         option(
-            "Where velocities come from when only positions are measured. kalman: the model, "
-            "corrected by encoders of 4096 counts a turn or 20 µm."
+            f"Where velocities come from when only positions are measured: {', '.join(STEPS)}. "
+            "kalman: the model, corrected by encoders of 4096 counts a turn or 20 µm.",
+            metavar="WORD",
         ),
     ] = "derivative",
-    time_constant: Annotated[float, option("Time constant of the filtered derivative, s.")] = 0.01,
+    time_constant: Annotated[
+        float | None, option("derivative: time constant of its filter, s. Default: 0.01.")
+    ] = None,
     acceleration: Annotated[
-        float,
-        option("super-twisting: bound on every coordinate's acceleration, rad/s² or m/s²."),
-    ] = 200.0,
+        float | None,
+        option(
+            "super-twisting: bound on every coordinate's acceleration, rad/s² or m/s². "
+            "Default: 200."
+        ),
+    ] = None,
     slew: Annotated[
         float | None,
         option("Largest rate of change of an input, in its unit per second. Default: no limit."),
@@ -139,6 +139,7 @@ def export_c(
     options.check_control(control, ("designed", "one-time"), surface)
     wanted = check or report or bool(rigs) or bit_flips
     _check_request(name, out, every=every, wanted=wanted, carried=bool(platforms))
+    one_of("objective", objective, get_args(Goal))
     check_out(out)
     law = ReachingLaw(eta, layer)
 
@@ -165,7 +166,9 @@ def export_c(
 
     names = list(LIBRARY) if every else [str(name)]
     made = [controller(mechanism_named(n, setting)) for n in names]
-    starts = [parse_start(one.mechanism, start) for one in made] if rigs or bit_flips else []
+    starts = (
+        [parse_start(one.mechanism, start) for one in made] if start or rigs or bit_flips else []
+    )
     written = {file: content for one in made for file, content in files(one).items()}
     for one in made if platforms else ():
         x0 = parse_start(one.mechanism, start) if start else None
@@ -239,16 +242,25 @@ def _first_optimum(
 
 
 def _estimator(
-    belief: Mechanism, velocity: str, time_constant: float, acceleration: float
+    belief: Mechanism, velocity: str, time_constant: float | None, acceleration: float | None
 ) -> EstimatorStep:
-    """Return where velocities come from, by its name."""
+    """Return where velocities come from, by its name; a setting of another one is refused."""
+    one_of("--velocity", velocity, STEPS)
+    settings = {"derivative": time_constant, "super-twisting": acceleration}
+    for other, value in settings.items():
+        if value is not None and other != velocity:
+            raise InvalidInputError(
+                f"setting of --velocity {other}",
+                value=f"{value:g}, with --velocity {velocity}",
+                limit=f"with --velocity {other}",
+                remedy="Leave one of them out",
+            )
     if velocity == "kalman":
         encoders = bench_for(belief).encoders
         counts = [encoders[c.name].resolution for c in belief.coordinates]
         return KalmanStep(tuple(count / math.sqrt(12) for count in counts))
-    if velocity == "super-twisting":
-        return SuperTwistingStep(acceleration)
-    return DerivativeStep(time_constant)
+    setting = settings.get(velocity)
+    return STEPS[velocity]() if setting is None else STEPS[velocity](setting)
 
 
 @command(

@@ -136,10 +136,11 @@ def animate(
     The film ends where the motion has settled, or after 8 s, see --longest.
     """
     request = {k: v for k, v in locals().items() if k != "out"}
-    from undertow.display.animation import Film, film_files
+    from undertow.display.animation import Film, check_film, film_files
     from undertow.studies.motion import ended
 
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
+    check_film(longest=longest, speed=speed)
     check_out(out)
     loop = ClosedLoop(belief, goal)
     with progress_bar() as progress:

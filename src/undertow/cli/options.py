@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from undertow.base import InvalidInputError, one_of
+from undertow.models.importers.formats import file_words
 
 
 def option(*names_and_help: str, **more: Any) -> Any:
@@ -30,8 +31,8 @@ OneName = Annotated[
 AnyName = Annotated[
     str,
     typer.Argument(
-        help="Mechanism of the library, e.g. rotary_pendulum, or your own: FILE.py:NAME, FILE.urdf "
-        "or FILE.xml. Append :JOINT,JOINT to name the actuated joints where a URDF or MJCF "
+        help="Mechanism of the library, e.g. rotary_pendulum, or your own: FILE.py:NAME, "
+        f"{file_words()}. Append :JOINT,JOINT to name the actuated joints where a URDF or MJCF "
         "file does not, :-JOINT to freeze one, @upright, @hanging, @nearest or @JOINT=180deg to "
         "choose its equilibrium.",
         metavar="NAME",

@@ -62,6 +62,10 @@ def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
     words = [word for word in target or () if word in WORDS]
     rest = [word for word in target or () if word not in WORDS]
     data = DataName.of(name)
+    if len(words) > 1:
+        raise InvalidInputError(
+            "target", value=" and ".join(words), limit="one equilibrium", remedy="Keep one of them"
+        )
     if data is None and words:
         raise InvalidInputError(
             "target",
@@ -75,7 +79,7 @@ def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
                 "target", value=f"{words[0]} beside {name}", limit="one of them"
             )
         return name, rest
-    places = [word for word in rest if "=" in word and "@" not in word]
+    places = [word for word in rest if "=" in word and "@" not in word and not _is_csv(word)]
     if places and not words:
         try:
             fixed = invariant_coordinates(named(name))
@@ -84,6 +88,11 @@ def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
         words = [word for word in places if word.partition("=")[0] not in fixed]
         rest = [word for word in rest if word not in words]
     return f"{name}@{','.join(words)}" if words else name, rest
+
+
+def _is_csv(word: str) -> bool:
+    """Whether a word of ``--target`` names a file, in whose path an equals sign may stand."""
+    return word.lower().endswith(".csv")
 
 
 def objective_named(
@@ -246,7 +255,7 @@ unit, m. Write for instance --target x=1m
     """
     if not words:
         return None
-    if len(words) == 1 and "=" not in words[0]:
+    if len(words) == 1 and ("=" not in words[0] or _is_csv(words[0])):
         return Reference.read(words[0])
     return _target_of_words(words, lambda name: _units_of(mechanism, name, "target"), "--target ")
 

@@ -222,6 +222,8 @@ def run(
             lost = f", {written.dropped:,} rows lost" if written.dropped else ""
             kept_as = f"Log {log}" if log else "Log of the page, not kept (--log run.db keeps it)"
             show(f"{kept_as}: {written.failure or 'written'}{lost}")
+            if written.earlier is not None:
+                show(f"Earlier log moved to {written.earlier}")
         verdict = report.verdict  # with the log closed
         show(f"Verdict: {verdict}.")
     exit_unless(not verdict.exit_code, verdict.exit_code)

@@ -17,6 +17,7 @@ from undertow.cli.parsing import mechanism_named, parse_start
 from undertow.cli.terminal import command, progress_bar
 from undertow.cli.terminal import show as say
 from undertow.models import Mechanism
+from undertow.models.importers.formats import file_words
 
 if TYPE_CHECKING:
     from undertow.display.live import Show
@@ -66,7 +67,7 @@ def show(
     name: Annotated[
         str,
         typer.Argument(
-            help="Mechanism of the library, or your own: FILE.py:NAME, FILE.urdf or FILE.xml, with "
+            help=f"Mechanism of the library, or your own: FILE.py:NAME, {file_words()}, with "
             ":JOINT,JOINT for the actuated joints where the file does not name them; or the log "
             "of a run, FILE.db, also of one that goes on.",
             metavar="NAME|LOG",
@@ -117,6 +118,14 @@ def show(
         raise InvalidInputError(
             "--mechanism", value=mechanism, limit="for a log, FILE.db", remedy="Leave it out"
         )
+    for what, given in (("--start", start), ("--set", setting), ("--limit", limit)):
+        if log and given:
+            raise InvalidInputError(
+                f"{what} with a log",
+                value=", ".join(given),
+                limit="for a mechanism: what a log shows has been",
+                remedy="Leave it out",
+            )
     shown: Show
     with progress_bar() as progress:
         if log:

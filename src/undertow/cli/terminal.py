@@ -139,12 +139,22 @@ def _with_errors_in_one_line(function: Callable[P, None]) -> Callable[P, None]:
             typer.echo("interrupted", err=True)
             raise typer.Exit(INTERRUPTED) from None
         except UndertowError as error:
-            typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
-            words = " ".join(str(error).split())  # some may be a file's, and anything
-            typer.echo(printable(words), err=True)
+            _say_error(str(error))
             raise typer.Exit(2 if isinstance(error, ValueError) else 1) from None
+        except BrokenPipeError:  # who read the output has gone
+            raise
+        except OSError as error:  # a full disk behind a redirection, a terminal that is closed
+            said, of = error.strerror or str(error), error.filename or "the output"
+            _say_error(f"{of}: got {said}, must be a file that can be written. Name another one")
+            raise typer.Exit(1) from None
 
     return guarded
+
+
+def _say_error(text: str) -> None:
+    """Print an error in one line; some of its words may be a file's, and anything."""
+    typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
+    typer.echo(printable(" ".join(text.split())), err=True)
 
 
 def terminal(*, stderr: bool = False) -> Console:

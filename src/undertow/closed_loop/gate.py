@@ -18,6 +18,9 @@ from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 
+#: What :func:`cost_gate` asks for, and says of a plan that it admits.
+_ADMITTED = "stable, feasible, cost not raised"
+
 
 @dataclass(frozen=True)
 class Admission:
@@ -64,7 +67,7 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
         return Admission(
             False, f"raises the predicted cost: {new_cost:.6g} > {old_cost:.6g}", old_cost
         )
-    return Admission(True, "stable, feasible, cost not raised", float(new_cost))
+    return Admission(True, _ADMITTED, float(new_cost))
 
 
 def gate_words(gate: Gate) -> str:
@@ -74,7 +77,7 @@ def gate_words(gate: Gate) -> str:
     'stable, feasible, cost not raised'
     """
     if gate is cost_gate:
-        return "stable, feasible, cost not raised"
+        return _ADMITTED
     return getattr(gate, "words", "") or getattr(gate, "__name__", type(gate).__name__)
 
 

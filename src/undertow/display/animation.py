@@ -22,7 +22,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from undertow.base import manifest, positive
+from undertow.base import file_name, manifest, positive
 from undertow.closed_loop import Trajectory
 from undertow.closed_loop.figures import COLOURS, figure_bytes, style
 from undertow.display.sketches import Box, Disc, Label, Line, Sketch, projected, sketch
@@ -38,6 +38,18 @@ _KINDS: dict[str, dict[str, Any]] = {
     "frame": {"color": COLOURS["grey"], "linewidth": 2.0},
     "ground": {"color": COLOURS["grey"], "linewidth": 2.0},
 }
+
+
+def check_film(*, longest: float, speed: float, fps: float = 25.0) -> None:
+    """Refuse a frame rate, a length, s, or a speed that no film has, before any long work.
+
+    Raises
+    ------
+    InvalidInputError
+        For one that is not positive.
+    """
+    for name, value in (("frame rate", fps), ("length", longest), ("speed", speed)):
+        positive(f"{name} of an animation", value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +91,8 @@ class Film:
         trajectory
             A recorded motion.
         fps
-            Frames in a second.
+            Frames in a second, 50 at most; the nearest that a GIF can keep, whose frames last
+            whole hundredths of a second.
         longest
             Longest film, s.
         speed
@@ -93,8 +106,8 @@ class Film:
         InvalidInputError
             For a frame rate, length or speed that is not positive.
         """
-        for name, value in (("frame rate", fps), ("length", longest), ("speed", speed)):
-            positive(f"{name} of an animation", value)
+        check_film(fps=fps, longest=longest, speed=speed)
+        fps = 100.0 / max(2, round(100.0 / fps))
         mechanism = trajectory.mechanism
         drawn = sketch(mechanism) if figure is None else figure
         start = trajectory.t[0]
@@ -397,7 +410,7 @@ def film_files(film: Film, request: Mapping[str, object]) -> dict[str, bytes]:
         figure = Figure(figsize=(4.5, 4.5))
         still(figure.add_subplot(), film)
         picture = figure_bytes(figure)
-    name = film.mechanism.name
+    name = file_name(film.mechanism.name)
     return {
         f"{name}.gif": gif(film),
         f"{name}.png": picture,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from undertow.base import checked
+from undertow.base import checked, file_name
 from undertow.law import first_surface, sliding_matrix
 from undertow.models import Mechanism, linearise
 from undertow.symbolic.formulas import plain, readable, rounded, tex, tex_words
@@ -107,7 +107,7 @@ class Derivation:
 
     def files(self) -> dict[str, bytes]:
         """Return the formulas as ``NAME.txt`` and ``NAME.tex``."""
-        name = self.mechanism.name
+        name = file_name(self.mechanism.name)
         return {f"{name}.txt": self.text().encode(), f"{name}.tex": self.latex().encode()}
 
 
@@ -248,7 +248,7 @@ def _coordinates(mechanism: Mechanism) -> Section:
         f"  {plain(c.symbol)} ({c.unit}, {'actuated' if i < m else 'free'}): {c.description}"
         for i, c in enumerate(mechanism.coordinates)
     ]
-    lines += [f"  {plain(c.symbol)} ({c.unit}): input, |{plain(c.symbol)}| ≤ {c.limit:g}"
+    lines += [f"  {plain(c.symbol)} ({c.unit or 1}): input, |{plain(c.symbol)}| ≤ {c.limit:g}"
               for c in mechanism.inputs]  # fmt: skip
     lines += [
         f"  {plain(p.symbol)} = {f'{p.value:.6g} {p.unit}'.strip()}: {p.description}"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,23 +14,80 @@ from undertow.models import FloatArray, Mechanism
 from undertow.plants import Measurement
 from undertow.symbolic import numba
 
+if TYPE_CHECKING:
+    from undertow.estimators.belief import Belief, ParameterEstimate
 
-class Estimator(Protocol):
-    """What turns measurements into states, one sample after another.
+
+class Estimator(ABC):
+    """What turns measurements into states, one sample after another; all that a run asks of it.
+
+    One of your own derives from this class and defines :meth:`reset` and :meth:`estimate`; the rest
+    is as for states that are exact and a model that is known, until it says otherwise.
+
+    Parameters
+    ----------
+    mechanism
+        Whose coordinates they are.
+    period
+        Usual time between samples, s.
 
     Attributes
     ----------
     disturbance
         Estimated matched disturbance, (m,), in the inputs' units: what a controller may take
         off its output; zeros where none is estimated.  The next call writes it over.
+    felt
+        Its size, averaged over the last second, (m,); written over.
+    belief
+        What is not known of the mechanism's parameters and is estimated with the state; ``None``:
+        they are exact.
+    parameters
+        Values of all parameters of the mechanism that it goes by, (P,), SI units; written over.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> class AtRest(Estimator):
+    ...     def reset(self, x0):
+    ...         self.x = np.array(x0, dtype=float)
+    ...     def estimate(self, measurement, u):
+    ...         return np.concatenate([measurement.q, np.zeros(self.mechanism.n)])
+    >>> AtRest(ut.mechanisms.rotary_pendulum()).steady_covariance().any()
+    np.False_
     """
 
-    disturbance: FloatArray
+    belief: Belief | None = None
 
+    def __init__(self, mechanism: Mechanism, period: float = 0.001) -> None:
+        positive("period of an estimator", period)
+        self.mechanism, self.period = mechanism, float(period)
+        self.disturbance: FloatArray = np.zeros(mechanism.m)
+        self.felt: FloatArray = np.zeros(mechanism.m)
+        self.parameters: FloatArray = mechanism.parameter_values.copy()
+
+    @property
+    def jumps(self) -> int:
+        """How often velocities have jumped: what was planned before is for another motion."""
+        return 0
+
+    @property
+    def learnt(self) -> ParameterEstimate | None:
+        """What is known by now of the uncertain parameters; ``None`` without a belief."""
+        return None
+
+    def steady_covariance(self) -> FloatArray:
+        """Return what it does not know of the state, at rest at the target, (2n, 2n)."""
+        return np.zeros((2 * self.mechanism.n, 2 * self.mechanism.n))
+
+    def noise_covariance(self) -> FloatArray:
+        """Return what the sensors' noise alone makes of the estimate at the target, (2n, 2n)."""
+        return np.zeros((2 * self.mechanism.n, 2 * self.mechanism.n))
+
+    @abstractmethod
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
-        ...
 
+    @abstractmethod
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
         """Return the state x = (q, q̇), (2n,), after a measurement.
 
@@ -45,10 +103,9 @@ class Estimator(Protocol):
         numpy.ndarray
             The estimator's own array: the next call writes it over.
         """
-        ...
 
 
-class Measured:
+class Measured(Estimator):
     """No estimator at all: for rigs that measure velocities too.
 
     Raises
@@ -57,9 +114,9 @@ class Measured:
         At the first measurement without velocities.
     """
 
-    def __init__(self, mechanism: Mechanism) -> None:
+    def __init__(self, mechanism: Mechanism, period: float = 0.001) -> None:
+        super().__init__(mechanism, period)
         self._x = np.zeros(2 * mechanism.n)
-        self.disturbance = np.zeros(mechanism.m)
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
@@ -120,15 +177,13 @@ def _twisted(x: FloatArray, q: FloatArray, h: float, bound: FloatArray) -> None:
         x[n + i] -= side * step / h
 
 
-class _Differentiator:
+class _Differentiator(Estimator):
     """What both share: a state, a clock, a first measurement."""
 
     def __init__(self, mechanism: Mechanism, period: float) -> None:
-        positive("period of an estimator", period)
-        self.mechanism, self.period = mechanism, float(period)
+        super().__init__(mechanism, period)
         self._x = np.zeros(2 * mechanism.n)
         self._t = math.nan
-        self.disturbance = np.zeros(mechanism.m)
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""

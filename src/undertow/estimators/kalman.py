@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.estimators.belief import EVEN, Belief, ParameterEstimate
+from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray, Mechanism, require_smooth
 from undertow.plants import Measurement
 from undertow.plants.stepping import compiled_module
@@ -241,7 +242,7 @@ def _module(mechanism: Mechanism) -> Any:
     return compiled_module(mechanism, "kalman", "Kalman filter", _BODY, parts)
 
 
-class KalmanFilter:
+class KalmanFilter(Estimator):
     """Extended Kalman filter on the mechanism's own model, positions measured only.
 
     Parameters
@@ -310,8 +311,8 @@ class KalmanFilter:
             [*mechanism.force, *mechanism.mass_matrix],
             mechanism.x,
         )
+        super().__init__(mechanism, period)
         n, m = mechanism.n, mechanism.m
-        positive("period of an estimator", period)
         positive(
             "disturbance_drift, delay and parameter_drift of a Kalman filter",
             (disturbance_drift, delay, parameter_drift),
@@ -337,7 +338,6 @@ class KalmanFilter:
             "acceleration_noise": acceleration_noise, "disturbance_drift": disturbance_drift,
             "delay": delay, "belief": belief, "parameter_drift": parameter_drift,
         }  # fmt: skip
-        self.mechanism, self.period = mechanism, float(period)
         self._known = known = 0 if belief is None else len(belief.tolerances)
         self._learnt = 2 * n + (m if disturbance_drift > 0 else 0)
         size = self._learnt + known
@@ -349,14 +349,14 @@ class KalmanFilter:
         self._x, self._out = memory["x"], memory["out"]
         self._P: FloatArray = memory["P"]
         self._odd: FloatArray = memory["odd"]
-        self.felt: FloatArray = memory["felt"]
+        self.felt = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
         self._variance[:] = one_for_each("position_noise", position_noise, n) ** 2
         unknown = one_for_each("acceleration_noise", acceleration_noise, n)
         memory["noise"][n : 2 * n] = unknown**2
         memory["noise"][2 * n : self._learnt] = disturbance_drift**2
         memory["limits"][:] = self._limits = mechanism.input_limits
-        self.parameters: FloatArray = memory["parameters"]
+        self.parameters = memory["parameters"]
         if belief is not None:
             memory["noise"][self._learnt :] = parameter_drift**2
             memory["place"][:] = belief.places
@@ -366,7 +366,8 @@ class KalmanFilter:
             memory["excited"][:] = EXCITED * belief.full_accelerations
         self.belief = belief
         self._state: FloatArray = self._out[: 2 * n]
-        self.disturbance = self._x[2 * n : self._learnt] if disturbance_drift > 0 else np.zeros(m)
+        if disturbance_drift > 0:
+            self.disturbance = self._x[2 * n : self._learnt]
         self._estimate = _module(mechanism).estimate
         self.reset(np.zeros(2 * n))
 
@@ -427,8 +428,9 @@ class KalmanFilter:
         return double
 
     def steady_covariance(self) -> FloatArray:
-        """Return the covariance that a filter like this one comes to, at rest at the target."""
-        return self._at_rest().covariance
+        """Return the state's covariance that a filter like this one comes to at rest, (2n, 2n)."""
+        size = 2 * self.mechanism.n
+        return self._at_rest().covariance[:size, :size]
 
     def noise_covariance(self) -> FloatArray:
         """Return what the sensors' noise alone makes of the estimate at the target, (2n, 2n).

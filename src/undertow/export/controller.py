@@ -115,7 +115,7 @@ class EmbeddedController:
         limits = self.mechanism.input_limits
         built_in = len(self.plan.surfaces)
         for what, value, good, limit in (
-            ("period of the exported loop", self.period, 0 < self.period < 1, "0 to 1 s"),
+            ("period of the exported loop", self.period, 0 < self.period < 1, "> 0, < 1 s"),
             ("missed periods", self.missed, self.missed >= 0, "0 or more"),
             ("real", repr(self.real), self.real in ("double", "float"), "'double' or 'float'"),
             (

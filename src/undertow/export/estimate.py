@@ -12,7 +12,7 @@ nothing is inverted on the target.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -179,19 +179,19 @@ class KalmanStep:
         n = mechanism.n
         noise, unknown = self.noises(n)
         filter_ = KalmanFilter(mechanism, period, position_noise=noise, acceleration_noise=unknown)
-        return np.asarray(filter_.steady_covariance()[: 2 * n, :n] / noise**2)
+        return np.asarray(filter_.steady_covariance()[:, :n] / noise**2)
 
     def estimator(self, mechanism: Mechanism, period: float) -> Observer:
         """Return the same in Python."""
         return Observer(mechanism, period, self.gains(mechanism, period))
 
 
-class Observer:
-    """What the exported observer must agree with: an :class:`undertow.estimators.Estimator`."""
+class Observer(Estimator):
+    """What the exported observer must agree with."""
 
     def __init__(self, mechanism: Mechanism, period: float, gains: FloatArray) -> None:
-        self.mechanism, self.period, self.gains = mechanism, period, gains
-        self.disturbance = np.zeros(mechanism.m)
+        super().__init__(mechanism, period)
+        self.gains = gains
         self._x = np.zeros(2 * mechanism.n)
 
     def reset(self, x0: ArrayLike) -> None:
@@ -226,6 +226,13 @@ def acceleration_code(mechanism: Mechanism, parameters: Mapping[sp.Symbol, str],
 
 
 EstimatorStep = DifferentiatorStep | KalmanStep
+
+#: Those that can be exported, by name.
+STEPS: Mapping[str, Callable[..., EstimatorStep]] = {
+    "derivative": DerivativeStep,
+    "super-twisting": SuperTwistingStep,
+    "kalman": KalmanStep,
+}
 
 
 def estimate_code(

@@ -11,15 +11,15 @@ from undertow.base import InvalidInputError, one_of
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
 from undertow.models.importers.equilibrium import WORDS, at_equilibrium, where
-from undertow.models.importers.mjcf import from_mjcf, read_mjcf
+from undertow.models.importers.formats import FORMATS, file_words, format_of
 from undertow.models.importers.python_file import in_a_file, mechanism_from_file
 from undertow.models.importers.tree import Tree
-from undertow.models.importers.urdf import from_urdf, read_urdf
 
-#: Ends of the names of files that are data.
-FILES = {".urdf": from_urdf, ".xml": from_mjcf, ".mjcf": from_mjcf}
-
-_DATA = re.compile(r"(?P<file>.+?\.(?:urdf|xml|mjcf))(?::(?P<joints>[^@]*))?(?:@(?P<target>.+))?")
+_BEHIND = r"(?::(?P<joints>[^@]*))?(?:@(?P<target>.+))?"
+_ENDS = "|".join(suffix.removeprefix(".") for suffix in FORMATS)
+_DATA = re.compile(rf"(?P<file>.+?\.(?:{_ENDS})){_BEHIND}", re.IGNORECASE)
+#: What looks like a file, of whatever format.
+_FILE = re.compile(rf"(?P<file>.*?\.[A-Za-z]\w*){_BEHIND}")
 _PLACE = re.compile(r"([^=]+)=([-+]?[\d.]+(?:[eE][-+]?\d+)?)(deg|rad|m)")
 
 
@@ -38,7 +38,7 @@ def named(name: str) -> Mechanism:
     Raises
     ------
     InvalidInputError
-        For an unknown name.
+        For an unknown name, and for a file of another format.
     ModelError
         When the file describes no such mechanism.
     ArtefactError
@@ -48,12 +48,14 @@ def named(name: str) -> Mechanism:
         return mechanism_from_file(name)
     data = DataName.of(name)
     if data is not None:
-        read = FILES[data.file.suffix]
+        read = format_of(data.file).mechanism
         driven, target = data.actuated or None, data.equilibrium
         if isinstance(target, str):
             return read(data.file, actuated=driven, frozen=data.frozen, equilibrium=target)
         return at_equilibrium(read(data.file, actuated=driven, frozen=data.frozen), target)
-    own = "One of your own is FILE.py:NAME, FILE.urdf or FILE.xml"
+    if name not in LIBRARY and (file := _FILE.fullmatch(name)) is not None:
+        format_of(Path(file["file"]))
+    own = f"One of your own is FILE.py:NAME, {file_words()}"
     one_of("mechanism", name, LIBRARY, own)
     return LIBRARY[name]()
 
@@ -69,9 +71,7 @@ def tree_named(name: str) -> Tree | None:
     data = DataName.of(name)
     if in_a_file(name) or data is None:
         return None
-    if data.file.suffix == ".urdf":
-        return read_urdf(data.file)[0]
-    return read_mjcf(data.file, motors=not data.actuated)
+    return format_of(data.file).tree(data.file, not data.actuated)
 
 
 def origin(name: str) -> dict[str, float]:
@@ -85,7 +85,7 @@ def origin(name: str) -> dict[str, float]:
     data = DataName.of(name)
     if data is None:
         return {}
-    read = FILES[data.file.suffix]
+    read = format_of(data.file).mechanism
     drawn = read(data.file, actuated=data.actuated or None, frozen=data.frozen)
     return where(drawn, data.equilibrium)[0]
 

@@ -22,6 +22,7 @@ from undertow.base import (
     UndertowError,
     check_fields,
     checked,
+    error_text,
     near,
     positive,
     raised_at,
@@ -695,6 +696,8 @@ def _energy_unit(mechanism: Mechanism) -> str:
     """Return the unit of ∫uᵀu dt."""
     units = {channel.unit for channel in mechanism.inputs}
     unit = units.pop() if len(units) == 1 else "mixed units"
+    if not unit:  # of a motor of an MJCF file, whose input is a number
+        return "s"
     return f"({unit})² s" if " " in unit else f"{unit}² s"
 
 
@@ -766,7 +769,7 @@ def _failed(what: str, error: Exception) -> InvalidInputError:
     """A formula of the user's that raised, with what it said and where."""
     return InvalidInputError(
         what,
-        value=f"{type(error).__name__}: {error}{raised_at(error)}",
+        value=f"{error_text(error)}{raised_at(error)}",
         limit="a function that returns a SymPy expression of its argument's names",
         remedy="Write it with SymPy's functions, sympy.sin(v.phi) for math.sin or numpy.sin, and "
         "sympy.Piecewise for conditions",

@@ -20,7 +20,7 @@ import numpy as np
 from undertow.base import error_text
 from undertow.cascade import Admission, Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
-from undertow.estimators import Estimator, KalmanFilter
+from undertow.estimators import Estimator
 from undertow.law import InnerLoop, ReferenceMotion
 from undertow.models import FloatArray, error_dynamics
 from undertow.optimiser import Proposal
@@ -154,10 +154,9 @@ class Controller:
         own = len(mechanism.parameters)
         self._parameters: FloatArray = fast["parameters"][:own]
         self._row: FloatArray = fast["parameters"][own:]
-        self._learning: KalmanFilter | None = None
-        self._filter = estimator if isinstance(estimator, KalmanFilter) else None
+        self._learning: Estimator | None = None
         self._jumps, self._early = 0, False
-        if isinstance(estimator, KalmanFilter) and estimator.belief and cascade.known:
+        if estimator.belief and cascade.known:
             self._learning = estimator
             self._bears = InnerLoop(mechanism, memory.surface, cascade.reaching)
         self.u: FloatArray = fast["output"]
@@ -254,9 +253,7 @@ class Controller:
 
     def _jumped(self) -> bool:
         """Whether velocities have jumped in this step."""
-        if self._filter is None:
-            return False
-        before, self._jumps = self._jumps, self._filter.jumps
+        before, self._jumps = self._jumps, self.estimator.jumps
         return self._jumps > before and self.mode in (Mode.CATCH, Mode.BALANCE)
 
     def _take_reserve(self, t: float) -> None:

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 from undertow.base import MissingExtraError
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
-from undertow.estimators import Belief, KalmanFilter
+from undertow.estimators import Belief, Estimator, KalmanFilter
 from undertow.law import ProvedSet, ReachingLaw, Surface, first_surface
-from undertow.models import FloatArray, Mechanism
+from undertow.models import Mechanism
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
 
@@ -58,7 +58,7 @@ def estimator_for(
     )
 
 
-def default_gate(estimator: KalmanFilter | None = None) -> Gate:
+def default_gate(estimator: Estimator | None = None) -> Gate:
     """Return the gate that a surface must pass where nobody asks for another: everywhere.
 
     With exact states, :func:`undertow.cascade.cost_gate`: stable, feasible from here, the cost
@@ -75,12 +75,12 @@ def default_gate(estimator: KalmanFilter | None = None) -> Gate:
         BEARS * estimator.period,
         RESERVE,
         period=estimator.period,
-        covariance=steady_covariance(estimator),
+        covariance=estimator.steady_covariance(),
         noise=NOISE,
     )
 
 
-def for_rig(cascade: Cascade, estimator: KalmanFilter) -> Cascade:
+def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
     """Return a cascade whose gate and covariance suit a rig, where they are for exact states."""
     gate = default_gate(estimator) if cascade.gate is cost_gate else cascade.gate
     covariance = cascade.covariance
@@ -89,19 +89,13 @@ def for_rig(cascade: Cascade, estimator: KalmanFilter) -> Cascade:
     return replace(cascade, gate=gate, covariance=covariance)
 
 
-def steady_covariance(estimator: KalmanFilter) -> FloatArray:
-    """Return what an estimator does not know of the state at the target, (2n, 2n)."""
-    size = 2 * estimator.mechanism.n
-    return estimator.steady_covariance()[:size, :size]
-
-
-def reaching_for(estimator: KalmanFilter) -> ReachingLaw:
+def reaching_for(estimator: Estimator) -> ReachingLaw:
     """Return the paper's reaching law, its boundary layer as thick as the sensors need.
 
     The gains near the target go with η/ε: ε is doubled until what the estimator does not know
     takes no more than ``NOISE`` of the input on the first surface, ``DOUBLED`` times at most.
     """
-    mechanism, covariance = estimator.mechanism, steady_covariance(estimator)
+    mechanism, covariance = estimator.mechanism, estimator.steady_covariance()
     surface = first_surface(mechanism)
     laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
     quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, NamedTuple, Self, TypeGuard
 
@@ -20,8 +20,8 @@ from undertow.plants import Measurement
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.slow_loop import Answer
 
-#: Columns that are no floating-point numbers, with their types in SQL.
-_SQL = {"k": "INTEGER PRIMARY KEY", "mode": "INTEGER", "surface": "INTEGER"}
+#: Columns of whole numbers; the first one is the key of a row.
+WHOLE = ("k", "mode", "surface")
 
 #: What the names of columns are made of: measured states, demanded inputs, surface values.
 _MEASURED, _DEMAND, _SURFACE = "_measured", "_demand", "s_"
@@ -39,14 +39,17 @@ class Stamps(NamedTuple):
 
 def sql_type(name: str) -> str:
     """Return the type in SQL of a column."""
-    return _SQL.get(name, "REAL")
+    if name not in WHOLE:
+        return "REAL"
+    return "INTEGER PRIMARY KEY" if name == WHOLE[0] else "INTEGER"
 
 
 @dataclass(frozen=True)
 class Columns:
     """Where each quantity stands in a row of ``steps``.
 
-    Every name of a coordinate, state or input of the mechanism gives a column.
+    Every name of a coordinate, state or input of the mechanism gives a column, with an underscore
+    behind it where that is the name of another one.
 
     ``k``, ``t``, ``clock``: number of the step, its time since the start of the run, s, and on the
     clock, s. ``mode``, ``surface``: state of the run, and sequence number of the plan in use.
@@ -79,14 +82,18 @@ class Columns:
     @classmethod
     def of(cls, mechanism: Mechanism) -> Self:
         """Return the columns for a mechanism."""
-        n, states = mechanism.n, mechanism.state_names
-        inputs = [i.name for i in mechanism.inputs]
-        single = {name: name for name in cls.__dataclass_fields__ if name != "names"}
+        n, surfaces = mechanism.n, [f"{_SURFACE}{i}" for i in range(mechanism.m)]
+        several = {"names", "q", "v", "x", "s", "demand", "u"}
+        single = {name: name for name in cls.__dataclass_fields__}
+        taken = {*surfaces, *single} - several
+        states = _free(mechanism.state_names, _MEASURED, taken)
+        inputs = _free([i.name for i in mechanism.inputs], _DEMAND, taken)
+        del single["names"]
         groups: dict[str, str | list[str]] = single | {
             "q": [f"{name}{_MEASURED}" for name in states[:n]],
             "v": [f"{name}{_MEASURED}" for name in states[n:]],
-            "x": list(states),
-            "s": [f"{_SURFACE}{i}" for i in range(mechanism.m)],
+            "x": states,
+            "s": surfaces,
             "demand": [f"{name}{_DEMAND}" for name in inputs],
             "u": inputs,
         }
@@ -153,14 +160,15 @@ class Columns:
         """
         measured = [name for name in names if name.endswith(_MEASURED)]
         demand = [name for name in names if name.endswith(_DEMAND)]
-        surface = [name for name in names if name.startswith(_SURFACE)] + ["margin", "surface"]
         found = {
             "state": [Columns.quantity(name) for name in measured],
             "measured": ["rig_t", *measured],
             "input": [Columns.quantity(name) for name in demand],
             "demand": demand,
-            "surface": surface,
         }
+        own = {"margin", "surface"}.union(*found.values())
+        surface = [name for name in names if name.startswith(_SURFACE) and name not in own]
+        found["surface"] = [*surface, "margin", "surface"]
         taken = {"k", "t"}.union(*found.values())
         return {**found, "loop": [name for name in names if name not in taken]}
 
@@ -171,6 +179,22 @@ class Columns:
         positions = [name for name in groups["state"] if not name.endswith("_dot")]
         surfaces = [name for name in groups["surface"] if name.startswith(_SURFACE)]
         return positions, groups["input"], surfaces
+
+
+def _free(names: Iterable[str], suffix: str, taken: set[str]) -> list[str]:
+    """Return names for columns, alone and with a suffix, and add them to those that are taken.
+
+    SQLite takes capitals for small letters: an input T would be the time t.  What is taken, or
+    would be, has underscores behind it.
+    """
+    found = []
+    for name in names:
+        free = name
+        while taken & {free.lower(), f"{free}{suffix}".lower()}:
+            free += "_"
+        taken |= {free.lower(), f"{free}{suffix}".lower()}
+        found.append(free)
+    return found
 
 
 #: Paths of references that are data, by name.

@@ -136,7 +136,8 @@ class Log:
         self._unsynced, self._synced = False, time.monotonic()
         check_log(path)
         with _refused(path):
-            _move_earlier(path)
+            #: Where an earlier log of the same name is now.
+            self.earlier = _move_earlier(path)
             self._file = self._make(1)
         self._thread: Background | None = None
         if threaded:
@@ -420,13 +421,14 @@ def check_journal(path: Path) -> None:
         raise FileExistsError("a journal that names another one, which no run writes")
 
 
-def _move_earlier(path: Path) -> None:
-    """Keep an earlier log of the same name, with its parts."""
+def _move_earlier(path: Path) -> Path | None:
+    """Keep an earlier log of the same name, with its parts; return where, if there is one."""
     earlier = parts_of(path)
     if not earlier:
-        return
+        return None
     number = 1
     while parts_of(Path(f"{path}.{number}")):
         number += 1
     for one in earlier:
         one.rename(f"{path}.{number}{one.name.removeprefix(path.name)}")
+    return Path(f"{path}.{number}")

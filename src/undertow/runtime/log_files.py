@@ -14,11 +14,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from undertow.base import checked, require_extra, versions
+from undertow.base import check_replaces, checked, require_extra, versions
 from undertow.base.artefacts import whole
 from undertow.base.errors import or_refused
 from undertow.mechanisms import LIBRARY
-from undertow.runtime.encoding import Columns
+from undertow.runtime.encoding import WHOLE, Columns
 from undertow.runtime.log import ANSWERS
 from undertow.runtime.recording import Recording
 
@@ -64,6 +64,7 @@ def column_units(recording: Recording) -> dict[str, str]:
     found = {}
     for column in recording.columns:
         plain = Columns.quantity(column)
+        plain = plain if plain in known else plain.rstrip("_")
         rate = known.get(plain.removesuffix("_dot"), "") if plain.endswith("_dot") else ""
         found[column] = known.get(plain) or (f"{rate}/s" if rate else _UNITS.get(column, ""))
     return found
@@ -93,17 +94,16 @@ def to_parquet(recording: Recording, path: str | Path) -> Path:
     need = "Parquet files need pyarrow"
     arrow = require_extra("pyarrow", "logs", need)
     parquet = require_extra("pyarrow.parquet", "logs", need)
-    whole = {"k", "mode", "surface"}
     units = column_units(recording)
     fields, arrays = [], []
     for name, values in zip(recording.columns, recording.steps.T, strict=True):
-        kind = arrow.int64() if name in whole else arrow.float64()
+        kind = arrow.int64() if name in WHOLE else arrow.float64()
         fields.append(arrow.field(name, kind, metadata={"unit": units[name]}))
-        arrays.append(arrow.array(values, type=kind, from_pandas=name in whole))
+        arrays.append(arrow.array(values, type=kind, from_pandas=name in WHOLE))
     rest = {name: getattr(recording, name) for name in ("meta", "events", "answers")}
     facts = {"undertow": _json(rest)}
     table = arrow.table(arrays, schema=arrow.schema(fields, metadata=facts))
-    return _written(Path(path), lambda stream: parquet.write_table(table, stream))
+    return _written(Path(path), b"PAR1", lambda stream: parquet.write_table(table, stream))
 
 
 @checked
@@ -130,7 +130,8 @@ def to_mcap(recording: Recording, path: str | Path) -> Path:
         When it cannot be written.
     """
     mcap = require_extra("mcap.writer", "logs", "MCAP files need mcap")
-    return _written(Path(path), lambda stream: _write_mcap(mcap.Writer(stream), recording))
+    write = lambda stream: _write_mcap(mcap.Writer(stream), recording)  # noqa: E731
+    return _written(Path(path), b"\x89MCAP", write)
 
 
 def _write_mcap(writer: Any, recording: Recording) -> None:
@@ -214,9 +215,11 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
-def _written(path: Path, write: Callable[[BinaryIO], None]) -> Path:
-    """Write a file that appears whole or not at all."""
+def _written(path: Path, begins: bytes, write: Callable[[BinaryIO], None]) -> Path:
+    """Write a file that appears whole or not at all, and never over one that begins otherwise."""
     refusal = "a file that can be written", "Choose another folder"
-    with or_refused(f"file '{path}'", *refusal), whole(path) as draft, open(draft, "wb") as stream:
-        write(stream)
+    with or_refused(f"file '{path}'", *refusal):
+        check_replaces(path, begins)
+        with whole(path) as draft, open(draft, "wb") as stream:
+            write(stream)
     return path

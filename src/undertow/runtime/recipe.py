@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
@@ -14,7 +14,7 @@ import numpy as np
 from undertow.base import InvalidInputError, UndertowError, check_fields, one_of
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
-from undertow.estimators import KalmanFilter
+from undertow.estimators import Estimator
 from undertow.law import Plan, ReachingLaw, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
@@ -103,6 +103,9 @@ class Recipe:
         A cascade with further settings, for the same mechanism and objective.  Its gate,
         covariance and reaching law are kept if they are not the defaults, which are for exact
         states.
+    estimator
+        Makes an estimator for the controller's model and the bench that it is told of; by default
+        :func:`undertow.runtime.controller_defaults.estimator_for`, a Kalman filter, which learns.
 
     Raises
     ------
@@ -126,6 +129,7 @@ class Recipe:
     learns: bool = True
     settings: Settings = field(default_factory=Settings)
     design: Cascade | None = None
+    estimator: Callable[[Mechanism, Bench], Estimator] | None = None
 
     def __repr__(self) -> str:
         """Show what is run, for what, and where."""
@@ -168,6 +172,8 @@ class Recipe:
 
     def in_names(self) -> Self | None:
         """Return the same recipe with names in place of objects; None where they have none."""
+        if self.estimator is not None:
+            return None
         belief, made = self.belief, self
         if isinstance(self.mechanism, Mechanism):
             known = LIBRARY[belief.name]() if belief.name in LIBRARY else None
@@ -313,13 +319,27 @@ class Recipe:
             return IdealRig(self.belief, self.x0, self.period)
         return RealisticRig(self.bench, self.x0, self.seed)
 
-    def make_estimator(self) -> KalmanFilter:
-        """Return the estimator that suits the rig's sensors and delays."""
-        known = self._designed.known
-        if self.rig == "ideal":  # belief is truth: nothing disturbs it
-            exact = Bench(self.belief).with_timing(period=self.period)
-            return estimator_for(self.belief, exact, drift=0.0, known=known)
-        return estimator_for(self.belief, self.bench, known=known)
+    def make_estimator(self) -> Estimator:
+        """Return the estimator that suits the rig's sensors and delays, or the one of one's own.
+
+        Raises
+        ------
+        InvalidInputError
+            Where what is made is none.
+        """
+        known, ideal = self._designed.known, self.rig == "ideal"
+        bench = Bench(self.belief).with_timing(period=self.period) if ideal else self.bench
+        if self.estimator is None:  # on the ideal rig belief is truth: nothing disturbs it
+            return estimator_for(self.belief, bench, 0.0 if ideal else None, known)
+        made: object = self.estimator(self.belief, bench)
+        if not isinstance(made, Estimator) or not hasattr(made, "mechanism"):
+            raise InvalidInputError(
+                "estimator of a run",
+                value=f"{made!r}, a {type(made).__name__}"[:80],
+                limit="an undertow.estimators.Estimator that its own __init__ has begun",
+                remedy="Derive your own from it: a run asks more of it than reset and estimate",
+            )
+        return made
 
     def make_controller(self, memory: CascadeState) -> Controller:
         """Return the controller, idle."""
@@ -336,7 +356,7 @@ class Recipe:
     def as_dict(self) -> dict[str, Any]:
         """JSON values from which :meth:`from_dict` makes the recipe again, if it is all data."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
-        del values["design"]
+        del values["design"], values["estimator"]  # objects
         if isinstance(self.target, Reference):
             values["target"] = [MOVING, reference_to(self.target)]
         return values | {"settings": asdict(self.settings), "words": WORDS}
@@ -355,7 +375,7 @@ class Recipe:
             OLD_SETTINGS.get(name, name): value for name, value in taken.get("settings", {}).items()
         }
         for made, given in ((cls, taken), (Settings, settings)):
-            known = [item.name for item in fields(made) if item.name != "design"]  # an object
+            known = [item.name for item in fields(made) if item.name not in ("design", "estimator")]
             for name in given:
                 one_of(f"field of a log's {made.__name__}", name, known, _ANOTHER_VERSION)
         target: Any = taken.get("target", ())

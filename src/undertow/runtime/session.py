@@ -13,10 +13,13 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
+from undertow.estimators import Estimator
 from undertow.law import Reference, SetPoints, Target
 from undertow.mechanisms.named import origin
+from undertow.models import Mechanism
+from undertow.models.importers.formats import FORMATS, MJCF
 from undertow.models.importers.python_file import in_a_file
-from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
+from undertow.plants import Bench, IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
 from undertow.runtime.clock import SimulatedClock, WallClock
 from undertow.runtime.encoding import Columns
 from undertow.runtime.log import Log, check_log
@@ -68,7 +71,7 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
             return plant
         plant.close()  # it can be made; now the process that will hold it makes it
         return held(lambda: rig_from_file(word, recipe.belief))
-    if word == "mujoco" or word.endswith(".xml"):
+    if word == "mujoco" or FORMATS.get(Path(word).suffix.lower()) is MJCF:
         scene = None if word == "mujoco" else Path(word)
         at = origin(recipe.mechanism) if scene and isinstance(recipe.mechanism, str) else {}
 
@@ -79,7 +82,7 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
     raise InvalidInputError(
         "rig",
         value=repr(word),
-        limit="ideal, realistic, mujoco, FILE.xml or FILE.py:NAME",
+        limit="ideal, realistic, mujoco, FILE.xml, FILE.mjcf or FILE.py:NAME",
         remedy="A driver of your own: see examples/serial_rig.py",
     )
 
@@ -195,6 +198,7 @@ def run(
     processes: int = 3,
     settings: Settings | None = None,
     target: Mapping[str, float] | Target | None = None,
+    estimator: Callable[[Mechanism, Bench], Estimator] | None = None,
     progress: Callable[[str, float], None] | None = None,
     **state: float,
 ) -> Report:
@@ -231,6 +235,10 @@ def run(
         Where to, x = 0 by default: coordinates to positions, or :class:`undertow.SetPoints` that
         jump at times since the start of the run, each as soon as there is a plan for it; or a
         :class:`undertow.Reference` to follow, whose time is that of the run.
+    estimator
+        Makes an :class:`undertow.estimators.Estimator` for the mechanism and the bench that the
+        rig is taken for.  By default a Kalman filter, which learns; a run with another one is
+        logged, but its log is not replayed.
     progress
         Called with (what, fraction) while the run is prepared.
 
@@ -266,6 +274,7 @@ def run(
             learns=cascade.belief != "exact",
             settings=settings,
             design=cascade,
+            estimator=estimator,
         )
         prepared = session(
             recipe,

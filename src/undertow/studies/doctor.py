@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.base import Progress, no_progress, versions
+from undertow.base import Progress, error_text, no_progress, versions
 from undertow.cascade import Cascade
 from undertow.checks import check_mechanism
 from undertow.closed_loop import ClosedLoop, Event
@@ -175,7 +175,7 @@ def self_test(progress: Progress = no_progress) -> Iterator[Result]:
         try:
             passed, words = test(mechanism)
         except Exception as error:  # whatever is wrong here is what is asked for
-            passed, words = False, f"{type(error).__name__}: {error}"
+            passed, words = False, error_text(error)
         yield Result(name, passed, words, time.perf_counter() - began)
 
 

@@ -28,10 +28,10 @@ from undertow.base import (
 from undertow.cascade import Cascade
 from undertow.closed_loop import Event
 from undertow.closed_loop.figures import state_words
-from undertow.mechanisms.named import FILES, named
+from undertow.mechanisms.named import named
 from undertow.models import Mechanism
+from undertow.models.importers.formats import FORMATS, format_of
 from undertow.models.importers.mujoco_compiler import agreement
-from undertow.models.importers.urdf import read_urdf
 from undertow.objective import objective_for
 from undertow.runtime import default_gate
 from undertow.studies.experiment import Experiment
@@ -94,17 +94,24 @@ def model_files(
     ArtefactError
         Where there is no such folder, or nothing in it, or too much.
     """
+    if not folder.is_dir():
+        raise ArtefactError(
+            f"models in '{folder}'",
+            value="a file" if folder.exists() else "no such folder",
+            limit="a folder",
+            remedy=f"One file: undertow simulate {folder}" if folder.exists() else "Check the path",
+        )
     files = sorted(
         Path(place, name)
         for place, _, names in os.walk(folder)
         for name in names
-        if Path(name).suffix in FILES
+        if Path(name).suffix.lower() in FORMATS
     )
     if not 0 < len(files) <= MOST:
         raise ArtefactError(
             f"models in '{folder}'",
             value=f"{len(files)} files",
-            limit=f"1 to {MOST} files that end in {', '.join(FILES)}",
+            limit=f"1 to {MOST} files that end in {', '.join(FORMATS)}",
             remedy="Name the folder that they are in",
         )
     shorts = {str(file.relative_to(folder)): file for file in files}
@@ -149,9 +156,9 @@ def _read(file: Path) -> tuple[str, Mechanism]:
     try:
         return str(file), named(str(file))
     except ModelError as error:
-        if "names no actuator" not in error.what or file.suffix != ".urdf":
+        if "names no actuator" not in error.what or format_of(file).motors:
             raise
-        joints = read_urdf(file)[0].moving
+        joints = format_of(file).tree(file, False).moving
         if not 1 < len(joints) <= _MOST_TRIED:
             raise
         name = f"{file}:{joints[0].name}"

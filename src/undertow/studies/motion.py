@@ -12,14 +12,14 @@ from undertow.base import facts, finite, manifest, mark, table, to_csv
 from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
-from undertow.law import Surface
+from undertow.law import Surface, Target
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
 
 _ENDINGS = {
-    Event.REACHED: "reached the target, ‖x‖ ≤ {radius:g}",
-    Event.HORIZON: "had not reached ‖x‖ ≤ {radius:g} by the horizon: ‖x‖ = {norm:.3g}",
+    Event.REACHED: "reached the target, {off} ≤ {radius:g}",
+    Event.HORIZON: "had not reached {off} ≤ {radius:g} by the horizon: {off} = {norm:.3g}",
     Event.CONSTRAINT: "broke {broken}",
     Event.SINGULAR: "met the singularity (37): the law does not exist further on",
     Event.DIVERGED: "diverged",
@@ -41,17 +41,45 @@ def _head(
     ]
 
 
-def ended(motion: Trajectory, objective: Objective) -> str:
-    """Say in words how a motion ended."""
+#: The same of a motion along a reference.
+_ALONG = {
+    Event.REACHED: "followed the reference to the end, where {off} ≤ {radius:g}",
+    Event.HORIZON: "was off the reference at the end: {off} = {norm:.3g}, not ≤ {radius:g}",
+}
+
+
+def ended(motion: Trajectory, objective: Objective, target: Target | None = None) -> str:
+    """Say in words how a motion ended; ``target`` where that is not x = 0."""
+    if target is not None:
+        return _ended_at(motion, objective, target)
     if motion.event == Event.REACHED and motion.time == motion.t[0]:
         return (
             f"started at the target, ‖x‖ ≤ {objective.terminal_radius:g}: there was nothing to do"
         )
-    broken = _broken(motion, objective) if motion.event == Event.CONSTRAINT else ""
-    words = _ENDINGS[motion.event].format(
-        radius=objective.terminal_radius, norm=float(np.linalg.norm(motion.x[-1])), broken=broken
+    return _ended(_ENDINGS, motion, objective, motion.x[-1], "‖x‖")
+
+
+def _ended_at(motion: Trajectory, objective: Objective, target: Target) -> str:
+    """Say how a motion to a target elsewhere ended: what counts is how far it is off that."""
+    legs = target.legs(motion.mechanism, max(motion.time, objective.horizon))
+    begun = [leg for begin, leg in legs if begin <= motion.time]
+    words = _ENDINGS | _ALONG if begun[-1].moves else _ENDINGS
+    return _ended(
+        words, motion, objective, motion.x[-1] - begun[-1].state(motion.time), "‖x − x_r‖"
     )
-    return f"{words}, at {motion.time:.3f} s"
+
+
+def _ended(
+    words: Mapping[Event, str],
+    motion: Trajectory,
+    objective: Objective,
+    error: FloatArray,
+    off: str,
+) -> str:
+    broken = _broken(motion, objective) if motion.event == Event.CONSTRAINT else ""
+    radius, norm = objective.terminal_radius, float(np.linalg.norm(error))
+    said = words[motion.event].format(off=off, radius=radius, norm=norm, broken=broken)
+    return f"{said}, at {motion.time:.3f} s"
 
 
 def _broken(motion: Trajectory, objective: Objective) -> str:
@@ -77,16 +105,17 @@ def motion_report(
     surface: Surface,
     run: Run | None = None,
     cascade: Cascade | None = None,
-    target: str = "",
+    target: Target | None = None,
+    words: str = "",
 ) -> RenderableType:
     """Return a simulated motion for the terminal.
 
     ``surface`` is the (first) one, ``run`` the record of ``cascade`` where one was run, ``target``
-    where to, in words, where that is not x = 0.
+    where to, and in ``words``, where that is not x = 0.
     """
     rows = _head(mechanism, objective, start, None if cascade is None else cascade.gate)
-    if target:
-        rows.append(("target", target))
+    if target is not None:
+        rows.append(("target", words))
     if run is None:
         rows.append(("surface", _surface_words(surface)))
     else:
@@ -112,9 +141,10 @@ def motion_report(
         ),
     ]
     good = motion.event == Event.REACHED
+    said = ended(motion, objective, target)
     if good and motion.time == motion.t[0]:
-        return Group(facts(rows), Text(ended(motion, objective)))
-    return Group(facts(rows), mark(good) + Text(f" {ended(motion, objective)}"))
+        return Group(facts(rows), Text(said))
+    return Group(facts(rows), mark(good) + Text(f" {said}"))
 
 
 def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]:

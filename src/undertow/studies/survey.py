@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -111,15 +112,17 @@ def survey(
     InvalidInputError
         For an unknown mechanism or goal, or one without a usual start, before any work.
     """
-    chosen = [named(name) for name in (LIBRARY if names is None else names)]
+    given = {name: named(name) for name in (LIBRARY if names is None else names)}
+    own = Counter(mechanism.name for mechanism in given.values())
+    chosen = {m.name if own[m.name] == 1 else name: m for name, m in given.items()}
     tasks: dict[Key, Callable[[], Entry]] = {}
-    for goal, mechanism in product(goals, chosen):
+    for goal, (name, mechanism) in product(goals, chosen.items()):
         objective = objective_for(mechanism, goal, horizon=horizon)
         objective.check_start(mechanism, mechanism.usual_start)
-        tasks[mechanism.name, goal] = partial(
-            survey_one, mechanism, objective, goal=goal, seed=seed, bounds=bounds
+        tasks[name, goal] = partial(
+            survey_one, mechanism, objective, goal=goal, seed=seed, bounds=bounds, name=name
         )
-    models = [mechanism.fingerprint for mechanism in chosen]
+    models = [mechanism.fingerprint for mechanism in chosen.values()]
     settings = {"horizon": horizon, "seed": seed, "bounds": bounds, "models": models}
     return Experiment(
         "survey", tuple[str, str, Entry], tasks, settings, report,
@@ -136,12 +139,13 @@ def survey_one(
     seed: int = 0,
     bounds: bool = True,
     within: Sequence[Constraint] = (),
+    name: str = "",
 ) -> Entry:
     """Bring one mechanism from a start to its target; one line of the survey.
 
     From ``x0``, (2n,), the mechanism's listed start by default; ``goal`` is the objective's word,
-    for the line. The motion of the bound keeps what is ``within`` besides the objective's own
-    constraints: what every surface must keep anyway.
+    and ``name`` the mechanism's, if not its own, for the line. The motion of the bound keeps what
+    is ``within`` besides the objective's own constraints: what every surface must keep anyway.
 
     Raises
     ------
@@ -175,7 +179,7 @@ def survey_one(
     bare = replace(objective, unit="", constraints=(), travel=False)
     return Entry(
         goal=goal,
-        name=mechanism.name,
+        name=name or mechanism.name,
         n=mechanism.n,
         m=mechanism.m,
         start=state_words(mechanism, x0),

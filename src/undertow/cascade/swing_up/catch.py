@@ -17,7 +17,7 @@ import numpy as np
 from undertow.base import InvalidInputError, UndertowError
 from undertow.cascade.swing_up.law import SwingUp, periods
 from undertow.closed_loop import ClosedLoop
-from undertow.estimators import Estimator, KalmanFilter
+from undertow.estimators import Estimator
 from undertow.law import InnerLoop, ProvedSet, ReachingLaw, Surface, first_surface
 from undertow.models import FloatArray, Mechanism, linearise
 from undertow.objective import MinimumTime, state_box
@@ -203,7 +203,7 @@ class SwingUpAndCatch:
     lost: float = math.radians(60.0)
     events: list[tuple[float, str]] = field(default_factory=list)
     _law: InnerLoop | None = None
-    _learning: KalmanFilter | None = None
+    _learning: Estimator | None = None
     _offset: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
     _next: float = 0.0
     _since: float | None = None
@@ -211,7 +211,7 @@ class SwingUpAndCatch:
 
     def listen(self, estimator: Estimator) -> None:
         """Balance with the parameters that an estimator learns, if it is for the same mechanism."""
-        if isinstance(estimator, KalmanFilter) and estimator.belief is not None:
+        if estimator.belief is not None:
             same = estimator.mechanism.fingerprint == self.region.mechanism.fingerprint
             self._learning = estimator if same else None
 

@@ -136,8 +136,10 @@ def where(mechanism: Mechanism, target: str | Mapping[str, float]) -> tuple[dict
         As for that.
     """
     if isinstance(target, Mapping):
-        words = "the equilibrium near " + _position(mechanism, _positions(mechanism, target))
-        return find_equilibrium(mechanism, **target), words
+        guess = _positions(mechanism, target)
+        words = "the equilibrium near " + _position(mechanism, guess)
+        found = find_equilibrium(mechanism, **target)
+        return _unwound(mechanism, found, guess), words
     if target:
         one_of("target equilibrium", target, WORDS, "Or say where: joint=ANGLE")
     if target in ("upright", "hanging"):
@@ -160,6 +162,17 @@ def where(mechanism: Mechanism, target: str | Mapping[str, float]) -> tuple[dict
         value="motions that no input reaches",
         limit="controllable",
         remedy=_adrift(mechanism) or "Actuate another joint: FILE:JOINT,JOINT",
+    )
+
+
+def _unwound(mechanism: Mechanism, found: dict[str, float], guess: FloatArray) -> dict[str, float]:
+    """Return an equilibrium less the whole turns of hinges between it and the guess, (n,)."""
+    q = np.array(list(found.values()))
+    hinges = np.array([c.unit == "rad" for c in mechanism.coordinates])
+    turns = np.where(hinges, np.round((q - guess) / (2 * math.pi)), 0.0)
+    near = q - 2 * math.pi * turns
+    return (
+        _named(mechanism, near) if turns.any() and _residual(mechanism, near) <= AT_REST else found
     )
 
 

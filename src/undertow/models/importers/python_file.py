@@ -9,7 +9,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from undertow.base import ArtefactError, InvalidInputError, UndertowError, checked, near, raised_at
+from undertow.base import (
+    ArtefactError,
+    InvalidInputError,
+    UndertowError,
+    checked,
+    error_text,
+    near,
+    raised_at,
+)
 from undertow.models.mechanism import Mechanism
 
 
@@ -113,7 +121,7 @@ def named_in_file(
     except (Exception, SystemExit) as error:  # a user's file may do anything
         raise ArtefactError(
             f"{what} file '{file}'",
-            value=f"{type(error).__name__}: {error}{raised_at(error, str(path))}",
+            value=f"{error_text(error)}{raised_at(error, str(path))}",
             limit="a file that runs",
             remedy="Run it by itself: python FILE.py" if path.is_file() else "Check the path",
         ) from error

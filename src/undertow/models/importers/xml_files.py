@@ -12,7 +12,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from undertow.base import ArtefactError, InvalidInputError, ModelError, read_file
+from undertow.base import ArtefactError, InvalidInputError, ModelError, error_text, read_file
 from undertow.models.mechanism import FloatArray
 
 #: Largest file, bytes; deepest nesting, and most elements, of one that is read.
@@ -140,7 +140,7 @@ def computable(what: str) -> Iterator[None]:
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise InvalidInputError(
             f"numbers of the {what}",
-            value=f"{type(error).__name__}: {error}",
+            value=error_text(error),
             limit="those of a mechanism, SI units",
             remedy="Look for one that is far too large or too small",
         ) from error

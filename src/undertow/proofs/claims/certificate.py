@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from undertow.base.artefacts import write_file
-from undertow.base.errors import CertificateError, UndertowError
+from undertow.base.errors import CertificateError, UndertowError, error_text
 from undertow.base.files import check_file, parse_json, read_file
 from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, Surface
@@ -226,7 +226,7 @@ class Certificate:
         try:
             return cls._from_document(document)
         except (UndertowError, AttributeError, *_BROKEN) as error:
-            value = f"{type(error).__name__}: {error}"
+            value = error_text(error)
             raise _error(value, "complete, with numbers of the right shapes") from error
 
     @classmethod

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from undertow.base.errors import CertificateError, UndertowError
+from undertow.base.errors import CertificateError, UndertowError, error_text
 from undertow.base.verdict import Verdict, inward
 from undertow.law.surface import ProvedSet
 from undertow.models.mechanism import Mechanism
@@ -243,7 +243,7 @@ def _decide(mechanism: Mechanism, subject: Subject, stated: StatedClaim, seconds
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise CertificateError(
             f"claim '{stated.kind}'",
-            value=f"{type(error).__name__}: {error}",
+            value=error_text(error),
             limit="complete, with numbers that can be computed with",
         ) from error
     margin = stated.verdict.margin

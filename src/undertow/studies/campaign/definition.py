@@ -14,6 +14,7 @@ from typing import Any, get_args
 from undertow.base import ArtefactError, InvalidInputError, near, one_of, read_file
 from undertow.mechanisms.named import from_anywhere, named
 from undertow.models import Mechanism
+from undertow.models.importers.formats import file_words
 from undertow.models.importers.python_file import in_a_file
 from undertow.objective import Goal, Objective, objective_for
 
@@ -78,7 +79,7 @@ class Definition:
                 raise InvalidInputError(
                     f"mechanism of the campaign '{path}'",
                     value=name,
-                    limit="a name of the library, FILE.urdf or FILE.xml",
+                    limit=f"a name of the library, {file_words()}",
                     remedy=f"Code of your own is named where it is run: --mechanism {name}",
                 )
             beside = path.parent / name

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, error_text
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, StateFeedback
 from undertow.law import InnerLoop, first_surface
@@ -98,7 +98,7 @@ class Refereed:
         try:
             return what(*given)
         except Exception as error:
-            raise ForfeitError(1, f"{type(error).__name__}: {error}") from error
+            raise ForfeitError(1, error_text(error)) from error
 
 
 class Feedback:

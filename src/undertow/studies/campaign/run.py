@@ -21,6 +21,7 @@ from undertow.base import (
     Progress,
     ResourceError,
     UndertowError,
+    error_text,
     no_progress,
     printable,
     raised_at,
@@ -283,7 +284,7 @@ class Campaign:
         elif isinstance(error, UndertowError):
             words = str(error)
         else:
-            words = f"{name}: {error}{raised_at(error)}"
+            words = f"{error_text(error)}{raised_at(error)}"
         outcome.failures[shard] = printable(" ".join(words.split()))
 
 

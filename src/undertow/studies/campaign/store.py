@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.base import ArtefactError, printable, require_extra
+from undertow.base import ArtefactError, error_text, printable, require_extra
 from undertow.studies.campaign.study import Arrays, Study
 
 #: The mask's name, and that of the dimension that numbers the shards.
@@ -50,7 +50,10 @@ class Store:
         self.path = path
         if not (path / "zarr.json").is_file():
             raise ArtefactError(
-                f"store '{path}'", value="none", limit="a campaign's", remedy="Leave out --resume"
+                f"store '{path}'",
+                value="none",
+                limit="a campaign's",
+                remedy="Name that of an earlier campaign, or begin one without --resume",
             )
         try:
             self._group: Any = _zarr().open_group(str(path), mode="r+")
@@ -255,7 +258,7 @@ def unwritten(path: Path, error: OSError) -> ArtefactError:
 def _damaged(path: Path, error: Exception) -> ArtefactError:
     return ArtefactError(
         f"store '{path}'",
-        value=f"{type(error).__name__}: {printable(str(error))[:200]}",
+        value=printable(error_text(error))[:200],
         limit="a campaign's",
         remedy="It is damaged or something else: name another folder with --out",
     )

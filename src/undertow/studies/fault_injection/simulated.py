@@ -95,14 +95,19 @@ class CaseResult:
         return sound and (self.held or (stopped and not self.case.holds))
 
 
-class _FaultyEstimator:
+class _FaultyEstimator(Estimator):
     """An estimator that goes wrong from some time on."""
 
     def __init__(
         self, honest: Estimator, corrupt: Callable[[FloatArray], FloatArray], since: float
     ):
+        super().__init__(honest.mechanism, honest.period)
         self.honest, self.corrupt, self.since = honest, corrupt, since
         self.disturbance = honest.disturbance
+
+    @property
+    def jumps(self) -> int:
+        return self.honest.jumps
 
     def reset(self, x0: ArrayLike) -> None:
         self.honest.reset(x0)

@@ -211,7 +211,10 @@ def summary(found: BringUp) -> tuple[str, ...]:
             f"{', '.join(identified.held)}; what is identified is in proportion to them."
         )
     if not found.wrong:
-        lines.append("Nothing is wrong.")
+        looked = (
+            "" if identified is not None else " so far: delay and parameters were not looked at"
+        )
+        lines.append(f"Nothing is wrong{looked}.")
     lines += [f"Wrong: {f.check} of {f.part}: {f.measured}. {f.remedy}." for f in found.wrong]
     return tuple(lines)
 

@@ -90,7 +90,7 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
     variation = ", ".join(f"{v / seconds:.4g}" for v in report.total_variation)
     rows += [
         ("answers of the optimiser", verdicts or "none"),
-        ("chattering", f"{variation} {unit}/s of total variation"),
+        ("chattering", f"{variation} {unit or 1}/s of total variation"),
     ]
     lines = facts(rows)
     lines.columns[0].max_width = 24
@@ -243,8 +243,8 @@ def chatter_figure(recording: Recording) -> bytes:
         ax.step(recording["t"][:whole:count], variation, where="post", label=name, lw=1)
     unit = ", ".join(sorted(set(units.values())))
     ax.set(
-        xlabel="time, s", ylabel=f"total variation, {unit}/s", yscale="symlog",
-        title=f"chattering: {total:.4g} {unit} in all, in windows of {WINDOW:g} s",
+        xlabel="time, s", ylabel=f"total variation, {unit or 1}/s", yscale="symlog",
+        title=f"chattering: {f'{total:.4g} {unit}'.rstrip()} in all, in windows of {WINDOW:g} s",
     )  # fmt: skip
     ax.title.set_fontsize(10)
     ax.set_ylim(bottom=0)

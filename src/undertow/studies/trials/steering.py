@@ -19,7 +19,7 @@ import sympy as sp
 from undertow.base import require_extra
 from undertow.bounds.expressions import dynamics
 from undertow.cascade import Cascade, CascadeState
-from undertow.estimators import Estimator, KalmanFilter, StateFeedback
+from undertow.estimators import Estimator, StateFeedback
 from undertow.law import InnerLoop
 from undertow.models import (
     UNCONTROLLABLE,
@@ -65,15 +65,13 @@ class CascadeSteering:
         self.waiting: Proposal | None = None
         self.ticks = self.admitted = self.refused = 0
         self.began = 0.0
-        self.estimator: KalmanFilter | None = None
-        self.learning: KalmanFilter | None = None
+        self.estimator: Estimator | None = None
+        self.learning: Estimator | None = None
         self.jumps = 0
 
     def listen(self, estimator: Estimator) -> None:
         """Hear of jumps, and go on with the parameters that are learnt for the same belief."""
         known = self.cascade.known
-        if not isinstance(estimator, KalmanFilter):
-            return
         self.estimator, self.jumps = estimator, estimator.jumps
         if known is None or estimator.belief is None:
             return
