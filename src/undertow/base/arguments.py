@@ -95,18 +95,21 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
     rest = more.get(inspect.Parameter.VAR_POSITIONAL)
     others = more.get(inspect.Parameter.VAR_KEYWORD)
     places = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    words = {p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         tests, last = _tests(function), len(places)
         for k, value in enumerate(args):
-            test = tests.get(places[k] if k < last else rest)
+            parameter = places[k] if k < last else rest
+            test = tests.get(parameter)
             if test is not None and not test(value):
-                _refuse(function, places[k] if k < last else f"{k - last}", value, rest)
+                _refuse(function, parameter, value, "" if k < last else f"{k - last}")
         for name, value in kwargs.items():
-            test = tests.get(name) or tests.get(others)
+            parameter = name if name in words else others
+            test = tests.get(parameter)
             if test is not None and not test(value):
-                _refuse(function, name, value, others)
+                _refuse(function, parameter, value, name)
         return function(*args, **kwargs)  # of a missing or an unknown name Python itself tells
 
     return call
@@ -256,15 +259,17 @@ def _tests(of: Any) -> dict[str | None, Callable[[Any], bool]]:
     return {name: _test(hint) for name, hint in _hints(of).items()}
 
 
-def _refuse(of: Any, name: str, value: object, starred: str | None = None) -> None:
-    """Raise with what an argument or a field is, and what its annotation asks for."""
-    hints = _hints(of)
-    hint = hints.get(name) or hints[starred or name]
+def _refuse(of: Any, parameter: str | None, value: object, name: str = "") -> None:
+    """Raise with what an argument or a field is, and what its annotation asks for.
+
+    ``name`` is its own where it is one of those behind ``parameter``.
+    """
+    hint = _hints(of)[str(parameter)]
     members = [m for m in _members(hint) if m is not types.NoneType]
     names = (_name(m) for member in members for m in (member, *_contents(member)))
     remedies = (REMEDIES.get(name) for name in names)
     raise InvalidInputError(
-        f"{name} of {of.__qualname__}",
+        f"{name or parameter} of {of.__qualname__}",
         value=_shown(value),
         limit=" or ".join(_words(m) for m in members),
         remedy=next((r for r in remedies if r), "Its documentation shows what it takes"),

@@ -411,7 +411,7 @@ class Reference:
 
     paths: Mapping[str, ReferencePath]
     period: float = 0.0
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         """Refuse what is no function of time."""
