@@ -290,7 +290,9 @@ class _Task:
             for shrink in 0.8 ** np.arange(12):
                 if terminal is None:
                     break
-                own = replace(terminal, radius=shrink * terminal.radius).stated(self.mechanism, None)
+                own = replace(terminal, radius=shrink * terminal.radius).stated(
+                    self.mechanism, None
+                )
                 loop.aim(own.W, own.radius)
                 if not loop.terminal()[0]:
                     return loop, own
