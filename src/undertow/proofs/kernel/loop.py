@@ -117,6 +117,7 @@ class HeldLoop(Loop):
         self.size, self.model, self.law = 2 * n, model, law
         self.period = np.array(hull(period, period))
         varied = [p for p in model.parameters if p.name in plant]
+        self.varied = [p.name for p in varied]
         self.plant = [plant[p.name] for p in varied]
         states = 2 * n + len(varied)
         graph, start = Graph(states + states * (states + m) + m), Graph(states)
@@ -203,7 +204,7 @@ class HeldLoop(Loop):
         while todo:
             part, tried = todo.pop(), tried + 1
             why, margin = self._contracts(V, np.vstack([np.column_stack([-half, half]), part]))
-            least = min(least, margin)
+            least = least if why else min(least, margin)
             if why and (not len(part) or tried > MOST_PLANTS):
                 return why, margin
             if why:

@@ -21,8 +21,8 @@ from undertow.proofs.kernel.graph import FloatArray, Graph, Program
 #: Coefficients of a step, the part of a step that may have a corner inside, and the shortest.
 ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
 
-#: Coefficients of a step of a held input, which is short.
-HELD_ORDER = 5
+#: Coefficients of a step of a held input, up to a period of 1 ms and beyond.
+HELD_ORDER, LONG_ORDER = 5, 8
 
 #: Columns of C, more of which than those of the start come from corners, before a tube is lost.
 MOST_COLUMNS = 600
@@ -187,7 +187,7 @@ class Held:
         u = ops.along(np.concatenate([around[:, :1], slopes], axis=1), centre, *set_)
         return u, centre, slopes, len(pieces) == 1
 
-    def advance(self, tube: Tube, h: FloatArray, order: int = HELD_ORDER) -> FloatArray | None:
+    def advance(self, tube: Tube, h: FloatArray) -> FloatArray | None:
         """Move a set of x on by a period, whose ends are h (2,), in one step.
 
         Returns
@@ -196,7 +196,7 @@ class Held:
             A box that all motions stay in on the way, (N, 2); None where they may leave the domain
             of F or the law, or no bounds are found.
         """
-        n, X = self.N, tube.hull
+        n, X, order = self.N, tube.hull, _order(h)
         u, centre, slopes, one = self.input(tube)
         if not (np.isfinite(u).all() and np.isfinite(slopes).all()):
             return None
@@ -227,7 +227,6 @@ class Held:
         u_m: FloatArray,
         slopes: FloatArray,
         h: FloatArray,
-        order: int = HELD_ORDER,
     ) -> tuple[FloatArray, FloatArray] | None:
         """Enclose the derivative of x(h) by x(0) on a box, (N, N, 2), and where motions stay.
 
@@ -238,7 +237,7 @@ class Held:
         u, u_m, slopes
             The law on it, (m, 2), at m, (m, 2), and its derivative on it, (m, N, 2).
         """
-        n, both = self.N, np.vstack([X, self.start])
+        n, both, order = self.N, np.vstack([X, self.start]), _order(h)
         stay = _stay(self.both, both, u, h[1])
         if stay is None:
             return None
@@ -353,6 +352,10 @@ def _stay(program: Program, X: FloatArray, fixed: FloatArray, h: float) -> Float
         wider = np.column_stack([reach[:, 0] - room, reach[:, 1] + room])
         stay = np.where(left, wider, stay)
     return None
+
+
+def _order(h: FloatArray) -> int:
+    return HELD_ORDER if h[1] < 1.0001e-3 else LONG_ORDER
 
 
 def _ends(program: Program, box: FloatArray, fixed: FloatArray) -> FloatArray:

@@ -94,9 +94,9 @@ def certify_surface(
     search, 0 leaves it out. ``loop`` also proves how far off the target the full closed loop may
     start at rest, which takes minutes; for that the input is held for ``hold`` ms (0: renewed at
     every instant). ``uncertain`` plant parameters lie in [low, high] instead of being the law's
-    own: for the closed loop with a held input, and for a second region on the surface. ``predict`` also predicts the
-    motion from the start, and from random ones up to it (sampled). The ``title`` is for tables, the
-    surface itself by default.
+    own: for the closed loop with a held input, and for a second region on the surface. ``predict``
+    also predicts the motion from the start, and from random ones up to it (sampled). The ``title``
+    is for tables, the surface itself by default.
     """
     began = time.perf_counter()
     claims: list[StatedClaim] = []
