@@ -269,7 +269,7 @@ def escapes(loop: Loop, data: Document) -> bool:
 def diverges(loop: Loop, data: Document) -> bool:
     """Some start on the line is not home after ten seconds."""
     x, ends = np.zeros((8, 4)), [float(Fraction(v)) for v in data["starts"]["phi"]]
-    x[:, 1] = np.linspace(*ends, 8)
+    x[:, 1] = np.linspace(ends[0], ends[1], 8)
     return away(loop.run(x, 10.0, float(Fraction(data["period"])))[:, :], 0.02)
 
 

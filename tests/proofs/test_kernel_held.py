@@ -57,7 +57,7 @@ def claim(period: Fraction = PERIOD, plant: Any = None, **starts: float) -> Clos
 
 def states(loop: HeldLoop, model: Model = MODEL, numbers: Any = NUMBERS) -> Program:
     """(q, q̇) by (q, p, s) and the parameters that vary."""
-    n, graph = model.n, Graph(loop.field.N)
+    n, graph = model.n, Graph(loop.held.N)
     own = iter(graph.inputs[2 * n :])
     varied = set(loop.varied)
     p = [next(own) if k.name in varied else graph.number(k.value or 0) for k in model.parameters]
@@ -69,16 +69,16 @@ def sampled(
     plant: ut.Mechanism, x: FloatArray, period: float, count: int, law: SlidingModeLaw
 ) -> FloatArray:
     """States at the samples of a law that is held, (count + 1, 2n), by SciPy."""
-    path, n = [x], plant.n
-    for _ in range(count):
-        u = law(0.0, x).u
+    path, n = np.tile(x, (count + 1, 1)), plant.n
+    for k in range(count):
+        u = law(0.0, path[k]).u
 
         def rate(_: float, y: FloatArray, u: FloatArray = u) -> FloatArray:
-            return np.r_[y[n:], plant.accelerations(0.0, y, u)]
+            return np.concatenate([y[n:], plant.accelerations(0.0, y, u)])
 
-        x = solve_ivp(rate, (0, period), x, method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
-        path.append(x)
-    return np.array(path)
+        found = solve_ivp(rate, (0, period), path[k], method="DOP853", rtol=1e-11, atol=1e-13)
+        path[k + 1] = found.y[:, -1]
+    return path
 
 
 # -- tubes ----------------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ def misses(name: str, count: int, seed: int, part: float) -> tuple[int, int, lis
                 u = own.clipped(own.demand(there, piece)[1], clip)
                 series = plant.motion(there, lambda y: plant.rate(y, piece, clip, u))  # noqa: B023
                 there = [sum(v[j] * T**j for j in range(ORDER)) for v in series]
-                if not loop.advance(tube, 0.0)[1]:
+                if not loop.advance(tube):
                     break
                 seen += 1
                 wrong += not all(
@@ -157,7 +157,7 @@ def test_wide_tubes_hold_motions_across_clip_and_layer() -> None:
     ])  # fmt: skip
     met = set[tuple[bool, bool]]()
     for k in range(1, 451):
-        assert loop.advance(tube, 0.0)[1]
+        assert loop.advance(tube)
         x, (low, high) = paths[:, k], tube.image(back).T
         assert (x >= low - 1e-8).all()
         assert (x <= high + 1e-8).all()
@@ -173,14 +173,14 @@ def test_wide_tubes_hold_motions_across_clip_and_layer() -> None:
 def test_the_derivative_of_the_map_holds_difference_quotients() -> None:
     """Of all states and of the mass, over the box of the set, against SciPy."""
     loop = HeldLoop(MODEL, NUMBERS, PERIOD, within("1/50", "m"))
-    loop.aim(END.W, END.radius)
+    loop.take(END.W, END.radius)
     V = ops.inverse(loop.W)
     half = np.array([ops.norm(row) * loop.radius[1] for row in V])
     mass = [0.1225, 0.1275]
     X = np.vstack([np.column_stack([-half, half]), [mass]])
     middle, slopes = loop.slopes(X)
     u, zero = np.array([[-15.0, 15.0]]), np.zeros((1, 2))
-    found = loop.field.derivative(X, middle, u, zero, slopes, loop.period)
+    found = loop.held.derivative(X, u, middle, zero, slopes, loop.step)
     assert found is not None
     J, back, law = found[0], states(loop), SlidingModeLaw(RIG, SURFACE, LAW)
 
@@ -194,7 +194,7 @@ def test_the_derivative_of_the_map_holds_difference_quotients() -> None:
     for _ in range(10):
         ball = rng.normal(size=4)
         z = V.mean(axis=-1) @ (0.9 * loop.radius[0] * ball / np.linalg.norm(ball))
-        point = np.r_[z, rng.uniform(*mass)]
+        point = np.r_[z, rng.uniform(mass[0], mass[1])]
         for j in range(5):
             step = h[j] * np.eye(5)[j]
             quotient = (image(point + step) - image(point - step)) / (2 * h[j])
@@ -206,7 +206,7 @@ def test_the_derivative_of_the_map_holds_difference_quotients() -> None:
 def test_the_terminal_set_shrinks_from_sample_to_sample() -> None:
     """Proved for every mass within 5 %, and so it is in simulation; what is larger is not."""
     loop = HeldLoop(MODEL, NUMBERS, PERIOD, within("1/20", "m"))
-    loop.aim(END.W, END.radius)
+    loop.take(END.W, END.radius)
     why, margin = loop.terminal()
     assert not why
     assert margin > 0
@@ -230,7 +230,7 @@ def test_the_terminal_set_shrinks_from_sample_to_sample() -> None:
         (1, PERIOD, within("19/20", "m"), ""),
     ):
         other = HeldLoop(MODEL, NUMBERS, period, plant)
-        other.aim(END.W, radius * END.radius)
+        other.take(END.W, radius * END.radius)
         why, _ = other.terminal()
         assert why
         assert words in why
@@ -247,7 +247,7 @@ def test_an_equilibrium_is_shown_for_every_plant_or_not_at_all() -> None:
     )
     pushed = replace(MODEL, nodes=(*MODEL.nodes, *extra), f=(k + 3, MODEL.f[1]))
     loop = HeldLoop(pushed, NUMBERS, PERIOD, within("1/20", "m"))
-    loop.aim(END.W, END.radius)
+    loop.take(END.W, END.radius)
     assert "f(0, 0) = 0 is not shown" in loop.terminal()[0]
 
 
@@ -290,10 +290,10 @@ def test_what_is_false_or_not_shown_is_not_proved() -> None:
         assert found.kind == "undecided"
         assert why in found.why
     loop = HeldLoop(MODEL, NUMBERS, PERIOD, {})
-    loop.aim(END.W, END.radius)
+    loop.take(END.W, END.radius)
     start = np.zeros((4, 2))
     start[1] = math.radians(45.5)
-    assert not loop.follow(start, 0.0)[2]
+    assert not loop.follow(start)[1]
 
 
 def test_cuts_may_be_of_the_plant_too() -> None:
@@ -335,4 +335,4 @@ def test_a_search_refuses_what_it_cannot_be_about() -> None:
         ("plant in a box", {"plant": {"m": (0.1, 0.2)}}),
     ):
         with pytest.raises(InvalidInputError, match=words):
-            prove_loop(RIG, SURFACE, LAW, coordinate="phi", reach=0.1, **more)  # type: ignore[arg-type]
+            prove_loop(RIG, SURFACE, LAW, coordinate="phi", reach=0.1, **more)

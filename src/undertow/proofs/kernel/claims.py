@@ -18,7 +18,7 @@ import numpy as np
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
 from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
-from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop, arrive
+from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
 from undertow.proofs.kernel.model import (
     Algebra,
     Law,
@@ -713,7 +713,7 @@ class ClosedLoop(Claim):
         for name, (low, high) in box.items():
             cuts = sorted({v for v in self.cuts.get(name, ()) if low < v < high})
             pieces.append([hull(*ends) for ends in itertools.pairwise([low, *cuts, high])])
-        end = arrive(loop, np.array([*itertools.product(*pieces)]), float(self.step))
+        end = loop.arrive(np.array([*itertools.product(*pieces)]))
         method = "validated tubes into an ellipsoid that is proved to be a terminal set"
         details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}
         if not end.all:
@@ -725,9 +725,10 @@ class ClosedLoop(Claim):
         """The loop with its terminal set, or what is not shown of that."""
         if not self.period:
             kind, why, _, _ = end.decide(model, law, 0)
-            return why if kind != "proved" else ContinuousLoop(model, law, end.W, end.radius)
+            own = (model, law, end.W, end.radius, self.step)
+            return why if kind != "proved" else ContinuousLoop(*own)
         loop = HeldLoop(model, law, self.period, self.plant)
-        loop.aim(end.W, end.radius)
+        loop.take(end.W, end.radius)
         return loop.terminal()[0] or loop
 
 

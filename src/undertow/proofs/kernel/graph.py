@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
 
-_NOWHERE: Mapping[int, int] = {}
+NOWHERE: Mapping[int, int] = {}
 _NONE, _NO_SEEDS = np.empty(0, dtype=np.int64), np.empty((0, 0, 2))
 
 FloatArray = NDArray[np.float64]
@@ -249,7 +249,7 @@ class Graph:
         """Return min(max(a, −limit), limit)."""
         return self.make("min", self.make("max", a, self.make("neg", limit)), limit)
 
-    def depends(self, roots: Iterable[int], sides: Mapping[int, int] = _NOWHERE) -> list[int]:
+    def depends(self, roots: Iterable[int], sides: Mapping[int, int] = NOWHERE) -> list[int]:
         """Return the nodes that some depend on, in order, themselves included."""
         needed, todo = set[int](), list(roots)
         while todo:
@@ -264,7 +264,7 @@ class Graph:
         return [] if node[0] in ("input", "number", "pi") else [int(v) for v in node[1:]]
 
     def tangents(
-        self, roots: Sequence[int], seeds: Mapping[int, int], sides: Mapping[int, int] = _NOWHERE
+        self, roots: Sequence[int], seeds: Mapping[int, int], sides: Mapping[int, int] = NOWHERE
     ) -> list[int]:
         """Return derivatives of nodes along seeds (node to its derivative), by the chain rule.
 
@@ -350,7 +350,7 @@ class Graph:
         """Return the max and min that nodes depend on."""
         return [k for k in self.depends(roots) if self.nodes[k][0] in ("max", "min")]
 
-    def program(self, roots: Sequence[int], sides: Mapping[int, int] = _NOWHERE) -> Program:
+    def program(self, roots: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
         """Lower what some nodes depend on; every input stays one.
 
         ``sides`` has an operand for a max or min: the one that it is known to be.

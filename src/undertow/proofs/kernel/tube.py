@@ -9,14 +9,14 @@ order and, where no bounds are found, the step.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import FloatArray, Graph, Program
+from undertow.proofs.kernel.graph import NOWHERE, FloatArray, Graph, Program
 
 #: Coefficients of a step, the part of a step that may have a corner inside, and the shortest.
 ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
@@ -106,7 +106,7 @@ class Field:
 
 
 class Held:
-    """ẋ = F(x, u), u = law(x) at the beginning of a period and the same until its end (Lemma 10).
+    """ẋ = F(x, u), u = law(x) at the beginning of a period and the same until its end (Lemma 12).
 
     Inputs of the graph are x (N), Y (N (N + m)), u (m): Y, the derivative of the motion by where it
     begins and by u, moves with it.
@@ -118,74 +118,73 @@ class Held:
     """
 
     def __init__(self, graph: Graph, rates: Sequence[int], law: Sequence[int]) -> None:
-        self.N, self.m = len(rates), len(law)
-        self.graph, self.law, both = graph, law, self.N + self.m
-        x, u = graph.inputs[: self.N], graph.inputs[-self.m :]
-        Y = [graph.inputs[self.N + i * both : self.N + (i + 1) * both] for i in range(self.N)]
-        columns = []
-        for j in range(both):
-            seeds = {x[i]: Y[i][j] for i in range(self.N)}
-            seeds |= {u[j - self.N]: graph.number(1)} if j >= self.N else {}
-            columns.append(graph.tangents(rates, seeds))
-        self.flow = graph.program(rates)
-        self.both = graph.program([*rates, *(c[i] for i in range(self.N) for c in columns)])
-        self.start = ops.points(np.eye(self.N, both)).reshape(-1, 2)
-        self.renewed = graph.program(law)
-        self._corners = graph.corners(law)
+        self.N, self.m = N, m = len(rates), len(law)
+        self.graph, self.law, x, u = graph, law, graph.inputs[:N], graph.inputs[-m:]
+        Y = np.array(graph.inputs[N:-m]).reshape(N, N + m).T.tolist()
+        one, columns = graph.number(1), []
+        for j, column in enumerate(Y):
+            by_u = {u[j - N]: one} if j >= N else {}
+            columns.append(graph.tangents(rates, dict(zip(x, column, strict=True)) | by_u))
+        self.both = graph.program([*rates, *(c[i] for i in range(N) for c in columns)])
+        self.start = ops.points(np.eye(N, N + m)).reshape(-1, 2)
+        self.flow, self.renewed = graph.program(rates), graph.program(law)
+        self._corners, self._pieces = graph.corners(law), dict[tuple[int, ...], Program]()
         operands = [graph.nodes[k][1:] for k in self._corners]
         self.gaps = graph.program([graph.make("sub", a, b) for a, b in operands])
-        self._pieces = dict[tuple[bool, ...], Program]()
 
-    def fixed(self, u: FloatArray) -> FloatArray:
-        """Return the inputs besides x, where Y does not matter."""
-        return np.vstack([self.start, u])
+    def by_states(self, nodes: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
+        """Return nodes, and their derivatives by x, row by row."""
+        one, graph = self.graph.number(1), self.graph
+        slopes = [graph.tangents(nodes, {x: one}, sides) for x in graph.inputs[: self.N]]
+        return graph.program([*nodes, *(c[i] for i in range(len(nodes)) for c in slopes)], sides)
 
-    def _piece(self, second: tuple[bool, ...]) -> Program:
-        """The law and its derivative by x, row by row, where corners are these operands."""
-        if second not in self._pieces:
-            graph, one = self.graph, self.graph.number(1)
-            sides = {
-                k: graph.nodes[k][2 if b else 1] for k, b in zip(self._corners, second, strict=True)
-            }
-            slopes = [graph.tangents(self.law, {x: one}, sides) for x in graph.inputs[: self.N]]
-            rows = [c[i] for i in range(self.m) for c in slopes]
-            self._pieces[second] = graph.program([*self.law, *rows], sides)
-        return self._pieces[second]
+    def fixed(self, u: FloatArray | None = None) -> FloatArray:
+        """Return the inputs besides x, where Y does not matter, nor u if none is given."""
+        return np.vstack([self.start, np.zeros((self.m, 2)) if u is None else u])
 
     def input(self, tube: Tube) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-        """Enclose the law on a set and at its m (m, 2), and its slopes from m to points of the set.
+        """Enclose the law on a set and at its m (m, 2), and its mean slopes from m (m, N, 2).
 
-        Slopes are (m, N, 2), of all pieces that are not excluded on the set.  Also: whether that
-        is one.
+        Also: whether one piece of the law is left on the set; else slopes are those of all that
+        are, for a mean may be of several.
         """
-        none, set_ = np.zeros((self.m, 2)), tube.parts
-        around, centre = _around(self.gaps, tube.hull, tube.m, self.fixed(none))
-        gaps = ops.along(around, centre, *set_)
-        options = []
+        none, options = self.fixed(), []
+        gaps = ops.along(*_around(self.gaps, tube.hull, tube.m, none), *tube.parts)
         for (low, high), k in zip(gaps, self._corners, strict=True):
-            largest = self.graph.nodes[k][0] == "max"
-            options.append(
-                [largest] if high <= 0.0 else [not largest] if low >= 0.0 else [False, True]
-            )
-        pieces = [*itertools.product(*options)]
-        slopes = np.empty((0, 0))
+            larger = 2 if self.graph.nodes[k][0] == "max" else 1  # where the gap is below 0
+            options.append([larger] if high <= 0.0 else [3 - larger] if low >= 0.0 else [1, 2])
+        pieces, slopes = [*itertools.product(*options)], list[FloatArray]()
         for piece in pieces:
-            around, centre = _around(self._piece(piece), tube.hull, tube.m, self.fixed(none))
-            if len(pieces) == 1:  # the mean of a derivative on the way is half as far off
-                around[:, 1:] *= 0.5
-            own = ops.along(around, centre, *set_)[self.m :].reshape(self.m, self.N, 2)
-            if slopes.size:
-                own = np.stack(
-                    [
-                        np.minimum(own[..., 0], slopes[..., 0]),
-                        np.maximum(own[..., 1], slopes[..., 1]),
-                    ],
-                    -1,
-                )
-            slopes = own
-        around, centre = _around(self.renewed, tube.hull, tube.m, self.fixed(none))
-        u = ops.along(np.concatenate([around[:, :1], slopes], axis=1), centre, *set_)
-        return u, centre, slopes, len(pieces) == 1
+            if piece not in self._pieces:
+                sides = {
+                    k: self.graph.nodes[k][i] for k, i in zip(self._corners, piece, strict=True)
+                }
+                self._pieces[piece] = self.by_states(self.law, sides)
+            around, centre = _around(self._pieces[piece], tube.hull, tube.m, none)
+            around[:, 1:] *= 0.5 if len(pieces) == 1 else 1.0
+            slopes.append(ops.along(around, centre, *tube.parts)[self.m :])
+        every = np.array(slopes).reshape(-1, self.m, self.N, 2)
+        L = np.stack([every[..., 0].min(axis=0), every[..., 1].max(axis=0)], axis=-1)
+        around, centre = _around(self.renewed, tube.hull, tube.m, none)
+        u = ops.along(np.concatenate([around[:, :1], L], axis=1), centre, *tube.parts)
+        return u, centre, L, len(pieces) == 1
+
+    def _series(
+        self,
+        X: FloatArray,
+        u: FloatArray,
+        m: FloatArray,
+        u_m: FloatArray,
+        L: FloatArray,
+        order: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Coefficients of (x, Y) on a box, with derivatives along (I, L), and at m."""
+        seeds = np.zeros((self.N + len(self.start) + self.m, self.N, 2))
+        seeds[: self.N], seeds[-self.m :] = ops.points(np.eye(self.N)), L
+        low, high = np.vstack([X, self.fixed(u)]).T.copy()
+        whole = self.both.series(low, high, order - 1, seeds)
+        low, high = np.vstack([np.column_stack([m, m]), self.fixed(u_m)]).T.copy()
+        return whole, self.both.series(low, high, order - 1)[:, :, 0]
 
     def advance(self, tube: Tube, h: FloatArray) -> FloatArray | None:
         """Move a set of x on by a period, whose ends are h (2,), in one step.
@@ -197,70 +196,47 @@ class Held:
             of F or the law, or no bounds are found.
         """
         n, X, order = self.N, tube.hull, _order(h)
-        u, centre, slopes, one = self.input(tube)
-        if not (np.isfinite(u).all() and np.isfinite(slopes).all()):
-            return None
-        stay = _stay(self.flow, X, self.fixed(u), h[1])
+        u, u_m, L, one = self.input(tube)
+        stay = _stay(self.flow, X, self.fixed(u), h[1]) if np.isfinite(L).all() else None
         if stay is None:
             return None
         low, high = np.vstack([stay, self.fixed(u)]).T.copy()
         rest = self.flow.series(low, high, order)[:, order, 0]
-        low[:n], high[:n] = X.T
-        unit = ops.points(np.eye(n))
-        seeds = np.concatenate([unit, np.zeros((len(self.start), n, 2)), slopes])
-        whole = self.both.series(low, high, order - 1, seeds)
-        low, high = np.vstack([np.column_stack([tube.m, tube.m]), self.fixed(centre)]).T.copy()
-        at = self.both.series(low, high, order - 1)[:, :, 0]
+        whole, at = self._series(X, u, tube.m, u_m, L, order)
         part = whole[n:].reshape(-1, 1 + n, 2).copy()
-        part[:, 1:] *= 0.5
+        part[:, 1:] *= 0.5  # of the derivative's change, on the way
         Y = ops.along(part, at[n:].reshape(-1, 2), *tube.parts).reshape(n, n + self.m, order, 2)
-        around, way = np.zeros((n, order, 1 + n, 2)), np.concatenate([unit, slopes])
+        around, way = np.zeros((n, order, 1 + n, 2)), np.concatenate([ops.points(np.eye(n)), L])
         for k in range(order):
-            around[:, k, 1:] = ops.product(np.ascontiguousarray(Y[:, :, k]), way)
+            around[:, k, 1:] = ops.product(Y[:, :, k].copy(), way)
         return stay if tube.move(rest, at[:n], around, h, one) else None
 
     def derivative(
-        self,
-        X: FloatArray,
-        m: FloatArray,
-        u: FloatArray,
-        u_m: FloatArray,
-        slopes: FloatArray,
+        self, X: FloatArray, u: FloatArray, m: FloatArray, u_m: FloatArray, L: FloatArray,
         h: FloatArray,
-    ) -> tuple[FloatArray, FloatArray] | None:
+    ) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
         """Enclose the derivative of x(h) by x(0) on a box, (N, N, 2), and where motions stay.
 
         Parameters
         ----------
         X, m
             The box, (N, 2), and a point of it, (N,).
-        u, u_m, slopes
+        u, u_m, L
             The law on it, (m, 2), at m, (m, 2), and its derivative on it, (m, N, 2).
         """
-        n, both, order = self.N, np.vstack([X, self.start]), _order(h)
-        stay = _stay(self.both, both, u, h[1])
+        n, order = self.N, _order(h)
+        stay = _stay(self.both, np.vstack([X, self.start]), u, h[1])
         if stay is None:
             return None
         low, high = np.vstack([stay, u]).T.copy()
-        rest = self.both.series(low, high, order)[n:, order, 0]
-        low, high = np.vstack([both, u]).T.copy()
-        unit = ops.points(np.eye(n))
-        seeds = np.concatenate([unit, np.zeros((len(self.start), n, 2)), slopes])
-        whole = self.both.series(low, high, order - 1, seeds)[n:]
-        low, high = np.vstack([np.column_stack([m, m]), self.start, u_m]).T.copy()
-        at = self.both.series(low, high, order - 1)[n:, :, 0]
-        end = rest
-        for k in range(order - 1, -1, -1):
-            own, _ = ops.mean_values(
-                np.ascontiguousarray(whole[:, k]),
-                np.ascontiguousarray(at[:, k]),
-                X[:, 0].copy(),
-                X[:, 1].copy(),
-                m,
-            )
+        end = self.both.series(low, high, order)[n:, order, 0]
+        whole, at = self._series(X, u, m, u_m, L, order)
+        a, b = X.T.copy()
+        for k in reversed(range(order)):
+            own, _ = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), a, b, m)
             end = ops.carried(end, own, h)
-        Y = end.reshape(n, n + self.m, 2)
-        return ops.product(Y, np.concatenate([unit, slopes])), stay[:n]
+        way = np.concatenate([ops.points(np.eye(n)), L])
+        return ops.product(end.reshape(n, n + self.m, 2), way), stay[:n]
 
 
 @dataclass
@@ -300,8 +276,7 @@ class Tube:
 
     def image(self, program: Program) -> FloatArray:
         """Enclose values on the set, (O, 2)."""
-        still = np.zeros((len(self.m), 1, 2))
-        return np.asarray(ops.along(*self.values(program), self.C, self.xi, self.Q, self.r, still))
+        return np.asarray(ops.along(*self.values(program), *self.parts))
 
     def map(self, program: Program) -> bool:
         """Replace the set by its image; whether that is bounded."""

@@ -182,7 +182,7 @@ def prove_loop(
         box[index] = edges[-1], min(edges[-1] + width, reach)
         if time.process_time() - started > seconds:
             break
-        there = all(loop.follow(np.vstack([box, part]), float(STEP))[2] for part in parts)
+        there = all(loop.follow(np.vstack([box, part]))[1] for part in parts)
         if not there and len(parts) < MOST_PARTS and width < reach / 128:
             parts, width = _sliced(task.box, len(parts)), 2 * width
         if there:
@@ -279,7 +279,7 @@ class _Task:
             terminal = None if search is None else _terminal(search, path)
             if terminal is not None:
                 own = terminal.stated(self.mechanism, None)
-                return ContinuousLoop(self.model, self.numbers, own.W, own.radius), own
+                return ContinuousLoop(self.model, self.numbers, own.W, own.radius, STEP), own
         else:
             held, loop = (
                 HeldLoop(self.model, self.numbers, self.period, plant)
@@ -293,7 +293,7 @@ class _Task:
                 own = replace(terminal, radius=shrink * terminal.radius).stated(
                     self.mechanism, None
                 )
-                loop.aim(own.W, own.radius)
+                loop.take(own.W, own.radius)
                 if not loop.terminal()[0]:
                     return loop, own
         raise InfeasibleError(
@@ -319,7 +319,7 @@ def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
     scale = np.array([*([1.0] * n), *map(float, scale_of(loop.model)), *([1.0] * m)])
     X = np.zeros((loop.size, 2))
     middle, slopes = loop.slopes(X)
-    found = loop.field.derivative(X, middle, zero, zero, slopes, loop.period)
+    found = loop.held.derivative(X, zero, middle, zero, slopes, loop.step)
     if loop.no_equilibrium or found is None:
         return None
     A = scale[:, None] * found[0].mean(axis=-1) / scale
@@ -327,11 +327,11 @@ def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
 
     def margin(candidate: TerminalEllipsoid) -> float:
         W = tuple(tuple(Fraction(float(v)) for v in row) for row in candidate.W)
-        loop.aim(W, Fraction(float(candidate.radius)))
+        loop.take(W, Fraction(float(candidate.radius)))
         why, found = loop.terminal()
         return min(found, 0.0) if why else found
 
-    return EllipsoidSearch.of(margin, A, C, layer, float(loop.period[1]))
+    return EllipsoidSearch.of(margin, A, C, layer, float(loop.step[1]))
 
 
 def _terminal(search: EllipsoidSearch, path: FloatArray) -> TerminalEllipsoid | None:
