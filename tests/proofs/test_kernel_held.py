@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,10 @@ from undertow.proofs.kernel.claims import ClosedLoop, TerminalEllipsoid, decide,
 from undertow.proofs.kernel.graph import Graph, Program
 from undertow.proofs.kernel.loop import HeldLoop
 from undertow.proofs.kernel.model import Model, System
-from undertow.proofs.kernel.reader import Refused
+from undertow.proofs.kernel.reader import Refused, read
 from undertow.proofs.search.closed_loop import follow, prove_loop
 
+ROOT = Path(__file__).parents[2]
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
 SURFACE, LAW = CASES[3].surface, ReachingLaw()
 MODEL, NUMBERS = model_of(RIG), law_of(RIG, SURFACE, LAW)
@@ -336,3 +338,28 @@ def test_a_search_refuses_what_it_cannot_be_about() -> None:
     ):
         with pytest.raises(InvalidInputError, match=words):
             prove_loop(RIG, SURFACE, LAW, coordinate="phi", reach=0.1, **more)
+
+
+# -- what is kept ---------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("case", "degrees"), [(4, 30.7), (5, 19.8)])
+def test_kept_starts_of_the_sampled_loop_are_proved_from_their_file(
+    case: int, degrees: float
+) -> None:
+    """The pieces next to the target and the farthest ones; ``undertow verify`` decides all."""
+    document = read((ROOT / "tests/data/held_loop_v2.json").read_bytes())
+    assert document.model == MODEL
+    law = law_of(RIG, CASES[case - 1].surface, LAW)
+    (subject,) = (s for s in document.subjects if s.law == law)
+    own = read_claim(subject.claims[0], MODEL)
+    assert isinstance(own, ClosedLoop)
+    end = own.starts["phi"][1]
+    assert -own.starts["phi"][0] == end >= math.radians(degrees)
+    assert (own.period, own.plant) == (PERIOD, {})
+    cuts = sorted(own.cuts["phi"])
+    for low, high in ((-cuts[4], cuts[4]), (cuts[-3], end)):
+        found = decide(MODEL, law, replace(own, starts={"phi": (low, high)}))
+        assert found.kind == "proved", found.why
+        assert found.details["tubes"] < 12
