@@ -22,8 +22,6 @@ from undertow.export import EmbeddedController, KalmanStep
 from undertow.export.host import Build
 from undertow.models import FloatArray
 from undertow.plants.stepping import stepping
-from undertow.proofs.closed_loop.loop import LoopMotion
-from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.region.motion import SurfaceMotion
 
 STEP = 0.002
@@ -133,54 +131,6 @@ def swing_up(subject: Subject) -> Iterator[Difference]:
             coupling = coupling + M[0][i] * exactly(x)[n + i]
         true = [S, S * moved, B[0][0], coupling]
         yield from subject.compared("swing-up: S, h, B, M_au q̇_u", x, blocks, true)
-
-
-def loop_programme(subject: Subject) -> Iterator[Difference]:
-    """The equations that regions of the whole loop are proved with: floats, and enclosures.
-
-    They are in z = (q, p, s), s the surface and p = M_uu(0)⁻¹ [M_auᵀ M_uu] q̇: the velocities are
-    solved for exactly.
-    """
-    mechanism, n, m = subject.mechanism, subject.mechanism.n, subject.mechanism.m
-    surface = subject.surface
-    motion = LoopMotion(mechanism, surface, subject.reaching)
-    names = [i.name for i in mechanism.inputs]
-    layer = exactly(subject.reaching.vector(m)[m:])
-    parameters = [Interval(p) for p in mechanism.parameter_values]
-    position, velocity = _rows(surface.position_row), _rows(surface.velocity_row)
-    at_target = _rows(mechanism.M(np.zeros(n))[m:, m:])
-    for x in subject.states:
-        z = motion.from_state(x)
-        q, p, s = ([[v] for v in exactly(part)] for part in np.split(z, [n, 2 * n - m]))
-        M, _, _ = subject.model.matrices(0.0, [*exactly(z[:n]), *exactly(x[n:])])
-        pull = product(position, q)
-        right = [*([a[0] - b[0]] for a, b in zip(s, pull, strict=True)), *product(at_target, p)]
-        speed = [row[0] for row in solve([*velocity, *M[m:]], right)]
-        state = [*exactly(z[:n]), *speed]
-        law = subject.model.law(surface, subject.reaching, state)
-        rates, demand = motion(z)
-        yield from subject.compared("loop programme: demand", x, demand, law.demand, names)
-        yield from subject.compared("loop programme: q̇", x, rates[:n], speed)
-        qdd = subject.model.accelerations(0.0, state, law.u)
-        s_dot = [
-            a[0] + b[0]
-            for a, b in zip(
-                product(velocity, [[v] for v in qdd]),
-                product(position, [[v] for v in speed]),
-                strict=True,
-            )
-        ]
-        yield from subject.compared("loop programme: ṡ", x, rates[2 * n - m :], s_dot)
-        switch = [float((v[0] / e).clip(1.0)) for v, e in zip(s, layer, strict=True)]
-        around = [Interval(*np.nextafter(v, [-np.inf, np.inf])) for v in switch]
-        found = motion.equations.program.points(*map(Interval, z), *around, *parameters)
-        for name, box, true in zip(names, found[2 * n - m : 2 * n], law.demand, strict=True):
-            low, high = float(box.lo), float(box.hi)
-            slack = 2.0**-52 * true.size  # M_uu(0) may be rounded or not
-            off = 0.0 if true.inside(low - slack, high + slack) else true.off(low)
-            yield Difference(
-                f"loop programme: enclosure of {name}", subject.where(x), low, float(true), off
-            )
 
 
 def sliding_motion(subject: Subject) -> Iterator[Difference]:

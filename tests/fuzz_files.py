@@ -439,28 +439,15 @@ class Certificates:
     """Certificates with a claim of each kind; most of the mutated ones have a checksum again."""
 
     def __init__(self, _folder: Path) -> None:
-        from undertow.base import Verdict
-        from undertow.proofs.claims.certificate import (
-            Certificate,
-            StatedClaim,
-            Subject,
-            read_certificate,
-        )
+        from undertow.proofs.claims.certificate import Certificate, Subject
         from undertow.proofs.claims.verify import verify
         from undertow.studies.certification import certify_surface
 
         rig, surface = ut.mechanisms.rotary_pendulum(), ut.Surface(-1, -1.59, 1.96, 12.1)
         one = certify_surface(rig, surface, rig.state(phi=0.5), seconds=0.0, predict=False)
-        data = Path(__file__).parent / "data"
-        more = []
-        stated = read_certificate(data / "loops.json").subjects[0].claims[0]
-        more.append(
-            StatedClaim(stated.kind, stated.data, Verdict(stated.kind, "proved", 1e-3, "rad"))
-        )
         self.samples = []
-        for claims in (one.subject.claims, *((claim,) for claim in one.subject.claims), *more):
-            given = claims if isinstance(claims, tuple) else (claims,)
-            subject = Subject(surface, ut.ReachingLaw(), given, ())
+        for claims in (one.subject.claims, *((claim,) for claim in one.subject.claims)):
+            subject = Subject(surface, ut.ReachingLaw(), claims, ())
             content = Certificate.of(rig, [subject], {"undertow": "fuzz"}).to_bytes()
             self.samples.append(json.loads(content))
             verify(Certificate.from_bytes(content), rig, max_seconds=1.0)  # compiles what it needs

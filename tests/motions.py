@@ -15,7 +15,6 @@ import numpy as np
 import sympy as sp
 
 import undertow as ut
-from undertow.models import FloatArray
 
 BITS, ORDER = 220, 26
 flint.ctx.cap = ORDER  # of series; python-flint cuts them after ten terms by itself
@@ -51,7 +50,7 @@ def first(value: Any) -> Any:
 
 
 class Reference:
-    """A mechanism under its law in z = (q, p, s), on one piece of sat and clip at a time."""
+    """A mechanism under its law, on one piece of sat and clip at a time."""
 
     def __init__(self, mechanism: ut.Mechanism, surface: ut.Surface, law: ut.ReachingLaw) -> None:
         self.mechanism, self.n, self.m = mechanism, mechanism.n, mechanism.m
@@ -78,8 +77,6 @@ class Reference:
             [exact(v) for v in row] for row in np.hstack([surface.lambda_a, surface.lambda_u])
         ]
         self.eta, self.layer = ([exact(v) for v in part] for part in np.split(law.vector(m), 2))
-        at_target = mechanism.M(np.zeros(self.n))[m:, m:]
-        self.unit = [[exact(v) for v in row] for row in at_target]
 
     def matrices(self, q: Sequence[Any], v: Sequence[Any]) -> tuple[Any, Any, Any]:
         n, m = self.n, self.m
@@ -88,28 +85,6 @@ class Reference:
         M = [flat[i * n : (i + 1) * n] for i in range(n)]
         B = [flat[n * n + n + i * m :][:m] for i in range(m)]
         return M, flat[n * n : n * n + n], B
-
-    def state(self, z: Sequence[Any]) -> list[Any]:
-        """(q, q̇) at z: p and s are linear in q̇."""
-        n, m = self.n, self.m
-        q, p, s = z[:n], z[n : 2 * n - m], z[2 * n - m :]
-        M, _, _ = self.matrices(q, [v * 0 for v in q])
-        pull = [sum(u * w for u, w in zip(row, p, strict=True)) for row in self.unit]
-        right = [
-            s[i] - sum(w * v for w, v in zip(self.position[i], q, strict=True)) for i in range(m)
-        ]
-        zero = q[0] * 0
-        rows = [*M[m:], *([zero + w for w in row] for row in self.velocity)]
-        return [*q, *solve(rows, [*pull, *right])]
-
-    def place(self, x: Sequence[Any]) -> list[Any]:
-        """z at (q, q̇)."""
-        n, m = self.n, self.m
-        q, v = x[:n], x[n:]
-        M, _, _ = self.matrices(q, v)
-        momentum = [sum(a * b for a, b in zip(row, v, strict=True)) for row in M[m:]]
-        p = solve([[v[0] * 0 + w for w in row] for row in self.unit], momentum)
-        return [*q, *p, *self.s(x)]
 
     def s(self, x: Sequence[Any]) -> list[Any]:
         q, v = x[: self.n], x[self.n :]
@@ -176,28 +151,3 @@ class Reference:
                 for v, r in zip(x0, speeds, strict=True)
             ]
         return series
-
-    def after(
-        self, z: Sequence[float], times: Sequence[float], *, held: bool = False
-    ) -> list[list[Any] | None]:
-        """z at some times, None where sat or clip changed its piece before.
-
-        With ``held`` the input is that of the start all the time.
-        """
-        with flint.ctx.workprec(BITS):
-            x0 = self.state([exact(v) for v in z])
-            piece, clip = self.pieces(x0)
-            u0 = self.clipped(self.demand(x0, piece)[1], clip) if held else None
-            series = self.motion(x0, lambda x: self.rate(x, piece, clip, u0))
-            found: list[list[Any] | None] = []
-            for t in times:
-                x = [sum(v[k] * exact(t) ** k for k in range(ORDER)) for v in series]
-                same = held or self.pieces(x) == (piece, clip)
-                found.append(self.place(x) if same else None)
-            return found
-
-
-def holds(low: FloatArray, high: FloatArray, value: Sequence[Any]) -> bool:
-    """Whether a box holds a point, for certain."""
-    with flint.ctx.workprec(BITS):
-        return all(exact(a) <= v <= exact(b) for a, b, v in zip(low, high, value, strict=True))

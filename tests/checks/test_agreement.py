@@ -21,7 +21,6 @@ from agreements import (
     bypassing_the_door,
     estimator,
     exported_law,
-    loop_programme,
     named,
     rig_stepping,
     settling,
@@ -171,7 +170,6 @@ REST: dict[str, tuple[Callable[[Subject], Iterator[Difference]], float]] = {
     "rig": (rig_stepping, LIMIT),
     "estimator": (estimator, LIMIT),
     "swing-up": (swing_up, LIMIT),
-    "loop programme": (loop_programme, LIMIT),
     "sliding motion": (sliding_motion, LIMIT),
     "large steps, energy": (settling, SETTLED),
     "large steps, time": (partial(settling, objective=ut.MinimumTime(travel=False)), SETTLED),
@@ -268,7 +266,6 @@ def test_a_mechanism_of_odd_names_compiled(tmp_path: Path) -> None:
     assert report.passed, str(report)
     assert mechanism.with_parameters(self=0.01).state(sw_0=0.1)[1] == 0.1
     subject = Subject(mechanism, count=1)
-    agree(loop_programme(subject), LIMIT)
     agree(sliding_motion(subject))
     agree(exported_law(subject, tmp_path))
 

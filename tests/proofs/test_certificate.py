@@ -34,15 +34,12 @@ from undertow.proofs.claims.certificate import (
     read_certificate,
 )
 from undertow.proofs.claims.closed_loop import LoopClaim, Starts
-from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.claims.nonsingular import nonsingular
 from undertow.proofs.claims.reaching import reaching
 from undertow.proofs.claims.region import reaches, verify_region
 from undertow.proofs.claims.stability import StabilityClaim, hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import match, proved_sets, verify
-from undertow.proofs.closed_loop.loop import LoopMotion
-from undertow.proofs.closed_loop.terminal_set import TerminalSet
 from undertow.proofs.gate import Policy, assess
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
@@ -559,7 +556,6 @@ def test_a_model_with_a_kink_is_refused_by_every_claim(name: str) -> None:
     model = kinked(KINKS[name])
     law = ut.ReachingLaw()
     ellipsoid = TerminalEllipsoid(np.eye(4), np.eye(4), 0.01)
-    draft = LoopDraft("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0, hold=1)
     loop = LoopClaim(
         {"starts": {}, "period": "0", "plant": {}, "disturbance": ["0"] * 2, "ball": "0"}
     )
@@ -570,7 +566,6 @@ def test_a_model_with_a_kink_is_refused_by_every_claim(name: str) -> None:
         lambda: reaching(model, SURFACE, box),
         lambda: verify_region(SurfaceMotion(model, SURFACE), quadratic(np.eye(3), 0.01)),
         lambda: ellipsoid.decide(model, SURFACE, law),
-        lambda: draft.decide(model, SURFACE, law),
         lambda: loop.decide(model, SURFACE, law),
         lambda: certify_surface(model, SURFACE, np.zeros(4), seconds=0.0, predict=False),
     ):
@@ -607,19 +602,8 @@ def test_an_equilibrium_that_is_off_is_not_rounded_home(shift: float) -> None:
     off = kinked(rest.xreplace({X: TILT}))
     assert not hurwitz(off, SURFACE)
     assert not verify_region(SurfaceMotion(off, SURFACE), quadratic(np.eye(3), 0.01))
-    assert not LoopMotion(off, SURFACE).at_rest
-    assert not LoopMotion(off, SURFACE).odd
     found = TerminalEllipsoid(np.eye(4), np.eye(4), 1e-3)
     assert "f_u(0, 0) = 0" in found.decide(off, SURFACE, ut.ReachingLaw()).method
-
-
-def test_a_hold_that_is_no_whole_number_is_refused() -> None:
-    """0.9 steps were taken for none."""
-    claim = LoopDraft("phi", (0.0, 0.01), TerminalSet(np.eye(3), [0.1]), 0.001, 1.0)
-    for hold in (0.9, 1.0, "1", True, None):
-        with pytest.raises(InvalidInputError, match="hold"):
-            LoopDraft.from_dict(claim.to_dict() | {"hold": hold})
-    assert LoopDraft.from_dict(claim.to_dict() | {"hold": 2}).hold == 2
 
 
 def test_reaching_names_its_region_and_ends_at_the_singularity() -> None:

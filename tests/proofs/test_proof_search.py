@@ -26,10 +26,6 @@ from undertow.base import Verdict
 from undertow.base.errors import InfeasibleError
 from undertow.models import FloatArray
 from undertow.proofs.claims.region import reaches
-from undertow.proofs.closed_loop.loop import LoopMotion
-from undertow.proofs.closed_loop.run import _inside
-from undertow.proofs.closed_loop.terminal_set import TerminalSet
-from undertow.proofs.intervals.batch import Interval
 from undertow.proofs.region.lyapunov import (
     LyapunovFunction,
     directions,
@@ -42,7 +38,6 @@ from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_par
 from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _on_axis, grow
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
 from undertow.proofs.search.linear_program import minimise_linear
-from undertow.proofs.search.loop_draft import _boxes, _terminal, follow
 from undertow.proofs.search.quadratic import quadratic
 from undertow.proofs.search.region import LEAP, TIGHT, _proved_chain, _tight_level
 from vector_field import VectorField
@@ -387,78 +382,3 @@ def test_a_level_is_raised_to_within_two_per_cent_of_what_is_proved(edge: float)
     assert min(refused) <= TIGHT * level * (1 + 1e-9)
     assert refusal.kind == "undecided"
     assert len(decide.asked) < 20
-
-
-# -- the loop's search ------------------------------------------------------------------------
-
-LOOP = LoopMotion(RIG, SURFACE, ut.ReachingLaw(20.0, 0.02))
-
-
-@pytest.mark.parametrize("widest", [None, 0.004])
-def test_boxes_of_starts_are_neighbours_and_narrow_where_it_matters(widest: float | None) -> None:
-    """They cover the reach without gap; narrow at the layer's edge, narrower far than near."""
-    reach = 0.5
-    boxes = _boxes(LOOP, "phi", reach, widest)
-    assert (boxes[0][0], boxes[-1][1]) == (0.0, reach)
-    assert [b for _, b in boxes[:-1]] == [a for a, _ in boxes[1:]]
-    first, layer = widest or reach / 350, 0.02 / 9.0  # |λ_u| = 9
-    widths = np.array([b - a for a, b in boxes])
-    near = np.array([a for a, _ in boxes]) < 2 * layer
-    assert 2 < near.sum() < len(boxes) / 2
-    assert widths[near].max() <= min(first, 0.15 * layer) * (1 + 1e-9)
-    free = widths[~near][:-1]
-    assert free[0] > 0.15 * layer
-    assert free[0] == pytest.approx(first, rel=0.02)
-    assert (np.diff(free) < 1e-12).all()
-    assert 0.4 * first <= free[-1] < 0.45 * first
-
-
-def test_motions_of_the_loop_are_followed_as_scipy_does() -> None:
-    x = np.array([[0.0, 0.2, 0.0, 0.0], [0.1, -0.1, 0.3, 0.0]])
-    z = LOOP.from_state(x)
-    path, times = follow(LOOP, z, 0.3, 0.0005, 20)
-    np.testing.assert_allclose(times, 0.01 * np.arange(31), atol=1e-12)
-    for lane in range(2):
-        exact = solve_ivp(
-            lambda t, y: LOOP(y[None])[0][0], (0, 0.3), z[lane],
-            rtol=1e-9, atol=1e-11, t_eval=times[:-1], max_step=0.002,
-        )  # fmt: skip
-        np.testing.assert_allclose(path[:-1, lane], exact.y.T, atol=2e-5)
-
-
-def test_a_terminal_set_is_made_again_for_a_shorter_reach() -> None:
-    """Where many motions fail to enter; never for one that is worse, and three times at most."""
-    asked: list[float] = []
-
-    def ends(*answers: float | None) -> tuple[str, float]:
-        asked.clear()
-        left = list(answers)
-
-        def attempt(reach: float) -> tuple[str, float]:
-            asked.append(reach)
-            answer = left.pop(0)
-            if answer is None:
-                raise InfeasibleError("motions", value=0, limit=1, remedy="")
-            return f"set {len(asked)}", answer
-
-        return _terminal(attempt, 1.0)  # type: ignore[arg-type, return-value]
-
-    assert ends(0.9) == ("set 1", 0.9)
-    assert asked == [1.0]
-    assert ends(0.5, 0.55) == ("set 2", 0.55)  # 0.92 of the 0.6 that was asked for
-    assert asked == [1.0, pytest.approx(0.6)]
-    assert ends(0.5, 0.4) == ("set 1", 0.5)
-    assert ends(0.5, None) == ("set 1", 0.5)
-    assert ends(0.2, 0.2000001, 0.2000002, 9.0) == ("set 3", 0.2000002)
-    assert len(asked) == 3
-    with pytest.raises(InfeasibleError):
-        ends(None)
-
-
-def test_tubes_are_inside_if_all_of_them_is() -> None:
-    """‖x‖ ≤ 1 at the farthest corner and |s_i| ≤ σ_i at either end."""
-    low = np.array([[0.0, 0.5, -0.7, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0, 0, -0.2, 0.0]])
-    high = np.array([[0.7, 0.9, 0.7, 0.1, 0.1], [0.7, 0.5, 0.7, 0.1, 0.1], [0.0, 0, 0, 0.1, 0.11]])
-    inside = _inside(Interval(low, high), 2, np.array([0.1]))
-    assert inside.tolist() == [True, False, True, False, False]
-    assert isinstance(TerminalSet(np.eye(2), 0.1).times(2.0), TerminalSet)

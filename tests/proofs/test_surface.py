@@ -21,14 +21,9 @@ from undertow.law import (
 from undertow.law.sliding import singularity
 from undertow.models import linearise
 from undertow.proofs import Verdict, hurwitz, nonsingular, reaching, singular_distance
-from undertow.proofs.intervals.batch import Interval, IntervalArithmetic
 from undertow.proofs.intervals.interval import (
-    ball,
-    compile_outward,
-    derivative_tape,
     exact_fraction,
 )
-from undertow.symbolic import Tape
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 
@@ -69,61 +64,6 @@ def pencil_margin(mechanism: ut.Mechanism, surface: ut.Surface) -> float:
 
 
 # -- outward rounding ----------------------------------------------------------------------
-
-
-def test_interval_operations_contain_the_true_value() -> None:
-    """Each operation on a batch contains the exact (ball) result at points inside."""
-    rng = np.random.default_rng(1)
-    a, b = sp.symbols("a b", real=True)
-    expressions = [
-        a + b, a - b, a * b, a / (b**2 + 1), a**3, a**4, sp.sin(a), sp.cos(a), sp.sin(a * b),
-        sp.log(a**2 + sp.Rational(1, 3)), sp.sqrt(a**2 + 1), sp.Abs(a) * b, sp.tan(b / 4),
-        sp.Max(a, b), sp.Min(a, 0), sp.Float(0.1) * a, sp.pi * b, 1 / (b**2 + 1) ** 2,
-    ]  # fmt: skip
-    tape = Tape()
-    outputs = tape.let_all(expressions)
-    fast = compile_outward(tape, [a, b], outputs, IntervalArithmetic())
-    exact = compile_outward(tape, [a, b], outputs)
-    centre = rng.uniform(-3.0, 3.0, (2, 200))
-    width = 10.0 ** rng.uniform(-12, 0.3, (2, 200))
-    low, high = centre - width, centre + width
-    results = fast(Interval(low[0], high[0]), Interval(low[1], high[1]))
-    for where in (0.0, 0.37, 1.0):
-        point = np.clip(low + where * (high - low), low, high)
-        for k in range(200):
-            truth = exact(ball(float(point[0, k])), ball(float(point[1, k])))
-            for expression, result, value in zip(expressions, results, truth, strict=True):
-                lo, hi = ball(float(result.lo[k])), ball(float(result.hi[k]))
-                assert not value < lo, (expression, point[:, k])
-                assert not value > hi, (expression, point[:, k])
-
-
-def test_points_stay_tight() -> None:
-    """A point's enclosure is wider than the point by rounding alone."""
-    x = Interval(np.linspace(-3, 3, 101))
-    for result in (x * x * x, x.sin(), x.cos(), 1 / (x**2 + 1), (x**2 + 1).log()):
-        assert np.max(result.hi - result.lo) < 1e-12
-
-
-def test_undefined_values_prove_nothing() -> None:
-    """Roots, logs and quotients without a value give NaN or the whole line."""
-    x = Interval(np.array([-1.0]), np.array([1.0]))
-    for result in (x.sqrt(), x.log(), x.log().sin(), (1 / x) * 0.5):
-        assert not (result.hi < 1e300).any()
-        assert not (result.lo > -1e300).any()
-
-
-def test_forward_derivatives_equal_symbolic_ones() -> None:
-    """The chain rule on the tape gives the gradient of the whole expression."""
-    a, b = sp.symbols("a b", real=True)
-    expression = sp.sin(a * b) ** 2 / (1 + a**2) + sp.cos(a * b)
-    tape = Tape()
-    output = tape.let(expression)
-    gradient = derivative_tape(tape, [a, b], output)
-    values = compile_outward(tape, [a, b], gradient)(ball(0.3), ball(-0.7))
-    for symbol, value in zip((a, b), values, strict=True):
-        expected = float(sp.diff(expression, symbol).subs({a: 0.3, b: -0.7}))
-        assert float(value.mid()) == pytest.approx(expected, rel=1e-12)
 
 
 def test_floats_count_as_the_binary_numbers_that_they_are() -> None:

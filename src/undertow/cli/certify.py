@@ -52,7 +52,7 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
     "undertow certify rotary_pendulum --run --start phi=40deg --set d_e=0.025 --out proof",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=20deg --out proof",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=10deg --hold 1",
-    "undertow certify rotary_pendulum --loop --seconds 0 --start phi=10deg --within m=5",
+    "undertow certify rotary_pendulum --loop --seconds 0 --start phi=5deg --hold 1 --within m=2",
     "undertow certify --appendix",
     "undertow certify --appendix --loop --set d_e=0.073 --out proof",
     "undertow certify model.py:make",
@@ -109,7 +109,7 @@ def certify(
     from undertow.studies import certification
 
     given = f"{name or 'no mechanism'}{' and --appendix' if appendix else ''}"
-    alone, whole = "one of them: a run has its own surfaces", "whole ms, 0 to 1000"
+    alone, whole = "one of them: a run has its own surfaces", "whole ms, 0 to 100"
     timed = seconds is None or 0 <= seconds < 1e5
     region = not run and (bool(seconds) if seconds is not None or appendix else True)
     for good, what, value, limit in (
@@ -123,7 +123,8 @@ def certify(
             "without a region and --loop",
             "an option of their proofs",
         ),
-        (0 <= hold <= 1000, "--hold", hold, whole),
+        (0 <= hold <= 100, "--hold", hold, whole),
+        (not (loop and within) or hold, "--within with --loop", "no --hold", "a held input"),
     ):
         if not good:
             raise InvalidInputError(what, value=value, limit=limit)

@@ -1,10 +1,10 @@
 """Certificates: claims about a surface, a region or the closed loop, each with its verdict.
 
-``kernel`` decides; ``intervals`` and ``closed_loop`` what it does not yet: a held input, a plant in
-a box, the appendix's cases.  ``claims`` has a file for each kind of claim and reads, writes and
-verifies certificates; what ``search`` finds is trusted nowhere.  The admission gate
-(:mod:`undertow.proofs.gate`) and random trials (:mod:`undertow.proofs.sampled`) prove less.  Needs
-the extra ``undertow[certify]`` (python-flint, Clarabel), imported when first used.
+``kernel`` decides; ``intervals`` the appendix's cases, which it does not yet.  ``claims`` has a
+file for each kind of claim and reads, writes and verifies certificates; what ``search`` finds is
+trusted nowhere.  The admission gate (:mod:`undertow.proofs.gate`) and random trials
+(:mod:`undertow.proofs.sampled`) prove less.  Needs the extra ``undertow[certify]`` (python-flint,
+Clarabel), imported when first used.
 """
 
 from undertow.base.verdict import Verdict
@@ -17,7 +17,6 @@ from undertow.proofs.claims.certificate import (
 )
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.closed_loop import LoopClaim
-from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.claims.nonsingular import NonsingularClaim, nonsingular, singular_distance
 from undertow.proofs.claims.reaching import (
     DisturbanceBound,
@@ -34,7 +33,6 @@ from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.sampled import box_starts, sampled_extent, sampled_region
 from undertow.proofs.search.closed_loop import ProvedLoop, prove_loop
-from undertow.proofs.search.loop_draft import DraftedLoop, draft_loop
 from undertow.proofs.search.region import ProvedRegion, prove_region
 from undertow.proofs.search.terminal_ellipsoid import search_for, terminal_sets
 
@@ -45,9 +43,7 @@ __all__ = [
     "Claim",
     "ClosedLoopProgram",
     "DisturbanceBound",
-    "DraftedLoop",
     "LoopClaim",
-    "LoopDraft",
     "LyapunovFunction",
     "NonsingularClaim",
     "Policy",
@@ -66,7 +62,6 @@ __all__ = [
     "box_starts",
     "certified_gate",
     "check_settings",
-    "draft_loop",
     "hurwitz",
     "nonsingular",
     "prove_loop",

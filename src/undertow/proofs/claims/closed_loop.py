@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -77,8 +78,16 @@ class LoopClaim(Claim):
         ends = np.array([[float(v) for v in starts.get(x, (0, 0))] for x in model.states])
         return np.asarray(ends * (1 - 1e-15))
 
-    def terminal(self, mechanism: Mechanism) -> tuple[FloatArray, float]:
-        """Return W, (2n, 2n), and ρ of the set in which its motions end.
+    @property
+    def period(self) -> float:
+        """How long the input is held, s; 0: it is renewed at every instant."""
+        return float(Fraction(self.data["period"]))
+
+    def terminal(self, mechanism: Mechanism, surface: Surface) -> tuple[FloatArray, float]:
+        """Return W, (2n, 2n), and ρ of the set |W x| ≤ ρ in which its motions end.
+
+        With a held input the set is one of (q, p, s), which is linear in x near the target only:
+        then W is of that.
 
         Raises
         ------
@@ -88,7 +97,11 @@ class LoopClaim(Claim):
         end = self._own(model_of(mechanism)).terminal
         if end is None:
             raise InvalidInputError("claim of a closed loop", value="no terminal set in its hint")
-        return np.array(end.W, dtype=float), float(end.radius)
+        W, n, m = np.array(end.W, dtype=float), mechanism.n, mechanism.m
+        if self.period:
+            momenta = np.hstack([np.zeros((n - m, n)), mechanism.M(np.zeros(n))[m:]])
+            W = W @ np.vstack([np.eye(n, 2 * n), momenta, surface.matrix])
+        return W, float(end.radius)
 
     def proved_set(
         self, mechanism: Mechanism, surface: Surface, law: ReachingLaw

@@ -23,7 +23,6 @@ from undertow.proofs.claims.certificate import Certificate, StatedClaim, Subject
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.document import decide_document
-from undertow.proofs.claims.loop_draft import LoopDraft
 from undertow.proofs.claims.model_data import model_data
 from undertow.proofs.claims.nonsingular import NonsingularClaim
 from undertow.proofs.claims.reaching import ReachingClaim
@@ -43,7 +42,6 @@ CLAIMS: Mapping[str, type[Claim]] = {
         RegionClaim,
         TerminalEllipsoid,
         LoopClaim,
-        LoopDraft,
         AppendixClaim,
     )
 }

@@ -66,9 +66,3 @@ def is_odd(
     flip = {x: -x for x in symbols}
     rest = [e - e.xreplace(flip) for e in even] + [e + e.xreplace(flip) for e in odd]
     return all(sp.expand(e) == 0 for e in rest)
-
-
-def vanishes(expressions: Iterable[sp.Expr], at: Iterable[sp.Symbol]) -> bool:
-    """Whether exact expressions are shown to be 0 where some symbols are, for all others."""
-    origin = dict.fromkeys(at, sp.Integer(0))
-    return all(sp.simplify(sp.sympify(e).subs(origin)) == 0 for e in expressions)

@@ -1,11 +1,7 @@
-"""Outward-rounded evaluation of expressions: balls (python-flint) and batches of intervals.
+"""Outward-rounded evaluation of expressions in python-flint's ``arb``, balls of any precision.
 
 A tape becomes a Python function that uses nothing but ``+ - * / **`` and methods such as
-``.sin()``; it runs on any number type that has them:
-
-* python-flint's ``arb``: a ball of any precision that contains the true value;
-* :class:`undertow.proofs.intervals.batch.Interval`: a batch of intervals in NumPy float64, for
-  branch and bound.
+``.sin()``.
 """
 
 from __future__ import annotations
@@ -13,15 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import sympy as sp
 
 from undertow.base.errors import InvalidInputError, MissingExtraError
 from undertow.symbolic import Tape
-from undertow.symbolic.tape import Assignment
 
-#: One call's arguments and results: arb balls, or Intervals.
+#: One call's arguments and results: arb balls.
 OutwardFunction = Callable[..., list[Any]]
 
 
@@ -81,29 +76,7 @@ def exact_fraction(expression: sp.Expr) -> Fraction:
     raise InvalidInputError("exact value", value=str(expression), limit="a rational number")
 
 
-# -- expressions to functions of outward-rounded numbers ---------------------------------
-
-
-class Arithmetic(Protocol):
-    """Makes the constants of one number type."""
-
-    def rational(self, value: Fraction) -> Any:
-        """Return an enclosure of a rational number."""
-
-    def pi(self) -> Any:
-        """Return an enclosure of π."""
-
-
-class BallArithmetic:
-    """Constants as arb balls, at the precision set in ``flint.ctx``."""
-
-    def rational(self, value: Fraction) -> Any:
-        """Return an arb."""
-        return ball(value)
-
-    def pi(self) -> Any:
-        """Return an arb."""
-        return flint().arb.pi()
+# -- expressions to functions of balls -------------------------------------------------------
 
 
 _METHODS = {
@@ -120,8 +93,7 @@ _METHODS = {
 class _Printer:
     """SymPy to source made of operators and methods; constants are collected apart."""
 
-    def __init__(self, arithmetic: Arithmetic, names: dict[sp.Symbol, str]) -> None:
-        self.arithmetic = arithmetic
+    def __init__(self, names: dict[sp.Symbol, str]) -> None:
         self.names = names
         self.constants: dict[str, Any] = {}
 
@@ -137,9 +109,9 @@ class _Printer:
         if e.is_Rational or e.is_Float:
             value = exact_fraction(e)
             key = f"c{value.numerator}_{value.denominator}".replace("-", "m")
-            return self.constant(key, self.arithmetic.rational(value))
+            return self.constant(key, ball(value))
         if e is sp.pi:
-            return self.constant("c_pi", self.arithmetic.pi())
+            return self.constant("c_pi", flint().arb.pi())
         if e.is_Add:
             return "(" + " + ".join(self.text(a) for a in e.args) + ")"
         if e.is_Mul:
@@ -182,9 +154,8 @@ def compile_outward(
     tape: Tape,
     inputs: Sequence[sp.Symbol],
     outputs: Sequence[sp.Expr],
-    arithmetic: Arithmetic | None = None,
 ) -> OutwardFunction:
-    """Return a function of ``inputs`` (arb balls by default) giving a list of ``outputs``.
+    """Return a function of ``inputs``, arb balls, giving a list of ``outputs``.
 
     Parameters
     ----------
@@ -194,21 +165,17 @@ def compile_outward(
         Symbols that stay arguments, in the order of the call.
     outputs
         Atoms of the tape, or small expressions of them.
-    arithmetic
-        Balls by default; ``IntervalArithmetic()`` for batches.
 
     Raises
     ------
     MissingExtraError
-        For balls without python-flint.
+        Without python-flint.
     InvalidInputError
         For a function that has no outward-rounded form here.
     """
-    kind = BallArithmetic() if arithmetic is None else arithmetic
-    if arithmetic is None:
-        flint()
+    flint()
     names = {s: f"a{i}" for i, s in enumerate(inputs)}
-    printer = _Printer(kind, names)
+    printer = _Printer(names)
     body = []
     for line in tape.live(outputs):
         text = printer.text(line.expression)
@@ -225,34 +192,3 @@ def compile_outward(
     scope: dict[str, Any] = dict(printer.constants)
     exec(compile(source, "<undertow outward>", "exec"), scope)
     return cast(OutwardFunction, scope["run"])
-
-
-def derivative_tape(tape: Tape, variables: Sequence[sp.Symbol], output: sp.Expr) -> list[sp.Expr]:
-    """Lay ∂output/∂variables on the same tape by forward differentiation of its lines.
-
-    The chain rule on the short lines keeps the code short where differentiating the
-    whole expression would not.
-
-    Returns
-    -------
-    list of sympy.Expr
-        One atom (or 0) per variable.
-    """
-    lines: list[Assignment] = tape.live([output])
-    gradients = []
-    for variable in variables:
-        known: dict[sp.Symbol, sp.Expr] = {variable: sp.Integer(1)}
-        for symbol, expression in lines:
-            total = sp.Integer(0)
-            for inner in sorted(expression.free_symbols & known.keys(), key=str):
-                total += sp.diff(expression, inner) * known[inner]
-            if total != 0:
-                known[symbol] = tape.let(total)
-        gradients.append(tape.let(_chain(output, known)))
-    return gradients
-
-
-def _chain(output: sp.Expr, known: dict[sp.Symbol, sp.Expr]) -> sp.Expr:
-    output = sp.sympify(output)
-    symbols = sorted(output.free_symbols & known.keys(), key=str)
-    return sum((sp.diff(output, s) * known[s] for s in symbols), sp.Integer(0))

@@ -18,7 +18,7 @@ import numpy as np
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
 from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
-from undertow.proofs.kernel.loop import Loop
+from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
 from undertow.proofs.kernel.model import (
     Algebra,
     Law,
@@ -27,6 +27,7 @@ from undertow.proofs.kernel.model import (
     Quantity,
     Sliding,
     System,
+    input_limits,
     system,
 )
 from undertow.proofs.kernel.reader import (
@@ -417,10 +418,8 @@ def ellipsoid(
 
 def ellipsoid_program(own: System) -> Program:
     """Return q̈, the demand, pivots, det B and det Γ of the loop inside the layer."""
-    q_dd, demand = own.loop(layer=True)
-    return own.graph.program(
-        [*q_dd, *demand, *own.pivots, own.B_determinant, own.gamma_determinant]
-    )
+    q_dd, demand = own.loop(own.push(layer=True))
+    return own.graph.program([*q_dd, *demand, *own.regular])
 
 
 @dataclass(frozen=True)
@@ -502,12 +501,6 @@ def _rows(law: Law) -> FloatArray:
     """C of s = C x, enclosed, (m, 2n, 2)."""
     blocks = zip(law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u, strict=True)
     return np.array([[hull(v, v) for part in row for v in part] for row in blocks])
-
-
-def input_limits(model: Model) -> FloatArray:
-    """Lower bounds of the input limits, (m,), ∞ for none."""
-    ends = [math.inf if i.value is None else hull(i.value, i.value)[0] for i in model.inputs]
-    return np.array(ends)
 
 
 # -- 5.5 ------------------------------------------------------------------------------------------
@@ -626,6 +619,9 @@ def _surface_names(model: Model) -> tuple[str, ...]:
 #: Step of the tubes where no hint gives another, s.
 STEP = Fraction(1, 128)
 
+#: States, and parameters that vary, of one loop with a held input.
+MOST_STATES = 12
+
 
 @dataclass(frozen=True)
 class ClosedLoop(Claim):
@@ -652,7 +648,9 @@ class ClosedLoop(Claim):
         require(ball == 0 or any(bounds), "a ball of 0 without a disturbance")
         fields(hint, "hint", (), {"terminal", "step", "boxes"})
         cuts = hint.get("boxes", {})
-        require(isinstance(cuts, dict) and cuts.keys() <= box.keys(), "boxes: states of the starts")
+        plant = _read_plant(data["plant"], model)
+        known = {*box, *plant}
+        require(isinstance(cuts, dict) and cuts.keys() <= known, "boxes: what varies at the start")
         require(all(isinstance(v, list) for v in cuts.values()), "boxes: lists")
         cuts = {name: numbers(v, len(v)) for name, v in cuts.items()}
         require(math.prod(1 + len(v) for v in cuts.values()) <= 20_000, "at most 20000 boxes")
@@ -662,7 +660,6 @@ class ClosedLoop(Claim):
         if terminal is not None:
             fields(terminal, "terminal", TerminalEllipsoid.keys)
             terminal = TerminalEllipsoid.read(terminal, model)
-        plant = _read_plant(data["plant"], model)
         return cls(box, period, plant, bounds, ball, terminal, cuts, step)
 
     def data(self) -> dict[str, Any]:
@@ -693,33 +690,46 @@ class ClosedLoop(Claim):
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
-        if self.period or self.plant or any(self.disturbance):
-            return "undecided", "a held input, other plants and forces: not decided here", {}, {}
+        if any(self.disturbance) or (self.plant and not self.period):
+            why = "forces, and other plants under an input that is not held: not decided here"
+            return "undecided", why, {}, {}
         if law.switching != "saturation" or any(law.disturbance) or self.terminal is None:
             why = "saturation, constant gains and a terminal set are needed"
             return "undecided", why, {}, {}
-        kind, why, _, _ = self.terminal.decide(model, law, max_boxes)
-        if kind != "proved":
-            return "undecided", f"the terminal set: {why}", {}, {}
-        box = [self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states]
-        wide = [i for i, (low, high) in enumerate(box) if low < high]
-        if wide and system(model, law).odd and all(low == -high for low, high in box):
-            box[wide[0]] = Fraction(0), box[wide[0]][1]
+        if 2 * model.n + len(self.plant) > MOST_STATES:
+            return "undecided", f"more than {MOST_STATES} states and parameters that vary", {}, {}
         try:
-            loop = Loop(model, law, self.terminal.W, self.terminal.radius)
+            loop = self._loop(model, law, self.terminal)
         except ArithmeticError as error:
             return "undecided", f"at the target: {error}", {}, {}
+        if isinstance(loop, str):
+            return "undecided", f"the terminal set: {loop}", {}, {}
+        box = {x: self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states}
+        wide = [x for x, (low, high) in box.items() if low < high]
+        if wide and system(model, law).odd and all(low == -high for low, high in box.values()):
+            box[wide[0]] = Fraction(0), box[wide[0]][1]
+        box |= {p.name: self.plant[p.name] for p in model.parameters if p.name in self.plant}
         pieces = []
-        for name, (low, high) in zip(model.states, box, strict=True):
+        for name, (low, high) in box.items():
             cuts = sorted({v for v in self.cuts.get(name, ()) if low < v < high})
             pieces.append([hull(*ends) for ends in itertools.pairwise([low, *cuts, high])])
-        end = loop.arrive(np.array([*itertools.product(*pieces)]), float(self.step))
+        end = loop.arrive(np.array([*itertools.product(*pieces)]))
         method = "validated tubes into an ellipsoid that is proved to be a terminal set"
         details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}
         if not end.all:
-            witness = dict(zip(model.states, end.lost.tolist(), strict=True))
+            witness = dict(zip(box, end.lost.tolist(), strict=True))
             return "undecided", f"{method}: a tube is lost", witness, details
         return "proved", method, {}, details
+
+    def _loop(self, model: Model, law: Law, end: TerminalEllipsoid) -> Loop | str:
+        """The loop with its terminal set, or what is not shown of that."""
+        if not self.period:
+            kind, why, _, _ = end.decide(model, law, 0)
+            own = (model, law, end.W, end.radius, self.step)
+            return why if kind != "proved" else ContinuousLoop(*own)
+        loop = HeldLoop(model, law, self.period, self.plant)
+        loop.take(end.W, end.radius)
+        return loop.terminal()[0] or loop
 
 
 # -- all of them ----------------------------------------------------------------------------------

@@ -22,9 +22,9 @@ import numba
 import numpy as np
 
 __all__ = ["ABS", "ADD", "BINARY", "COS", "DIV", "EXP", "LOG", "MAX", "MIN", "MUL", "NEG", "PI",
-           "SIN", "SQR", "SQRT", "SUB", "add", "along", "apply", "ellipsoid", "enclose", "excluded",
-           "hulled", "inverse", "jets", "mean_values", "models", "norm", "ranges", "reached",
-           "taylor_step", "up"]  # fmt: skip
+           "SIN", "SQR", "SQRT", "SUB", "add", "along", "apply", "carried", "decrease", "ellipsoid",
+           "enclose", "excluded", "hulled", "inverse", "jets", "mean_values", "models", "norm",
+           "ranges", "reached", "taylor_step", "up"]  # fmt: skip
 
 
 #: Operations of code; those that take two operands; SIN and COS name each other as the second.
@@ -447,20 +447,20 @@ def _line(J, op, r, k, a, b):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def jets(code, constants, low, high, rates, order, variables):  # type: ignore[no-untyped-def]
+def jets(code, constants, low, high, rates, order, seeds):  # type: ignore[no-untyped-def]
     """Run code over one box: the jets of all registers, (R, order + 1, 1 + V, 2).
 
-    Registers are the inputs, the constants, then one for each line of code.  The first
-    ``variables`` inputs are differentiated by.  ``rates`` are the registers of ẋ for the first
-    inputs x, whose coefficients follow from x' = ẋ; other inputs are constant.
+    Registers are the inputs, the constants, then one for each line of code.  ``seeds`` (S, V, 2)
+    are the derivatives of the first inputs by V variables.  ``rates`` are the registers of ẋ for
+    the first inputs x, whose coefficients follow from x' = ẋ; other inputs are constant.
     """
     inputs, first = len(low), len(low) + len(constants)
     total = first + len(code)
-    J = np.zeros((total, order + 1, 1 + variables, 2))
+    J = np.zeros((total, order + 1, 1 + seeds.shape[1], 2))
     for i in range(inputs):
         J[i, 0, 0, 0], J[i, 0, 0, 1] = low[i], high[i]
-        if i < variables:
-            J[i, 0, 1 + i] = 1.0
+        if i < len(seeds):
+            J[i, 0, 1:] = seeds[i]
     for i in range(len(constants)):
         J[inputs + i, 0, 0] = constants[i]
     for k in range(order + 1):
@@ -588,6 +588,16 @@ def reached(X, rates, h):  # type: ignore[no-untyped-def]
 
 
 @_njit
+def carried(end, part, h):  # type: ignore[no-untyped-def]
+    """One step of Horner's scheme: h · end + part, all (N, 2), h (2,)."""
+    out = np.empty_like(end)
+    for i in range(len(end)):
+        a, b = mul(end[i, 0], end[i, 1], h[0], h[1])
+        out[i, 0], out[i, 1] = add(a, b, part[i, 0], part[i, 1])
+    return out
+
+
+@_njit
 def along(whole, centre, C, xi, Q, r, moved):  # type: ignore[no-untyped-def]
     """Values at m + C ξ + Q r + moved (N, 1, 2), by their intervals and their mean values, (O, 2).
 
@@ -648,16 +658,17 @@ def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-unt
 
     ``rest`` (N, 2) is the last coefficient over a box that motions stay in, ``centre`` (N, K, 2)
     the others at m, ``around`` (N, K, 1 + N, 2) the others over the set with their derivatives.
-    C (N, L) and Q (N, N) are doubles, ξ (L, 1, 2) and r (N, 1, 2) boxes.
+    C (N, L) and Q (N, N) are doubles, ξ (L, 1, 2) and r (N, 1, 2) boxes, h (2,) is
+    an interval.
     """
     n = len(m)
     end, S = rest.copy(), np.zeros((n, n, 2))
     for k in range(centre.shape[1] - 1, -1, -1):  # Horner in h; the remainder comes first
         for i in range(n):
-            a, b = mul(end[i, 0], end[i, 1], h, h)
+            a, b = mul(end[i, 0], end[i, 1], h[0], h[1])
             end[i, 0], end[i, 1] = add(a, b, centre[i, k, 0], centre[i, k, 1])
             for j in range(n):
-                a, b = mul(S[i, j, 0], S[i, j, 1], h, h)
+                a, b = mul(S[i, j, 0], S[i, j, 1], h[0], h[1])
                 c, d = around[i, k, 1 + j]
                 S[i, j, 0], S[i, j, 1] = add(a, b, c, d)
     if not (np.isfinite(end).all() and np.isfinite(S).all()):
@@ -682,6 +693,31 @@ def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-unt
 
 
 # -- a terminal ellipsoid -------------------------------------------------------------------------
+
+
+@_njit
+def decrease(A, held):  # type: ignore[no-untyped-def]
+    """Dominance of −(A + Aᵀ), or of −(A + Aᵀ + AᵀA) if held: > 0 proves it positive definite.
+
+    A (N, N, 2) is W J W⁻¹ with the derivative J of ẋ, or of x(T) − x(0).
+    """
+    size = len(A)
+    S, scale = np.empty((size, size, 2)), np.ones(size)
+    square = product(np.ascontiguousarray(A.transpose(1, 0, 2)), A)
+    for i in range(size):
+        for j in range(size):
+            a, b = add(A[i, j, 0], A[i, j, 1], A[j, i, 0], A[j, i, 1])
+            if held:
+                a, b = add(a, b, square[i, j, 0], square[i, j, 1])
+            S[i, j, 0], S[i, j, 1] = -b, -a
+        middle = 0.5 * (S[i, i, 0] + S[i, i, 1])
+        if middle > 1e-100:
+            scale[i] = 1.0 / math.sqrt(middle)
+    for i in range(size):  # a congruence with a positive diagonal: any will do
+        for j in range(size):
+            a, b = mul(S[i, j, 0], S[i, j, 1], scale[i], scale[i])
+            S[i, j, 0], S[i, j, 1] = mul(a, b, scale[j], scale[j])
+    return dominance(S)
 
 
 @_njit
@@ -711,20 +747,7 @@ def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no
     for i in range(n):
         F[i, n + i] = 1.0
         F[n + i] = whole[i, 1:]
-    A = product(product(W, F), V)
-    S, scale = np.empty((size, size, 2)), np.ones(size)
-    for i in range(size):
-        for j in range(size):
-            a, b = add(A[i, j, 0], A[i, j, 1], A[j, i, 0], A[j, i, 1])
-            S[i, j, 0], S[i, j, 1] = -b, -a
-        middle = 0.5 * (S[i, i, 0] + S[i, i, 1])
-        if middle > 1e-100:
-            scale[i] = 1.0 / math.sqrt(middle)
-    for i in range(size):  # a congruence with a positive diagonal: any will do
-        for j in range(size):
-            a, b = mul(S[i, j, 0], S[i, j, 1], scale[i], scale[i])
-            S[i, j, 0], S[i, j, 1] = mul(a, b, scale[j], scale[j])
-    margin = dominance(S)
+    margin = decrease(product(product(W, F), V), False)
     return (0 if margin > 0.0 else 5), margin
 
 

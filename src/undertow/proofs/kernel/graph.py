@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
 
-_NOWHERE: Mapping[int, int] = {}
-_NONE = np.empty(0, dtype=np.int64)
+NOWHERE: Mapping[int, int] = {}
+_NONE, _NO_SEEDS = np.empty(0, dtype=np.int64), np.empty((0, 0, 2))
 
 FloatArray = NDArray[np.float64]
 Node = tuple[Any, ...]
@@ -143,19 +143,20 @@ class Program:
 
     def __call__(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
         """Enclose over a box (inputs,): values and derivatives by the first, (O, 1 + V, 2)."""
-        jets = ops.jets(self.code, self.constants, low, high, _NONE, 0, variables)
+        seeds = ops.points(np.eye(variables))
+        jets = ops.jets(self.code, self.constants, low, high, _NONE, 0, seeds)
         return np.asarray(jets[self.outputs, 0])
 
     def series(
-        self, low: FloatArray, high: FloatArray, order: int, variables: int = 0
+        self, low: FloatArray, high: FloatArray, order: int, seeds: FloatArray = _NO_SEEDS
     ) -> FloatArray:
         """Enclose Taylor coefficients of motions ẋ = outputs of the first N inputs.
 
-        Returns (N, order + 1, 1 + variables, 2): each with its derivatives by where the motion
-        passes at time 0.
+        Returns (N, order + 1, 1 + V, 2): each with its derivatives by V variables; ``seeds``,
+        (S, V, 2), are those of the first inputs at time 0.
         """
         rates = self.outputs
-        jets = ops.jets(self.code, self.constants, low, high, rates, order, variables)
+        jets = ops.jets(self.code, self.constants, low, high, rates, order, seeds)
         return np.asarray(jets[: len(rates)])
 
 
@@ -248,7 +249,7 @@ class Graph:
         """Return min(max(a, −limit), limit)."""
         return self.make("min", self.make("max", a, self.make("neg", limit)), limit)
 
-    def depends(self, roots: Iterable[int], sides: Mapping[int, int] = _NOWHERE) -> list[int]:
+    def depends(self, roots: Iterable[int], sides: Mapping[int, int] = NOWHERE) -> list[int]:
         """Return the nodes that some depend on, in order, themselves included."""
         needed, todo = set[int](), list(roots)
         while todo:
@@ -262,12 +263,19 @@ class Graph:
         node = self.nodes[k]
         return [] if node[0] in ("input", "number", "pi") else [int(v) for v in node[1:]]
 
-    def tangents(self, roots: Sequence[int], seeds: Mapping[int, int]) -> list[int]:
-        """Return derivatives of nodes along seeds (node to its derivative), by the chain rule."""
+    def tangents(
+        self, roots: Sequence[int], seeds: Mapping[int, int], sides: Mapping[int, int] = NOWHERE
+    ) -> list[int]:
+        """Return derivatives of nodes along seeds (node to its derivative), by the chain rule.
+
+        ``sides`` has an operand for a max or min: the one that it is known to be.
+        """
         known = dict(seeds)
-        for k in self.depends(roots):
+        for k in self.depends(roots, sides):
             operands = self._operands(k)
-            if k in known or not any(j in known for j in operands):
+            if k in sides and sides[k] in known:
+                known[k] = known[sides[k]]
+            if k in known or k in sides or not any(j in known for j in operands):
                 continue
             pairs = zip(self._slopes(k), operands, strict=True)
             known[k] = self.sum(self.make("mul", s, known[j]) for s, j in pairs if j in known)
@@ -342,7 +350,7 @@ class Graph:
         """Return the max and min that nodes depend on."""
         return [k for k in self.depends(roots) if self.nodes[k][0] in ("max", "min")]
 
-    def program(self, roots: Sequence[int], sides: Mapping[int, int] = _NOWHERE) -> Program:
+    def program(self, roots: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
         """Lower what some nodes depend on; every input stays one.
 
         ``sides`` has an operand for a max or min: the one that it is known to be.

@@ -1,22 +1,27 @@
-"""The closed loop from boxes of starts: tubes of (q, p, s) that end in a terminal ellipsoid.
+"""The closed loop from boxes of starts: tubes of (q, p, s) that end in a terminal set.
 
-Coordinates and rates are those of Lemma 8 of ``docs/certificate-format.md``.
+Coordinates and rates are those of Lemmas 8 and 10 of ``docs/certificate-format.md``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import FloatArray, hull
-from undertow.proofs.kernel.model import Law, Matrix, Model, System, system
-from undertow.proofs.kernel.tube import Field, Tube
+from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
+from undertow.proofs.kernel.model import Law, Matrix, Model, System, input_limits, scale_of, system
+from undertow.proofs.kernel.tube import Field, Held, Tube
 
-#: Steps of one tube, and of all before the checker gives up; the thinnest part of the starts.
-LONGEST, MOST_STEPS, THINNEST = 2000, 500_000, 2.0**-16
+#: Longest motion, s; steps of one tube, and of all before the checker gives up.
+LONGEST, MOST_OF_ONE, MOST_STEPS = 15.625, 50_000, 500_000
+
+#: The thinnest part of the starts; parts of a box of plants before a terminal set is not shown.
+THINNEST, MOST_PLANTS = 2.0**-16, 512
 
 
 @dataclass(frozen=True)
@@ -31,62 +36,213 @@ class Arrival:
 
 
 class Loop:
-    """One closed loop, and the set {|W x| ≤ radius} that its motions are to enter."""
+    """One closed loop, and the set {|W z| ≤ ρ} that its motions are to enter.
 
-    def __init__(self, model: Model, law: Law, W: Matrix, radius: Fraction) -> None:
-        own, plain = System(model, law, momenta=True), system(model, law)
-        graph = own.graph
-        self.field, self.fixed = Field(graph, own.sliding()), own.fixed()
-        rows = [
-            graph.sum(
-                graph.make("mul", graph.number(w), x) for w, x in zip(row, own.x, strict=True)
-            )
-            for row in W
-        ]
-        self.rows, self.radius = graph.program(rows), hull(radius, radius)[0]
-        self.regular = graph.program([*own.pivots, own.B_determinant, own.gamma_determinant])
-        self.coordinates = plain.graph.program(plain.momentum_and_surface())
+    Attributes
+    ----------
+    field, fixed, step
+        How states move, inputs of its graph besides them, (F, 2), and by how much at once, s.
+    coordinates
+        States, by a start.
+    rows, radius
+        W z, and the ends of ρ.
+    """
 
-    def inside(self, tube: Tube) -> bool:
-        """Whether a set of (q, p, s) lies in the set that is to be entered."""
-        return bool(ops.norm(tube.image(self.rows)) <= self.radius)
+    model: Model
+    field: Field | Held
+    fixed: FloatArray
+    step: FloatArray
+    coordinates: Program
+    regular: Program
+    rows: Program
+    radius: tuple[float, float]
 
-    def follow(self, box: FloatArray, step: float) -> tuple[int, bool]:
-        """Return how many steps a tube from a box of x (2n, 2) takes, and whether it arrives."""
-        tube = Tube.of(self.field, self.fixed, box)
-        if not tube.map(self.coordinates):
-            return 0, False
-        pivots = len(self.regular.outputs) - 2
-        for k in range(LONGEST):
-            if self.inside(tube):
+    def tube(self, box: FloatArray) -> Tube:
+        """Return a box of starts, (N, 2)."""
+        return Tube.of(self.fixed, box)
+
+    def advance(self, tube: Tube) -> bool:
+        """Move a set on by a step; whether it stays where model and law are regular."""
+        if isinstance(self.field, Held):
+            stay = self.field.advance(tube, self.step)
+            return stay is not None and self.kept(stay, self.field.fixed())
+        stay = self.field.advance(tube, float(self.step[1]))
+        return stay is not None and self.kept(stay, self.fixed)
+
+    def kept(self, stay: FloatArray, fixed: FloatArray) -> bool:
+        """Whether model and law are regular on a box."""
+        low, high = np.vstack([stay, fixed]).T.copy()
+        ends = self.regular(low, high)[:, 0].reshape(-1, self.model.n + 2, 2)
+        kept = (ends[..., 0] > 0.0) | (ends[..., 1] < 0.0)
+        return bool(kept.all() and (ends[:, :-2, 0] > 0.0).all())
+
+    def aim(self, graph: Graph, x: Sequence[int], W: Matrix, radius: Fraction) -> None:
+        """Take {|W x| ≤ radius} as the set."""
+        self.W, self.radius = (
+            np.array([[hull(v, v) for v in row] for row in W]),
+            hull(radius, radius),
+        )
+        make, number = graph.make, graph.number
+        parts = [[make("mul", number(w), k) for w, k in zip(row, x, strict=True)] for row in W]
+        self.rows = graph.program([graph.sum(row) for row in parts])
+
+    def follow(self, box: FloatArray) -> tuple[int, bool]:
+        """Return how many steps a tube from a box of starts (N, 2) takes, and whether it ends."""
+        tube, most = self.tube(box), min(LONGEST / self.step[1], MOST_OF_ONE)
+        good, k = tube.map(self.coordinates), 0
+        while good and k <= most:
+            if ops.norm(tube.image(self.rows)) <= self.radius[0]:
                 return k, True
-            stay = tube.advance(step)
-            if stay is None:
-                return k, False
-            low, high = np.vstack([stay, self.fixed]).T.copy()
-            ends = self.regular(low, high)[:, 0]
-            kept = (ends[:, 0] > 0.0) | (ends[:, 1] < 0.0)
-            if not (kept.all() and (ends[:pivots, 0] > 0.0).all()):
-                return k, False
-        return LONGEST, False
+            good, k = self.advance(tube), k + 1
+        return k, False
 
-    def arrive(self, boxes: FloatArray, step: float) -> Arrival:
-        """Follow boxes (K, 2n, 2), halved across the relatively widest side where they are lost."""
+    def arrive(self, boxes: FloatArray) -> Arrival:
+        """Follow boxes (K, N, 2), halved across the relatively widest side where they are lost."""
         size = np.maximum(boxes[..., 1].max(axis=0) - boxes[..., 0].min(axis=0), 1e-300)
-        todo, tubes, steps, latest = [*boxes], 0, 0, 0
+        todo, tubes, steps, latest, unit = [*boxes], 0, 0, 0, float(self.step[1])
         while todo:
             part, tubes = todo.pop(), tubes + 1
-            taken, there = self.follow(part, step)
+            taken, there = self.follow(part)
             steps += taken
             if there:
                 latest = max(latest, taken)
                 continue
             width = part[:, 1] - part[:, 0]
             at = int((width / size).argmax())
-            middle = 0.5 * part[at, 0] + 0.5 * part[at, 1]
             if steps > MOST_STEPS or not width[at] > size[at] * THINNEST:
-                return Arrival(False, part.mean(axis=1), tubes, steps, latest * step)
-            lower, upper = part.copy(), part.copy()
-            lower[at, 1] = upper[at, 0] = middle
-            todo += [lower, upper]
-        return Arrival(True, np.empty(0), tubes, steps, latest * step)
+                return Arrival(False, part.mean(axis=1), tubes, steps, latest * unit)
+            todo += _halves(part, at)
+        return Arrival(True, np.empty(0), tubes, steps, latest * unit)
+
+
+class ContinuousLoop(Loop):
+    """The loop whose input is renewed at every instant, and {|W x| ≤ radius}."""
+
+    def __init__(self, model: Model, law: Law, W: Matrix, radius: Fraction, step: Fraction) -> None:
+        own, plain = System(model, law, momenta=True), system(model, law)
+        self.model = model
+        self.field, self.fixed = Field(own.graph, own.sliding()), own.fixed()
+        self.step = np.full(2, float(step))
+        self.aim(own.graph, own.x, W, radius)
+        self.regular = own.graph.program(own.regular)
+        self.coordinates = plain.graph.program(plain.momentum_and_surface())
+
+
+class HeldLoop(Loop):
+    """The loop with a held input and a plant in a box: states are (q, p, s) and what varies."""
+
+    def __init__(
+        self,
+        model: Model,
+        law: Law,
+        period: Fraction,
+        plant: Mapping[str, tuple[Fraction, Fraction]],
+    ) -> None:
+        n, m = model.n, model.m
+        self.size, self.model, self.law = 2 * n, model, law
+        varied = [p for p in model.parameters if p.name in plant]
+        self.varied, self.plant = [p.name for p in varied], [plant[p.name] for p in varied]
+        states = 2 * n + len(varied)
+        graph, start = Graph(states + states * (states + m) + m), Graph(states)
+        self.graph, self.start = graph, start
+
+        def lay(graph: Graph, momenta: bool) -> System:
+            own = dict(zip(varied, graph.inputs[2 * n : states], strict=True))
+            p = [own[k] if k in own else graph.number(k.value or 0) for k in model.parameters]
+            leaves = [*graph.inputs[: 2 * n], *p]
+            return System(model, law, momenta=momenta, graph=graph, leaves=leaves)
+
+        at, plain = lay(graph, True), lay(start, False)
+        p_hat = [graph.number(p.value or 0) for p in model.parameters]
+        known = System(model, law, graph=graph, leaves=[*at.x, *p_hat])
+        known.s = at.s  # the coordinate itself
+        renewed = known.loop(known.push(layer=False))[1]
+        clipped = [
+            d if i.value is None else graph.clip(d, graph.number(i.value))
+            for d, i in zip(renewed, model.inputs, strict=True)
+        ]
+        self.rates = [*at.sliding(graph.inputs[-m:]), *([graph.number(0)] * len(varied))]
+        self.field = self.held = Held(graph, self.rates, clipped)
+        self.fixed, self.step = np.empty((0, 2)), np.array(hull(period, period))
+        self.demand = known.loop(known.push(layer=True))[1]
+        self.inside = self.held.by_states(self.demand)
+        self.regular = graph.program([*at.regular, *known.regular])
+        self.coordinates = start.program([*plain.momentum_and_surface(), *start.inputs[2 * n :]])
+
+    def take(self, W: Matrix, radius: Fraction) -> None:
+        """Take {|W (q, D p, s)| ≤ radius} as the set."""
+        n, m = self.model.n, self.model.m
+        scale = [*([Fraction(1)] * n), *scale_of(self.model), *([Fraction(1)] * m)]
+        W = tuple(tuple(w * c for w, c in zip(row, scale, strict=True)) for row in W)
+        self.aim(self.start, self.start.inputs[: self.size], W, radius)
+
+    @cached_property
+    def no_equilibrium(self) -> str:
+        """Why the target is not shown to be at rest with u = 0 for every plant, if it is not."""
+        rest = [Span(0)] * (len(self.graph.inputs) - self.size - len(self.plant))
+        at = [*([Span(0)] * self.size), *(Span(*ends) for ends in self.plant), *rest]
+        try:
+            values = self.graph.exact([*self.rates, *self.demand], at)
+        except ArithmeticError as error:
+            return f"at the target: {error}"
+        return "" if all(v.zero for v in values) else "f(0, 0) = 0 is not shown exactly"
+
+    def terminal(self) -> tuple[str, float]:
+        """Decide Lemma 11 of the set: what is not shown, or nothing, and a margin."""
+        if self.no_equilibrium:
+            return self.no_equilibrium, -np.inf
+        V, least = ops.inverse(self.W), np.inf
+        half = np.array([ops.up(ops.norm(row) * self.radius[1]) for row in V])
+        if not np.isfinite(half).all():
+            return "W is not shown to be invertible", -np.inf
+        if not (half[self.size - self.model.m :] <= [hull(v, v)[0] for v in self.law.layer]).all():
+            return "the boundary layer is left", -np.inf
+        whole = np.array([hull(*ends) for ends in self.plant]).reshape(-1, 2)
+        box, todo, tried = np.column_stack([-half, half]), [whole], 0
+        while todo:
+            part, tried = todo.pop(), tried + 1
+            why, margin = self._contracts(V, np.vstack([box, part]))
+            if not why:
+                least = min(least, margin)
+                continue
+            if not len(part) or tried > MOST_PLANTS:
+                return why, margin
+            width = (part[:, 1] - part[:, 0]) / (whole[:, 1] - whole[:, 0] + 1e-300)
+            todo += _halves(part, int(width.argmax()))
+        return "", least
+
+    def slopes(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z = 0 at the middle of plants, and the demand's derivative on X: (m, N, 2)."""
+        m, (a, b) = self.model.m, X.T.copy()
+        middle = np.append(np.zeros(self.size), X[self.size :].mean(axis=1))
+        low, high = np.vstack([X, self.held.fixed()]).T.copy()
+        over = self.inside(low, high, len(X))
+        low[: len(X)] = high[: len(X)] = middle
+        own = ops.mean_values(over, self.inside(low, high)[:, 0], a, b, middle)[0]
+        return middle, own[m:].reshape(m, len(X), 2)
+
+    def _contracts(self, V: FloatArray, X: FloatArray) -> tuple[str, float]:
+        """Decide Lemma 11 for a part of the plants: X (N, 2) is a box around the set, and it."""
+        size, (middle, L) = self.size, self.slopes(X)
+        rows = ops.product(L[:, :size].copy(), V)
+        most = np.array([ops.up(ops.norm(row) * self.radius[1]) for row in rows])
+        if not (most <= input_limits(self.model)).all():
+            return "an input limit is met", -np.inf
+        u, zero = np.column_stack([-most, most]), np.zeros((len(most), 2))
+        found = self.held.derivative(X, u, middle, zero, L, self.step)
+        if found is None:
+            return "motions over a period have no bounds", -np.inf
+        if not self.kept(found[1], self.held.fixed()):
+            return "model and law are not shown to be regular", -np.inf
+        E = found[0][:size, :size].copy()
+        for i in range(size):
+            E[i, i] = ops.add(*E[i, i], -1.0, -1.0)
+        margin = ops.decrease(ops.product(ops.product(self.W, E), V), True)
+        return ("" if margin > 0.0 else "|W z| is not shown to fall"), margin
+
+
+def _halves(box: FloatArray, at: int) -> list[FloatArray]:
+    """Return a box (N, 2) cut across one side."""
+    lower, upper = box.copy(), box.copy()
+    lower[at, 1] = upper[at, 0] = 0.5 * box[at, 0] + 0.5 * box[at, 1]
+    return [lower, upper]

@@ -5,6 +5,7 @@ Formulas and Lemmas 1 and 2 of ``docs/certificate-format.md``, section 4.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -225,8 +226,9 @@ class System:
     """The plant and the law on one graph: everything that claims are about.
 
     The inputs are x = (q, q̇), then the parameters, then, where ``law`` is None, the numbers of
-    a law as :attr:`Law.numbers` gives them; else they are exact in the graph.  With ``momenta``
-    the first inputs are (q, p, s) instead, and ``x`` are nodes of them.
+    a law as :attr:`Law.numbers` gives them; else they are exact in the graph.  ``leaves`` are other
+    nodes for x and the parameters, of their own ``graph``.  With ``momenta`` the first of them are
+    (q, p, s) instead, and ``x`` are nodes of them.
     """
 
     def __init__(
@@ -236,13 +238,18 @@ class System:
         switching: str = "saturation",
         disturbance: Sequence[Fraction] = (),
         momenta: bool = False,
+        graph: Graph | None = None,
+        leaves: Sequence[int] = (),
     ) -> None:
         n, m = model.n, model.m
         self.model, self.law = model, law
         self.switching = law.switching if law is not None else switching
         bounds = law.disturbance if law is not None else disturbance
         fixed = 2 * n + len(model.parameters)
-        self.graph = graph = Graph(fixed + (2 * m * n + 2 * m if law is None else 0))
+        if graph is None:
+            graph = Graph(fixed + (2 * m * n + 2 * m if law is None else 0))
+            leaves = graph.inputs[:fixed]
+        self.graph = graph
         nodes = graph.inputs[fixed:] if law is None else [graph.number(v) for v in law.numbers]
         given = iter(nodes)
 
@@ -252,8 +259,8 @@ class System:
         self.alpha_a, self.lambda_a = block(m, m), block(m, m)
         self.alpha_u, self.lambda_u = block(m, n - m), block(m, n - m)
         self.eta, self.layer = block(1, m)[0], block(1, m)[0]
-        self.x = graph.inputs[: 2 * n]
-        self.M, self.f, self.B = model.lay(graph)
+        self.x = list(leaves[: 2 * n])
+        self.M, self.f, self.B = model.lay(graph, leaves)
         self.algebra = algebra = Algebra(graph)
         M_aa, self.M_au = [r[:m] for r in self.M[:m]], [r[m:] for r in self.M[:m]]
         self.M_ua, M_uu = [r[:m] for r in self.M[m:]], [r[m:] for r in self.M[m:]]
@@ -267,14 +274,14 @@ class System:
         self.B_adjugate, self.B_determinant = algebra.adjugate(self.B)
         self.bounds = [graph.number(v) for v in bounds]
         if momenta:
-            self._slide(graph.inputs)
+            self._slide(leaves)
 
-    def _slide(self, z: list[int]) -> None:
+    def _slide(self, z: Sequence[int]) -> None:
         """Take the inputs for (q, p, s): q̇ from M_ua v_a + M_uu v_u = D p, and s."""
         graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
         p = [graph.make("mul", d, v) for d, v in zip(self.scale, z[n : 2 * n - m], strict=True)]
         y = algebra.solve(self.uu, self._column(p))
-        self.s = z[2 * n - m : 2 * n]
+        self.s = list(z[2 * n - m : 2 * n])
         right = algebra.each("sub", self._column(self.s), algebra.times(self.alpha_u, y))
         for A, q in ((self.lambda_a, z[:m]), (self.lambda_u, z[m:n])):
             right = algebra.each("sub", right, algebra.times(A, self._column(q)))
@@ -287,9 +294,7 @@ class System:
     @cached_property
     def scale(self) -> list[int]:
         """D, (n − m,), near the diagonal of M_uu at the target: p is of the size of a rate."""
-        m = self.model.m
-        at = self.graph.exact([self.M[i][i] for i in range(m, self.model.n)], self.origin())
-        return [self.graph.number(Fraction(float(v.low))) for v in at]
+        return [self.graph.number(v) for v in scale_of(self.model)]
 
     def momentum_and_surface(self) -> list[int]:
         """Return (q, p, s) by x."""
@@ -298,8 +303,11 @@ class System:
         p = [self.graph.make("div", a, d) for a, d in zip(p, self.scale, strict=True)]
         return [*self.x[:n], *p, *self.s]
 
-    def sliding(self) -> list[int]:
-        """Return the rates of (q, p, s) (Lemma 8), of the loop with its layer and its clip."""
+    def sliding(self, u: Sequence[int] | None = None) -> list[int]:
+        """Return the rates of (q, p, s), of the loop with its layer and its clip (Lemma 8).
+
+        With other inputs u, nodes, those of the plant with them (Lemma 10).
+        """
         graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
         make, zero, v = graph.make, graph.number(0), self.x[n:]
         speeds = dict(zip(self.x[:n], v, strict=True))
@@ -308,15 +316,24 @@ class System:
             "add", self._column(self.f[m:]), algebra.times(turned, self._column(v))
         )
         p_dot = [make("div", row[0], d) for row, d in zip(force, self.scale, strict=True)]
+        push = [zero] * m if u is not None else self.push(layer=False)
         over: Nodes = []  # d − u
-        for d, limit in zip(self.loop(layer=False)[1], self.model.inputs, strict=True):
+        for i, (d, limit) in enumerate(zip(self.loop(push)[1], self.model.inputs, strict=True)):
+            if u is not None:
+                over.append([make("sub", d, u[i])])
+                continue
             end = graph.number(limit.value or 0)
             above = make("max", make("sub", d, end), zero)
             below = make("min", make("add", d, end), zero)
             over.append([zero if limit.value is None else make("add", above, below)])
         lost = algebra.times(self.gamma, algebra.solve(self.ss, algebra.times(self.B, over)))
-        pairs = zip(self.push(layer=False), lost, strict=True)
+        pairs = zip(push, lost, strict=True)
         return [*v, *p_dot, *(make("neg", make("add", a, row[0])) for a, row in pairs)]
+
+    @property
+    def regular(self) -> list[int]:
+        """Pivots of M, which are to be > 0, then det B and det Γ, which are not to be 0."""
+        return [*self.pivots, self.B_determinant, self.gamma_determinant]
 
     @property
     def odd(self) -> bool:
@@ -391,11 +408,10 @@ class System:
             push.append(graph.make("mul", k, ratio))
         return push
 
-    def loop(self, *, layer: bool) -> tuple[list[int], list[int]]:
-        """Return q̈ (n,) and the demand d (m,) of the loop whose input is the demand."""
+    def loop(self, push: Sequence[int]) -> tuple[list[int], list[int]]:
+        """Return q̈ (n,) and the demand d (m,) of the loop whose input is it, with K σ = push."""
         graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
         make = graph.make
-        push = self.push(layer=layer)
         y = algebra.solve(self.uu, self._column(self.f[m:]))
         h = algebra.each("sub", self._column(self.f[:m]), algebra.times(self.M_au, y))
         x = self.x
@@ -423,6 +439,28 @@ class System:
         """Exact inputs at x = 0."""
         values = [Span(p.value) for p in self.model.parameters if p.value is not None]
         return [*([Span(0)] * (2 * self.model.n)), *values]
+
+
+def input_limits(model: Model) -> FloatArray:
+    """Lower bounds of the input limits, (m,), ∞ for none."""
+    ends = [math.inf if i.value is None else hull(i.value, i.value)[0] for i in model.inputs]
+    return np.array(ends)
+
+
+@lru_cache(maxsize=64)
+def scale_of(model: Model) -> tuple[Fraction, ...]:
+    """Doubles near the diagonal of M_uu at the target, (n − m,).
+
+    Raises
+    ------
+    ArithmeticError
+        Where M may not be defined there.
+    """
+    graph = Graph(2 * model.n)
+    leaves = [*graph.inputs, *(graph.number(p.value or 0) for p in model.parameters)]
+    mass, _, _ = model.lay(graph, leaves)
+    at = graph.exact([mass[i][i] for i in range(model.m, model.n)], [Span(0)] * (2 * model.n))
+    return tuple(Fraction(float(v.low)) for v in at)
 
 
 @lru_cache(maxsize=64)

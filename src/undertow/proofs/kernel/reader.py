@@ -210,11 +210,10 @@ def read_law(data: Any, model: Model) -> Law:
 
 @dataclass(frozen=True)
 class Subject:
-    """A law, the claims on it as they stand in the file, and drafts, which are not checked."""
+    """A law, and the claims on it as they stand in the file."""
 
     law: Law
     claims: tuple[Mapping[str, Any], ...]
-    drafts: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -289,13 +288,12 @@ def read(content: bytes) -> Document:
     model = read_model(data["model"])
     subjects = []
     for item in _list(data["subjects"], 1, MOST_CLAIMS):
-        fields(item, "subject", {"law", "claims"}, {"drafts"})
+        fields(item, "subject", {"law", "claims"})
         claims = _list(item["claims"], 0, MOST_CLAIMS)
         for claim in claims:
             require(isinstance(claim, dict) and "kind" in claim, "a claim with its kind")
-        drafts = _list(item.get("drafts", []), 0, MOST_CLAIMS)
-        subjects.append(Subject(read_law(item["law"], model), tuple(claims), tuple(drafts)))
-    count = sum(len(s.claims) + len(s.drafts) for s in subjects)
+        subjects.append(Subject(read_law(item["law"], model), tuple(claims)))
+    count = sum(len(s.claims) for s in subjects)
     require(1 <= count <= MOST_CLAIMS, f"{count} claims: at least one, at most {MOST_CLAIMS}")
     require(isinstance(data["made_with"], dict), "made_with: an object")
     made_with = {

@@ -8,17 +8,21 @@ order and, where no bounds are found, the step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import FloatArray, Graph, Program
+from undertow.proofs.kernel.graph import NOWHERE, FloatArray, Graph, Program
 
 #: Coefficients of a step, the part of a step that may have a corner inside, and the shortest.
 ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
+
+#: Coefficients of a step of a held input, up to a period of 1 ms and beyond.
+HELD_ORDER, LONG_ORDER = 5, 8
 
 #: Columns of C, more of which than those of the start come from corners, before a tube is lost.
 MOST_COLUMNS = 600
@@ -50,43 +54,8 @@ class Field:
             self._pieces[key] = self._graph.program(self._rates, sides)
         return self._pieces[key], bool((first | second).all())
 
-
-@dataclass
-class Tube:
-    """One set of states on its way.
-
-    Parameters
-    ----------
-    field
-        F, (N,), of its first N inputs.
-    fixed
-        Enclosures of its other inputs, (F, 2).
-    hull
-        A box around the set now, (N, 2).
-    """
-
-    field: Field
-    fixed: FloatArray
-    hull: FloatArray
-    m: FloatArray
-    C: FloatArray
-    xi: FloatArray
-    Q: FloatArray
-    r: FloatArray
-
-    @classmethod
-    def of(cls, field: Field, fixed: FloatArray, box: FloatArray) -> Self:
-        """Start from a box of doubles, (N, 2)."""
-        n = len(box)
-        middle = 0.5 * box[:, 0] + 0.5 * box[:, 1]
-        xi = np.array([ops.add(a, b, -v, -v) for (a, b), v in zip(box, middle, strict=True)])
-        return cls(
-            field, fixed, box.copy(), middle, np.eye(n), xi.reshape(n, 1, 2), np.eye(n),
-            np.zeros((n, 1, 2)),
-        )  # fmt: skip
-
-    def advance(self, h: float, order: int = ORDER) -> FloatArray | None:
-        """Move on by h, in shorter steps where one is not shown.
+    def advance(self, tube: Tube, h: float, order: int = ORDER) -> FloatArray | None:
+        """Move a set on by h, in shorter steps where one is not shown.
 
         Returns
         -------
@@ -97,10 +66,10 @@ class Tube:
         whole: FloatArray | None = None
         done, part = 0.0, 1.0
         while done < 1.0:  # parts are powers of two: h · part and their sum are exact
-            stay = self._step(h * part, order, part <= SHORT)
+            stay = self._step(tube, h * part, order, part <= SHORT)
             if stay is None:
                 part *= 0.5
-                if part < SHORTEST or self.C.shape[1] > MOST_COLUMNS:
+                if part < SHORTEST or tube.C.shape[1] > MOST_COLUMNS:
                     return None
                 continue
             if whole is None:
@@ -110,8 +79,196 @@ class Tube:
             done += part
             while part < 1.0 and done % (2.0 * part) == 0.0:
                 part *= 2.0
-        self.hull = ops.hulled(self.m, self.C, self.xi, self.Q, self.r)
         return whole
+
+    def _step(self, tube: Tube, h: float, order: int, short: bool) -> FloatArray | None:
+        """Move a set on by h; the box that motions stay in, or None where nothing is shown."""
+        X, n = tube.hull, len(tube.m)
+        stay = _stay(self.whole, X, tube.fixed, h)
+        if stay is None:
+            return None
+        rates = _ends(self.whole, stay, tube.fixed)
+        way = ops.reached(np.zeros_like(X), rates, h).reshape(n, 1, 2)
+        gaps = _around(self.gaps, stay, tube.m, tube.fixed)
+        program, decided = self.piece(ops.along(*gaps, tube.C, tube.xi, tube.Q, tube.r, way))
+        if not decided and not short:
+            return None
+        low, high = np.vstack([stay, tube.fixed]).T.copy()
+        rest = program.series(low, high, order)[:, order, 0]
+        if np.isnan(rest).any():  # a corner is inside: the short formula, Clarke's derivatives
+            order = 2
+            rest = program.series(low, high, order)[:, order, 0]
+        low[:n] = high[:n] = tube.m
+        centre = program.series(low, high, order - 1)[:, :, 0]
+        low[:n], high[:n] = X.T
+        around = program.series(low, high, order - 1, ops.points(np.eye(n)))
+        return stay if tube.move(rest, centre, around, np.array([h, h]), decided) else None
+
+
+class Held:
+    """ẋ = F(x, u), u = law(x) at the beginning of a period and the same until its end (Lemma 12).
+
+    Inputs of the graph are x (N), Y (N (N + m)), u (m): Y, the derivative of the motion by where it
+    begins and by u, moves with it.
+
+    Parameters
+    ----------
+    rates, law
+        Nodes of F (N), by x and u, and of the law (m), by x.
+    """
+
+    def __init__(self, graph: Graph, rates: Sequence[int], law: Sequence[int]) -> None:
+        self.N, self.m = N, m = len(rates), len(law)
+        self.graph, self.law, x, u = graph, law, graph.inputs[:N], graph.inputs[-m:]
+        Y = np.array(graph.inputs[N:-m]).reshape(N, N + m).T.tolist()
+        one, columns = graph.number(1), []
+        for j, column in enumerate(Y):
+            by_u = {u[j - N]: one} if j >= N else {}
+            columns.append(graph.tangents(rates, dict(zip(x, column, strict=True)) | by_u))
+        self.both = graph.program([*rates, *(c[i] for i in range(N) for c in columns)])
+        self.start = ops.points(np.eye(N, N + m)).reshape(-1, 2)
+        self.flow, self.renewed = graph.program(rates), graph.program(law)
+        self._corners, self._pieces = graph.corners(law), dict[tuple[int, ...], Program]()
+        operands = [graph.nodes[k][1:] for k in self._corners]
+        self.gaps = graph.program([graph.make("sub", a, b) for a, b in operands])
+
+    def by_states(self, nodes: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
+        """Return nodes, and their derivatives by x, row by row."""
+        one, graph = self.graph.number(1), self.graph
+        slopes = [graph.tangents(nodes, {x: one}, sides) for x in graph.inputs[: self.N]]
+        return graph.program([*nodes, *(c[i] for i in range(len(nodes)) for c in slopes)], sides)
+
+    def fixed(self, u: FloatArray | None = None) -> FloatArray:
+        """Return the inputs besides x, where Y does not matter, nor u if none is given."""
+        return np.vstack([self.start, np.zeros((self.m, 2)) if u is None else u])
+
+    def input(self, tube: Tube) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+        """Enclose the law on a set and at its m (m, 2), and its mean slopes from m (m, N, 2).
+
+        Also: whether one piece of the law is left on the set; else slopes are those of all that
+        are, for a mean may be of several.
+        """
+        none, options = self.fixed(), []
+        gaps = ops.along(*_around(self.gaps, tube.hull, tube.m, none), *tube.parts)
+        for (low, high), k in zip(gaps, self._corners, strict=True):
+            larger = 2 if self.graph.nodes[k][0] == "max" else 1  # where the gap is below 0
+            options.append([larger] if high <= 0.0 else [3 - larger] if low >= 0.0 else [1, 2])
+        pieces, slopes = [*itertools.product(*options)], list[FloatArray]()
+        for piece in pieces:
+            if piece not in self._pieces:
+                sides = {
+                    k: self.graph.nodes[k][i] for k, i in zip(self._corners, piece, strict=True)
+                }
+                self._pieces[piece] = self.by_states(self.law, sides)
+            around, centre = _around(self._pieces[piece], tube.hull, tube.m, none)
+            around[:, 1:] *= 0.5 if len(pieces) == 1 else 1.0
+            slopes.append(ops.along(around, centre, *tube.parts)[self.m :])
+        every = np.array(slopes).reshape(-1, self.m, self.N, 2)
+        L = np.stack([every[..., 0].min(axis=0), every[..., 1].max(axis=0)], axis=-1)
+        around, centre = _around(self.renewed, tube.hull, tube.m, none)
+        u = ops.along(np.concatenate([around[:, :1], L], axis=1), centre, *tube.parts)
+        return u, centre, L, len(pieces) == 1
+
+    def _series(
+        self,
+        X: FloatArray,
+        u: FloatArray,
+        m: FloatArray,
+        u_m: FloatArray,
+        L: FloatArray,
+        order: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Coefficients of (x, Y) on a box, with derivatives along (I, L), and at m."""
+        seeds = np.zeros((self.N + len(self.start) + self.m, self.N, 2))
+        seeds[: self.N], seeds[-self.m :] = ops.points(np.eye(self.N)), L
+        low, high = np.vstack([X, self.fixed(u)]).T.copy()
+        whole = self.both.series(low, high, order - 1, seeds)
+        low, high = np.vstack([np.column_stack([m, m]), self.fixed(u_m)]).T.copy()
+        return whole, self.both.series(low, high, order - 1)[:, :, 0]
+
+    def advance(self, tube: Tube, h: FloatArray) -> FloatArray | None:
+        """Move a set of x on by a period, whose ends are h (2,), in one step.
+
+        Returns
+        -------
+        ndarray or None
+            A box that all motions stay in on the way, (N, 2); None where they may leave the domain
+            of F or the law, or no bounds are found.
+        """
+        n, X, order = self.N, tube.hull, _order(h)
+        u, u_m, L, one = self.input(tube)
+        stay = _stay(self.flow, X, self.fixed(u), h[1]) if np.isfinite(L).all() else None
+        if stay is None:
+            return None
+        low, high = np.vstack([stay, self.fixed(u)]).T.copy()
+        rest = self.flow.series(low, high, order)[:, order, 0]
+        whole, at = self._series(X, u, tube.m, u_m, L, order)
+        part = whole[n:].reshape(-1, 1 + n, 2).copy()
+        part[:, 1:] *= 0.5  # of the derivative's change, on the way
+        Y = ops.along(part, at[n:].reshape(-1, 2), *tube.parts).reshape(n, n + self.m, order, 2)
+        around, way = np.zeros((n, order, 1 + n, 2)), np.concatenate([ops.points(np.eye(n)), L])
+        for k in range(order):
+            around[:, k, 1:] = ops.product(Y[:, :, k].copy(), way)
+        return stay if tube.move(rest, at[:n], around, h, one) else None
+
+    def derivative(
+        self, X: FloatArray, u: FloatArray, m: FloatArray, u_m: FloatArray, L: FloatArray,
+        h: FloatArray,
+    ) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
+        """Enclose the derivative of x(h) by x(0) on a box, (N, N, 2), and where motions stay.
+
+        Parameters
+        ----------
+        X, m
+            The box, (N, 2), and a point of it, (N,).
+        u, u_m, L
+            The law on it, (m, 2), at m, (m, 2), and its derivative on it, (m, N, 2).
+        """
+        n, order = self.N, _order(h)
+        stay = _stay(self.both, np.vstack([X, self.start]), u, h[1])
+        if stay is None:
+            return None
+        low, high = np.vstack([stay, u]).T.copy()
+        end = self.both.series(low, high, order)[n:, order, 0]
+        whole, at = self._series(X, u, m, u_m, L, order)
+        a, b = X.T.copy()
+        for k in reversed(range(order)):
+            own, _ = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), a, b, m)
+            end = ops.carried(end, own, h)
+        way = np.concatenate([ops.points(np.eye(n)), L])
+        return ops.product(end.reshape(n, n + self.m, 2), way), stay[:n]
+
+
+@dataclass
+class Tube:
+    """One set of states on its way.
+
+    Parameters
+    ----------
+    fixed
+        Enclosures of the inputs besides states, (F, 2).
+    hull
+        A box around the set now, (N, 2).
+    """
+
+    fixed: FloatArray
+    hull: FloatArray
+    m: FloatArray
+    C: FloatArray
+    xi: FloatArray
+    Q: FloatArray
+    r: FloatArray
+
+    @classmethod
+    def of(cls, fixed: FloatArray, box: FloatArray) -> Self:
+        """Start from a box of doubles, (N, 2)."""
+        n = len(box)
+        middle = 0.5 * box[:, 0] + 0.5 * box[:, 1]
+        xi = np.array([ops.add(a, b, -v, -v) for (a, b), v in zip(box, middle, strict=True)])
+        return cls(
+            fixed, box.copy(), middle, np.eye(n), xi.reshape(n, 1, 2), np.eye(n),
+            np.zeros((n, 1, 2)),
+        )  # fmt: skip
 
     def values(self, program: Program) -> tuple[FloatArray, FloatArray]:
         """Enclose values and derivatives over the hull, (O, 1 + N, 2), and values at m, (O, 2)."""
@@ -119,69 +276,61 @@ class Tube:
 
     def image(self, program: Program) -> FloatArray:
         """Enclose values on the set, (O, 2)."""
-        still = np.zeros((len(self.m), 1, 2))
-        return np.asarray(ops.along(*self.values(program), self.C, self.xi, self.Q, self.r, still))
+        return np.asarray(ops.along(*self.values(program), *self.parts))
 
     def map(self, program: Program) -> bool:
         """Replace the set by its image; whether that is bounded."""
         around, centre = self.values(program)
         state, none = (self.m, self.C, self.xi, self.Q, self.r), np.zeros_like(self.hull)
-        good = bool(ops.taylor_step(none, centre[:, None], around[:, None], 1.0, *state))
+        good = bool(ops.taylor_step(none, centre[:, None], around[:, None], np.ones(2), *state))
         self.hull = ops.hulled(*state)
         return good
 
-    def _step(self, h: float, order: int, short: bool) -> FloatArray | None:
-        """Move on by h; the box that motions stay in, or None where nothing is shown."""
-        X, n = ops.hulled(self.m, self.C, self.xi, self.Q, self.r), len(self.m)
-        stay = self._stay(X, h)
-        if stay is None:
-            return None
-        rates = _ends(self.field.whole, stay, self.fixed)
-        way = ops.reached(np.zeros_like(X), rates, h).reshape(n, 1, 2)
-        gaps = _around(self.field.gaps, stay, self.m, self.fixed)
-        program, decided = self.field.piece(ops.along(*gaps, self.C, self.xi, self.Q, self.r, way))
-        if not decided and not short:
-            return None
-        low, high = np.vstack([stay, self.fixed]).T.copy()
-        rest = program.series(low, high, order)[:, order, 0]
-        if np.isnan(rest).any():  # a corner is inside: the short formula, Clarke's derivatives
-            order = 2
-            rest = program.series(low, high, order)[:, order, 0]
-        low[:n] = high[:n] = self.m
-        centre = program.series(low, high, order - 1)[:, :, 0]
-        low[:n], high[:n] = X.T
-        around = program.series(low, high, order - 1, n)
+    @property
+    def parts(self) -> tuple[FloatArray, ...]:
+        """C, ξ, Q, r, and no more: the set around m."""
+        return self.C, self.xi, self.Q, self.r, np.zeros((len(self.m), 1, 2))
+
+    def move(
+        self, rest: FloatArray, centre: FloatArray, around: FloatArray, h: FloatArray, smooth: bool
+    ) -> bool:
+        """Replace the set by what a step makes of it, if that is bounded (Lemma 6)."""
         state = [v.copy() for v in (self.m, self.C, self.Q, self.r)]
         m, C, Q, r = state
         if not ops.taylor_step(rest, centre, around, h, m, C, self.xi, Q, r):
-            return None
-        if decided:
+            return False
+        if smooth:
             self.m, self.C, self.Q, self.r = state
         else:  # what a corner adds is carried like a part of the start
             self.C, self.xi = np.hstack([C, Q]), np.concatenate([self.xi, r])
-            self.m, self.Q, self.r = m, np.eye(n), np.zeros((n, 1, 2))
-        return stay
+            self.m, self.Q, self.r = m, np.eye(len(m)), np.zeros((len(m), 1, 2))
+        self.hull = ops.hulled(self.m, self.C, self.xi, self.Q, self.r)
+        return True
 
-    def _stay(self, X: FloatArray, h: float) -> FloatArray | None:
-        """A box that motions from X stay in for h (Lemma 6), (N, 2), or None."""
-        stay = X.copy()
-        for attempt in range(12):
-            rates = _ends(self.field.whole, stay, self.fixed)
-            reach = ops.reached(X, rates, h)
-            if not np.isfinite(reach).all():
-                return None
-            left = np.column_stack([reach[:, 0] < stay[:, 0], reach[:, 1] > stay[:, 1]])
-            for i, side in zip(*np.nonzero(left), strict=True) if attempt else ():
-                face = stay.copy()
-                face[i] = stay[i, side]
-                rate = _ends(self.field.whole, face, self.fixed)[i]
-                left[i, side] = not (rate[1] < 0.0 if side else rate[0] > 0.0)
-            if not left.any():
-                return stay
-            room = (0.1 if attempt < 6 else 0.5) * (reach[:, 1] - reach[:, 0]) + 1e-300
-            wider = np.column_stack([reach[:, 0] - room, reach[:, 1] + room])
-            stay = np.where(left, wider, stay)
-        return None
+
+def _stay(program: Program, X: FloatArray, fixed: FloatArray, h: float) -> FloatArray | None:
+    """A box that motions from X stay in for h (Lemma 6), (N, 2), or None."""
+    stay = X.copy()
+    for attempt in range(12):
+        reach = ops.reached(X, _ends(program, stay, fixed), h)
+        if not np.isfinite(reach).all():
+            return None
+        left = np.column_stack([reach[:, 0] < stay[:, 0], reach[:, 1] > stay[:, 1]])
+        for i, side in zip(*np.nonzero(left), strict=True) if attempt else ():
+            face = stay.copy()
+            face[i] = stay[i, side]
+            rate = _ends(program, face, fixed)[i]
+            left[i, side] = not (rate[1] < 0.0 if side else rate[0] > 0.0)
+        if not left.any():
+            return stay
+        room = (0.1 if attempt < 6 else 0.5) * (reach[:, 1] - reach[:, 0]) + 1e-300
+        wider = np.column_stack([reach[:, 0] - room, reach[:, 1] + room])
+        stay = np.where(left, wider, stay)
+    return None
+
+
+def _order(h: FloatArray) -> int:
+    return HELD_ORDER if h[1] < 1.0001e-3 else LONG_ORDER
 
 
 def _ends(program: Program, box: FloatArray, fixed: FloatArray) -> FloatArray:

@@ -6,10 +6,13 @@ Nothing here proves anything: what is found is decided by
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -21,12 +24,17 @@ from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.intervals.require import require
-from undertow.proofs.kernel.claims import ClosedLoop
-from undertow.proofs.kernel.loop import Loop
+from undertow.proofs.kernel import claims as kernel
+from undertow.proofs.kernel.claims import STEP
+from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
+from undertow.proofs.kernel.model import Law, Model, scale_of
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.
 MOTIONS, THINNEST = 24, 2.0**-13
+
+#: Parts that a box of plants is cut into before a start is given up.
+MOST_PARTS = 64
 
 
 @dataclass(frozen=True)
@@ -73,11 +81,12 @@ def runge_kutta(
 
 
 def follow(
-    law: SlidingModeLaw, x: FloatArray, duration: float, every: int = 4
+    law: SlidingModeLaw, x: FloatArray, duration: float, every: int = 4, period: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
     """Return float64 RK4 motions of the clipped loop from states (L, 2n), and their times.
 
-    Steps are of ε/η, the time in which s decays in the layer, and of 5 ms at most.
+    Steps are of ε/η, the time in which s decays in the layer, and of 5 ms at most; with the input
+    held for a period, they are periods.
 
     Returns
     -------
@@ -86,13 +95,21 @@ def follow(
     """
     n = law.mechanism.n
     eta, layer = law.reaching.per_surface(law.mechanism.m)
-    step = float(min(0.005, np.min(layer / eta)))
+    step = period or float(min(0.005, np.min(layer / eta)))
 
-    def rate(x: FloatArray) -> FloatArray:
-        q_dd = law.mechanism.accelerations(0.0, x, law(0.0, x).u)
-        return np.concatenate([x[..., n:], q_dd], axis=-1)
+    def under(u: FloatArray, x: FloatArray) -> FloatArray:
+        return np.concatenate([x[..., n:], law.mechanism.accelerations(0.0, x, u)], axis=-1)
 
-    return runge_kutta(rate, x, duration, step, every)
+    if not period:
+        return runge_kutta(lambda x: under(law(0.0, x).u, x), x, duration, step, every)
+    path, count = [x], max(1, round(duration / period))
+    with np.errstate(all="ignore"):
+        for k in range(1, count + 1):
+            u = law(0.0, x).u
+            x = runge_kutta(partial(under, u), x, period, period, 1)[0][1]
+            if k % every == 0:
+                path.append(x)
+    return np.array(path), np.linspace(0.0, period * every * (len(path) - 1), len(path))
 
 
 def prove_loop(
@@ -102,14 +119,13 @@ def prove_loop(
     *,
     coordinate: str,
     reach: float,
+    period: float = 0.0,
+    plant: Mapping[str, tuple[float, float]] | None = None,
     duration: float = 15.0,
     seconds: float = 300.0,
     progress: Callable[[str], None] | None = None,
 ) -> ProvedLoop:
     """Prove that the loop converges from rest, one coordinate off the target, as far as it can.
-
-    The law acts at every instant on the plant that it knows; for a held input, or a plant in a
-    box, see :func:`undertow.proofs.draft_loop`.
 
     Parameters
     ----------
@@ -117,6 +133,12 @@ def prove_loop(
         Which one.
     reach
         Starts beyond this are not tried, SI units.
+    period
+        The law's input is held for so long, s, as the decimal that it is written as; 0: renewed at
+        every instant.
+    plant
+        Parameters of the plant that lie in [low, high], around those that the law knows; for a held
+        input.
     duration
         Longest motion, s.
     seconds
@@ -130,7 +152,8 @@ def prove_loop(
     Raises
     ------
     InvalidInputError
-        For a coordinate that the mechanism does not have, or a reach that is not positive.
+        For a coordinate that the mechanism does not have, a reach that is not positive, or a plant
+        in a box whose input is not held.
     InfeasibleError
         When not even the first box could be proved.
     """
@@ -138,34 +161,30 @@ def prove_loop(
     require(coordinate in names, "coordinate of the starts", coordinate, ", ".join(names))
     for what, value in (("reach of the starts", reach), ("duration", duration)):
         require(np.isfinite(value) and value > 0, what, value, "finite, > 0")
+    good = np.isfinite(period) and 0 <= period <= 0.1
+    require(good, "period of a held input", period, "0 to 0.1 s")
+    remedy = "Take the period of the sampler, such as 0.001 s"
+    require(
+        period or not plant, "plant in a box", "an input renewed at every instant", "held", remedy
+    )
     law = ReachingLaw() if reaching is None else reaching
+    task = _Task(
+        mechanism, surface, law, coordinate, reach, Fraction(repr(float(period))), dict(plant or {})
+    )
+    loop, known = task.aimed(duration)
     index = names.index(coordinate)
-    sliding, search = SlidingModeLaw(mechanism, surface, law), search_for(mechanism, surface, law)
-    terminal = None
-    if search is not None:
-        x = np.zeros((MOTIONS, 2 * mechanism.n))
-        x[:, index] = np.linspace(reach / MOTIONS, reach, MOTIONS)
-        terminal = _terminal(search, follow(sliding, x, duration)[0])
-    if terminal is None:
-        raise InfeasibleError(
-            f"terminal set of {surface}",
-            value="no motion enters a proved ellipsoid",
-            limit=f"from rest up to {coordinate} = {reach:.4g}, within {duration:g} s",
-            remedy="Take a longer duration or a smaller reach",
-        )
-    own = terminal.stated(mechanism, None)
-    zero, still = Fraction(0), (Fraction(0),) * mechanism.n
-    claim = ClosedLoop({}, zero, {}, still, zero, own)
-    loop = Loop(model_of(mechanism), law_of(mechanism, surface, law), own.W, own.radius)
     # Around the edge of the layer a box is a small part of it, or its tube crosses for long.
     weight = np.abs(surface.position_row[:, index]).max()
     width = min(reach / 32, 0.15 * float(np.min(law.layer)) / max(weight, 1e-12))
     edges, box = [0.0], np.zeros((2 * mechanism.n, 2))
+    parts = _sliced(task.box, 0)
     while edges[-1] < reach and width > reach * THINNEST:
         box[index] = edges[-1], min(edges[-1] + width, reach)
         if time.process_time() - started > seconds:
             break
-        _, there = loop.follow(box, float(claim.step))
+        there = all(loop.follow(np.vstack([box, part]))[1] for part in parts)
+        if not there and len(parts) < MOST_PARTS and width < reach / 128:
+            parts, width = _sliced(task.box, len(parts)), 2 * width
         if there:
             edges.append(float(box[index, 1]))
             if progress is not None and len(edges) % 20 == 0:
@@ -178,13 +197,141 @@ def prove_loop(
             limit=f"boxes down to {reach * THINNEST:.2g} of {coordinate}",
             remedy="Give a smaller reach",
         )
-    end = Fraction(edges[-1])
     cuts = {coordinate: tuple(Fraction(v) for v in edges[1:-1])}
-    found = LoopClaim(
-        ClosedLoop({coordinate: (-end, end)}, zero, {}, still, zero, own, cuts).data()
-    )
+    for j, name in enumerate(task.varied):
+        ends = sorted({Fraction(float(v)) for part in parts for v in part[j]})
+        cuts[name] = tuple(ends[1:-1])
+    found = LoopClaim(task.claim(known, Fraction(edges[-1]), cuts).data())
     verdict = found.decide(mechanism, surface, law)
     return ProvedLoop(found, verdict, time.process_time() - started)
+
+
+def _sliced(box: FloatArray, before: int) -> list[FloatArray]:
+    """Cut a box of parameters (P, 2) into more parts than before, each side alike."""
+    if not len(box):
+        return [box]
+    count = 1
+    while count ** len(box) <= before:
+        count *= 2
+    sides = [itertools.pairwise(np.linspace(a, b, count + 1).tolist()) for a, b in box]
+    return [np.array(part) for part in itertools.product(*sides)]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is to be proved, as the kernel has it."""
+
+    mechanism: Mechanism
+    surface: Surface
+    law: ReachingLaw
+    coordinate: str
+    reach: float
+    period: Fraction
+    plant: Mapping[str, tuple[float, float]]
+
+    @cached_property
+    def model(self) -> Model:
+        return model_of(self.mechanism)
+
+    @cached_property
+    def numbers(self) -> Law:
+        return law_of(self.mechanism, self.surface, self.law)
+
+    @property
+    def varied(self) -> list[str]:
+        """Names of the parameters that vary, in the model's order."""
+        return [p.name for p in self.model.parameters if p.name in self.plant]
+
+    @property
+    def box(self) -> FloatArray:
+        """Their ranges, (P, 2)."""
+        return np.array([self.plant[k] for k in self.varied], dtype=float).reshape(-1, 2)
+
+    @property
+    def exact_box(self) -> dict[str, tuple[Fraction, Fraction]]:
+        return {k: (Fraction(float(a)), Fraction(float(b))) for k, (a, b) in self.plant.items()}
+
+    def claim(
+        self, end: kernel.TerminalEllipsoid, reach: Fraction, cuts: dict[str, Any]
+    ) -> kernel.ClosedLoop:
+        """Return the claim about starts at rest up to a reach."""
+        still, starts = (Fraction(0),) * self.mechanism.n, {self.coordinate: (-reach, reach)}
+        zero = Fraction(0)
+        return kernel.ClosedLoop(starts, self.period, self.exact_box, still, zero, end, cuts)
+
+    def aimed(self, duration: float) -> tuple[Loop, kernel.TerminalEllipsoid]:
+        """Return the loop with a proved terminal set that simulated motions enter early.
+
+        Raises
+        ------
+        InfeasibleError
+            Where none is found.
+        """
+        n, period = self.mechanism.n, float(self.period)
+        steered = SlidingModeLaw(self.mechanism, self.surface, self.law)
+        x = np.zeros((MOTIONS, 2 * n))
+        index = [c.name for c in self.mechanism.coordinates].index(self.coordinate)
+        x[:, index] = np.linspace(self.reach / MOTIONS, self.reach, MOTIONS)
+        every = max(1, round(0.005 / period)) if period else 4
+        path = follow(steered, x, duration, every, period)[0]
+        if not period:
+            search = search_for(self.mechanism, self.surface, self.law)
+            terminal = None if search is None else _terminal(search, path)
+            if terminal is not None:
+                own = terminal.stated(self.mechanism, None)
+                return ContinuousLoop(self.model, self.numbers, own.W, own.radius, STEP), own
+        else:
+            held, loop = (
+                HeldLoop(self.model, self.numbers, self.period, plant)
+                for plant in ({}, self.exact_box)
+            )
+            search = _held_search(held)
+            terminal = None if search is None else _terminal(search, self._coordinates(path))
+            for shrink in 0.8 ** np.arange(12):
+                if terminal is None:
+                    break
+                own = replace(terminal, radius=shrink * terminal.radius).stated(
+                    self.mechanism, None
+                )
+                loop.take(own.W, own.radius)
+                if not loop.terminal()[0]:
+                    return loop, own
+        raise InfeasibleError(
+            f"terminal set of {self.surface}",
+            value="no motion enters a proved ellipsoid",
+            limit=f"from rest up to {self.coordinate} = {self.reach:.4g}, within {duration:g} s",
+            remedy="Take a longer duration, a smaller reach, a shorter period or a smaller box",
+        )
+
+    def _coordinates(self, x: FloatArray) -> FloatArray:
+        """Return (q, M_ua v_a + M_uu v_u, s) of states (…, 2n)."""
+        n, m = self.mechanism.n, self.mechanism.m
+        q, v, surface = x[..., :n], x[..., n:], self.surface
+        with np.errstate(all="ignore"):
+            p = np.einsum("...ij,...j->...i", self.mechanism.M(q)[..., m:, :], v)
+        s = q @ surface.position_row.T + v @ np.hstack([surface.alpha_a, surface.alpha_u]).T
+        return np.concatenate([q, p, s], axis=-1)
+
+
+def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
+    """Prepare the search for the loop with a held input, in (q, D p, s)."""
+    n, m, zero = loop.model.n, loop.model.m, np.zeros((loop.model.m, 2))
+    scale = np.array([*([1.0] * n), *map(float, scale_of(loop.model)), *([1.0] * m)])
+    X = np.zeros((loop.size, 2))
+    middle, slopes = loop.slopes(X)
+    found = loop.held.derivative(X, zero, middle, zero, slopes, loop.step)
+    if loop.no_equilibrium or found is None:
+        return None
+    A = scale[:, None] * found[0].mean(axis=-1) / scale
+    C, layer = np.eye(m, 2 * n, 2 * n - m), np.array([float(v) for v in loop.law.layer])
+
+    def margin(candidate: TerminalEllipsoid) -> float:
+        W = tuple(tuple(Fraction(float(v)) for v in row) for row in candidate.W)
+        loop.take(W, Fraction(float(candidate.radius)))
+        why, found = loop.terminal()
+        return min(found, 0.0) if why else found
+
+    return EllipsoidSearch.of(margin, A, C, layer, float(loop.step[1]))
 
 
 def _terminal(search: EllipsoidSearch, path: FloatArray) -> TerminalEllipsoid | None:

@@ -6,9 +6,10 @@ Nothing here proves anything: every set that is returned is one that the kernel 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,8 +39,10 @@ class EllipsoidSearch:
 
     Parameters
     ----------
-    loop, numbers, C, layer, limits, centre
-        The interval program and what its proof takes.
+    margin
+        The kernel's margin of a candidate, at most 0 where it is not proved.
+    C, layer
+        s = C x, (m, 2n), and the half-widths of the layer, (m,).
     T, T_inverse
         Real modal matrix with columns of unit length, (2n, 2n), and its inverse.
     rates
@@ -48,16 +51,46 @@ class EllipsoidSearch:
         The number of the mode of each column, (2n,): a complex pair shares one.
     """
 
-    loop: ClosedLoopProgram
-    numbers: FloatArray
+    margin: Callable[[TerminalEllipsoid], float]
     C: FloatArray
     layer: FloatArray
-    limits: FloatArray
-    centre: FloatArray
     T: FloatArray
     T_inverse: FloatArray
     rates: FloatArray
     modes: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, margin: Callable[[TerminalEllipsoid], float], A: FloatArray, C: FloatArray,
+        layer: FloatArray, period: float = 0.0,
+    ) -> Self | None:  # fmt: skip
+        """Take the modes of ẋ = A x or, with a period, of x(period) = A x(0).
+
+        ``None`` where it is not stable, or has no full set of modes.
+        """
+        if not np.isfinite(A).all():
+            return None
+        values, vectors = np.linalg.eig(A)
+        with np.errstate(divide="ignore"):
+            decay = -np.log(np.abs(values)) / period if period else -values.real
+        decay = np.minimum(decay, 1e6)  # of a mode that is gone after one period
+        if not (decay > 0).all():
+            return None
+        columns: list[FloatArray] = []
+        rates: list[float] = []
+        modes: list[int] = []
+        for value, rate, vector in zip(values, decay, vectors.T, strict=True):
+            if value.imag < 0:
+                continue  # the conjugate has been taken
+            new = [vector.real] if value.imag == 0 else [vector.real, vector.imag]
+            modes += [modes[-1] + 1 if modes else 0] * len(new)
+            columns += [v / np.linalg.norm(vector) for v in new]
+            rates += [rate] * len(new)
+        T = np.array(columns, dtype=np.float64).T
+        if not np.linalg.cond(T) < 1e12:
+            return None
+        inverse = np.asarray(np.linalg.inv(T), dtype=np.float64)
+        return cls(margin, C, layer, T, inverse, np.array(rates), np.array(modes))
 
     def _candidate(self, weights: FloatArray, radius: float) -> TerminalEllipsoid:
         """Return {|W x| ≤ ρ} with semi-axes ρ·exp(weight) along the modes."""
@@ -65,11 +98,6 @@ class EllipsoidSearch:
         return TerminalEllipsoid(
             self.T_inverse / d[:, None], self.T * (d / np.sqrt(self.rates)), radius
         )
-
-    def _margin(self, candidate: TerminalEllipsoid) -> float:
-        rows = self.C, self.layer
-        code, margin, _ = prove(self.loop, self.numbers, rows, self.limits, candidate, self.centre)
-        return margin if code == 0 else min(margin, 0.0)
 
     def around(self, x: ArrayLike) -> TerminalEllipsoid | None:
         """Return a proved terminal set that contains the state x, (2n,), or ``None``."""
@@ -92,7 +120,7 @@ class EllipsoidSearch:
             # Modes that are all but gone still need some room for what the others stir up.
             trial = np.log(np.maximum(size, floor * size.max()))
             candidate = through(trial)
-            margin = self._margin(candidate)
+            margin = self.margin(candidate)
             if margin > 0:
                 return candidate
             if margin > best:
@@ -104,7 +132,7 @@ class EllipsoidSearch:
                 trial = weights.copy()
                 trial[j] += sign * step
                 candidate = through(trial)
-                margin = self._margin(candidate)
+                margin = self.margin(candidate)
                 if margin > 0:
                     return candidate
                 tried += 1
@@ -144,7 +172,7 @@ class EllipsoidSearch:
                 trial[j] += sign * step
                 # Worth a bisection only if a larger ball is proved.
                 need = radius * 1.05 * ball / self._candidate(trial, radius).ball
-                if self._margin(self._candidate(trial, need)) > 0:
+                if self.margin(self._candidate(trial, need)) > 0:
                     radius = self._widest(trial, need, 1.1)
                     weights, ball = trial, self._candidate(trial, radius).ball
             if ball < 1.02 * before:
@@ -155,7 +183,7 @@ class EllipsoidSearch:
         """Largest radius that is proved, within a factor; 0 where none is."""
         low, high, radius = 0.0, np.inf, start
         for _ in range(40):
-            if self._margin(self._candidate(weights, radius)) > 0:
+            if self.margin(self._candidate(weights, radius)) > 0:
                 low = radius
             else:
                 high = radius
@@ -186,37 +214,15 @@ def search_for(
     numbers = loop.numbers(mechanism, surface, reaching)
     at_target = loop.at_target(numbers)
     gradients = at_target[:, 1:]
-    n = loop.n
+    n, rows = loop.n, loop.rows(numbers)
     A = np.vstack([np.eye(n, 2 * n, n), gradients[:n].mean(axis=-1)])
-    if not np.isfinite(A).all():
-        return None
-    values, vectors = np.linalg.eig(A)
-    if not (values.real < 0).all():
-        return None
-    columns: list[FloatArray] = []
-    rates: list[float] = []
-    modes: list[int] = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value.imag < 0:
-            continue  # the conjugate has been taken
-        new = [vector.real] if value.imag == 0 else [vector.real, vector.imag]
-        modes += [modes[-1] + 1 if modes else 0] * len(new)
-        columns += [v / np.linalg.norm(vector) for v in new]
-        rates += [-value.real] * len(new)
-    T = np.array(columns, dtype=np.float64).T
-    if not np.linalg.cond(T) < 1e12:
-        return None
-    return EllipsoidSearch(
-        loop,
-        numbers,
-        *loop.rows(numbers),
-        mechanism.input_limits,
-        at_target[:, 0].copy(),
-        T,
-        np.asarray(np.linalg.inv(T), dtype=np.float64),
-        np.array(rates),
-        np.array(modes),
-    )
+    limits, centre = mechanism.input_limits, at_target[:, 0].copy()
+
+    def margin(candidate: TerminalEllipsoid) -> float:
+        code, found, _ = prove(loop, numbers, rows, limits, candidate, centre)
+        return found if code == 0 else min(found, 0.0)
+
+    return EllipsoidSearch.of(margin, A, *rows)
 
 
 def terminal_sets(

@@ -18,11 +18,9 @@ from undertow.objective import MinimumEnergy
 from undertow.proofs import (
     AppendixClaim,
     Claim,
-    DraftedLoop,
     LyapunovFunction,
     NonsingularClaim,
     Policy,
-    ProvedLoop,
     ProvedRegion,
     ReachingClaim,
     RegionClaim,
@@ -32,7 +30,6 @@ from undertow.proofs import (
     SurfaceMotion,
     assess,
     box_starts,
-    draft_loop,
     prove_loop,
     prove_region,
     reaching,
@@ -95,11 +92,11 @@ def certify_surface(
     The positions of ``start``, (2n,), with both signs, span the region in which the law must exist,
     and say which way the region of attraction should reach; ``seconds``, s, is the effort for its
     search, 0 leaves it out. ``loop`` also proves how far off the target the full closed loop may
-    start at rest, which takes minutes; for that the input is held for ``hold`` steps of 1 ms (0: at
+    start at rest, which takes minutes; for that the input is held for ``hold`` ms (0: renewed at
     every instant). ``uncertain`` plant parameters lie in [low, high] instead of being the law's
-    own: for the closed loop, and for a second region on the surface. ``predict`` also predicts the
-    motion from the start, and from random ones up to it (sampled). The ``title`` is for tables, the
-    surface itself by default.
+    own: for the closed loop with a held input, and for a second region on the surface. ``predict``
+    also predicts the motion from the start, and from random ones up to it (sampled). The ``title``
+    is for tables, the surface itself by default.
     """
     began = time.perf_counter()
     claims: list[StatedClaim] = []
@@ -255,14 +252,10 @@ class _Decisions:
         index = int(np.argmax(away))
         reach = float(away[index]) or (1.0 if free[index].unit == "rad" else 0.5)
         about, name = (mechanism, self.surface, self.law), free[index].name
-        proved: ProvedLoop | DraftedLoop
         try:
-            if hold or self.uncertain:
-                proved = draft_loop(
-                    *about, coordinate=name, reach=reach, hold=hold, uncertain=self.uncertain
-                )
-            else:
-                proved = prove_loop(*about, coordinate=name, reach=reach)
+            proved = prove_loop(
+                *about, coordinate=name, reach=reach, period=hold / 1000, plant=self.uncertain
+            )
         except UndertowError as error:
             words = "the full closed loop converges from rest"
             return None, Verdict(words, "undecided", method=str(error))

@@ -29,13 +29,14 @@ def loop_figure(
     Left: the first coordinate that varies, over time.  Right: the same coordinate and its rate,
     with the shadow of the terminal set, until a motion enters it.
     """
-    box, (W, radius) = claim.box(mechanism), claim.terminal(mechanism)
+    box, (W, radius) = claim.box(mechanism), claim.terminal(mechanism, surface)
     index = int((box[:, 1] > box[:, 0]).argmax())
     extent = float(box[index, 1])
     ratio = np.linspace(0.0, BEYOND, STARTS + 1)[1:]
     x = np.zeros((STARTS, 2 * mechanism.n))
     x[:, index] = ratio * extent
-    path, times = follow(SlidingModeLaw(mechanism, surface, reaching), x, LONGEST, every=1)
+    law = SlidingModeLaw(mechanism, surface, reaching)
+    path, times = follow(law, x, LONGEST, every=1, period=claim.period)
     with np.errstate(all="ignore"):
         inside = np.linalg.norm(path @ W.T, axis=-1) <= radius
     home = inside.any(axis=0)
