@@ -2,8 +2,8 @@
 
 :mod:`.kernel` compiles what :mod:`.kernel_source` writes: small Runge-Kutta steps, and the large
 ones of :mod:`.exponential_integrator`, with the linear model of :mod:`.linear_model`.  Motions that
-are shown or that decide are integrated to a tolerance, by :mod:`.adaptive_integrator`;
-:mod:`.gate` decides which of two plans a loop goes on with.
+are shown, and those that decide with an exact belief, are integrated to a tolerance, by
+:mod:`.adaptive_integrator`; :mod:`.gate` decides which of two plans a loop goes on with.
 """
 
 from undertow.closed_loop.along_reference import simulate_along

@@ -1,1 +1,1 @@
-"""Arithmetic with rounding that encloses: intervals, Taylor models, branch and bound."""
+"""Arithmetic with rounding that encloses: intervals, exact models, branch and bound."""

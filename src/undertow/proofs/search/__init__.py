@@ -1,1 +1,1 @@
-"""Searches for what is then proved: nothing here is trusted, and no proof imports it."""
+"""Searches for what is then proved: nothing here is trusted, and nothing that decides uses it."""
