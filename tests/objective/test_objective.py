@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import sympy as sp
 import undertow as ut
 from support import interpreted, random_mechanism
 from undertow.base import InvalidInputError
+from undertow.objective import Goal, objective_for
 from undertow.objective.objective import Names, travel_box
 
 
@@ -252,9 +254,12 @@ def test_a_terminal_set_wider_than_the_range_is_refused() -> None:
     cart = ut.mechanisms.cart_pendulum()
     rail = replace(cart.coordinates[0], low=-1e-4, high=1e-4)
     small = replace(cart, coordinates=(rail, cart.coordinates[1]))
-    with pytest.raises(InvalidInputError, match=r"terminal_radius.*at most 9\.5e-05"):
+    with pytest.raises(InvalidInputError, match=r"terminal_radius.*at most 0\.00095"):
         ut.MinimumTime().on(small)
     assert ut.MinimumTime(terminal_radius=1e-5).on(small).constraints
+    for name, make in ut.mechanisms.LIBRARY.items():
+        for goal in get_args(Goal):
+            assert objective_for(make(), goal).on(make()), (name, goal)
     one_sided = replace(rail, low=0.0, high=1.0)  # the target is at its end: that is no fault
     assert ut.MinimumTime().on(replace(cart, coordinates=(one_sided, cart.coordinates[1])))
 

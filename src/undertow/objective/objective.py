@@ -48,6 +48,9 @@ TRAVEL = 0.95
 #: :mod:`undertow.closed_loop.exponential_integrator`.
 SPARE = 0.05
 
+#: Radius of a terminal set, at most, over the range of a state.
+WIDEST = 10.0
+
 
 class Names:
     """The states, inputs and parameters of a mechanism as attributes: ``v.phi``, ``v.voltage``.
@@ -387,7 +390,7 @@ class Objective:
         ------
         InvalidInputError
             For a declared range that does not hold the target, for a :func:`state_box` that reaches
-            beyond one, and for a range that lies within the terminal set.
+            beyond one, and for a range that is nothing beside the terminal set.
 
         Warns
         -----
@@ -407,7 +410,10 @@ class Objective:
         return self if constraints == self.constraints else replace(self, constraints=constraints)
 
     def _check_terminal_set(self, mechanism: Mechanism, constraints: Iterable[Constraint]) -> None:
-        """Refuse a terminal set beside which a range is small: all that is in it has arrived.
+        """Refuse a terminal set beside which a range is nothing: all that is in it has arrived.
+
+        A ball that is somewhat wider than one coordinate's travel is a matter of taste: the TORA's
+        cart moves 2.5 cm, and may come to rest within 5 cm, rad and their rates.
 
         Raises
         ------
@@ -418,12 +424,12 @@ class Objective:
             box: Any = c.formula
             if isinstance(box, _Within) and not box.target:
                 most = max(-box.low, box.high)
-                if most < self.terminal_radius:
+                if WIDEST * most < self.terminal_radius:
                     raise InvalidInputError(
                         f"terminal_radius of objective '{self.name}' for '{mechanism.name}'",
                         value=f"{self.terminal_radius:g}",
-                        limit=f"at most {most:g}: a motion with {c.words} would have arrived "
-                        "wherever it is",
+                        limit=f"at most {WIDEST * most:g}, {WIDEST:g} times the range: a motion "
+                        f"with {c.words} would have arrived wherever it is",
                         remedy="Give a smaller terminal_radius, or lengths and times in units of "
                         "the mechanism's own size",
                     )
