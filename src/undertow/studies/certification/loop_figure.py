@@ -79,8 +79,17 @@ def loop_figure(
         if home.all():
             del handles[3]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-        figure.suptitle(title, fontsize=10)
+        figure.suptitle(f"{title}\n{_conditions(mechanism, claim.period)}", fontsize=10)
     return figure
+
+
+def _conditions(mechanism: Mechanism, period: float) -> str:
+    limits = ", ".join(
+        f"|{symbol_of(i.name)}| ≤ {i.limit:g} {i.unit}".rstrip() for i in mechanism.inputs
+    )
+    return f"{limits}, " + (
+        f"held for {1e3 * period:g} ms" if period else "renewed at every instant"
+    )
 
 
 def _motion(axes: Axes, a: FloatArray, b: FloatArray, ratio: float, home: bool) -> None:
