@@ -256,9 +256,8 @@ def write_file(path: Path, content: bytes) -> Path:
     """
     refusal = "a file that can be written", "Choose another folder or name"
     with or_refused(f"file '{path}'", *refusal):
-        check_replaces(
-            path, b"{" if content.startswith(b"{") else content[:4]
-        )  # JSON, however laid
+        length = 1 if content.startswith(b"{") else 4  # JSON may be laid out in several ways
+        check_replaces(path, content[:length])
         if path.exists() and not path.is_file():  # a device or a pipe
             path.write_bytes(content)
         else:

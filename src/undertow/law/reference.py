@@ -40,6 +40,7 @@ from undertow.base import (
     UndertowError,
     check_fields,
     checked,
+    error_text,
     floats,
     one_of,
     positive,
@@ -581,7 +582,7 @@ def _asked(name: str, path: ReferencePath, t: FloatArray) -> FloatArray:
     except Exception as error:  # a user's function may do anything
         raise InvalidInputError(
             what,
-            value=f"{type(error).__name__}: {error}{raised_at(error)}",
+            value=f"{error_text(error)}{raised_at(error)}",
             limit="a function of the time t ≥ 0, s, that returns a number for each",
             remedy="Write it with NumPy's functions, or for one time",
         ) from error

@@ -306,11 +306,10 @@ class _Task:
     def _coordinates(self, x: FloatArray) -> FloatArray:
         """Return (q, M_ua v_a + M_uu v_u, s) of states (…, 2n)."""
         n, m = self.mechanism.n, self.mechanism.m
-        q, v, surface = x[..., :n], x[..., n:], self.surface
+        q, v = x[..., :n], x[..., n:]
         with np.errstate(all="ignore"):
             p = np.einsum("...ij,...j->...i", self.mechanism.M(q)[..., m:, :], v)
-        s = q @ surface.position_row.T + v @ np.hstack([surface.alpha_a, surface.alpha_u]).T
-        return np.concatenate([q, p, s], axis=-1)
+        return np.concatenate([q, p, x @ self.surface.matrix.T], axis=-1)
 
 
 def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
