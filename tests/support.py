@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import sympy as sp
 
 import undertow as ut
@@ -19,6 +20,16 @@ SHAPES = ((2, 1), (3, 1), (3, 2), (4, 2), (5, 2))
 
 #: (t, x) to u: a control law as the reference integrators take it.
 Feedback = Callable[[float, FloatArray], FloatArray]
+
+
+def rest_slow(cases: Iterable[object], *quick: object) -> list[object]:
+    """Parameters of a test: those that are not among the ``quick`` ones run with the slow tests."""
+    return [
+        case
+        if case in quick
+        else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
+        for case in cases
+    ]
 
 
 @lru_cache(maxsize=32)

@@ -17,6 +17,7 @@ import scipy.optimize
 import sympy as sp
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError, MissingExtraError, ModelError
 from undertow.bounds import Bound, bound
 from undertow.bounds.expressions import smooth, translate
@@ -171,6 +172,7 @@ def test_energy_is_counted_until_the_terminal_set_is_reached() -> None:
     assert late.cost == pytest.approx(at(0.7 * least.x), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_an_energy_bound_is_what_the_plant_does_with_its_input() -> None:
     """Applied to a rig sample by sample, u(t) costs and arrives as the bound says."""
     plant, period, spent = ut.mechanisms.pendubot(), 5e-5, 0.0
@@ -273,6 +275,7 @@ def test_halving_the_mesh_does_not_move_the_cost() -> None:
         assert max(coarse.change, fine.change) < 1e-3
 
 
+@pytest.mark.slow
 def test_more_time_and_a_weaker_actuator_never_help_and_hurt() -> None:
     """A longer horizon cannot raise the optimum; a lower input limit cannot lower it."""
     assert least_energy(0.025, 41.0, 60.0).cost < least_energy(0.025, 41.0, 17.0).cost
@@ -285,7 +288,7 @@ def test_more_time_and_a_weaker_actuator_never_help_and_hurt() -> None:
 # -- the result checks itself -------------------------------------------------------------
 
 
-@pytest.mark.parametrize("which", ["energy", "time", "swing"])
+@pytest.mark.parametrize("which", rest_slow(["energy", "time", "swing"], "energy"))
 def test_result_carries_its_own_optimality(which: str) -> None:
     """Feasible, stationary, between the nodes too; u within its limit at every instant."""
     found = swing() if which == "swing" else least_time(0.025, 41.0)
@@ -323,6 +326,7 @@ def test_minimum_time_input_is_bang_bang() -> None:
 # -- an accurate integrator agrees --------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_minimum_time_input_drives_the_plant_into_the_terminal_set() -> None:
     """Integrated open loop over all its 0.51 s, u(t) ends at the edge of the terminal set.
 
@@ -335,6 +339,7 @@ def test_minimum_time_input_drives_the_plant_into_the_terminal_set() -> None:
     np.testing.assert_allclose(end, found.x[-1], atol=4e-3)
 
 
+@pytest.mark.slow
 def test_minimum_energy_input_drives_the_plant_for_the_first_second() -> None:
     """Integrated open loop for 1 s, the state stays on the motion that was found.
 
@@ -347,6 +352,7 @@ def test_minimum_energy_input_drives_the_plant_for_the_first_second() -> None:
     assert abs(end[1]) < 0.2  # the pendulum was at 0.716 rad
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["energy", "swing"])
 def test_every_piece_of_the_motion_is_one_of_the_plant(which: str) -> None:
     """From states 0.25 s apart on the motion, u(t) leads to the next one, all the way."""
@@ -363,6 +369,7 @@ def moves_as_the_plant(found: Bound) -> None:
 # -- basins, constraints and guesses ------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_swinging_through_the_bottom_costs_a_twentieth() -> None:
     """The direct optimum is local: another basin is far cheaper, and it is a real motion."""
     found = swing()
@@ -381,6 +388,7 @@ def test_direct_optimum_is_that_of_all_motions_above_the_horizontal() -> None:
     assert found.cost == pytest.approx(least_energy(0.025, 41.0, 17.0).cost, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_active_path_constraint_holds_and_costs() -> None:
     """|θ| ≤ 5 rad, broken by the free optimum, holds at all nodes and raises the cost."""
     rig = pendulum()
@@ -431,6 +439,7 @@ def test_simulated_closed_loop_as_guess_costs_no_less_than_the_bound() -> None:
 # -- any n and m --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_cart_pendulum() -> None:
     """Another mechanism: caught from 30°, checked by integration."""
     plant = cart_pendulum()
@@ -443,6 +452,7 @@ def test_cart_pendulum() -> None:
     assert cheap.cost < 20.0**2 * found.time
 
 
+@pytest.mark.slow
 def test_three_coordinates_two_inputs() -> None:
     """n = 3, m = 2: a pendulum between two carts on a spring; each input keeps its limit."""
     s, r, p = ut.Coordinate("s", "m"), ut.Coordinate("r", "m"), ut.Coordinate("p", "rad")
@@ -474,6 +484,7 @@ def test_mechanisms_of_the_library(name: str) -> None:
     np.testing.assert_allclose(drive(found, x0, 0.0, found.time), found.x[-1], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_running_cost_that_counts_rest_frees_the_final_time() -> None:
     """Φ = 1 + 0.01 u² is not zero at rest: t_f is free, and the cost above minimum time."""
     rig = pendulum()
@@ -611,6 +622,7 @@ def test_without_casadi_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
         bound(rig, ut.MinimumTime(), rig.state(phi=0.7))
 
 
+@pytest.mark.slow
 def test_solver_is_silent_and_repeatable(capfd: pytest.CaptureFixture[str]) -> None:
     """Nothing is printed, and the same question has bit for bit the same answer."""
     first, second = (

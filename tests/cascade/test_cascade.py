@@ -393,6 +393,7 @@ def test_a_run_that_ends_before_anything_can_arrive_begins_all_the_same(
         cascade.simulate(phi=ut.deg(30), duration=1e-4)
 
 
+@pytest.mark.slow
 def test_a_target_that_the_inputs_cannot_hold_is_named(rig: ut.Mechanism) -> None:
     """No search finds a surface then; to start closer, as other refusals advise, would not help."""
     pushed = rig.disturbed({"theta": 0.5})
@@ -415,7 +416,7 @@ def test_a_cascade_is_for_the_usual_objective_where_nobody_says(rig: ut.Mechanis
 
 @pytest.mark.parametrize("duration", [0.0335, 0.0301])
 def test_a_run_ends_when_it_was_asked_to(rig: ut.Mechanism, duration: float) -> None:
-    cascade = ut.Cascade(rig, belief="exact", cold=Budget(32), warm=Budget(8))
+    cascade = ut.Cascade(rig, ut.MinimumEnergy(), belief="exact", cold=Budget(32), warm=Budget(8))
     run = cascade.simulate(phi=0.3, duration=duration)
     assert run.time == pytest.approx(duration, abs=1e-15)
     assert len(run.trajectory.t) == 18 if duration > 0.033 else 17

@@ -64,6 +64,7 @@ def test_gates_refuse_what_bears_too_little(arm: ut.Mechanism, base: ut.Surface)
     assert refused.cost == pytest.approx(float(loop.batch(x, base).cost[0]))
 
 
+@pytest.mark.slow
 def test_what_an_estimator_does_not_know_comes_out_as_input(
     arm: ut.Mechanism, base: ut.Surface
 ) -> None:
@@ -163,6 +164,7 @@ def test_while_friction_is_large_soft_surfaces_are_refused(arm: ut.Mechanism) ->
     assert after.plan in cascade.reserve
 
 
+@pytest.mark.slow
 def test_a_plan_in_reserve_takes_over_where_the_one_in_use_falls(arm: ut.Mechanism) -> None:
     """From the state after a knock that a soft surface does not bear; an exact belief keeps it."""
     objective = objective_for(arm, "bench-energy")

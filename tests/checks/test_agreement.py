@@ -27,6 +27,7 @@ from agreements import (
     sliding_motion,
     swing_up,
 )
+from support import rest_slow
 from undertow.base import ModelError
 from undertow.checks import agreement, check_mechanism, exact
 from undertow.checks.agreement import (
@@ -503,7 +504,7 @@ FUNCTIONS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("text", FUNCTIONS)
+@pytest.mark.parametrize("text", rest_slow(FUNCTIONS, *FUNCTIONS[::3]))
 def test_functions_that_code_is_written_for(text: str, interpreted: None) -> None:
     """Claim: each is compiled as it is meant, also as a factor and of negative arguments."""
     plain = named(["a", "b", "F"], title=f"force {text}")

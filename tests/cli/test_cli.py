@@ -576,6 +576,7 @@ def _typed(*words: str, **how: Any) -> subprocess.CompletedProcess[bytes]:
     return subprocess.run(command, stderr=subprocess.PIPE, timeout=120, check=False, **how)
 
 
+@pytest.mark.slow
 def test_a_terminal_that_cannot_show_a_letter_costs_no_result() -> None:
     """A result of minutes ended in UnicodeEncodeError on a terminal without ‖ or ≤."""
     ended = _typed("simulate", RIG, "--help", stdout=subprocess.PIPE,
@@ -585,6 +586,7 @@ def test_a_terminal_that_cannot_show_a_letter_costs_no_result() -> None:
     assert b"?x?" in ended.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_behind_a_redirection_is_one_line() -> None:
     with open("/dev/full", "wb") as full:
@@ -594,6 +596,7 @@ def test_a_full_disk_behind_a_redirection_is_one_line() -> None:
     assert ended.stderr.count(b"\n") == 1
 
 
+@pytest.mark.slow
 def test_no_output_at_all_is_none() -> None:
     """`>&-`: nothing to write to, and nothing to flush."""
     ended = _typed("--version", preexec_fn=lambda: os.close(1))

@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from support import rest_slow
 from undertow.cli import app
 
 runner = CliRunner()
@@ -73,6 +74,7 @@ def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -
     assert len(err.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_a_verdict_and_its_exit_code(tmp_path: Path) -> None:
     """Too short to settle: caught, 3; nothing to hold it with: lost or stopped; help tells all."""
     words = ("run", "rotary_pendulum", "--start", "phi=15deg", "--simulated")
@@ -123,7 +125,7 @@ class Arm(IdealRig):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a supervisor is a forked process")
-@pytest.mark.parametrize("supervisor", [None, "--no-supervisor"])
+@pytest.mark.parametrize("supervisor", rest_slow([None, "--no-supervisor"], None))
 def test_a_rig_of_ones_own_is_kept_by_another_process_unless_told_otherwise(
     supervisor: str | None, tmp_path: Path
 ) -> None:
@@ -171,7 +173,10 @@ class Arm(IdealRig):
 """
 
 
-@pytest.mark.parametrize(("step", "code"), [("150", 5), ("150 or self.count > 150", 7)])
+@pytest.mark.parametrize(
+    ("step", "code"),
+    [("150", 5), pytest.param("150 or self.count > 150", 7, marks=pytest.mark.slow)],
+)
 def test_a_driver_that_leaves_the_interpreter_does_not_choose_the_exit_code(
     step: str, code: int, tmp_path: Path
 ) -> None:

@@ -81,6 +81,7 @@ def test_every_mechanism_is_simulated_to_five_digits(
     assert found.state <= 1e-4
 
 
+@pytest.mark.slow
 def test_the_tolerance_is_a_dial(accuracy: ModuleType, rig: ut.Mechanism) -> None:
     """A thousandth of the tolerance is at most a hundredth of the error."""
     case = accuracy.Case("dial", rig, ut.MinimumTime(), rig.state(phi=0.7), Plan.of(PASSING))

@@ -53,7 +53,7 @@ def test_the_reach_of_a_step_bounds_what_scipy_integrates() -> None:
     loop = ClosedLoop(rig, ut.MinimumEnergy(constraints=box), tail_rtol=TAIL_RTOL)
     prepared = _prepared(loop, _around(rig, LANES, 0.1, seed=4))
     reach = prepared.reach.reshape(STEP_SIZES, 2, 4, LANES)
-    for lane, A in enumerate(_whole(prepared.A)):
+    for lane, A in list(enumerate(_whole(prepared.A)))[::4]:
         chain = np.zeros((8, 8))
         chain[:4, :4], chain[:4, 4:] = A, np.eye(4)
         for level in range(STEP_SIZES):

@@ -49,10 +49,13 @@ def agree(
     [
         pytest.param(ClosedLoop(RIG, ut.MinimumEnergy(horizon=2.0)), marks=pytest.mark.slow),
         ClosedLoop(RIG, ut.MinimumTime(horizon=2.0), zoh_steps=2),
-        ClosedLoop(
-            RIG,
-            ut.MinimumTime(horizon=2.0, constraints=ut.state_box(phi=0.7)),
-            plant=ut.mechanisms.rotary_pendulum(m=0.2),
+        pytest.param(
+            ClosedLoop(
+                RIG,
+                ut.MinimumTime(horizon=2.0, constraints=ut.state_box(phi=0.7)),
+                plant=ut.mechanisms.rotary_pendulum(m=0.2),
+            ),
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["energy", "sampled", "another plant in a box"],

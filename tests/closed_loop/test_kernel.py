@@ -24,6 +24,7 @@ from support import (
     random_mechanism,
     random_states,
     random_surface,
+    rest_slow,
     runge_kutta,
 )
 from undertow.closed_loop.kernel import build_loop_graph
@@ -123,7 +124,7 @@ SOME = {(2, 1, "saturation"), (2, 1, "tanh"), (2, 1, "sign"), (4, 2, "saturation
 
 @pytest.mark.parametrize(
     ("n", "m", "switching"),
-    [pytest.param(*shape, marks=() if shape in SOME else pytest.mark.slow) for shape in LOOPS],
+    rest_slow(LOOPS, *SOME),
 )
 def test_continuous_kernels_step_as_runge_kutta_in_numpy_does(
     n: int, m: int, switching: Switching
@@ -143,7 +144,7 @@ def test_continuous_kernels_step_as_runge_kutta_in_numpy_does(
     np.testing.assert_allclose(run.margin[:-1], recorded.margin, rtol=1e-10)
 
 
-@pytest.mark.parametrize(("n", "m"), SHAPES)
+@pytest.mark.parametrize(("n", "m"), rest_slow(SHAPES, (2, 1), (3, 2)))
 def test_sampled_kernels_hold_the_input_of_a_belief_that_is_wrong(n: int, m: int) -> None:
     """Zero-order hold, noise, another plant with a disturbance in time: still the same numbers."""
     belief, surface = random_mechanism(n, m), random_surface(n, m)
@@ -343,7 +344,8 @@ def test_lane_loops_are_compiled_to_vectors() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parameter", "coordinate"), [("d_1", "b"), ("h", "W"), ("v0", "step"), ("limit_0", "noise")]
+    ("parameter", "coordinate"),
+    rest_slow([("d_1", "b"), ("h", "W"), ("v0", "step"), ("limit_0", "noise")], ("h", "W")),
 )
 def test_names_of_users_meet_no_variable_of_the_kernel(parameter: str, coordinate: str) -> None:
     """A mechanism may call its parameters and coordinates what the kernel calls its own."""

@@ -14,7 +14,7 @@ import scipy.linalg
 import sympy as sp
 
 import undertow as ut
-from support import SHAPES, random_mechanism, random_surface
+from support import SHAPES, random_mechanism, random_surface, rest_slow
 from undertow.cascade.cascade import TAIL_RTOL
 from undertow.closed_loop import ClosedLoop, Ensemble, Event, RolloutBuffers
 from undertow.closed_loop.linear_model import NOBODY, Prepared, TerminalLinearModel, _solve
@@ -78,15 +78,8 @@ def test_linear_ends_agree_with_scipy(build: Callable[[], ut.Mechanism]) -> None
 
 @pytest.mark.parametrize(
     ("n", "m", "members"),
-    [
-        *((2, 1, 0), (3, 2, 0), (2, 1, 2), (3, 2, 2)),
-        *(
-            pytest.param(n, m, members, marks=pytest.mark.slow)
-            for n, m in SHAPES if (n, m) not in ((2, 1), (3, 2))
-            for members in (0, 2)
-        ),
-    ],
-)  # fmt: skip
+    rest_slow([(n, m, members) for n, m in SHAPES for members in (0, 2)], (2, 1, 0), (3, 2, 2)),
+)
 def test_linear_models_are_those_of_the_law_and_the_plant(n: int, m: int, members: int) -> None:
     """A by central differences of plant and law, xᵀQx by the stage cost along the law, any n, m.
 

@@ -15,6 +15,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.cli import app
 from undertow.display.animation import Film, evaluator, gif, still
@@ -103,9 +104,7 @@ def film(name: str) -> Film:
     return Film.of(motion(LIBRARY[name]()), fps=5)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(k, marks=() if k in SOME else pytest.mark.slow) for k in NAMES]
-)
+@pytest.mark.parametrize("name", rest_slow(NAMES, *SOME))
 def test_every_mechanism_moves_in_its_gif(name: str) -> None:
     """Claim: a GIF of as many frames as the film, at its pace, in which something moves."""
     shown = film(name)
@@ -175,7 +174,8 @@ def test_animate_on_the_command_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("speed", "fps"), [(1.0, 10.0), (0.5, 10.0), (2.0, 10.0), (1.0, 30.0), (0.5, 200.0)]
+    ("speed", "fps"),
+    rest_slow([(1.0, 10.0), (0.5, 10.0), (2.0, 10.0), (1.0, 30.0), (0.5, 200.0)], (0.5, 10.0)),
 )
 def test_a_film_lasts_as_long_as_it_says(speed: float, fps: float) -> None:
     """Half the speed takes twice as long; the last picture stays a second.

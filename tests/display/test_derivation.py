@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import undertow as ut
 from agreements import named
+from support import rest_slow
 from undertow.cli import app
 from undertow.display.derivation import (
     Derivation,
@@ -134,7 +135,10 @@ def test_roots_of_the_polynomial_are_the_sliding_eigenvalues(name: str) -> None:
     assert np.abs(determinant(poles)).max() < 1e-7 * scale
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", "double_pendulum_on_a_cart"])
+@pytest.mark.parametrize(
+    "name",
+    rest_slow(["rotary_pendulum", "double_pendulum_on_a_cart"], "double_pendulum_on_a_cart"),
+)
 def test_conditions_as_shown_decide_stability(name: str) -> None:
     """Claim: the printed inequalities hold exactly where the exact margin is positive."""
     formulas = shown(name)

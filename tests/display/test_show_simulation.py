@@ -172,6 +172,7 @@ def test_a_hand_pulls_with_a_force_at_a_place(simulation: Simulation) -> None:
         simulation.hear({"do": "grab", "at": [9.0, 9.0]}, 1)
 
 
+@pytest.mark.slow
 def test_a_push_is_an_impulse_and_is_recovered_from(simulation: Simulation) -> None:
     """The pendulum gets 0.7 rad/s, is planned for at once, and comes back."""
     go(simulation, 2.0)
@@ -208,6 +209,7 @@ def test_what_has_fallen_says_so_and_is_caught_again(simulation: Simulation) -> 
     assert abs(simulation.rig.truth[1]) < 0.05
 
 
+@pytest.mark.slow
 def test_controls_do_what_they_say(simulation: Simulation) -> None:
     """Target, objective, period and limit of the controller; mass and friction of the plant."""
     go(simulation, 1.0)
@@ -240,6 +242,7 @@ def test_controls_do_what_they_say(simulation: Simulation) -> None:
         simulation.hear({"do": "explode"}, 1)
 
 
+@pytest.mark.slow
 def test_a_heavier_plant_is_learnt() -> None:
     """A motion of a plant with more mass moves the estimate that the law goes by towards it."""
     simulation = shown()

@@ -77,6 +77,7 @@ def test_the_kalman_filter_finds_the_state_of_its_own_model(arm: ut.Mechanism) -
     assert np.abs(record.x - record.truth)[200:].max() < 1e-7
 
 
+@pytest.mark.slow
 def test_the_covariance_of_the_kalman_filter_is_honest(arm: ut.Mechanism) -> None:
     """The errors that it makes have the variance it says: NEES within wide bounds."""
     rng = np.random.default_rng(0)

@@ -222,7 +222,7 @@ def _knocked(
     return kalman, before, kalman.learnt.offset, off
 
 
-@pytest.mark.parametrize("knock", [-2.0, 6.0])
+@pytest.mark.parametrize("knock", [pytest.param(-2.0, marks=pytest.mark.slow), 6.0])
 def test_a_knock_is_a_jump_of_the_velocities_and_no_parameter(arm: Mechanism, knock: float) -> None:
     """Velocities are found within 5 ms; parameters move no farther than without the knock."""
     calm, before, after, off = _knocked(arm, 0.0)

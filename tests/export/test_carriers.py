@@ -215,7 +215,7 @@ def test_the_ros2_package_fits_together() -> None:
     ("name", "coordinates", "channel", "parameters", "prefix"),
     [
         ('2 "y" <&> \\', ("y", "float"), "return", "for while struct", "ut"),
-        ("Über/pendel", ("θ", "φ"), "main", "α EOF NAN", "foo"),
+        pytest.param("Über/pendel", ("θ", "φ"), "main", "α EOF NAN", "foo", marks=pytest.mark.slow),
     ],
 )
 def test_names_of_a_user_stay_clear_of_all_of_them(

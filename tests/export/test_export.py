@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import undertow as ut
-from support import bar
+from support import bar, rest_slow
 from undertow.base import (
     ArtefactError,
     InvalidInputError,
@@ -99,7 +99,7 @@ def gcc(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
         ("rotary_pendulum", "double", DerivativeStep()),
         ("rotary_pendulum", "float", SuperTwistingStep()),
         (M, "double", SuperTwistingStep((300.0, 200.0, 100.0))),
-        (M, "float", DerivativeStep(0.004)),
+        pytest.param(M, "float", DerivativeStep(0.004), marks=pytest.mark.slow),
         ("rotary_pendulum", "double", KalmanStep()),
     ],
 )
@@ -188,6 +188,7 @@ def test_every_mechanism_of_the_library(name: str, real: str, tmp_path: Path) ->
     assert 100 < footprint.instructions < 5000
 
 
+@pytest.mark.slow
 def test_disturbance_bounds_and_other_switching_functions_are_exported(tmp_path: Path) -> None:
     """The gains (13) from bounds, and the other switching functions."""
     rig = LIBRARY[M]().with_disturbance_bounds(0.3, 0.2, 0.1)
@@ -591,7 +592,7 @@ int main(void)
 """
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", rest_slow(["double", "float"], "float"))
 def test_each_word_of_the_memory_is_checked_where_it_is_used(real: str, tmp_path: Path) -> None:
     """The output, its mirror, indices, counters, plan, latch, estimate, memory never begun.
 
@@ -656,6 +657,7 @@ def test_bits_upset_under_two_motors_and_a_plan_of_three_surfaces(tmp_path: Path
     assert sum(upsets.held.values()) > 0.8 * sum(upsets.runs.values())
 
 
+@pytest.mark.slow
 def test_an_output_beyond_its_limit_is_counted(tmp_path: Path) -> None:
     """The search for them finds one: a controller that clips too late."""
     controller = exported(prefix="other")
@@ -1305,7 +1307,10 @@ def test_report_counts_instructions_and_bytes(tmp_path: Path) -> None:
     assert max(len(line) for line in said.splitlines() if "Written" not in line) <= 80
 
 
-@pytest.mark.parametrize("words", ["*\\ #error run /*", "/* */*/", "????/ \\", "kg/*m**/ ???"])
+@pytest.mark.parametrize(
+    "words",
+    rest_slow(["*\\ #error run /*", "/* */*/", "????/ \\", "kg/*m**/ ???"], "/* */*/", "????/ \\"),
+)
 def test_words_of_a_user_stay_in_their_comment(words: str, tmp_path: Path) -> None:
     """Names, units and descriptions neither end a comment nor begin one: the C compiles."""
     plain = ut.mechanisms.cart_pendulum()

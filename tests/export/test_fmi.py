@@ -159,6 +159,7 @@ def check_units(controller: EmbeddedController, folder: Path) -> None:
             assert (np.abs(plant.read(x_names) - x) <= 1e-9 * np.maximum(1, np.abs(x))).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_motor_three_link"])
 def test_units_are_valid_and_equal_python(name: str, tmp_path: Path) -> None:
     """Show 6: FMPy has no complaint, and there are 1e-9 between a unit and Python."""

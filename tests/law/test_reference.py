@@ -53,7 +53,10 @@ def test_what_is_invariant_is_found_symbolically() -> None:
 
 @pytest.mark.parametrize(
     ("mechanism", "reference"),
-    [(CRANE, ut.Reference.sine(0.2, x=0.5)), (GANTRY, ut.Reference.sine(0.25, x=0.4, y=0.2))],
+    [
+        (CRANE, ut.Reference.sine(0.2, x=0.5)),
+        pytest.param(GANTRY, ut.Reference.sine(0.25, x=0.4, y=0.2), marks=pytest.mark.slow),
+    ],
 )
 def test_a_periodic_reference_is_a_motion_of_the_mechanism(
     mechanism: ut.Mechanism, reference: ut.Reference

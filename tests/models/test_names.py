@@ -12,7 +12,7 @@ import sympy as sp
 from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 
 import undertow as ut
-from support import interpreted
+from support import interpreted, rest_slow
 from undertow.base import InvalidInputError, ModelError, UndertowError
 from undertow.checks import check_mechanism
 from undertow.display.animation import evaluator
@@ -384,7 +384,9 @@ def test_a_kinked_model_is_refused_where_a_derivative_is_needed(what: str) -> No
             KalmanFilter(rig)
 
 
-@pytest.mark.parametrize("what", ["modulus", "maximum", "cases", "modulus times sign"])
+@pytest.mark.parametrize(
+    "what", rest_slow(["modulus", "maximum", "cases", "modulus times sign"], "cases")
+)
 def test_a_kinked_model_is_simulated_where_no_derivative_is_needed(what: str) -> None:
     """Claim: with a surface of one's own it rolls out, as SciPy integrates its equations."""
     from scipy.integrate import solve_ivp

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from support import rest_slow
 from undertow.optimiser.arrival import ArrivalSearch, FloatArray, _steps
 
 RADIUS = 1e-3
@@ -93,7 +94,7 @@ SEEDS = range(1), pytest.param(range(1, 14), marks=pytest.mark.slow)
 
 @pytest.mark.parametrize("seeds", SEEDS)
 @pytest.mark.parametrize("reaching", [False, True])
-@pytest.mark.parametrize("name", ["rotary_pendulum", "cart_pendulum"])
+@pytest.mark.parametrize("name", rest_slow(["rotary_pendulum", "cart_pendulum"], "rotary_pendulum"))
 def test_no_first_answer_promises_an_arrival_that_only_its_own_steps_see(
     name: str, reaching: bool, seeds: range
 ) -> None:

@@ -39,6 +39,7 @@ def earliest(name: str) -> OpenLoopMotion:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["rotary_pendulum", pytest.param("overhead_crane", marks=pytest.mark.slow)]
 )
@@ -88,6 +89,7 @@ def test_a_schedule_is_near_the_earliest_arrival(name: str) -> None:
     assert stability_margin(made.mechanism, last.vector[None])[0] > 0
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_schedule_is_a_schedule() -> None:
     """Each multiple of the period is a time of it, so the promised cost never rises."""
     made = cascade("rotary_pendulum")
@@ -101,9 +103,8 @@ def test_what_is_left_of_a_schedule_is_a_schedule() -> None:
     assert run.cost <= run.updates[0].predicted + 1e-9
 
 
-@pytest.mark.parametrize(
-    "push", [*(pytest.param(p, marks=pytest.mark.slow) for p in (0.0, -0.01)), 0.01]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("push", [0.0, -0.01, 0.01])
 def test_a_pushed_schedule_is_led_back(push: float) -> None:
     """Its surfaces are moved together until they arrive again, within the budget of a period."""
     made = cascade("cart_pendulum")
@@ -171,9 +172,8 @@ def test_times_are_refined() -> None:
     assert refined([], 0.1, 0.004, 0.002) == (0.0,)
 
 
-@pytest.mark.parametrize(
-    ("d_e", "degrees"), [pytest.param(0.073, 41.0, marks=pytest.mark.slow), (0.04, 33.0)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("d_e", "degrees"), [(0.073, 41.0), (0.04, 33.0)])
 def test_several_surfaces_are_nearer_to_the_bound_of_energy(d_e: float, degrees: float) -> None:
     """A part of what one surface wastes remains, and each later decision keeps it or gains."""
     rig = ut.mechanisms.rotary_pendulum(d_e=d_e)

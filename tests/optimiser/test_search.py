@@ -66,7 +66,9 @@ def test_solves_the_standard_problems(cost: Cost, d: int) -> None:
     assert (min if cost is rosenbrock and d > 3 else max)(spent) < 4_000
 
 
-@pytest.mark.parametrize(("cost", "d"), [(ellipsoid, 5), (rosenbrock, 4)])
+@pytest.mark.parametrize(
+    ("cost", "d"), [(ellipsoid, 5), pytest.param(rosenbrock, 4, marks=pytest.mark.slow)]
+)
 def test_matches_the_cmaes_package(cost: Cost, d: int) -> None:
     """Evaluations to 1e-8 like the ``cmaes`` package's, in the median of nine seeds.
 

@@ -241,9 +241,8 @@ def test_parameters_and_the_hand_vary_within_what_is_declared(arm: ut.Mechanism)
     assert np.std(starts) == pytest.approx(bench.hand["phi"], rel=0.4)
 
 
-@pytest.mark.parametrize(
-    "name", ["gantry_crane", pytest.param("triple_pendulum_on_a_cart", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow  # kernels of their own
+@pytest.mark.parametrize("name", ["gantry_crane", "triple_pendulum_on_a_cart"])
 def test_a_usual_bench_can_be_made_of_any_mechanism(name: str) -> None:
     mechanism = ut.mechanisms.LIBRARY[name]()
     rig = RealisticRig(plausible_rig(mechanism), seed=1)

@@ -188,6 +188,7 @@ def test_a_real_time_iteration_stays_at_a_converged_plan(
     np.testing.assert_allclose(control._plan[1], before[1], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_what_predictive_control_learns_is_the_librarys_belief(
     predictive: ModuleType, rivals: ModuleType, rig: ut.Mechanism
 ) -> None:

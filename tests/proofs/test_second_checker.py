@@ -98,6 +98,7 @@ def number(text: str) -> Fraction:
 # -- the kept file, and the command ---------------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_kept_file_is_decided_alike(program: Path, tmp_path: Path) -> None:
     run = answer(program, KEPT.read_bytes(), tmp_path)

@@ -228,6 +228,7 @@ def test_a_stable_surface_whose_region_holds_the_singularity_is_refuted() -> Non
     assert nonsingular(RIG, BASE, {"theta": (-1.0, 1.0), "phi": (-0.2, 1.36)})
 
 
+@pytest.mark.slow
 def test_proved_margins_bound_random_samples() -> None:
     """Two inputs: the ratio and the singular value are below every sample and near the least."""
     mechanism = two_arm()

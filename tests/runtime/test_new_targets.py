@@ -90,6 +90,7 @@ def test_a_run_is_given_another_target_and_replayed_to_the_same_bits(tmp_path: P
     assert told[:2] == (600, 0.6)
 
 
+@pytest.mark.slow
 def test_a_log_without_what_was_asked_for_is_another_run(tmp_path: Path) -> None:
     """What was asked for is what the replay goes by."""
     import sqlite3
@@ -138,6 +139,7 @@ def test_thrown_out_the_target_is_asked_for_again() -> None:
     assert answer.memory.target is None
 
 
+@pytest.mark.slow
 def test_where_there_is_no_plan_the_target_stays_and_the_run_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,8 +173,9 @@ HERE, ELSEWHERE = (ReferenceMotion.at_rest(np.array([q, 0.0])) for q in (0.3, 0.
 @pytest.mark.parametrize(
     ("asked", "jump", "target"),
     [
-        (False, True, ELSEWHERE), (False, True, None), (False, False, ELSEWHERE),
-        (True, True, ELSEWHERE), (True, True, None), (True, True, HERE),
+        (False, True, ELSEWHERE), (False, False, ELSEWHERE), (True, True, ELSEWHERE),
+        *(pytest.param(*case, marks=pytest.mark.slow)
+          for case in ((False, True, None), (True, True, None), (True, True, HERE))),
     ],
 )  # fmt: skip
 def test_an_answer_for_another_target_is_refused(
@@ -200,6 +203,7 @@ def test_an_answer_for_another_target_is_refused(
     assert controller.memory.target is (HERE if good else None)
 
 
+@pytest.mark.slow
 def test_a_jump_is_not_made_where_the_state_is_not_the_expected_one() -> None:
     """The output of that step is the old plan's about the old target."""
     recipe = Recipe(start=(0.0, 0.05, 0.0, 0.0), evaluations=32)

@@ -12,6 +12,7 @@ import pytest
 
 import undertow as ut
 from runs import RECIPE
+from support import rest_slow
 from undertow.cascade import Admission, CascadeState
 from undertow.law import Plan, ReachingLaw, first_surface, sliding_matrix
 from undertow.runtime import (
@@ -159,7 +160,7 @@ FORGERIES = {
 }
 
 
-@pytest.mark.parametrize("name", FORGERIES)
+@pytest.mark.parametrize("name", rest_slow(FORGERIES, "λ flipped", "one bit", "plan flipped"))
 def test_a_forged_answer_is_refused_with_its_reason_and_counted(
     name: str, controller: Controller, tmp_path: Path
 ) -> None:

@@ -38,6 +38,7 @@ def off(log: Path, after: float) -> tuple[float, float]:
     return float(arm), float(pendulum)
 
 
+@pytest.mark.slow
 def test_a_run_follows_a_sine_and_is_replayed_to_the_same_bits(tmp_path: Path) -> None:
     """The arm swings by 20°; answers are asked for, judged along the reference and used."""
     log = tmp_path / "run.db"

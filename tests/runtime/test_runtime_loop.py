@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from runs import RECIPE
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.cascade import CascadeState
 from undertow.plants import Measurement, RealisticRig
@@ -161,7 +162,13 @@ def test_a_worker_that_fails_leaves_the_last_plan(controller: Controller) -> Non
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"law_vectors": None}, {"x": [0.0] * 4}, {"sequence": "1"}, {"memory": None}, None]
+    "wrong",
+    rest_slow(
+        [{"law_vectors": None}, {"x": [0.0] * 4}, {"sequence": "1"}, {"memory": None}, None],
+        {"law_vectors": None},
+        {"sequence": "1"},
+        None,
+    ),
 )
 def test_what_is_no_whole_answer_is_not_looked_at(
     wrong: dict[str, object] | None, tmp_path: Path

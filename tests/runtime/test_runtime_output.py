@@ -281,6 +281,7 @@ def test_a_share_is_that_of_the_last_window() -> None:
     assert whole.value == pytest.approx(parts.value)
 
 
+@pytest.mark.slow
 def test_reads_that_fail_too_often_stop_the_run(controller: Controller) -> None:
     """One in three raises, and no gap is as long as the patience; one in ten is bridged."""
 
@@ -382,11 +383,16 @@ class Slow(Device):
     ("cost", "stops"),
     [
         (lambda k: 1.5e-3 if k > 100 else 0.0, True),
-        (lambda k: 8e-3 if k > 100 else 0.0, True),
-        (lambda k: 3e-3 if k > 100 and k % 4 == 0 else 0.0, True),
-        (lambda k: 0.9e-3, False),
         (lambda k: 0.05 if k == 200 else 0.0, False),  # a host that stands still for once
-        (lambda k: 0.02 if k % 200 == 100 else 0.0, False),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                (lambda k: 8e-3 if k > 100 else 0.0, True),
+                (lambda k: 3e-3 if k > 100 and k % 4 == 0 else 0.0, True),
+                (lambda k: 0.9e-3, False),
+                (lambda k: 0.02 if k % 200 == 100 else 0.0, False),
+            )
+        ),
     ],
 )
 def test_deadlines_missed_beyond_a_share_of_a_second_stop_the_run(

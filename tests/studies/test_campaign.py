@@ -312,6 +312,7 @@ def test_damaged_chunks_are_found_and_computed_again(
     assert content(path) == content(serial)
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_campaign_and_keeps_what_is_done(serial: Path, tmp_path: Path) -> None:
     """Files of at most so many bytes, by the system: a write fails in its middle."""
     path = tmp_path / "store"

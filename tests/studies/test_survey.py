@@ -66,7 +66,8 @@ def test_simulate_every_other_with_no_further_choice(name: str) -> None:
     check_simulate(name)
 
 
-@pytest.mark.parametrize("name", [PROMPT, pytest.param("acrobot", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [PROMPT, "acrobot"])
 def test_costs_fall_from_first_surface_to_cascade(name: str) -> None:
     """Claim: optimising once never costs more than the first surface, the cascade not more yet."""
     pytest.importorskip("casadi")

@@ -93,6 +93,7 @@ def test_a_fault_is_read_back_from_its_name() -> None:
             Fault.parse(wrong)
 
 
+@pytest.mark.slow
 def test_a_run_makes_every_call(campaign: Systematic) -> None:
     """Nothing that is to fail is out of reach: else a campaign proves nothing of it."""
     for rig, counts in campaign.count().items():

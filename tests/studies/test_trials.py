@@ -50,6 +50,7 @@ def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mecha
     assert costs["cascade"] < costs["one-time"] * 1.002
 
 
+@pytest.mark.slow
 def test_the_cascade_balances_realistic_rigs_and_saves_energy(arm: ut.Mechanism) -> None:
     x0, goal = arm.state(phi=ut.deg(35)), objective_for(arm, "bench-energy")
     made = controllers(arm, srv02_rig(), goal, x0, budget=128)

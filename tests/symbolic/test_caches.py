@@ -233,10 +233,9 @@ def read_only(tmp_path: Path) -> dict[str, str]:
     return {"PYTHONPATH": str(package), "HOME": str(home), "TMPDIR": str(temporary)}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="capabilities of Linux")
-@pytest.mark.parametrize(
-    "code", [COMPILED, pytest.param(READ_ONLY_RUN, marks=pytest.mark.slow)], ids=["import", "run"]
-)
+@pytest.mark.parametrize("code", [COMPILED, READ_ONLY_RUN], ids=["import", "run"])
 def test_an_installation_and_a_home_that_cannot_be_written_are_no_obstacle(
     read_only: dict[str, str], code: str
 ) -> None:
@@ -325,6 +324,7 @@ print(round(theirs(x), 6))
 '''
 
 
+@pytest.mark.slow
 def test_kept_machine_code_loads_without_what_compiling_needs(tmp_path: Path) -> None:
     """Claim: a second process runs it without numba's own functions, and can still compile."""
     paths = os.pathsep.join(sys.path)
