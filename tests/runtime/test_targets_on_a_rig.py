@@ -86,3 +86,10 @@ def test_a_recipe_with_a_target_is_data() -> None:
     assert again == recipe
     assert [begin for begin, _ in again.legs] == [0.0, 2.5]
     assert np.allclose(again.legs[1][1].state(9.0), CRANE.state(x=-0.3))
+
+
+def test_a_target_is_refused_before_a_controller_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its estimator and gate took seconds to compile, for a run that cannot be."""
+    monkeypatch.setattr(Recipe, "make_estimator", lambda _self: pytest.fail("it was made"))
+    with pytest.raises(InvalidInputError, match="95 % of the travel"):
+        Recipe("overhead_crane", target=[(0.0, {"x": 2.0})])

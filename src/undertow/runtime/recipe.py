@@ -253,7 +253,7 @@ class Recipe:
         """When the target jumps, s, and where to; empty for x = 0."""
         if not self.target:
             return ()
-        objective, settings, goal = self.cascade.objective, self.settings, self.target
+        objective, settings, goal = self._designed.objective, self.settings, self.target
         if not isinstance(goal, Reference):
             return checked_legs(self.belief, objective, settings, SetPoints(goal))
         return checked_legs(self.belief, objective, settings, goal, self.duration)
