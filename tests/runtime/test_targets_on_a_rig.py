@@ -92,4 +92,4 @@ def test_a_target_is_refused_before_a_controller_is_made(monkeypatch: pytest.Mon
     """Its estimator and gate took seconds to compile, for a run that cannot be."""
     monkeypatch.setattr(Recipe, "make_estimator", lambda _self: pytest.fail("it was made"))
     with pytest.raises(InvalidInputError, match="95 % of the travel"):
-        Recipe("overhead_crane", target=[(0.0, {"x": 2.0})])
+        Recipe("overhead_crane", target=((0.0, {"x": 2.0}),))

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import undertow as ut
 from undertow.base import Verdict
 from undertow.cli import app
+from undertow.law import first_surface
 from undertow.proofs import LoopClaim, RegionClaim, read_certificate
 from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.gate import Policy, certified_gate
@@ -108,17 +109,17 @@ def test_the_papers_cases_at_once() -> None:
     assert "0.5481 1/s" in shown  # the rate of docs/appendix.md
 
 
-def region() -> ProvedRegion:
-    """A round set, small enough to be one of attraction."""
+def region(size: float = 0.02) -> ProvedRegion:
+    """A round set, by default small enough to be one of attraction."""
     import scipy.linalg
 
     motion = SurfaceMotion(RIG, GOOD)
     P = scipy.linalg.solve_continuous_lyapunov(motion.jacobian.T, -np.diag([30.0, 0.3, 3.0]))
     squares = np.array([[2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0], [0, 1, 1], [0, 0, 2]])
     values = [P[0, 0], 2 * P[0, 1], 2 * P[0, 2], P[1, 1], 2 * P[1, 2], P[2, 2]]
-    V = LyapunovFunction(np.eye(3), squares, np.array(values) / 0.02)
+    V = LyapunovFunction(np.eye(3), squares, np.array(values) / size)
     sound = Verdict("a region", "proved")
-    return ProvedRegion(motion, np.eye(3)[0], (V,), sound, 0.02, Verdict("a larger one", "refuted"))
+    return ProvedRegion(motion, np.eye(3)[0], (V,), sound, size, Verdict("a larger one", "refuted"))
 
 
 def test_a_region_for_every_plant_of_a_box() -> None:
@@ -158,19 +159,24 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
     assert "full loop" in text(appendix_report([case]))
 
 
-def test_the_simulated_region_is_the_non_singular_strip() -> None:
-    """Between the singular angles, ±58.0°, all slow motions come home; beyond, none."""
-    angles = np.array([-1.1, -1.0, -0.5, 0.0, 0.5, 1.0, 1.1])
-    y = np.zeros((7, 3))
-    y[:, 0] = angles
-    home = figure.simulated(region(), y)
-    assert home.tolist() == [False, True, True, True, True, True, False]
+@pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link"])
+def test_points_of_a_picture_are_states_on_the_surface(name: str) -> None:
+    """s = 0 there by the law itself, and a state's point is the point it was made from."""
+    mechanism = ut.mechanisms.LIBRARY[name]()
+    surface = first_surface(mechanism)
+    motion = SurfaceMotion(mechanism, surface)
+    y = np.random.default_rng(2).uniform(-0.2, 0.2, (3, 4, motion.size))
+    x = figure.states(motion, y)
+    assert x.shape == (3, 4, 2 * mechanism.n)
+    law = ut.SlidingModeLaw(mechanism, surface)
+    assert np.abs(law(0.0, x.reshape(-1, x.shape[-1])).s).max() < 1e-12 * np.abs(x).max()
+    np.testing.assert_allclose(figure.points(motion, x), y, atol=1e-12)
 
 
 @pytest.mark.slow
 def test_the_picture_names_its_axes_in_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figure, "GRID", 9)
-    drawn = region_figure(region(), "a title")
+    drawn = region_figure(region(), ut.ReachingLaw(), "a title")
     left, right = drawn.axes
     assert left.get_xlabel() == "φ (°)"
     assert "°/s" in left.get_ylabel()
@@ -185,31 +191,33 @@ def test_unknown_evidence_is_refused() -> None:
     assert "faith" in answer.output
 
 
-@pytest.mark.slow  # proves and draws
-def test_the_picture_of_a_region_says_where_it_ignores_the_input_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """At φ = 50° on the surface the law asks for more than 15 V; near the target for less.
-
-    A small region says nothing with 15 V, and says it with a motor of 0.1 V.
-    """
-    monkeypatch.setattr(figure, "GRID", 9)
-    one = region()
-    motion = one.motion
+def test_what_the_actuators_can_keep_on_the_surface() -> None:
+    """At φ = 50° on the surface the law asks for more than 15 V; at the target for nothing."""
+    motion = region().motion
     assert isinstance(motion, SurfaceMotion)
     surface = motion.surface
     x = motion.mechanism.state(phi=ut.deg(50), theta=0.0)
-    w = (surface.lambda_u / surface.lambda_a).item() * x[1]
-    y = np.array([[x[1], 0.0, w], [0.0, 0.0, 0.0]])
     x[2] = float((surface.lambda_u * x[1] / -surface.alpha_a).item())
     law = ut.SlidingModeLaw(motion.mechanism, surface)(0.0, x)
     assert float(law.s[0]) == pytest.approx(0.0, abs=1e-12)
-    spare = figure.held(motion, y)
+    spare = figure.held(motion, np.array([figure.points(motion, x), np.zeros(3)]))
     assert spare[0] == pytest.approx(1 - abs(law.demand[0]) / 15)
     assert spare[0] < 0
     assert spare[1] == 1.0
-    assert figure.region_figure(one, "a title").get_suptitle() == "a title"
-    weak = SurfaceMotion(motion.mechanism.with_input_limit(0.1), surface)
-    said = figure.region_figure(replace(one, motion=weak), "a title")
-    assert "input limit ignored" in said.get_suptitle()
-    assert any("0.1 V" in text.get_text() for text in said.legends[0].get_texts())
+
+
+@pytest.mark.slow  # draws
+def test_the_picture_of_a_region_has_the_input_limit_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It names the limit, and is as wide as what comes home: less with a weaker motor."""
+    monkeypatch.setattr(figure, "GRID", 9)
+    one, fastest = region(20.0), []
+    assert isinstance(one.motion, SurfaceMotion)
+    for volts in (15.0, 1.0):
+        motion = SurfaceMotion(one.motion.mechanism.with_input_limit(volts), one.motion.surface)
+        drawn = region_figure(replace(one, motion=motion), ut.ReachingLaw(), "a title")
+        words = [text.get_text() for text in drawn.legends[0].get_texts()]
+        assert f"comes home with {volts:g} V, simulated" in words
+        assert "proved, input not limited" in words
+        fastest.append(drawn.axes[0].get_ylim()[1])
+    assert fastest[1] < 0.5 * fastest[0]
+    assert fastest[0] < 3000  # °/s

@@ -173,7 +173,7 @@ def _files(
         if item.region is not None:
             progress("figure", 0.95)
             key = "region" if len(certified) == 1 else f"region_{index + 1}"
-            figures[key] = certification.region_figure(item.region, title)
+            figures[key] = certification.region_figure(item.region, item.subject.reaching, title)
         for claim in (c for c in item.subject.claims if c.kind == "closed loop"):
             found, subject = LoopClaim.from_dict(claim.data), item.subject
             key = "loop" if len(certified) == 1 else f"loop_{index + 1}"
