@@ -26,7 +26,7 @@ import numpy as np
 import undertow as ut
 from undertow.cascade import cost_gate
 from undertow.cascade.cascade import TAIL_RTOL
-from undertow.proofs.gate import Policy, assess, certified_gate
+from undertow.proofs.gate import GatePolicy, assess, certified_gate
 from undertow.proofs.search.terminal_ellipsoid import search_for
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
@@ -90,7 +90,7 @@ def main() -> int:
             "cost gate, integrated": cost_gate,
             "cost gate, linear end": lambda loop, *rest, q=quick: cost_gate(q, *rest),
             "first look at a surface": modes,
-            "evidence": lambda loop, old, new, x, h: assess(loop, new, x, h, Policy()),
+            "evidence": lambda loop, old, new, x, h: assess(loop, new, x, h, GatePolicy()),
             "certified gate": ended,
         }
         found = timed(now, asked, rounds, answers)

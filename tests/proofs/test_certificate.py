@@ -40,7 +40,7 @@ from undertow.proofs.claims.region import reaches, verify_region
 from undertow.proofs.claims.stability import StabilityClaim, hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import match, proved_sets, verify
-from undertow.proofs.gate import Policy, assess
+from undertow.proofs.gate import GatePolicy, assess
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.terminal_ellipsoid import search_for
@@ -351,7 +351,7 @@ def test_a_verified_certificate_serves_the_gate(written: bytes) -> None:
     x = 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
     assert sets[0].contains(x)
     assert not sets[0].contains(RIG.state(phi=0.3))
-    verdict = assess(ut.ClosedLoop(RIG), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    verdict = assess(ut.ClosedLoop(RIG), Plan.of(SURFACE), x, 20.0, GatePolicy(("region",)), sets)
     assert "proved before" in verdict.method
     doubtful = [replace(item, verdict=Verdict("x", "undecided")) for item in checked]
     assert proved_sets(RIG, doubtful) == ()
@@ -364,7 +364,7 @@ def test_proved_sets_are_of_one_mechanism(written: bytes) -> None:
     with pytest.raises(CertificateError, match="other equations, parameters or limits"):
         proved_sets(heavy, checked)
     sets, x = proved_sets(RIG, checked), 1e-4 * np.array([1.0, -1.0, 1.0, 1.0])
-    verdict = assess(ut.ClosedLoop(heavy), Plan.of(SURFACE), x, 20.0, Policy(("region",)), sets)
+    verdict = assess(ut.ClosedLoop(heavy), Plan.of(SURFACE), x, 20.0, GatePolicy(("region",)), sets)
     assert "proved before" not in verdict.method
 
 

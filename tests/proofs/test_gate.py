@@ -18,7 +18,7 @@ from undertow.law import Plan, ProvedSet
 from undertow.law.sliding import singularity
 from undertow.models import FloatArray
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
-from undertow.proofs.gate import Evidence, Policy, assess, certified_gate
+from undertow.proofs.gate import Evidence, GatePolicy, assess, certified_gate
 from undertow.proofs.search.terminal_ellipsoid import search_for
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
@@ -63,7 +63,7 @@ class Fake:
 def cascade(answers: Sequence[ut.Surface | None], **settings: Any) -> ut.Cascade:
     """A cascade whose optimiser lies: it claims cost 0 for everything."""
     goal = ut.MinimumTime(horizon=20.0)
-    gate = certified_gate(Policy())
+    gate = certified_gate(GatePolicy())
     return ut.Cascade(
         RIG, goal, gate=gate, first=GOOD, planner=Fake(answers), **settings, belief="exact"
     )
@@ -146,7 +146,7 @@ FAR = RIG.state(phi=0.3)
     ],
 )
 def test_a_policy_says_what_will_do(accept: tuple[Evidence, ...], x: FloatArray, kind: str) -> None:
-    verdict = assess(LOOP, Plan.of(GOOD), x, 20.0, Policy(accept))
+    verdict = assess(LOOP, Plan.of(GOOD), x, 20.0, GatePolicy(accept))
     assert verdict.kind == kind
     if kind == "undecided":
         assert verdict.details["evidence"] is None
@@ -160,8 +160,8 @@ def test_a_policy_says_what_will_do(accept: tuple[Evidence, ...], x: FloatArray,
 def test_margins_of_the_policy_count() -> None:
     """A singularity close to the path, a constraint, a hard input limit."""
     near = singular_at(0.32)
-    assert assess(LOOP, Plan.of(near), FAR, 20.0, Policy(("dual",))).kind == "undecided"
-    strict = Policy(("dual",), singular_margin=0.92)
+    assert assess(LOOP, Plan.of(near), FAR, 20.0, GatePolicy(("dual",))).kind == "undecided"
+    strict = GatePolicy(("dual",), singular_margin=0.92)
     assert "singularity margin" in assess(LOOP, Plan.of(GOOD), FAR, 20.0, strict).method
     box = ut.state_box(phi_dot=4.0)
     goal = ut.MinimumTime(horizon=20.0, constraints=box, hard_input=True)
@@ -171,7 +171,7 @@ def test_margins_of_the_policy_count() -> None:
     path, spare = float(free.path.min()), float(free.input.min())
 
     def answer(constraint_margin: float = 0.0, input_margin: float = 0.0) -> str:
-        policy = Policy(("dual",), 0.05, constraint_margin, input_margin)
+        policy = GatePolicy(("dual",), 0.05, constraint_margin, input_margin)
         verdict = assess(loop, Plan.of(GOOD), FAR, 20.0, policy)
         return verdict.method if verdict.kind == "undecided" else verdict.kind
 
@@ -187,11 +187,11 @@ def test_a_sampled_loop_has_no_terminal_set() -> None:
     verdict = assess(held, Plan.of(GOOD), FAR, 20.0)
     assert verdict.kind == "undecided"
     assert "continuous law" in verdict.method
-    assert assess(held, Plan.of(GOOD), FAR, 20.0, Policy(("sampled",))).kind == "sampled"
+    assert assess(held, Plan.of(GOOD), FAR, 20.0, GatePolicy(("sampled",))).kind == "sampled"
 
 
 def test_nearby_states_that_fail_are_counted() -> None:
-    wide = Policy(("sampled",), samples=32, spread=1.5)
+    wide = GatePolicy(("sampled",), samples=32, spread=1.5)
     assert "nearby states fail" in assess(LOOP, Plan.of(GOOD), FAR, 20.0, wide).method
 
 
@@ -209,7 +209,7 @@ def test_sets_that_were_proved_before_are_used() -> None:
     """For the same surface and law alone."""
     here = ProvedSet(GOOD, ut.ReachingLaw(), Known(lambda x: bool(abs(x[1]) < 0.4)))
     other = ProvedSet(SLOW, ut.ReachingLaw(), Known(lambda x: True))
-    only = Policy(("region",))
+    only = GatePolicy(("region",))
     assert assess(LOOP, Plan.of(GOOD), FAR, 20.0, only, [other]).kind == "undecided"
     assert assess(LOOP, Plan.of(GOOD), FAR, 20.0, only, [other, here]).kind == "proved"
 
@@ -218,14 +218,14 @@ def test_a_schedule_is_judged_by_its_last_surface() -> None:
     """Prediction goes through the changes; no region is claimed before the last one acts."""
     plan = Plan((SLOW, GOOD), (0.0, 0.2))
     assert assess(LOOP, plan, FAR, 20.0).details["evidence"] == "dual"
-    assert "changes surfaces" in assess(LOOP, plan, NEAR, 20.0, Policy(("region",))).method
+    assert "changes surfaces" in assess(LOOP, plan, NEAR, 20.0, GatePolicy(("region",))).method
     broken = Plan((GOOD, UNSTABLE), (0.0, 0.2))
     assert assess(LOOP, broken, FAR, 20.0).kind == "undecided"
 
 
 def test_the_refusal_keeps_the_old_plans_cost_and_verdict() -> None:
     """Stable, cheaper, and still refused: its path passes the singularity too closely."""
-    policy = Policy(("dual",), singular_margin=0.9)
+    policy = GatePolicy(("dual",), singular_margin=0.9)
     fast = ut.Surface(-1, -3.0, 1.42, 9.2)
     gate = certified_gate(policy)
     cheap = cost_gate(LOOP, Plan.of(SLOW), Plan.of(fast), FAR, 20.0)
@@ -241,7 +241,7 @@ def test_the_refusal_keeps_the_old_plans_cost_and_verdict() -> None:
 @pytest.mark.slow  # an interpreter of its own
 def test_a_gate_travels_to_another_process() -> None:
     """The optimiser may run in a process of its own: what it decides there is the same."""
-    gate = certified_gate(Policy(("dual",), singular_margin=0.1), tail=5e-3)
+    gate = certified_gate(GatePolicy(("dual",), singular_margin=0.1), tail=5e-3)
     there = pickle.loads(pickle.dumps(gate))
     assert there == gate
     question = (LOOP, Plan.of(SLOW), Plan.of(GOOD), FAR, 20.0)
@@ -250,7 +250,7 @@ def test_a_gate_travels_to_another_process() -> None:
 
 def test_the_first_plan_is_used_and_judged() -> None:
     """There is no other: the log says what the gate thinks of it."""
-    strict = certified_gate(Policy(("region",)))
+    strict = certified_gate(GatePolicy(("region",)))
     made = replace(cascade([None]), gate=strict)
     run = made.simulate(phi=0.3)
     first = run.updates[0].admission
@@ -288,4 +288,4 @@ def test_ellipsoids_of_the_gate_are_invariant_under_switching_back() -> None:
 )
 def test_policies_that_mean_nothing_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match="polic"):
-        Policy(**settings)
+        GatePolicy(**settings)

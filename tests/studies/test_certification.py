@@ -19,7 +19,7 @@ from undertow.cli import app
 from undertow.law import first_surface
 from undertow.proofs import LoopClaim, RegionClaim, read_certificate
 from undertow.proofs.claims.appendix import CASES
-from undertow.proofs.gate import Policy, certified_gate
+from undertow.proofs.gate import GatePolicy, certified_gate
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.region import ProvedRegion
@@ -51,7 +51,7 @@ def text(shown: Any, width: int = 150) -> str:
 @pytest.fixture(scope="module")
 def run() -> ut.Run:
     """A short cascade whose gate asks for evidence."""
-    gate = certified_gate(Policy(("region", "dual")))
+    gate = certified_gate(GatePolicy(("region", "dual")))
     cascade = ut.Cascade(
         RIG, GOAL, gate=gate, first=GOOD, cold=ut.Budget(64), warm=ut.Budget(32), belief="exact"
     )

@@ -12,7 +12,7 @@ from undertow.cli.options import option
 from undertow.cli.terminal import command, completed, end_interrupted, exit_unless, show
 
 if TYPE_CHECKING:
-    from undertow.studies.campaign import Outcome
+    from undertow.studies.campaign import CampaignResult
 
 
 @command(
@@ -106,7 +106,7 @@ def campaign(
     elif shard is not None:
         show(*alone(task, shard))
     else:
-        outcomes: list[Outcome] = []
+        outcomes: list[CampaignResult] = []
         with executor_for(threads=threads, workers=workers, scheduler=scheduler) as (pool, width):
             whole = completed(
                 lambda progress: outcomes.append(

@@ -163,10 +163,10 @@ def simulate(
 
 def _evidence_gate(accept: list[str]) -> Gate:
     """Return the gate that asks for evidence of these kinds."""
-    from undertow.proofs import Policy, certified_gate
+    from undertow.proofs import GatePolicy, certified_gate
 
     kinds: Any = tuple(accept)
-    return certified_gate(Policy(kinds))
+    return certified_gate(GatePolicy(kinds))
 
 
 @command(

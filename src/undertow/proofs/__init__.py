@@ -29,7 +29,7 @@ from undertow.proofs.claims.region import RegionClaim, verify_region
 from undertow.proofs.claims.stability import StabilityClaim, hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram, TerminalEllipsoid
 from undertow.proofs.claims.verify import Checked, check_settings, proved_sets, verify
-from undertow.proofs.gate import Policy, assess, certified_gate
+from undertow.proofs.gate import GatePolicy, assess, certified_gate
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.sampled import box_starts, sampled_extent, sampled_region
@@ -44,10 +44,10 @@ __all__ = [
     "Claim",
     "ClosedLoopProgram",
     "DisturbanceBound",
+    "GatePolicy",
     "LoopClaim",
     "LyapunovFunction",
     "NonsingularClaim",
-    "Policy",
     "ProvedLoop",
     "ProvedRegion",
     "ReachingCertificate",

@@ -1,6 +1,6 @@
 """The admission gate with verdicts: a new surface needs evidence for the present state.
 
-A :class:`Policy` says which kinds of evidence the user accepts, the strongest first:
+A :class:`GatePolicy` says which kinds of evidence the user accepts, the strongest first:
 
 ``region``
     The state is inside a proved region of attraction of the closed loop with the new surface
@@ -47,7 +47,7 @@ _KINDS: tuple[Evidence, ...] = ("region", "dual", "sampled", "local")
 
 
 @dataclass(frozen=True)
-class Policy:
+class GatePolicy:
     """Which evidence is accepted for a new surface at the present state, with what margins.
 
     Parameters
@@ -66,7 +66,7 @@ class Policy:
 
     Examples
     --------
-    >>> Policy(accept=("region", "dual")).singular_margin
+    >>> GatePolicy(accept=("region", "dual")).singular_margin
     0.05
     """
 
@@ -99,7 +99,7 @@ class _Case:
     plan: Plan
     x: FloatArray
     horizon: float
-    policy: Policy
+    policy: GatePolicy
     sets: Sequence[ProvedSet]
 
     @property
@@ -155,7 +155,7 @@ def assess(
     plan: Plan,
     x: FloatArray,
     horizon: float,
-    policy: Policy = Policy(),
+    policy: GatePolicy = GatePolicy(),
     sets: Iterable[ProvedSet] = (),
 ) -> Verdict:
     """Return the strongest accepted evidence that a plan brings the state x to the target.
@@ -246,7 +246,7 @@ def _dual(case: _Case) -> Verdict | str:
 class _Margins:
     """Smallest margins along a prediction, against the policy's."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: GatePolicy) -> None:
         self.policy = policy
         self.singular = math.inf
 
@@ -316,7 +316,7 @@ def _with_tail(loop: ClosedLoop, tail: float) -> ClosedLoop:
 class CertifiedGate:
     """The gate that :func:`certified_gate` returns; a plain record, so it can be pickled."""
 
-    policy: Policy
+    policy: GatePolicy
     sets: tuple[ProvedSet, ...]
     base: Gate
     tail: float
@@ -343,7 +343,7 @@ class CertifiedGate:
 
 
 def certified_gate(
-    policy: Policy = Policy(),
+    policy: GatePolicy = GatePolicy(),
     *,
     sets: Iterable[ProvedSet] = (),
     base: Gate = cost_gate,
@@ -371,8 +371,8 @@ def certified_gate(
     Examples
     --------
     >>> import undertow as ut
-    >>> from undertow.proofs import Policy, certified_gate
+    >>> from undertow.proofs import GatePolicy, certified_gate
     >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
-    >>> cascade = ut.Cascade(rig, ut.MinimumTime(), gate=certified_gate(Policy(("dual",))))
+    >>> cascade = ut.Cascade(rig, ut.MinimumTime(), gate=certified_gate(GatePolicy(("dual",))))
     """
     return CertifiedGate(policy, tuple(sets), base, tail)

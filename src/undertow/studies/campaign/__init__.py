@@ -5,14 +5,14 @@ A :class:`Definition` is data; it means a :class:`Study`, whose grid is cut into
 """
 
 from undertow.studies.campaign.definition import Definition
-from undertow.studies.campaign.run import Campaign, Outcome, compute, executor_for
+from undertow.studies.campaign.run import Campaign, CampaignResult, compute, executor_for
 from undertow.studies.campaign.store import Store, dataset, digest
 from undertow.studies.campaign.study import Study
 
 __all__ = [
     "Campaign",
+    "CampaignResult",
     "Definition",
-    "Outcome",
     "Store",
     "Study",
     "compute",

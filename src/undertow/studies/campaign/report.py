@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import RenderableType
 
 from undertow.base import duration, number, table
-from undertow.studies.campaign.run import Campaign, Outcome, compute
+from undertow.studies.campaign.run import Campaign, CampaignResult, compute
 from undertow.studies.campaign.store import Store, digest
 
 #: Numbers of shards that a sentence lists.
@@ -39,7 +39,7 @@ def alone(campaign: Campaign, shard: int) -> list[str]:
     ]
 
 
-def report(campaign: Campaign, outcome: Outcome) -> list[RenderableType]:
+def report(campaign: Campaign, outcome: CampaignResult) -> list[RenderableType]:
     """Return what came of a run: numbers of every variable, and what failed."""
     parts = tables(campaign) if outcome.done else []
     repaired = f", {len(outcome.repaired)} because they were damaged" if outcome.repaired else ""

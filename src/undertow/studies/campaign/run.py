@@ -136,7 +136,7 @@ def work(definition: Definition, key: str, path: str, shard: int, limit: float |
 
 
 @dataclass
-class Outcome:
+class CampaignResult:
     """What came of a campaign: ``done`` of ``shards`` finished, and why others failed, by number.
 
     ``computed`` now, in ``seconds``; ``repaired`` were damaged in the store.
@@ -222,7 +222,7 @@ class Campaign:
         limit: float | None = None,
         resume: bool = False,
         progress: Progress = no_progress,
-    ) -> Outcome:
+    ) -> CampaignResult:
         """Compute what the store has not, and return what came of it.
 
         Parameters
@@ -249,7 +249,7 @@ class Campaign:
         with store.alone():
             repaired = store.repair(self.study) if resume else []
             marks = store.marks()
-            outcome = Outcome(len(marks), int((marks != 0).sum()), repaired=repaired)
+            outcome = CampaignResult(len(marks), int((marks != 0).sum()), repaired=repaired)
             missing = (
                 (k, (work, self.definition, self.key, str(self.path), k, limit))
                 for k in (marks == 0).nonzero()[0].tolist()
@@ -265,7 +265,7 @@ class Campaign:
                 outcome.seconds = time.perf_counter() - clock
         return outcome
 
-    def _count(self, outcome: Outcome, shard: int, future: Future[int]) -> None:
+    def _count(self, outcome: CampaignResult, shard: int, future: Future[int]) -> None:
         """Count an ended shard; raise what is wrong with the store or the executor."""
         if future.cancelled():
             raise _lost("it cancelled a shard")
@@ -352,7 +352,7 @@ def _lost(words: str) -> ResourceError:
     )
 
 
-def _words(outcome: Outcome) -> str:
+def _words(outcome: CampaignResult) -> str:
     """Say how far a campaign is; a new sentence at each per cent."""
     failed = f", {len(outcome.failures)} failed" if outcome.failures else ""
     return f"{100 * outcome.done // outcome.shards} % of {outcome.shards} shards{failed}"

@@ -18,9 +18,9 @@ from undertow.objective import MinimumEnergy
 from undertow.proofs import (
     AppendixClaim,
     Claim,
+    GatePolicy,
     LyapunovFunction,
     NonsingularClaim,
-    Policy,
     ProvedRegion,
     ReachingClaim,
     RegionClaim,
@@ -134,7 +134,7 @@ def certify_surface(
             progress("prediction", 0.95)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
             horizon = closed.objective.horizon
-            remarks.append(assess(closed, Plan.of(surface), start, horizon, Policy()))
+            remarks.append(assess(closed, Plan.of(surface), start, horizon, GatePolicy()))
             progress("random starts", 0.97)
             remarks += _sampled(closed, surface, start)
     subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
