@@ -57,6 +57,9 @@ FAR = math.radians(46)
 #: Part of what one disturbance alone may be that is claimed: rounding away from the edge.
 CLAIMED = 0.999
 
+#: About how long what comes first takes, the whole closed loop, and what is sampled at last, s.
+FIRST, LOOP, LAST = 0.6, 120.0, 5.0
+
 
 @dataclass(frozen=True, eq=False)
 class Certified:
@@ -108,34 +111,40 @@ def certify_surface(
         else:
             remarks.append(verdict)
 
-    progress("stability", 0.0)
+    most = FIRST + seconds + (LOOP if loop else 0.0) + (LAST if predict else 0.0)
+
+    def tell(what: str, after: float) -> None:
+        """Say what comes after so many of the seconds that all may take."""
+        progress(what, after / most)
+
+    tell("stability", 0.0)
     decide = _Decisions(mechanism, surface, reaching_law, start, dict(uncertain or {}))
     keep(*decide.own(StabilityClaim()))
     region = None
     if claims:
-        progress("terminal set", 0.03)
+        tell("terminal set", 0.3 * FIRST)
         keep(*decide.ellipsoid())
-        progress("non-singularity", 0.05)
+        tell("non-singularity", 0.5 * FIRST)
         if decide.box:
             keep(*decide.nonsingular())
-        progress("disturbances", 0.08)
+        tell("disturbances", 0.8 * FIRST)
         for claim, verdict in decide.disturbances():
             keep(claim, verdict)
         if seconds > 0:
-            progress("region on the surface", 0.1)
+            tell("region on the surface", FIRST)
             region, found, verdict = decide.region(seconds)
             keep(found, verdict)
             if region is not None and uncertain:
                 keep(*decide.region_in_box(region))
         if loop:
-            progress("the whole closed loop", 0.5)
+            tell("the whole closed loop", FIRST + seconds)
             keep(*decide.loop(hold))
         if predict and start.any():
-            progress("prediction", 0.95)
+            tell("prediction", most - LAST)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
             horizon = closed.objective.horizon
             remarks.append(assess(closed, Plan.of(surface), start, horizon, GatePolicy()))
-            progress("random starts", 0.97)
+            tell("random starts", most - 0.5 * LAST)
             remarks += _sampled(closed, surface, start)
     subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
     return Certified(title or str(surface), subject, region, time.perf_counter() - began)
