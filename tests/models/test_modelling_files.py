@@ -290,6 +290,33 @@ def test_motors_named_after_their_joints() -> None:
     assert [i.name for i in modelling.from_mjcf(text).inputs] == ["x_motor"]
 
 
+def test_two_motors_on_one_joint_are_named() -> None:
+    """They count as one input; of two joints it was said that they were fully actuated."""
+    pytest.importorskip("mujoco")
+    two = changed(CART_MJCF, "<actuator>", '<actuator><motor name="aux" joint="x" gear="3"/>')
+    with pytest.raises(ModelError, match=r"joint 'x' .*two motors, aux and .*FILE:x"):
+        modelling.from_mjcf(two)
+    assert modelling.from_mjcf(two, actuated=["x"]).m == 1
+
+
+def test_a_servo_whose_force_is_limited_is_said_to_be() -> None:
+    """MuJoCo clips it with its own spring and damper in it, a mechanism its input alone."""
+    mujoco = pytest.importorskip("mujoco")
+    motor = '<motor name="force" joint="x" ctrlrange="-20 20"/>'
+    servo = '<velocity name="servo" joint="x" kv="5" ctrlrange="-1 1"/>'
+    text = changed(CART_MJCF, motor, servo)
+    clipped = changed(text, 'kv="5"', 'kv="5" forcerange="-2 2"')
+    free, limited = modelling.from_mjcf(text), modelling.from_mjcf(clipped)
+    said = "the force limit of servo on its own spring and damper"
+    assert said in limited.description
+    assert said not in free.description
+    model = mujoco.MjModel.from_xml_string(clipped)
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1.0
+    mujoco.mj_forward(model, data)
+    assert data.actuator_force[0] == -2.0  # -5 by its damper: what is said to be left out
+
+
 def test_names_that_differ_in_punctuation_only_are_refused() -> None:
     """Claim: two links that would share a parameter are refused, not merged."""
     text = changed(CART_URDF, '"rod"', '"cart."')
@@ -373,6 +400,27 @@ def test_broken_xml_is_refused(text: str, error: type[Exception], match: str) ->
     """Claim: what is no URDF is refused, broken XML with line and column."""
     with pytest.raises(error, match=match):
         modelling.from_urdf(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("<mujoco><worldbody></mujoco>", "well-formed"),
+        ("<robot/>", "root <robot>"),
+        ("<!DOCTYPE m [<!ENTITY a 'b'>]><mujoco/>", "entity"),
+        ("<mujoco><worldbody><body><joint size='no'/></body></worldbody></mujoco>", "compiler"),
+        ("<mujoco><include file='inner.xml'/></mujoco>", "well-formed"),
+    ],
+)
+def test_a_refusal_names_the_file_that_is_broken(tmp_path: Path, text: str, match: str) -> None:
+    """Claim: of an included file it is that one, at whatever stage it is refused."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "inner.xml").write_text("<mujoco><worldbody></mujoco>", encoding="utf-8")
+    (tmp_path / "outer.xml").write_text(text, encoding="utf-8")
+    with pytest.raises(UndertowError, match=match) as caught:
+        modelling.from_mjcf(tmp_path / "outer.xml")
+    broken = "inner.xml" if "include" in text else "outer.xml"
+    assert f"model file '{tmp_path / broken}'" in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def compiled(mujoco: Any, document: Document) -> Any:
         mechanics = _INERTIA.search(said) or "not found" in said
         refusal = ModelError if mechanics else InvalidInputError
         raise refusal(
-            "MJCF",
+            document.what,
             value=said.removeprefix("XML ").removeprefix("Error: "),
             limit="a model that MuJoCo's compiler takes",
             remedy="Correct the file there; MuJoCo's documentation says what each element takes",
@@ -335,13 +335,15 @@ class _Compiled:
             if model.actuator_forcelimited[k]:
                 force = _one_size(f"forcerange of {what}", model.actuator_forcerange[k])
                 limits.append(force / abs(gain))
-            self._servo(k, name, coefficients, gear)
+            servo = self._servo(k, name, coefficients, gear)
             force = gear * gain
             yield Actuator(
-                name, coefficients, force, min(limits), unit if force == 1 else "", stroke
-            )
+                name, coefficients, force, min(limits), unit if force == 1 else "", stroke,
+                clipped=bool(servo.stiffness or servo.damping)
+                and bool(model.actuator_forcelimited[k] or math.isfinite(effort)),
+            )  # fmt: skip
 
-    def _servo(self, k: int, name: str, coefficients: dict[str, float], gear: float) -> None:
+    def _servo(self, k: int, name: str, coefficients: dict[str, float], gear: float) -> Coupling:
         """What an actuator does without input: the spring and damper of a servo, a rotor."""
         model = self.model
         offset, spring, damper = (float(v) for v in model.actuator_biasprm[k, :3])
@@ -353,16 +355,16 @@ class _Compiled:
             raise _refused(f"actuator '{name}' that pushes without input", "Leave its bias out")
         if np.any(getattr(model, "actuator_dampingpoly", 0)):
             raise _refused(f"a damping of actuator '{name}' that is not linear", "Leave it out")
-        self.servos.append(
-            Coupling(
-                f"{name}_servo",
-                coefficients,
-                damping=(damping - damper) * gear**2,
-                stiffness=-spring * gear**2,
-                rest=-offset / (spring * gear) if spring else 0.0,
-                armature=armature * gear**2,
-            )
+        servo = Coupling(
+            f"{name}_servo",
+            coefficients,
+            damping=(damping - damper) * gear**2,
+            stiffness=-spring * gear**2,
+            rest=-offset / (spring * gear) if spring else 0.0,
+            armature=armature * gear**2,
         )
+        self.servos.append(servo)
+        return servo
 
 
 def _one_size(what: str, given: Sequence[float]) -> float:
