@@ -48,10 +48,10 @@ AXES = {
     "phi_dot": {"from": -8.0, "to": 8.0, "count": 8},
 }
 REGION: dict[str, Any] = {"kind": "region", "axes": AXES, "horizon": 8.0, "shard": 16}
-PLANTS: dict[str, Any] = {"kind": "plants", "plants": 2, "shard": 1, "seconds": 0.3}
+PLANTS: dict[str, Any] = {"kind": "plants", "plants": 4, "shard": 1, "seconds": 0.3}
 DESIGNS: dict[str, Any] = {
     "kind": "designs", "plants": 4, "start": {"phi": 0.2}, "horizon": 5.0,
-    "axes": {"l": {"from": 0.15, "to": 0.18, "count": 2}},
+    "axes": {"l": {"from": 0.15, "to": 0.18, "count": 4}},
 }  # fmt: skip
 
 MAP = Definition.of(RIG, **REGION)
@@ -127,7 +127,12 @@ def test_states_on_the_surface_are_on_it() -> None:
 
 @pytest.mark.parametrize(
     "how",
-    [{"threads": 2}, pytest.param({"workers": 1}, marks=pytest.mark.slow), {"workers": 2}],
+    [
+        {"threads": 2},
+        pytest.param({"workers": 1}, marks=pytest.mark.slow),
+        {"workers": 2},
+        pytest.param({"workers": 4}, marks=pytest.mark.slow),
+    ],
     ids=str,
 )
 def test_every_executor_writes_the_same_bits(
@@ -144,7 +149,7 @@ def test_studies_of_plants_and_designs_have_the_same_bits_too(
 ) -> None:
     definition = Definition.of(RIG, **said)
     run(definition, tmp_path / "serial")
-    for how in ({"threads": 2}, {"workers": 1}, {"workers": 2}):
+    for how in ({"threads": 2}, {"workers": 1}, {"workers": 2}, {"workers": 4}):
         path = tmp_path / str(how)
         run(definition, path, **how)
         assert content(path) == content(tmp_path / "serial"), how
@@ -398,6 +403,32 @@ def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
     assert not Store(path).marks().any()
 
 
+@pytest.mark.slow
+def test_ctrl_c_ends_workers_without_their_tracebacks(tmp_path: Path) -> None:
+    """A terminal sends it to every process of the command."""
+    file, out = tmp_path / "map.toml", tmp_path / "map.zarr"
+    file.write_text(TOML.replace("count = 12", "count = 4000"))  # 2,000 shards
+    hears = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code = f"{hears}from undertow.cli import main; main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, "campaign", str(file), "--out", str(out), "--workers", "2"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        said = ""
+        for line in process.stdout:
+            said += line
+            if "% of" in line:
+                os.killpg(process.pid, signal.SIGINT)
+                break
+        said += process.stdout.read()
+    assert process.returncode == 130
+    assert "Traceback" not in said
+    assert "go on with --resume" in said
+    assert 0 < (Store(out).marks() != 0).sum() < 2000
+
+
 TOML = """
 kind = "region"
 mechanism = "rotary_pendulum"
@@ -434,6 +465,7 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
         (["--shard", "6"], "0 to 5"),
         (["--limit", "3"], "--workers 1"),
         (["--threads", "2", "--workers", "1"], "two places"),
+        (["--status", "--tables"], "--tables and --status"),
         ([], "--resume"),
     ):
         refused = runner.invoke(app, [*told, *wrong])
@@ -457,11 +489,34 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
         ({"limits": {"voltage": -1.0}}, "voltage"),
         ({"objective": "beauty"}, "one of energy"),
         ({"sliding": "yes"}, "true or false"),
+        ({"µ": 1.0, "μ": 2.0}, "U\\+00B5"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(change: dict[str, Any], words: str) -> None:
     with pytest.raises((InvalidInputError, ModelError), match=words):
         Campaign(Definition.of(RIG, **REGION | change), Path("nowhere"))
+
+
+def test_names_of_ones_own_are_spelt_as_they_are_or_refused(tmp_path: Path) -> None:
+    """The µ of keyboards is the Greek one; a state called like what is recorded was a traceback."""
+    code = tmp_path / "own.py"
+    code.write_text(
+        "import undertow as ut\n"
+        "def make(name):\n"
+        "    x, a = ut.Coordinate('x', 'm'), ut.Coordinate(name, 'rad')\n"
+        "    v, w, c = x.velocity, a.velocity, __import__('sympy').cos(a.symbol)\n"
+        "    return ut.Mechanism.from_energies('own', [x, a], [ut.Input('F', 'N', 9.0)],\n"
+        "        kinetic=v**2/2 + c*v*w/5 + w**2/9, potential=2*c)\n"
+        "greek, cost = make('µ'), make('cost')\n"
+    )
+    axis = {"from": -0.1, "to": 0.1, "count": 2}
+    named = f"{code}:greek"
+    keyboard = Definition.of(named, kind="region", axes={"µ": axis}, at={"µ_dot": 0.1})
+    study: Any = study_of(keyboard)
+    assert [a.name for a in study.axes] == ["μ"]
+    assert study.at[-1] == 0.1
+    with pytest.raises(InvalidInputError, match="axis 'cost' of the campaign"):
+        study_of(Definition.of(f"{code}:cost", kind="region", axes={"cost": axis}))
 
 
 CASE = {"surface": [-1.0, -1.59, 1.96, 12.1], "sliding": True, "kind": "region"}

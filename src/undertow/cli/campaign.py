@@ -88,6 +88,15 @@ def campaign(
             limit="workers",
             remedy="A thread cannot be ended: add --workers 1",
         )
+    alone_ones = {
+        "--picture": picture is not None, "--tables": tables, "--status": status,
+        "--shard": shard is not None,
+    }  # fmt: skip
+    asked = [name for name, given in alone_ones.items() if given]
+    if len(asked) > 1:
+        raise InvalidInputError(
+            "what is shown of the campaign", value=" and ".join(asked), limit="one of them"
+        )
     if proof is not None and picture is None:
         raise InvalidInputError(
             "--proof", value="no --picture", limit="a picture that shows it",

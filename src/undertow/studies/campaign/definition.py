@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 from undertow.base import ArtefactError, InvalidInputError, near, one_of, read_file
 from undertow.mechanisms.named import from_anywhere, named
-from undertow.models import Mechanism
+from undertow.models import Mechanism, by_names
 from undertow.models.importers.formats import file_words
 from undertow.models.importers.python_file import in_a_file
 from undertow.objective import Goal, Objective, objective_for
@@ -127,7 +127,7 @@ class Settings:
 
     def __init__(self, values: Mapping[str, Any], where: str) -> None:
         self.where = where
-        self._values = dict(values)
+        self._values = by_names("settings of a campaign", values)
         self._known: list[str] = []
 
     def what(self, name: str) -> str:
