@@ -317,6 +317,28 @@ def test_a_servo_whose_force_is_limited_is_said_to_be() -> None:
     assert data.actuator_force[0] == -2.0  # -5 by its damper: what is said to be left out
 
 
+def test_the_force_limit_of_a_tendon_limits_its_motor() -> None:
+    """Its input was without limit, or the file refused for a motion that was not MuJoCo's."""
+    mujoco = pytest.importorskip("mujoco")
+    tendon = (
+        '<tendon><fixed name="rope" actuatorfrcrange="-6 9"><joint joint="x" coef="2"/></fixed>'
+        "</tendon><actuator>"
+    )
+    text = changed(CART_MJCF, "<actuator>", tendon)
+    for ctrl, limit in (("", 2.0), ('ctrlrange="-20 20"', 2.0), ('ctrlrange="-1 1"', 1.0)):
+        motor = f'<motor name="force" tendon="rope" gear="3" {ctrl}/>'
+        given = changed(text, '<motor name="force" joint="x" ctrlrange="-20 20"/>', motor)
+        assert modelling.from_mjcf(given).input_limits.tolist() == [limit]
+        model = mujoco.MjModel.from_xml_string(given)
+        data = mujoco.MjData(model)
+        pushed = []
+        for u in (limit, 0.99 * limit):
+            data.ctrl[0] = -u
+            mujoco.mj_forward(model, data)
+            pushed.append(-float(data.qfrc_actuator[0]))
+        assert pushed == pytest.approx([6 * limit, 5.94 * limit])
+
+
 def test_names_that_differ_in_punctuation_only_are_refused() -> None:
     """Claim: two links that would share a parameter are refused, not merged."""
     text = changed(CART_URDF, '"rod"', '"cart."')
@@ -500,6 +522,8 @@ def test_actuated_joints_that_do_not_exist_are_refused() -> None:
         ('axis="0 1 0"', 'axis="0 1 0" class="soft"', "default class name 'soft'"),
         ('joint="x" ctrl', 'joint="y" ctrl', "'y'"),
         ('joint="x" ctrl', 'site="tip" ctrl', "target 'tip' not found"),
+        ("<worldbody>", '<option actuatorgroupdisable="0"/><worldbody>', "'force' .*switched off"),
+        ('damping="0.001"', 'stiffness="3" springyield="1"', "'phi' that yields"),
     ],
 )
 def test_mjcf_that_is_not_understood_is_refused(old: str, new: str, match: str) -> None:

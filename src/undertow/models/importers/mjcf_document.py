@@ -34,7 +34,7 @@ _NAMING = {"name", "class", "childclass", "file", "model"}
 _ODD = re.compile(r"(?i)(?<![a-z_])[-+]?(nan|inf|infinity)(?![a-z_0-9])")
 
 #: Options that say something about motion.
-_OPTIONS = {"gravity", "density", "viscosity", "wind"}
+_OPTIONS = {"actuatorgroupdisable", "gravity", "density", "viscosity", "wind"}
 _FLAGS = {"gravity", "spring", "damper", "passive", "actuation"}
 _ORIENTED = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 
