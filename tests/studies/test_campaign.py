@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,13 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.base import ArtefactError, InvalidInputError, ModelError, ResourceError
+from undertow.base import (
+    ArtefactError,
+    InvalidInputError,
+    ModelError,
+    ResourceError,
+    UndertowError,
+)
 from undertow.cli import app
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.studies.campaign import (
@@ -567,6 +574,37 @@ def test_pictures_show_slices_volumes_and_proved_sets(serial: Path, tmp_path: Pa
     assert [a.get_title(loc="left") for a in panels[:3]][1] == "θ̇ = 0°/s"
     with pytest.raises(ArtefactError, match="definition in the store"):
         picture(Campaign(volume, serial))
+
+
+def test_a_terminal_set_is_drawn_where_states_are_off_the_surface(tmp_path: Path) -> None:
+    """Its edge in the slice is |W x| = ρ, and what is said of its reach is that of the edge."""
+    rig = ut.mechanisms.rotary_pendulum()
+    told = ["certify", RIG, "--seconds", "0", "--out", str(tmp_path)]
+    assert CliRunner().invoke(app, told).exit_code == 0
+    proof = tmp_path / "certificate.json"
+    axes = {"phi": AXES["phi"] | {"count": 3}, "theta_dot": AXES["phi_dot"] | {"count": 3}}
+    definition = Definition.of(RIG, **REGION | {"axes": axes})
+    run(definition, tmp_path / "store")
+    campaign: Any = Campaign(definition, tmp_path / "store")
+    proved: Any = proved_set(campaign.study, proof)
+    panel = picture(campaign, proved).axes[0].child_axes[0]
+    phi, rate = np.radians(np.asarray(panel.lines[0].get_data()))
+    states = np.zeros((len(phi), 4))
+    states[:, 1], states[:, 2] = phi, rate
+    assert proved.level(states) == pytest.approx(1.0, abs=1e-9)
+    home = ClosedLoop(rig, ut.MinimumEnergy(horizon=8.0)).batch(states, ut.first_surface(rig))
+    assert home.reached.all()
+    (words,) = picture_file(campaign, proof)[1]
+    reach = [float(v) for v in re.findall(r"± ([\d.e-]+)", words)]
+    assert reach == pytest.approx([np.degrees(v).max() for v in (phi, rate)], rel=1e-2)
+    for other in ({"surface": [-1.0, -1.59, 1.96, 12.1]}, {"limits": {"voltage": 5.0}}):
+        changed: Any = study_of(Definition.of(RIG, **REGION | other))
+        with pytest.raises(UndertowError):
+            proved_set(changed, proof)
+    aside = Campaign(Definition.of(RIG, **REGION, at={"theta": 0.1}), tmp_path / "aside")
+    run(aside.definition, aside.path)
+    with pytest.raises(InvalidInputError, match="other states at the target"):
+        picture(aside, proved)
 
 
 def test_a_definition_runs_no_code(tmp_path: Path) -> None:

@@ -66,7 +66,8 @@ def campaign(
         Path | None, option("Draw what the store has into this PNG, and nothing else.")
     ] = None,
     proof: Annotated[
-        Path | None, option("Certificate whose region on the surface the picture shows.")
+        Path | None,
+        option("Certificate whose region on the surface, or terminal set, the picture shows."),
     ] = None,
 ) -> None:
     """Compute many shards of work, and keep them in a store that survives interruptions."""
