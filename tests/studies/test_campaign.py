@@ -538,7 +538,7 @@ def test_every_state_of_a_proved_region_comes_home_without_a_limit() -> None:
     """The proof knows no input limit: then simulation must agree, and with 15 V it need not."""
     limited = Campaign(Definition.of(RIG, **CASE, axes=ON_SURFACE), Path("nowhere"))
     study: Any = limited.study
-    proved = proved_set(study, REGIONS)
+    proved: Any = proved_set(study, REGIONS)
     _, states = study.states(0)
     with np.errstate(all="ignore"):
         inside = proved(sliding_coordinates(study, states)) <= 1.0

@@ -61,8 +61,8 @@ def picture(campaign: Campaign, proved: Proved | None = None) -> Figure:
         For other numbers of axes, a set of the sliding motion where the states are not on a
         surface, and a terminal set where those that stay as they are are not at the target.
     """
-    study, data = campaign.study, campaign.dataset()
-    data = data.isel({
+    study: Any = campaign.study
+    data = campaign.dataset().isel({
         axis.name: slice(None, None, -(-len(axis.values) // DRAWN)) for axis in study.axes
     })  # fmt: skip
     region = isinstance(study, RegionMap)
@@ -74,10 +74,10 @@ def picture(campaign: Campaign, proved: Proved | None = None) -> Figure:
         raise InvalidInputError(
             "proved set in a picture", value="states off the surface", limit="sliding = true"
         )
-    if isinstance(proved, TerminalEllipsoid) and np.any(study.at):
+    if isinstance(proved, TerminalEllipsoid) and (not region or np.any(study.at)):
         raise InvalidInputError(
-            "proved terminal set in a picture", value=study.at, limit="other states at the target",
-            remedy="Leave the table 'at' out",
+            "proved terminal set in a picture", value="states off the target",
+            limit="a region, other states at the target", remedy="Leave the table 'at' out",
         )  # fmt: skip
     if region and len(study.axes) == 3:
         return _volume(study, data)
@@ -193,7 +193,7 @@ def _draw_proved(axes: Axes, study: RegionMap, proved: LyapunovFunction) -> None
 def _draw_terminal(axes: Axes, study: RegionMap, proved: TerminalEllipsoid) -> None:
     """Draw the edge of a terminal set in the slice, in a frame of its own, and where it is."""
     colour = COLOURS["vermilion"]
-    factors = [_label(study, axis.name)[0] for axis in study.axes]
+    factors = np.array([_label(study, axis.name)[0] for axis in study.axes])
     edge = (factors * _cut(study, proved)).T
     axes.plot(0.0, 0.0, "+", color=colour, ms=9, mew=1.4)
     frame = axes.inset_axes((0.73, 0.68, 0.25, 0.3))
