@@ -114,3 +114,13 @@ def test_a_picture_has_the_ending_of_what_it_is(tmp_path: Path) -> None:
         with pytest.raises(ArtefactError, match=rf"Name it .*{better}"):
             write_file(tmp_path / name, content)
         assert not (tmp_path / name).exists()
+
+
+def test_a_file_of_another_kind_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    """What was refused was refused once more around it, with another remedy."""
+    log = tmp_path / "run.db"
+    log.write_bytes(b"SQLite format 3")
+    with pytest.raises(ArtefactError) as caught:
+        write_file(log, b"PAR1")
+    assert str(caught.value).count("got ") == 1
+    assert str(caught.value).endswith("Choose another name")
