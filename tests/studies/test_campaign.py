@@ -621,3 +621,19 @@ def test_a_definition_runs_no_code(tmp_path: Path) -> None:
     file.write_text("kind = ")
     with pytest.raises(ArtefactError, match="TOML"):
         Definition.read(file)
+    code.write_text("raise SystemExit('it was run')\n")
+    for more in ("", f'mechanism = "{RIG}"\n'):
+        file.write_text(f'{more}kind = "league"\nmechanisms = ["{RIG}", "{code}:rig"]\n')
+        with pytest.raises(InvalidInputError, match="--mechanism"):
+            study_of(Definition.read(file))
+
+
+def test_model_files_lie_beside_the_definition(tmp_path: Path) -> None:
+    """With joints behind their names, and among several mechanisms, too."""
+    (tmp_path / "own.urdf").write_text("<robot/>")
+    whole = f"{tmp_path / 'own.urdf'}:j_1"
+    file = tmp_path / "map.toml"
+    file.write_text('mechanism = "own.urdf:j_1"')
+    assert Definition.read(file).mechanism == whole
+    file.write_text(f'mechanisms = ["{RIG}", "own.urdf:j_1"]')
+    assert Definition.read(file).said["mechanisms"] == [RIG, whole]
