@@ -22,9 +22,10 @@ from undertow.base import (
     one_of,
     table,
     to_csv,
+    write_file,
     write_files,
 )
-from undertow.base.errors import InvalidInputError
+from undertow.base.errors import ArtefactError, InvalidInputError
 
 
 def shown(*parts: RenderableType) -> list[str]:
@@ -102,3 +103,24 @@ def test_a_name_of_somebodys_is_a_file_in_the_folder_that_is_named(tmp_path: Pat
     for name in ("../../cart", "a/b", "..", "tab\t", "x" * 300, "Wagen ü"):
         write_files(tmp_path / name[:1].replace(".", "p"), {f"{file_name(name)}.txt": b"1"})
     assert sorted(p.name for p in tmp_path.iterdir()) == ["W", "a", "p", "t", "x"]
+
+
+def test_a_picture_has_the_ending_of_what_it_is(tmp_path: Path) -> None:
+    """``--picture map.jpg`` and ``run.animate("film.mp4")`` wrote a PNG and a GIF."""
+    png, gif = b"\x89PNG\r\n", b"GIF89a"
+    for name, content in (("a.png", png), ("A.PNG", png), ("plain", png), ("a.gif", gif)):
+        assert write_file(tmp_path / name, content).read_bytes() == content
+    for name, content, better in (("map.jpg", png, "map.png"), ("film.mp4", gif, "film.gif")):
+        with pytest.raises(ArtefactError, match=rf"Name it .*{better}"):
+            write_file(tmp_path / name, content)
+        assert not (tmp_path / name).exists()
+
+
+def test_a_file_of_another_kind_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    """What was refused was refused once more around it, with another remedy."""
+    log = tmp_path / "run.db"
+    log.write_bytes(b"SQLite format 3")
+    with pytest.raises(ArtefactError) as caught:
+        write_file(log, b"PAR1")
+    assert str(caught.value).count("got ") == 1
+    assert str(caught.value).endswith("Choose another name")

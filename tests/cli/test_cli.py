@@ -537,6 +537,26 @@ def test_the_doctor_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     assert out.count("ok  ") == 4
 
 
+def test_the_doctor_does_not_call_a_late_machine_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Periods missed, but not half of them: the test passes, and the last line says what of it."""
+    from undertow.studies import doctor
+
+    for name in ("_formulas", "_motion", "_balance", "_proof", "_c"):
+        monkeypatch.setattr(doctor, name, lambda _: (True, "fine"))
+
+    class Late:
+        missed_deadlines, skipped_periods, steps = 40, 5, 2000
+        response_times = wakeup_delays = type("Times", (), {"quantile": lambda *_: 1e-4})()
+
+    monkeypatch.setattr(doctor, "run", lambda *_, **__: Late())
+    code, out, _ = run("doctor")
+    words = " ".join(out.split())
+    assert code == 0
+    assert "45 of 2000 periods missed" in words
+    assert f"All tests pass, but {doctor.TOO_LATE}." in words
+    assert "All is well" not in out
+
+
 @pytest.mark.slow
 def test_the_doctor_passes_here() -> None:
     """All six tests, on this machine."""

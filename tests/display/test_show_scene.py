@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from undertow.display.sketches import Disc, Label, Line, sketch
 from undertow.display.tree_sketch import sketch_named
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
+from undertow.studies.live.messages import described
 
 URDF = """<robot name="lever"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0 0 0.25"/><mass value="0.5"/>
@@ -121,3 +123,9 @@ def test_what_has_no_kinematics_gets_labelled_dials() -> None:
     parts = sketch_named("own.py:own", mechanism).parts
     assert [part.text for part in parts if isinstance(part, Label)] == ["a, rad", "b, m"]
     assert any(isinstance(part, Line) for part in parts)
+
+
+def test_a_description_of_several_lines_is_one_sentence_on_the_page() -> None:
+    """What was read of a file ran together there, for HTML takes line ends for spaces."""
+    rig = replace(named("overhead_crane"), description="one\ntwo, three")
+    assert described(rig, Scene(rig, sketch(rig)))["about"] == "one; two, three"

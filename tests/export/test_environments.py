@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from typing import Any
@@ -200,3 +201,31 @@ def test_what_does_not_end_an_episode_is_observed_as_it_is() -> None:
     kept, free = (ut.export.BalancingTask(cart, ut.MinimumTime(travel=t)) for t in (True, False))
     assert kept.box[1][0] == 1.5
     assert free.box[1][0] == free.escape
+
+
+@pytest.mark.parametrize(
+    "action", [["left"], [None], [1j], [math.nan], [math.inf], [0.1, 0.2], 0.1, [[0.1]], {}]
+)
+def test_an_action_that_is_none_is_refused_in_one_environment_as_in_many(action: Any) -> None:
+    """Text and complex numbers were raw errors; in many environments NaN became the state."""
+    env, many = ut.environment(RIG), ut.vector_environment(RIG, num_envs=2)
+    env.reset(seed=0)
+    begun = many.reset(seed=0)[0].copy()
+    with pytest.raises(InvalidInputError, match="action of an environment"):
+        env.step(action)
+    with pytest.raises(InvalidInputError, match="actions of a vector environment"):
+        many.step([[0.0], action])  # type: ignore[arg-type]
+    assert (many._lanes.x == begun).all()
+
+
+def test_seeds_and_options_that_are_none_are_refused() -> None:
+    """A seed of 1.5 was 1; options that are no mapping, and 2.0 environments, raw errors."""
+    many = ut.vector_environment(RIG, num_envs=2.0)  # type: ignore[arg-type]
+    assert many.num_envs == 2
+    for seed in (1.5, "a", True, [1, 2, 3], [1.0, 2.0]):
+        with pytest.raises(InvalidInputError, match="seeds of a vector environment"):
+            many.reset(seed=seed)  # type: ignore[arg-type]
+    for env in (many, ut.environment(RIG)):
+        with pytest.raises(InvalidInputError, match="options of reset"):
+            env.reset(options=[0.3])  # type: ignore[arg-type]
+    assert (many.reset(seed=7)[0] == many.reset(seed=[7, 8])[0]).all()

@@ -293,6 +293,55 @@ def test_motors_named_after_their_joints() -> None:
     assert [i.name for i in modelling.from_mjcf(text).inputs] == ["x_motor"]
 
 
+def test_two_motors_on_one_joint_are_named() -> None:
+    """They count as one input; of two joints it was said that they were fully actuated."""
+    pytest.importorskip("mujoco")
+    two = changed(CART_MJCF, "<actuator>", '<actuator><motor name="aux" joint="x" gear="3"/>')
+    with pytest.raises(ModelError, match=r"joint 'x' .*two motors, aux and .*FILE:x"):
+        modelling.from_mjcf(two)
+    assert modelling.from_mjcf(two, actuated=["x"]).m == 1
+
+
+def test_a_servo_whose_force_is_limited_is_said_to_be() -> None:
+    """MuJoCo clips it with its own spring and damper in it, a mechanism its input alone."""
+    mujoco = pytest.importorskip("mujoco")
+    motor = '<motor name="force" joint="x" ctrlrange="-20 20"/>'
+    servo = '<velocity name="servo" joint="x" kv="5" ctrlrange="-1 1"/>'
+    text = changed(CART_MJCF, motor, servo)
+    clipped = changed(text, 'kv="5"', 'kv="5" forcerange="-2 2"')
+    free, limited = modelling.from_mjcf(text), modelling.from_mjcf(clipped)
+    said = "the force limit of servo on its own spring and damper"
+    assert said in limited.description
+    assert said not in free.description
+    model = mujoco.MjModel.from_xml_string(clipped)
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1.0
+    mujoco.mj_forward(model, data)
+    assert data.actuator_force[0] == -2.0  # -5 by its damper: what is said to be left out
+
+
+def test_the_force_limit_of_a_tendon_limits_its_motor() -> None:
+    """Its input was without limit, or the file refused for a motion that was not MuJoCo's."""
+    mujoco = pytest.importorskip("mujoco")
+    tendon = (
+        '<tendon><fixed name="rope" actuatorfrcrange="-6 9"><joint joint="x" coef="2"/></fixed>'
+        "</tendon><actuator>"
+    )
+    text = changed(CART_MJCF, "<actuator>", tendon)
+    for ctrl, limit in (("", 2.0), ('ctrlrange="-20 20"', 2.0), ('ctrlrange="-1 1"', 1.0)):
+        motor = f'<motor name="force" tendon="rope" gear="3" {ctrl}/>'
+        given = changed(text, '<motor name="force" joint="x" ctrlrange="-20 20"/>', motor)
+        assert modelling.from_mjcf(given).input_limits.tolist() == [limit]
+        model = mujoco.MjModel.from_xml_string(given)
+        data = mujoco.MjData(model)
+        pushed = []
+        for u in (limit, 0.99 * limit):
+            data.ctrl[0] = -u
+            mujoco.mj_forward(model, data)
+            pushed.append(-float(data.qfrc_actuator[0]))
+        assert pushed == pytest.approx([6 * limit, 5.94 * limit])
+
+
 def test_names_that_differ_in_punctuation_only_are_refused() -> None:
     """Claim: two links that would share a parameter are refused, not merged."""
     text = changed(CART_URDF, '"rod"', '"cart."')
@@ -379,6 +428,27 @@ def test_broken_xml_is_refused(text: str, error: type[Exception], match: str) ->
 
 
 @pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("<mujoco><worldbody></mujoco>", "well-formed"),
+        ("<robot/>", "root <robot>"),
+        ("<!DOCTYPE m [<!ENTITY a 'b'>]><mujoco/>", "entity"),
+        ("<mujoco><worldbody><body><joint size='no'/></body></worldbody></mujoco>", "compiler"),
+        ("<mujoco><include file='inner.xml'/></mujoco>", "well-formed"),
+    ],
+)
+def test_a_refusal_names_the_file_that_is_broken(tmp_path: Path, text: str, match: str) -> None:
+    """Claim: of an included file it is that one, at whatever stage it is refused."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "inner.xml").write_text("<mujoco><worldbody></mujoco>", encoding="utf-8")
+    (tmp_path / "outer.xml").write_text(text, encoding="utf-8")
+    with pytest.raises(UndertowError, match=match) as caught:
+        modelling.from_mjcf(tmp_path / "outer.xml")
+    broken = "inner.xml" if "include" in text else "outer.xml"
+    assert f"model file '{tmp_path / broken}'" in str(caught.value)
+
+
+@pytest.mark.parametrize(
     ("old", "new", "match"),
     [
         ('name="phi"', 'name="x"', "named twice.*x"),
@@ -455,6 +525,8 @@ def test_actuated_joints_that_do_not_exist_are_refused() -> None:
         ('axis="0 1 0"', 'axis="0 1 0" class="soft"', "default class name 'soft'"),
         ('joint="x" ctrl', 'joint="y" ctrl', "'y'"),
         ('joint="x" ctrl', 'site="tip" ctrl', "target 'tip' not found"),
+        ("<worldbody>", '<option actuatorgroupdisable="0"/><worldbody>', "'force' .*switched off"),
+        ('damping="0.001"', 'stiffness="3" springyield="1"', "'phi' that yields"),
     ],
 )
 def test_mjcf_that_is_not_understood_is_refused(old: str, new: str, match: str) -> None:

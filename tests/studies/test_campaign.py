@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,13 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.base import ArtefactError, InvalidInputError, ModelError, ResourceError
+from undertow.base import (
+    ArtefactError,
+    InvalidInputError,
+    ModelError,
+    ResourceError,
+    UndertowError,
+)
 from undertow.cli import app
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.studies.campaign import (
@@ -48,10 +55,10 @@ AXES = {
     "phi_dot": {"from": -8.0, "to": 8.0, "count": 8},
 }
 REGION: dict[str, Any] = {"kind": "region", "axes": AXES, "horizon": 8.0, "shard": 16}
-PLANTS: dict[str, Any] = {"kind": "plants", "plants": 2, "shard": 1, "seconds": 0.3}
+PLANTS: dict[str, Any] = {"kind": "plants", "plants": 4, "shard": 1, "seconds": 0.3}
 DESIGNS: dict[str, Any] = {
     "kind": "designs", "plants": 4, "start": {"phi": 0.2}, "horizon": 5.0,
-    "axes": {"l": {"from": 0.15, "to": 0.18, "count": 2}},
+    "axes": {"l": {"from": 0.15, "to": 0.18, "count": 4}},
 }  # fmt: skip
 
 MAP = Definition.of(RIG, **REGION)
@@ -127,7 +134,12 @@ def test_states_on_the_surface_are_on_it() -> None:
 
 @pytest.mark.parametrize(
     "how",
-    [{"threads": 2}, pytest.param({"workers": 1}, marks=pytest.mark.slow), {"workers": 2}],
+    [
+        {"threads": 2},
+        pytest.param({"workers": 1}, marks=pytest.mark.slow),
+        {"workers": 2},
+        pytest.param({"workers": 4}, marks=pytest.mark.slow),
+    ],
     ids=str,
 )
 def test_every_executor_writes_the_same_bits(
@@ -144,7 +156,7 @@ def test_studies_of_plants_and_designs_have_the_same_bits_too(
 ) -> None:
     definition = Definition.of(RIG, **said)
     run(definition, tmp_path / "serial")
-    for how in ({"threads": 2}, {"workers": 1}, {"workers": 2}):
+    for how in ({"threads": 2}, {"workers": 1}, {"workers": 2}, {"workers": 4}):
         path = tmp_path / str(how)
         run(definition, path, **how)
         assert content(path) == content(tmp_path / "serial"), how
@@ -399,6 +411,32 @@ def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
     assert not Store(path).marks().any()
 
 
+@pytest.mark.slow
+def test_ctrl_c_ends_workers_without_their_tracebacks(tmp_path: Path) -> None:
+    """A terminal sends it to every process of the command."""
+    file, out = tmp_path / "map.toml", tmp_path / "map.zarr"
+    file.write_text(TOML.replace("count = 12", "count = 4000"))  # 2,000 shards
+    hears = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code = f"{hears}from undertow.cli import main; main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, "campaign", str(file), "--out", str(out), "--workers", "2"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        said = ""
+        for line in process.stdout:
+            said += line
+            if "% of" in line:
+                os.killpg(process.pid, signal.SIGINT)
+                break
+        said += process.stdout.read()
+    assert process.returncode == 130
+    assert "Traceback" not in said
+    assert "go on with --resume" in said
+    assert 0 < (Store(out).marks() != 0).sum() < 2000
+
+
 TOML = """
 kind = "region"
 mechanism = "rotary_pendulum"
@@ -435,6 +473,7 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
         (["--shard", "6"], "0 to 5"),
         (["--limit", "3"], "--workers 1"),
         (["--threads", "2", "--workers", "1"], "two places"),
+        (["--status", "--tables"], "--tables and --status"),
         ([], "--resume"),
     ):
         refused = runner.invoke(app, [*told, *wrong])
@@ -458,11 +497,34 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
         ({"limits": {"voltage": -1.0}}, "voltage"),
         ({"objective": "beauty"}, "one of energy"),
         ({"sliding": "yes"}, "true or false"),
+        ({"µ": 1.0, "μ": 2.0}, "U\\+00B5"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(change: dict[str, Any], words: str) -> None:
     with pytest.raises((InvalidInputError, ModelError), match=words):
         Campaign(Definition.of(RIG, **REGION | change), Path("nowhere"))
+
+
+def test_names_of_ones_own_are_spelt_as_they_are_or_refused(tmp_path: Path) -> None:
+    """The µ of keyboards is the Greek one; a state called like what is recorded was a traceback."""
+    code = tmp_path / "own.py"
+    code.write_text(
+        "import undertow as ut\n"
+        "def make(name):\n"
+        "    x, a = ut.Coordinate('x', 'm'), ut.Coordinate(name, 'rad')\n"
+        "    v, w, c = x.velocity, a.velocity, __import__('sympy').cos(a.symbol)\n"
+        "    return ut.Mechanism.from_energies('own', [x, a], [ut.Input('F', 'N', 9.0)],\n"
+        "        kinetic=v**2/2 + c*v*w/5 + w**2/9, potential=2*c)\n"
+        "greek, cost = make('µ'), make('cost')\n"
+    )
+    axis = {"from": -0.1, "to": 0.1, "count": 2}
+    named = f"{code}:greek"
+    keyboard = Definition.of(named, kind="region", axes={"µ": axis}, at={"µ_dot": 0.1})
+    study: Any = study_of(keyboard)
+    assert [a.name for a in study.axes] == ["μ"]
+    assert study.at[-1] == 0.1
+    with pytest.raises(InvalidInputError, match="axis 'cost' of the campaign"):
+        study_of(Definition.of(f"{code}:cost", kind="region", axes={"cost": axis}))
 
 
 CASE = {"surface": [-1.0, -1.59, 1.96, 12.1], "sliding": True, "kind": "region"}
@@ -477,7 +539,7 @@ def test_every_state_of_a_proved_region_comes_home_without_a_limit() -> None:
     """The proof knows no input limit: then simulation must agree, and with 15 V it need not."""
     limited = Campaign(Definition.of(RIG, **CASE, axes=ON_SURFACE), Path("nowhere"))
     study: Any = limited.study
-    proved = proved_set(study, REGIONS)
+    proved: Any = proved_set(study, REGIONS)
     _, states = study.states(0)
     with np.errstate(all="ignore"):
         inside = proved(sliding_coordinates(study, states)) <= 1.0
@@ -515,6 +577,37 @@ def test_pictures_show_slices_volumes_and_proved_sets(serial: Path, tmp_path: Pa
         picture(Campaign(volume, serial))
 
 
+def test_a_terminal_set_is_drawn_where_states_are_off_the_surface(tmp_path: Path) -> None:
+    """Its edge in the slice is |W x| = ρ, and what is said of its reach is that of the edge."""
+    rig = ut.mechanisms.rotary_pendulum()
+    told = ["certify", RIG, "--seconds", "0", "--out", str(tmp_path)]
+    assert CliRunner().invoke(app, told).exit_code == 0
+    proof = tmp_path / "certificate.json"
+    axes = {"phi": AXES["phi"] | {"count": 3}, "theta_dot": AXES["phi_dot"] | {"count": 3}}
+    definition = Definition.of(RIG, **REGION | {"axes": axes})
+    run(definition, tmp_path / "store")
+    campaign: Any = Campaign(definition, tmp_path / "store")
+    proved: Any = proved_set(campaign.study, proof)
+    panel = picture(campaign, proved).axes[0].child_axes[0]
+    phi, rate = np.radians(np.asarray(panel.lines[0].get_data()))
+    states = np.zeros((len(phi), 4))
+    states[:, 1], states[:, 2] = phi, rate
+    assert proved.level(states) == pytest.approx(1.0, abs=1e-9)
+    home = ClosedLoop(rig, ut.MinimumEnergy(horizon=8.0)).batch(states, ut.first_surface(rig))
+    assert home.reached.all()
+    (words,) = picture_file(campaign, proof)[1]
+    reach = [float(v) for v in re.findall(r"± ([\d.e-]+)", words)]
+    assert reach == pytest.approx([np.degrees(v).max() for v in (phi, rate)], rel=1e-2)
+    for other in ({"surface": [-1.0, -1.59, 1.96, 12.1]}, {"limits": {"voltage": 5.0}}):
+        changed: Any = study_of(Definition.of(RIG, **REGION | other))
+        with pytest.raises(UndertowError):
+            proved_set(changed, proof)
+    aside = Campaign(Definition.of(RIG, **REGION, at={"theta": 0.1}), tmp_path / "aside")
+    run(aside.definition, aside.path)
+    with pytest.raises(InvalidInputError, match="other states at the target"):
+        picture(aside, proved)
+
+
 def test_a_definition_runs_no_code(tmp_path: Path) -> None:
     """A Python file is run where the command line names it, and its content counts."""
     code = tmp_path / "own.py"
@@ -529,3 +622,19 @@ def test_a_definition_runs_no_code(tmp_path: Path) -> None:
     file.write_text("kind = ")
     with pytest.raises(ArtefactError, match="TOML"):
         Definition.read(file)
+    code.write_text("raise SystemExit('it was run')\n")
+    for more in ("", f'mechanism = "{RIG}"\n'):
+        file.write_text(f'{more}kind = "league"\nmechanisms = ["{RIG}", "{code}:rig"]\n')
+        with pytest.raises(InvalidInputError, match="--mechanism"):
+            study_of(Definition.read(file))
+
+
+def test_model_files_lie_beside_the_definition(tmp_path: Path) -> None:
+    """With joints behind their names, and among several mechanisms, too."""
+    (tmp_path / "own.urdf").write_text("<robot/>")
+    whole = f"{tmp_path / 'own.urdf'}:j_1"
+    file = tmp_path / "map.toml"
+    file.write_text('mechanism = "own.urdf:j_1"')
+    assert Definition.read(file).mechanism == whole
+    file.write_text(f'mechanisms = ["{RIG}", "own.urdf:j_1"]')
+    assert Definition.read(file).said["mechanisms"] == [RIG, whole]

@@ -52,7 +52,11 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def floats(what: str, values: ArrayLike) -> np.typing.NDArray[np.float64]:
+def floats(
+    what: str,
+    values: ArrayLike,
+    remedy: str = "Set states by name: mechanism.state(name=value)",
+) -> np.typing.NDArray[np.float64]:
     """Return values as an array of floats, or refuse them.
 
     Raises
@@ -66,7 +70,7 @@ def floats(what: str, values: ArrayLike) -> np.typing.NDArray[np.float64]:
         what,
         value=_shown(values),
         limit="numbers, in SI units",
-        remedy="Set states by name: mechanism.state(name=value)",
+        remedy=remedy,
     )
 
 

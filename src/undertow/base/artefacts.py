@@ -28,6 +28,9 @@ if TYPE_CHECKING:  # Rich takes time to import, which a table is worth and an im
     from rich.table import Table
     from rich.text import Text
 
+#: What pictures are written: how their names end, by how their contents begin.
+PICTURES = {b"\x89PNG": ".png", b"GIF8": ".gif"}
+
 PACKAGES = ("undertow", "numpy", "scipy", "sympy", "numba", "matplotlib", "casadi")
 
 
@@ -252,8 +255,17 @@ def write_file(path: Path, content: bytes) -> Path:
     Raises
     ------
     ArtefactError
-        When it cannot be written, and where a file of another kind is there.
+        When it cannot be written, where a file of another kind is there, and for a picture whose
+        name ends as that of another kind.
     """
+    kind = next((end for begin, end in PICTURES.items() if content.startswith(begin)), "")
+    if kind and path.suffix and path.suffix.lower() != kind:
+        raise ArtefactError(
+            f"picture '{path}'",
+            value=f"a name that ends in {path.suffix}",
+            limit=f"one in {kind}, which is what is written",
+            remedy=f"Name it {path.with_suffix(kind)}",
+        )
     refusal = "a file that can be written", "Choose another folder or name"
     with or_refused(f"file '{path}'", *refusal):
         length = 1 if content.startswith(b"{") else 4  # JSON may be laid out in several ways

@@ -116,6 +116,8 @@ def or_refused(what: str, limit: str, remedy: str) -> Iterator[None]:
     """
     try:
         yield
+    except UndertowError:  # said already
+        raise
     except OSError as error:
         said = error.strerror or str(error)
         raise ArtefactError(what, value=said, limit=limit, remedy=remedy) from error

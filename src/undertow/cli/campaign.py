@@ -66,7 +66,8 @@ def campaign(
         Path | None, option("Draw what the store has into this PNG, and nothing else.")
     ] = None,
     proof: Annotated[
-        Path | None, option("Certificate whose region on the surface the picture shows.")
+        Path | None,
+        option("Certificate whose region on the surface, or terminal set, the picture shows."),
     ] = None,
 ) -> None:
     """Compute many shards of work, and keep them in a store that survives interruptions."""
@@ -87,6 +88,15 @@ def campaign(
             value=f"{limit:g} s, for threads",
             limit="workers",
             remedy="A thread cannot be ended: add --workers 1",
+        )
+    alone_ones = {
+        "--picture": picture is not None, "--tables": tables, "--status": status,
+        "--shard": shard is not None,
+    }  # fmt: skip
+    asked = [name for name, given in alone_ones.items() if given]
+    if len(asked) > 1:
+        raise InvalidInputError(
+            "what is shown of the campaign", value=" and ".join(asked), limit="one of them"
         )
     if proof is not None and picture is None:
         raise InvalidInputError(

@@ -36,11 +36,15 @@ def doctor(
     if not test:
         return
     show("\nSelf-test: ten seconds, or a minute where all has to be compiled first")
-    passed = True
+    passed, warnings = True, []
     with progress_bar() as progress:
         for result in self_test(progress):
             passed &= result.passed
+            warnings += [result.warning] * bool(result.warning)
             mark = "ok  " if result.passed else "FAIL"
             show(f"{mark} {result.name} ({result.seconds:.1f} s): {result.words}")
-    show("All is well." if passed else "Something is wrong: see FAIL above.")
+    if not passed:
+        show("Something is wrong: see FAIL above.")
+    else:
+        show(f"All tests pass, but {'; '.join(warnings)}." if warnings else "All is well.")
     exit_unless(passed)

@@ -19,6 +19,7 @@ from undertow.base import (
     between,
     check_fields,
     checked,
+    floats,
     positive,
     require_extra,
 )
@@ -158,10 +159,22 @@ class BalancingTask:
             return False
         return True
 
-    def inputs(self, actions: NDArray[Any]) -> FloatArray:
-        """Return the inputs of actions in [−1, 1], (…, m), in the units of the inputs."""
-        inside = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)
-        return np.asarray(inside * self.mechanism.input_limits)
+    def inputs(self, actions: NDArray[Any], *count: int) -> FloatArray:
+        """Return the inputs of actions in [−1, 1], (*count, m), in the units of the inputs.
+
+        Raises
+        ------
+        InvalidInputError
+            For actions of another shape, and those that are no finite numbers.
+        """
+        shape, remedy = (*count, self.mechanism.m), "Give a number in [−1, 1] for each input"
+        what = "actions of a vector environment" if count else "action of an environment"
+        given = floats(what, actions, remedy)
+        bad = ~np.isfinite(given)
+        if given.shape != shape or bad.any():
+            value = f"{given[bad][0]}" if given.shape == shape else f"shape {given.shape}"
+            raise InvalidInputError(what, value=value, limit=f"finite, {shape}", remedy=remedy)
+        return np.asarray(np.clip(given, -1.0, 1.0) * self.mechanism.input_limits)
 
     def events(self, x: FloatArray, margin: FloatArray) -> NDArray[np.int64]:
         """Return what became of states x, (N, 2n), with path margins (N,): HORIZON goes on."""
@@ -383,7 +396,7 @@ def vector_environment(
     require_extra("gymnasium", "gym", NEEDS)
     from undertow.export.gym import VectorEnvironment
 
-    return VectorEnvironment(_task(mechanism, objective, False, period, penalty), num_envs)
+    return VectorEnvironment(_task(mechanism, objective, False, period, penalty), int(num_envs))
 
 
 def _task(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,13 @@ def _begin(
     """Return where an episode begins, (2n,): ``options`` may name states, else it is drawn."""
     if not options:
         return task.start(rng)
+    if not isinstance(options, Mapping):
+        raise InvalidInputError(
+            "options of reset()",
+            value=repr(options),
+            limit="states by name",
+            remedy='Write options={"phi": 0.3}, SI units; None draws the start',
+        )
     x = task.mechanism.state(**options)
     task.problem.check_start(task.mechanism, x)
     return x
@@ -129,16 +137,9 @@ class Environment(gymnasium.Env[FloatArray, NDArray[Any]]):
         Raises
         ------
         InvalidInputError
-            For an action of another shape, and after the end of an episode.
+            For an action that is not (m,) finite numbers, and after the end of an episode.
         """
-        shape = np.shape(action)
-        if shape != (self.task.mechanism.m,) or not np.isfinite(action).all():
-            raise InvalidInputError(
-                "action of an environment",
-                value=f"{action!r}, shape {shape}",
-                limit=f"finite, ({self.task.mechanism.m},)",
-                remedy="One number in [−1, 1] for each input",
-            )
+        inputs = self.task.inputs(action)
         if not self._left:
             raise InvalidInputError(
                 "step of an environment",
@@ -146,7 +147,7 @@ class Environment(gymnasium.Env[FloatArray, NDArray[Any]]):
                 limit="an episode that goes on",
                 remedy="Call reset() first",
             )
-        cost, margin = self._plant.step(self.task.inputs(action))
+        cost, margin = self._plant.step(inputs)
         event = self.task.events(self._plant.x[None], np.array([margin]))
         reward = float(self.task.rewards(np.array([cost]), event)[0])
         self._left -= 1
@@ -217,16 +218,16 @@ class VectorEnvironment(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
             (N, 2n), SI units.
         """
         if seed is not None:
-            first = np.atleast_1d(seed)
-            seed = [int(k) for k in (first if np.ndim(seed) else first + range(self.num_envs))]
-            if len(seed) != self.num_envs:
+            given = np.asarray(seed)
+            if given.dtype.kind not in "iu" or given.shape not in ((), (self.num_envs,)):
                 raise InvalidInputError(
                     "seeds of a vector environment",
-                    value=f"{len(seed)} seeds",
-                    limit=f"one, or {self.num_envs}",
+                    value=repr(seed) if given.size == 1 else f"shape {given.shape}",
+                    limit=f"a whole number, or {self.num_envs}",
                     remedy="Give the first one alone: the others count on from it",
                 )
-            self._rngs = [seeding.np_random(one)[0] for one in seed]
+            seeds = given if given.ndim else given + np.arange(self.num_envs)
+            self._rngs = [seeding.np_random(int(one))[0] for one in seeds]
         self._begin(range(self.num_envs), options)
         return self._observations(self._lanes.x), {}
 
@@ -250,16 +251,14 @@ class VectorEnvironment(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
         observations, rewards, terminations, truncations, infos
             (N, 2n), and (N,) each.  Where an episode ends, ``infos["event"]`` says how, and
             ``infos["_event"]`` is true.
+
+        Raises
+        ------
+        InvalidInputError
+            For actions that are not (N, m) finite numbers.
         """
-        if np.shape(actions) != (self.num_envs, self.task.mechanism.m):
-            raise InvalidInputError(
-                "actions of a vector environment",
-                value=f"shape {np.shape(actions)}",
-                limit=f"({self.num_envs}, {self.task.mechanism.m})",
-                remedy="One row for each environment",
-            )
         over = self._left == 0
-        self._lanes.u[:] = self.task.inputs(actions).T
+        self._lanes.u[:] = self.task.inputs(actions, self.num_envs).T
         cost, margin = self._lanes.step()
         x = self._lanes.x
         event = self.task.events(x, margin)

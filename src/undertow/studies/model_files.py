@@ -135,7 +135,8 @@ def _one(file: Path, short: str, simulate: bool, seed: int) -> ModelFile:
         if simulate:
             row = _motion(row, mechanism, seed)
     except UndertowError as error:
-        none = error.what == "model file" and str(error.value).startswith("root")
+        what = error.what.replace(f"model file '{file}'", "model file")  # the row names it
+        none = what == "model file" and str(error.value).startswith("root")
         about = (
             "no model"
             if none
@@ -143,7 +144,7 @@ def _one(file: Path, short: str, simulate: bool, seed: int) -> ModelFile:
                 (word for kind, word in _ABOUT.items() if isinstance(error, kind)), "a motion"
             )
         )
-        why = f"{error.what}: {error.value}" if error.value is not None else error.what
+        why = f"{what}: {error.value}" if error.value is not None else what
         row = replace(row, refused=about, why=" ".join(why.replace("|", "/").split()))
     return replace(row, seconds=time.perf_counter() - began)
 

@@ -14,7 +14,14 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from undertow.base import ArtefactError, InvalidInputError, ModelError, one_of, read_file
 from undertow.models.importers.tree import FREE_BASE, MOST_MOVING
-from undertow.models.importers.xml_files import LARGEST, MOST, is_text, numbers_of, parse_xml
+from undertow.models.importers.xml_files import (
+    LARGEST,
+    MOST,
+    is_text,
+    numbers_of,
+    parse_xml,
+    source_words,
+)
 
 #: Most files that one model is made of, and most bytes of all its meshes.
 MOST_FILES, MOST_MESHES = 200, 1 << 28
@@ -27,7 +34,7 @@ _NAMING = {"name", "class", "childclass", "file", "model"}
 _ODD = re.compile(r"(?i)(?<![a-z_])[-+]?(nan|inf|infinity)(?![a-z_0-9])")
 
 #: Options that say something about motion.
-_OPTIONS = {"gravity", "density", "viscosity", "wind"}
+_OPTIONS = {"actuatorgroupdisable", "gravity", "density", "viscosity", "wind"}
 _FLAGS = {"gravity", "spring", "damper", "passive", "actuation"}
 _ORIENTED = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 
@@ -37,12 +44,13 @@ class Document:
     """An MJCF document of its own.
 
     ``files``: meshes by the names that the elements have for them; ``frozen``: names of the joints
-    that were taken out.
+    that were taken out; ``what``: which file it is, for messages.
     """
 
     root: ET.Element
     files: dict[str, bytes] = field(default_factory=dict)
     frozen: tuple[str, ...] = ()
+    what: str = "MJCF"
 
     @property
     def text(self) -> str:
@@ -80,7 +88,7 @@ def mjcf_document(source: str | Path, frozen: Sequence[str] = ()) -> Document:
     _check_moving(root)
     _to_local_frames(root)
     _main_class(root)
-    document = Document(root, frozen=tuple(frozen))
+    document = Document(root, frozen=tuple(frozen), what=source_words(source, "mujoco"))
     _strip(root)
     _meshes(document, folder)
     return document

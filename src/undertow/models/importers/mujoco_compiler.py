@@ -90,7 +90,7 @@ def compiled(mujoco: Any, document: Document) -> Any:
         mechanics = _INERTIA.search(said) or "not found" in said
         refusal = ModelError if mechanics else InvalidInputError
         raise refusal(
-            "MJCF",
+            document.what,
             value=said.removeprefix("XML ").removeprefix("Error: "),
             limit="a model that MuJoCo's compiler takes",
             remedy="Correct the file there; MuJoCo's documentation says what each element takes",
@@ -236,6 +236,8 @@ class _Compiled:
             if np.any(getattr(model, what, 0)):
                 raise _refused(f"a {what[4:-4]} of '{child}' that is not linear", "Leave it out")
         name = self.name("JOINT", j) or f"{child}_{kind}"
+        if np.any(getattr(model, "jnt_springyield", np.zeros(j + 1))[j]):
+            raise _refused(f"a spring of joint '{name}' that yields", "Leave springyield out")
         low, high = -math.inf, math.inf
         if model.jnt_limited[j]:
             low, high = (float(v) for v in model.jnt_range[j])
@@ -272,6 +274,8 @@ class _Compiled:
                 raise _refused(f"<spatial> tendon '{name}'", "Only fixed tendons are linear in q")
             if model.tendon_frictionloss[t] or model.tendon_limited[t]:
                 raise _refused(f"friction or limits on tendon '{name}'", "Put them on joints")
+            if np.any(getattr(model, "tendon_springyield", np.zeros(t + 1))[t]):
+                raise _refused(f"a spring of tendon '{name}' that yields", "Leave springyield out")
             low, high = model.tendon_lengthspring[t]
             if model.tendon_stiffness[t] and low != high:
                 raise _refused(f"a slack spring on tendon '{name}'", "Give one springlength")
@@ -296,6 +300,9 @@ class _Compiled:
         for k in range(model.nu):
             name = self.name("ACTUATOR", k) or f"u_{k + 1}"
             what, on = f"actuator '{name}'", int(model.actuator_trnid[k, 0])
+            if model.opt.disableactuator >> int(model.actuator_group[k]) & 1:
+                raise _refused(f"{what} of a group that is switched off", "Take it out, or its "
+                               "group out of actuatorgroupdisable")  # fmt: skip
             stateless = int(model.actuator_dyntype[k]) == int(mujoco.mjtDyn.mjDYN_NONE)
             if not stateless:
                 raise _refused(f"{what} that has states of its own", "Use <motor>, or name the "
@@ -307,6 +314,7 @@ class _Compiled:
                                "actuated joints: actuated=['...']")  # fmt: skip
             gear = float(model.actuator_gear[k, 0])
             gain = float(model.actuator_gainprm[k, 0])
+            pull = math.inf  # of the tendon, along it
             if int(model.actuator_trntype[k]) in joint_like:
                 joint = self.of_joint[on]
                 coefficients, stroke, effort = {joint.name: 1.0}, "", joint.effort
@@ -314,6 +322,9 @@ class _Compiled:
             elif int(model.actuator_trntype[k]) == int(mujoco.mjtTrn.mjTRN_TENDON):
                 coefficients, stroke = dict(tendons[on].coefficients), tendons[on].name
                 unit, effort = "", math.inf
+                if np.any(getattr(model, "tendon_actfrclimited", np.zeros(on + 1))[on]):
+                    label = f"actuatorfrcrange of tendon '{tendons[on].name}'"
+                    pull = _one_size(label, model.tendon_actfrcrange[on]) / abs(gear or 1.0)
                 if len(coefficients) == 1:  # a joint in disguise
                     ((alone, factor),) = coefficients.items()
                     (joint,) = (j for j in self.joints if j.name == alone)
@@ -329,19 +340,21 @@ class _Compiled:
                     limit="numbers that are not zero",
                     remedy="A motor that moves nothing is no input: leave it out",
                 )
-            limits = [effort / abs(gear * gain)]
+            limits = [effort / abs(gear * gain), pull / abs(gain)]
             if model.actuator_ctrllimited[k]:
                 limits.append(_one_size(f"ctrlrange of {what}", model.actuator_ctrlrange[k]))
             if model.actuator_forcelimited[k]:
                 force = _one_size(f"forcerange of {what}", model.actuator_forcerange[k])
                 limits.append(force / abs(gain))
-            self._servo(k, name, coefficients, gear)
+            servo = self._servo(k, name, coefficients, gear)
             force = gear * gain
             yield Actuator(
-                name, coefficients, force, min(limits), unit if force == 1 else "", stroke
-            )
+                name, coefficients, force, min(limits), unit if force == 1 else "", stroke,
+                clipped=bool(servo.stiffness or servo.damping)
+                and bool(model.actuator_forcelimited[k] or math.isfinite(min(effort, pull))),
+            )  # fmt: skip
 
-    def _servo(self, k: int, name: str, coefficients: dict[str, float], gear: float) -> None:
+    def _servo(self, k: int, name: str, coefficients: dict[str, float], gear: float) -> Coupling:
         """What an actuator does without input: the spring and damper of a servo, a rotor."""
         model = self.model
         offset, spring, damper = (float(v) for v in model.actuator_biasprm[k, :3])
@@ -353,16 +366,16 @@ class _Compiled:
             raise _refused(f"actuator '{name}' that pushes without input", "Leave its bias out")
         if np.any(getattr(model, "actuator_dampingpoly", 0)):
             raise _refused(f"a damping of actuator '{name}' that is not linear", "Leave it out")
-        self.servos.append(
-            Coupling(
-                f"{name}_servo",
-                coefficients,
-                damping=(damping - damper) * gear**2,
-                stiffness=-spring * gear**2,
-                rest=-offset / (spring * gear) if spring else 0.0,
-                armature=armature * gear**2,
-            )
+        servo = Coupling(
+            f"{name}_servo",
+            coefficients,
+            damping=(damping - damper) * gear**2,
+            stiffness=-spring * gear**2,
+            rest=-offset / (spring * gear) if spring else 0.0,
+            armature=armature * gear**2,
         )
+        self.servos.append(servo)
+        return servo
 
 
 def _one_size(what: str, given: Sequence[float]) -> float:
@@ -484,6 +497,7 @@ def compare(
         model.opt.disableflags |= int(getattr(bits, f"mjDSBL_{what}"))
     model.actuator_forcelimited[:] = 0
     model.jnt_actfrclimited[:] = 0
+    getattr(model, "tendon_actfrclimited", model.jnt_actfrclimited)[:] = 0
     data = mujoco.MjData(model)
     rows = _rows(mechanism, tree, own, driven)
     target = np.array([q_target.get(c.name, 0.0) for c in mechanism.coordinates])

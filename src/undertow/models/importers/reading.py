@@ -51,6 +51,9 @@ def described(mechanism: Mechanism, tree: Tree, how: str, frozen: Sequence[str])
     left = "contacts, shapes"
     if any(mechanism.disturbance_bounds):
         left += ", dry friction (a bound on the disturbance)"
+    clipped = [a.name for a in tree.actuators if a.clipped]
+    if clipped:
+        left += f", the force limit of {', '.join(clipped)} on its own spring and damper"
     if frozen:
         left += f"; frozen {', '.join(frozen)}"
     lines = (how, f"joints {joints}", f"inputs {'; '.join(inputs)}", f"left out {left}")

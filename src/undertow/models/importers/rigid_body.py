@@ -241,7 +241,17 @@ def _inputs(
             "line",
         )
     B = sp.zeros(len(joints), len(tree.actuators))
+    driver: dict[tuple[str, ...], str] = {}
     for k, actuator in enumerate(tree.actuators):
+        first = driver.setdefault(alone := tuple(actuator.coefficients), actuator.name)
+        if len(alone) == 1 and first != actuator.name:
+            raise ModelError(
+                f"joint '{alone[0]}' of '{tree.name}'",
+                value=f"two motors, {first} and {actuator.name}",
+                limit="one: what two push together is one input",
+                remedy=f"Merge them, or drive the joint instead: actuated=['{alone[0]}'], "
+                f"FILE:{alone[0]} on the command line",
+            )
         for joint, coefficient in actuator.coefficients.items():
             whose = f"joint of actuator '{actuator.name}' of '{tree.name}'"
             one_of(whose, joint, index, "Check the spelling, and that the joint moves")

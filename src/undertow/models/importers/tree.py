@@ -136,6 +136,9 @@ class Actuator:
         Of the input.
     stroke
         Name of Σ c_j q_j, which becomes a coordinate where it is no joint by itself.
+    clipped
+        Whether the file limits what it pushes with its own spring and damper, too, as a tree
+        cannot.
     """
 
     name: str
@@ -144,6 +147,7 @@ class Actuator:
     limit: float = math.inf
     unit: str = ""
     stroke: str = ""
+    clipped: bool = False
 
 
 #: The numbers of a tree's parts that cannot be infinite.

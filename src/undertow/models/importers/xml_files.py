@@ -32,6 +32,11 @@ def is_text(source: str | Path) -> bool:
     return isinstance(source, str) and source.lstrip().startswith("<")
 
 
+def source_words(source: str | Path, root: str) -> str:
+    """Say for a message which file a source is, or that it is text."""
+    return f"<{root}> text" if is_text(source) else f"model file '{source}'"
+
+
 def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
     """Parse XML text (it starts with ``<``) or a file, and check the name of its root.
 
@@ -47,6 +52,7 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
     ModelError
         For another root element.
     """
+    what = source_words(source, root)
     if not isinstance(source, str | Path):
         raise InvalidInputError(
             f"<{root}> file",
@@ -61,33 +67,33 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
             text = read_file(Path(source), "model file", most=LARGEST).decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise ArtefactError(
-                f"model file '{source}'",
+                what,
                 value="no UTF-8 text",
                 limit="a readable file, or XML text",
                 remedy="Save it as UTF-8",
             ) from error
     if "<!ENTITY" in text:
         raise InvalidInputError(
-            f"<{root}> file",
+            what,
             value="entity declarations",
             limit="plain XML",
             remedy="Expand the entities first",
         )
     text = _DEFAULTED.sub(r"\1", _DECLARATION.sub("", text)).rstrip("\0 \t\r\n")
     try:
-        _check_size(text, root)
+        _check_size(text, what)
         element = ET.fromstring(text)
     except ET.ParseError as error:
         line, column = error.position
         raise InvalidInputError(
-            f"<{root}> file is no well-formed XML",
+            f"{what} is no well-formed XML",
             value=f"{error.msg.split(':')[0]} at line {line}, column {column}",
             limit="every tag closed and every attribute quoted",
             remedy="Correct the file there",
         ) from error
     if element.tag not in (root, *more):
         raise ModelError(
-            "model file",
+            what,
             value=f"root <{element.tag}>",
             limit=f"<{root}>",
             remedy="URDF has <robot>: from_urdf; MJCF <mujoco>: from_mjcf",
@@ -95,7 +101,7 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
     return element
 
 
-def _check_size(text: str, root: str) -> None:
+def _check_size(text: str, what: str) -> None:
     """Refuse what is nested or repeated beyond any mechanism, before a tree is built of it.
 
     Raises
@@ -110,7 +116,7 @@ def _check_size(text: str, root: str) -> None:
         depth, count = depth + 1, count + 1
         if depth > DEEPEST or count > MOST:
             raise InvalidInputError(
-                f"<{root}> file",
+                what,
                 value=f"elements nested {depth} deep" if depth > DEEPEST else f"{count} elements",
                 limit=f"at most {DEEPEST} deep, {MOST} in all",
                 remedy="Keep the bodies of one mechanism alone",

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, get_args
 
 from undertow.base import ArtefactError, InvalidInputError, near, one_of, read_file
-from undertow.mechanisms.named import from_anywhere, named
-from undertow.models import Mechanism
+from undertow.mechanisms.named import DataName, from_anywhere, named
+from undertow.models import Mechanism, by_names
 from undertow.models.importers.formats import file_words
 from undertow.models.importers.python_file import in_a_file
 from undertow.objective import Goal, Objective, objective_for
@@ -55,7 +55,8 @@ class Definition:
         ArtefactError
             For a file that cannot be read or is no TOML.
         InvalidInputError
-            For a mechanism that is missing, or in a Python file that was not named besides.
+            For a mechanism that is missing, and for one in a Python file, which only
+            ``mechanism`` may name.
         """
         content = read_file(path, "definition of a campaign", most=LARGEST)
         try:
@@ -75,15 +76,11 @@ class Definition:
                 f"mechanism of the campaign '{path}'", value=name, limit="a name, like 'acrobot'"
             )
         if mechanism is None:
-            if in_a_file(name):
-                raise InvalidInputError(
-                    f"mechanism of the campaign '{path}'",
-                    value=name,
-                    limit=f"a name of the library, {file_words()}",
-                    remedy=f"Code of your own is named where it is run: --mechanism {name}",
-                )
-            beside = path.parent / name
-            name = str(beside) if Path(name).suffix and beside.exists() else name
+            name = _of_data(name, path)
+            if isinstance(several, list):
+                said["mechanisms"] = [
+                    _of_data(one, path) if isinstance(one, str) else one for one in several
+                ]
         whole = tuple(from_anywhere(one) for one in code)
         return replace(cls.of(from_anywhere(name), **said), code=whole)
 
@@ -116,6 +113,27 @@ class Definition:
         return Settings(self.said, "")
 
 
+def _of_data(name: str, definition: Path) -> str:
+    """Return the whole name of a mechanism that a definition names; files may lie beside it.
+
+    Raises
+    ------
+    InvalidInputError
+        For one in a Python file.
+    """
+    if in_a_file(name):
+        raise InvalidInputError(
+            f"mechanism of the campaign '{definition}'",
+            value=name,
+            limit=f"a name of the library, {file_words()}",
+            remedy=f"Code of your own is named where it is run: --mechanism {name}",
+        )
+    data = DataName.of(name)
+    if data is not None and (definition.parent / data.file).exists():
+        name = str(definition.parent / name)
+    return from_anywhere(name)
+
+
 def _each_once(value: Any) -> bool:
     """Whether a value is a list of words, all different."""
     words = isinstance(value, list) and all(isinstance(one, str) for one in value)
@@ -127,7 +145,7 @@ class Settings:
 
     def __init__(self, values: Mapping[str, Any], where: str) -> None:
         self.where = where
-        self._values = dict(values)
+        self._values = by_names("settings of a campaign", values)
         self._known: list[str] = []
 
     def what(self, name: str) -> str:

@@ -16,7 +16,9 @@ from undertow.base import InvalidInputError
 from undertow.closed_loop.figures import COLOURS, display, figure_bytes, style
 from undertow.models import FloatArray
 from undertow.proofs.claims.certificate import read_certificate
+from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import match
+from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import SurfaceRegion, read_claim
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.studies.campaign.region_map import EVENTS, RegionMap
@@ -36,10 +38,13 @@ LOST = {
     "horizon": ("#fff3c4", "not within the horizon"),
 }
 
+#: What a certificate proves of a map's states: of those on the surface, or of any.
+Proved = LyapunovFunction | TerminalEllipsoid
+
 _GREEK = {"theta": "θ", "phi": "φ", "psi": "ψ"}
 
 
-def picture(campaign: Campaign, proved: LyapunovFunction | None = None) -> Figure:
+def picture(campaign: Campaign, proved: Proved | None = None) -> Figure:
     """Return the maps of a campaign's store; white is what is not computed yet.
 
     Parameters
@@ -47,15 +52,17 @@ def picture(campaign: Campaign, proved: LyapunovFunction | None = None) -> Figur
     campaign
         Over two axes, or a region over three.
     proved
-        A proved set of the sliding motion, drawn into a region of states on its surface.
+        A proved set of the sliding motion, drawn into a region of states on its surface; or a
+        proved terminal set, which is too small for a map and is drawn larger, beside its place.
 
     Raises
     ------
     InvalidInputError
-        For other numbers of axes, or a proved set where the states are not on a surface.
+        For other numbers of axes, a set of the sliding motion where the states are not on a
+        surface, and a terminal set where those that stay as they are are not at the target.
     """
-    study, data = campaign.study, campaign.dataset()
-    data = data.isel({
+    study: Any = campaign.study
+    data = campaign.dataset().isel({
         axis.name: slice(None, None, -(-len(axis.values) // DRAWN)) for axis in study.axes
     })  # fmt: skip
     region = isinstance(study, RegionMap)
@@ -63,10 +70,15 @@ def picture(campaign: Campaign, proved: LyapunovFunction | None = None) -> Figur
         raise InvalidInputError(
             "axes of a picture", value=len(study.axes), limit="two, or three states of a region"
         )
-    if proved is not None and not (isinstance(study, RegionMap) and study.sliding):
+    if isinstance(proved, LyapunovFunction) and not (region and study.sliding):
         raise InvalidInputError(
             "proved set in a picture", value="states off the surface", limit="sliding = true"
         )
+    if isinstance(proved, TerminalEllipsoid) and (not region or np.any(study.at)):
+        raise InvalidInputError(
+            "proved terminal set in a picture", value="states off the target",
+            limit="a region, other states at the target", remedy="Leave the table 'at' out",
+        )  # fmt: skip
     if region and len(study.axes) == 3:
         return _volume(study, data)
     names = [name for name in study.variables if name != "event"]
@@ -77,7 +89,9 @@ def picture(campaign: Campaign, proved: LyapunovFunction | None = None) -> Figur
             facts = data[name].attrs
             unit = "" if facts["units"] == "1" else f" ({facts['units']})"
             figure.colorbar(mesh, ax=axes, label=f"{name}{unit}", extend="max")
-            if proved is not None and isinstance(study, RegionMap):
+            if isinstance(proved, TerminalEllipsoid):
+                _draw_terminal(axes, study, proved)
+            elif proved is not None:
                 _draw_proved(axes, study, proved)
         _legend(figure, study, data, proved)
         figure.suptitle(_title(study, data), fontsize=10)
@@ -126,7 +140,6 @@ def _map(axes: Axes, study: Any, data: Any, name: str, most: float | None = None
 def _volume(study: Any, data: Any) -> Figure:
     """Draw the time to come home in slices through a volume."""
     last = study.axes[-1]
-    factor, label = _label(study, last.name)
     values = np.asarray(data[last.name])
     places = np.unique(np.linspace(0, len(values) - 1, SLICES).round().astype(int))
     most = _most(np.asarray(data.time))
@@ -136,9 +149,7 @@ def _volume(study: Any, data: Any) -> Figure:
         mesh: Any = None
         for axes, place in zip(panels.ravel(), places, strict=False):
             mesh = _map(axes, study, data.isel({last.name: int(place)}), "time", most)
-            symbol, _, unit = label.partition(" (")
-            space = "" if unit.startswith("°") else " "
-            axes.set_title(f"{symbol} = {factor * values[place]:.3g}{space}{unit[:-1]}", loc="left")
+            axes.set_title(_said(study, last.name, values[place]), loc="left")
             axes.label_outer()
         figure.colorbar(mesh, ax=panels, label="time (s)", extend="max")
         _legend(figure, study, data, None)
@@ -146,7 +157,7 @@ def _volume(study: Any, data: Any) -> Figure:
     return figure
 
 
-def _legend(figure: Figure, study: Any, data: Any, proved: LyapunovFunction | None) -> None:
+def _legend(figure: Figure, study: Any, data: Any, proved: Proved | None) -> None:
     handles: list[Any] = []
     if "event" in data:
         events = np.unique(np.asarray(data.event))
@@ -155,7 +166,11 @@ def _legend(figure: Figure, study: Any, data: Any, proved: LyapunovFunction | No
                 handles.append(Patch(color=colour, label=words))
     if proved is not None:
         line = Line2D([], [], color=COLOURS["vermilion"], lw=1.6)
-        line.set_label("proved region of the sliding motion, inputs not limited")
+        line.set_label(
+            "proved terminal set, inputs limited, drawn larger"
+            if isinstance(proved, TerminalEllipsoid)
+            else "proved region of the sliding motion, inputs not limited"
+        )
         handles.append(line)
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
@@ -175,6 +190,27 @@ def _draw_proved(axes: Axes, study: RegionMap, proved: LyapunovFunction) -> None
     )  # fmt: skip
 
 
+def _draw_terminal(axes: Axes, study: RegionMap, proved: TerminalEllipsoid) -> None:
+    """Draw the edge of a terminal set in the slice, in a frame of its own, and where it is."""
+    colour = COLOURS["vermilion"]
+    factors = np.array([_label(study, axis.name)[0] for axis in study.axes])
+    edge = (factors * _cut(study, proved)).T
+    axes.plot(0.0, 0.0, "+", color=colour, ms=9, mew=1.4)
+    frame = axes.inset_axes((0.73, 0.68, 0.25, 0.3))
+    frame.plot(*edge, color=colour, lw=1.6)
+    for axis, reach in zip((frame.xaxis, frame.yaxis), edge.max(axis=1), strict=True):
+        axis.set_ticks([-reach, reach], [f"−{reach:.2g}", f"{reach:.2g}"], fontsize=6)
+    frame.tick_params(length=2, pad=1)
+
+
+def _cut(study: RegionMap, proved: TerminalEllipsoid) -> FloatArray:
+    """Return points on the edge of a terminal set in the slice through the target, (K, 2)."""
+    round_once = np.linspace(0.0, 2 * np.pi, 181)
+    R = np.linalg.qr(proved.W[:, study.places], mode="r")  # |W x| = |R p| in the slice
+    circle = proved.radius * np.array([np.cos(round_once), np.sin(round_once)])
+    return np.asarray(np.linalg.solve(R, circle).T)
+
+
 def sliding_coordinates(study: RegionMap, states: FloatArray) -> FloatArray:
     """Return y = (q_u, q̇_u, w) of states, (…, 2n), with w = q_a + λ_a⁻¹ λ_u q_u."""
     n, m, surface = study.mechanism.n, study.mechanism.m, study.surface
@@ -183,42 +219,57 @@ def sliding_coordinates(study: RegionMap, states: FloatArray) -> FloatArray:
     return np.concatenate([q_u, v_u, w], axis=-1)
 
 
-def proved_set(study: RegionMap, path: Path) -> LyapunovFunction:
-    """Return the region that a certificate states of the study's mechanism and surface.
+def proved_set(study: RegionMap, path: Path) -> Proved:
+    """Return what a certificate states of the study's mechanism and law.
 
-    It is not decided again here: ``undertow verify`` does.
+    For states on the surface that is a region on it, else a terminal set.  It is not decided again
+    here: ``undertow verify`` does.
 
     Raises
     ------
     InvalidInputError
-        When it states none of this surface.
+        When it states none of this surface, or of this law.
     ArtefactError, CertificateError
         When it cannot be read, or is about another mechanism.
     """
     certificate = read_certificate(path)
     document = certificate.document
+    wanted = study.surface.vector
+    if not study.sliding:
+        wanted = np.append(wanted, study.loop.reaching.vector(study.mechanism.m))
     if document is not None:
         match(certificate, study.mechanism, own_parameters=True)
         for subject in document.subjects:
             law = np.array([float(v) for v in subject.law.numbers])
-            if not np.array_equal(law[: len(study.surface.vector)], study.surface.vector):
+            if not np.array_equal(law[: len(wanted)], wanted):
                 continue
             for said in subject.claims:
                 claim = read_claim(said, document.model)
-                if isinstance(claim, SurfaceRegion):
+                if isinstance(claim, SurfaceRegion) and study.sliding:
                     return _function(claim)
+                if isinstance(claim, kernel.TerminalEllipsoid) and not study.sliding:
+                    W = np.array(claim.W, dtype=float)
+                    return TerminalEllipsoid(W, np.linalg.inv(W), float(claim.radius))
     raise InvalidInputError(
         f"certificate '{path}' for a picture",
-        value="no region on this surface",
+        value="no region on this surface" if study.sliding else "no terminal set of this law",
         limit=f"one on {study.surface}",
         remedy="Give the definition the certificate's surface",
     )
 
 
-def proved_words(campaign: Campaign, proved: LyapunovFunction) -> str:
-    """Say how many states of a finished shard in the proved set come home with the input limits."""
+def proved_words(campaign: Campaign, proved: Proved) -> str:
+    """Say how many states of a finished shard in the proved set come home with the input limits.
+
+    Of a terminal set, in which there are hardly any, how far it reaches in the slice.
+    """
     study, data = campaign.study, campaign.dataset()
     assert isinstance(study, RegionMap)
+    if isinstance(proved, TerminalEllipsoid):
+        R = np.linalg.qr(proved.W[:, study.places], mode="r")  # |W x| = |R p| in the slice
+        sizes = proved.radius * np.linalg.norm(np.linalg.inv(R), axis=1)
+        reach = (_said(study, a.name, v, "±") for a, v in zip(study.axes, sizes, strict=True))
+        return f"proved terminal set, inputs limited: {', '.join(reach)}"
     inside = home = 0
     for shard in range(study.shards):
         _, states = study.states(shard)
@@ -261,6 +312,14 @@ def _label(study: Any, name: str) -> tuple[float, str]:
     symbol = _GREEK.get(stem, stem)
     symbol = f"{symbol}\N{COMBINING DOT ABOVE}" if rate else symbol
     return factor, f"{symbol}{number.translate(_LOW)} ({unit})"
+
+
+def _said(study: Any, name: str, value: float, relation: str = "=") -> str:
+    """Return the value of an axis in display units, in words."""
+    factor, label = _label(study, name)
+    symbol, _, unit = label.partition(" (")
+    space = "" if unit.startswith("°") else " "
+    return f"{symbol} {relation} {factor * value:.3g}{space}{unit[:-1]}"
 
 
 _LOW = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")

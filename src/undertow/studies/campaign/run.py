@@ -33,7 +33,7 @@ from undertow.studies.campaign.designs import Designs
 from undertow.studies.campaign.league import League
 from undertow.studies.campaign.random_plants import RandomPlants
 from undertow.studies.campaign.region_map import RegionMap
-from undertow.studies.campaign.store import Store, dataset, digest
+from undertow.studies.campaign.store import DONE, SHARD, Store, dataset, digest
 from undertow.studies.campaign.study import Arrays, Study
 from undertow.studies.experiment import Serial, ended
 from undertow.symbolic.store import content_key
@@ -48,6 +48,9 @@ MOST_FAILURES = 20
 
 #: How often a worker may die of a shard before it counts as failed.
 DEATHS = 2
+
+#: Run by workers of this machine when they begin: Ctrl-C is for the process that started them.
+DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 _BUILDING, _COMPUTING = threading.RLock(), threading.Lock()
 
@@ -68,6 +71,14 @@ def study_of(definition: Definition) -> Study:
         if definition.code:
             study.enter(definition.code)
         settings.finish()
+        for axis in study.axes:
+            if axis.name in (*study.variables, DONE, SHARD):
+                raise InvalidInputError(
+                    f"axis '{axis.name}' of the campaign",
+                    value="a name of what the store has itself",
+                    limit=f"none of {', '.join((*study.variables, DONE, SHARD))}",
+                    remedy="Call the coordinate or the parameter something else",
+                )
     return study
 
 
@@ -320,6 +331,7 @@ def executor_for(
         "distributed.scheduler.worker-saturation": 1.0,  # a dead one had one shard, no other's
         "distributed.admin.tick.limit": "1h",
         "distributed.comm.timeouts.connect": "20s",
+        "distributed.worker.preload": [*dask.config.get("distributed.worker.preload", []), DEAF],
     }
     with dask.config.set(settings):
         cluster = None

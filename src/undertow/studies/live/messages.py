@@ -24,7 +24,7 @@ def described(mechanism: Mechanism, scene: Scene) -> Message:
     return {
         "kind": "hello",
         "mechanism": mechanism.name.replace("_", " "),
-        "about": mechanism.description,
+        "about": "; ".join(mechanism.description.splitlines()),
         "coordinates": [
             {"name": c.name, "about": c.description, **shown(c.unit)} for c in mechanism.coordinates
         ],
