@@ -6,20 +6,22 @@ starts, on ellipsoids, and where a function of a region is 1, with the plant and
 at corners of their boxes.  Each has to do what its claim says.
 
 ``python tests/claimed_motions.py tests/data/*.json`` follows a million of them, says how many did
-not, and ends with 1 if there is one.  Needs gcc or another C compiler; some minutes.
+not, and ends with 1 if there is one.  With ``--limit`` it says instead how much of what comes home
+by simulation is claimed.  Needs gcc or another C compiler; some minutes.
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
+import itertools
 import json
 import shutil
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -133,6 +135,8 @@ class Edge:
         With a claim about s alone: how fast |s| has to fall, 1/s.
     share
         Part of its claim's motions.
+    box
+        Of a closed loop: its starts, (4, 2).
     """
 
     what: str
@@ -142,6 +146,7 @@ class Edge:
     forces: FloatArray = field(default_factory=lambda: np.zeros(2))
     growth: float | None = None
     share: float = 1.0
+    box: FloatArray | None = None
 
     def run(self, simulator: Simulator, rng: np.random.Generator, count: int) -> FloatArray:
         """Follow motions; return how many there are of each outcome, and the latest arrival, s."""
@@ -168,6 +173,18 @@ class Edge:
         home = times[outcomes == 0]
         counted = np.bincount(outcomes, minlength=len(OUTCOMES)).astype(float)
         return np.append(counted, home.max(initial=0.0))
+
+    def part(self, simulator: Simulator, rng: np.random.Generator, count: int) -> float:
+        """Return the starts of a closed loop as a part of the largest that all come home.
+
+        Boxes of the same shape are tried, each a hundredth larger, with so many motions each.
+        """
+        assert self.box is not None
+        for percent in itertools.count(101):
+            larger = replace(self, starts=on_faces(self.box * percent / 100))
+            if larger.run(simulator, rng, count)[1:-1].any():
+                return 100.0 / (percent - 1)
+        raise AssertionError
 
 
 def box_of(data: Mapping[str, list[str]], names: tuple[str, ...], at: FloatArray) -> FloatArray:
@@ -343,7 +360,7 @@ def edges(document: Document) -> Iterator[Edge]:
                 whole.period = period
                 box = box_of(claim["plant"], PARAMETERS, plant)
                 starts = box_of(claim["starts"], STATES, np.zeros(4))
-                yield Edge(f"{what}: loop", whole, on_faces(starts), box)
+                yield Edge(f"{what}: loop", whole, on_faces(starts), box, box=starts)
                 if "terminal" in claim.get("hint", {}):
                     own_task, (W, radius) = with_set(claim["hint"]["terminal"], period)
                     yield Edge(
@@ -358,11 +375,20 @@ def main() -> int:
     parser.add_argument("files", nargs="+", type=Path, help="certificates")
     parser.add_argument("--motions", type=int, default=1_000_000, help="in all, more where short")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--limit", type=int, metavar="N", help="try larger starts, N motions each")
     asked = parser.parse_args()
     found = [(f.name, e) for f in asked.files for e in edges(json.loads(f.read_text()))]
     failed, total = 0, 0
     with tempfile.TemporaryDirectory() as folder:
         simulator, rng = Simulator(Path(folder)), np.random.default_rng(asked.seed)
+        if asked.limit:
+            for name, edge in found:
+                if edge.box is not None:
+                    ends = np.rad2deg(edge.box[1, 1])
+                    part = edge.part(simulator, rng, asked.limit)
+                    print(f"{name}, {edge.what}: phi up to {ends:.2f} deg, {part:.0%} of "
+                          f"{ends / part:.2f} deg, up to which all motions come home")  # fmt: skip
+            return 0
         weights = np.array(
             [edge.share / np.sqrt(1 + edge.run(simulator, rng, PILOT)[-1]) for _, edge in found]
         )
