@@ -266,7 +266,7 @@ def test_an_odd_loop_is_known_by_its_nodes() -> None:
 
 @pytest.mark.slow  # up to a minute of one core each
 @pytest.mark.parametrize(
-    ("case", "degrees"), [(1, 35.80), (2, 39.88), (3, 40.39), (4, 39.21), (5, 32.95)]
+    ("case", "degrees"), [(1, 35.80), (2, 39.88), (3, 40.39), (4, 40.26), (5, 32.95)]
 )
 def test_the_kept_lines_of_starts_are_proved_from_their_file(case: int, degrees: float) -> None:
     document = read((ROOT / "tests/data/closed_loop_v2.json").read_bytes())

@@ -363,12 +363,15 @@ def mutant(source: random.Random) -> Document:
 
 
 @needs_compiler
+@pytest.mark.parametrize(
+    ("seed", "documents"), [(16, 60), pytest.param(1, 300, marks=pytest.mark.slow)]
+)
 def test_mutants_are_decided_alike_and_nothing_false_is_proved(
-    program: Path, tmp_path: Path
+    program: Path, tmp_path: Path, seed: int, documents: int
 ) -> None:
-    source = random.Random(16)
+    source = random.Random(seed)
     count = {"proved": 0, "refuted by samples": 0}
-    for index in range(60):
+    for index in range(documents):
         document = mutant(source)
         content, judge = signed(document), Judge(document)
         ours = [d.kind for _, _, d in check(read(content))]
@@ -386,8 +389,9 @@ def test_mutants_are_decided_alike_and_nothing_false_is_proved(
             if judge.refutes(claim):
                 count["refuted by samples"] += 1
                 assert "proved" not in (a, b), where
-    assert count["proved"] > 60
-    assert count["refuted by samples"] > 60
+    print(f"{5 * documents} claims, {count}, 0 of what is refuted proved")
+    assert count["proved"] > documents
+    assert count["refuted by samples"] > documents
 
 
 @needs_compiler

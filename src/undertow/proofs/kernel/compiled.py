@@ -598,18 +598,17 @@ def carried(end, part, h):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def along(whole, centre, C, xi, Q, r, moved):  # type: ignore[no-untyped-def]
-    """Values at m + C ξ + Q r + moved (N, 1, 2), by their intervals and their mean values, (O, 2).
+def along(whole, centre, C, xi, moved):  # type: ignore[no-untyped-def]
+    """Values at m + C ξ + moved (N, 1, 2), by their intervals and their mean values, (O, 2).
 
     ``whole`` are values and derivatives over a box that holds them, (O, 1 + N, 2), ``centre``
     values at m, (O, 2).
     """
     out, slope = whole[:, 0].copy(), np.ascontiguousarray(whole[:, 1:])
-    first, second = product(product(slope, points(C)), xi), product(product(slope, points(Q)), r)
-    third = product(slope, moved)
+    first, second = product(product(slope, points(C)), xi), product(slope, moved)
     for o in range(len(whole)):
         a, b = centre[o]
-        for part in (first, second, third):
+        for part in (first, second):
             a, b = add(a, b, part[o, 0, 0], part[o, 0, 1])
         if a == a and out[o, 0] == out[o, 0]:
             out[o, 0], out[o, 1] = max(a, out[o, 0]), min(b, out[o, 1])
@@ -617,49 +616,21 @@ def along(whole, centre, C, xi, Q, r, moved):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def _orthogonal(A, widths):  # type: ignore[no-untyped-def]
-    """Orthonormal columns near those of A, the widest first (Lohner); nothing rests on them."""
-    n = len(A)
-    size = np.empty(n)
-    for j in range(n):
-        size[j] = np.sqrt((A[:, j] ** 2).sum()) * widths[j]
-    order, Q, filled = np.argsort(-size), np.zeros((n, n)), 0
-    for j in range(2 * n):  # the columns, then unit vectors where columns are dependent
-        v = np.zeros(n)
-        if j < n:
-            v[:] = A[:, order[j]]
-        else:
-            v[j - n] = 1.0
-        before = np.sqrt((v * v).sum())
-        for _ in range(2):
-            for k in range(filled):
-                v -= (v * Q[:, k]).sum() * Q[:, k]
-        length = np.sqrt((v * v).sum())
-        if length > 1e-10 * before and filled < n:
-            Q[:, filled] = v / length
-            filled += 1
-    return Q
-
-
-@_njit
-def hulled(m, C, xi, Q, r):  # type: ignore[no-untyped-def]
-    """The box around m + C ξ + Q r, (N, 2)."""
-    first, second = product(points(C), xi), product(points(Q), r)
-    X = np.empty((len(m), 2))
+def hulled(m, C, xi):  # type: ignore[no-untyped-def]
+    """The box around m + C ξ, (N, 2)."""
+    X = product(points(C), xi)[:, 0].copy()
     for i in range(len(m)):
-        a, b = add(first[i, 0, 0], first[i, 0, 1], second[i, 0, 0], second[i, 0, 1])
-        X[i, 0], X[i, 1] = add(m[i], m[i], a, b)
+        X[i, 0], X[i, 1] = add(m[i], m[i], X[i, 0], X[i, 1])
     return X
 
 
 @_njit
-def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-untyped-def]
-    """{m + C ξ + Q r} after h, Lemma 6: new m, C, Q and r into theirs; whether all is bounded.
+def taylor_step(rest, centre, around, h, m, C, xi):  # type: ignore[no-untyped-def]
+    """{m + C ξ} after h, Lemma 6: new m and C into theirs; the box (N, 1, 2) that is to be added.
 
     ``rest`` (N, 2) is the last coefficient over a box that motions stay in, ``centre`` (N, K, 2)
     the others at m, ``around`` (N, K, 1 + N, 2) the others over the set with their derivatives.
-    C (N, L) and Q (N, N) are doubles, ξ (L, 1, 2) and r (N, 1, 2) boxes, h (2,) is
-    an interval.
+    C (N, L) are doubles, ξ (L, 1, 2) is a box, h (2,) an interval.  NaN where nothing is bounded.
     """
     n = len(m)
     end, S = rest.copy(), np.zeros((n, n, 2))
@@ -671,10 +642,10 @@ def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-unt
                 a, b = mul(S[i, j, 0], S[i, j, 1], h[0], h[1])
                 c, d = around[i, k, 1 + j]
                 S[i, j, 0], S[i, j, 1] = add(a, b, c, d)
+    drift = np.full((n, 1, 2), _NAN)
     if not (np.isfinite(end).all() and np.isfinite(S).all()):
-        return False
-    carried, turned = product(S, points(C)), product(S, points(Q))
-    drift = np.zeros((n, 1, 2))
+        return drift
+    carried = product(S, points(C))
     for i in range(n):
         m[i] = 0.5 * (end[i, 0] + end[i, 1])
         drift[i, 0, 0], drift[i, 0, 1] = add(end[i, 0], end[i, 1], -m[i], -m[i])
@@ -683,13 +654,7 @@ def taylor_step(rest, centre, around, h, m, C, xi, Q, r):  # type: ignore[no-unt
             a, b = add(carried[i, j, 0], carried[i, j, 1], -C[i, j], -C[i, j])
             a, b = mul(a, b, xi[j, 0, 0], xi[j, 0, 1])
             drift[i, 0, 0], drift[i, 0, 1] = add(drift[i, 0, 0], drift[i, 0, 1], a, b)
-    Q[:] = _orthogonal(0.5 * (turned[..., 0] + turned[..., 1]), r[:, 0, 1] - r[:, 0, 0] + 1e-300)
-    back = inverse(points(Q))
-    moved, pushed = product(product(back, turned), r), product(back, drift)
-    for i in range(n):
-        a, b = add(moved[i, 0, 0], moved[i, 0, 1], pushed[i, 0, 0], pushed[i, 0, 1])
-        r[i, 0, 0], r[i, 0, 1] = a, b
-    return bool(np.isfinite(r).all())
+    return drift
 
 
 # -- a terminal ellipsoid -------------------------------------------------------------------------

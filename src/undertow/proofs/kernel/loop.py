@@ -86,9 +86,9 @@ class Loop:
         parts = [[make("mul", number(w), k) for w, k in zip(row, x, strict=True)] for row in W]
         self.rows = graph.program([graph.sum(row) for row in parts])
 
-    def follow(self, box: FloatArray) -> tuple[int, bool]:
+    def follow(self, box: FloatArray, most: int = MOST_OF_ONE) -> tuple[int, bool]:
         """Return how many steps a tube from a box of starts (N, 2) takes, and whether it ends."""
-        tube, most = self.tube(box), min(LONGEST / self.step[1], MOST_OF_ONE)
+        tube, most = self.tube(box), min(int(LONGEST / self.step[1]), most)
         good, k = tube.map(self.coordinates), 0
         while good and k <= most:
             if ops.norm(tube.image(self.rows)) <= self.radius[0]:

@@ -1,9 +1,10 @@
 """Validated integration: boxes of states that move with ẋ = F(x), by Taylor steps (Lemma 6).
 
-A set is m + C ξ + Q r: ξ the box that it started as, C the derivative of the flow as far as
-doubles carry it, Q orthonormal (Lohner), r the box of what has been added since.  The right-hand
-side is code; a corner of the clip or of the layer shortens the formula of a step to the second
-order and, where no bounds are found, the step.
+A set is m + C ξ, ξ a box: the one that it started as, and those that steps have added since, each
+carried on by the derivative of the flow as far as doubles hold it.  So nothing wraps but what is
+folded: the smallest columns of C, where there are many.  The right-hand side is code; a corner of
+the clip or of the layer shortens the formula of a step to the second order and, where no bounds are
+found, the step.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
 #: Coefficients of a step of a held input, up to a period of 1 ms and beyond.
 HELD_ORDER, LONG_ORDER = 5, 8
 
-#: Columns of C, more of which than those of the start come from corners, before a tube is lost.
-MOST_COLUMNS = 600
+#: Columns of C before the smallest are folded into a box, and how many are left then.
+MOST_COLUMNS, KEPT_COLUMNS, FEW_COLUMNS = 300, 240, 8
 
 
 class Field:
@@ -69,7 +70,7 @@ class Field:
             stay = self._step(tube, h * part, order, part <= SHORT)
             if stay is None:
                 part *= 0.5
-                if part < SHORTEST or tube.C.shape[1] > MOST_COLUMNS:
+                if part < SHORTEST:
                     return None
                 continue
             if whole is None:
@@ -90,7 +91,7 @@ class Field:
         rates = _ends(self.whole, stay, tube.fixed)
         way = ops.reached(np.zeros_like(X), rates, h).reshape(n, 1, 2)
         gaps = _around(self.gaps, stay, tube.m, tube.fixed)
-        program, decided = self.piece(ops.along(*gaps, tube.C, tube.xi, tube.Q, tube.r, way))
+        program, decided = self.piece(ops.along(*gaps, tube.C, tube.xi, way))
         if not decided and not short:
             return None
         low, high = np.vstack([stay, tube.fixed]).T.copy()
@@ -102,7 +103,7 @@ class Field:
         centre = program.series(low, high, order - 1)[:, :, 0]
         low[:n], high[:n] = X.T
         around = program.series(low, high, order - 1, ops.points(np.eye(n)))
-        return stay if tube.move(rest, centre, around, np.array([h, h]), decided) else None
+        return stay if tube.move(rest, centre, around, np.array([h, h])) else None
 
 
 class Held:
@@ -142,11 +143,11 @@ class Held:
         """Return the inputs besides x, where Y does not matter, nor u if none is given."""
         return np.vstack([self.start, np.zeros((self.m, 2)) if u is None else u])
 
-    def input(self, tube: Tube) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    def input(self, tube: Tube) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Enclose the law on a set and at its m (m, 2), and its mean slopes from m (m, N, 2).
 
-        Also: whether one piece of the law is left on the set; else slopes are those of all that
-        are, for a mean may be of several.
+        Where several pieces of the law may be met, slopes are those of all, for a mean may be of
+        several.
         """
         none, options = self.fixed(), []
         gaps = ops.along(*_around(self.gaps, tube.hull, tube.m, none), *tube.parts)
@@ -167,7 +168,7 @@ class Held:
         L = np.stack([every[..., 0].min(axis=0), every[..., 1].max(axis=0)], axis=-1)
         around, centre = _around(self.renewed, tube.hull, tube.m, none)
         u = ops.along(np.concatenate([around[:, :1], L], axis=1), centre, *tube.parts)
-        return u, centre, L, len(pieces) == 1
+        return u, centre, L
 
     def _series(
         self,
@@ -196,7 +197,7 @@ class Held:
             of F or the law, or no bounds are found.
         """
         n, X, order = self.N, tube.hull, _order(h)
-        u, u_m, L, one = self.input(tube)
+        u, u_m, L = self.input(tube)
         stay = _stay(self.flow, X, self.fixed(u), h[1]) if np.isfinite(L).all() else None
         if stay is None:
             return None
@@ -205,11 +206,11 @@ class Held:
         whole, at = self._series(X, u, tube.m, u_m, L, order)
         part = whole[n:].reshape(-1, 1 + n, 2).copy()
         part[:, 1:] *= 0.5  # of the derivative's change, on the way
-        Y = ops.along(part, at[n:].reshape(-1, 2), *tube.parts).reshape(n, n + self.m, order, 2)
+        Y = ops.along(part, at[n:].reshape(-1, 2), *tube.coarse).reshape(n, n + self.m, order, 2)
         around, way = np.zeros((n, order, 1 + n, 2)), np.concatenate([ops.points(np.eye(n)), L])
         for k in range(order):
             around[:, k, 1:] = ops.product(Y[:, :, k].copy(), way)
-        return stay if tube.move(rest, at[:n], around, h, one) else None
+        return stay if tube.move(rest, at[:n], around, h) else None
 
     def derivative(
         self, X: FloatArray, u: FloatArray, m: FloatArray, u_m: FloatArray, L: FloatArray,
@@ -256,8 +257,6 @@ class Tube:
     m: FloatArray
     C: FloatArray
     xi: FloatArray
-    Q: FloatArray
-    r: FloatArray
 
     @classmethod
     def of(cls, fixed: FloatArray, box: FloatArray) -> Self:
@@ -265,10 +264,7 @@ class Tube:
         n = len(box)
         middle = 0.5 * box[:, 0] + 0.5 * box[:, 1]
         xi = np.array([ops.add(a, b, -v, -v) for (a, b), v in zip(box, middle, strict=True)])
-        return cls(
-            fixed, box.copy(), middle, np.eye(n), xi.reshape(n, 1, 2), np.eye(n),
-            np.zeros((n, 1, 2)),
-        )  # fmt: skip
+        return cls(fixed, box.copy(), middle, np.eye(n), xi.reshape(n, 1, 2))
 
     def values(self, program: Program) -> tuple[FloatArray, FloatArray]:
         """Enclose values and derivatives over the hull, (O, 1 + N, 2), and values at m, (O, 2)."""
@@ -281,31 +277,46 @@ class Tube:
     def map(self, program: Program) -> bool:
         """Replace the set by its image; whether that is bounded."""
         around, centre = self.values(program)
-        state, none = (self.m, self.C, self.xi, self.Q, self.r), np.zeros_like(self.hull)
-        good = bool(ops.taylor_step(none, centre[:, None], around[:, None], np.ones(2), *state))
-        self.hull = ops.hulled(*state)
-        return good
+        none = np.zeros_like(self.hull)
+        return self.move(none, centre[:, None], around[:, None], np.ones(2))
 
     @property
     def parts(self) -> tuple[FloatArray, ...]:
-        """C, ξ, Q, r, and no more: the set around m."""
-        return self.C, self.xi, self.Q, self.r, np.zeros((len(self.m), 1, 2))
+        """C and ξ, and no more: the set around m."""
+        return self.C, self.xi, np.zeros((len(self.m), 1, 2))
 
-    def move(
-        self, rest: FloatArray, centre: FloatArray, around: FloatArray, h: FloatArray, smooth: bool
-    ) -> bool:
+    @property
+    def coarse(self) -> tuple[FloatArray, ...]:
+        """A set of few columns around this one, in place of :attr:`parts`."""
+        return *_folded(self.C, self.xi, FEW_COLUMNS), np.zeros((len(self.m), 1, 2))
+
+    def move(self, rest: FloatArray, centre: FloatArray, around: FloatArray, h: FloatArray) -> bool:
         """Replace the set by what a step makes of it, if that is bounded (Lemma 6)."""
-        state = [v.copy() for v in (self.m, self.C, self.Q, self.r)]
-        m, C, Q, r = state
-        if not ops.taylor_step(rest, centre, around, h, m, C, self.xi, Q, r):
+        m, C = self.m.copy(), self.C.copy()
+        added = ops.taylor_step(rest, centre, around, h, m, C, self.xi)
+        if not np.isfinite(added).all():
             return False
-        if smooth:
-            self.m, self.C, self.Q, self.r = state
-        else:  # what a corner adds is carried like a part of the start
-            self.C, self.xi = np.hstack([C, Q]), np.concatenate([self.xi, r])
-            self.m, self.Q, self.r = m, np.eye(len(m)), np.zeros((len(m), 1, 2))
-        self.hull = ops.hulled(self.m, self.C, self.xi, self.Q, self.r)
+        self.m, self.C, self.xi = (
+            m,
+            np.hstack([C, np.eye(len(m))]),
+            np.concatenate([self.xi, added]),
+        )
+        if self.C.shape[1] > MOST_COLUMNS:
+            self.C, self.xi = _folded(self.C, self.xi, KEPT_COLUMNS)
+        self.hull = ops.hulled(self.m, self.C, self.xi)
         return True
+
+
+def _folded(C: FloatArray, xi: FloatArray, kept: int) -> tuple[FloatArray, FloatArray]:
+    """Leave the columns of a set that are the most of its width somewhere; a box for the others."""
+    if C.shape[1] <= kept + len(C):
+        return C, xi
+    part = np.abs(C) * np.abs(xi).max(axis=-1).T
+    size = (part / (part.sum(axis=1, keepdims=True) + 1e-300)).max(axis=0)
+    order = np.argsort(-size, kind="stable")
+    most, others = np.sort(order[:kept]), order[kept:]
+    box = ops.product(ops.points(C[:, others]), xi[others])
+    return np.hstack([C[:, most], np.eye(len(C))]), np.concatenate([xi[most], box])
 
 
 def _stay(program: Program, X: FloatArray, fixed: FloatArray, h: float) -> FloatArray | None:

@@ -26,12 +26,15 @@ from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.intervals.require import require
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import STEP
-from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
+from undertow.proofs.kernel.loop import MOST_OF_ONE, ContinuousLoop, HeldLoop, Loop
 from undertow.proofs.kernel.model import Law, Model, scale_of
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.
 MOTIONS, THINNEST = 24, 2.0**-13
+
+#: Steps that a tube may take beyond twice those of the longest before it: then it is too wide.
+PATIENCE = 500
 
 #: Parts that a box of plants is cut into before a start is given up.
 MOST_PARTS = 64
@@ -177,12 +180,17 @@ def prove_loop(
     weight = np.abs(surface.position_row[:, index]).max()
     width = min(reach / 32, 0.15 * float(np.min(law.layer)) / max(weight, 1e-12))
     edges, box = [0.0], np.zeros((2 * mechanism.n, 2))
-    parts = _sliced(task.box, 0)
+    parts, latest = _sliced(task.box, 0), 0
     while edges[-1] < reach and width > reach * THINNEST:
         box[index] = edges[-1], min(edges[-1] + width, reach)
         if time.process_time() - started > seconds:
             break
-        there = all(loop.follow(np.vstack([box, part]))[1] for part in parts)
+        there, most = True, 2 * latest + PATIENCE if len(edges) > 1 else MOST_OF_ONE
+        for part in parts:
+            taken, there = loop.follow(np.vstack([box, part]), most)
+            if not there:
+                break
+            latest = max(latest, taken)
         if not there and len(parts) < MOST_PARTS and width < reach / 128:
             parts, width = _sliced(task.box, len(parts)), 2 * width
         if there:
