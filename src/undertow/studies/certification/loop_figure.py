@@ -58,13 +58,14 @@ def loop_figure(
         if not home.all():
             _motion(left, times, factor * path[:, last, index], ratio[last], False)
         wide = factor * extent
-        left.plot([0, 0], [-wide, wide], color=COLOURS["blue"], lw=6, clip_on=False, zorder=4)
+        bar = {"color": COLOURS["blue"], "solid_capstyle": "butt"}
+        left.plot([0, 0], [-wide, wide], lw=6, clip_on=False, zorder=4, **bar)
         shown = factor * path[:, :last, index]
         left.set_ylim(1.1 * min(shown.min(), -wide), 1.1 * factor * x[last, index])
         left.set_xlim(0.0, shown_time)
         left.set_xlabel("t (s)")
         left.set_ylabel(f"{name} ({unit})")
-        right.plot([-wide, wide], [0.0, 0.0], color=COLOURS["blue"], lw=4, solid_capstyle="butt")
+        right.plot([-wide, wide], [0.0, 0.0], lw=4, **bar)
         edge = _shadow(np.asarray(radius * np.linalg.inv(W)[[index, partner]]))
         right.fill(factor * edge[0], rate * edge[1], color=COLOURS["green"], zorder=5)
         right.set_xlabel(f"{name} ({unit})")
