@@ -28,7 +28,7 @@ demo: $(STAMP) ## repeat the paper's experiment, tables and figures into results
 test: $(STAMP) ## run the tests, but for the slow ones
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-# With MINUTES=12, say, so much of them as fits, their files in the order that DRAW draws.
+# With MINUTES=20, say, so much of them as fits, their files in the order that DRAW draws.
 slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow \
 	    $(if $(MINUTES),--minutes=$(MINUTES) --draw=$(DRAW)) || [ $$? -eq 5 ]
