@@ -636,3 +636,20 @@ def test_bad_input_is_refused_with_value_limit_and_remedy(what: str) -> None:
 def test_a_state_that_is_nan_is_refused(rig: ut.Mechanism, base: ut.Surface) -> None:
     with pytest.raises(InvalidInputError, match=r"phi_dot.*nan"):
         ut.SlidingModeLaw(rig, base)(0.0, [0.0, 0.1, 0.0, math.nan])
+
+
+@shapes
+def test_sliding_coordinates_are_those_of_the_states_on_the_surface(n: int, m: int) -> None:
+    """s = 0 there by the law itself; back and forth are inverses."""
+    mechanism, surface = random_mechanism(n, m), random_surface(n, m)
+    y = np.random.default_rng(n).uniform(-0.2, 0.2, (3, 4, 2 * n - m))
+    x = surface.on_surface(y)
+    assert x.shape == (3, 4, 2 * n)
+    law = ut.SlidingModeLaw(mechanism, surface)
+    assert np.abs(law(0.0, x.reshape(-1, 2 * n)).s).max() < 1e-12 * np.abs(surface.matrix).max()
+    np.testing.assert_allclose(surface.sliding_coordinates(x), y, atol=1e-11)
+    with pytest.raises(InvalidInputError, match=r"sliding coordinates.*shape"):
+        surface.on_surface(y[..., 1:])
+    singular = ut.Surface(surface.alpha_a, np.zeros((m, m)), surface.alpha_u, surface.lambda_u)
+    with pytest.raises(InvalidInputError, match="lambda_a of a surface"):
+        singular.sliding_coordinates(x)

@@ -40,7 +40,6 @@ from undertow.studies.campaign.figures import (
     picture,
     picture_file,
     proved_set,
-    sliding_coordinates,
 )
 from undertow.studies.campaign.run import study_of
 
@@ -542,7 +541,7 @@ def test_every_state_of_a_proved_region_comes_home_without_a_limit() -> None:
     proved: Any = proved_set(study, REGIONS)
     _, states = study.states(0)
     with np.errstate(all="ignore"):
-        inside = proved(sliding_coordinates(study, states)) <= 1.0
+        inside = proved(study.surface.sliding_coordinates(states)) <= 1.0
     assert 0.4 < inside.mean() < 0.9
     free = Definition.of(RIG, **CASE, axes=ON_SURFACE, limits={"voltage": 1e6})
     assert (compute(free, 0)["event"].ravel()[inside] == Event.REACHED).all()

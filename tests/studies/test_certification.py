@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 import undertow as ut
 from undertow.base import Verdict
 from undertow.cli import app
-from undertow.law import first_surface
 from undertow.proofs import LoopClaim, RegionClaim, read_certificate
 from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.gate import GatePolicy, certified_gate
@@ -159,20 +158,6 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
     assert "full loop" in text(appendix_report([case]))
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link"])
-def test_points_of_a_picture_are_states_on_the_surface(name: str) -> None:
-    """s = 0 there by the law itself, and a state's point is the point it was made from."""
-    mechanism = ut.mechanisms.LIBRARY[name]()
-    surface = first_surface(mechanism)
-    motion = SurfaceMotion(mechanism, surface)
-    y = np.random.default_rng(2).uniform(-0.2, 0.2, (3, 4, motion.size))
-    x = figure.states(motion, y)
-    assert x.shape == (3, 4, 2 * mechanism.n)
-    law = ut.SlidingModeLaw(mechanism, surface)
-    assert np.abs(law(0.0, x.reshape(-1, x.shape[-1])).s).max() < 1e-12 * np.abs(x).max()
-    np.testing.assert_allclose(figure.points(motion, x), y, atol=1e-12)
-
-
 @pytest.mark.slow
 def test_the_picture_names_its_axes_in_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figure, "GRID", 9)
@@ -200,7 +185,7 @@ def test_what_the_actuators_can_keep_on_the_surface() -> None:
     x[2] = float((surface.lambda_u * x[1] / -surface.alpha_a).item())
     law = ut.SlidingModeLaw(motion.mechanism, surface)(0.0, x)
     assert float(law.s[0]) == pytest.approx(0.0, abs=1e-12)
-    spare = figure.held(motion, np.array([figure.points(motion, x), np.zeros(3)]))
+    spare = figure.held(motion, np.array([surface.sliding_coordinates(x), np.zeros(3)]))
     assert spare[0] == pytest.approx(1 - abs(law.demand[0]) / 15)
     assert spare[0] < 0
     assert spare[1] == 1.0

@@ -107,6 +107,19 @@ def _starts(n: int, m: int) -> tuple[int, int, int, int, int, int]:
     return 0, m * m, 2 * m * m, m * m + m * n, 2 * m * n, 2 * m * n + m
 
 
+#: What helps who gives states of the wrong size.
+BY_NAME = "Set states by name: mechanism.state(name=value)"
+
+
+def _rows(what: str, values: ArrayLike, width: int, remedy: str = BY_NAME) -> FloatArray:
+    """Return points, (…, width), or refuse them."""
+    rows = floats(what, values, remedy)
+    if rows.ndim == 0 or rows.shape[-1] != width:
+        value, limit = f"shape {rows.shape}", f"(…, {width})"
+        raise InvalidInputError(what, value=value, limit=limit, remedy=remedy)
+    return rows
+
+
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A linear sliding surface, equation (10).
@@ -245,15 +258,45 @@ class Surface:
     @checked
     def s(self, x: ArrayLike) -> FloatArray:
         """Return s at the states x: (…, 2n) to (…, m)."""
-        states = floats("states of a surface", x)
-        if states.ndim == 0 or states.shape[-1] != 2 * self.n:
+        return np.asarray(_rows("states of a surface", x, 2 * self.n) @ self.matrix.T)
+
+    @checked
+    def sliding_coordinates(self, x: ArrayLike) -> FloatArray:
+        """Return y = (q_u, q̇_u, w) of the states x, (…, 2n) to (…, 2n − m): what moves on s = 0.
+
+        w = q_a + λ_a⁻¹ λ_u q_u is the slow coordinate: on the surface ẇ follows from q̇_u and w.
+
+        Raises
+        ------
+        InvalidInputError
+            For another shape, and where λ_a is singular.
+        """
+        states, n, m = _rows("states of a surface", x, 2 * self.n), self.n, self.m
+        w = states[..., :m] + states[..., m:n] @ self._lean.T
+        return np.concatenate([states[..., m:n], states[..., n + m :], w], axis=-1)
+
+    @checked
+    def on_surface(self, y: ArrayLike) -> FloatArray:
+        """Return the states with s = 0 at y = (q_u, q̇_u, w), (…, 2n − m) to (…, 2n).
+
+        The inverse of :meth:`sliding_coordinates` on the surface, with its errors.
+        """
+        free = self.n - self.m
+        points = _rows("sliding coordinates", y, self.n + free, "Give q_u, q̇_u and w")
+        q_u, v_u, w = np.split(points, [free, 2 * free], axis=-1)
+        pull = w @ self.lambda_a.T + v_u @ self.alpha_u.T
+        v_a = -np.linalg.solve(self.alpha_a, pull[..., None])[..., 0]
+        return np.concatenate([w - q_u @ self._lean.T, q_u, v_a, v_u], axis=-1)
+
+    @property
+    def _lean(self) -> FloatArray:
+        """λ_a⁻¹ λ_u, (m, n − m)."""
+        try:
+            return np.asarray(np.linalg.solve(self.lambda_a, self.lambda_u))
+        except np.linalg.LinAlgError:
             raise InvalidInputError(
-                "states of a surface",
-                value=f"shape {states.shape}",
-                limit=f"(…, {2 * self.n})",
-                remedy="Set states by name: mechanism.state(name=value)",
-            )
-        return np.asarray(states @ self.matrix.T)
+                "lambda_a of a surface", value="a singular one", limit="one that can be inverted"
+            ) from None
 
     def __eq__(self, other: object) -> bool:
         """Compare entry by entry."""

@@ -183,7 +183,7 @@ def _draw_proved(axes: Axes, study: RegionMap, proved: LyapunovFunction) -> None
     points = np.tile(study.at, (len(a), len(b), 1))
     points[..., study.places[0]], points[..., study.places[1]] = np.meshgrid(a, b, indexing="ij")
     with np.errstate(all="ignore"):
-        level = proved(sliding_coordinates(study, points))
+        level = proved(study.surface.sliding_coordinates(points))
     axes.contour(
         fa * a, fb * b, np.where(np.isfinite(level), level, 2.0).T, [1.0],
         colors=[to_rgba(COLOURS["vermilion"])], linewidths=1.6,
@@ -209,14 +209,6 @@ def _cut(study: RegionMap, proved: TerminalEllipsoid) -> FloatArray:
     R = np.linalg.qr(proved.W[:, study.places], mode="r")  # |W x| = |R p| in the slice
     circle = proved.radius * np.array([np.cos(round_once), np.sin(round_once)])
     return np.asarray(np.linalg.solve(R, circle).T)
-
-
-def sliding_coordinates(study: RegionMap, states: FloatArray) -> FloatArray:
-    """Return y = (q_u, q̇_u, w) of states, (…, 2n), with w = q_a + λ_a⁻¹ λ_u q_u."""
-    n, m, surface = study.mechanism.n, study.mechanism.m, study.surface
-    q_a, q_u, v_u = states[..., :m], states[..., m:n], states[..., n + m :]
-    w = q_a + q_u @ np.linalg.solve(surface.lambda_a, surface.lambda_u).T
-    return np.concatenate([q_u, v_u, w], axis=-1)
 
 
 def proved_set(study: RegionMap, path: Path) -> Proved:
@@ -275,7 +267,7 @@ def proved_words(campaign: Campaign, proved: Proved) -> str:
         _, states = study.states(shard)
         events = np.asarray(data.event[study.part(shard)]).ravel()
         with np.errstate(all="ignore"):
-            within = (proved(sliding_coordinates(study, states)) <= 1.0) & (events >= 0)
+            within = (proved(study.surface.sliding_coordinates(states)) <= 1.0) & (events >= 0)
         inside += int(within.sum())
         home += int((events[within] == EVENTS.index("reached")).sum())
     return f"{inside} states in the proved region; {home} of them come home with the input limits"

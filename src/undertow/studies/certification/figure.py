@@ -27,31 +27,13 @@ GRID, COARSE = 101, 25
 LONGEST, DRAWN = 30.0, 14
 
 
-def states(motion: SurfaceMotion, y: FloatArray) -> FloatArray:
-    """Return the states on the surface at points y = (q_u, q̇_u, w) (…, N), (…, 2n)."""
-    mechanism, surface = motion.mechanism, motion.surface
-    free = mechanism.n - mechanism.m
-    q_u, v_u, w = y[..., :free], y[..., free : 2 * free], y[..., 2 * free :]
-    q_a = w - q_u @ np.linalg.solve(surface.lambda_a, surface.lambda_u).T
-    pull = w @ surface.lambda_a.T + v_u @ surface.alpha_u.T
-    v_a = -np.linalg.solve(surface.alpha_a, pull[..., None])[..., 0]
-    return np.concatenate([q_a, q_u, v_a, v_u], axis=-1)
-
-
-def points(motion: SurfaceMotion, x: FloatArray) -> FloatArray:
-    """Return y of states (…, 2n), on the surface or not, (…, N)."""
-    m, n, surface = motion.mechanism.m, motion.mechanism.n, motion.surface
-    w = x[..., :m] + x[..., m:n] @ np.linalg.solve(surface.lambda_a, surface.lambda_u).T
-    return np.concatenate([x[..., m:n], x[..., n + m :], w], axis=-1)
-
-
 def held(motion: SurfaceMotion, y: FloatArray) -> FloatArray:
     """Return what the actuators have to spare at points y (…, N) of the surface, (…,).
 
     On the surface the law asks for what keeps the motion there; the smallest 1 − |u_i|/u_max,i is
     below 0 where that is more than an actuator gives: no motion stays on the surface there.
     """
-    x = states(motion, y).reshape(-1, 2 * motion.mechanism.n)
+    x = motion.surface.on_surface(y).reshape(-1, 2 * motion.mechanism.n)
     with np.errstate(all="ignore"):
         demand = SlidingModeLaw(motion.mechanism, motion.surface)(0.0, x).demand
         spare = (1.0 - np.abs(demand) / motion.mechanism.input_limits).min(axis=-1)
@@ -104,10 +86,11 @@ def _slice(axes: Axes, region: ProvedRegion, loop: ClosedLoop, other: int) -> No
     """Draw the plane of coordinates 0 and ``other``."""
     motion = region.motion
     assert isinstance(motion, SurfaceMotion)
+    surface = motion.surface
 
     def home(y: FloatArray) -> NDArray[np.bool_]:
         """Whether the closed loop comes home from points (B, N)."""
-        return loop.batch(states(motion, y), motion.surface.vector).reached
+        return loop.batch(surface.on_surface(y), surface.vector).reached
 
     wide, high = _extents(region, home, other)
     grid = _grid(motion, wide, high, other, GRID)
@@ -130,8 +113,8 @@ def _slice(axes: Axes, region: ProvedRegion, loop: ClosedLoop, other: int) -> No
     kept = np.maximum(inside, 1.0 - spare)  # at most 1 where both are so
     axes.contourf(a, b, np.minimum(kept, 9.0), [-1.0, 1.0], colors=[blue])
     axes.contour(a, b, inside, [1.0], colors=COLOURS["blue"], linewidths=1.2)
-    for x in states(motion, _edge(region, other)):
-        y = points(motion, loop.simulate(x, motion.surface).x)
+    for x in surface.on_surface(_edge(region, other)):
+        y = surface.sliding_coordinates(loop.simulate(x, surface).x)
         axes.plot(fa * y[:, 0], fb * y[:, other], color=COLOURS["vermilion"], lw=0.8)
         axes.plot(fa * y[0, 0], fb * y[0, other], ".", color=COLOURS["vermilion"], ms=4, zorder=3)
     axes.plot(0, 0, "+", color=COLOURS["black"], ms=7, zorder=4)
