@@ -112,7 +112,7 @@ def parts() -> dict[str, Any]:
         "child": "arm", "coefficients": {"a": 1.0}, "torque_constant": 1.0, "resistance": 1.0,
         "tree": tree, "motors": motor, "text": "rotary_pendulum.py:NAME",
         "objective": problem, "cascade": cascade, "controllers": [ut.lqr(rig)],
-        "controller": cascade, "observation": x,
+        "controller": cascade, "observation": x, "y": surface.sliding_coordinates(x),
         "certificate": ut.certify(rig, surface, seconds=0.0), "folder": "firmware",
         "tolerances": {"m": 0.01}, "estimate": belief.prior, "offsets": [0.0],
         "values": rig.parameter_values, "path": "run.db",
