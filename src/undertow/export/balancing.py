@@ -160,7 +160,7 @@ class BalancingTask:
         return True
 
     def inputs(self, actions: NDArray[Any], *count: int) -> FloatArray:
-        """Return the inputs of actions in [−1, 1], (*count, m), in the units of the inputs.
+        """Return the inputs of actions in [−1, 1], (m,), or (N, m) of ``count`` N, in their units.
 
         Raises
         ------
