@@ -69,16 +69,8 @@ class Simulator:
         assert COMPILER is not None, "needs a C compiler: install gcc"
         built = folder / "claimed_motions.so"
         flags = ["-std=c11", "-O3", "-march=native", "-Wall", "-Wextra", "-Werror"]
-        words = [
-            *flags,
-            "-shared",
-            "-fPIC",
-            "-o",
-            str(built),
-            str(HERE / "claimed_motions.c"),
-            "-lm",
-        ]
-        subprocess.run([COMPILER, *words], check=True)
+        made = ["-shared", "-fPIC", "-o", str(built), str(HERE / "claimed_motions.c"), "-lm"]
+        subprocess.run([COMPILER, *flags, *made], check=True)
         self.library = ctypes.CDLL(str(built))
 
     def follow(

@@ -7,6 +7,7 @@ at_once()
 # ruff: noqa: E402 - what follows, here and in other packages, takes a second to import
 
 from undertow.base.arguments import (
+    BY_NAME,
     REMEDIES,
     at_least,
     between,
@@ -56,6 +57,7 @@ from undertow.base.progress import Progress, duration, no_progress
 from undertow.base.verdict import Verdict, inward
 
 __all__ = [
+    "BY_NAME",
     "INTERRUPTED",
     "REMEDIES",
     "ArtefactError",

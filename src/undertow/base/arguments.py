@@ -52,11 +52,11 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def floats(
-    what: str,
-    values: ArrayLike,
-    remedy: str = "Set states by name: mechanism.state(name=value)",
-) -> np.typing.NDArray[np.float64]:
+#: What helps who gives states of another kind or size.
+BY_NAME = "Set states by name: mechanism.state(name=value)"
+
+
+def floats(what: str, values: ArrayLike, remedy: str = BY_NAME) -> np.typing.NDArray[np.float64]:
     """Return values as an array of floats, or refuse them.
 
     Raises

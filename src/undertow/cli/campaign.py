@@ -89,11 +89,11 @@ def campaign(
             limit="workers",
             remedy="A thread cannot be ended: add --workers 1",
         )
-    alone_ones = {
+    views = {
         "--picture": picture is not None, "--tables": tables, "--status": status,
         "--shard": shard is not None,
     }  # fmt: skip
-    asked = [name for name, given in alone_ones.items() if given]
+    asked = [name for name, given in views.items() if given]
     if len(asked) > 1:
         raise InvalidInputError(
             "what is shown of the campaign", value=" and ".join(asked), limit="one of them"

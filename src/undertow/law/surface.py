@@ -16,6 +16,7 @@ import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base import (
+    BY_NAME,
     InvalidInputError,
     at_least,
     check_fields,
@@ -105,10 +106,6 @@ class LawLayout(NamedTuple):
 @cache
 def _starts(n: int, m: int) -> tuple[int, int, int, int, int, int]:
     return 0, m * m, 2 * m * m, m * m + m * n, 2 * m * n, 2 * m * n + m
-
-
-#: What helps who gives states of the wrong size.
-BY_NAME = "Set states by name: mechanism.state(name=value)"
 
 
 def _rows(what: str, values: ArrayLike, width: int, remedy: str = BY_NAME) -> FloatArray:

@@ -19,6 +19,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 
 from undertow.base import (
+    BY_NAME,
     InvalidInputError,
     ModelError,
     check_fields,
@@ -627,8 +628,7 @@ class Mechanism:
         InvalidInputError
             With the offending entry.
         """
-        remedy = "Set states by name: mechanism.state(name=value)"
-        state = self._columns("state", x, self.state_names, remedy)
+        state = self._columns("state", x, self.state_names, BY_NAME)
         if not np.isfinite(state).all():
             first = int(np.argwhere(~np.isfinite(state))[0][-1])
             raise InvalidInputError(
