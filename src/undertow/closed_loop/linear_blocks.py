@@ -9,8 +9,11 @@ matrices is written out for the given N, so that its innermost loop runs over th
 
 from __future__ import annotations
 
+from functools import lru_cache
+from types import ModuleType
+
 from undertow.closed_loop.work_array import LANES
-from undertow.symbolic import SELECT, single_assignment
+from undertow.symbolic import SELECT, content_key, generated, single_assignment
 
 #: Time of the first stored power e^{At}, s; level k stands for 2ᵏ units.
 UNIT = 0.005
@@ -22,20 +25,20 @@ LEVELS = 16
 STEP_SIZES = 9
 
 
-def linear_source(size: int) -> str:
-    """Return the source of a module with a function ``double``.
+@lru_cache(maxsize=8)
+def linear_blocks(size: int) -> ModuleType:
+    """Return the module with the function ``double`` for N = ``size``, from the cache if known.
 
     ``double(A, Q, P, stable, powers, forced)`` takes A (C, n, N), the lower half of a system of
     second order, and Q (C, N, N), or (1, N, N) for all; C is a multiple of the lanes.  It writes
     P (C, N, N), whether e^{At} decays at all, ``stable`` (C,), ``powers`` of e^{At}
     (C/16, STEP_SIZES, N·N·16) and ``forced``, F and G (C/16, STEP_SIZES, 2, N·N·16).
 
-    Parameters
-    ----------
-    size
-        N.
     """
-    N = size
+    return generated("linear", str(size), content_key(str(size)), lambda: _source(size))
+
+
+def _source(N: int) -> str:
     area = N * N * LANES
     # Each matrix is an array of its own and a row is done at once: that way LLVM sees vectors.
     read = [f"a_{k} = a[(r * {N} + {k}) * {LANES} + i]" for k in range(N)]
@@ -59,20 +62,20 @@ import math
 import numba
 import numpy as np
 {SELECT}
-inlined = numba.njit(
-    cache=True, nogil=True, error_model="numpy", forceinline=True, no_cfunc_wrapper=True,
-    no_cpython_wrapper=True, fastmath={{"contract", "nsz", "arcp"}},
+inner = numba.njit(
+    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True,
+    fastmath={{"contract", "nsz", "arcp"}},
 )
 
 
-@inlined
+@inner
 def _product(a, b, add, factor, o):
     for r in range({N}):
         for i in range({LANES}):
 {_indented(product)}
 
 
-@inlined
+@inner
 def _turned(a, b, add, o):
     for r in range({N}):
         for i in range({LANES}):

@@ -23,7 +23,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from undertow.closed_loop.ensemble import Ensemble
-from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT, linear_source
+from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT, linear_blocks
 from undertow.closed_loop.work_array import LANES
 from undertow.law import LawLayout
 from undertow.models import (
@@ -35,7 +35,7 @@ from undertow.models import (
     numbers,
 )
 from undertow.objective import Objective
-from undertow.symbolic import compiled, load_module
+from undertow.symbolic import compiled
 
 #: Terms of the series of e^{|A|t} before a loop is too fast to bound.
 TERMS = 60
@@ -144,7 +144,7 @@ class TerminalLinearModel:
         # Where Φ has no quadratic part (minimum time) the state itself must be exact.
         self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
         self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
-        self._blocks = load_module(f"linear_{2 * n}", linear_source(2 * n))
+        self._blocks = linear_blocks(2 * n)
         self._take(mechanism, ensemble)
 
     def _take(self, mechanism: Mechanism, ensemble: Ensemble | None) -> None:
