@@ -320,6 +320,17 @@ def test_a_servo_whose_force_is_limited_is_said_to_be() -> None:
     assert data.actuator_force[0] == -2.0  # -5 by its damper: what is said to be left out
 
 
+def test_a_range_that_is_not_symmetric_is_said_to_be_cut() -> None:
+    """The limit of an input is one magnitude: the smaller side, and the rest is named."""
+    pytest.importorskip("mujoco")
+    motor = '<motor name="force" joint="x" ctrlrange="-20 20"/>'
+    text = changed(CART_MJCF, motor, motor.replace("-20 20", "-20 12"))
+    assert "beyond" not in modelling.from_mjcf(CART_MJCF).description
+    cut = modelling.from_mjcf(text)
+    assert cut.inputs[0].limit == 12.0
+    assert "ctrlrange -20 to 12 of force beyond ±12" in cut.description
+
+
 def test_the_force_limit_of_a_tendon_limits_its_motor() -> None:
     """Its input was without limit, or the file refused for a motion that was not MuJoCo's."""
     mujoco = pytest.importorskip("mujoco")

@@ -341,17 +341,26 @@ class _Compiled:
                     remedy="A motor that moves nothing is no input: leave it out",
                 )
             limits = [effort / abs(gear * gain), pull / abs(gain)]
-            if model.actuator_ctrllimited[k]:
-                limits.append(_one_size(f"ctrlrange of {what}", model.actuator_ctrlrange[k]))
-            if model.actuator_forcelimited[k]:
-                force = _one_size(f"forcerange of {what}", model.actuator_forcerange[k])
-                limits.append(force / abs(gain))
+            left_out = []
+            for label, limited, (low, high), size in (
+                ("ctrlrange", model.actuator_ctrllimited[k], model.actuator_ctrlrange[k], 1.0),
+                ("forcerange", model.actuator_forcelimited[k], model.actuator_forcerange[k], gain),
+            ):
+                if limited:
+                    smaller = _one_size(f"{label} of {what}", (low, high))
+                    limits.append(smaller / abs(size))
+                    if -low != high:
+                        left_out.append(
+                            f"{label} {low:g} to {high:g} of {name} beyond ±{smaller:g}"
+                        )
             servo = self._servo(k, name, coefficients, gear)
+            limited = model.actuator_forcelimited[k] or math.isfinite(min(effort, pull))
+            if limited and (servo.stiffness or servo.damping):
+                left_out.append(f"the force limit of {name} on its own spring and damper")
             force = gear * gain
             yield Actuator(
                 name, coefficients, force, min(limits), unit if force == 1 else "", stroke,
-                clipped=bool(servo.stiffness or servo.damping)
-                and bool(model.actuator_forcelimited[k] or math.isfinite(min(effort, pull))),
+                tuple(left_out),
             )  # fmt: skip
 
     def _servo(self, k: int, name: str, coefficients: dict[str, float], gear: float) -> Coupling:

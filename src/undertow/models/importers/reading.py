@@ -51,9 +51,7 @@ def described(mechanism: Mechanism, tree: Tree, how: str, frozen: Sequence[str])
     left = "contacts, shapes"
     if any(mechanism.disturbance_bounds):
         left += ", dry friction (a bound on the disturbance)"
-    clipped = [a.name for a in tree.actuators if a.clipped]
-    if clipped:
-        left += f", the force limit of {', '.join(clipped)} on its own spring and damper"
+    left += "".join(f", {words}" for actuator in tree.actuators for words in actuator.left_out)
     if frozen:
         left += f"; frozen {', '.join(frozen)}"
     lines = (how, f"joints {joints}", f"inputs {'; '.join(inputs)}", f"left out {left}")

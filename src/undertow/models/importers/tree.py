@@ -136,9 +136,8 @@ class Actuator:
         Of the input.
     stroke
         Name of Σ c_j q_j, which becomes a coordinate where it is no joint by itself.
-    clipped
-        Whether the file limits what it pushes with its own spring and damper, too, as a tree
-        cannot.
+    left_out
+        What the file says of it and a tree cannot, in words.
     """
 
     name: str
@@ -147,7 +146,7 @@ class Actuator:
     limit: float = math.inf
     unit: str = ""
     stroke: str = ""
-    clipped: bool = False
+    left_out: tuple[str, ...] = ()
 
 
 #: The numbers of a tree's parts that cannot be infinite.
