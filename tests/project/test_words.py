@@ -658,6 +658,19 @@ def test_an_interrupted_survey_keeps_its_rows(
     assert not kept.exists()  # all of it is in the table
 
 
+@pytest.mark.parametrize(
+    ("words", "takers"),
+    [(["robustness", "--angle", "30"], "balance"), (["mujoco", "--quick"], "balance, swing-up"),
+     (["library", "--fresh", "1"], "swing-up"), (["balance", "--no-single"], "robustness")],
+)  # fmt: skip
+def test_options_of_other_trials_are_refused(words: list[str], takers: str) -> None:
+    """They were passed over without a word."""
+    result = CliRunner(env={"COLUMNS": "300"}).invoke(app, ["trials", *words])
+    assert result.exit_code == 2
+    assert f"{words[1].replace('--no-', '--')} with undertow trials" in result.stderr
+    assert f"an option of {takers}" in result.stderr
+
+
 def test_interrupted_trials_keep_their_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,8 +8,20 @@ from typing import Annotated, Literal
 
 import typer
 
+from undertow.base import InvalidInputError
 from undertow.cli.options import option
 from undertow.cli.terminal import carry_out, command
+
+#: Options that some experiments have, and which.
+TAKEN_BY = {
+    "--seeds": ("balance", "swing-up", "estimators", "library", "coverage"),
+    "--angle": ("balance",),
+    "--rigs": ("robustness",),
+    "--single": ("robustness",),
+    "--limits": ("balance",),
+    "--quick": ("balance", "swing-up", "robustness", "estimators", "library", "coverage"),
+    "--fresh": ("swing-up",),
+}
 
 
 @command(
@@ -36,19 +48,48 @@ def trials(
             show_choices=False,
         ),
     ],
-    seeds: Annotated[int, option("Rigs, one for each seed.", min=1)] = 20,
+    seeds: Annotated[
+        int | None,
+        option(
+            "Rigs, one for each seed; not for robustness and mujoco. Default: 20; 5 for "
+            "estimators and library.",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
     angle: Annotated[
-        float, option("balance: start of the pendulum, degrees from the upright.")
-    ] = 35.0,
-    rigs: Annotated[int, option("robustness: random rigs.", min=1)] = 200,
+        float | None,
+        option(
+            "balance: start of the pendulum, degrees from the upright. Default: 35.",
+            show_default=False,
+        ),
+    ] = None,
+    rigs: Annotated[
+        int | None,
+        option("robustness: random rigs. Default: 200.", min=1, show_default=False),
+    ] = None,
     single: Annotated[
-        bool, option("robustness: also look for the largest single change that is survived.")
-    ] = True,
+        bool | None,
+        option(
+            "--single/--no-single",
+            "robustness: also look for the largest single change that is survived. Default: yes.",
+            show_default=False,
+        ),
+    ] = None,
     limits: Annotated[
-        bool, option("balance: also search for the catch limits, which takes longest.")
-    ] = True,
+        bool | None,
+        option(
+            "--limits/--no-limits",
+            "balance: also search for the catch limits, which takes longest. Default: yes.",
+            show_default=False,
+        ),
+    ] = None,
     quick: Annotated[
-        bool, option("--quick", "Quick look: three rigs, no search for catch limits.")
+        bool,
+        option(
+            "--quick",
+            "Quick look: three seeds, ten random rigs, no search for limits; not for mujoco.",
+        ),
     ] = False,
     fresh: Annotated[
         int | None,
@@ -71,13 +112,26 @@ def trials(
     """Run controllers on realistic rigs with many seeds, and show the results as tables."""
     from undertow.studies.trials.experiments import experiment
 
+    given = {
+        "--seeds": seeds, "--angle": angle, "--rigs": rigs, "--single": single,
+        "--limits": limits, "--quick": quick or None, "--fresh": fresh,
+    }  # fmt: skip
+    for name, value in given.items():
+        takers = TAKEN_BY[name]
+        if value is not None and what not in takers:
+            raise InvalidInputError(
+                f"{name} with undertow trials {what}",
+                value=value,
+                limit=f"an option of {', '.join(takers)}",
+                remedy=f"Leave {name} out",
+            )
     work = experiment(
         what,
-        seeds=min(seeds, 3) if quick else seeds,
-        angle=math.radians(angle),
-        limits=limits and not quick,
-        rigs=min(rigs, 10) if quick else rigs,
-        single=single and not quick,
+        seeds=min(seeds or 3, 3) if quick else seeds,
+        angle=math.radians(35.0 if angle is None else angle),
+        limits=limits is not False and not quick,
+        rigs=min(rigs or 10, 10) if quick else rigs or 200,
+        single=single is not False and not quick,
         fresh=fresh,
     )
     carry_out(work, out)

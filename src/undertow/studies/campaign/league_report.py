@@ -90,7 +90,7 @@ def _scores(names: list[str], won: NDArray[Any], ratio: FloatArray, data: Any) -
         heads,
         [cells for *_, cells in sorted(rows, key=lambda row: (row[0], _last(row[1])))],
         whole=heads,
-        title=f"{len(names)} entrants on {data.sizes['mechanism']} mechanisms",
+        title=f"Entrants: {len(names)}. Mechanisms: {data.sizes['mechanism']}",
         note="cost: of won runs, over the plant's own bound: median, 95 % of it, worst\n"
         "step: processor time of a call, one a millisecond; mean, and the longest"
         + (f"\nforfeited runs: {gave_none}" if gave_none else ""),

@@ -41,7 +41,7 @@ ROWS = {
 def experiment(
     what: str,
     *,
-    seeds: int = 20,
+    seeds: int | None = None,
     angle: float = 0.0,
     limits: bool = True,
     rigs: int = 200,
@@ -55,7 +55,7 @@ def experiment(
     what
         Its name.
     seeds
-        Rigs, one for each seed; ``estimators`` and ``library`` have five at most.
+        Rigs, one for each seed: ``None`` for five with ``estimators`` and ``library``, else 20.
     angle
         ``balance``: φ(0), rad.
     limits
@@ -65,6 +65,8 @@ def experiment(
     fresh
         ``swing-up``: seed of a new search for gains; ``None`` takes those of the library.
     """
+    if seeds is None:
+        seeds = 5 if what in ("estimators", "library") else 20
     if what == "coverage":
         return coverage(seeds)
     if what == "balance":
@@ -83,7 +85,7 @@ def experiment(
             lambda found: [report.robustness_report(found)], gather=grouped, whole=True,
         )  # fmt: skip
     line, task, names, shown = ROWS[what]
-    given: dict[str, Any] = {"seeds": min(seeds, 5)}
+    given: dict[str, Any] = {"seeds": seeds}
     if what == "mujoco":
         given = {}
     if what == "swing-up":
