@@ -28,7 +28,7 @@ WRONG: tuple[Any, ...] = (None, "a", math.nan, math.inf, -1, [], [[]], {}, objec
 
 #: What is short in the tests where the default is not.
 SHORT = {
-    "duration", "horizon", "samples", "compiled", "seconds", "max_seconds", "simulated",
+    "duration", "horizon", "samples", "compiled", "seconds", "simulated",
     "intervals",
 }  # fmt: skip
 
@@ -116,7 +116,7 @@ def parts() -> dict[str, Any]:
         "certificate": ut.certify(rig, surface, seconds=0.0), "folder": "firmware",
         "tolerances": {"m": 0.01}, "estimate": belief.prior, "offsets": [0.0],
         "values": rig.parameter_values, "path": "run.db",
-        "seconds": 0.01, "max_seconds": 0.1, "simulated": True, "intervals": 8,
+        "seconds": 0.01, "simulated": True, "intervals": 8,
     }  # fmt: skip
 
 

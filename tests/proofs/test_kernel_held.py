@@ -19,7 +19,6 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
-from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.claims import ClosedLoop, TerminalEllipsoid, decide, read_claim
@@ -29,6 +28,7 @@ from undertow.proofs.kernel.model import Model, System
 from undertow.proofs.kernel.reader import Refused, read
 from undertow.proofs.kernel.tube import _folded
 from undertow.proofs.search.closed_loop import follow, prove_loop
+from undertow.studies.paper.appendix import CASES
 
 ROOT = Path(__file__).parents[2]
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)

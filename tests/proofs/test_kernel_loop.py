@@ -15,7 +15,6 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
-from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.claims.certificate import Certificate
 from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.model_data import law_of, model_of
@@ -34,6 +33,7 @@ from undertow.proofs.kernel.reader import Refused, read
 from undertow.proofs.search.closed_loop import prove_loop
 from undertow.proofs.search.terminal_ellipsoid import search_for
 from undertow.studies.certification import loop_figure
+from undertow.studies.paper.appendix import CASES
 
 ROOT = Path(__file__).parents[2]
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)

@@ -16,7 +16,6 @@ import undertow as ut
 from undertow.base import InvalidInputError, UnstableSurfaceError
 from undertow.law import SlidingModeLaw, sliding_matrix
 from undertow.models import TIME
-from undertow.proofs.claims.appendix import CASES, Constants
 from undertow.proofs.claims.region import reaches, verify_region
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.claims import SurfaceRegion, decide, read_claim
@@ -29,6 +28,7 @@ from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.chart import natural_stretch
 from undertow.proofs.search.linear_program import minimise_linear
 from undertow.proofs.search.region import search_region
+from undertow.studies.paper.appendix import CASES, Constants
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 

@@ -10,13 +10,13 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cli import app
 from undertow.law import ReachingLaw
-from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.sampled import (
     box_starts,
     failure_bound,
     sampled_extent,
     sampled_region,
 )
+from undertow.studies.paper.appendix import CASES
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.073)
 LAW = ReachingLaw()

@@ -13,7 +13,7 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.law import SlidingModeLaw
 from undertow.proofs import hurwitz
-from undertow.proofs.claims.appendix import (
+from undertow.studies.paper.appendix import (
     CASES,
     PRINTED,
     Constants,

@@ -17,7 +17,6 @@ import undertow as ut
 from undertow.base import Verdict
 from undertow.cli import app
 from undertow.proofs import LoopClaim, RegionClaim, read_certificate
-from undertow.proofs.claims.appendix import CASES
 from undertow.proofs.gate import GatePolicy, certified_gate
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
@@ -33,6 +32,7 @@ from undertow.studies.certification import (
     run_report,
     subject_report,
 )
+from undertow.studies.paper.appendix import CASES
 
 pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
 
@@ -142,7 +142,7 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
     rig = ut.mechanisms.rotary_pendulum(d_e=0.073)
     kept = read_certificate(Path(__file__).parents[1] / "data" / "closed_loop_v2.json")
     stated = kept.subjects[3].claims[0]
-    claim, sound = LoopClaim.from_dict(stated.data), Verdict("starts", "proved", 0.68, "rad")
+    claim, sound = LoopClaim(stated.claim.data()), Verdict("starts", "proved", 0.68, "rad")
     reaches: list[float] = []
 
     def prove(asked: decide._Decisions, hold: int) -> tuple[LoopClaim, Verdict]:

@@ -175,7 +175,7 @@ def _files(
             key = "region" if len(certified) == 1 else f"region_{index + 1}"
             figures[key] = certification.region_figure(item.region, item.subject.reaching, title)
         for claim in (c for c in item.subject.claims if c.kind == "closed loop"):
-            found, subject = LoopClaim.from_dict(claim.data), item.subject
+            found, subject = LoopClaim(claim.claim.data()), item.subject
             key = "loop" if len(certified) == 1 else f"loop_{index + 1}"
             figures[key] = certification.loop_figure(
                 mechanism, subject.surface, subject.reaching, found, title
@@ -209,15 +209,15 @@ def verify(
             metavar="NAME=VALUE",
         ),
     ] = None,
-    seconds: Annotated[float, option("Time limit for each claim, s.")] = 600.0,
     both: Annotated[
         bool, option("Ask the second checker too (make checker), and fail where they differ.")
     ] = False,
+    seconds: Annotated[float, option("With --both: time limit of the second checker, s.")] = 600.0,
 ) -> None:
     """Check a certificate again, from the file and the mechanism alone.
 
-    A file of version 2 holds its model; where the library has none of that name, and none is given,
-    it is decided for the model of the file.
+    The file holds its model; where the library has none of that name, and none is given, it is
+    decided for the model of the file.
 
     Exit status 0 when every claim is proved again, else 1.
     """
@@ -229,12 +229,6 @@ def verify(
     certificate = read_certificate(file)
     check_settings(certificate, parse_values(setting))
     known = mechanism is not None or certificate.name in LIBRARY
-    if not known and certificate.document is None:
-        raise InvalidInputError(
-            "certificate of a mechanism that the library does not have",
-            value=certificate.name,
-            remedy="Name its file: --mechanism FILE.py:NAME",
-        )
     model = mechanism_named(mechanism or certificate.name) if known else None
     own = mechanism is not None and in_a_file(mechanism)
     again: list[tuple[str, float]] = []
@@ -247,9 +241,7 @@ def verify(
             started.append(perf_counter())
             progress(what, fraction)
 
-        checked = decide(
-            certificate, model, own_parameters=own, max_seconds=seconds, progress=timed
-        )
+        checked = decide(certificate, model, own_parameters=own, progress=timed)
     show(certification.verification_report(certificate, checked), least=80)
     alike = True
     if both:

@@ -1,15 +1,13 @@
 """Certificates: claims about a surface, a region or the closed loop, each with its verdict.
 
-``kernel`` decides; with ``intervals`` the appendix's cases are decided, and how far from singular
-and how strong a law is.  ``claims`` has a
-file for each kind of claim and reads, writes and verifies certificates; what ``search`` finds is
-trusted nowhere.  The admission gate (:mod:`undertow.proofs.gate`) and random trials
+``kernel`` decides; ``intervals`` measure how far from singular and how strong a law is.  ``claims``
+has a file for each kind of claim and reads, writes and verifies certificates; what ``search`` finds
+is trusted nowhere.  The admission gate (:mod:`undertow.proofs.gate`) and random trials
 (:mod:`undertow.proofs.sampled`) prove less.  Needs the extra ``undertow[certify]`` (python-flint,
 Clarabel), imported when first used.
 """
 
 from undertow.base.verdict import Verdict
-from undertow.proofs.claims.appendix import AppendixClaim
 from undertow.proofs.claims.certificate import (
     Certificate,
     StatedClaim,
@@ -38,7 +36,6 @@ from undertow.proofs.search.region import ProvedRegion, prove_region
 from undertow.proofs.search.terminal_ellipsoid import search_for, terminal_sets
 
 __all__ = [
-    "AppendixClaim",
     "Certificate",
     "Checked",
     "Claim",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, ClassVar, Self, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -29,21 +29,9 @@ class LoopClaim(Claim):
         Its numbers as ``docs/certificate-format.md``, section 5.6, has them.
     """
 
-    kind: ClassVar[str] = "closed loop"
     data: Mapping[str, Any]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return its numbers as JSON values."""
-        return dict(self.data)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild from :meth:`to_dict`."""
-        return cls(dict(data))
-
-    def decide(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
-    ) -> Verdict:
+    def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Let the kernel decide it; the margin is the largest start of the first state that varies.
 
         Raises
@@ -68,7 +56,7 @@ class LoopClaim(Claim):
         return self._own(model_of(mechanism))
 
     def _own(self, model: Model) -> kernel.ClosedLoop:
-        claim = kernel.read_claim({"kind": self.kind, **self.data}, model)
+        claim = kernel.read_claim({"kind": kernel.ClosedLoop.kind, **self.data}, model)
         return cast(kernel.ClosedLoop, claim)
 
     def box(self, mechanism: Mechanism) -> FloatArray:

@@ -1,7 +1,4 @@
-"""Certificates of version 2: written from claims that were proved, decided by the kernel.
-
-Kinds that the kernel does not decide yet stay in files of version 1, beside them.
-"""
+"""The certificate's file: written from claims that were proved, read and decided by the kernel."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ def document_bytes(
     subjects: Sequence[tuple[Surface, ReachingLaw, Sequence[kernel.Claim]]],
     versions: Mapping[str, str | None],
 ) -> bytes:
-    """Return a file of version 2; every number in it is exact.
+    """Return the file; every number in it is exact.
 
     Raises
     ------
@@ -67,7 +64,7 @@ def json_bytes(document: Mapping[str, Any]) -> bytes:
 
 
 def read_document(content: bytes) -> Document:
-    """Read a file of version 2, its claims too.
+    """Read a file, its claims too.
 
     Raises
     ------
@@ -84,7 +81,7 @@ def read_document(content: bytes) -> Document:
             "certificate",
             value=str(error),
             limit="as docs/certificate-format.md says",
-            remedy="It was edited or damaged; certify again",
+            remedy="It was edited or damaged, or is of another version: certify again",
         ) from error
     return document
 

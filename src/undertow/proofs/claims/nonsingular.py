@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, ClassVar
+from typing import Any
 
 from undertow.base.arguments import one_of
 from undertow.base.verdict import Kind, Verdict, inward, within
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import Mechanism
-from undertow.proofs.claims.claim import Box, Claim, Readers, box_of
+from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.intervals.branch import BallFunction, minimise_proved
 from undertow.proofs.intervals.exact_model import exact_matrix, exact_mechanism
@@ -213,13 +213,9 @@ class NonsingularClaim(Claim):
         Coordinate name to (low, high), SI units; coordinates left out stay at the target.
     """
 
-    kind: ClassVar[str] = "nonsingular"
-    reads: ClassVar[Readers] = {"region": box_of}
     region: Box
 
-    def decide(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
-    ) -> Verdict:
+    def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Decide it as :func:`nonsingular` does."""
         return nonsingular(mechanism, surface, self.region)
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import reduce
 from operator import sub
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -37,7 +37,7 @@ from undertow.law import (
     check_surface_shape,
 )
 from undertow.models.mechanism import Mechanism
-from undertow.proofs.claims.claim import Box, Claim, Readers, box_of, floats_of
+from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.nonsingular import exact_box, nonsingular, region_box, region_words
 from undertow.proofs.intervals.branch import BallFunction, Minimum, minimise_proved
@@ -344,15 +344,11 @@ class ReachingClaim(Claim):
         Bounds |g_j| ≤ ḡ_j, all acting at once, (n,), N m or N.
     """
 
-    kind: ClassVar[str] = "reaching"
-    reads: ClassVar[Readers] = {"region": box_of, "eta": floats_of, "disturbance": floats_of}
     region: Box
     eta: tuple[float, ...]
     disturbance: tuple[float, ...]
 
-    def decide(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
-    ) -> Verdict:
+    def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Decide it as :func:`reaching` does for the gains of the reaching law."""
         return reaching(
             mechanism, surface, self.region, law, eta=self.eta, disturbance=self.disturbance

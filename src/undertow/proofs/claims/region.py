@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, ClassVar, Self, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from undertow.base.verdict import Kind, Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
-from undertow.proofs.claims.claim import Box, Claim, Readers, box_of, floats_of
+from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.intervals.require import require
 from undertow.proofs.kernel import claims as kernel
@@ -24,15 +24,6 @@ from undertow.proofs.kernel.model import Matrix
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
-
-#: Functions of one region that are read.
-LONGEST_CHAIN = 200
-
-
-def _chain(listed: Sequence[Mapping[str, Any]]) -> tuple[LyapunovFunction, ...]:
-    if not 0 < len(listed) <= LONGEST_CHAIN:
-        raise ValueError(f"a chain of {len(listed)} functions")
-    return tuple(LyapunovFunction.from_dict(item) for item in listed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,29 +40,14 @@ class RegionClaim(Claim):
         Parameters that are only known to lie in [low, high], SI units.
     """
 
-    kind: ClassVar[str] = "surface region"
-    reads: ClassVar[Readers] = {"functions": _chain, "start": floats_of, "parameters": box_of}
     functions: tuple[LyapunovFunction, ...]
     start: tuple[float, ...]
     parameters: Box = field(default_factory=dict)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return its numbers as JSON values, the box only where there is one."""
-        data = super().to_dict()
-        return {k: v for k, v in data.items() if k != "parameters" or v}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild from :meth:`to_dict`, or from one function alone."""
-        listed = {} if "functions" in data else {"functions": [data["function"]]}
-        return super().from_dict({"parameters": {}, **data, **listed})
-
-    def decide(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
-    ) -> Verdict:
+    def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Let the kernel decide it; the margin is the start's distance from 0."""
         model = model_of(mechanism)
-        own = kernel.read_claim({"kind": self.kind, **self._own().data()}, model)
+        own = kernel.read_claim({"kind": kernel.SurfaceRegion.kind, **self._own().data()}, model)
         answer = kernel.decide(model, law_of(mechanism, surface, law), own)
         kind, margin = cast(Kind, answer.kind), float(np.linalg.norm(self.start)) * (1 - 1e-12)
         unit = mechanism.coordinates[mechanism.m].unit

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import ClassVar
 
 import numpy as np
 
@@ -107,11 +106,7 @@ def hurwitz(mechanism: Mechanism, surface: Surface) -> Verdict:
 class StabilityClaim(Claim):
     """Motions on the surface near the target converge to it exponentially."""
 
-    kind: ClassVar[str] = "stability"
-
-    def decide(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
-    ) -> Verdict:
+    def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Decide it as :func:`hurwitz` does."""
         return hurwitz(mechanism, surface)
 

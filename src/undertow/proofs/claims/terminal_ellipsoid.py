@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import ClassVar, cast
+from typing import Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from undertow.law import (
     check_surface_shape,
 )
 from undertow.models.mechanism import FloatArray, Mechanism
-from undertow.proofs.claims.claim import Claim, Readers, matrix_of
+from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.intervals.require import require, require_autonomous
 from undertow.proofs.kernel import claims as kernel
@@ -46,11 +46,15 @@ class TerminalEllipsoid(Claim):
         ρ > 0.
     """
 
-    kind: ClassVar[str] = "terminal ellipsoid"
-    reads: ClassVar[Readers] = {"W": matrix_of, "U": matrix_of, "radius": float}
     W: FloatArray
     U: FloatArray
     radius: float
+
+    @classmethod
+    def of(cls, claim: kernel.TerminalEllipsoid) -> Self:
+        """Return the ellipsoid that a certificate states."""
+        W = np.array(claim.W, dtype=float)
+        return cls(W, np.linalg.inv(W), float(claim.radius))
 
     def level(self, x: ArrayLike) -> FloatArray:
         """Return |W x| / ρ at the states x, (…, 2n): at most 1 inside."""
@@ -76,9 +80,7 @@ class TerminalEllipsoid(Claim):
             f"converges, inside the layer and {limits_in_words(mechanism)}"
         )
 
-    def decide(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
-    ) -> Verdict:
+    def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Decide whether it is a region of attraction of the full closed loop.
 
         The continuous law (5) with (12), inside the layer and unclipped, belief equal to plant.

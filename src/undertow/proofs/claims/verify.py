@@ -1,50 +1,27 @@
 """Verifies a certificate from the file and the mechanism alone.
 
-Every claim decides itself again (:meth:`undertow.proofs.Claim.decide`).  Nothing of the search
-that found it is imported here, directly or through others (``pyproject.toml`` and the tests see to
-it): no linear program, no semidefinite solver, no optimiser.  What is proved is proved for the
-equations of the mechanism that is passed in; the file only supplies numbers to try.  So the
-sentence of a verdict is made from the numbers that were decided on; the file's own sentences do
-not count.
+The kernel decides every claim again.  Nothing of the search that found it is imported here,
+directly or through others (``pyproject.toml`` and the tests see to it): no linear program, no
+semidefinite solver, no optimiser.  What is proved is proved for the equations of the mechanism that
+is passed in; the file only supplies numbers to try.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from undertow.base.errors import CertificateError, UndertowError, error_text
-from undertow.base.verdict import Verdict, inward
+from undertow.base.errors import CertificateError, UndertowError
+from undertow.base.verdict import Verdict
 from undertow.law.surface import ProvedSet
 from undertow.models.mechanism import Mechanism
-from undertow.proofs.claims.appendix import AppendixClaim
-from undertow.proofs.claims.certificate import Certificate, StatedClaim, Subject
-from undertow.proofs.claims.claim import Claim
+from undertow.proofs.claims.certificate import Certificate, Subject
 from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.document import decide_document
 from undertow.proofs.claims.model_data import model_data
-from undertow.proofs.claims.nonsingular import NonsingularClaim
-from undertow.proofs.claims.reaching import ReachingClaim
-from undertow.proofs.claims.region import RegionClaim
-from undertow.proofs.claims.stability import StabilityClaim
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
-from undertow.proofs.intervals.exact_model import exact_mechanism
+from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.reader import digest
-
-#: Every kind of claim, by its name in a certificate.
-CLAIMS: Mapping[str, type[Claim]] = {
-    claim.kind: claim
-    for claim in (
-        StabilityClaim,
-        NonsingularClaim,
-        ReachingClaim,
-        RegionClaim,
-        TerminalEllipsoid,
-        LoopClaim,
-        AppendixClaim,
-    )
-}
 
 
 @dataclass(frozen=True)
@@ -56,7 +33,7 @@ class Checked:
     subject
         Whose claim it is.
     claim
-        As the file has it; its words say nothing.
+        Its numbers, exact.
     verdict
         As it was decided now, with the sentence that was decided.
     model
@@ -64,14 +41,9 @@ class Checked:
     """
 
     subject: Subject
-    claim: StatedClaim
+    claim: kernel.Claim
     verdict: Verdict
     model: str
-
-    @property
-    def reworded(self) -> bool:
-        """Whether the file says something else than what was decided."""
-        return self.claim.verdict.claim != self.verdict.claim
 
 
 def match(
@@ -119,13 +91,13 @@ def match(
         raise CertificateError(
             "parameters of a certificate", value=str(error), limit="physical"
         ) from error
-    structure = matched.structure if own.document is None else digest(model_data(matched))
+    found, stated = digest(model_data(matched)), own.document.model_hash
+    made_with = str(own.document.made_with.get("sympy"))[:12]
     _require(
-        own.structure == structure,
+        found == stated,
         f"equations of '{name}'",
-        f"hash {structure[:12]}…",
-        f"{own.structure[:12]}…, those of the certificate "
-        f"(SymPy {str(own.versions.get('sympy'))[:12]!r})",
+        f"hash {found[:12]}…",
+        f"{stated[:12]}…, those of the certificate (SymPy {made_with!r})",
         "The model has changed since: certify again",
     )
     return matched
@@ -159,7 +131,6 @@ def verify(
     mechanism: Mechanism | None,
     *,
     own_parameters: bool = False,
-    max_seconds: float = 600.0,
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[Checked, ...]:
     """Decide all claims of a certificate again.
@@ -169,10 +140,8 @@ def verify(
     certificate
         From :func:`undertow.proofs.read_certificate`.
     mechanism, own_parameters
-        As for :func:`match`.  A file of version 2 says everything by itself: with None it is
-        decided for the model that is in it.
-    max_seconds
-        Effort for each claim.
+        As for :func:`match`.  The file says everything by itself: with None it is decided for the
+        model that is in it.
     progress
         Called with (claim, part done).
 
@@ -184,75 +153,22 @@ def verify(
     Raises
     ------
     CertificateError
-        For another mechanism, a claim of an unknown kind, or one without claims.
+        For another mechanism, or a certificate without claims.
     ModelError
         For a mechanism that is not smooth.
     MissingExtraError
         Without python-flint.
     """
-    if certificate.document is not None:
-        return _verify_document(certificate, mechanism, own_parameters, progress)
-    if mechanism is None:
-        raise CertificateError(
-            "certificate of version 1", value="no mechanism", limit="the one that it is about"
-        )
-    matched = match(certificate, mechanism, own_parameters=own_parameters)
-    model = exact_mechanism(matched)
-    tasks = [(s, c) for s in certificate.subjects for c in s.claims]
-    _require(bool(tasks), "certificate", "no claim", "at least one")
-    unknown = ", ".join(repr(kind) for kind in sorted({c.kind for _, c in tasks} - set(CLAIMS)))
-    limit, remedy = f"one of {', '.join(CLAIMS)}", "It was made by a later version of Undertow"
-    _require(not unknown, "claim of a certificate", unknown, limit, remedy)
-    done: list[Checked] = []
-    for index, (subject, claim) in enumerate(tasks):
-        if progress is not None:
-            progress(claim.kind, index / len(tasks))
-        asked = subject.surface, subject.reaching, claim
-        known = (c for c in done if (c.subject.surface, c.subject.reaching, c.claim) == asked)
-        same = next(known, None)  # what stands there again is not decided again
-        verdict = _decide(model, subject, claim, max_seconds) if same is None else same.verdict
-        done.append(Checked(subject, claim, verdict, matched.fingerprint))
-    return tuple(done)
-
-
-def _verify_document(
-    certificate: Certificate,
-    mechanism: Mechanism | None,
-    own_parameters: bool,
-    progress: Callable[[str, float], None] | None,
-) -> tuple[Checked, ...]:
-    document, model = certificate.document, certificate.structure
-    assert document is not None
+    document = certificate.document
+    model = document.model_hash
     if mechanism is not None:
         model = match(certificate, mechanism, own_parameters=own_parameters).fingerprint
     subjects = [s for s in certificate.subjects for _ in s.claims]
-    stated = [c for s in certificate.subjects for c in s.claims]
     decided = decide_document(document, progress)
     return tuple(
         Checked(subject, claim, verdict, model)
-        for subject, claim, (_, _, verdict) in zip(subjects, stated, decided, strict=True)
+        for subject, (_, claim, verdict) in zip(subjects, decided, strict=True)
     )
-
-
-def _decide(mechanism: Mechanism, subject: Subject, stated: StatedClaim, seconds: float) -> Verdict:
-    try:
-        claim = CLAIMS[stated.kind].from_dict(stated.data)
-        verdict = claim.decide(mechanism, subject.surface, subject.reaching, seconds=seconds)
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise CertificateError(
-            f"claim '{stated.kind}'",
-            value=error_text(error),
-            limit="complete, with numbers that can be computed with",
-        ) from error
-    margin = stated.verdict.margin
-    if verdict and math.isfinite(margin) and not verdict.margin >= margin - 1e-9 * abs(margin):
-        return replace(
-            verdict,
-            kind="undecided",
-            method=f"the file states a margin of {margin:.6g}, "
-            f"proved is {inward(verdict.margin, 6)}",
-        )
-    return verdict
 
 
 def proved_sets(mechanism: Mechanism, checked: Sequence[Checked]) -> tuple[ProvedSet, ...]:
@@ -283,11 +199,15 @@ def proved_sets(mechanism: Mechanism, checked: Sequence[Checked]) -> tuple[Prove
         "those of this very mechanism",
         "Pass the mechanism with the certificate's parameters: with_parameters(…)",
     )
-    found = (
-        CLAIMS[item.claim.kind]
-        .from_dict(item.claim.data)
-        .proved_set(mechanism, item.subject.surface, item.subject.reaching)
-        for item in checked
-        if item.verdict
-    )
-    return tuple(proved for proved in found if proved is not None)
+    proved = (item for item in checked if item.verdict)
+    found = (_proved_set(mechanism, item.subject, item.claim) for item in proved)
+    return tuple(region for region in found if region is not None)
+
+
+def _proved_set(mechanism: Mechanism, subject: Subject, claim: kernel.Claim) -> ProvedSet | None:
+    law = mechanism, subject.surface, subject.reaching
+    if isinstance(claim, kernel.TerminalEllipsoid):
+        return TerminalEllipsoid.of(claim).proved_set(*law)
+    if isinstance(claim, kernel.ClosedLoop):
+        return LoopClaim(claim.data()).proved_set(*law)
+    return None

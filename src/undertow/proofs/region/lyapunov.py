@@ -14,10 +14,9 @@ good: whatever V is, the checker decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,46 +80,6 @@ class LyapunovFunction:
         """Make V = |z|²."""
         size = len(scale)
         return cls(scale, 2 * np.eye(size, dtype=np.int64), np.ones(size), stretch, pole)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
-        data: dict[str, Any] = {
-            "scale": self.scale.tolist(),
-            "exponents": np.asarray(self.exponents).tolist(),
-            "coefficients": np.asarray(self.coefficients).tolist(),
-        }
-        if self.stretch is not None:
-            data |= {"stretch": np.asarray(self.stretch).tolist(), "pole": float(self.pole)}
-        return data
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild from :meth:`to_dict`; sizes that no search makes are refused.
-
-        Raises
-        ------
-        LookupError, TypeError, ValueError
-            For data that are incomplete, or arrays of another shape.
-        """
-        terms, size = len(data["exponents"]), len(data["scale"])
-        if not (0 < size <= 12 and 0 < terms <= 5000):
-            raise ValueError(f"a function of {size} variables with {terms} terms")
-        exponents = np.array(data["exponents"])
-        if exponents.dtype.kind != "i" or exponents.shape != (terms, size) or exponents.max() > 24:
-            raise ValueError("exponents that are no whole numbers up to 24, one row per term")
-        stretch, pole = None, np.inf
-        if "stretch" in data:
-            count = len(data["stretch"])
-            if count > 12:
-                raise ValueError(f"{count} stretches")
-            stretch, pole = _array(data["stretch"], count, size, size), float(data["pole"])
-        return cls(
-            _array(data["scale"], size, size),
-            exponents.astype(np.int64),
-            _array(data["coefficients"], terms),
-            stretch,
-            pole,
-        )
 
     @cached_property
     def _inverse(self) -> FloatArray:
@@ -232,13 +191,6 @@ class LyapunovFunction:
         ]
         least = [float(self(g.points(rays)).min()) for g in guards]
         return guards[int(np.argmax(least))]
-
-
-def _array(value: Any, *shape: int) -> FloatArray:
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"an array of shape {array.shape} where {shape} is due")
-    return array
 
 
 def directions(rng: np.random.Generator, count: int, size: int) -> FloatArray:

@@ -19,7 +19,7 @@ from undertow.proofs.claims.certificate import read_certificate
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import match
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.claims import SurfaceRegion, read_claim
+from undertow.proofs.kernel.claims import SurfaceRegion
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.studies.campaign.region_map import EVENTS, RegionMap
 from undertow.studies.campaign.run import Campaign
@@ -225,23 +225,19 @@ def proved_set(study: RegionMap, path: Path) -> Proved:
         When it cannot be read, or is about another mechanism.
     """
     certificate = read_certificate(path)
-    document = certificate.document
     wanted = study.surface.vector
     if not study.sliding:
         wanted = np.append(wanted, study.loop.reaching.vector(study.mechanism.m))
-    if document is not None:
-        match(certificate, study.mechanism, own_parameters=True)
-        for subject in document.subjects:
-            law = np.array([float(v) for v in subject.law.numbers])
-            if not np.array_equal(law[: len(wanted)], wanted):
-                continue
-            for said in subject.claims:
-                claim = read_claim(said, document.model)
-                if isinstance(claim, SurfaceRegion) and study.sliding:
-                    return _function(claim)
-                if isinstance(claim, kernel.TerminalEllipsoid) and not study.sliding:
-                    W = np.array(claim.W, dtype=float)
-                    return TerminalEllipsoid(W, np.linalg.inv(W), float(claim.radius))
+    match(certificate, study.mechanism, own_parameters=True)
+    for subject in certificate.subjects:
+        law = np.append(subject.surface.vector, subject.reaching.vector(study.mechanism.m))
+        if not np.array_equal(law[: len(wanted)], wanted):
+            continue
+        for claim in (stated.claim for stated in subject.claims):
+            if isinstance(claim, kernel.SurfaceRegion) and study.sliding:
+                return _function(claim)
+            if isinstance(claim, kernel.TerminalEllipsoid) and not study.sliding:
+                return TerminalEllipsoid.of(claim)
     raise InvalidInputError(
         f"certificate '{path}' for a picture",
         value="no region on this surface" if study.sliding else "no terminal set of this law",

@@ -16,7 +16,6 @@ from undertow.law import Plan, ReachingLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import MinimumEnergy
 from undertow.proofs import (
-    AppendixClaim,
     Claim,
     GatePolicy,
     LyapunovFunction,
@@ -39,10 +38,10 @@ from undertow.proofs import (
     singular_distance,
     verify_region,
 )
-from undertow.proofs.claims.appendix import CASES, Constants
 from undertow.proofs.claims.claim import Box
 from undertow.proofs.claims.region import reaches
 from undertow.proofs.region.lyapunov import extent
+from undertow.studies.paper.appendix import CASES, Constants, two_vertex
 from undertow.studies.paper.appendix_search import search_rate
 
 #: Most coordinates of a motion on the surface for which a region is searched.
@@ -66,13 +65,14 @@ class Certified:
     """One surface with all that is known of it.
 
     ``title``: its name in tables. ``subject``: claims and remarks, as they go into the certificate.
-    ``region``: the proved region on the surface, where there is one. ``seconds``: how long it took,
-    s.
+    ``region``: the proved region on the surface, where there is one. ``interval``: for a case of
+    the appendix, whether R ≻ 0 on its Ĩ. ``seconds``: how long it took, s.
     """
 
     title: str
     subject: Subject
     region: ProvedRegion | None = None
+    interval: Verdict | None = None
     seconds: float = 0.0
 
 
@@ -107,7 +107,7 @@ def certify_surface(
 
     def keep(claim: Claim | None, verdict: Verdict) -> None:
         if claim is not None and verdict:
-            claims.append(StatedClaim.of(claim, verdict))
+            claims.append(StatedClaim(claim.stated(mechanism, verdict), verdict))
         else:
             remarks.append(verdict)
 
@@ -147,7 +147,8 @@ def certify_surface(
             tell("random starts", most - 0.5 * LAST)
             remarks += _sampled(closed, surface, start)
     subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
-    return Certified(title or str(surface), subject, region, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return Certified(title or str(surface), subject, region, seconds=seconds)
 
 
 def _box(mechanism: Mechanism, start: FloatArray) -> dict[str, tuple[float, float]]:
@@ -349,19 +350,20 @@ def certify_appendix(
             predict=False,
         )  # fmt: skip
         P, _ = search_rate(case.reduced(constants), case.half_width)
-        law = ReachingLaw()
-        decide = _Decisions(mechanism, case.surface, law, start, dict(uncertain or {}))
-        decided = [decide.own(AppendixClaim(P, case.half_width))]
-        more: tuple[Verdict, ...] = ()
+        interval = two_vertex(case.reduced(constants), P, case.half_width)
+        claims, remarks = base.subject.claims, base.subject.remarks
         if loop:
+            law = ReachingLaw()
             closed = ClosedLoop(mechanism, MinimumEnergy(horizon=80.0), law, tail_rtol=1e-3)
-            more = (sampled_extent(closed, case.surface, "phi", FAR),)
-            limit = mechanism.state(phi=float(more[0].details["extent"]))
-            decided.append(replace(decide, start=limit).loop(hold))
-        proved = [StatedClaim.of(c, v) for c, v in decided if c is not None and v]
-        claims = (*base.subject.claims, *proved)
-        rest = (v for c, v in decided if c is None or not v)
-        remarks = (*base.subject.remarks, *rest, *more)
+            sampled = sampled_extent(closed, case.surface, "phi", FAR)
+            limit = mechanism.state(phi=float(sampled.details["extent"]))
+            decide = _Decisions(mechanism, case.surface, law, limit, dict(uncertain or {}))
+            claim, verdict = decide.loop(hold)
+            if claim is not None and verdict:
+                claims = (*claims, StatedClaim(claim.stated(mechanism, verdict), verdict))
+            else:
+                remarks = (*remarks, verdict)
+            remarks = (*remarks, sampled)
         subject = replace(base.subject, claims=claims, remarks=remarks)
-        certified.append(replace(base, subject=subject))
+        certified.append(replace(base, subject=subject, interval=interval))
     return tuple(certified)

@@ -131,7 +131,6 @@ def verify(
     certificate: Certificate | str | Path,
     mechanism: Mechanism,
     *,
-    max_seconds: float = 600.0,
     progress: Progress | None = None,
 ) -> Verification:
     """Decide every claim of a certificate again, for a mechanism with its own parameters.
@@ -144,8 +143,6 @@ def verify(
         The file, or what :func:`certify` returned.
     mechanism
         Which it must be about: the same equations, parameters and input limits.
-    max_seconds
-        Effort for each claim, s.
     progress
         Called with (claim, part done).
 
@@ -159,7 +156,5 @@ def verify(
     given = (
         certificate if isinstance(certificate, Certificate) else read_certificate(Path(certificate))
     )
-    found = decide(
-        given, mechanism, own_parameters=True, max_seconds=max_seconds, progress=progress
-    )
+    found = decide(given, mechanism, own_parameters=True, progress=progress)
     return Verification(given.name, found)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -15,10 +14,7 @@ from undertow.base import Verdict, inward, mark
 from undertow.base import artefacts as results
 from undertow.cascade import Run
 from undertow.models import Mechanism
-from undertow.proofs import Certificate, Checked, StatedClaim, Subject
-from undertow.proofs.claims.document import document_bytes
-from undertow.proofs.claims.verify import CLAIMS
-from undertow.proofs.kernel import claims as kernel
+from undertow.proofs import Certificate, Checked, Subject
 from undertow.studies.certification.decide import Certified
 from undertow.studies.motion import evidence_counts
 
@@ -83,18 +79,20 @@ def appendix_report(cases: Sequence[Certified]) -> RenderableType:
     for case in cases:
         known = {c.kind: c.verdict for c in case.subject.claims}
 
-        def cell(kind: str, known: Mapping[str, Verdict] = known) -> Text:
-            if kind not in known:
+        def cell(verdict: Verdict | None) -> Text:
+            if not verdict:
                 return Text("not proved", style="red")
-            return Text(f"proved, {_margin(known[kind])}", style="green")
+            return Text(f"proved, {_margin(verdict)}", style="green")
 
         ellipsoid = known.get("terminal ellipsoid")
         ball = "not proved"
         if ellipsoid is not None:
             ball = f"‖x‖ ≤ {inward(ellipsoid.details['ball'] * (1 - 1e-12), 2)}"
-        region = cell("surface region") if case.region is not None else Text("not asked for")
-        more = [region, cell("closed loop")] if loops else [region]
-        table.add_row(case.title, cell("stability"), cell("appendix interval"), ball, *more)
+        region = (
+            cell(known.get("surface region")) if case.region is not None else Text("not asked for")
+        )
+        more = [region, cell(known.get("closed loop"))] if loops else [region]
+        table.add_row(case.title, cell(known.get("stability")), cell(case.interval), ball, *more)
     return table
 
 
@@ -158,22 +156,14 @@ def verification_report(certificate: Certificate, checked: Sequence[Checked]) ->
         table.add_row(_kind(item.verdict), words, _margin(item.verdict))
     held = sum(bool(item.verdict) for item in checked)
     values = ", ".join(f"{k} = {v!r}" for k, v in certificate.parameters.items())
-    others = sum(item.reworded for item in checked)
-    remarks = sum(len(s.remarks) for s in certificate.subjects)
     lines: list[RenderableType] = [
         table,
         Text(f"{certificate.name} with {values}", style="dim"),
         mark(held == len(checked)) + Text(f" {held} of {len(checked)} claims proved again"),
     ]
-    if certificate.document is not None:
-        alone = all(item.model == certificate.structure for item in checked)
-        whose = "not compared with another" if alone else f"made again from {certificate.name}"
-        lines.append(Text(f"the model is the file's own, {whose}", style="dim"))
-    if others:
-        note = f"the file words {others} of them otherwise: what is said here was decided"
-        lines.append(Text(note, style="yellow"))
-    if remarks:
-        lines.append(Text(f"{remarks} remarks that are no proofs were not checked", style="dim"))
+    alone = all(item.model == certificate.document.model_hash for item in checked)
+    whose = "not compared with another" if alone else f"made again from {certificate.name}"
+    lines.append(Text(f"the model is the file's own, {whose}", style="dim"))
     return Group(*lines)
 
 
@@ -182,27 +172,9 @@ def certificate_files(
     certified: Sequence[Certified],
     figures: Mapping[str, bytes] | None = None,
 ) -> dict[str, bytes]:
-    """Return the files: ``certificate.json``, what the kernel decides; figures; ``drafts.json``.
-
-    ``drafts.json`` is of version 1: claims of kinds that the kernel does not decide yet, and the
-    remarks.  It is left out where there are none.
-    """
-    versions = results.versions()
-    proved, drafts = [], []
-    for item in certified:
-        subject, known = item.subject, list[kernel.Claim]()
-        rest = list[StatedClaim]()
-        for claim in subject.claims:
-            own = CLAIMS[claim.kind].from_dict(claim.data).stated(mechanism, claim.verdict)
-            known += [] if own is None else [own]
-            rest += [claim] if own is None else []
-        if known:
-            proved.append((subject.surface, subject.reaching, known))
-        if rest:
-            drafts.append(replace(subject, claims=tuple(rest)))
+    """Return the files: ``certificate.json``, where a claim is proved, and the figures."""
+    certificate = Certificate.of(mechanism, [c.subject for c in certified], results.versions())
     files = dict(figures or {})
-    if proved:
-        files["certificate.json"] = document_bytes(mechanism, proved, versions)
-    if drafts:
-        files["drafts.json"] = Certificate.of(mechanism, drafts, versions).to_bytes()
+    if certificate.content:
+        files["certificate.json"] = certificate.content
     return files

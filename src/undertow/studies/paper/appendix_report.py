@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from undertow.base import Verdict, inward, markdown_table
 from undertow.closed_loop.figures import figure_files, style
 from undertow.mechanisms import rotary_pendulum
-from undertow.proofs.claims.appendix import (
+from undertow.proofs.claims.stability import hurwitz
+from undertow.studies.paper.appendix import (
     CASES,
     PRINTED,
     AppendixCase,
@@ -26,7 +27,6 @@ from undertow.proofs.claims.appendix import (
     paper_rate,
     two_vertex,
 )
-from undertow.proofs.claims.stability import hurwitz
 from undertow.studies.paper.appendix_search import search_interval, search_rate
 
 

@@ -1,6 +1,6 @@
 """The search for the appendix's P: semidefinite programs at the two vertices (Clarabel).
 
-What is found is rounded to decimals and proved by :mod:`undertow.proofs.claims.appendix`, which
+What is found is rounded to decimals and proved by :mod:`undertow.studies.paper.appendix`, which
 shares nothing with the search.
 """
 
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from undertow.base import InfeasibleError, require_extra
 from undertow.base.verdict import Verdict
-from undertow.proofs.claims.appendix import (
+from undertow.proofs.intervals.interval import flint
+from undertow.studies.paper.appendix import (
     BITS,
     Lyapunov,
     Reduced,
@@ -23,7 +24,6 @@ from undertow.proofs.claims.appendix import (
     gamma_factor,
     two_vertex,
 )
-from undertow.proofs.intervals.interval import flint
 
 FloatArray = NDArray[np.float64]
 

@@ -19,12 +19,11 @@ in (A20): what R ≻ 0 proves is local stability.  Derivation: ``docs/appendix.m
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -32,9 +31,8 @@ from numpy.typing import NDArray
 
 from undertow.base.errors import InvalidInputError
 from undertow.base.verdict import Kind, Verdict, inward
-from undertow.law import ReachingLaw, Surface
+from undertow.law import Surface
 from undertow.models.mechanism import FloatArray, Mechanism
-from undertow.proofs.claims.claim import Claim, Readers
 from undertow.proofs.claims.stability import exact_linearisation
 from undertow.proofs.intervals.interval import ball, flint, lower_float, upper_float
 
@@ -350,44 +348,6 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
             return Verdict(claim, "undecided", value, "", {"y1": where}, method)
         witness = {"y1": where} | {f"direction {i + 1}": v for i, v in enumerate(direction)}
         return Verdict(claim, "refuted", value, "", witness, method)
-
-
-def _exact(value: Any) -> Fraction:
-    """A number as text, digits alone: an exponent may stand for more of them than there are."""
-    text = str(value)
-    if not re.fullmatch(r"-?[0-9]{1,40}(/[0-9]{1,40}|\.[0-9]{1,40})?", text):
-        raise ValueError("a number that is neither a decimal nor a fraction of up to 40 digits")
-    return Fraction(text)
-
-
-@dataclass(frozen=True)
-class AppendixClaim(Claim):
-    """R(y₁) ≻ 0 for |y₁| ≤ half_width with some P, on the surface of one of the five cases.
-
-    Parameters
-    ----------
-    P
-        The Lyapunov matrix, exact.
-    half_width
-        Half-width of Ĩ, rad, exact.
-    """
-
-    kind: ClassVar[str] = "appendix interval"
-    reads: ClassVar[Readers] = {
-        "P": lambda values: Lyapunov(*map(_exact, values)),
-        "half_width": _exact,
-    }
-    P: Lyapunov
-    half_width: Fraction
-
-    def decide(
-        self, mechanism: Mechanism, surface: Surface, law: ReachingLaw, *, seconds: float = 600.0
-    ) -> Verdict:
-        """Decide it as :func:`two_vertex` does, with the b, c, d of the mechanism."""
-        case = next((c for c in CASES if c.surface == surface), None)
-        if case is None:
-            raise ValueError("a surface that is none of the appendix's")
-        return two_vertex(case.reduced(Constants.of(mechanism)), self.P, self.half_width)
 
 
 def _negative_direction(R: tuple[Matrix, Matrix], xi: Any) -> list[float] | None:
