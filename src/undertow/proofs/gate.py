@@ -36,7 +36,7 @@ from undertow.closed_loop.rollout import ClosedLoop
 from undertow.closed_loop.trajectory import Batch, Event
 from undertow.law import Plan, ProvedSet, ReachingLaw, Surface, stability_margin
 from undertow.models.mechanism import FloatArray
-from undertow.proofs.intervals.require import require
+from undertow.proofs.require import require
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 Evidence = Literal["region", "dual", "sampled", "local"]

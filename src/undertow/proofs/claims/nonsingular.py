@@ -1,32 +1,38 @@
 """Whether the law exists all over a region of positions.
 
-α_a − α_u M_uu⁻¹ M_auᵀ must be invertible there.  Branch and bound in ball arithmetic looks for the
-least determinant, relative to the target; the kernel decides that it is no less.
+α_a − α_u M_uu⁻¹ M_auᵀ must be invertible there.  The kernel decides by how much; here the largest
+numbers that it proves are looked for.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import cast
 
 from undertow.base.arguments import one_of
-from undertow.base.verdict import Kind, Verdict, inward, within
+from undertow.base.verdict import Kind, Verdict
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.intervals.branch import BallFunction, minimise_proved
-from undertow.proofs.intervals.exact_model import exact_matrix, exact_mechanism
-from undertow.proofs.intervals.interval import ball, compile_outward
-from undertow.proofs.intervals.require import require
 from undertow.proofs.kernel import claims as kernel
-from undertow.symbolic import Tape
+from undertow.proofs.require import require
+
+#: The least ratio that is asked for.
+TINY = 1e-9
+
+#: Effort of a decision that is not worth more.
+FEW = 100
+
+#: Largest and smallest factor on the first guess that are tried.
+FAR = 1e9
 
 
-def region_box(mechanism: Mechanism, region: Box) -> list[tuple[float, float]]:
-    """Return the box of positions, one (low, high) per coordinate.
+def exact_region(mechanism: Mechanism, region: Box) -> dict[str, tuple[Fraction, Fraction]]:
+    """Return the rational numbers that the ends of a region of positions are.
 
     Raises
     ------
@@ -35,73 +41,63 @@ def region_box(mechanism: Mechanism, region: Box) -> list[tuple[float, float]]:
         the target, from which the non-singular set must be connected.
     """
     names = [c.name for c in mechanism.coordinates]
-    box = [(0.0, 0.0)] * mechanism.n
     for name, (low, high) in region.items():
         one_of("region of positions", name, names)
         good = math.isfinite(low) and math.isfinite(high) and low <= 0 <= high
         limit = "finite, with low ≤ 0 ≤ high: the target must be inside"
         require(good, f"region of '{name}'", (low, high), limit)
-        box[names.index(name)] = (float(low), float(high))
-    return box
-
-
-def region_words(mechanism: Mechanism, region: Box) -> str:
-    """Return a region of positions in words, its ends rounded inwards."""
-    units = {c.name: c.unit for c in mechanism.coordinates}
-    parts = [
-        f"|{k}| ≤ {inward(b, 6)} {units[k]}" if a == -b else f"{k} in {within(a, b)} {units[k]}"
-        for k, (a, b) in region.items()
-        if (a, b) != (0.0, 0.0)
-    ]
-    if not parts:
-        return "at the target"
-    rest = len(parts) < mechanism.n
-    return f"for {', '.join(parts)}" + (", the other coordinates at the target" if rest else "")
-
-
-#: A ratio that is claimed of a region where none was found.
-TINY = 1e-9
-
-
-def exact_box(region: Box) -> dict[str, tuple[Fraction, Fraction]]:
-    """Return the rational numbers that the ends of a region are."""
     return {k: (Fraction(float(a)), Fraction(float(b))) for k, (a, b) in region.items()}
 
 
-def _gamma(mechanism: Mechanism, surface: Surface) -> tuple[BallFunction, BallFunction]:
-    """Return det Γ(q)/det Γ(0) and a lower bound of Γ's smallest singular value."""
-    tape = Tape()
-    mechanism = exact_mechanism(mechanism)
-    part = mechanism.partition(tape)
-    gamma = tape.matrix(exact_matrix(surface.alpha_a) - exact_matrix(surface.alpha_u) * part.X)
-    _, determinant = tape.adjugate(gamma)
-    frobenius = tape.let(sum(entry**2 for entry in gamma))
-    run = compile_outward(
-        tape, [*mechanism.q, *mechanism.parameter_symbols], [determinant, frobenius]
-    )
-    parameters = [ball(v) for v in mechanism.parameter_values]
-    m, zero = mechanism.m, ball(0.0)
+@dataclass(frozen=True)
+class Largest:
+    """The largest number for which something was proved.
 
-    def evaluate(q: list[Any]) -> list[Any]:
-        # A Γ that does not depend on the position comes back as whole numbers.
-        return [zero + value for value in run(*q, *parameters)]
+    ``proved``: that number, 0 for none and ``inf`` where it has no end. ``refuted``: the smallest
+    for which it is false, ``inf`` where none was found. ``failed``: the decision at the smallest
+    number for which it was not proved.
+    """
 
-    target = evaluate([zero] * mechanism.n)[0]
+    proved: float
+    refuted: float
+    failed: kernel.Decision | None
 
-    def ratio(q: list[Any]) -> Any:
-        return evaluate(q)[0] / target
 
-    def distance(q: list[Any]) -> Any:
-        # |det| = Π σ_i and the AM-GM inequality on the m − 1 larger ones.
-        value, square = evaluate(q)
-        size = abs(value)
-        return size if m == 1 else size / ((square / (m - 1)).sqrt() ** (m - 1))
-
-    return ratio, distance
+def largest(
+    decide: Callable[[float], kernel.Decision],
+    guess: float,
+    tolerance: float,
+    limit: float = math.inf,
+) -> Largest:
+    """Return the largest number up to a limit, to a relative tolerance, that is proved."""
+    low, high, refuted, failed = 0.0, math.inf, math.inf, None
+    value = min(guess, limit)
+    while not low or math.isinf(high) or high - low > tolerance * high:
+        found = decide(value)
+        if found.kind == "proved":
+            low = value
+            if low >= limit or low > FAR * guess:
+                return Largest(low if low >= limit else math.inf, math.inf, None)
+        else:
+            high, failed = value, found
+            if found.kind == "refuted":
+                refuted = value
+            if high < guess / FAR:
+                return Largest(0.0, refuted, failed)
+        if math.isinf(high):
+            value = min(2 * low, limit)
+        else:
+            value = 0.5 * (low + high) if low else 0.25 * high
+    return Largest(low, refuted, failed)
 
 
 def nonsingular(
-    mechanism: Mechanism, surface: Surface, region: Box, *, max_boxes: int = 20_000
+    mechanism: Mechanism,
+    surface: Surface,
+    region: Box,
+    *,
+    tolerance: float = 1e-4,
+    max_boxes: int = 20_000,
 ) -> Verdict:
     """Decide whether the law exists all over a region, the general form of (37).
 
@@ -110,47 +106,34 @@ def nonsingular(
     region
         Coordinate name to (low, high), SI units, the target inside; coordinates left out
         stay at the target.
+    tolerance
+        Relative, of the margin.
     max_boxes
-        Effort before giving up.
+        Effort of a decision before it gives up.
 
     Returns
     -------
     Verdict
         ``margin`` is a proved lower bound of det Γ(q)/det Γ(0) over the region, with
-        Γ = α_a − α_u M_uu⁻¹ M_auᵀ; ``refuted``: the ratio is ≤ 0 at the witness, so Γ is
-        singular on the way there.  ``details["smallest singular value"]`` bounds the
-        2-norm distance of Γ from the singular matrices, all over the region.
+        Γ = α_a − α_u M_uu⁻¹ M_auᵀ; ``refuted``: Γ is singular on the way to the witness.
     """
     check_surface_shape(mechanism, surface)
-    box = region_box(mechanism, region)
-    names = [c.name for c in mechanism.coordinates]
-    words = region_words(mechanism, region)
-    claim = f"the law exists {words}: α_a − α_u M_uu⁻¹ M_auᵀ is non-singular"
-    method = "ball arithmetic, branch and bound"
-    ratio, distance = _gamma(mechanism, surface)
-    found = minimise_proved(ratio, box, stop_below=0.0, max_boxes=max_boxes)
-    held = True if found.lower > 0 else False if found.value <= 0 else None
-    verdict = found.verdict(claim, names, "", method, held)
+    box = exact_region(mechanism, region)
     model, law = model_of(mechanism), law_of(mechanism, surface, ReachingLaw())
-    for slack in (1e-13, 1e-9, 1e-6):
-        least = found.lower * (1 - slack) if held else TINY
-        stated = kernel.Nonsingular(exact_box(region), Fraction(least))
-        decided = kernel.decide(model, law, stated, max_boxes)
-        if decided.kind == "proved" or not held:
-            break
-    method = decided.why
-    if decided.kind != verdict.kind or not held:
-        margin = min(verdict.margin, least) if held else verdict.margin
-        witness = decided.witness or verdict.witness
-        kind: Kind = "refuted" if decided.kind == "refuted" else "undecided"
-        return replace(
-            verdict, kind=kind, margin=margin, witness=witness, method=f"{method}, gave up"
-            if kind == "undecided" else method,
-        )  # fmt: skip
-    verdict = replace(verdict, margin=least, method=method)
-    near = minimise_proved(distance, box, max_boxes=max_boxes)
-    details = {**verdict.details, "smallest singular value": max(near.lower, 0.0)}
-    return replace(verdict, details=details)
+
+    def decide(ratio: float, boxes: int = max_boxes) -> kernel.Decision:
+        return kernel.decide(model, law, kernel.Nonsingular(box, Fraction(ratio)), boxes)
+
+    # A Γ that does not depend on the position keeps all of it, to rounding.
+    whole = (ratio for ratio in (1.0, 1 - 1e-12) if decide(ratio, FEW).kind == "proved")
+    margin = next(whole, 0.0)
+    if not margin and decide(TINY).kind == "proved":
+        margin = largest(decide, 0.5, tolerance, 1.0).proved or TINY
+    found = decide(margin or TINY)
+    proved = found.kind == "proved"
+    why = f"{found.why}, gave up" if found.kind == "undecided" else found.why
+    least = margin if proved else math.nan
+    return Verdict(found.sentence, cast(Kind, found.kind), least, "", found.witness, why)
 
 
 def singular_distance(
@@ -177,30 +160,20 @@ def singular_distance(
         The region scaled by ``proved`` is non-singular; scaled by ``refuted`` it is not
         (``inf`` where no singularity is within the limit).
     """
-    box = region_box(mechanism, region)
-    for c, (a, b) in zip(mechanism.coordinates, box, strict=True):
-        if c.unit == "rad" and max(-a, b) > 0:
-            limit = min(limit, math.pi / min(v for v in (-a, b) if v > 0))
-    ratio, _ = _gamma(mechanism, surface)
+    box = exact_region(mechanism, region)
+    for c in mechanism.coordinates:
+        reach = [float(abs(v)) for v in box.get(c.name, ()) if v]
+        if c.unit == "rad" and reach:
+            limit = min(limit, math.pi / min(reach))
+    model, law = model_of(mechanism), law_of(mechanism, surface, ReachingLaw())
 
-    def holds(factor: float) -> bool | None:
-        scaled = [(a * factor, b * factor) for a, b in box]
-        found = minimise_proved(
-            ratio, scaled, stop_below=0.0, stop_above=0.0, absolute=0.0, max_boxes=max_boxes
-        )
-        return True if found.lower > 0 else False if found.value <= 0 else None
+    def decide(factor: float) -> kernel.Decision:
+        exact = Fraction(factor)
+        scaled = {k: (a * exact, b * exact) for k, (a, b) in box.items()}
+        return kernel.decide(model, law, kernel.Nonsingular(scaled, Fraction(TINY)), max_boxes)
 
-    low, high = 0.0, limit
-    if holds(limit):
-        return limit, math.inf
-    refuted = math.inf
-    while high - low > tolerance * high:
-        middle = 0.5 * (low + high)
-        answer = holds(middle)
-        low, high = (middle, high) if answer else (low, middle)
-        if answer is False:
-            refuted = middle
-    return low, refuted
+    found = largest(decide, 1.0, tolerance, limit)
+    return found.proved, found.refuted
 
 
 @dataclass(frozen=True)
@@ -221,4 +194,4 @@ class NonsingularClaim(Claim):
 
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
         """Return it with the ratio that was proved."""
-        return kernel.Nonsingular(exact_box(self.region), Fraction(verdict.margin))
+        return kernel.Nonsingular(exact_region(mechanism, self.region), Fraction(verdict.margin))

@@ -8,47 +8,35 @@ which is (8)-(9) put into α_a g̃_a + α_u g̃_u.  (16), V̇ ≤ −Σ η_i |s_
 disturbance |g_j| ≤ ḡ_j iff Σ_j |W_ij(q)| ḡ_j ≤ k_i(q) − η_i for all i and all positions.
 The gains (13) use norms instead and are therefore larger than need be.
 
-Where the law does not exist there is nothing that it could overcome, so a region is proved
-non-singular first.  Not covered: an error in M (it makes g depend on u), saturation of the input,
-and the boundary layer, inside of which |s_i| ≤ ε_s · (bound/k_i) is what remains.
+The kernel decides it; here the largest numbers that it proves are looked for.  Where the law does
+not exist there is nothing that it could overcome, so a region is proved non-singular first.  Not
+covered: an error in M (it makes g depend on u), saturation of the input, and the boundary layer,
+inside of which |s_i| ≤ ε_s · (bound/k_i) is what remains.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import reduce
-from operator import sub
-from typing import Any
+from typing import cast
 
 import numpy as np
-import sympy as sp
 from numpy.typing import ArrayLike
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import Verdict, inward
-from undertow.law import (
-    LawSymbols,
-    ReachingLaw,
-    Surface,
-    build_law_graph,
-    check_surface_shape,
-)
-from undertow.models.mechanism import Mechanism
+from undertow.base.verdict import Kind, Verdict
+from undertow.law import ReachingLaw, Surface, check_surface_shape
+from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.claims.nonsingular import exact_box, nonsingular, region_box, region_words
-from undertow.proofs.intervals.branch import BallFunction, Minimum, minimise_proved
-from undertow.proofs.intervals.exact_model import exact_mechanism
-from undertow.proofs.intervals.interval import ball, compile_outward
+from undertow.proofs.claims.nonsingular import Largest, exact_region, largest, nonsingular
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.model import Law
-from undertow.symbolic import Tape
+from undertow.proofs.kernel.model import Law, Model
 
-#: Of one ball per coordinate.
-BallFunctions = Callable[[list[Any]], list[Any]]
+#: Effort of a decision before it gives up.
+MOST_BOXES = 20_000
 
 
 @dataclass(frozen=True)
@@ -68,7 +56,7 @@ class DisturbanceBound:
     unit
         Unit of both.
     witness
-        The position where it is hardest.
+        The position where it fails.
     as_input
         ``proved`` as a disturbance at the input, in its unit (matched ones, B diagonal).
     input_unit
@@ -120,7 +108,7 @@ def reaching(
     eta: ArrayLike = 0.0,
     disturbance: Sequence[float] | None = None,
     tolerance: float = 1e-3,
-    max_boxes: int = 20_000,
+    max_boxes: int = MOST_BOXES,
 ) -> ReachingCertificate:
     """Prove the reaching condition (16) over a region of positions.
 
@@ -137,6 +125,8 @@ def reaching(
         Bounds |g_j| ≤ ḡ_j to be decided, (n,), N m or N; the mechanism's own by default.
     tolerance
         Relative gap between proved and refuted figures.
+    max_boxes
+        Effort of a decision before it gives up.
 
     Returns
     -------
@@ -149,45 +139,27 @@ def reaching(
     ModelError
         For a model that is not smooth.
     """
-    mechanism = exact_mechanism(mechanism)
     check_surface_shape(mechanism, surface)
-    n, m = mechanism.n, mechanism.m
-    box = region_box(mechanism, region)
-    names = [c.name for c in mechanism.coordinates]
-    rate = _row("reaching rate η", eta, m)
-    bounds = _row(
-        "disturbance bounds",
-        mechanism.disturbance_bounds if disturbance is None else disturbance,
-        n,
-    )
-    balance = _Balance.of(mechanism, surface, box, gains, rate, tolerance, max_boxes)
-    rows = [balance.minimum(balance.margin(i, bounds)) for i in range(m)]
-    lower = min(r.lower for r in rows)
-    worst = replace(min(rows, key=lambda r: r.value), lower=lower)
-    claim = _claim(mechanism, bounds, rate, region_words(mechanism, region))
-    decided = kernel.decide(
-        model_of(mechanism),
-        _law(mechanism, surface, gains),
-        kernel.Reaching(
-            exact_box(region), tuple(map(Fraction, bounds)), tuple(map(Fraction, rate))
-        ),
-        max_boxes,
-    )
-    method, kinds = decided.why, {"proved": True, "refuted": False}
-    held = kinds.get(decided.kind)
-    verdict = worst.verdict(claim, names, "1/s", method, held)
+    rate = _row("reaching rate η", eta, mechanism.m)
+    own = mechanism.disturbance_bounds if disturbance is None else disturbance
+    bounds = _row("disturbance bounds", own, mechanism.n)
+    condition = _Condition.of(mechanism, surface, region, gains, tolerance, max_boxes)
     exists = nonsingular(mechanism, surface, region, max_boxes=max_boxes)
-    largest = tuple(balance.alone(j) for j in range(n))
     if not exists:
         why = f"the law is not shown to exist there: {exists.method}"
-        verdict = replace(exists, claim=claim, unit="", method=why)
-        none = [replace(b, proved=0.0, as_input=0.0 * b.as_input) for b in largest]
+        verdict = replace(exists, claim=condition.decide(bounds, rate).sentence, method=why)
+        none = [condition.bound(j, 0.0, 0.0, {}) for j in range(mechanism.n)]
         return ReachingCertificate(verdict, tuple(none), 0.0)
+    verdict = condition.verdict(bounds, rate)
+    alone = tuple(condition.alone(j, rate) for j in range(mechanism.n))
     if verdict.kind == "refuted":
-        does = "; ".join(str(bound) for bound in largest)
+        does = "; ".join(str(bound) for bound in alone)
         short = f"K falls short by {-verdict.margin:.4g} 1/s; alone it overcomes: {does}"
-        verdict = replace(verdict, method=f"{method}; {short}")
-    return ReachingCertificate(verdict, largest, balance.factor(bounds)[0] if held else 0.0)
+        verdict = replace(verdict, method=f"{verdict.method}; {short}")
+    scale = math.inf if verdict else 0.0
+    if verdict and any(bounds):
+        scale = condition.largest(np.array(bounds), rate).proved
+    return ReachingCertificate(verdict, alone, scale)
 
 
 def _law(mechanism: Mechanism, surface: Surface, gains: ArrayLike | ReachingLaw | None) -> Law:
@@ -200,11 +172,6 @@ def _law(mechanism: Mechanism, surface: Surface, gains: ArrayLike | ReachingLaw 
     return replace(law, eta=constant, disturbance=(Fraction(0),) * mechanism.n)
 
 
-def _unit(coordinate: str) -> str:
-    """Unit of the generalised force on a coordinate."""
-    return "N m" if coordinate == "rad" else "N"
-
-
 def _row(what: str, values: ArrayLike, size: int) -> list[float]:
     row = np.atleast_1d(np.asarray(values, dtype=float))
     if row.size not in (1, size) or not (np.isfinite(row).all() and (row >= 0).all()):
@@ -212,25 +179,24 @@ def _row(what: str, values: ArrayLike, size: int) -> list[float]:
     return [float(v) for v in np.broadcast_to(row, (size,))]
 
 
-def _claim(mechanism: Mechanism, bounds: list[float], rate: list[float], where: str) -> str:
-    loads = ", ".join(
-        f"{c.name}: {inward(v, 6)} {_unit(c.unit)}"
-        for c, v in zip(mechanism.coordinates, bounds, strict=True)
-        if v
-    )
-    what = f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
-    left = ", ".join(inward(r, 6) for r in rate)
-    return f"the law {what} {where}: (16) with η = {left}, the inputs not limited"
+def _at_target(mechanism: Mechanism, surface: Surface) -> FloatArray:
+    """Return |W| at the target, (m, n): where a search begins."""
+    m, M = mechanism.m, mechanism.M(np.zeros(mechanism.n))
+    X = np.linalg.solve(M[m:, m:], M[m:, :m])
+    W_a = (surface.alpha_a - surface.alpha_u @ X) @ np.linalg.inv(M[:m, :m] - M[:m, m:] @ X)
+    W_u = surface.alpha_u @ np.linalg.inv(M[m:, m:]) - W_a @ X.T
+    return np.asarray(np.abs(np.hstack([W_a, W_u])))
 
 
 @dataclass(frozen=True, eq=False)
-class _Balance:
-    """k_i(q) − η_i, (m,), and W(q), (mn,), as functions of position balls, over a box."""
+class _Condition:
+    """(16) over a region, for any disturbance and rate."""
 
     mechanism: Mechanism
-    box: list[tuple[float, float]]
-    spare: BallFunctions
-    weights: BallFunctions
+    model: Model
+    law: Law
+    region: dict[str, tuple[Fraction, Fraction]]
+    weights: FloatArray
     tolerance: float
     max_boxes: int
 
@@ -239,94 +205,77 @@ class _Balance:
         cls,
         mechanism: Mechanism,
         surface: Surface,
-        box: list[tuple[float, float]],
+        region: Box,
         gains: ArrayLike | ReachingLaw | None,
-        rate: list[float],
         tolerance: float,
         max_boxes: int,
-    ) -> _Balance:
-        n, m = mechanism.n, mechanism.m
-        tape = Tape()
-        part = mechanism.partition(tape)
-        symbols = LawSymbols.of(n, m)
-        law = build_law_graph(part, mechanism.x, symbols, "sign", mechanism.disturbance_bounds)
-        alpha_a, _, alpha_u, _ = symbols.blocks
-        gamma = tape.matrix(alpha_a - alpha_u * part.X)
-        W_a = tape.product(gamma, tape.cholesky(part.S).solve(sp.eye(m)))
-        inverse = tape.cholesky(part.M_uu).solve(sp.eye(n - m))
-        W_u = tape.matrix(alpha_u * inverse - W_a * part.X.T)
-        inputs = [*mechanism.q, *symbols.surface, *mechanism.parameter_symbols]
-        fixed = [ball(float(v)) for v in (*surface.vector, *mechanism.parameter_values)]
-        run_w = compile_outward(tape, inputs, list(sp.Matrix.hstack(W_a, W_u)))
-        if gains is None or isinstance(gains, ReachingLaw):
-            own = (ReachingLaw() if gains is None else gains).per_surface(m)[0]
-            run_k = compile_outward(tape, [*inputs, *symbols.eta], law.gains)
-            more = [*fixed, *(ball(float(v)) for v in own)]
-        else:
-            constant = [ball(k) for k in _row("gains K", gains, m)]
-            run_k, more = (lambda *_: constant), []
+    ) -> _Condition:
+        """Write it for the kernel."""
+        model, law = model_of(mechanism), _law(mechanism, surface, gains)
+        box, weights = exact_region(mechanism, region), _at_target(mechanism, surface)
+        return cls(mechanism, model, law, box, weights, tolerance, max_boxes)
 
-        def spare(q: list[Any]) -> list[Any]:
-            return [k - ball(r) for k, r in zip(run_k(*q, *more), rate, strict=True)]
-
-        return cls(mechanism, box, spare, lambda q: run_w(*q, *fixed), tolerance, max_boxes)
-
-    def minimum(self, function: BallFunction, **stops: float) -> Minimum:
-        """Enclose a function's minimum over the box."""
-        return minimise_proved(
-            function, self.box, tolerance=self.tolerance, max_boxes=self.max_boxes, **stops
+    def decide(
+        self, bounds: Sequence[float] | FloatArray, rate: Sequence[float], more: float = 0.0
+    ) -> kernel.Decision:
+        """Decide it for these bounds and rates, with ``more`` gain in every row."""
+        law = self.law
+        if more:
+            law = replace(law, eta=tuple(k + Fraction(more) for k in law.eta))
+        claim = kernel.Reaching(
+            self.region, tuple(map(Fraction, bounds)), tuple(map(Fraction, rate))
         )
+        return kernel.decide(self.model, law, claim, self.max_boxes)
 
-    def _loads(self, i: int, q: list[Any], bounds: list[float]) -> Iterator[Any]:
-        n, weights = len(bounds), self.weights(q)
-        return (abs(weights[i * n + j]) * ball(bounds[j]) for j in range(n) if bounds[j])
+    def largest(self, load: FloatArray, rate: Sequence[float]) -> Largest:
+        """Return the largest factor on a load that is overcome."""
+        least = self.decide(0.0 * load, rate)
+        if least.kind != "proved":
+            return Largest(0.0, 0.0, least)
+        spare = np.array([float(k) for k in self.law.eta]) - rate
+        pushed = self.weights @ load
+        ratios = spare[pushed > 0] / pushed[pushed > 0]
+        guess = float(ratios.min(initial=math.inf)) * 0.9
+        usable = math.isfinite(guess) and guess > 0
+        return largest(lambda t: self.decide(t * load, rate), guess if usable else 1.0,
+                       self.tolerance)  # fmt: skip
 
-    def margin(self, i: int, bounds: list[float]) -> BallFunction:
-        """What the disturbances leave of row i of (16)."""
-        return lambda q: reduce(sub, self._loads(i, q, bounds), self.spare(q)[i])
+    def verdict(self, bounds: Sequence[float], rate: Sequence[float]) -> Verdict:
+        """Decide it; the margin is what is left of (16) at its smallest, or the gain it lacks."""
+        found = self.decide(bounds, rate)
+        guess = max(0.1 * float(max(self.law.eta)), 1e-3)
+        if found.kind == "proved":
+            margin = largest(
+                lambda more: self.decide(bounds, [r + more for r in rate]), guess, self.tolerance
+            ).proved
+        else:
+            short = largest(
+                lambda inverse: self.decide(bounds, rate, 1 / inverse), 1 / guess, self.tolerance
+            )
+            margin = -1 / short.proved if short.proved else math.nan
+            if short.proved and short.failed and short.failed.kind == found.kind:
+                found = replace(found, witness=short.failed.witness)
+        kind = cast(Kind, found.kind)
+        return Verdict(found.sentence, kind, margin, "1/s", found.witness, found.why)
 
-    def factor(self, bounds: list[float]) -> tuple[float, float, tuple[float, ...]]:
-        """Largest factor on ``bounds``: proved, refuted, and where it is hardest."""
-        proved, refuted, point = math.inf, math.inf, tuple(0.0 for _ in self.box)
-        for i in range(self.mechanism.m if any(bounds) else 0):
-
-            def load(q: list[Any], i: int = i) -> Any:
-                return -sum(self._loads(i, q, bounds)) / self.spare(q)[i]
-
-            found = self.minimum(load)
-            low = 1 / -found.lower * (1 - 1e-15) if found.lower < 0 else math.inf
-            proved = min(proved, low if math.isfinite(found.lower) else 0.0)
-            high = 1 / -found.value * (1 + 1e-15) if found.value < 0 else math.inf
-            if high < refuted:
-                refuted, point = high, found.point
-        return proved, refuted, point
-
-    def alone(self, j: int) -> DisturbanceBound:
+    def alone(self, j: int, rate: Sequence[float]) -> DisturbanceBound:
         """What is overcome of a disturbance on coordinate j alone."""
-        mechanism, stops = self.mechanism, {"stop_above": 0.0, "stop_below": 0.0}
-        proved, refuted, point = 0.0, 0.0, tuple(0.0 for _ in self.box)
+        found = self.largest(np.eye(self.mechanism.n)[j], rate)
+        witness = dict(found.failed.witness) if found.failed else {}
+        return self.bound(j, found.proved, found.refuted, witness)
 
-        def least(i: int) -> float:
-            return self.minimum(lambda q: self.spare(q)[i], **stops).lower
-
-        if all(least(i) > 0 for i in range(mechanism.m)):
-            proved, refuted, point = self.factor([float(k == j) for k in range(mechanism.n)])
-        coordinate = mechanism.coordinates[j]
+    def bound(
+        self, j: int, proved: float, refuted: float, witness: dict[str, float]
+    ) -> DisturbanceBound:
+        """Return these figures of coordinate j with their units."""
+        mechanism = self.mechanism
+        coordinate, B, m = mechanism.coordinates[j], mechanism.B, mechanism.m
+        unit = "N m" if coordinate.unit == "rad" else "N"
         as_input, input_unit = math.nan, ""
-        B = mechanism.B
-        if j < mechanism.m and np.count_nonzero(B - np.diag(np.diag(B))) == 0:
+        if j < m and np.count_nonzero(B - np.diag(np.diag(B))) == 0:
             as_input, input_unit = proved / abs(float(B[j, j])), mechanism.inputs[j].unit
-        names = (c.name for c in mechanism.coordinates)
-        witness = dict(zip(names, point, strict=True))
         return DisturbanceBound(
-            coordinate.name,
-            j < mechanism.m,
-            proved,
-            refuted,
-            _unit(coordinate.unit),
-            witness,
-            as_input,
-            input_unit,
+            coordinate.name, j < m, proved, refuted, unit, witness, as_input, input_unit
         )
 
 
@@ -350,11 +299,10 @@ class ReachingClaim(Claim):
 
     def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Decide it as :func:`reaching` does for the gains of the reaching law."""
-        return reaching(
-            mechanism, surface, self.region, law, eta=self.eta, disturbance=self.disturbance
-        ).verdict
+        condition = _Condition.of(mechanism, surface, self.region, law, 1e-3, MOST_BOXES)
+        return condition.verdict(self.disturbance, self.eta)
 
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
         """Return it as the kernel decides it."""
         bounds, rate = (tuple(map(Fraction, v)) for v in (self.disturbance, self.eta))
-        return kernel.Reaching(exact_box(self.region), bounds, rate)
+        return kernel.Reaching(exact_region(mechanism, self.region), bounds, rate)

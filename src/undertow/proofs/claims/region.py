@@ -18,12 +18,12 @@ from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.intervals.require import require
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Matrix
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
+from undertow.proofs.require import require
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from undertow.law.stability import sliding_matrix
 from undertow.models.mechanism import TIME, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.intervals.exact_model import exact_mechanism
+from undertow.proofs.exact_model import exact_mechanism
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.graph import Span
 from undertow.proofs.kernel.model import System

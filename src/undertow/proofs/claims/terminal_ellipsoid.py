@@ -26,10 +26,10 @@ from undertow.law import (
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.intervals.require import require, require_autonomous
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.graph import Span
 from undertow.proofs.kernel.model import System
+from undertow.proofs.require import require, require_autonomous
 
 
 @dataclass(frozen=True, eq=False)

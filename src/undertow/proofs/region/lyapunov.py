@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.models.mechanism import FloatArray
-from undertow.proofs.intervals.require import require
+from undertow.proofs.require import require
 
 
 @dataclass(frozen=True)

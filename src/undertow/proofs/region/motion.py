@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from undertow.law import Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism, Parameter
-from undertow.proofs.intervals.exact_model import (
+from undertow.proofs.exact_model import (
     exact_matrix,
     exact_mechanism,
     is_odd,
 )
-from undertow.proofs.intervals.require import require, require_autonomous
+from undertow.proofs.require import require, require_autonomous
 from undertow.symbolic import Tape, compile_numpy
 
 

@@ -23,11 +23,11 @@ from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
-from undertow.proofs.intervals.require import require
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import STEP
 from undertow.proofs.kernel.loop import MOST_OF_ONE, ContinuousLoop, HeldLoop, Loop
 from undertow.proofs.kernel.model import Law, Model, scale_of
+from undertow.proofs.require import require
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.

@@ -29,17 +29,56 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from undertow.base.errors import InvalidInputError
+from undertow.base.errors import InvalidInputError, MissingExtraError
 from undertow.base.verdict import Kind, Verdict, inward
 from undertow.law import Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.stability import exact_linearisation
-from undertow.proofs.intervals.interval import ball, flint, lower_float, upper_float
 
 Matrix = list[list[Any]]
 BallMatrix = NDArray[np.object_]
 
 BITS = 200
+
+
+def flint() -> Any:
+    """Import python-flint, or say in one line what to install.
+
+    Raises
+    ------
+    MissingExtraError
+        When python-flint is not there.
+    """
+    try:
+        import flint as module
+    except ImportError as error:
+        raise MissingExtraError(
+            "ball arithmetic needs python-flint",
+            remedy="Install the extra: pip install 'undertow[certify]'",
+        ) from error
+    return module
+
+
+def ball(low: float | Fraction, high: float | Fraction | None = None) -> Any:
+    """Return an arb that contains [low, high], or the single number ``low``."""
+    module = flint()
+    first = module.arb(_fmpq(low))
+    return first if high is None or high == low else first.union(module.arb(_fmpq(high)))
+
+
+def _fmpq(value: float | Fraction) -> Any:
+    exact = Fraction(value)
+    return flint().fmpq(exact.numerator, exact.denominator)
+
+
+def lower_float(value: Any) -> float:
+    """Return a float that is not above the lower end of a ball."""
+    return math.nextafter(float(value.lower()), -math.inf)
+
+
+def upper_float(value: Any) -> float:
+    """Return a float that is not below the upper end of a ball."""
+    return math.nextafter(float(value.upper()), math.inf)
 
 
 class Constants(NamedTuple):

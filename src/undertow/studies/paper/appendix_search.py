@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from undertow.base import InfeasibleError, require_extra
 from undertow.base.verdict import Verdict
-from undertow.proofs.intervals.interval import flint
 from undertow.studies.paper.appendix import (
     BITS,
     Lyapunov,
     Reduced,
     decay_rate,
+    flint,
     gamma_factor,
     two_vertex,
 )

@@ -9,15 +9,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from fractions import Fraction
 from functools import lru_cache
 
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.base.errors import InvalidInputError
 from undertow.models.mechanism import TIME, Mechanism
 from undertow.models.validity import require_smooth
-from undertow.proofs.intervals.interval import exact_fraction
+
+
+def exact_fraction(expression: sp.Expr) -> Fraction:
+    """Return the exact value of a SymPy number: a Float counts as the binary number it is.
+
+    Raises
+    ------
+    InvalidInputError
+        For a number that is not rational.
+    """
+    if expression.is_Float:
+        sign, mantissa, exponent, _ = expression._mpf_
+        return Fraction((-1) ** sign * int(mantissa)) * Fraction(2) ** int(exponent)
+    if expression.is_Rational:
+        return Fraction(int(expression.p), int(expression.q))
+    raise InvalidInputError("exact value", value=str(expression), limit="a rational number")
 
 
 def exact_number(value: float) -> sp.Rational:

@@ -1,1 +1,0 @@
-"""Arithmetic with rounding that encloses: intervals, exact models, branch and bound."""
