@@ -77,7 +77,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@"$(PYTHON)" -m venv --clear $(VENV) || { \
 	    echo "error: '$(PYTHON) -m venv' failed; some systems package it apart (python3-venv)."; \
 	    exit 1; } >&2
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bounds,campaign,certify,compare,gym,interop,logs,mujoco,show,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[appendix,bounds,campaign,compare,gym,interop,logs,mujoco,show,dev]'
 	@touch $@
 
 # What builds the site comes on top, for those who build it.

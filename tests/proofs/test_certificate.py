@@ -49,7 +49,7 @@ from undertow.studies.certification import certificate_files, certify_surface, v
 from undertow.studies.paper.appendix import CASES, Constants, two_vertex
 from undertow.studies.paper.appendix_search import search_rate
 
-pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+pytest.importorskip("flint", reason="the appendix's cases take the extra undertow[appendix]")
 
 RIG = ut.mechanisms.rotary_pendulum()
 SURFACE = ut.Surface(-1, -1.59, 1.96, 12.1)

@@ -21,7 +21,7 @@ import scipy.integrate
 import scipy.linalg
 import sympy as sp
 
-pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+pytest.importorskip("flint", reason="the appendix's cases take the extra undertow[appendix]")
 
 import undertow as ut
 from undertow.base import UndertowError

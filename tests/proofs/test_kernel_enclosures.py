@@ -334,7 +334,7 @@ def loop_misses(
 
     In the coordinates (q, p, s); what the reference has of q and q̇ is compared with their image.
     """
-    flint = pytest.importorskip("flint", reason="the reference takes the extra undertow[certify]")
+    flint = pytest.importorskip("flint", reason="the reference takes the extra undertow[appendix]")
     from motions import BITS, ORDER, Reference, exact
 
     rig = ut.mechanisms.LIBRARY[name]()

@@ -89,7 +89,7 @@ def sampled(
 
 def misses(name: str, count: int, seed: int, part: float) -> tuple[int, int, list[float]]:
     """Thin tubes of three periods against series of 60 digits, the plant not the law's."""
-    flint = pytest.importorskip("flint", reason="the reference takes the extra undertow[certify]")
+    flint = pytest.importorskip("flint", reason="the reference takes the extra undertow[appendix]")
     from motions import BITS, ORDER, Reference, exact
 
     rig = ut.mechanisms.LIBRARY[name]()

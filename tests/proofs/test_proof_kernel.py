@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 import sympy as sp
 
-pytest.importorskip("flint", reason="the search for claims is the extra undertow[certify]")
-
 import undertow as ut
 from undertow.base import ModelError
 from undertow.base.errors import CertificateError

@@ -19,8 +19,6 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
-pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
-
 import undertow as ut
 from support import rest_slow
 from undertow.base import Verdict

@@ -30,8 +30,6 @@ from undertow.proofs.search.linear_program import minimise_linear
 from undertow.proofs.search.region import search_region
 from undertow.studies.paper.appendix import CASES, Constants
 
-pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
-
 RIG = ut.mechanisms.rotary_pendulum()
 MOTION = SurfaceMotion(RIG, ut.Surface(-1, -1.59, 1.96, 12.1))
 CONSTANTS = Constants.of(RIG)

@@ -20,8 +20,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-pytest.importorskip("flint", reason="the search for claims is the extra undertow[certify]")
-
 import undertow as ut
 from undertow.cli import app
 from undertow.proofs.claims.document import document_bytes

@@ -25,8 +25,6 @@ from undertow.proofs.exact_model import (
     exact_fraction,
 )
 
-pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
-
 RIG = ut.mechanisms.rotary_pendulum()
 BASE = ut.Surface(-1, -0.5, 5, 10)
 

@@ -19,8 +19,6 @@ ALARM = pytest.mark.skipif(
 
 
 def cases(kind: str, count: int) -> None:
-    if kind == "certificate":
-        pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
     summary = fuzz_files.fuzz(kind, count)
     assert summary.count == count
     assert summary.failures == []

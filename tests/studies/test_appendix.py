@@ -28,8 +28,8 @@ from undertow.studies.paper.appendix import (
 from undertow.studies.paper.appendix_report import _rows, figures, report
 from undertow.studies.paper.appendix_search import search_interval, search_rate
 
-pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
-pytest.importorskip("clarabel", reason="the search is the extra undertow[certify]")
+pytest.importorskip("flint", reason="the appendix's cases take the extra undertow[appendix]")
+pytest.importorskip("clarabel", reason="the search is the extra undertow[appendix]")
 
 RIG = ut.mechanisms.rotary_pendulum()
 REAL = Constants.of(RIG)

@@ -34,7 +34,7 @@ from undertow.studies.certification import (
 )
 from undertow.studies.paper.appendix import CASES
 
-pytest.importorskip("flint", reason="ball arithmetic is the extra undertow[certify]")
+pytest.importorskip("flint", reason="the appendix's cases take the extra undertow[appendix]")
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 GOOD = ut.Surface(-1, -1.59, 1.96, 12.1)

@@ -1,10 +1,8 @@
 """Certificates: claims about a surface, a region or the closed loop, each with its verdict.
 
-``kernel`` decides.  ``claims``
-has a file for each kind of claim and reads, writes and verifies certificates; what ``search`` finds
-is trusted nowhere.  The admission gate (:mod:`undertow.proofs.gate`) and random trials
-(:mod:`undertow.proofs.sampled`) prove less.  Needs the extra ``undertow[certify]`` (python-flint,
-Clarabel), imported when first used.
+``kernel`` decides.  ``claims`` has a file for each kind of claim and reads, writes and verifies
+certificates; what ``search`` finds is trusted nowhere.  The admission gate
+(:mod:`undertow.proofs.gate`) and random trials (:mod:`undertow.proofs.sampled`) prove less.
 """
 
 from undertow.base.verdict import Verdict

@@ -6,12 +6,10 @@ mechanism, from the sampling period, and from what a bench tells of its sensors 
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from undertow.base import MissingExtraError
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
 from undertow.estimators import Belief, Estimator, KalmanFilter
 from undertow.law import ProvedSet, ReachingLaw, Surface, first_surface
@@ -105,9 +103,7 @@ def reaching_for(estimator: Estimator) -> ReachingLaw:
 def provable(
     mechanism: Mechanism, surfaces: Sequence[Surface], reaching: ReachingLaw
 ) -> tuple[ProvedSet, ...]:
-    """Return the sets that are proved for a catch: none can be without ``undertow[certify]``."""
+    """Return the sets that are proved for a catch."""
     from undertow.proofs import terminal_sets
 
-    with contextlib.suppress(MissingExtraError):
-        return terminal_sets(mechanism, surfaces, reaching)
-    return ()
+    return terminal_sets(mechanism, surfaces, reaching)

@@ -39,7 +39,7 @@ from undertow.symbolic.private import cache_folder, private_folder
 ADDS = {
     "show": "the live page",
     "bounds": "optimal-control bounds",
-    "certify": "proofs of regions and of the closed loop",
+    "appendix": "the paper's appendix: a Lyapunov matrix for each case",
     "mujoco": "an independent engine, and its reader of MJCF",
     "interop": "pandas, xarray, python-control",
     "gym": "environments for Gymnasium",

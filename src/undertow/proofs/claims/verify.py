@@ -156,8 +156,6 @@ def verify(
         For another mechanism, or a certificate without claims.
     ModelError
         For a mechanism that is not smooth.
-    MissingExtraError
-        Without python-flint.
     """
     document = certificate.document
     model = document.model_hash

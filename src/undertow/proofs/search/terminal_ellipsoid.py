@@ -232,8 +232,6 @@ def terminal_sets(
 
     Raises
     ------
-    MissingExtraError
-        Without ``undertow[certify]``.
     InvalidInputError
         For a force that depends on time, or a switching function that is not smooth at 0.
     """

@@ -62,8 +62,6 @@ def certify(
 
     Raises
     ------
-    MissingExtraError
-        Without ``undertow[certify]``.
     ModelError
         For a mechanism that is not smooth.
 
@@ -150,8 +148,6 @@ def verify(
     ------
     ArtefactError, CertificateError
         When the file cannot be read, is damaged, or is about another mechanism.
-    MissingExtraError
-        Without ``undertow[certify]``.
     """
     given = (
         certificate if isinstance(certificate, Certificate) else read_certificate(Path(certificate))

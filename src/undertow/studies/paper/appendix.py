@@ -54,21 +54,15 @@ def flint() -> Any:
     except ImportError as error:
         raise MissingExtraError(
             "ball arithmetic needs python-flint",
-            remedy="Install the extra: pip install 'undertow[certify]'",
+            remedy="Install the extra: pip install 'undertow[appendix]'",
         ) from error
     return module
 
 
-def ball(low: float | Fraction, high: float | Fraction | None = None) -> Any:
-    """Return an arb that contains [low, high], or the single number ``low``."""
-    module = flint()
-    first = module.arb(_fmpq(low))
-    return first if high is None or high == low else first.union(module.arb(_fmpq(high)))
-
-
-def _fmpq(value: float | Fraction) -> Any:
+def ball(value: float | Fraction) -> Any:
+    """Return an arb that contains a number."""
     exact = Fraction(value)
-    return flint().fmpq(exact.numerator, exact.denominator)
+    return flint().arb(flint().fmpq(exact.numerator, exact.denominator))
 
 
 def lower_float(value: Any) -> float:

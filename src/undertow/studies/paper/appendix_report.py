@@ -183,7 +183,7 @@ def files() -> dict[str, bytes]:
     Raises
     ------
     MissingExtraError
-        Where ``undertow[certify]`` is not installed.
+        Where ``undertow[appendix]`` is not installed.
     """
     return {
         "appendix.md": markdown().encode(),

@@ -32,7 +32,7 @@ def _solve_sdp(
     objective: FloatArray, blocks: Sequence[tuple[FloatArray, FloatArray]]
 ) -> FloatArray:
     """Minimise objective·x subject to C + Σ x_i A_i ⪰ 0 for blocks (C, A), A (k, 3, 3)."""
-    clarabel = require_extra("clarabel", "certify", "the search for P needs Clarabel")
+    clarabel = require_extra("clarabel", "appendix", "the search for P needs Clarabel")
     from scipy import sparse
 
     def svec(M: FloatArray) -> FloatArray:
