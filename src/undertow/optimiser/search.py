@@ -7,6 +7,11 @@ where there may be several one after another: its copies are what they are impro
 
 What independent random starts of a global search lead to is kept: it tells how likely its answer
 is the best one, see :mod:`undertow.optimiser.confidence`.
+
+References
+----------
+.. [1] Ursem, "Multinational evolutionary algorithms", Proc. CEC 1999, 1633-1640: the hill-valley
+   test.
 """
 
 from __future__ import annotations
@@ -150,20 +155,36 @@ def single_budget(size: int) -> int:
 def restart_budget(size: int) -> int:
     """Return the evaluations of all restarts with so many coordinates; none where they are many."""
     terms = (size + 1) * (size + 2) // 2
-    return RESTARTS * (TRIED + TERMS * terms) if size <= MODEL_SIZE else 0
+    return RESTARTS * (TRIED + TERMS * terms + LANES) if size <= MODEL_SIZE else 0
 
 
 def _restart(task: Optimisation) -> None:
-    """Search from independent random starts, and keep where that leads."""
-    task.minima.append(task.best_cost)
-    each = task.left // RESTARTS
+    """Search from independent random starts, and keep the minima to which that leads.
+
+    An end from which the way straight to the best plan leads over no higher cost lies in the
+    valley of that [1]_: descents that are not finished are not other minima.
+    """
+    each, ends = task.left // RESTARTS - LANES, []
     for _ in range(RESTARTS):
-        if task.left < each or task.late():
+        if task.left < each + LANES or task.late():
             break
         drawn = task.firsts[0] + task.space.steps(task.rng, np.ones(TRIED))
-        here = drawn[task.cost(drawn).argmin()]
-        cost = _model_search(task, here, each - TRIED).best_f
-        task.minima.append(cost if cost < INADMISSIBLE else np.inf)
+        here, cost = drawn[task.cost(drawn).argmin()], np.inf
+        most, gained = each - TRIED, True
+        while gained and most >= LANES and not task.late():
+            before = task.evaluations
+            search = _model_search(task, here, most)
+            gained = search.best_f < (1.0 - WORTHWHILE) * cost
+            here, cost = search.best_x, min(cost, search.best_f)
+            most -= max(task.evaluations - before, 1)
+        if cost < INADMISSIBLE:
+            ends.append((here, cost))
+    parts = np.linspace(0.0, 1.0, LANES + 2)[1:-1, None]
+    task.minima.append(task.best_cost)
+    for here, cost in ends:
+        between = task.cost(task.centre + parts * (here - task.centre))
+        valley = between.max() <= (1.0 + WORTHWHILE) * cost
+        task.minima.append(task.best_cost if valley else cost)
 
 
 def _division(task: Optimisation) -> tuple[float, ...]:

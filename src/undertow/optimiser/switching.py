@@ -25,7 +25,7 @@ from undertow.optimiser.schedules import earliest_arrival, earliest_motion
 from undertow.optimiser.task import Optimisation
 
 #: Draws around the fits, and their spread, between two powers of ten.
-DRAWN, SPREAD = 700, (-2.5, 0.0)
+DRAWN, SPREAD = 2000, (-2.5, 0.0)
 
 #: Members, first spread and most generations of a population around the closest of them.
 MEMBERS, NARROW, GENERATIONS = 24, 0.05, 60
