@@ -48,7 +48,7 @@ def test_the_law_asks_for_no_input_where_the_motion_switches(
 ) -> None:
     """The law itself, at these states, for fits that nothing else draws: |u| ≪ its limit.
 
-    Before and after, along the motion, it is at the limits on the motion's side.
+    Where the motion is at a limit, its sign is the motion's.
     """
     task, motion = earliest
     mechanism, limit = task.loop.mechanism, task.loop.input_limits[0]
@@ -60,10 +60,12 @@ def test_the_law_asks_for_no_input_where_the_motion_switches(
         (surface,), (law,) = plan.surfaces, plan.laws(task.loop.reaching)
         control = SlidingModeLaw(mechanism, surface, reaching=law)
         u = np.array([float(control(0.0, state).u[0]) for state in x.T])
-        along = np.array([float(control(0.0, state).u[0]) for state in motion.x[:-3]])
-        held = np.abs(motion.u[:-3, 0]) > 0.99 * limit
-        agrees = np.sign(along[:-1]) == np.sign(motion.u[:-3, 0])[: len(along) - 1]
-        small.append(np.abs(u).max() < 0.05 * limit and agrees[held[:-1]].mean() > 0.85)
+        # Nodes of the motion but for the first, where its start is, and the end beside the target.
+        along = np.array([float(control(0.0, state).u[0]) for state in motion.x[1:-3]])
+        before, after = motion.u[:-3, 0] / limit, motion.u[1:-2, 0] / limit
+        held = (before * after) > 0.99  # at one limit on either side of the node
+        agrees = along[held] * before[held] > 0.0
+        small.append(np.abs(u).max() < 0.05 * limit and agrees.all())
     assert sum(small) >= 3
 
 
