@@ -6,12 +6,13 @@ arrival by :mod:`undertow.optimiser.arrival`.  Of a smooth cost the best single 
 where there may be several one after another: its copies are what they are improved from.
 
 What independent random starts of a global search lead to is kept: it tells how likely its answer
-is the best one, see :mod:`undertow.optimiser.confidence`.
+is the best one, see :mod:`undertow.optimiser.confidence`.  For a smooth cost these are descents of
+their own in the end, unfinished ones told from other minima by a hill-valley test [1]_; for the
+time of arrival the searches far and wide and from switching points.
 
 References
 ----------
-.. [1] Ursem, "Multinational evolutionary algorithms", Proc. CEC 1999, 1633-1640: the hill-valley
-   test.
+.. [1] Ursem, "Multinational evolutionary algorithms", Proc. CEC 1999, 1633-1640.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def _restart(task: Optimisation) -> None:
     """Search from independent random starts, and keep the minima to which that leads.
 
     An end from which the way straight to the best plan leads over no higher cost lies in the
-    valley of that [1]_: descents that are not finished are not other minima.
+    valley of that: descents that are not finished are not other minima.
     """
     each, ends = task.left // RESTARTS - LANES, []
     for _ in range(RESTARTS):
