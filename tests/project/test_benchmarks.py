@@ -336,7 +336,11 @@ def test_basins_count_what_only_others_find_and_leave_out_what_nobody_does(
     """Claim: where only a long search arrives the default has missed; where none does, nobody."""
     kind = basins.Kind("cart_pendulum", "energy", "free")
     costs = [(1.0, 0.995), (1.02, 1.0), (np.inf, 3.0), (np.inf, np.inf)]
-    every = [basins.Tally(kind, k, {"default": a, "ours 1": b}) for k, (a, b) in enumerate(costs)]
+    sure = (0.91, 0.95, None, 0.5)
+    every = [
+        basins.Tally(kind, k, {"default": a, "ours 1": b}, said)
+        for k, ((a, b), said) in enumerate(zip(costs, sure, strict=True))
+    ]
     assert [t.missed for t in every] == [False, True, True, False]
     good, count, low, high = basins.share(every)
     assert (good, count) == (1, 3)
@@ -344,7 +348,8 @@ def test_basins_count_what_only_others_find_and_leave_out_what_nobody_does(
     assert high == pytest.approx(0.7923, abs=1e-3)
     basins.report(every, [kind], 0)
     shown = capsys.readouterr().out
-    assert re.search(r"cart_pendulum, energy, free +4 +1 +1 of 3 .* fails", shown)
+    assert re.search(r"cart_pendulum, energy, free +4 +1 +1 of 2 +1 of 3 .* fails", shown)
+    assert "2 of 4 answers, 1 of them within 1 %" in shown
     assert "1 of 3 starts, 33.3 %" in shown
 
 

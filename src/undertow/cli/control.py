@@ -184,7 +184,9 @@ def optimise(
     hard_input: options.HardInput = False,
     box: options.Box = None,
     horizon: options.Horizon = 60.0,
-    evaluations: Annotated[int, option("Largest number of rollouts of the search.")] = 3072,
+    evaluations: Annotated[
+        int | None, option("Largest number of rollouts of the search; by default as it needs.")
+    ] = None,
     seed: options.Seed = 0,
     out: Annotated[Path | None, folder("proposal.json")] = None,
 ) -> None:
@@ -194,7 +196,8 @@ def optimise(
 
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
     check_out(out)
-    optimiser = Optimiser(ClosedLoop(belief, goal), cold=Budget(evaluations), seed=seed)
+    cold = None if evaluations is None else Budget(evaluations)
+    optimiser = Optimiser(ClosedLoop(belief, goal), cold=cold, seed=seed)
     with progress_bar() as progress:
         progress("searching for the best surface", 0.0)
         proposal = optimiser.require(x0)

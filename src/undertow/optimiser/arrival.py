@@ -72,10 +72,13 @@ class ArrivalSearch:
     shorter: float = SHORTER
     fewest: int = FEWEST
 
-    def run(self, z: FloatArray, T: float, members: int) -> None:
-        """Search from those of some parameters (N, d) that come nearest until T, s."""
+    def run(self, z: FloatArray, T: float, members: int) -> float:
+        """Search from those of some parameters (N, d) that come nearest until T, s.
+
+        Returns the earliest arrival that was found, s.
+        """
         if self.without(len(z)):
-            return
+            return np.inf
         z, x, t = nearest(z, *self.states(z, T), members)
         damping, quiet, earliest = np.full(len(z), 1e-2), 0, np.inf
         while quiet < PATIENCE and len(z) and not self.without(len(z) * (z.shape[1] + len(TRIALS))):
@@ -96,6 +99,7 @@ class ArrivalSearch:
             else:
                 quiet += 1
             z, x, t, damping = closer(partial(self.states, T=T), z, x, t, damping)
+        return float(earliest)
 
 
 def closer(

@@ -1,15 +1,21 @@
-"""Surfaces fitted to a piece of a given motion, by linear least squares.
+"""Surfaces fitted to a given motion, by linear least squares.
 
-In its boundary layer the law makes ṡ + r s = 0 with the rate r = η/ε.  Along a motion that is
-given, with its accelerations, that is linear in the entries of λ_a, α_u and λ_u: each row of a
+In its boundary layer the law makes ṡ + r s = 0 with the rate r = η/ε.  Where a motion is given,
+with its accelerations, that is linear in the entries of λ_a, α_u and λ_u: each row of a
 surface is the least-squares solution, drawn towards a first surface where the motion leaves it
-open.  The layer is as thick as keeps the motion inside it.  How fast r should be and how strongly
-to draw is not known: each pair of some gives a surface.
+open.  How fast r should be and how strongly to draw is not known: each pair of some gives a
+surface.
+
+A piece of a motion is followed within a layer as thick as keeps it inside (:func:`fits`).  A
+motion that is at the limits of its inputs but for its switches is followed where the law, too,
+passes through no input at the switching points (:func:`switching_fits`).
 """
 
 from __future__ import annotations
 
 import itertools
+import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -24,6 +30,11 @@ RATES, DRAWN_TO = (15.0, 40.0, 80.0, 150.0, 300.0), (1e-4, 1e-2, 1e-1)
 #: Thickness of the layer, in parts of the largest |s| along the motion.
 THICK = 2.0
 
+#: The same of a motion that switches.  At an infinite rate s = 0 at its switching points, whatever
+#: the accelerations are; the law has the largest of the others.
+SWITCHING_RATES, SWITCHING_DRAWN_TO = (60.0, 100.0, 170.0, 300.0, math.inf), (1e-6, 1e-2, 3e-2)
+SWITCHING_THICK = (0.05, 0.3, 2.0)
+
 
 def fits(space: SearchSpace, anchor: Surface, x: FloatArray, qdd: FloatArray) -> FloatArray:
     """Return search coordinates (N, d) of surfaces that follow a piece of a motion.
@@ -37,25 +48,65 @@ def fits(space: SearchSpace, anchor: Surface, x: FloatArray, qdd: FloatArray) ->
     x, qdd
         States (2n, K) and accelerations (n, K) along the piece, SI units.
     """
+    pairs = itertools.product(RATES, DRAWN_TO)
+    return np.array([next(_encoded(space, anchor, x, qdd, x, *pair, (THICK,))) for pair in pairs])
+
+
+def switching_fits(
+    space: SearchSpace, anchor: Surface, x: FloatArray, qdd: FloatArray, along: FloatArray
+) -> FloatArray:
+    """Return search coordinates (N, d) of surfaces that switch at some points of a motion.
+
+    Parameters
+    ----------
+    space, anchor
+        See :func:`fits`; without reaching laws of their own only the surfaces count.
+    x, qdd
+        States (2n, K) and accelerations (n, K) without input there, SI units.
+    along
+        States (2n, L) along the whole motion.
+    """
+    pairs = itertools.product(SWITCHING_RATES, SWITCHING_DRAWN_TO)
+    return np.vstack(
+        [list(_encoded(space, anchor, x, qdd, along, *pair, SWITCHING_THICK)) for pair in pairs]
+    )
+
+
+def _encoded(
+    space: SearchSpace,
+    anchor: Surface,
+    x: FloatArray,
+    qdd: FloatArray,
+    along: FloatArray,
+    r: float,
+    drawn: float,
+    thick: tuple[float, ...],
+) -> Iterator[FloatArray]:
+    """Yield the coordinates of a fit with layers in parts of the largest |s| along a motion."""
     n, m = space.n, space.m
-    q, v = x[:n], x[n:]
     first = anchor.normalised()
     centre = np.hstack([first.lambda_a, first.alpha_u, first.lambda_u])
     width = np.maximum(np.abs(centre), 0.05 * np.abs(centre).max())
-    laid = np.vstack([q[:m], v[m:], q[m:]])
+    moved, laid = (0.0, 1.0) if math.isinf(r) else (1.0, r)  # parts of ṡ and of s
+
+    def terms(x: FloatArray) -> FloatArray:
+        q, v = x[:n], x[n:]
+        return np.vstack([q[:m], v[m:], q[m:]])
+
+    v = x[n:]
     rates = np.vstack([v[:m], qdd[m:], v[m:]])
-    found = []
-    for r, drawn in itertools.product(RATES, DRAWN_TO):
-        rows, layer = np.empty((m, 2 * n - m)), np.empty(m)
-        for i in range(m):
-            wanted = qdd[i] + r * v[i]
-            unit = np.abs(wanted).max() + 1e-12
-            terms = ((rates + r * laid) * width[i][:, None]).T / unit
-            ridge = drawn * np.eye(len(width[i]))
-            sides = np.concatenate([wanted / unit, drawn * centre[i] / width[i]])
-            rows[i] = width[i] * np.linalg.lstsq(np.vstack([terms, ridge]), sides, rcond=None)[0]
-            layer[i] = THICK * np.abs(rows[i] @ laid - v[i]).max() + 1e-9
-        surface = Surface(-np.eye(m), rows[:, :m], rows[:, m:n], rows[:, n:])
-        law = ReachingLaw(tuple(r * layer), tuple(layer))
-        found.append(space.encode(Plan((surface,), (0.0,), (law,))))
-    return np.array(found)
+    rows, largest = np.empty((m, 2 * n - m)), np.empty(m)
+    for i in range(m):
+        wanted = moved * qdd[i] + laid * v[i]
+        unit = np.abs(wanted).max() + 1e-12
+        sides = ((moved * rates + laid * terms(x)) * width[i][:, None]).T / unit
+        ridge = drawn * np.eye(len(width[i]))
+        goals = np.concatenate([wanted / unit, drawn * centre[i] / width[i]])
+        rows[i] = width[i] * np.linalg.lstsq(np.vstack([sides, ridge]), goals, rcond=None)[0]
+        largest[i] = np.abs(rows[i] @ terms(along) - along[n + i]).max() + 1e-9
+    surface = Surface(-np.eye(m), rows[:, :m], rows[:, m:n], rows[:, n:])
+    rate = min(r, SWITCHING_RATES[-2])
+    for part in thick:
+        layer = part * largest
+        law = ReachingLaw(tuple(rate * layer), tuple(layer))
+        yield space.encode(Plan((surface,), (0.0,), (law,)))

@@ -139,6 +139,27 @@ class EarliestArrival:
         x = self._flow(motion.x[k].T, u, times - k * piece)
         return x, self._accelerations(x, u)
 
+    def switches(self, motion: OpenLoopMotion) -> tuple[FloatArray, FloatArray]:
+        """Return where inputs pass from one limit to the other: states (2n, K), (n, K).
+
+        The latter are the accelerations with that input at zero.  A switch within a piece is
+        where the limits before and after it make the piece's input in the mean.
+        """
+        limits, piece = self.mechanism.input_limits, motion.time / NODES
+        part = motion.u / limits
+        states, inputs = [np.empty((2 * self.mechanism.n, 0))], [np.empty((len(limits), 0))]
+        for k, i in zip(*np.nonzero(part[:-1] * part[1:] < 0), strict=True):
+            mixed = k if abs(part[k, i]) < abs(part[k + 1, i]) else k + 1
+            before = np.sign(part[k, i])
+            u = motion.u[mixed].copy()
+            u[i] = before * limits[i]
+            passed = 0.5 * (1.0 + before * part[mixed, i]) * piece
+            states.append(self._flow(motion.x[mixed][:, None], u[:, None], np.array([passed])))
+            u[i] = 0.0
+            inputs.append(u[:, None])
+        x, u = np.hstack(states), np.hstack(inputs)
+        return x, self._accelerations(x, u)
+
     def _accelerations(self, x: FloatArray, u: FloatArray) -> FloatArray:
         qdd = self.mechanism.function("dynamics")(0.0, *x, *u, *self.mechanism.parameter_values)
         return np.vstack([np.broadcast_to(entry, x.shape[1:]) for entry in qdd])

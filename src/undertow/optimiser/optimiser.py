@@ -15,7 +15,14 @@ from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_designs
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
-from undertow.optimiser.search import FINE, global_search, local_search, search_earlier
+from undertow.optimiser.search import (
+    FINE,
+    global_search,
+    local_search,
+    restart_budget,
+    search_earlier,
+    single_budget,
+)
 from undertow.optimiser.search_space import DecisionVariables, SearchSpace
 from undertow.optimiser.task import Optimisation
 
@@ -137,9 +144,8 @@ class Optimiser:
         if self.counts_time:
             return Budget(16384 * size)
         size //= self.space.segments
-        divided = FINE * size if schedule or self.space.segments > 1 else 0
-        # 6144 for the three of n = 2; a covariance takes as long to learn as it has entries.
-        return Budget(2048 * size**2 // 3 + divided)
+        several = schedule or self.space.segments > 1
+        return Budget(single_budget(size) + (FINE * size if several else restart_budget(size)))
 
     @checked
     def propose(

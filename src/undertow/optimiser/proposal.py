@@ -72,6 +72,10 @@ class Proposal:
         Time for which ``x`` was given, s.
     message, remedy
         What went wrong, and what could help, in words.
+    confidence
+        How likely no plan of the same kind costs over 1 % less, 0 to 1, from where searches from
+        independent random starts ended, see :mod:`undertow.optimiser.confidence`.  ``None`` for
+        a re-optimisation, for schedules, and where the budget allows fewer than two of these.
     """
 
     plan: Plan | None
@@ -85,12 +89,15 @@ class Proposal:
     computed_for: float
     message: str = ""
     remedy: str = ""
+    confidence: float | None = None
 
     def __repr__(self) -> str:
-        """Show the answer: the plan, its cost, how it was found."""
+        """Show the answer: the plan, its cost, how it was found, how sure that it is the best."""
         plan = self.message if self.plan is None else self.plan
+        sure = "" if self.confidence is None else f"confidence {self.confidence:.0%}, "
         return (
-            f"Proposal({self.status}, cost {self.cost:.6g}, {self.evaluations} evaluations, {plan})"
+            f"Proposal({self.status}, cost {self.cost:.6g}, {sure}"
+            f"{self.evaluations} evaluations, {plan})"
         )
 
     @property

@@ -55,16 +55,8 @@ def follow_earliest(task: Optimisation, keep: int = 0) -> Iterator[bool]:
     optimum.  Yields after each whether the plan is as early by now.  So many evaluations are
     left over.
     """
-    loop, best, long = task.loop, task.best, task.best_cost
-    if best is None or not np.isfinite(loop.mechanism.input_limits).all():
-        return
-    if not long < INADMISSIBLE:
-        long = float(loop.batch(task.x, best, duration=task.horizon, seek=True).closest_time[0])
-    if long <= loop.step:
-        return
-    recorded = loop.simulate(task.x, best, duration=long)
-    arrival = _arrival(task, keep)
-    motion = arrival.improve(OpenLoopMotion.of(recorded, long))
+    arrival = earliest_arrival(task, keep)
+    motion = earliest_motion(task, arrival)
     if motion is None:
         return
     earliest = motion.time
@@ -78,8 +70,20 @@ def follow_earliest(task: Optimisation, keep: int = 0) -> Iterator[bool]:
             yield task.best_cost <= AS_EARLY * earliest
 
 
-def _arrival(task: Optimisation, keep: int) -> EarliestArrival:
-    """The task over all inputs, as long as more evaluations than these are left."""
+def earliest_motion(task: Optimisation, arrival: EarliestArrival) -> OpenLoopMotion | None:
+    """Return the earliest arrival over all inputs near the best plan's; ``None`` without one."""
+    loop, best, long = task.loop, task.best, task.best_cost
+    if best is None or not np.isfinite(loop.mechanism.input_limits).all():
+        return None
+    if not long < INADMISSIBLE:
+        long = float(loop.batch(task.x, best, duration=task.horizon, seek=True).closest_time[0])
+    if long <= loop.step:
+        return None
+    return arrival.improve(OpenLoopMotion.of(loop.simulate(task.x, best, duration=long), long))
+
+
+def earliest_arrival(task: Optimisation, keep: int) -> EarliestArrival:
+    """Return the task over all inputs, as long as more evaluations than these are left."""
     loop = task.loop
     low, high = loop.objective.range_of(loop.mechanism)
     radius = loop.objective.terminal_radius
@@ -95,7 +99,7 @@ def _follow(task: Optimisation, motion: OpenLoopMotion, keep: int) -> None:
     """
     if motion.time < (1.0 - WORTHWHILE) * task.best_cost - task.resolution:
         for _ in range(TRIES):
-            plan = _schedule(task, _arrival(task, keep), motion)
+            plan = _schedule(task, earliest_arrival(task, keep), motion)
             if plan is not None:
                 task.consider(plan)
                 lead_back(task, plan)

@@ -4,6 +4,15 @@ A global search first improves the best of some quadratic designs, which is an a
 then looks elsewhere: for a smooth cost by descents from the best of many draws, for the time of
 arrival by :mod:`undertow.optimiser.arrival`.  Of a smooth cost the best single surface comes first,
 where there may be several one after another: its copies are what they are improved from.
+
+What independent random starts of a global search lead to is kept: it tells how likely its answer
+is the best one, see :mod:`undertow.optimiser.confidence`.  For a smooth cost these are descents of
+their own in the end, unfinished ones told from other minima by a hill-valley test [1]_; for the
+time of arrival the searches far and wide and from switching points.
+
+References
+----------
+.. [1] Ursem, "Multinational evolutionary algorithms", Proc. CEC 1999, 1633-1640.
 """
 
 from __future__ import annotations
@@ -19,6 +28,7 @@ from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
 from undertow.optimiser.schedules import WIDE, WORTHWHILE, follow_earliest, lead_back
+from undertow.optimiser.switching import SwitchingSurfaces
 from undertow.optimiser.task import Optimisation
 from undertow.optimiser.trust_region import TrustRegion
 
@@ -32,6 +42,10 @@ LOOKS = 2
 #: gain this part of the time.
 PATIENCE, GAIN = 8, 3e-3
 
+#: Searches with a model from the best of so many draws each, after a global search of a smooth
+#: cost, to see where they end; and their evaluations, in terms of the model.
+RESTARTS, TRIED, TERMS = 11, 64, 24
+
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
 
@@ -42,6 +56,10 @@ POLISH = 512
 #: A search for arrivals far and wide: its members, draws for each of them, and between which parts
 #: of the best time it begins: what arrives a little later may lead to what arrives earlier.
 CROWD, DRAWS, BEGINS = 48, 64, (0.95, 1.3)
+
+#: Searches from the switches of the earliest arrival that follow each one far and wide, and how
+#: many around the best plan may lead nowhere then.
+SWITCHING, LESS_FRUITLESS = 2, 2
 
 #: The same around the best plan: the spread is between two powers of ten; and how many of these
 #: searches in turn may lead nowhere before the next one far and wide.  With few parameters arrivals
@@ -83,6 +101,9 @@ def global_search(task: Optimisation) -> Iterator[bool]:
     if several:
         task.switch_at((0.0,))
         task.kept = min(FINE * task.space.size, 3 * task.left // 4)
+    again = 0 if several or task.optimiser.counts_time else restart_budget(task.space.size)
+    if again and task.left >= single_budget(task.space.size) + again:
+        task.kept = again
     z = task.firsts[: max(1, task.left)]
     scores = task.cost(z)
     if task.optimiser.counts_time:
@@ -114,11 +135,57 @@ def global_search(task: Optimisation) -> Iterator[bool]:
     while task.left >= optimiser.population and not task.late():
         start = task.centre + task.space.steps(rng, np.ones(1))[0]
         _descend(task, start, 0.3, task.left, 3e-3)
+    if not several and task.kept:
+        task.kept = 0
+        _restart(task)
     yield converged
     if several:
         task.kept = 0
         task.switch_at(_division(task))
         yield _descend(task, task.centre, 0.1, task.left, 1e-4)
+
+
+def single_budget(size: int) -> int:
+    """Return the evaluations of a search for a single surface of a smooth cost.
+
+    6144 for the three parameters of n = 2; a covariance takes as long to learn as it has entries.
+    """
+    return 2048 * size**2 // 3
+
+
+def restart_budget(size: int) -> int:
+    """Return the evaluations of all restarts with so many coordinates; none where they are many."""
+    terms = (size + 1) * (size + 2) // 2
+    return RESTARTS * (TRIED + TERMS * terms + LANES) if size <= MODEL_SIZE else 0
+
+
+def _restart(task: Optimisation) -> None:
+    """Search from independent random starts, and keep the minima to which that leads.
+
+    An end from which the way straight to the best plan leads over no higher cost lies in the
+    valley of that: descents that are not finished are not other minima.
+    """
+    each, ends = task.left // RESTARTS - LANES, []
+    for _ in range(RESTARTS):
+        if task.left < each + LANES or task.late():
+            break
+        drawn = task.firsts[0] + task.space.steps(task.rng, np.ones(TRIED))
+        here, cost = drawn[task.cost(drawn).argmin()], np.inf
+        most, gained = each - TRIED, True
+        while gained and most >= LANES and not task.late():
+            before = task.evaluations
+            search = _model_search(task, here, most)
+            gained = search.best_f < (1.0 - WORTHWHILE) * cost
+            here, cost = search.best_x, min(cost, search.best_f)
+            most -= max(task.evaluations - before, 1)
+        if cost < INADMISSIBLE:
+            ends.append((here, cost))
+    parts = np.linspace(0.0, 1.0, LANES + 2)[1:-1, None]
+    task.minima.append(task.best_cost)
+    for here, cost in ends:
+        between = task.cost(task.centre + parts * (here - task.centre))
+        valley = between.max() <= (1.0 + WORTHWHILE) * cost
+        task.minima.append(task.best_cost if valley else cost)
 
 
 def _division(task: Optimisation) -> tuple[float, ...]:
@@ -161,13 +228,13 @@ def local_search(task: Optimisation, incumbent: Plan) -> bool:
     return fruitless == LOOKS or search.converged
 
 
-def _model_search(task: Optimisation, here: FloatArray) -> TrustRegion:
-    """Follow a quadratic model of the cost from some coordinates on."""
+def _model_search(task: Optimisation, here: FloatArray, most: int | None = None) -> TrustRegion:
+    """Follow a quadratic model of the cost from some coordinates on, to so many evaluations."""
     search = TrustRegion(here, 0.1, LANES, task.rng)
     minimise(
         search,
         task.cost,
-        evaluations=task.left,
+        evaluations=task.left if most is None else most,
         tolerance=1e-4,
         resolution=task.resolution,
         relative=WORTHWHILE,
@@ -254,6 +321,7 @@ def _arrive_earlier(task: Optimisation, wide: bool = False, keep: int = 0) -> bo
     """Search for earlier arrivals around the best plan, or first far and wide.
 
     And far and wide again when that leads nowhere any more; so many evaluations are left over.
+    A first plan is looked for around the switches of the earliest motion, too.
     """
     rng, space, spent = task.rng, task.space, -1
     search = ArrivalSearch(
@@ -262,8 +330,12 @@ def _arrive_earlier(task: Optimisation, wide: bool = False, keep: int = 0) -> bo
         0.9 * task.loop.objective.terminal_radius,
         lambda evaluations: task.left < evaluations + keep or task.late(),
     )
-    most = FRUITLESS if task.optimiser.aims else 1
+    single = wide and not task.optimiser.freedom.schedule and task.loop.ensemble is None
+    most = 1
+    if task.optimiser.aims:
+        most = LESS_FRUITLESS if single else FRUITLESS
     fruitless = most if wide else 0
+    switching: SwitchingSurfaces | None = None
     while task.left > keep and not task.late() and task.evaluations > spent:
         before, spent = task.best_cost, task.evaluations
         if before <= task.loop.step:  # all but there
@@ -271,8 +343,14 @@ def _arrive_earlier(task: Optimisation, wide: bool = False, keep: int = 0) -> bo
         if not before < INADMISSIBLE or fruitless == most:
             z = task.firsts[0] + space.steps(rng, np.full(CROWD * DRAWS, WIDE))
             known = before < INADMISSIBLE
-            search.run(z, rng.uniform(*BEGINS) * before if known else _long(task), CROWD)
+            T = rng.uniform(*BEGINS) * before if known else _long(task)
+            task.minima.append(search.run(z, T, CROWD))
             fruitless = 0
+            if single and not search.without(len(z)):
+                single, switching = False, SwitchingSurfaces.of(task, keep)
+            if switching is not None:
+                ends = (switching.search(task, search) for _ in range(SWITCHING))
+                task.minima.extend(ends)
             continue
         spread = 10.0 ** rng.uniform(*NEAR_AND_FAR, FEW * AROUND)
         search.run(task.centre + space.steps(rng, spread), SHORTER * before, FEW)

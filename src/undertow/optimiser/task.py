@@ -18,6 +18,7 @@ from undertow.closed_loop import INADMISSIBLE, UNSTABLE, Event, RolloutBuffers
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import Margin, Plan, stability_margin
 from undertow.models import FloatArray
+from undertow.optimiser.confidence import confidence
 from undertow.optimiser.proposal import Budget, Proposal, Status, motion_margins
 from undertow.optimiser.search_space import SearchSpace
 from undertow.symbolic import compiled
@@ -96,6 +97,7 @@ class Optimisation:
         self._unscored: Plan | None = None
         self._pace = 0.0
         self.kept = 0
+        self.minima: list[float] = []
         self._buffers: dict[int, RolloutBuffers] = {}
 
     # -- budget ----------------------------------------------------------------------------
@@ -329,6 +331,7 @@ class Optimisation:
             computed_for,
             "" if found else message,
             "" if found else remedy,
+            None if self.warm or not found else confidence(self.minima),
         )
 
 

@@ -241,6 +241,12 @@ def motion_files(
     }
 
 
+def _confidence_row(proposal: Proposal) -> list[tuple[str, str]]:
+    if proposal.confidence is None:
+        return []
+    return [("confidence", f"{proposal.confidence:.0%} that no surface costs over 1 % less")]
+
+
 def proposal_report(
     mechanism: Mechanism, objective: Objective, start: FloatArray, proposal: Proposal
 ) -> RenderableType:
@@ -251,6 +257,7 @@ def proposal_report(
         ("surface", _surface_words(proposal.surface)),
         ("predicted cost", f"{proposal.cost:.6g} {objective.unit}"),
         ("status", proposal.status),
+        *_confidence_row(proposal),
         ("work", f"{proposal.evaluations} rollouts in {proposal.seconds:.2f} s"),
     ]
     bounds = objective.on(mechanism).constraints
@@ -280,6 +287,7 @@ def proposal_files(request: Mapping[str, object], proposal: Proposal) -> dict[st
         margins=[
             {"name": m.name, "value": finite(m.value), "unit": m.unit} for m in proposal.margins
         ],
+        confidence=proposal.confidence,
         evaluations=proposal.evaluations,
         seconds=round(proposal.seconds, 4),
     )
