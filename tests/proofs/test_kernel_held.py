@@ -205,9 +205,9 @@ def test_the_derivative_of_the_map_holds_difference_quotients() -> None:
     half = np.array([ops.norm(row) * loop.radius[1] for row in V])
     mass = [0.1225, 0.1275]
     X = np.vstack([np.column_stack([-half, half]), [mass]])
-    middle, slopes = loop.slopes(X)
-    u, zero = np.array([[-15.0, 15.0]]), np.zeros((1, 2))
-    found = loop.held.derivative(X, u, middle, zero, slopes, loop.step)
+    middle, demand = loop.slopes(X)
+    demand = demand._replace(u=np.array([[-15.0, 15.0]]))
+    found = loop.held.derivative(X, middle, demand, loop.step)
     assert found is not None
     J, back, law = found[0], states(loop), SlidingModeLaw(RIG, SURFACE, LAW)
 

@@ -322,11 +322,10 @@ class _Task:
 
 def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
     """Prepare the search for the loop with a held input, in (q, D p, s)."""
-    n, m, zero = loop.model.n, loop.model.m, np.zeros((loop.model.m, 2))
+    n, m = loop.model.n, loop.model.m
     scale = np.array([*([1.0] * n), *map(float, scale_of(loop.model)), *([1.0] * m)])
     X = np.zeros((loop.size, 2))
-    middle, slopes = loop.slopes(X)
-    found = loop.held.derivative(X, zero, middle, zero, slopes, loop.step)
+    found = loop.held.derivative(X, *loop.slopes(X), loop.step)
     if loop.no_equilibrium or found is None:
         return None
     A = scale[:, None] * found[0].mean(axis=-1) / scale
