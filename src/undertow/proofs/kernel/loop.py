@@ -6,7 +6,7 @@ Coordinates and rates are those of Lemmas 8 and 10 of ``docs/certificate-format.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -15,13 +15,16 @@ import numpy as np
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
 from undertow.proofs.kernel.model import Law, Matrix, Model, System, input_limits, scale_of, system
-from undertow.proofs.kernel.tube import Field, Held, Tube
+from undertow.proofs.kernel.tube import Field, Held, Sampled, Tube, expanded
 
 #: Longest motion, s; steps of one tube, and of all before the checker gives up.
 LONGEST, MOST_OF_ONE, MOST_STEPS = 15.625, 50_000, 500_000
 
 #: The thinnest part of the starts; parts of a box of plants before a terminal set is not shown.
 THINNEST, MOST_PLANTS = 2.0**-16, 512
+
+#: How far inside the layer, of its width, a set is cut at its edge: a part of one piece.
+EDGE = 2.0**-10
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Loop:
     """
 
     model: Model
-    field: Field | Held
+    field: Field
     fixed: FloatArray
     step: FloatArray
     coordinates: Program
@@ -63,9 +66,6 @@ class Loop:
 
     def advance(self, tube: Tube) -> bool:
         """Move a set on by a step; whether it stays where model and law are regular."""
-        if isinstance(self.field, Held):
-            stay = self.field.advance(tube, self.step)
-            return stay is not None and self.kept(stay, self.field.fixed())
         stay = self.field.advance(tube, float(self.step[1]))
         return stay is not None and self.kept(stay, self.fixed)
 
@@ -78,10 +78,7 @@ class Loop:
 
     def aim(self, graph: Graph, x: Sequence[int], W: Matrix, radius: Fraction) -> None:
         """Take {|W x| ≤ radius} as the set."""
-        self.W, self.radius = (
-            np.array([[hull(v, v) for v in row] for row in W]),
-            hull(radius, radius),
-        )
+        self.W, self.radius = np.array([[hull(v, v) for v in r] for r in W]), hull(radius, radius)
         make, number = graph.make, graph.number
         parts = [[make("mul", number(w), k) for w, k in zip(row, x, strict=True)] for row in W]
         self.rows = graph.program([graph.sum(row) for row in parts])
@@ -162,12 +159,35 @@ class HeldLoop(Loop):
             for d, i in zip(renewed, model.inputs, strict=True)
         ]
         self.rates = [*at.sliding(graph.inputs[-m:]), *([graph.number(0)] * len(varied))]
-        self.field = self.held = Held(graph, self.rates, clipped)
+        self.held = Held(graph, self.rates, clipped)
         self.fixed, self.step = np.empty((0, 2)), np.array(hull(period, period))
         self.demand = known.loop(known.push(layer=True))[1]
         self.inside = self.held.by_states(self.demand)
         self.regular = graph.program([*at.regular, *known.regular])
         self.coordinates = start.program([*plain.momentum_and_surface(), *start.inputs[2 * n :]])
+
+    def advance(self, tube: Tube) -> bool:
+        """Move a set on by a period; s_i by parts too, across an edge of the layer (Lemma 13)."""
+        reach = dict[int, FloatArray]()
+        for k, layer in enumerate(self.law.layer, self.size - self.model.m):
+            edge, ends = float(layer) * (1 - EDGE), tube.hull[k]
+            cuts = sorted({*ends, *np.clip([-edge, edge], *ends)})
+            parts = [replace(tube) for _ in cuts[1:]]
+            for part, low, high in zip(parts, cuts, cuts[1:], strict=False):
+                part.restrict(k, low, high)
+            if len(parts) > 1 and all(map(self._advance, parts)):
+                reach[k] = np.array([part.hull[k] for part in parts])
+        if not self._advance(tube):
+            return False
+        for k, ends in reach.items():
+            low, high = np.clip([ends.min(), ends.max()], *tube.hull[k])
+            if high - low < np.ptp(tube.hull[k]):
+                tube.restrict(k, low, high)
+        return True
+
+    def _advance(self, tube: Tube) -> bool:
+        stay = self.held.advance(tube, self.step)
+        return stay is not None and self.kept(stay, self.held.fixed())
 
     def take(self, W: Matrix, radius: Fraction) -> None:
         """Take {|W (q, D p, s)| ≤ radius} as the set."""
@@ -211,25 +231,23 @@ class HeldLoop(Loop):
             todo += _halves(part, int(width.argmax()))
         return "", least
 
-    def slopes(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z = 0 at the middle of plants, and the demand's derivative on X: (m, N, 2)."""
-        m, (a, b) = self.model.m, X.T.copy()
+    def slopes(self, X: FloatArray) -> tuple[FloatArray, Sampled]:
+        """Return z = 0 at the middle of plants, and the demand's derivatives on X."""
+        m, none = self.model.m, np.zeros((self.model.m, 2))
         middle = np.append(np.zeros(self.size), X[self.size :].mean(axis=1))
-        low, high = np.vstack([X, self.held.fixed()]).T.copy()
-        over = self.inside(low, high, len(X))
-        low[: len(X)] = high[: len(X)] = middle
-        own = ops.mean_values(over, self.inside(low, high)[:, 0], a, b, middle)[0]
-        return middle, own[m:].reshape(m, len(X), 2)
+        over, at = expanded(self.inside, X, middle, self.held.fixed())
+        L = ops.mean_values(over, at, *X.T.copy(), middle)[0]
+        return middle, Sampled(none, none, L[m:], at[m:], over[m:, 1:])
 
     def _contracts(self, V: FloatArray, X: FloatArray) -> tuple[str, float]:
         """Decide Lemma 11 for a part of the plants: X (N, 2) is a box around the set, and it."""
-        size, (middle, L) = self.size, self.slopes(X)
-        rows = ops.product(L[:, :size].copy(), V)
+        size, (middle, law) = self.size, self.slopes(X)
+        rows = ops.product(law.L.reshape(-1, len(X), 2)[:, :size].copy(), V)
         most = np.array([ops.up(ops.norm(row) * self.radius[1]) for row in rows])
         if not (most <= input_limits(self.model)).all():
             return "an input limit is met", -np.inf
-        u, zero = np.column_stack([-most, most]), np.zeros((len(most), 2))
-        found = self.held.derivative(X, u, middle, zero, L, self.step)
+        law = law._replace(u=np.column_stack([-most, most]))
+        found = self.held.derivative(X, middle, law, self.step)
         if found is None:
             return "motions over a period have no bounds", -np.inf
         if not self.kept(found[1], self.held.fixed()):

@@ -12,12 +12,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import NOWHERE, FloatArray, Graph, Program
+
+Pair = tuple[FloatArray, FloatArray]
 
 #: Coefficients of a step, the part of a step that may have a corner inside, and the shortest.
 ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
@@ -38,9 +40,8 @@ class Field:
     def __init__(self, graph: Graph, rates: Sequence[int]) -> None:
         self._graph, self._rates, self._pieces = graph, rates, dict[bytes, Program]()
         self._corners = graph.corners(rates)
-        operands = [graph.nodes[k][1:] for k in self._corners]
         self.whole = graph.program(rates)
-        self.gaps = graph.program([graph.make("sub", a, b) for a, b in operands])
+        self.gaps = graph.program([graph.make("sub", *graph.nodes[k][1:]) for k in self._corners])
 
     def piece(self, gaps: FloatArray) -> tuple[Program, bool]:
         """Return the rates where the gaps of corners lie in (K, 2), and whether all are decided."""
@@ -73,8 +74,7 @@ class Field:
                 if part < SHORTEST:
                     return None
                 continue
-            if whole is None:
-                whole = stay
+            whole = stay if whole is None else whole
             low, high = np.minimum(whole[:, 0], stay[:, 0]), np.maximum(whole[:, 1], stay[:, 1])
             whole = np.column_stack([low, high])
             done += part
@@ -90,7 +90,7 @@ class Field:
             return None
         rates = _ends(self.whole, stay, tube.fixed)
         way = ops.reached(np.zeros_like(X), rates, h).reshape(n, 1, 2)
-        gaps = _around(self.gaps, stay, tube.m, tube.fixed)
+        gaps = expanded(self.gaps, stay, tube.m, tube.fixed)
         program, decided = self.piece(ops.along(*gaps, tube.C, tube.xi, way))
         if not decided and not short:
             return None
@@ -106,11 +106,31 @@ class Field:
         return stay if tube.move(rest, centre, around, np.array([h, h])) else None
 
 
+class Sampled(NamedTuple):
+    """A law on a set of states and at a point m of it, with derivatives by the states.
+
+    Parameters
+    ----------
+    u, u_m
+        Its values, (m, 2) each.
+    L, L_m
+        Its derivative on the set, which holds means of it too, and at m, (m N, 2) each, row by row.
+    D
+        The derivative of that one on the set, (m N, N, 2).
+    """
+
+    u: FloatArray
+    u_m: FloatArray
+    L: FloatArray
+    L_m: FloatArray
+    D: FloatArray
+
+
 class Held:
     """ẋ = F(x, u), u = law(x) at the beginning of a period and the same until its end (Lemma 12).
 
-    Inputs of the graph are x (N), Y (N (N + m)), u (m): Y, the derivative of the motion by where it
-    begins and by u, moves with it.
+    Inputs of the graph are x (N), Z (N N), L (m N), u (m): Z, the derivative of the motion by where
+    it begins, of which the law's is L, moves with it.
 
     Parameters
     ----------
@@ -120,18 +140,14 @@ class Held:
 
     def __init__(self, graph: Graph, rates: Sequence[int], law: Sequence[int]) -> None:
         self.N, self.m = N, m = len(rates), len(law)
-        self.graph, self.law, x, u = graph, law, graph.inputs[:N], graph.inputs[-m:]
-        Y = np.array(graph.inputs[N:-m]).reshape(N, N + m).T.tolist()
-        one, columns = graph.number(1), []
-        for j, column in enumerate(Y):
-            by_u = {u[j - N]: one} if j >= N else {}
-            columns.append(graph.tangents(rates, dict(zip(x, column, strict=True)) | by_u))
+        self.graph, self.law, of = graph, law, [*graph.inputs[:N], *graph.inputs[-m:]]
+        by = np.array(graph.inputs[N:-m]).reshape(N + m, N).T.tolist()
+        columns = [graph.tangents(rates, dict(zip(of, column, strict=True))) for column in by]
         self.both = graph.program([*rates, *(c[i] for i in range(N) for c in columns)])
-        self.start = ops.points(np.eye(N, N + m)).reshape(-1, 2)
         self.flow, self.renewed = graph.program(rates), graph.program(law)
+        self.start = ops.points(np.eye(N)).reshape(-1, 2)
         self._corners, self._pieces = graph.corners(law), dict[tuple[int, ...], Program]()
-        operands = [graph.nodes[k][1:] for k in self._corners]
-        self.gaps = graph.program([graph.make("sub", a, b) for a, b in operands])
+        self.gaps = graph.program([graph.make("sub", *graph.nodes[k][1:]) for k in self._corners])
 
     def by_states(self, nodes: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
         """Return nodes, and their derivatives by x, row by row."""
@@ -139,52 +155,46 @@ class Held:
         slopes = [graph.tangents(nodes, {x: one}, sides) for x in graph.inputs[: self.N]]
         return graph.program([*nodes, *(c[i] for i in range(len(nodes)) for c in slopes)], sides)
 
-    def fixed(self, u: FloatArray | None = None) -> FloatArray:
-        """Return the inputs besides x, where Y does not matter, nor u if none is given."""
-        return np.vstack([self.start, np.zeros((self.m, 2)) if u is None else u])
+    def fixed(self, u: FloatArray | None = None, L: FloatArray | None = None) -> FloatArray:
+        """Return the inputs besides x, where Z does not matter, nor what is not given."""
+        none = np.zeros((self.m * (self.N + 1), 2))
+        rest = none[: self.m] if u is None else u
+        return np.vstack([self.start, none[self.m :] if L is None else L, rest])
 
-    def input(self, tube: Tube) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Enclose the law on a set and at its m (m, 2), and its mean slopes from m (m, N, 2).
+    def input(self, tube: Tube) -> Sampled:
+        """Enclose the law on a set.
 
-        Where several pieces of the law may be met, slopes are those of all, for a mean may be of
-        several.
+        Where several pieces of the law may be met, derivatives are those of all, for a mean may be
+        of several, and the same everywhere.
         """
-        none, options = self.fixed(), []
-        gaps = ops.along(*_around(self.gaps, tube.hull, tube.m, none), *tube.parts)
+        none, options, slopes = self.fixed(), list[list[int]](), list[FloatArray]()
+        gaps = ops.along(*expanded(self.gaps, tube.hull, tube.m, none), *tube.parts)
         for (low, high), k in zip(gaps, self._corners, strict=True):
             larger = 2 if self.graph.nodes[k][0] == "max" else 1  # where the gap is below 0
             options.append([larger] if high <= 0.0 else [3 - larger] if low >= 0.0 else [1, 2])
-        pieces, slopes = [*itertools.product(*options)], list[FloatArray]()
-        for piece in pieces:
+        for piece in itertools.product(*options):
             if piece not in self._pieces:
-                sides = {
-                    k: self.graph.nodes[k][i] for k, i in zip(self._corners, piece, strict=True)
-                }
+                pairs = zip(self._corners, piece, strict=True)
+                sides = {k: self.graph.nodes[k][i] for k, i in pairs}
                 self._pieces[piece] = self.by_states(self.law, sides)
-            around, centre = _around(self._pieces[piece], tube.hull, tube.m, none)
-            around[:, 1:] *= 0.5 if len(pieces) == 1 else 1.0
-            slopes.append(ops.along(around, centre, *tube.parts)[self.m :])
-        every = np.array(slopes).reshape(-1, self.m, self.N, 2)
+            own, at = expanded(self._pieces[piece], tube.hull, tube.m, none)
+            slopes.append(ops.along(own, at, *tube.parts)[self.m :])
+        every = np.array(slopes)
         L = np.stack([every[..., 0].min(axis=0), every[..., 1].max(axis=0)], axis=-1)
-        around, centre = _around(self.renewed, tube.hull, tube.m, none)
-        u = ops.along(np.concatenate([around[:, :1], L], axis=1), centre, *tube.parts)
-        return u, centre, L
+        L_m, D = at[self.m :], own[self.m :, 1:]
+        if len(slopes) > 1:
+            L_m, D = L, np.zeros_like(D)
+        around, centre = expanded(self.renewed, tube.hull, tube.m, none)
+        around[:, 1:] = L.reshape(self.m, self.N, 2)
+        return Sampled(ops.along(around, centre, *tube.parts), centre, L, L_m, D)
 
-    def _series(
-        self,
-        X: FloatArray,
-        u: FloatArray,
-        m: FloatArray,
-        u_m: FloatArray,
-        L: FloatArray,
-        order: int,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of (x, Y) on a box, with derivatives along (I, L), and at m."""
-        seeds = np.zeros((self.N + len(self.start) + self.m, self.N, 2))
-        seeds[: self.N], seeds[-self.m :] = ops.points(np.eye(self.N)), L
-        low, high = np.vstack([X, self.fixed(u)]).T.copy()
-        whole = self.both.series(low, high, order - 1, seeds)
-        low, high = np.vstack([np.column_stack([m, m]), self.fixed(u_m)]).T.copy()
+    def _series(self, X: FloatArray, m: FloatArray, law: Sampled, order: int) -> Pair:
+        """Coefficients of (x, Z) on a box, with derivatives by where motions begin, and at m."""
+        nothing = np.zeros((len(self.start), self.N, 2))
+        seeds = [ops.points(np.eye(self.N)), nothing, law.D, law.L.reshape(self.m, self.N, 2)]
+        low, high = np.vstack([X, self.fixed(law.u, law.L)]).T.copy()
+        whole = self.both.series(low, high, order - 1, np.concatenate(seeds))
+        low, high = np.vstack([np.column_stack([m, m]), self.fixed(law.u_m, law.L_m)]).T.copy()
         return whole, self.both.series(low, high, order - 1)[:, :, 0]
 
     def advance(self, tube: Tube, h: FloatArray) -> FloatArray | None:
@@ -196,48 +206,37 @@ class Held:
             A box that all motions stay in on the way, (N, 2); None where they may leave the domain
             of F or the law, or no bounds are found.
         """
-        n, X, order = self.N, tube.hull, _order(h)
-        u, u_m, L = self.input(tube)
-        stay = _stay(self.flow, X, self.fixed(u), h[1]) if np.isfinite(L).all() else None
+        n, order, law = self.N, _order(h), self.input(tube)
+        fixed = self.fixed(law.u)
+        stay = _stay(self.flow, tube.hull, fixed, h[1]) if np.isfinite(law.L).all() else None
         if stay is None:
             return None
-        low, high = np.vstack([stay, self.fixed(u)]).T.copy()
+        low, high = np.vstack([stay, fixed]).T.copy()
         rest = self.flow.series(low, high, order)[:, order, 0]
-        whole, at = self._series(X, u, tube.m, u_m, L, order)
+        whole, at = self._series(tube.hull, tube.m, law, order)
         part = whole[n:].reshape(-1, 1 + n, 2).copy()
         part[:, 1:] *= 0.5  # of the derivative's change, on the way
-        Y = ops.along(part, at[n:].reshape(-1, 2), *tube.coarse).reshape(n, n + self.m, order, 2)
-        around, way = np.zeros((n, order, 1 + n, 2)), np.concatenate([ops.points(np.eye(n)), L])
-        for k in range(order):
-            around[:, k, 1:] = ops.product(Y[:, :, k].copy(), way)
+        around = np.zeros((n, order, 1 + n, 2))
+        Z = ops.along(part, at[n:].reshape(-1, 2), *tube.coarse).reshape(n, n, order, 2)
+        around[:, :, 1:] = Z.transpose(0, 2, 1, 3)
         return stay if tube.move(rest, at[:n], around, h) else None
 
-    def derivative(
-        self, X: FloatArray, u: FloatArray, m: FloatArray, u_m: FloatArray, L: FloatArray,
-        h: FloatArray,
-    ) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
-        """Enclose the derivative of x(h) by x(0) on a box, (N, N, 2), and where motions stay.
+    def derivative(self, X: FloatArray, m: FloatArray, law: Sampled, h: FloatArray) -> Pair | None:
+        """Enclose the derivative of x(h) by x(0) on a box X with a point m, (N, N, 2).
 
-        Parameters
-        ----------
-        X, m
-            The box, (N, 2), and a point of it, (N,).
-        u, u_m, L
-            The law on it, (m, 2), at m, (m, 2), and its derivative on it, (m, N, 2).
+        Also: a box that motions stay in.
         """
-        n, order = self.N, _order(h)
-        stay = _stay(self.both, np.vstack([X, self.start]), u, h[1])
+        n, order, fixed = self.N, _order(h), np.vstack([law.L, law.u])
+        stay = _stay(self.both, np.vstack([X, self.start]), fixed, h[1])
         if stay is None:
             return None
-        low, high = np.vstack([stay, u]).T.copy()
+        low, high = np.vstack([stay, fixed]).T.copy()
         end = self.both.series(low, high, order)[n:, order, 0]
-        whole, at = self._series(X, u, m, u_m, L, order)
-        a, b = X.T.copy()
+        whole, at = self._series(X, m, law, order)
         for k in reversed(range(order)):
-            own, _ = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), a, b, m)
+            own, _ = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), *X.T.copy(), m)
             end = ops.carried(end, own, h)
-        way = np.concatenate([ops.points(np.eye(n)), L])
-        return ops.product(end.reshape(n, n + self.m, 2), way), stay[:n]
+        return end.reshape(n, n, 2), stay[:n]
 
 
 @dataclass
@@ -261,14 +260,13 @@ class Tube:
     @classmethod
     def of(cls, fixed: FloatArray, box: FloatArray) -> Self:
         """Start from a box of doubles, (N, 2)."""
-        n = len(box)
         middle = 0.5 * box[:, 0] + 0.5 * box[:, 1]
-        xi = np.array([ops.add(a, b, -v, -v) for (a, b), v in zip(box, middle, strict=True)])
-        return cls(fixed, box.copy(), middle, np.eye(n), xi.reshape(n, 1, 2))
+        xi = [ops.add(a, b, -v, -v) for (a, b), v in zip(box, middle, strict=True)]
+        return cls(fixed, box.copy(), middle, np.eye(len(box)), np.array(xi)[:, None])
 
-    def values(self, program: Program) -> tuple[FloatArray, FloatArray]:
+    def values(self, program: Program) -> Pair:
         """Enclose values and derivatives over the hull, (O, 1 + N, 2), and values at m, (O, 2)."""
-        return _around(program, self.hull, self.m, self.fixed)
+        return expanded(program, self.hull, self.m, self.fixed)
 
     def image(self, program: Program) -> FloatArray:
         """Enclose values on the set, (O, 2)."""
@@ -277,8 +275,14 @@ class Tube:
     def map(self, program: Program) -> bool:
         """Replace the set by its image; whether that is bounded."""
         around, centre = self.values(program)
-        none = np.zeros_like(self.hull)
-        return self.move(none, centre[:, None], around[:, None], np.ones(2))
+        return self.move(np.zeros_like(self.hull), centre[:, None], around[:, None], np.ones(2))
+
+    def restrict(self, k: int, low: float, high: float) -> None:
+        """Let coordinate k be anywhere in [low, high], the others be as they are."""
+        m, C, box, one = self.m.copy(), self.C.copy(), self.hull.copy(), np.eye(len(self.m), 1, -k)
+        m[k], C[k], box[k] = 0.5 * low + 0.5 * high, 0.0, (low, high)
+        self.m, self.C, self.hull = m, np.hstack([C, one]), box
+        self.xi = np.concatenate([self.xi, [[ops.add(low, high, -m[k], -m[k])]]])
 
     @property
     def parts(self) -> tuple[FloatArray, ...]:
@@ -296,18 +300,15 @@ class Tube:
         added = ops.taylor_step(rest, centre, around, h, m, C, self.xi)
         if not np.isfinite(added).all():
             return False
-        self.m, self.C, self.xi = (
-            m,
-            np.hstack([C, np.eye(len(m))]),
-            np.concatenate([self.xi, added]),
-        )
+        self.m, self.C = m, np.hstack([C, np.eye(len(m))])
+        self.xi = np.concatenate([self.xi, added])
         if self.C.shape[1] > MOST_COLUMNS:
             self.C, self.xi = _folded(self.C, self.xi, KEPT_COLUMNS)
         self.hull = ops.hulled(self.m, self.C, self.xi)
         return True
 
 
-def _folded(C: FloatArray, xi: FloatArray, kept: int) -> tuple[FloatArray, FloatArray]:
+def _folded(C: FloatArray, xi: FloatArray, kept: int) -> Pair:
     """Leave the columns of a set that are the most of its width somewhere; a box for the others."""
     if C.shape[1] <= kept + len(C):
         return C, xi
@@ -350,9 +351,7 @@ def _ends(program: Program, box: FloatArray, fixed: FloatArray) -> FloatArray:
     return program(low, high)[:, 0]
 
 
-def _around(
-    program: Program, box: FloatArray, m: FloatArray, fixed: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def expanded(program: Program, box: FloatArray, m: FloatArray, fixed: FloatArray) -> Pair:
     """Enclose values and derivatives over a box, (O, 1 + N, 2), and values at m, (O, 2)."""
     low, high = np.vstack([box, fixed]).T.copy()
     return program(low, high, len(m)), _ends(program, np.column_stack([m, m]), fixed)

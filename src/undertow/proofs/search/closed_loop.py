@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 
 from undertow.base.errors import InfeasibleError
 from undertow.base.verdict import Verdict
@@ -295,6 +296,8 @@ class _Task:
             )
             search = _held_search(held)
             terminal = None if search is None else _terminal(search, self._coordinates(path))
+            if terminal is not None and self.plant:
+                terminal = replace(terminal, W=_for_all_plants(loop, terminal.W))
             for shrink in 0.8 ** np.arange(12):
                 if terminal is None:
                     break
@@ -320,16 +323,45 @@ class _Task:
         return np.concatenate([q, p, x @ self.surface.matrix.T], axis=-1)
 
 
-def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
-    """Prepare the search for the loop with a held input, in (q, D p, s)."""
-    n, m, zero = loop.model.n, loop.model.m, np.zeros((loop.model.m, 2))
-    scale = np.array([*([1.0] * n), *map(float, scale_of(loop.model)), *([1.0] * m)])
-    X = np.zeros((loop.size, 2))
-    middle, slopes = loop.slopes(X)
-    found = loop.held.derivative(X, zero, middle, zero, slopes, loop.step)
+def _map_at_target(loop: HeldLoop, plant: Sequence[float] = ()) -> FloatArray | None:
+    """The derivative of one plant's map from sample to sample at the target, in (q, D p, s)."""
+    scale = np.ones(loop.size)
+    scale[loop.model.n : loop.size - loop.model.m] = [float(v) for v in scale_of(loop.model)]
+    X = np.append(np.zeros(loop.size), plant)[:, None] + np.zeros(2)
+    found = loop.held.derivative(X, *loop.slopes(X), loop.step)
     if loop.no_equilibrium or found is None:
         return None
-    A = scale[:, None] * found[0].mean(axis=-1) / scale
+    J = found[0][: loop.size, : loop.size].mean(axis=-1)
+    return np.asarray(scale[:, None] * J / scale)
+
+
+def _for_all_plants(loop: HeldLoop, W: FloatArray) -> FloatArray:
+    """W of an ellipsoid that the maps of all plants of a box may shrink; of one plant, as it was.
+
+    It is of the mean Lyapunov function of the middle and of the corners, for what the first one's
+    falls with the plant in the middle; W is turned so that its own fall is nearly diagonal.
+    """
+    ends = [(float(a), float(b)) for a, b in loop.plant]
+    plants = [[0.5 * (a + b) for a, b in ends], *itertools.product(*ends)]
+    maps = [J for p in plants if (J := _map_at_target(loop, p)) is not None]
+    if len(maps) < len(plants):
+        return W
+    P = W.T @ W
+    lost = P - maps[0].T @ P @ maps[0]
+    mean = np.mean([solve_discrete_lyapunov(J.T, lost) for J in maps], axis=0)
+    try:
+        root = np.linalg.cholesky(mean).T
+    except np.linalg.LinAlgError:  # a corner is not stable
+        return W
+    turned = [root @ J @ np.linalg.inv(root) for J in maps]
+    return np.asarray(np.linalg.eigh(sum(J.T @ J for J in turned))[1].T @ root)
+
+
+def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
+    """Prepare the search for the loop with a held input, in (q, D p, s)."""
+    n, m, A = loop.model.n, loop.model.m, _map_at_target(loop)
+    if A is None:
+        return None
     C, layer = np.eye(m, 2 * n, 2 * n - m), np.array([float(v) for v in loop.law.layer])
 
     def margin(candidate: TerminalEllipsoid) -> float:
