@@ -156,7 +156,6 @@ def test_a_target_that_moves(names: dict[str, Any]) -> None:
 
 
 def test_prove(names: dict[str, Any]) -> None:
-    pytest.importorskip("flint")
     made = does("6.", names)
     assert "stability" in {c.kind for c in made["certificate"].subjects[0].claims}
     again = pickle.loads(pickle.dumps(made["certificate"]))
