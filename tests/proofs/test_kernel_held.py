@@ -415,7 +415,9 @@ def test_a_search_refuses_what_it_cannot_be_about() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "degrees"), [(1, 33.8), (2, 40.3), (3, 38.9), (4, 41.0), (5, 39.1)])
+@pytest.mark.parametrize(
+    ("case", "degrees"), [(1, 33.8), (2, 40.3), (3, 38.9), (4, 41.0), (5, 39.1)]
+)
 def test_kept_starts_of_the_sampled_loop_are_proved_from_their_file(
     case: int, degrees: float
 ) -> None:
