@@ -321,7 +321,8 @@ def _arrive_earlier(task: Optimisation, wide: bool = False, keep: int = 0) -> bo
     """Search for earlier arrivals around the best plan, or first far and wide.
 
     And far and wide again when that leads nowhere any more; so many evaluations are left over.
-    A first plan is looked for around the switches of the earliest motion, too.
+    A first plan with a reaching law of its own is looked for around the switches of the earliest
+    motion, too: without one, a few surfaces switch there, and more local searches serve better.
     """
     rng, space, spent = task.rng, task.space, -1
     search = ArrivalSearch(
@@ -330,7 +331,8 @@ def _arrive_earlier(task: Optimisation, wide: bool = False, keep: int = 0) -> bo
         0.9 * task.loop.objective.terminal_radius,
         lambda evaluations: task.left < evaluations + keep or task.late(),
     )
-    single = wide and not task.optimiser.freedom.schedule and task.loop.ensemble is None
+    freedom = task.optimiser.freedom
+    single = wide and freedom.reaching and not freedom.schedule and task.loop.ensemble is None
     most = 1
     if task.optimiser.aims:
         most = LESS_FRUITLESS if single else FRUITLESS
