@@ -2,8 +2,8 @@
 What is proved
 ==============
 
-Claims about a surface, each decided with intervals or exact numbers, or said to be undecided. A longer
-search also proves a region of attraction.
+Claims about a surface, each decided with intervals or exact numbers, or said to be undecided. A
+longer search also proves a region of attraction.
 """
 
 import matplotlib.pyplot as plt
