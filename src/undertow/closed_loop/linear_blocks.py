@@ -33,7 +33,6 @@ def linear_blocks(size: int) -> ModuleType:
     second order, and Q (C, N, N), or (1, N, N) for all; C is a multiple of the lanes.  It writes
     P (C, N, N), whether e^{At} decays at all, ``stable`` (C,), ``powers`` of e^{At}
     (C/16, STEP_SIZES, N·N·16) and ``forced``, F and G (C/16, STEP_SIZES, 2, N·N·16).
-
     """
     return generated("linear", str(size), content_key(str(size)), lambda: _source(size))
 

@@ -7,12 +7,11 @@ mechanism, from the sampling period, and from what a bench tells of its sensors 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
 from undertow.estimators import Belief, Estimator, KalmanFilter
-from undertow.law import ProvedSet, ReachingLaw, Surface, first_surface
+from undertow.law import ReachingLaw, first_surface
 from undertow.models import Mechanism
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
@@ -98,12 +97,3 @@ def reaching_for(estimator: Estimator) -> ReachingLaw:
     laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
     quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)
     return next(quiet, laws[-1])
-
-
-def provable(
-    mechanism: Mechanism, surfaces: Sequence[Surface], reaching: ReachingLaw
-) -> tuple[ProvedSet, ...]:
-    """Return the sets that are proved for a catch."""
-    from undertow.proofs import terminal_sets
-
-    return terminal_sets(mechanism, surfaces, reaching)

@@ -28,7 +28,6 @@ from undertow.runtime.controller_defaults import (
     RESERVE,
     estimator_for,
     for_rig,
-    provable,
     reaching_for,
 )
 from undertow.runtime.encoding import MOVING, reference_from, reference_to
@@ -245,7 +244,9 @@ class Recipe:
         """Swing-up and catch, where it is wanted."""
         if not self.swing_up:
             return None
-        region = CatchRegion(self.belief, reaching=self.cascade.reaching, prove=provable)
+        from undertow.proofs import terminal_sets
+
+        region = CatchRegion(self.belief, reaching=self.cascade.reaching, prove=terminal_sets)
         return SwingUpAndCatch(designed(self.belief), region)
 
     @cached_property

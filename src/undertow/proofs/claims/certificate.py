@@ -185,7 +185,8 @@ class Certificate:
         CertificateError
             Where no claim is proved.
         """
-        return self.content if self.document else b""
+        _ = self.document  # refused where there is none
+        return self.content
 
     def save(self, path: str | Path) -> Path:
         """Write the file that :func:`undertow.verify` reads, and return where it is.

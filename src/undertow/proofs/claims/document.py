@@ -22,12 +22,12 @@ def document_bytes(
     subjects: Sequence[tuple[Surface, ReachingLaw, Sequence[kernel.Claim]]],
     versions: Mapping[str, str | None],
 ) -> bytes:
-    """Return the file; every number in it is exact.
+    """Return the file; every number in it is exact.  Whoever keeps it reads it first.
 
     Raises
     ------
     CertificateError
-        For what a certificate cannot hold.
+        For a model or a law that a certificate cannot hold.
     """
     model = model_data(mechanism)
     document: dict[str, Any] = {
@@ -45,9 +45,7 @@ def document_bytes(
         "made_with": {k: v if v is None else v[:64] for k, v in versions.items()},
     }
     document["checksum"] = digest(document)
-    content = json_bytes(document)
-    read_document(content)
-    return content
+    return json_bytes(document)
 
 
 def json_bytes(document: Mapping[str, Any]) -> bytes:

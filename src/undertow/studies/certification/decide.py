@@ -106,10 +106,7 @@ def certify_surface(
     remarks: list[Verdict] = []
 
     def keep(claim: Claim | None, verdict: Verdict) -> None:
-        if claim is not None and verdict:
-            claims.append(StatedClaim(claim.stated(mechanism, verdict), verdict))
-        else:
-            remarks.append(verdict)
+        _keep(mechanism, claim, verdict, claims, remarks)
 
     most = FIRST + seconds + (LOOP if loop else 0.0) + (LAST if predict else 0.0)
 
@@ -149,6 +146,20 @@ def certify_surface(
     subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
     seconds = time.perf_counter() - began
     return Certified(title or str(surface), subject, region, seconds=seconds)
+
+
+def _keep(
+    mechanism: Mechanism,
+    claim: Claim | None,
+    verdict: Verdict,
+    claims: list[StatedClaim],
+    remarks: list[Verdict],
+) -> None:
+    """Add to the claims what is proved, to the remarks what is not."""
+    if claim is not None and verdict:
+        claims.append(StatedClaim(claim.stated(mechanism, verdict), verdict))
+    else:
+        remarks.append(verdict)
 
 
 def _box(mechanism: Mechanism, start: FloatArray) -> dict[str, tuple[float, float]]:
@@ -351,19 +362,15 @@ def certify_appendix(
         )  # fmt: skip
         P, _ = search_rate(case.reduced(constants), case.half_width)
         interval = two_vertex(case.reduced(constants), P, case.half_width)
-        claims, remarks = base.subject.claims, base.subject.remarks
+        claims, remarks = list(base.subject.claims), list(base.subject.remarks)
         if loop:
             law = ReachingLaw()
             closed = ClosedLoop(mechanism, MinimumEnergy(horizon=80.0), law, tail_rtol=1e-3)
             sampled = sampled_extent(closed, case.surface, "phi", FAR)
             limit = mechanism.state(phi=float(sampled.details["extent"]))
             decide = _Decisions(mechanism, case.surface, law, limit, dict(uncertain or {}))
-            claim, verdict = decide.loop(hold)
-            if claim is not None and verdict:
-                claims = (*claims, StatedClaim(claim.stated(mechanism, verdict), verdict))
-            else:
-                remarks = (*remarks, verdict)
-            remarks = (*remarks, sampled)
-        subject = replace(base.subject, claims=claims, remarks=remarks)
+            _keep(mechanism, *decide.loop(hold), claims, remarks)
+            remarks.append(sampled)
+        subject = replace(base.subject, claims=tuple(claims), remarks=tuple(remarks))
         certified.append(replace(base, subject=subject, interval=interval))
     return tuple(certified)
