@@ -32,11 +32,11 @@ def _reference(
     n, known = arm.n, len(belief.tolerances)
     size = 2 * n + known
 
+    moves = arm.function("dynamics")
+
     def rates(z: FloatArray, u: FloatArray) -> FloatArray:
-        plant = arm.with_values(belief.values(z[2 * n :]))
-        return np.concatenate(
-            [z[n : 2 * n], plant.accelerations(0.0, z[: 2 * n], u), 0.0 * z[2 * n :]]
-        )
+        x, offset = z[: 2 * n], z[2 * n :]
+        return np.array([*x[n:], *moves(0.0, *x, *u, *belief.values(offset)), *(0.0 * offset)])
 
     z, P = np.zeros(size), np.diag([NOISE**2] * n + [1.0] * n + [1.0 / 3.0] * known)
     z[:n] = readings[0]
