@@ -291,7 +291,7 @@ def advance(t, length, noise, block, late, old, seen, knocks):
 {COMPILED}
 def play(times, inputs, rows, noise, block, late, old, seen, knocks):
     # Inputs, (N, m), from one of the times to the next; ``rows`` gets the states there.
-{unpacked(RIG_LAYOUT)}
+{unpacked(RIG_LAYOUT, "x", "u")}
     rows[0] = x
     for k in range(times.shape[0] - 1):
         u[:] = inputs[k]

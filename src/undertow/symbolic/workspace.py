@@ -58,13 +58,19 @@ class Workspace:
         return self._views[name]
 
 
-def unpacked(layout: Layout) -> str:
-    """Return the lines that give a compiled function the views of a block, by name."""
-    lines, at = [], "0"
+def unpacked(layout: Layout, *names: str) -> str:
+    """Return the lines that give a compiled function the views of a block, all or by name.
+
+    Where a view ends is added up as they go, once each: a compiler works on every sum that it sees.
+    """
+    wanted, lines = set(names or layout), ["    _end = 0"]
     for name, parts in layout.items():
         count = " * ".join(f"({part.strip()})" for part in parts.split(","))
-        end = f"{at} + {count}" if at != "0" else count
-        shape = f".reshape(({parts}))" if "," in parts else ""
-        lines.append(f"    {name} = block[{at}:{end}]{shape}")
-        at = end
+        if name in wanted:
+            shape = f".reshape(({parts}))" if "," in parts else ""
+            lines.append(f"    {name} = block[_end : _end + {count}]{shape}")
+            wanted.remove(name)
+        if not wanted:
+            break
+        lines.append(f"    _end += {count}")
     return "\n".join(lines) + "\n"
