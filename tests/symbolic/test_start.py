@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import re
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +15,16 @@ import pytest
 import sympy as sp
 
 import undertow as ut
+import undertow.cascade.swing_up.search
+import undertow.runtime.sensors
+import undertow.runtime.steps
 from undertow.closed_loop import kernel
 from undertow.law import stability
 from undertow.mechanisms import LIBRARY
 from undertow.models import lagrange, linearise, numbers
 from undertow.symbolic import store
+
+PACKAGE = Path(ut.__file__).parent
 
 
 @pytest.fixture(autouse=True)
@@ -241,3 +249,30 @@ def test_a_known_first_surface_is_not_designed_again(
         ut.first_surface(rig, rate=0.5)
     with pytest.raises(TypeError):
         ut.first_surface(rig.with_parameters(m_p=0.1234))
+
+
+def _assigned_arrays(source: str) -> Iterator[str]:
+    """Yield what assigns more than a number to a slice, in functions that are compiled."""
+    for function in ast.walk(ast.parse(source)):
+        words = " ".join(map(ast.unparse, getattr(function, "decorator_list", ())))
+        if isinstance(function, ast.FunctionDef) and re.search("njit|compiled|inner", words):
+            for node in ast.walk(function):
+                targets = node.targets if isinstance(node, ast.Assign) else []
+                if any(":" in ast.unparse(target) for target in targets) and not re.fullmatch(
+                    r"-?(\d|\.)+|(math|np)\.\w+|_NAN|\(.*\)", ast.unparse(node.value)
+                ):
+                    yield f"{function.name}: {ast.unparse(node)}"
+
+
+def _is_body(text: object) -> bool:
+    return isinstance(text, str) and text.startswith("\n@numba.njit")
+
+
+def test_compiled_code_copies_arrays_by_their_entries() -> None:
+    """For ``a[:] = b`` numba compiles the text of its error, strings and all: two seconds."""
+    assert [*_assigned_arrays("@njit\ndef f(a, b):\n    a[:] = b\n    a[:] = 0.0")]
+    texts = [file.read_text(encoding="utf-8") for file in PACKAGE.rglob("*.py")]
+    modules = [module for name, module in sys.modules.items() if name.startswith("undertow.")]
+    written = [text for module in modules for text in vars(module).values() if _is_body(text)]
+    assert len(written) >= 6  # of generated functions
+    assert not [found for text in [*texts, *written] for found in _assigned_arrays(text)]

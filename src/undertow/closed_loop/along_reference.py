@@ -38,12 +38,14 @@ def along(
     for k in range(steps + 1):
         lane = lanes[segments[min(k, steps - 1)]]
         total[:], spent = 0.0, 0.0
-        at[:] = x
+        for i in range(2 * n):
+            at[i] = x[i]
         for stage in range(4):
             half = 2 * k + (0, 1, 1, 2)[stage]
             if k == steps and stage > 0:
                 break
-            belief[own:] = reference[half]
+            for i in range(3 * n):
+                belief[own + i] = reference[half, i]
             for i in range(2 * n):
                 e[i] = at[i] - reference[half, i]
             if hold == 0 or (stage == 0 and k % hold == 0):

@@ -143,7 +143,9 @@ def summarise(member_out, weights, tail, margins, out):  # type: ignore[no-untyp
             out[plan, column] = member_out[worst, column]
         if arrived == members:
             out[plan, 0] = _dearest(costs, weights, tail)
-            out[plan, 1] = times.max()
+            out[plan, 1] = times[0]
+            for k in range(1, members):
+                out[plan, 1] = max(out[plan, 1], times[k])
         for column in range(4, 4 + margins):
             low = member_out[first, column]
             for k in range(1, members):
@@ -185,13 +187,21 @@ def _grade(event):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _dearest(costs, weights, tail):  # type: ignore[no-untyped-def]
-    """Return the mean of the dearest members, those that weigh ``tail`` together."""
-    if tail <= 0.0:
-        return costs.max()
-    order = np.argsort(-costs)
+    """Return the mean of the dearest members, those that weigh ``tail`` together.
+
+    Found one by one: of a few members, and a sort of NumPy's takes a second to compile.
+    """
     left, total = tail, 0.0
-    for k in order:
+    counted = np.zeros(len(costs), dtype=np.bool_)
+    for _ in range(len(costs)):
+        k = -1
+        for j in range(len(costs)):
+            if not counted[j] and (k < 0 or costs[j] > costs[k]):
+                k = j
+        if tail <= 0.0:
+            return costs[k]
         part = min(weights[k], left)
         total += part * costs[k]
         left -= part
+        counted[k] = True
     return total / tail

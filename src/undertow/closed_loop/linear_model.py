@@ -366,18 +366,21 @@ def _reach(A, powers, forced, bounded, reach):  # type: ignore[no-untyped-def]
         block, i = lane // LANES, lane % LANES
         for b in range(len(bounded)):
             bound = bounded[b]
-            term[:] = 0.0
-            term[bound] = UNIT
-            row[:] = term
+            for j in range(N):
+                row[j] = term[j] = UNIT if j == bound else 0.0
             for order in range(2, TERMS + 1):
                 for j in range(N):
                     value = term[j - n] if j >= n else 0.0
                     for a in range(n):
                         value += term[n + a] * abs(A[lane, a, j])
                     after[j] = value * UNIT / order
-                row += after
-                term[:] = after
-                if term.sum() <= 1e-9 * row.sum():
+                rest = total = 0.0
+                for j in range(N):
+                    term[j] = after[j]
+                    row[j] += after[j]
+                    rest += term[j]
+                    total += row[j]
+                if rest <= 1e-9 * total:
                     break
             else:
                 row[:] = math.inf
@@ -388,4 +391,5 @@ def _reach(A, powers, forced, bounded, reach):  # type: ignore[no-untyped-def]
                     for k in range(N):
                         value += row[k] * abs(powers[block, level, (k * N + j) * LANES + i])
                     after[j] = max(row[j], value)
-                row[:] = after
+                for j in range(N):
+                    row[j] = after[j]

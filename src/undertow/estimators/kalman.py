@@ -91,7 +91,8 @@ def measurement_update(
             continue
         spread = P[i, i] + variance[i]
         error = q[i] - x[i]
-        column[:size] = P[:, i]
+        for k in range(size):
+            column[k] = P[k, i]
         for k in range(size):
             if k < moving:
                 x[k] += column[k] * (error / spread)
@@ -228,7 +229,8 @@ def estimate(h, q, u, block, size, lead, known):
     for i in range(m if disturbed else 0):
         felt[i] += (abs(x[2 * n + i]) - felt[i]) * min(1.0, h / {AVERAGED})
     count[0] = start + 1.0
-    out[:] = x
+    for i in range(x.shape[0]):
+        out[i] = x[i]
     for k in range(lead):
         then = past[(start + 2 + k) % (lead + 1)]
         move(h, out, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)

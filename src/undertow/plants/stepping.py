@@ -270,7 +270,8 @@ def advance(t, length, noise, block, late, old, seen, knocks):
                 for i in range(n):
                     for l in range(n):
                         x[n + i] += W[i * n + l] * pushes[k, 1 + l]
-        before[: 2 * n] = x
+        for i in range(2 * n):
+            before[i] = x[i]
         if rough or bounded or loose:
             mobility(x, parameters, W)
         rk4_step(t, h, 1.0, n, x, applied, viscous, parameters, work[0], work[1], work[2])
@@ -284,7 +285,8 @@ def advance(t, length, noise, block, late, old, seen, knocks):
             backlash_impact(h, x, before, drive, gap, gain, W)
         t += h
         counts[0] = j + 1
-        past[(j + 1) % past.shape[0]] = x[:seen]
+        for i in range(seen):
+            past[(j + 1) % past.shape[0], i] = x[i]
     measure(int(counts[0]), past, old, encoder, phase, noise, q)
 
 
@@ -292,11 +294,13 @@ def advance(t, length, noise, block, late, old, seen, knocks):
 def play(times, inputs, rows, noise, block, late, old, seen, knocks):
     # Inputs, (N, m), from one of the times to the next; ``rows`` gets the states there.
 {unpacked(RIG_LAYOUT, "x", "u")}
-    rows[0] = x
-    for k in range(times.shape[0] - 1):
-        u[:] = inputs[k]
-        advance(times[k], times[k + 1] - times[k], noise, block, late, old, seen, knocks)
-        rows[k + 1] = x
+    for k in range(times.shape[0]):
+        for i in range(2 * n):
+            rows[k, i] = x[i]
+        if k + 1 < times.shape[0]:
+            for i in range(m):
+                u[i] = inputs[k, i]
+            advance(times[k], times[k + 1] - times[k], noise, block, late, old, seen, knocks)
 """
 
 

@@ -194,10 +194,14 @@ def _judge(
             left[i, j] = M[i, m + j]
             for k in range(m):
                 left[i, j] -= M[i, k] * right[k, n + j]
-    right[:free, :size] = A[n:]
+    for i in range(free):
+        for j in range(size):
+            right[i, j] = A[n + i, j]
     if _solve(left, right, free, size) == 0.0:
         return False
-    A[n:] = right[:free, :size]
+    for i in range(free):
+        for j in range(size):
+            A[n + i, j] = right[i, j]
     return is_hurwitz(A, polynomials, routh)
 
 
@@ -213,17 +217,21 @@ def is_hurwitz(A: FloatArray, polynomials: FloatArray, routh: FloatArray) -> boo
     """
     size = A.shape[0]
     total = 0.0
-    for value in A.flat:
-        total += abs(value)
+    for i in range(size):
+        for j in range(size):
+            total += abs(A[i, j])
     if not total < np.inf:
         return False
     _balance(A)
     scale = 0.0  # a polynomial in s/ω, ω about the size of the largest eigenvalue
-    for value in A.flat:
-        scale = max(scale, abs(value))
+    for i in range(size):
+        for j in range(size):
+            scale = max(scale, abs(A[i, j]))
     if not scale > 0.0:
         return False
-    A /= scale
+    for i in range(size):
+        for j in range(size):
+            A[i, j] /= scale
     for k in range(1, size - 1):
         pivot = k
         for i in range(k + 1, size):

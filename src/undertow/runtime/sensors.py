@@ -81,7 +81,8 @@ def gate_measurement(x, u, block):
     # is, and which reading is frozen (-1: none).
 {unpacked(_LAYOUT)}
     h, jump, frozen = settings[0], settings[1], settings[2]
-    expected[:] = x
+    for i in range(2 * n):
+        expected[i] = x[i]
     heun_step(h, expected, u, viscous, parameters, work)
     gains(parameters, gain)
     missing, worst, still, moved = 0, 0, -1, False
@@ -110,13 +111,15 @@ def gate_measurement(x, u, block):
                 still = i
             if ages[i] > {REST} or (quiet[0] < {PROBE} <= quiet[0] + h):
                 ages[i] = 0.0
-                free[i] = x
+                for j in range(2 * n):
+                    free[i, j] = x[j]
                 free[i, i], free[i, n + i] = q[i], 0.0
         elif q[i] == q[i]:
             moved = True
             counts[i] = min(counts[i], abs(q[i] - last[i]))
             ages[i] = 0.0
-            free[i] = x
+            for j in range(2 * n):
+                free[i, j] = x[j]
             free[i, i] = last[i] = q[i]
     quiet[0] = 0.0 if moved or quiet[0] > {PROBE + PROBES} else quiet[0] + h
     return missing, worst, still
@@ -143,9 +146,10 @@ def check(stamp, x, u, block):
         size += abs(q[i])
     if clock[3] == 0.0 and size < math.inf:
         clock[3] = 1.0
-        last[:] = q
         for i in range(n):
-            free[i, :n], free[i, n:] = q, 0.0
+            last[i] = q[i]
+            for j in range(n):
+                free[i, j], free[i, n + j] = q[j], 0.0
         return {SOUND}, 0, 0, True, clock[1], 0.0
     if clock[3] == 0.0:
         clock[2] += settings[0]

@@ -202,7 +202,8 @@ def reference_row(
     n, last = q.shape[1], times.shape[0] - 1
     row[n:] = 0.0
     if last == 0:
-        row[:n] = q[0]
+        for i in range(n):
+            row[i] = q[0, i]
         return
     low, high = 0, last - 1
     while low < high:

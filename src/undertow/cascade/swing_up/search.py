@@ -103,7 +103,8 @@ def attempt(x, gains, belief, plant, drag, limit, stops, P, level, k, wraps, sec
         gain = work[4]
         if not advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
             out[1] = math.inf
-            x[:] = x0
+            for i in range(2 * n):
+                x[i] = x0[i]
             return
         for i in range(n):
             turn = wraps[i]

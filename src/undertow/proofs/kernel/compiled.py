@@ -459,14 +459,15 @@ def jets(code, constants, low, high, rates, order, seeds):  # type: ignore[no-un
     J = np.zeros((total, order + 1, 1 + seeds.shape[1], 2))
     for i in range(inputs):
         J[i, 0, 0, 0], J[i, 0, 0, 1] = low[i], high[i]
-        if i < len(seeds):
-            J[i, 0, 1:] = seeds[i]
+        for v in range(seeds.shape[1] if i < len(seeds) else 0):
+            J[i, 0, 1 + v, 0], J[i, 0, 1 + v, 1] = seeds[i, v]
     for i in range(len(constants)):
-        J[inputs + i, 0, 0] = constants[i]
+        J[inputs + i, 0, 0, 0], J[inputs + i, 0, 0, 1] = constants[i]
     for k in range(order + 1):
         for i in range(len(rates) if k else 0):
             c, d = reciprocal(float(k), float(k))
-            J[i, k] = J[rates[i], k - 1]
+            for v in range(J.shape[2]):
+                J[i, k, v, 0], J[i, k, v, 1] = J[rates[i], k - 1, v]
             _scaled(J, i, k, c, d)
         for line in range(len(code)):
             _line(J, code[line, 0], first + line, k, code[line, 1], code[line, 2])
@@ -514,7 +515,8 @@ def product(A, B):  # type: ignore[no-untyped-def]
 def points(A):  # type: ignore[no-untyped-def]
     """Doubles as intervals."""
     out = np.empty((*A.shape, 2))
-    out[..., 0], out[..., 1] = A, A
+    for at, value in np.ndenumerate(A):
+        out[at] = value
     return out
 
 
@@ -667,8 +669,11 @@ def decrease(A, held):  # type: ignore[no-untyped-def]
     A (N, N, 2) is W J W⁻¹ with the derivative J of ẋ, or of x(T) − x(0).
     """
     size = len(A)
-    S, scale = np.empty((size, size, 2)), np.ones(size)
-    square = product(np.ascontiguousarray(A.transpose(1, 0, 2)), A)
+    S, turned, scale = np.empty((size, size, 2)), np.empty((size, size, 2)), np.ones(size)
+    for i in range(size):
+        for j in range(size):
+            turned[j, i, 0], turned[j, i, 1] = A[i, j]
+    square = product(turned, A)
     for i in range(size):
         for j in range(size):
             a, b = add(A[i, j, 0], A[i, j, 1], A[j, i, 0], A[j, i, 1])
@@ -700,7 +705,12 @@ def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no
         a, b = whole[i, 0]
         if not (a > 0.0 or (b < 0.0 and i >= n + m + n)):
             return 2, -_INF
-    rows = product(np.concatenate((C, whole[n : n + m, 1:])), V)
+    rows = np.empty((2 * m, size, 2))
+    for i in range(m):
+        for j in range(size):
+            rows[i, j, 0], rows[i, j, 1] = C[i, j]
+            rows[m + i, j, 0], rows[m + i, j, 1] = whole[n + i, 1 + j]
+    rows = product(rows, V)
     for i in range(m):
         if not up(norm(rows[i]) * radius) <= layer[i]:
             return 3, -_INF
@@ -711,7 +721,8 @@ def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no
     F = np.zeros((size, size, 2))
     for i in range(n):
         F[i, n + i] = 1.0
-        F[n + i] = whole[i, 1:]
+        for j in range(size):
+            F[n + i, j, 0], F[n + i, j, 1] = whole[i, 1 + j]
     margin = decrease(product(product(W, F), V), False)
     return (0 if margin > 0.0 else 5), margin
 
@@ -885,7 +896,8 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
                 C[:] = _NAN
         for lane in range(min(LANES, boxes - start)):
             for o in range(len(outputs)):
-                out[start + lane, o] = T[outputs[o], : E + 1, lane]
+                for k in range(E + 1):
+                    out[start + lane, o, k] = T[outputs[o], k, lane]
     return out
 
 
