@@ -192,7 +192,7 @@ def run(
     rig: Rig | None = None,
     *,
     seconds: float = 20.0,
-    x0: ArrayLike | None = None,
+    x0: ArrayLike | Mapping[str, float] | None = None,
     log: str | Path | None = None,
     simulated: bool = False,
     processes: int = 3,
