@@ -391,6 +391,10 @@ def test_a_run_that_ends_before_anything_can_arrive_begins_all_the_same(
     assert run.trajectory.event.name == "HORIZON"
     with pytest.raises(InvalidInputError, match="duration of a run"):
         cascade.simulate(phi=ut.deg(30), duration=1e-4)
+    with pytest.raises(
+        InvalidInputError, match=r"duration of a run, s: got 0\.002, must be ≥ 0\.004"
+    ):
+        cascade.simulate(phi=ut.deg(30), duration=cascade.step)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, minimize_scalar
 
@@ -126,6 +127,30 @@ def test_a_motion_that_dips_into_the_terminal_set_has_arrived(
     assert above == pytest.approx(brentq(beyond, around[0], nearest), rel=1e-5)
     assert below > above + 0.01
     assert below == pytest.approx(exact.time, rel=1e-5)
+
+
+def test_a_dip_before_a_corner_is_seen_from_wherever_the_motion_goes_on() -> None:
+    """A mast of 20 m is in the terminal set for 0.26 ms; then its law reaches a corner.
+
+    Begun anew on its way it arrives when it was to, whatever the steps are: Lemma 3 needs that.
+    """
+    x, a = ut.Coordinate("x", "m"), ut.Coordinate("a", "rad")
+    v, w = x.velocity, a.velocity
+    mast = ut.Mechanism.from_energies(
+        "mast", [x, a], [ut.Input("force", "N", 58860.0)],
+        kinetic=4000 * v**2 + 2e4 * sp.cos(a.symbol) * v * w + sp.Rational(2, 3) * 2e5 * w**2,
+        potential=196200 * sp.cos(a.symbol),
+    )  # fmt: skip
+    loop = ut.ClosedLoop(mast, ut.MinimumTime(horizon=30.0))
+    x0 = [4.7664312914, -0.1861452348, -1.6793983301, 0.0693800483]
+    surface = ut.Surface(-1, -0.409293966, -16.1867988, -21.3750603)
+    whole = loop.simulate(x0, surface)
+    assert whole.event == Event.REACHED
+    times = [
+        whole.t[k] + loop.simulate(whole.x[k], surface).time for k in range(1, len(whole.t) - 2, 50)
+    ]
+    assert len(times) > 20
+    np.testing.assert_allclose(times, whole.time, atol=1e-6)
 
 
 def test_the_end_of_a_motion_is_located(rig: ut.Mechanism) -> None:

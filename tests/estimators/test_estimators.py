@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from undertow.base import InvalidInputError
+from undertow.base import ArtefactError, InvalidInputError
 from undertow.estimators import (
     Estimator,
     FilteredDerivative,
@@ -242,20 +243,25 @@ class _AlphaBeta(Estimator):
     noise_covariance = steady_covariance
 
 
-def test_an_estimator_of_ones_own_runs_on_a_rig_end_to_end(arm: ut.Mechanism) -> None:
-    """It is all that a run asks for: first optimum, gate, slow loop, balance, verdict."""
+def test_an_estimator_of_ones_own_runs_on_a_rig_end_to_end(
+    arm: ut.Mechanism, tmp_path: Path
+) -> None:
+    """It is all that a run asks for: first optimum, gate, slow loop, balance, verdict, replay."""
     made: list[_AlphaBeta] = []
 
     def make(mechanism: ut.Mechanism, bench: Bench) -> Estimator:
         made.append(_AlphaBeta(mechanism, bench.timing.period))
         return made[-1]
 
-    cascade = ut.Cascade(arm, ut.objective_for(arm, "bench-energy"), warm=ut.Budget(64))
-    rig = IdealRig(arm, arm.state(phi=0.2), PERIOD)
-    report = ut.run(cascade, rig, seconds=1.5, simulated=True, estimator=make, phi=0.2)
+    cascade = ut.Cascade(arm, ut.objective_for(arm, "bench-energy"))
+    rig, log = IdealRig(arm, arm.state(phi=0.2), PERIOD), tmp_path / "run.db"
+    report = ut.run(cascade, rig, seconds=1.5, log=log, simulated=True, estimator=make, phi=0.2)
     assert str(report.verdict).startswith("balanced")
     assert max(one.calls for one in made if hasattr(one, "calls")) > 1000
     assert report.answers["applied"] > 5
+    assert ut.replay(log, estimator=make).identical
+    with pytest.raises(ArtefactError, match=r"own, must be.*replay\(path, estimator="):
+        ut.replay(log)
 
 
 def test_what_is_no_estimator_is_refused_at_the_door(arm: ut.Mechanism) -> None:

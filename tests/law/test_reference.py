@@ -281,3 +281,14 @@ def test_units_of_a_file_are_those_of_its_quantities(
     path.write_text(f"{head}\n0,0\n1,0.5\n")
     with pytest.raises(InvalidInputError, match=word):
         ut.Reference.read(path).legs(cart, 2.0)
+
+
+def test_a_reference_that_moves_nothing_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="paths of a reference: got none"):
+        ut.Reference.sine(0.5)
+
+
+@pytest.mark.parametrize("start", [math.nan, math.inf, -1.0])
+def test_a_ramp_begins_at_a_time(start: float) -> None:
+    with pytest.raises(InvalidInputError, match="start of a ramp, s"):
+        ut.Reference.ramp(1.0, start=start, x=0.1)

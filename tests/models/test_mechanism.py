@@ -527,6 +527,31 @@ def test_how_controllable_a_mechanism_is_does_not_depend_on_the_unit_of_its_inpu
     assert controllability(other) == pytest.approx(controllability(cart), rel=1e-9)
 
 
+def test_coordinates_may_be_called_like_keywords() -> None:
+    """A mapping names what a keyword of the same function hides."""
+    duration, target = ut.Coordinate("duration", "m"), ut.Coordinate("target", "rad")
+    v, w, a = duration.velocity, target.velocity, target.symbol
+    cart = ut.Mechanism.from_energies(
+        "cart", [duration, target], [ut.Input("plant", "N", 9.0)],
+        kinetic=v**2 + w**2 + v * w * sp.cos(a), potential=9.81 * sp.cos(a),
+    )  # fmt: skip
+    cascade = ut.Cascade(cart, ut.MinimumTime(), belief="exact", cold=ut.Budget(64))
+    run = cascade.simulate({"target": 0.1, "duration": 0.02}, duration=0.01)
+    assert run.trajectory.x[0].tolist() == [0.02, 0.1, 0.0, 0.0]
+    with pytest.raises(InvalidInputError, match="initial state: got x0 and target_dot"):
+        cascade.simulate({"target": 0.1}, target_dot=0.1)
+    with pytest.raises(InvalidInputError, match=r"unknown state of 'cart': got 'tarjet'"):
+        cascade.simulate({"tarjet": 0.1})
+
+
+def test_inputs_through_a_whole_matrix_are_sent_where_they_are_taken() -> None:
+    x, a = ut.Coordinate("x", "m"), ut.Coordinate("a", "rad")
+    with pytest.raises(ModelError, match=r"must be \(1, 1\).*modelling.from_energies"):
+        ut.Mechanism(
+            "z", (x, a), (ut.Input("f", "N"),), sp.eye(2), sp.zeros(2, 1), sp.Matrix([1, -1])
+        )
+
+
 def test_a_matrix_of_what_it_may_not_hold_says_what_it_may() -> None:
     """Not to declare a coordinate as a coordinate."""
     x, p = ut.Coordinate("x", "m"), ut.Coordinate("phi")

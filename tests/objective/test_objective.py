@@ -111,6 +111,13 @@ def test_a_start_outside_is_refused_and_one_that_inputs_decide_is_not(rig: ut.Me
     ut.MinimumTime(constraints=(power,)).check_start(rig, rig.state(theta_dot=2.0))
 
 
+def test_a_start_where_a_constraint_is_no_number_is_refused(rig: ut.Mechanism) -> None:
+    """ln(φ − 5) is complex below 5."""
+    odd = ut.Constraint("odd", lambda v: sp.log(v.phi - 5))
+    with pytest.raises(InvalidInputError, match="breaks 'odd': got margin nan, must be ≥ 0"):
+        ut.MinimumTime(constraints=(odd,)).check_start(rig, rig.state(phi=0.1))
+
+
 def test_between_tests_a_bound_is_passed_by_no_more_than_the_chord_allows(
     rig: ut.Mechanism, quick: ut.Surface
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -200,6 +201,29 @@ def test_hard_input_limit_that_no_surface_meets_is_refused(rig: ut.Mechanism) ->
     assert "hard input limit" in str(caught.value.value)
     assert "margin ≥ 0" in str(caught.value.limit)
     assert "Raise the actuator limit" in caught.value.remedy
+
+
+def test_what_the_inputs_cannot_do_is_said(rig: ut.Mechanism) -> None:
+    """By hand: e^{λt} against the limit wants λ ∫ e^{−λt} dt = 1 of the mode that grows."""
+    weak = rig.with_input_limit(0.05)
+    lin, x = weak.linearise(), weak.state(phi=ut.deg(20))
+    rates, modes = np.linalg.eig(lin.A.T)
+    k = int(np.argmax(rates.real))
+    push = abs(float((modes[:, k] @ lin.input)[0].real)) * 0.05 / rates[k].real
+    needed = abs(float((modes[:, k] @ x).real)) / push
+    assert needed > 2
+    optimiser = ut.Optimiser(ut.ClosedLoop(weak, ut.MinimumTime(horizon=2.0)), cold=ut.Budget(64))
+    with pytest.raises(InfeasibleError) as caught:
+        optimiser.require(x)
+    said = re.search(r"linear model at the target needs (\S+) times", caught.value.remedy)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(needed, rel=0.01)
+
+
+def test_degrees_for_radians_are_told(rig: ut.Mechanism) -> None:
+    optimiser = ut.Optimiser(ut.ClosedLoop(rig, ut.MinimumTime(horizon=2.0)), cold=ut.Budget(64))
+    with pytest.raises(InfeasibleError, match=r"phi = 20 rad is 1146°.*undertow.deg\(20\)"):
+        optimiser.require(rig.state(theta=7.0, phi=20.0))
 
 
 def test_infeasible_is_a_status_and_not_an_exception(optimisers: dict[str, ut.Optimiser]) -> None:

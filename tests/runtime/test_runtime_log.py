@@ -25,6 +25,7 @@ import sympy as sp
 import undertow as ut
 from undertow.base import ArtefactError, ResourceError, UndertowError
 from undertow.cascade import CascadeState
+from undertow.estimators import KalmanFilter
 from undertow.law import Plan
 from undertow.runtime import (
     Columns,
@@ -177,6 +178,11 @@ def test_the_file_opens_with_plain_sqlite(logged: Path) -> None:
     assert all(isinstance(row[3], float) for row in rows)
     assert meta["mechanism"] == "rotary_pendulum"
     assert Recipe.from_dict(meta["recipe"]) == RECIPE
+
+
+def test_an_estimator_that_the_run_did_not_have_is_refused(logged: Path) -> None:
+    with pytest.raises(ArtefactError, match=r"library's estimator.*Leave estimator out"):
+        replay(logged, estimator=lambda model, bench: KalmanFilter(model, bench.timing.period))
 
 
 def fill(log: Log, count: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -112,7 +112,7 @@ class Bound:
 def bound(
     mechanism: Mechanism,
     objective: Objective,
-    x0: ArrayLike | None = None,
+    x0: ArrayLike | Mapping[str, float] | None = None,
     *,
     horizon: float | None = None,
     intervals: int = 100,

@@ -600,7 +600,7 @@ class Cascade:
         if best.proposal.plan is None and short:
             return self.start_to(absolute, target, t, before)
         cost, proposal = best.cost, best.proposal
-        plan = proposal.required(here).plan
+        plan = proposal.required(here, x).plan
         assert plan is not None  # required
         if target is not None and target.moves:
             plan, cost = self._first_along(whole, plan, x, target, t, horizon)
@@ -847,7 +847,7 @@ class Cascade:
     @checked
     def simulate(
         self,
-        x0: ArrayLike | None = None,
+        x0: ArrayLike | Mapping[str, float] | None = None,
         *,
         plant: Mechanism | Mapping[float, Mechanism] | None = None,
         duration: float | None = None,
@@ -860,8 +860,8 @@ class Cascade:
         Parameters
         ----------
         x0
-            Initial state, (2n,); or give its non-zero entries by name (``phi=0.7``).
-            With neither, the mechanism's usual ``start``, where it has one.
+            Initial state, (2n,); or give its non-zero entries by name, ``phi=0.7`` or
+            ``{"phi": 0.7}``.  With neither, the mechanism's usual ``start``, where it has one.
         plant
             The truth; the belief by default.  One that changes while it runs is a mapping from the
             time, s, to what the plant is from then on.

@@ -219,7 +219,9 @@ def legs_to(
     last = goal.times[-1] if isinstance(goal, SetPoints) else 0.0
     total = last + cascade.objective.horizon if duration is None else duration
     positive("duration of a run, s", total, "Leave it out for the objective's horizon")
-    at_least("duration of a run, s", total, cascade.step, "Shorter than a step nothing moves")
+    at_least(
+        "duration of a run, s", total, 2 * cascade.step, "Searches look two steps ahead or more"
+    )
     if goal is None:
         return [Leg(0.0, total, total)]
     motions = legs_of(cascade.mechanism, cascade.objective, goal, total)

@@ -253,6 +253,12 @@ def _follow(  # type: ignore[no-untyped-def]
                         size = beyond
                         continue
                     ends = _event(margins, least, new[size_x], outer, terminal, escape, cap)
+                    if beyond < math.inf and ends != _REACHED:  # it may dip before the corner
+                        part = _dip(x, slopes, new, size, terminal, at)
+                        if part < 1.0:
+                            before, beyond = 0.0, size * part
+                            size = 0.5 * beyond
+                            continue
                     _keep_lowest(low, margins)
                     broken, instant = math.inf, row
                     while instant * pace * step < t + size and broken == math.inf:

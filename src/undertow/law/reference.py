@@ -418,6 +418,13 @@ class Reference:
         """Refuse what is no function of time."""
         check_fields(self)
         positive("period of a reference, s", self.period, "0 never repeats", zero=True)
+        if not self.paths:
+            raise InvalidInputError(
+                "paths of a reference",
+                value="none",
+                limit="one coordinate or more that moves",
+                remedy="Name it: Reference.sine(0.5, theta=0.3); to stay there is a set-point",
+            )
         for name, path in by_names("paths of a reference", self.paths).items():
             if not callable(path):
                 raise InvalidInputError(
@@ -462,6 +469,7 @@ class Reference:
     def ramp(cls, seconds: float, start: float = 0.0, **ends: float | tuple[float, float]) -> Self:
         """Return ways from 0, or (begin, end), of least jerk within so many s after ``start``."""
         positive("length of a ramp, s", seconds)
+        positive("start of a ramp, s", start, "It moves from then on", zero=True)
         paths = {}
         for name, end in by_names("ends of a ramp", ends).items():
             low, high = end if isinstance(end, Sequence | np.ndarray) else (0.0, end)

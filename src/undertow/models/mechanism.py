@@ -167,11 +167,17 @@ class Mechanism:
         ):
             matrix = matrix_of(f"{attribute} of '{self.name}'", value)
             if matrix.shape != shape:
+                remedy = "Give one row per coordinate, the actuated ones first"
+                if attribute == "input_matrix":
+                    remedy = (
+                        "Here each input acts on actuated coordinates alone; an (n, m) matrix goes "
+                        "into undertow.modelling.from_energies or from_matrices"
+                    )
                 raise ModelError(
                     f"shape of {attribute} of '{self.name}'",
                     value=matrix.shape,
                     limit=f"{shape}",
-                    remedy="Give one row per coordinate, the actuated ones first",
+                    remedy=remedy,
                 )
             object.__setattr__(self, attribute, matrix)
         given_bounds: Any = self.disturbance_bounds
@@ -567,8 +573,13 @@ class Mechanism:
         return self.check_state(x)
 
     @checked
-    def initial_state(self, x0: ArrayLike | None, names: Mapping[str, float]) -> FloatArray:
+    def initial_state(
+        self, x0: ArrayLike | Mapping[str, float] | None, names: Mapping[str, float]
+    ) -> FloatArray:
         """Return an initial state, (2n,), from a vector, from names, or the usual one.
+
+        Names may also be a mapping in the place of the vector: one that is a keyword of the
+        function at hand has no other way in.
 
         Raises
         ------
@@ -585,6 +596,8 @@ class Mechanism:
                 limit="x0 or names, not both",
                 remedy="Leave one of them out",
             )
+        if isinstance(x0, Mapping):
+            return self.state(**x0)
         x = self.check_state(x0)
         if x.ndim != 1:
             raise InvalidInputError(

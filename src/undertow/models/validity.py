@@ -312,7 +312,7 @@ def check_definite(
     for q, smallest in zip(places, least, strict=True):
         if not smallest > 0:
             where = ", ".join(
-                f"{c.name} = {v:.3g} {c.unit}" for c, v in zip(coordinates, q, strict=True)
+                f"{c.name} = {v + 0.0:.3g} {c.unit}" for c, v in zip(coordinates, q, strict=True)
             )
             raise ModelError(
                 f"{what} at {where}",

@@ -637,10 +637,13 @@ class Objective:
             values = mechanism.substitution | dict(zip(mechanism.x, state.tolist(), strict=True))
             for constraint, margin in asked:
                 found = margin.subs(values)
-                if found.is_number and float(found) < 0:
+                if not found.is_number:
+                    continue  # it depends on the input
+                value = float(found) if found.is_real else math.nan
+                if not value >= 0:
                     raise InvalidInputError(
                         f"{which} of '{mechanism.name}' breaks '{constraint.words}'",
-                        value=f"margin {float(found):.4g} {constraint.unit}".rstrip(),
+                        value=f"margin {value:.4g} {constraint.unit}".rstrip(),
                         limit="≥ 0",
                         remedy=remedy,
                     )

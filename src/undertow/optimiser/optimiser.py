@@ -249,4 +249,4 @@ class Optimiser:
         """
         loop = self.loop
         loop.objective.check_start(loop.mechanism, loop.mechanism.check_state(x))
-        return self.propose(x).required(loop)
+        return self.propose(x).required(loop, loop.mechanism.check_state(x))

@@ -12,7 +12,7 @@ from undertow.base import InfeasibleError, InvalidInputError, SingularSurfaceErr
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Margin, Plan, Surface, surface_margins
 from undertow.models import FloatArray
-from undertow.models.importers import holding_input
+from undertow.models.importers import holding_input, least_peak
 
 Status = Literal["converged", "budget spent", "infeasible", "failed"]
 
@@ -105,8 +105,8 @@ class Proposal:
         """The first surface of the plan."""
         return None if self.plan is None else self.plan.surfaces[0]
 
-    def required(self, loop: ClosedLoop) -> Proposal:
-        """Return it as it is, or raise with the evidence where there is no plan for a loop.
+    def required(self, loop: ClosedLoop, x: FloatArray) -> Proposal:
+        """Return it as it is, or raise with the evidence where there is no plan from x, (2n,).
 
         Raises
         ------
@@ -120,15 +120,23 @@ class Proposal:
                 value=self.message,
                 limit="every margin ≥ 0 and the terminal set reached within "
                 f"{loop.objective.horizon:g} s",
-                remedy=_too_weak(loop) or self.remedy,
+                remedy=_in_degrees(loop, x) or _too_weak(loop) or _too_far(loop, x) + self.remedy,
             )
         return self
 
 
+def _in_degrees(loop: ClosedLoop, x: FloatArray) -> str:
+    """What to do where a free joint begins more than a turn off; empty where none does."""
+    m, coordinates = loop.mechanism.m, loop.mechanism.coordinates
+    for c, angle in zip(coordinates[m:], x[m:].tolist(), strict=False):
+        if c.unit == "rad" and abs(angle) > 2 * math.pi:
+            turns = f"{c.name} = {angle:.4g} rad is {math.degrees(angle):.4g}°"
+            return f"{turns}: if degrees are meant, give undertow.deg({angle:.4g})"
+    return ""
+
+
 def _too_weak(loop: ClosedLoop) -> str:
     """What to do where the inputs cannot hold the mechanism at the target; empty where they can."""
-    if np.abs(loop.mechanism.f(np.zeros(2 * loop.mechanism.n))).max() == 0:
-        return ""
     held = np.abs(holding_input(loop.mechanism))
     weak = [
         f"{given.name} of {u:.3g} {given.unit}, and its limit is {limit:.3g}"
@@ -136,6 +144,13 @@ def _too_weak(loop: ClosedLoop) -> str:
         if u >= limit
     ]
     return f"The target is held by {'; '.join(weak)}: no start comes home" if weak else ""
+
+
+def _too_far(loop: ClosedLoop, x: FloatArray) -> str:
+    """What the linear model at the target needs from a start; empty where it has enough."""
+    needed = least_peak(loop.mechanism, x)
+    few = f"The linear model at the target needs {needed:.3g} times the inputs' limits from there. "
+    return few if needed > 1 else ""
 
 
 def motion_margins(

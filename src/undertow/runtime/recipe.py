@@ -171,8 +171,6 @@ class Recipe:
 
     def in_names(self) -> Self | None:
         """Return the same recipe with names in place of objects; None where they have none."""
-        if self.estimator is not None:
-            return None
         belief, made = self.belief, self
         if isinstance(self.mechanism, Mechanism):
             known = LIBRARY[belief.name]() if belief.name in LIBRARY else None
@@ -355,9 +353,13 @@ class Recipe:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values from which :meth:`from_dict` makes the recipe again, if it is all data."""
+        """JSON values from which :meth:`from_dict` makes the recipe again, if it is all data.
+
+        Of an estimator of one's own they say that there was one.
+        """
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         del values["design"], values["estimator"]  # objects
+        values["own_estimator"] = self.estimator is not None
         if isinstance(self.target, Reference):
             values["target"] = [MOVING, reference_to(self.target)]
         return values | {"settings": asdict(self.settings), "words": WORDS}
@@ -372,6 +374,7 @@ class Recipe:
             For fields that a recipe has not, or values that are none for them.
         """
         taken = _in_words_of_now(values)
+        taken.pop("own_estimator", None)
         settings = {
             OLD_SETTINGS.get(name, name): value for name, value in taken.get("settings", {}).items()
         }

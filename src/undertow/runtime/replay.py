@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 
 from undertow.base import ArtefactError, UndertowError, checked, error_text, file_hash, versions
+from undertow.estimators import Estimator
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
+from undertow.plants import Bench
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import (
     TOLD,
@@ -105,7 +107,11 @@ def build() -> dict[str, str | None]:
 
 @checked
 def replay(
-    path: str | Path, *, mechanism: str | Mechanism | None = None, decisions: bool = True
+    path: str | Path,
+    *,
+    mechanism: str | Mechanism | None = None,
+    estimator: Callable[[Mechanism, Bench], Estimator] | None = None,
+    decisions: bool = True,
 ) -> Replay:
     """Replay a log that carries its recipe.
 
@@ -116,6 +122,8 @@ def replay(
     mechanism
         A mechanism of one's own, ``FILE.py:NAME`` or itself, whose run it is.  The file that
         the log names is not run: say which one is.
+    estimator
+        Where the run had an estimator of one's own: what made it, as for :func:`undertow.run`.
     decisions
         Also let the gate judge each recorded answer again.
 
@@ -123,10 +131,11 @@ def replay(
     ------
     ArtefactError
         When the file is no log, is damaged, has no recipe, or is of another mechanism; when it
-        is of a mechanism in a file, and none is named.
+        is of a mechanism in a file, and none is named; when it is of a run with an estimator of
+        one's own, and none is given, or the other way round.
     """
     recording = read_log(Path(path))
-    recipe, remarks = recorded_recipe(recording, mechanism)
+    recipe, remarks = recorded_recipe(recording, mechanism, estimator)
     with legible(recording.path):
         memory = memory_from(recording.meta["memory"], recipe.reference)
         controller = recipe.make_controller(memory)
@@ -135,7 +144,9 @@ def replay(
 
 
 def recorded_recipe(
-    recording: Recording, mechanism: str | Mechanism | None = None
+    recording: Recording,
+    mechanism: str | Mechanism | None = None,
+    estimator: Callable[[Mechanism, Bench], Estimator] | None = None,
 ) -> tuple[Recipe, tuple[str, ...]]:
     """Return the recipe that a log carries, and what else is to be known of it, in sentences.
 
@@ -155,12 +166,23 @@ def recorded_recipe(
                 value="no recipe: the controller was built in Python",
                 remedy="Build it again, and call undertow.runtime.replay_controller",
             )
+        if bool(values.get("own_estimator")) != (estimator is not None):
+            raise ArtefactError(
+                f"log '{path}'",
+                value="a run with the library's estimator"
+                if estimator is not None
+                else "a run with an estimator of somebody's own",
+                limit="the estimator of the run",
+                remedy="Leave estimator out"
+                if estimator is not None
+                else "Give what made it, in Python: replay(path, estimator=...)",
+            )
         remarks: tuple[str, ...] = ()
         if in_a_file(str(values["mechanism"])) or mechanism is not None:
             remarks = _compare_source(recording, mechanism)
         if isinstance(mechanism, str):
             values = {**values, "mechanism": mechanism}
-        recipe = Recipe.from_dict(values)
+        recipe = replace(Recipe.from_dict(values), estimator=estimator)
         if isinstance(mechanism, Mechanism):
             recipe = replace(recipe, mechanism=mechanism)
         _check_mechanism(recording, recipe.belief)  # before anything is designed for it

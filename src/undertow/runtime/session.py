@@ -192,7 +192,7 @@ def run(
     rig: Rig | None = None,
     *,
     seconds: float = 20.0,
-    x0: ArrayLike | None = None,
+    x0: ArrayLike | Mapping[str, float] | None = None,
     log: str | Path | None = None,
     simulated: bool = False,
     processes: int = 3,
@@ -237,8 +237,8 @@ def run(
         :class:`undertow.Reference` to follow, whose time is that of the run.
     estimator
         Makes an :class:`undertow.estimators.Estimator` for the mechanism and the bench that the
-        rig is taken for.  By default a Kalman filter, which learns; a run with another one is
-        logged, but its log is not replayed.
+        rig is taken for.  By default a Kalman filter, which learns; the log of a run with another
+        one is replayed with it, ``replay("run.db", estimator=...)``.
     progress
         Called with (what, fraction) while the run is prepared.
 

@@ -11,6 +11,7 @@ from undertow.models.importers.equilibrium import (
     at_equilibrium,
     find_equilibrium,
     holding_input,
+    least_peak,
     move_target,
 )
 from undertow.models.importers.mjcf import from_mjcf, read_mjcf
@@ -38,6 +39,7 @@ __all__ = [
     "from_mjcf",
     "from_urdf",
     "holding_input",
+    "least_peak",
     "mechanism_from_file",
     "mechanism_from_tree",
     "move_target",

@@ -300,16 +300,29 @@ def _usual_start(mechanism: Mechanism) -> tuple[dict[str, float], float]:
     """
     free = mechanism.coordinates[mechanism.m]
     off = min(_OFF.get(free.unit, 0.05), 0.5 * free.high, -0.5 * free.low)
-    needed = _least_peak(mechanism, mechanism.state(**{free.name: off}))
+    needed = least_peak(mechanism, mechanism.state(**{free.name: off}))
     return {free.name: off if needed <= 1 else 0.5 * off / needed}, needed
 
 
-def _least_peak(mechanism: Mechanism, x: FloatArray) -> float:
+@checked
+def least_peak(mechanism: Mechanism, x: FloatArray) -> float:
     """Return the least peak of inputs, in parts of their limits, that stops all growing motions.
 
     Of the linear model at the target, a motion z = wᵀx that grows as e^{λt} comes to rest under
     u(t) where ∫ e^{−λt} wᵀB u dt = −z(0): a linear programme in u on 300 steps, until its slowest
     has grown e⁶ times.
+
+    Parameters
+    ----------
+    mechanism
+        The model, with the limits of its inputs.
+    x
+        State, (2n,).
+
+    Returns
+    -------
+    float
+        More than 1: the linear model cannot be brought to rest from there.  0 where nothing grows.
     """
     from scipy.optimize import linprog  # slow to import
 
@@ -317,6 +330,7 @@ def _least_peak(mechanism: Mechanism, x: FloatArray) -> float:
         lin = linearise(mechanism)
     except ModelError:
         return 0.0
+    x = mechanism.check_state(x)
     rates, modes = np.linalg.eig(lin.A.T)
     grows = rates.real > 1e-6
     limits = np.minimum(mechanism.input_limits, LARGEST)

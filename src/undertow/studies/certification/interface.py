@@ -22,7 +22,7 @@ from undertow.studies.certification.decide import certify_surface
 def certify(
     mechanism: Mechanism,
     surface: Surface,
-    x0: ArrayLike | None = None,
+    x0: ArrayLike | Mapping[str, float] | None = None,
     *,
     reaching: ReachingLaw = ReachingLaw(),
     seconds: float = 60.0,

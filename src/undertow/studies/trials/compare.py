@@ -139,7 +139,7 @@ def compare(
     *,
     plants: Sequence[Bench | Mechanism] | Mapping[str, Bench | Mechanism] = (),
     objective: Objective | None = None,
-    x0: ArrayLike | None = None,
+    x0: ArrayLike | Mapping[str, float] | None = None,
     seconds: float = 10.0,
     seed: int = 0,
     **state: float,
