@@ -253,14 +253,17 @@ def test_a_known_first_surface_is_not_designed_again(
 
 def _assigned_arrays(source: str) -> Iterator[str]:
     """Yield what assigns more than a number to a slice, in functions that are compiled."""
+    number = re.compile(r"-?(\d|\.)+|(math|np)\.\w+|_NAN|\(.*\)")
     for function in ast.walk(ast.parse(source)):
-        words = " ".join(map(ast.unparse, getattr(function, "decorator_list", ())))
-        if isinstance(function, ast.FunctionDef) and re.search("njit|compiled|inner", words):
-            for node in ast.walk(function):
-                targets = node.targets if isinstance(node, ast.Assign) else []
-                if any(":" in ast.unparse(target) for target in targets) and not re.fullmatch(
-                    r"-?(\d|\.)+|(math|np)\.\w+|_NAN|\(.*\)", ast.unparse(node.value)
-                ):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        if not re.search(
+            "njit|compiled|inner", " ".join(map(ast.unparse, function.decorator_list))
+        ):
+            continue
+        for node in ast.walk(function):
+            if isinstance(node, ast.Assign) and not number.fullmatch(ast.unparse(node.value)):
+                if any(":" in ast.unparse(target) for target in node.targets):
                     yield f"{function.name}: {ast.unparse(node)}"
 
 
