@@ -257,14 +257,11 @@ def _assigned_arrays(source: str) -> Iterator[str]:
     for function in ast.walk(ast.parse(source)):
         if not isinstance(function, ast.FunctionDef):
             continue
-        if not re.search(
-            "njit|compiled|inner", " ".join(map(ast.unparse, function.decorator_list))
-        ):
-            continue
-        for node in ast.walk(function):
+        words = " ".join(map(ast.unparse, function.decorator_list))
+        for node in ast.walk(function) if re.search("njit|compiled|inner", words) else ():
             if isinstance(node, ast.Assign) and not number.fullmatch(ast.unparse(node.value)):
-                if any(":" in ast.unparse(target) for target in node.targets):
-                    yield f"{function.name}: {ast.unparse(node)}"
+                named = [target for target in node.targets if ":" in ast.unparse(target)]
+                yield from (f"{function.name}: {ast.unparse(node)}" for _ in named)
 
 
 def _is_body(text: object) -> bool:
