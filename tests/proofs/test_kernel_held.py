@@ -486,7 +486,7 @@ def test_neighbours_of_kept_claims_that_are_false_are_not_proved() -> None:
     """Starts and plants that fall by simulation, next to those that are proved."""
     by_mass, by_both = kept("held_loop_plants_v2.json")
     (full,) = kept("held_loop_starts_v2.json")
-    law, widest = SlidingModeLaw(RIG, SURFACE, LAW), {k: 16 * v[1] for k, v in full.starts.items()}
+    law, widest = SlidingModeLaw(RIG, SURFACE, LAW), {k: 10 * v[1] for k, v in full.starts.items()}
     for own, plant, start in (
         (by_mass, {"m": 0.1275}, {"phi": math.radians(45.5)}),
         (by_both, {"m": 0.125, "a_e": 0.005}, {"phi": math.radians(8)}),
