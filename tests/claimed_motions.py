@@ -120,7 +120,7 @@ class Edge:
     task
         Law, limits and when a motion is home.
     starts
-        Draws states (N, 4) on its edge.
+        Draws states (N, 4) on its edge, for as many plants (N, 7).
     plants, forces
         Ends of the parameters, (7, 2), and largest forces, (2,).
     growth
@@ -133,7 +133,7 @@ class Edge:
 
     what: str
     task: Task
-    starts: Callable[[np.random.Generator, int], FloatArray]
+    starts: Callable[[np.random.Generator, FloatArray], FloatArray]
     plants: FloatArray
     forces: FloatArray = field(default_factory=lambda: np.zeros(2))
     growth: float | None = None
@@ -142,10 +142,10 @@ class Edge:
 
     def run(self, simulator: Simulator, rng: np.random.Generator, count: int) -> FloatArray:
         """Follow motions; return how many there are of each outcome, and the latest arrival, s."""
-        x = self.starts(rng, count)
-        corner = rng.random(len(x)) < 0.75
-        part = np.where(corner[:, None], rng.integers(0, 2, (len(x), 7)), rng.random((len(x), 7)))
+        corner = rng.random(count) < 0.75
+        part = np.where(corner[:, None], rng.integers(0, 2, (count, 7)), rng.random((count, 7)))
         plants = self.plants[:, 0] + part * (self.plants[:, 1] - self.plants[:, 0])
+        x = self.starts(rng, plants)
         forces = rng.choice([-1.0, 1.0], (len(x), 2)) * self.forces
         end, outcomes, times = simulator.follow(self.task, x, plants, forces)
         if self.growth is not None:
@@ -188,11 +188,11 @@ def box_of(data: Mapping[str, list[str]], names: tuple[str, ...], at: FloatArray
     return np.array(ends)
 
 
-def on_faces(box: FloatArray) -> Callable[[np.random.Generator, int], FloatArray]:
+def on_faces(box: FloatArray) -> Callable[[np.random.Generator, FloatArray], FloatArray]:
     """Draw from a box (N, 2): half of all entries at an end, most points on a face."""
 
-    def draw(rng: np.random.Generator, count: int) -> FloatArray:
-        shape = (count, len(box))
+    def draw(rng: np.random.Generator, plants: FloatArray) -> FloatArray:
+        shape = (len(plants), len(box))
         part = np.where(rng.random(shape) < 0.5, rng.integers(0, 2, shape), rng.random(shape))
         return np.asarray(box[:, 0] + part * (box[:, 1] - box[:, 0]))
 
@@ -200,16 +200,16 @@ def on_faces(box: FloatArray) -> Callable[[np.random.Generator, int], FloatArray
 
 
 def on_ellipsoid(
-    W: FloatArray, radius: float, plant: FloatArray, law: FloatArray, held: bool
-) -> Callable[[np.random.Generator, int], FloatArray]:
+    W: FloatArray, radius: float, law: FloatArray, held: bool
+) -> Callable[[np.random.Generator, FloatArray], FloatArray]:
     """Draw from {|W z| = radius}, a hair inside, as states; z = (q, p, s) if the input is held."""
 
-    def draw(rng: np.random.Generator, count: int) -> FloatArray:
-        e = rng.normal(size=(count, 4))
+    def draw(rng: np.random.Generator, plants: FloatArray) -> FloatArray:
+        e = rng.normal(size=(len(plants), 4))
         e *= radius * (1 - 1e-9) / np.linalg.norm(e, axis=1, keepdims=True)
         z = np.linalg.solve(W, e.T).T
         if held:
-            length, r_o, m = plant[:3]
+            length, r_o, m = plants[:, :3].T
             a_a, l_a, a_u, l_u = law[:4]
             b, c = m * length * r_o * np.cos(z[:, 1]), 4 / 3 * m * length**2
             # c v_u − b v_a = p and a_a v_a + a_u v_u = s − l_a q_a − l_u q_u
@@ -223,7 +223,7 @@ def on_ellipsoid(
 
 def on_level(
     claim: Document, index: int, law: FloatArray
-) -> Callable[[np.random.Generator, int], FloatArray]:
+) -> Callable[[np.random.Generator, FloatArray], FloatArray]:
     """Draw states on the surface where function ``index`` of a region is 1, a hair inside.
 
     In c = (I + Σ τʲ Sⱼ) y, of which V(A c) and G c are made; rays from 0, from |G c| = 1 inwards.
@@ -260,10 +260,10 @@ def on_level(
         T = np.eye(3) + sum(tau[:, None, None] ** (j + 1) * s for j, s in enumerate(S))
         return np.linalg.solve(T, c_[..., None])[..., 0]
 
-    def draw(rng: np.random.Generator, count: int) -> FloatArray:
-        e = rng.normal(size=(count, 3))
+    def draw(rng: np.random.Generator, plants: FloatArray) -> FloatArray:
+        e = rng.normal(size=(len(plants), 3))
         e = np.linalg.solve(G, (e / np.linalg.norm(e, axis=1, keepdims=True)).T).T
-        out = np.ones(count)
+        out = np.ones(len(plants))
         for _ in range(60):  # the outermost point inside, roughly
             outside = value(out[:, None] * e) > 1
             if not outside.any():
@@ -284,13 +284,14 @@ def on_level(
 
 def beyond_layer(
     phi: FloatArray, law: FloatArray
-) -> Callable[[np.random.Generator, int], FloatArray]:
+) -> Callable[[np.random.Generator, FloatArray], FloatArray]:
     """Draw states with |s| of one to three layers, on the ends of a region as often as inside."""
 
-    def draw(rng: np.random.Generator, count: int) -> FloatArray:
+    def draw(rng: np.random.Generator, plants: FloatArray) -> FloatArray:
         a_a, l_a, a_u, l_u, _, layer = law
+        count = len(plants)
         x = rng.uniform(-1, 1, (count, 4)) * [1.0, 0.0, 3.0, 3.0]
-        x[:, 1] = on_faces(phi[None])(rng, count)[:, 0]
+        x[:, 1] = on_faces(phi[None])(rng, plants)[:, 0]
         x[:, 3] = -np.sign(x[:, 1]) * np.abs(x[:, 3])  # it does not leave the region
         s = layer * rng.uniform(1.01, 3.0, count) * rng.choice([-1.0, 1.0], count)
         x[:, 2] = (s - l_a * x[:, 0] - a_u * x[:, 3] - l_u * x[:, 1]) / a_a
@@ -329,7 +330,7 @@ def edges(document: Document) -> Iterator[Edge]:
                 yield Edge(
                     f"{what}: ellipsoid",
                     own_task,
-                    on_ellipsoid(W, radius, plant, law, False),
+                    on_ellipsoid(W, radius, law, False),
                     exact,
                 )
             elif kind == "reaching":
@@ -357,7 +358,7 @@ def edges(document: Document) -> Iterator[Edge]:
                     own_task, (W, radius) = with_set(claim["hint"]["terminal"], period)
                     yield Edge(
                         f"{what}: its terminal set", own_task,
-                        on_ellipsoid(W, radius, plant, law, period > 0), exact,
+                        on_ellipsoid(W, radius, law, period > 0), box,
                     )  # fmt: skip
 
 

@@ -79,7 +79,8 @@ def test_the_equations_by_hand_are_those_of_the_file(name: str, simulator: Simul
 
 
 def test_motions_from_the_edges_of_quick_claims_do_what_is_claimed(simulator: Simulator) -> None:
-    for name in ("certificate_v2.json", "held_loop_v2.json"):
+    names = ("certificate_v2", "held_loop_v2", "held_loop_plants_v2", "held_loop_starts_v2")
+    for name in (f"{name}.json" for name in names):
         counted = failed(document(name), simulator, 64)
         assert len(counted) >= 2
         assert not any(counted.values()), counted
@@ -123,6 +124,8 @@ def _times(text: str, factor: float) -> str:
         ("certificate_v2.json", 0, 2),
         ("held_loop_v2.json", 0, 1.5),
         ("held_loop_v2.json", 1, 2.2),
+        ("held_loop_plants_v2.json", 0, 10),
+        ("held_loop_starts_v2.json", 0, 16),
         ("closed_loop_v2.json", 4, 1.5),
         ("regions.json", 4, 30),
     ],
@@ -152,6 +155,20 @@ def _plants(claim: Document) -> None:
 
 def _gone(claim: Document) -> None:
     claim["hint"] = {}
+
+
+def test_plants_of_a_box_are_tried_at_its_corners(simulator: Simulator) -> None:
+    """Boxes that are too wide are noticed, of the loop and of its terminal set."""
+    data = document("held_loop_plants_v2.json")
+    claims = data["subjects"][0]["claims"]
+    own = [p for p in data["model"]["parameters"] if p["name"] == "m"]
+    known = number(own[0]["value"])
+    for claim in claims:
+        assert number(claim["plant"]["m"][0]) == pytest.approx(0.98 * known)
+        claim["plant"]["m"] = [float(v * known).hex() for v in (0.2, 5.0)]
+    counted = failed(data, simulator, 200)
+    assert len(counted) == 2 * len(claims)
+    assert all(counted.values()), counted
 
 
 @pytest.mark.parametrize("change", [_period, _plants])

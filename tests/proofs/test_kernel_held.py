@@ -436,3 +436,83 @@ def test_kept_starts_of_the_sampled_loop_are_proved_from_their_file(
         found = decide(MODEL, law, replace(own, starts={"phi": (low, high)}))
         assert found.kind == "proved", found.why
         assert found.details["tubes"] < 12
+
+
+def kept(name: str) -> list[ClosedLoop]:
+    """The claims of a file about the law of case 4."""
+    document = read((ROOT / "tests/data" / name).read_bytes())
+    assert document.model == MODEL
+    (subject,) = document.subjects
+    assert subject.law == NUMBERS
+    claims = [read_claim(data, MODEL) for data in subject.claims]
+    assert all(isinstance(own, ClosedLoop) and own.period == PERIOD for own in claims)
+    return [own for own in claims if isinstance(own, ClosedLoop)]
+
+
+def last(own: ClosedLoop, box: Any) -> dict[str, tuple[Fraction, Fraction]]:
+    """The piece of a box of starts or plants next to its upper ends, as the claim cuts it."""
+    return {k: (max((*own.cuts.get(k, ()), low)), high) for k, (low, high) in box.items()}
+
+
+def first(own: ClosedLoop, box: Any) -> dict[str, tuple[Fraction, Fraction]]:
+    """The piece next to its lower ends."""
+    return {k: (low, min((*own.cuts.get(k, ()), high))) for k, (low, high) in box.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "degrees", "wide"),
+    [(0, 38.5, {"m": "1/50"}), (1, 8.0, {"m": "1/50", "a_e": "1/20"})],
+)
+def test_kept_starts_come_home_with_every_plant_of_a_box(
+    number: int, degrees: float, wide: dict[str, str]
+) -> None:
+    """The farthest pieces, with plants next to the corners; ``undertow verify`` decides all."""
+    own = kept("held_loop_plants_v2.json")[number]
+    box = {k: within(part, k)[k] for k, part in wide.items()}
+    assert own.plant.keys() == box.keys()
+    for name, ends in box.items():
+        assert [float(v) for v in own.plant[name]] == pytest.approx([float(v) for v in ends])
+    assert -own.starts["phi"][0] == own.starts["phi"][1] >= Fraction(math.radians(degrees))
+    assert own.starts.keys() == {"phi"}
+    far = last(own, own.starts)
+    for plant in (last(own, own.plant), first(own, own.plant)):
+        found = decide(MODEL, NUMBERS, replace(own, starts=far, plant=plant))
+        assert found.kind == "proved", found.why
+        assert found.details["tubes"] < 8
+
+
+def test_neighbours_of_kept_claims_that_are_false_are_not_proved() -> None:
+    """Starts and plants that fall by simulation, next to those that are proved."""
+    by_mass, by_both = kept("held_loop_plants_v2.json")
+    (full,) = kept("held_loop_starts_v2.json")
+    law, widest = SlidingModeLaw(RIG, SURFACE, LAW), {k: 10 * v[1] for k, v in full.starts.items()}
+    for own, plant, start in (
+        (by_mass, {"m": 0.1275}, {"phi": math.radians(45.5)}),
+        (by_both, {"m": 0.125, "a_e": 0.005}, {"phi": math.radians(8)}),
+        (full, {}, {k: float(v) for k, v in widest.items()}),
+    ):
+        x = RIG.state(**start)
+        assert not np.abs(sampled(RIG.with_parameters(**plant), x, 0.001, 1000, law)[-1, 1]) < 0.5
+        box = {k: (Fraction(v), Fraction(v)) for k, v in plant.items()}
+        loop = HeldLoop(MODEL, NUMBERS, PERIOD, box)
+        assert own.terminal is not None
+        loop.take(own.terminal.W, own.terminal.radius)
+        assert not loop.follow(np.column_stack([np.append(x, list(plant.values()))] * 2))[1]
+
+
+def test_a_kept_set_of_starts_is_of_full_dimension() -> None:
+    """Angles within 10° (arm) and 5° (pendulum), rates within 0.2 rad/s: a corner of it."""
+    (own,) = kept("held_loop_starts_v2.json")
+    wanted = {"theta": math.radians(10), "phi": math.radians(5), "theta_dot": 0.2, "phi_dot": 0.2}
+    assert own.starts.keys() == wanted.keys()
+    for name, most in wanted.items():
+        assert -own.starts[name][0] == own.starts[name][1]
+        assert float(own.starts[name][1]) >= most
+    assert not own.plant
+    corner = {
+        k: (high - (high - low) / 4, high) for k, (low, high) in last(own, own.starts).items()
+    }
+    found = decide(MODEL, NUMBERS, replace(own, starts=corner, cuts={}))
+    assert found.kind == "proved", found.why
+    assert found.details["tubes"] < 8
