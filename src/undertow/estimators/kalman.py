@@ -13,6 +13,9 @@ one means that the velocities have jumped: their covariance takes in as large a 
 show, and parameters are not learnt from that sample (a test of the innovations, and a reset of the
 covariance; Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
 2001, 11.6).
+
+An encoder's error is no white noise: while a joint moves by less than a count, one reading after
+the other has the same.  So many of them say no more than one does, and count as one.
 """
 
 from __future__ import annotations
@@ -100,6 +103,17 @@ def measurement_update(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def repeated(count: float, h: float, speed: float, spread: float, noise: float) -> float:
+    """Return how many readings in a row have the same error of rounding to a ``count``.
+
+    As many as a count is wider than what moves from one to the next, h later: the joint with its
+    speed, as far as that is known, of variance ``spread``, and ``noise``, a variance.  At least 1.
+    """
+    moves = math.sqrt(h * h * (speed * speed + spread) + noise)
+    return max(1.0, count / moves) if moves > 0.0 else 1.0
+
+
+@numba.njit(cache=True, error_model="numpy")
 def readings_after_jump(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, h: float,
     odd: FloatArray, taken: FloatArray,
@@ -140,6 +154,7 @@ def readings_after_jump(
 #: parameters, in tolerances; inputs act ``lead`` periods late.
 _LAYOUT = {
     "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
+    "counts": "n", "late": "1", "alone": "n", "each": "n",
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
     "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
@@ -219,9 +234,13 @@ def estimate(h, q, u, block, size, lead, known):
         if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
             moving = size
     predict_covariance(F, P, A, noise, h, moving)
-    if readings_after_jump(x, P, q, variance, h, odd, taken):
+    for i in range(n):
+        seen, rounded = variance[i] + (x[n + i] * late[0]) ** 2, counts[i] * counts[i] / 12.0
+        alone[i] = seen + rounded
+        each[i] = seen + rounded * repeated(counts[i], h, x[n + i], P[n + i, n + i], seen)
+    if readings_after_jump(x, P, q, alone, h, odd, taken):
         moving = learnt
-    measurement_update(x, P, taken[:n], variance, total, moving)
+    measurement_update(x, P, taken[:n], each, total, moving)
     for j in range(known):
         x[learnt + j] = max(-reach[j], min(reach[j], x[learnt + j]))
         parameters[int(place[j])] = nominal[j] + tolerance[j] * x[learnt + j]
@@ -238,7 +257,7 @@ def estimate(h, q, u, block, size, lead, known):
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
     parts = "from undertow.estimators.kalman import predict_covariance, measurement_update\n"
-    parts += "from undertow.estimators.kalman import readings_after_jump\n"
+    parts += "from undertow.estimators.kalman import readings_after_jump, repeated\n"
     return compiled_module(mechanism, "kalman", "Kalman filter", _BODY, parts)
 
 
@@ -252,11 +271,17 @@ class KalmanFilter(Estimator):
     period
         Usual time between samples, s.
     position_noise
-        Standard deviation of a position, rad or m, one or one per coordinate; an encoder of
-        resolution r has r/√12.
+        Standard deviation of a position, rad or m, one or one per coordinate, that each reading
+        has anew.
     acceleration_noise
         Density of what the model does not know of the accelerations, rad/s²/√Hz or
         m/s²/√Hz, one or one per coordinate.
+    resolution
+        One count of an encoder, rad or m, one or one per coordinate; 0: there is none.  Rounding
+        to counts is off by a count/√12, and by the same until the next count.
+    time_noise
+        Standard deviation of the moment that a reading is of, s: of a joint that moves it is one of
+        its position.
     disturbance_drift
         Density of the drift of a matched disturbance, in units of the input per √s; 0:
         no disturbance is estimated.
@@ -301,6 +326,8 @@ class KalmanFilter(Estimator):
         *,
         position_noise: ArrayLike = 5e-4,
         acceleration_noise: ArrayLike = 0.5,
+        resolution: ArrayLike = 0.0,
+        time_noise: float = 0.0,
         disturbance_drift: float = 0.0,
         delay: float = 0.0,
         belief: Belief | None = None,
@@ -314,8 +341,8 @@ class KalmanFilter(Estimator):
         super().__init__(mechanism, period)
         n, m = mechanism.n, mechanism.m
         positive(
-            "disturbance_drift, delay and parameter_drift of a Kalman filter",
-            (disturbance_drift, delay, parameter_drift),
+            "time_noise, disturbance_drift, delay and parameter_drift of a Kalman filter",
+            (time_noise, disturbance_drift, delay, parameter_drift),
             "0 turns each off",
             zero=True,
         )
@@ -335,7 +362,8 @@ class KalmanFilter(Estimator):
             )
         self._arguments: dict[str, Any] = {
             "mechanism": mechanism, "period": period, "position_noise": position_noise,
-            "acceleration_noise": acceleration_noise, "disturbance_drift": disturbance_drift,
+            "acceleration_noise": acceleration_noise, "resolution": resolution,
+            "time_noise": time_noise, "disturbance_drift": disturbance_drift,
             "delay": delay, "belief": belief, "parameter_drift": parameter_drift,
         }  # fmt: skip
         self._known = known = 0 if belief is None else len(belief.tolerances)
@@ -352,6 +380,9 @@ class KalmanFilter(Estimator):
         self.felt = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
         self._variance[:] = one_for_each("position_noise", position_noise, n) ** 2
+        memory["counts"][:] = one_for_each("resolution", resolution, n, zero=True)
+        self._single: FloatArray = self._variance + memory["counts"] ** 2 / 12.0
+        memory["late"][0] = time_noise
         unknown = one_for_each("acceleration_noise", acceleration_noise, n)
         memory["noise"][n : 2 * n] = unknown**2
         memory["noise"][2 * n : self._learnt] = disturbance_drift**2
@@ -383,7 +414,7 @@ class KalmanFilter(Estimator):
         self._x[: 2 * n] = x0
         self._P[:] = 0.0
         variances = np.zeros(len(self._x))
-        variances[:n], variances[n : 2 * n] = self._variance, spread**2
+        variances[:n], variances[n : 2 * n] = self._single, spread**2
         if learnt > 2 * n:
             known = np.isfinite(self._limits)
             variances[2 * n : learnt] = np.where(known, DISTURBED * self._limits, 1.0) ** 2
@@ -419,8 +450,13 @@ class KalmanFilter(Estimator):
         return ParameterEstimate(self._x[place].copy(), information, int(self._count[0]))
 
     def _at_rest(self) -> KalmanFilter:
-        """Return a filter like this one, after half a second at rest at the target."""
-        double = KalmanFilter(**self._arguments)
+        """Return a filter like this one, after half a second at rest at the target.
+
+        There a law that works moves each joint by a count from sample to sample: each reading has
+        an error of its own.
+        """
+        white = {"position_noise": np.sqrt(self._single), "resolution": 0.0}
+        double = KalmanFilter(**self._arguments | white)
         n, m = self.mechanism.n, self.mechanism.m
         double.reset(np.zeros(2 * n))
         for k in range(round(0.5 / self.period)):
