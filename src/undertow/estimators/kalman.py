@@ -15,7 +15,10 @@ covariance; Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracki
 2001, 11.6).
 
 An encoder's error is no white noise: while a joint moves by less than a count, one reading after
-the other has the same.  So many of them say no more than one does, and count as one.
+the other has the same.  Of parameters, which add up what each reading says, so many of them say no
+more than one does: each moves them by its share alone (a partial update; Brink, *J. Guidance,
+Control, and Dynamics* 40(9), 2017).  State and disturbance, which are soon forgotten, are not held
+up by that.
 """
 
 from __future__ import annotations
@@ -82,11 +85,12 @@ def predict_covariance(
 @numba.njit(cache=True, error_model="numpy")
 def measurement_update(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray,
-    moving: int,
+    learnt: int, share: FloatArray,
 ) -> None:  # fmt: skip
     """Take in positions one by one, nothing inverted; a missing one (NaN) is left out.
 
-    Numbers from ``moving`` on are considered and stay as they are (Schmidt's filter).
+    Numbers from ``learnt`` on are moved by a ``share``, (n,), of what a reading says of them; with
+    0 they are considered and stay as they are (Schmidt's filter).
     """
     size = x.shape[0]
     for i in range(q.shape[0]):
@@ -95,11 +99,12 @@ def measurement_update(
         spread = P[i, i] + variance[i]
         error = q[i] - x[i]
         column[:size] = P[:, i]
+        both = share[i] * (2.0 - share[i])
         for k in range(size):
-            if k < moving:
-                x[k] += column[k] * (error / spread)
-            for j in range(size if k < moving else moving):
-                P[k, j] -= column[k] * column[j] / spread
+            x[k] += column[k] * (error / spread) * (1.0 if k < learnt else share[i])
+            for j in range(size):
+                part = 1.0 if min(k, j) < learnt else both
+                P[k, j] -= column[k] * column[j] / spread * part
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -154,7 +159,7 @@ def readings_after_jump(
 #: parameters, in tolerances; inputs act ``lead`` periods late.
 _LAYOUT = {
     "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
-    "counts": "n", "late": "1", "alone": "n", "each": "n",
+    "counts": "n", "late": "1", "now": "n", "share": "n",
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
     "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
@@ -235,12 +240,14 @@ def estimate(h, q, u, block, size, lead, known):
             moving = size
     predict_covariance(F, P, A, noise, h, moving)
     for i in range(n):
-        seen, rounded = variance[i] + (x[n + i] * late[0]) ** 2, counts[i] * counts[i] / 12.0
-        alone[i] = seen + rounded
-        each[i] = seen + rounded * repeated(counts[i], h, x[n + i], P[n + i, n + i], seen)
-    if readings_after_jump(x, P, q, alone, h, odd, taken):
-        moving = learnt
-    measurement_update(x, P, taken[:n], each, total, moving)
+        now[i] = variance[i] + (x[n + i] * late[0]) ** 2
+        share[i] = 0.0
+        if moving > learnt:
+            new = now[i] - counts[i] * counts[i] / 12.0
+            share[i] = 1.0 / repeated(counts[i], h, x[n + i], P[n + i, n + i], new)
+    if readings_after_jump(x, P, q, now, h, odd, taken):
+        share[:] = 0.0
+    measurement_update(x, P, taken[:n], now, total, learnt, share)
     for j in range(known):
         x[learnt + j] = max(-reach[j], min(reach[j], x[learnt + j]))
         parameters[int(place[j])] = nominal[j] + tolerance[j] * x[learnt + j]
@@ -278,7 +285,8 @@ class KalmanFilter(Estimator):
         m/s²/√Hz, one or one per coordinate.
     resolution
         One count of an encoder, rad or m, one or one per coordinate; 0: there is none.  Rounding
-        to counts is off by a count/√12, and by the same until the next count.
+        to counts is off by a count/√12, and by the same until the next count: readings of one
+        count teach parameters as much as one does.
     time_noise
         Standard deviation of the moment that a reading is of, s: of a joint that moves it is one of
         its position.
@@ -379,9 +387,10 @@ class KalmanFilter(Estimator):
         self._odd: FloatArray = memory["odd"]
         self.felt = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
-        self._variance[:] = one_for_each("position_noise", position_noise, n) ** 2
-        memory["counts"][:] = one_for_each("resolution", resolution, n, zero=True)
-        self._single: FloatArray = self._variance + memory["counts"] ** 2 / 12.0
+        counts = memory["counts"]
+        counts[:] = one_for_each("resolution", resolution, n, zero=True)
+        noise = one_for_each("position_noise", position_noise, n)
+        self._variance[:] = noise**2 + counts**2 / 12.0
         memory["late"][0] = time_noise
         unknown = one_for_each("acceleration_noise", acceleration_noise, n)
         memory["noise"][n : 2 * n] = unknown**2
@@ -414,7 +423,7 @@ class KalmanFilter(Estimator):
         self._x[: 2 * n] = x0
         self._P[:] = 0.0
         variances = np.zeros(len(self._x))
-        variances[:n], variances[n : 2 * n] = self._single, spread**2
+        variances[:n], variances[n : 2 * n] = self._variance, spread**2
         if learnt > 2 * n:
             known = np.isfinite(self._limits)
             variances[2 * n : learnt] = np.where(known, DISTURBED * self._limits, 1.0) ** 2
@@ -450,13 +459,8 @@ class KalmanFilter(Estimator):
         return ParameterEstimate(self._x[place].copy(), information, int(self._count[0]))
 
     def _at_rest(self) -> KalmanFilter:
-        """Return a filter like this one, after half a second at rest at the target.
-
-        There a law that works moves each joint by a count from sample to sample: each reading has
-        an error of its own.
-        """
-        white = {"position_noise": np.sqrt(self._single), "resolution": 0.0}
-        double = KalmanFilter(**self._arguments | white)
+        """Return a filter like this one, after half a second at rest at the target."""
+        double = KalmanFilter(**self._arguments)
         n, m = self.mechanism.n, self.mechanism.m
         double.reset(np.zeros(2 * n))
         for k in range(round(0.5 / self.period)):
