@@ -11,7 +11,7 @@ from undertow.closed_loop import ClosedLoop
 from undertow.estimators import Belief, KalmanFilter
 from undertow.law import InnerLoop
 from undertow.models import FloatArray, Mechanism
-from undertow.plants import IdealRig, Measurement
+from undertow.plants import Bench, Encoder, IdealRig, Measurement, RealisticRig
 
 PERIOD, NOISE = 0.001, 2e-4
 
@@ -239,3 +239,91 @@ def test_a_single_bad_reading_is_left_out(arm: Mechanism) -> None:
     assert kalman.jumps == 0
     assert np.abs(off).max() < 0.1
     assert np.abs(after - before).max() < 0.2
+
+
+COUNT = 2 * np.pi / 4096
+
+
+def _off_by_counts(
+    wheel: Mechanism, belief: Belief, seed: int, **reading: float
+) -> tuple[float, float]:
+    """Learn another plant from its encoders for 4 s while the law for the model balances it.
+
+    The squared error in what the filter says of it, per parameter; the worst one, in tolerances.
+    """
+    rng = np.random.default_rng([seed, 9])
+    truth = rng.uniform(-0.2, 0.2, len(belief.tolerances))
+    plant = wheel.with_values(belief.values(truth))
+    law = InnerLoop(wheel, ut.first_surface(wheel), ut.ReachingLaw(40.0, 1.6))
+    counts = {c.name: Encoder(COUNT) for c in wheel.coordinates}
+    rig = RealisticRig(Bench(plant, encoders=counts), wheel.state(phi=0.02), seed)
+    kalman, u = KalmanFilter(wheel, PERIOD, belief=belief, **reading), np.zeros(1)
+    for k in range(4000):
+        seen = rig.read()
+        if k == 0:
+            kalman.reset(np.concatenate([seen.q, np.zeros(2)]))
+        u = law(kalman.estimate(seen, u)).copy()
+        rig.write(u)
+    assert abs(rig.truth[1]) < 0.05
+    learnt = kalman.learnt
+    assert learnt is not None
+    off = learnt.offset - truth
+    return float(off @ learnt.information @ off) / len(off), float(np.abs(off).max())
+
+
+def test_counts_teach_no_more_than_they_say() -> None:
+    """A slow pendulum stays within a count for tens of readings, which all have the same error.
+
+    Taken for as many independent ones they teach a plant that is none: by more than it can be off,
+    and by many times what the filter says.
+    """
+    wheel = ut.mechanisms.reaction_wheel_pendulum()
+    belief = Belief.usual(wheel)
+    counted = [
+        _off_by_counts(wheel, belief, seed, position_noise=1e-6, resolution=COUNT)
+        for seed in range(3)
+    ]
+    assert max(size for size, _ in counted) < 2.0
+    assert max(worst for _, worst in counted) < 1.5
+    white = _off_by_counts(wheel, belief, 0, position_noise=COUNT / np.sqrt(12))
+    assert white[0] > 50.0
+    assert white[1] > 3.0
+
+
+@pytest.mark.parametrize(("late", "jumps"), [(0.0, True), (3e-5, False)])
+def test_readings_of_another_moment_are_no_jump(arm: Mechanism, late: float, jumps: bool) -> None:
+    """The arm turns at 100 rad/s, and each reading is some 30 µs early or late."""
+    rng, kalman = np.random.default_rng(10), KalmanFilter(
+        arm, PERIOD, position_noise=NOISE, time_noise=late
+    )  # fmt: skip
+    rig = IdealRig(arm, arm.state(theta_dot=100.0), PERIOD)
+    kalman.reset(rig.truth)
+    for _ in range(300):
+        rig.write([0.0])
+        seen, x = rig.read(), rig.truth
+        q = seen.q + 3e-5 * rng.standard_normal() * x[2:] + NOISE * rng.standard_normal(2)
+        kalman.estimate(Measurement(seen.t, q), np.zeros(1))
+    assert (kalman.jumps > 0) is jumps
+
+
+def test_senseless_readings_are_refused(arm: Mechanism) -> None:
+    with pytest.raises(InvalidInputError, match="resolution"):
+        KalmanFilter(arm, resolution=[COUNT, -COUNT])
+    with pytest.raises(InvalidInputError, match="time_noise"):
+        KalmanFilter(arm, time_noise=-1e-5)
+
+
+def test_counts_of_a_joint_that_runs_are_white_noise(arm: Mechanism) -> None:
+    """It crosses one at each reading: the filter is that of a count/√12, to the bit."""
+    both = [
+        KalmanFilter(arm, PERIOD, position_noise=1e-6, resolution=1e-4),
+        KalmanFilter(arm, PERIOD, position_noise=np.sqrt(1e-12 + 1e-8 / 12)),
+    ]
+    states = []
+    for kalman in both:
+        kalman.reset([0.0, 0.0, 5.0, 5.0])
+        for k in range(1, 51):
+            q = np.array([5.0, 5.0]) * k * PERIOD
+            states.append(kalman.estimate(Measurement(k * PERIOD, q), np.zeros(1)).copy())
+    np.testing.assert_allclose(states[:50], states[50:], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(both[0].noise_covariance(), both[1].noise_covariance(), rtol=1e-9)

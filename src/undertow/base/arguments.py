@@ -183,9 +183,11 @@ def positive(
 
 
 def one_for_each(
-    what: str, values: ArrayLike, count: int, *, infinite: bool = False
+    what: str, values: ArrayLike, count: int, *, zero: bool = False, infinite: bool = False
 ) -> np.typing.NDArray[np.float64]:
     """Return positive numbers, (count,), from one for all of them or one for each.
+
+    ``zero``: it may be 0, ``infinite``: infinity too.
 
     Raises
     ------
@@ -195,7 +197,7 @@ def one_for_each(
     numbers, remedy = np.asarray(values, dtype=np.float64), "One number serves all"
     if numbers.shape not in ((), (count,)):
         raise InvalidInputError(what, value=values, limit=f"one number or {count}", remedy=remedy)
-    positive(what, values, remedy, infinite=infinite)
+    positive(what, values, remedy, zero=zero, infinite=infinite)
     return np.array(np.broadcast_to(numbers, (count,)))
 
 

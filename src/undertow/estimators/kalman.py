@@ -13,6 +13,12 @@ one means that the velocities have jumped: their covariance takes in as large a 
 show, and parameters are not learnt from that sample (a test of the innovations, and a reset of the
 covariance; Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
 2001, 11.6).
+
+An encoder's error is no white noise: while a joint moves by less than a count, one reading after
+the other has the same.  Of parameters, which add up what each reading says, so many of them say no
+more than one does: each moves them by its share alone (a partial update; Brink, *J. Guidance,
+Control, and Dynamics* 40(9), 2017).  State and disturbance, which are soon forgotten, are not held
+up by that.
 """
 
 from __future__ import annotations
@@ -79,11 +85,12 @@ def predict_covariance(
 @numba.njit(cache=True, error_model="numpy")
 def measurement_update(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray,
-    moving: int,
+    learnt: int, share: FloatArray,
 ) -> None:  # fmt: skip
     """Take in positions one by one, nothing inverted; a missing one (NaN) is left out.
 
-    Numbers from ``moving`` on are considered and stay as they are (Schmidt's filter).
+    Numbers from ``learnt`` on are moved by a ``share``, (n,), of what a reading says of them; with
+    0 they are considered and stay as they are (Schmidt's filter).
     """
     size = x.shape[0]
     for i in range(q.shape[0]):
@@ -91,13 +98,25 @@ def measurement_update(
             continue
         spread = P[i, i] + variance[i]
         error = q[i] - x[i]
+        both = share[i] * (2.0 - share[i])
         for k in range(size):
             column[k] = P[k, i]
         for k in range(size):
-            if k < moving:
-                x[k] += column[k] * (error / spread)
-            for j in range(size if k < moving else moving):
-                P[k, j] -= column[k] * column[j] / spread
+            x[k] += column[k] * (error / spread) * (1.0 if k < learnt else share[i])
+            for j in range(size):
+                part = 1.0 if min(k, j) < learnt else both
+                P[k, j] -= column[k] * column[j] / spread * part
+
+
+@numba.njit(cache=True, error_model="numpy")
+def repeated(count: float, h: float, speed: float, spread: float, noise: float) -> float:
+    """Return how many readings in a row have the same error of rounding to a ``count``.
+
+    As many as a count is wider than what moves from one to the next, h later: the joint with its
+    speed, as far as that is known, of variance ``spread``, and ``noise``, a variance.  At least 1.
+    """
+    moves = math.sqrt(h * h * (speed * speed + spread) + noise)
+    return max(1.0, count / moves) if moves > 0.0 else 1.0
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -141,6 +160,7 @@ def readings_after_jump(
 #: parameters, in tolerances; inputs act ``lead`` periods late.
 _LAYOUT = {
     "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
+    "counts": "n", "late": "1", "now": "n", "share": "n",
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
     "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
@@ -220,9 +240,15 @@ def estimate(h, q, u, block, size, lead, known):
         if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
             moving = size
     predict_covariance(F, P, A, noise, h, moving)
-    if readings_after_jump(x, P, q, variance, h, odd, taken):
-        moving = learnt
-    measurement_update(x, P, taken[:n], variance, total, moving)
+    for i in range(n):
+        now[i] = variance[i] + (x[n + i] * late[0]) ** 2
+        share[i] = 0.0
+        if moving > learnt:
+            new = now[i] - counts[i] * counts[i] / 12.0
+            share[i] = 1.0 / repeated(counts[i], h, x[n + i], P[n + i, n + i], new)
+    if readings_after_jump(x, P, q, now, h, odd, taken):
+        share[:] = 0.0
+    measurement_update(x, P, taken[:n], now, total, learnt, share)
     for j in range(known):
         x[learnt + j] = max(-reach[j], min(reach[j], x[learnt + j]))
         parameters[int(place[j])] = nominal[j] + tolerance[j] * x[learnt + j]
@@ -240,7 +266,7 @@ def estimate(h, q, u, block, size, lead, known):
 @lru_cache(maxsize=64)
 def _module(mechanism: Mechanism) -> Any:
     parts = "from undertow.estimators.kalman import predict_covariance, measurement_update\n"
-    parts += "from undertow.estimators.kalman import readings_after_jump\n"
+    parts += "from undertow.estimators.kalman import readings_after_jump, repeated\n"
     return compiled_module(mechanism, "kalman", "Kalman filter", _BODY, parts)
 
 
@@ -254,11 +280,18 @@ class KalmanFilter(Estimator):
     period
         Usual time between samples, s.
     position_noise
-        Standard deviation of a position, rad or m, one or one per coordinate; an encoder of
-        resolution r has r/√12.
+        Standard deviation of a position, rad or m, one or one per coordinate, that each reading
+        has anew.
     acceleration_noise
         Density of what the model does not know of the accelerations, rad/s²/√Hz or
         m/s²/√Hz, one or one per coordinate.
+    resolution
+        One count of an encoder, rad or m, one or one per coordinate; 0: there is none.  Rounding
+        to counts is off by a count/√12, and by the same until the next count: readings of one
+        count teach parameters as much as one does.
+    time_noise
+        Standard deviation of the moment that a reading is of, s: of a joint that moves it is one of
+        its position.
     disturbance_drift
         Density of the drift of a matched disturbance, in units of the input per √s; 0:
         no disturbance is estimated.
@@ -303,6 +336,8 @@ class KalmanFilter(Estimator):
         *,
         position_noise: ArrayLike = 5e-4,
         acceleration_noise: ArrayLike = 0.5,
+        resolution: ArrayLike = 0.0,
+        time_noise: float = 0.0,
         disturbance_drift: float = 0.0,
         delay: float = 0.0,
         belief: Belief | None = None,
@@ -316,8 +351,8 @@ class KalmanFilter(Estimator):
         super().__init__(mechanism, period)
         n, m = mechanism.n, mechanism.m
         positive(
-            "disturbance_drift, delay and parameter_drift of a Kalman filter",
-            (disturbance_drift, delay, parameter_drift),
+            "time_noise, disturbance_drift, delay and parameter_drift of a Kalman filter",
+            (time_noise, disturbance_drift, delay, parameter_drift),
             "0 turns each off",
             zero=True,
         )
@@ -337,7 +372,8 @@ class KalmanFilter(Estimator):
             )
         self._arguments: dict[str, Any] = {
             "mechanism": mechanism, "period": period, "position_noise": position_noise,
-            "acceleration_noise": acceleration_noise, "disturbance_drift": disturbance_drift,
+            "acceleration_noise": acceleration_noise, "resolution": resolution,
+            "time_noise": time_noise, "disturbance_drift": disturbance_drift,
             "delay": delay, "belief": belief, "parameter_drift": parameter_drift,
         }  # fmt: skip
         self._known = known = 0 if belief is None else len(belief.tolerances)
@@ -353,7 +389,11 @@ class KalmanFilter(Estimator):
         self._odd: FloatArray = memory["odd"]
         self.felt = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
-        self._variance[:] = one_for_each("position_noise", position_noise, n) ** 2
+        counts = memory["counts"]
+        counts[:] = one_for_each("resolution", resolution, n, zero=True)
+        noise = one_for_each("position_noise", position_noise, n)
+        self._variance[:] = noise**2 + counts**2 / 12.0
+        memory["late"][0] = time_noise
         unknown = one_for_each("acceleration_noise", acceleration_noise, n)
         memory["noise"][n : 2 * n] = unknown**2
         memory["noise"][2 * n : self._learnt] = disturbance_drift**2

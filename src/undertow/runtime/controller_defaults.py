@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
 from undertow.estimators import Belief, Estimator, KalmanFilter
 from undertow.law import ReachingLaw, first_surface
@@ -30,25 +32,31 @@ DRIFT = 0.1
 #: Standard deviation of a position that is read as it is, rad or m.
 EXACT = 1e-6
 
+#: Density of what the model leaves out of an acceleration, in parts per √Hz of what the full inputs
+#: do to it at the target, and at most, rad/s²/√Hz or m/s²/√Hz: also where they do nothing to it.
+LEFT_OUT, MOST_LEFT_OUT = 0.0014, 0.5
+
 
 def estimator_for(
     belief: Mechanism, bench: Bench, drift: float | None = None, known: Belief | None = None
 ) -> KalmanFilter:
-    """Return the Kalman filter that knows a bench's encoders, period and delays, nothing else.
+    """Return the Kalman filter that knows a bench's encoders, period, jitter and delays, no more.
 
     ``drift``: density of the matched disturbance's drift, input units per √s; ``DRIFT`` of the
     smallest limit by default, 0 estimates none. ``known``: what is not known of the model's
     parameters, which are then learnt.
     """
-    sigmas = []
-    for c in belief.coordinates:
-        encoder = bench.encoders.get(c.name, Encoder())
-        sigmas.append(max(math.hypot(encoder.resolution / math.sqrt(12), encoder.noise), EXACT))
-    timing = bench.timing
+    encoders = [bench.encoders.get(c.name, Encoder()) for c in belief.coordinates]
+    full, timing = Belief(belief, {}).full_accelerations, bench.timing
     return KalmanFilter(
         belief,
         timing.period,
-        position_noise=sigmas,
+        position_noise=[max(encoder.noise, EXACT) for encoder in encoders],
+        acceleration_noise=np.where(
+            full > 0, np.minimum(LEFT_OUT * full, MOST_LEFT_OUT), MOST_LEFT_OUT
+        ),
+        resolution=[encoder.resolution for encoder in encoders],
+        time_noise=timing.jitter / math.sqrt(12),
         disturbance_drift=DRIFT * float(finite_limits(belief).min()) if drift is None else drift,
         delay=timing.input_delay + timing.measurement_delay,
         belief=known,
