@@ -152,9 +152,10 @@ def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early()
             worker.ask(controller.request)
     (jump,) = (t for t, kind, _ in said if kind == "jump")
     assert 1.0 < jump < 1.004
-    used = [t for t, kind, text in said if kind == "answer" and "applied" in text and t > jump]
-    assert used[0] < jump + 0.002
-    assert used[1] < jump + 0.025
+    answers = [(t, text) for t, kind, text in said if kind == "answer" and t > jump]
+    assert answers[0][0] < jump + 0.002  # the plan in reserve
+    assert "applied" in answers[0][1]
+    assert answers[1][0] < jump + 0.025  # the decision, whatever the gate makes of it
     assert abs(rig.truth[1]) < 0.1
     assert controller.mode in (Mode.CATCH, Mode.BALANCE)
 

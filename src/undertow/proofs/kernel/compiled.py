@@ -465,10 +465,9 @@ def jets(code, constants, low, high, rates, order, seeds):  # type: ignore[no-un
         J[inputs + i, 0, 0, 0], J[inputs + i, 0, 0, 1] = constants[i]
     for k in range(order + 1):
         for i in range(len(rates) if k else 0):
-            c, d = reciprocal(float(k), float(k))
             for v in range(J.shape[2]):
                 J[i, k, v, 0], J[i, k, v, 1] = J[rates[i], k - 1, v]
-            _scaled(J, i, k, c, d)
+            _scaled(J, i, k, *reciprocal(float(k), float(k)))
         for line in range(len(code)):
             _line(J, code[line, 0], first + line, k, code[line, 1], code[line, 2])
     return J
@@ -514,10 +513,7 @@ def product(A, B):  # type: ignore[no-untyped-def]
 @_njit
 def points(A):  # type: ignore[no-untyped-def]
     """Doubles as intervals."""
-    out = np.empty((*A.shape, 2))
-    for at, value in np.ndenumerate(A):
-        out[at] = value
-    return out
+    return np.repeat(A, 2).reshape((*A.shape, 2))
 
 
 @_njit
@@ -670,9 +666,8 @@ def decrease(A, held):  # type: ignore[no-untyped-def]
     """
     size = len(A)
     S, turned, scale = np.empty((size, size, 2)), np.empty((size, size, 2)), np.ones(size)
-    for i in range(size):
-        for j in range(size):
-            turned[j, i, 0], turned[j, i, 1] = A[i, j]
+    for (i, j, end), value in np.ndenumerate(A):
+        turned[j, i, end] = value
     square = product(turned, A)
     for i in range(size):
         for j in range(size):
@@ -705,18 +700,13 @@ def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no
         a, b = whole[i, 0]
         if not (a > 0.0 or (b < 0.0 and i >= n + m + n)):
             return 2, -_INF
-    rows = np.empty((2 * m, size, 2))
+    moved, demand = product(C, V), product(whole[n : n + m, 1:], V)
     for i in range(m):
-        for j in range(size):
-            rows[i, j, 0], rows[i, j, 1] = C[i, j]
-            rows[m + i, j, 0], rows[m + i, j, 1] = whole[n + i, 1 + j]
-    rows = product(rows, V)
-    for i in range(m):
-        if not up(norm(rows[i]) * radius) <= layer[i]:
+        if not up(norm(moved[i]) * radius) <= layer[i]:
             return 3, -_INF
     for i in range(m):
         a, b = centre[n + i]
-        if not up(max(abs(a), abs(b)) + up(norm(rows[m + i]) * radius)) <= limits[i]:
+        if not up(max(abs(a), abs(b)) + up(norm(demand[i]) * radius)) <= limits[i]:
             return 4, -_INF
     F = np.zeros((size, size, 2))
     for i in range(n):
