@@ -314,7 +314,7 @@ def test_senseless_readings_are_refused(arm: Mechanism) -> None:
 
 
 def test_counts_of_a_joint_that_runs_are_white_noise(arm: Mechanism) -> None:
-    """It crosses one at each reading: the filter is that of a count/√12, to the bit."""
+    """It crosses one at each reading: the filter is that of a count/√12, to 1e-9."""
     both = [
         KalmanFilter(arm, PERIOD, position_noise=1e-6, resolution=1e-4),
         KalmanFilter(arm, PERIOD, position_noise=np.sqrt(1e-12 + 1e-8 / 12)),

@@ -259,9 +259,10 @@ def _assigned_arrays(source: str) -> Iterator[str]:
             continue
         words = " ".join(map(ast.unparse, function.decorator_list))
         for node in ast.walk(function) if re.search("njit|compiled|inner", words) else ():
-            if isinstance(node, ast.Assign) and not number.fullmatch(ast.unparse(node.value)):
-                named = [target for target in node.targets if ":" in ast.unparse(target)]
-                yield from (f"{function.name}: {ast.unparse(node)}" for _ in named)
+            if not isinstance(node, ast.Assign) or number.fullmatch(ast.unparse(node.value)):
+                continue
+            if ":" in " ".join(map(ast.unparse, node.targets)):
+                yield f"{function.name}: {ast.unparse(node)}"
 
 
 def _is_body(text: object) -> bool:
