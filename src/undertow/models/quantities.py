@@ -29,9 +29,11 @@ LONGEST = 200
 _RESERVED = re.compile(r"_(v|y|cse_|viscous_)\d+")
 
 
-#: Invisible characters that Unicode counts among letters and marks: fillers, joiners, selectors.
+#: Invisible characters that Unicode counts among letters and marks: fillers, joiners, selectors; of
+#: those of no width Python 3.13 takes two into names.
 _INVISIBLE = re.compile(
-    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f\u3164\ufe00-\ufe0f\uffa0"
+    "\U000e0100-\U000e01ef]"
 )
 
 
