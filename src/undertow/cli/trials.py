@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 import typer
 
 from undertow.base import InvalidInputError
-from undertow.cli.options import option
 from undertow.cli.terminal import carry_out, command
 
 #: Options that some experiments have, and which.
@@ -37,79 +36,48 @@ TAKEN_BY = {
 def trials(
     what: Annotated[
         Literal["balance", "swing-up", "mujoco", "robustness", "estimators", "library", "coverage"],
-        typer.Argument(
-            help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
-            "rest to balanced. mujoco: MuJoCo as the truth, no retuning. "
-            "robustness: random rigs, and which single change makes each controller fail. "
-            "estimators: the same law with each estimator. "
-            "library: every mechanism through the runtime. coverage: how often the intervals that "
-            "undertow bench identifies hold the truth.",
-            metavar="WHAT",
-            show_choices=False,
-        ),
+        typer.Argument(show_choices=False),
     ],
-    seeds: Annotated[
-        int | None,
-        option(
-            "Rigs, one for each seed; not for robustness and mujoco. Default: 20; 5 for "
-            "estimators and library.",
-            min=1,
-            show_default=False,
-        ),
-    ] = None,
-    angle: Annotated[
-        float | None,
-        option(
-            "balance: start of the pendulum, degrees from the upright. Default: 35.",
-            show_default=False,
-        ),
-    ] = None,
-    rigs: Annotated[
-        int | None,
-        option("robustness: random rigs. Default: 200.", min=1, show_default=False),
-    ] = None,
-    single: Annotated[
-        bool | None,
-        option(
-            "--single/--no-single",
-            "robustness: also look for the largest single change that is survived. Default: yes.",
-            show_default=False,
-        ),
-    ] = None,
-    limits: Annotated[
-        bool | None,
-        option(
-            "--limits/--no-limits",
-            "balance: also search for the catch limits, which takes longest. Default: yes.",
-            show_default=False,
-        ),
-    ] = None,
-    quick: Annotated[
-        bool,
-        option(
-            "--quick",
-            "Quick look: three seeds, ten random rigs, no search for limits; not for mujoco.",
-        ),
-    ] = False,
-    fresh: Annotated[
-        int | None,
-        option(
-            "swing-up: search for new gains with this seed, in place of the library's.",
-            metavar="SEED",
-            min=0,
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        option(
-            "Folder for the table as text. balance: for balance.csv and the figures too. "
-            "swing-up: for gains.json too, the gains as the library keeps them. robustness and "
-            "coverage: for robustness.jsonl or coverage.jsonl alone. Each result is kept there as "
-            "it is found; after an interruption the same command goes on."
-        ),
-    ] = None,
+    seeds: Annotated[int | None, typer.Option(min=1)] = None,
+    angle: float | None = None,
+    rigs: Annotated[int | None, typer.Option(min=1)] = None,
+    single: bool | None = None,
+    limits: bool | None = None,
+    quick: bool = False,
+    fresh: Annotated[int | None, typer.Option(min=0)] = None,
+    out: Path | None = None,
 ) -> None:
-    """Run controllers on realistic rigs with many seeds, and show the results as tables."""
+    """Run controllers on realistic rigs with many seeds, and show the results as tables.
+
+    Parameters
+    ----------
+    what : WHAT
+        balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at rest to
+        balanced. mujoco: MuJoCo as the truth, no retuning. robustness: random rigs, and which
+        single change makes each controller fail. estimators: the same law with each estimator.
+        library: every mechanism through the runtime. coverage: how often the intervals that
+        undertow bench identifies hold the truth.
+    seeds
+        Rigs, one for each seed; not for robustness and mujoco. Default: 20; 5 for estimators and
+        library.
+    angle
+        balance: start of the pendulum, degrees from the upright. Default: 35.
+    rigs
+        robustness: random rigs. Default: 200.
+    single
+        robustness: also look for the largest single change that is survived. Default: yes.
+    limits
+        balance: also search for the catch limits, which takes longest. Default: yes.
+    quick
+        Quick look: three seeds, ten random rigs, no search for limits; not for mujoco.
+    fresh : SEED
+        swing-up: search for new gains with this seed, in place of the library's.
+    out
+        Folder for the table as text. balance: for balance.csv and the figures too. swing-up: for
+        gains.json too, the gains as the library keeps them. robustness and coverage: for
+        robustness.jsonl or coverage.jsonl alone. Each result is kept there as it is found; after an
+        interruption the same command goes on.
+    """
     from undertow.studies.trials.experiments import experiment
 
     given = {
