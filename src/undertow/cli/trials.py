@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from undertow.base import InvalidInputError
 from undertow.cli.terminal import carry_out, command
-
-#: Options that some experiments have, and which.
-TAKEN_BY = {
-    "--seeds": ("balance", "swing-up", "estimators", "library", "coverage"),
-    "--angle": ("balance",),
-    "--rigs": ("robustness",),
-    "--single": ("robustness",),
-    "--limits": ("balance",),
-    "--quick": ("balance", "swing-up", "robustness", "estimators", "library", "coverage"),
-    "--fresh": ("swing-up",),
-}
 
 
 @command(
@@ -78,28 +68,29 @@ def trials(
         robustness.jsonl or coverage.jsonl alone. Each result is kept there as it is found; after an
         interruption the same command goes on.
     """
-    from undertow.studies.trials.experiments import experiment
+    from undertow.studies.trials.experiments import EXPERIMENTS
 
+    takes = {name: {*inspect.signature(make).parameters} for name, make in EXPERIMENTS.items()}
+    for own in takes.values():
+        own.update({"quick"} if own else ())
     given = {
-        "--seeds": seeds, "--angle": angle, "--rigs": rigs, "--single": single,
-        "--limits": limits, "--quick": quick or None, "--fresh": fresh,
+        "seeds": seeds, "angle": angle, "rigs": rigs, "single": single, "limits": limits,
+        "quick": quick or None, "fresh": fresh,
     }  # fmt: skip
-    for name, value in given.items():
-        takers = TAKEN_BY[name]
-        if value is not None and what not in takers:
+    asked = {option: value for option, value in given.items() if value is not None}
+    for option, value in asked.items():
+        takers = [name for name, own in takes.items() if option in own]
+        if what not in takers:
             raise InvalidInputError(
-                f"{name} with undertow trials {what}",
+                f"--{option} with undertow trials {what}",
                 value=value,
                 limit=f"an option of {', '.join(takers)}",
-                remedy=f"Leave {name} out",
+                remedy=f"Leave --{option} out",
             )
-    work = experiment(
-        what,
-        seeds=min(seeds or 3, 3) if quick else seeds,
-        angle=math.radians(35.0 if angle is None else angle),
-        limits=limits is not False and not quick,
-        rigs=min(rigs or 10, 10) if quick else rigs or 200,
-        single=single is not False and not quick,
-        fresh=fresh,
-    )
-    carry_out(work, out)
+    if angle is not None:
+        asked["angle"] = math.radians(angle)
+    if asked.pop("quick", False):
+        brief: dict[str, Any] = {"seeds": min(seeds or 3, 3), "rigs": min(rigs or 10, 10)}
+        brief |= {"single": False, "limits": False}
+        asked |= {option: brief[option] for option in takes[what] & {*brief}}
+    carry_out(EXPERIMENTS[what](**asked), out)
