@@ -58,11 +58,7 @@ class Designs(Study):
         for entry in zip(*values, strict=True):
             named = {axis.name: float(v) for axis, v in zip(self.axes, entry, strict=True)}
             rows.append(self._design(self.mechanism.with_parameters(**named)))
-        columns = np.array(rows).T
-        return {
-            name: column.reshape(shape)
-            for name, column in zip(self.variables, columns, strict=True)
-        }
+        return self.arrays(shape, np.array(rows).T)
 
     def _design(self, mechanism: Mechanism) -> tuple[float, float, float]:
         energy, time = (self._run(mechanism, goal) for goal in ("energy", "time"))

@@ -157,11 +157,7 @@ class League(Study):
         place = self.part(shard)
         number, who = place[0].start, place[1].start
         mechanism, objective = self.mechanisms[number], self.objectives[number]
-        shape = (1, 1, len(self.tasks), self.plants)
-        found: Arrays = {
-            name: np.full(shape, variable.missing, variable.dtype)
-            for name, variable in self.variables.items()
-        }
+        found = self.unknown((1, 1, len(self.tasks), self.plants))
         chosen = 0
         if who:
             entry = self.entries[who - 1]

@@ -91,10 +91,7 @@ class RandomPlants(Study):
         """Try every contender on the plants of a shard."""
         (part,) = self.part(shard)
         numbers = range(part.start, part.stop)
-        found: Arrays = {
-            name: np.empty(len(numbers), variable.dtype)
-            for name, variable in self.variables.items()
-        }
+        found = self.unknown((len(numbers),))
         for name in self.controllers:
             make = self.controller(name)
             for row, number in enumerate(numbers):

@@ -120,6 +120,17 @@ class Study(ABC):
         """Every mechanism that results depend on."""
         return self.mechanisms or (self.mechanism,)
 
+    def unknown(self, shape: tuple[int, ...]) -> Arrays:
+        """Return arrays of this size for every variable, with nothing in them yet."""
+        return {name: np.full(shape, v.missing, v.dtype) for name, v in self.variables.items()}
+
+    def arrays(self, shape: tuple[int, ...], columns: Any) -> Arrays:
+        """Return every variable from its flat column, in the order in which they are declared."""
+        return {
+            name: column.astype(v.dtype).reshape(shape)
+            for (name, v), column in zip(self.variables.items(), columns, strict=True)
+        }
+
     def same_bits(self, arrays: Arrays) -> Arrays:
         """Return the arrays that the definition alone decides."""
         return {k: v for k, v in arrays.items() if not self.variables[k].measured}
