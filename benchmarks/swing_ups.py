@@ -28,13 +28,8 @@ from plants import drawn, model
 from undertow.cascade.swing_up import CatchRegion, SwingUp, designed
 from undertow.estimators import Measured
 from undertow.plants import Bench
-from undertow.studies.trials.upright import (
-    SWING_SECONDS,
-    SWINGING,
-    SwingRun,
-    bench_of,
-    swing_trial,
-)
+from undertow.plants.bench import bench_for
+from undertow.studies.trials.upright import SWING_SECONDS, SWINGING, SwingRun, swing_trial
 
 #: Part of the plants that is to end balanced.
 WANTED = 0.99
@@ -50,7 +45,7 @@ def swung(name: str, seed: int, number: int, rig: bool) -> SwingRun:
     """Swing a plant up, with ideal states or on a realistic rig."""
     plant = drawn(name, seed, number)
     if rig:
-        bench = replace(bench_of(model(name)), mechanism=plant, tolerance={})
+        bench = replace(bench_for(model(name)), mechanism=plant, tolerance={})
         return swing_trial(bench, *designs(name), seed=number)
     bench = Bench(plant, tachometers={}).with_timing(steps=1)
     return swing_trial(bench, *designs(name), estimator=Measured(model(name)))

@@ -73,6 +73,17 @@ def test_long_examples_are_folded_for_a_terminal_of_80_columns() -> None:
             assert len(line) <= 78
 
 
+@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
+def test_every_option_is_explained_and_nothing_else_is(path: tuple[str, ...]) -> None:
+    """Each option and argument has help, and each one in the docstring is one of the command's."""
+    command = COMMANDS[path]
+    helps = {param.name: param.help for param in command.params}
+    assert all(helps.values())
+    own = re.findall(r"^    (\w+)(?: : \S+)?\n {8}\S", command.callback.__doc__, re.MULTILINE)
+    assert own == [name for name in helps if name in own]
+    assert ("Parameters\n" in command.callback.__doc__) == bool(own)
+
+
 def test_help_shows_every_command_in_an_order_that_cannot_break() -> None:
     """Every command has its place; one that is in no list comes last and breaks nothing."""
     names = {path[0] for path in COMMANDS if len(path) == 1}

@@ -57,6 +57,16 @@ def test_minimum_time_costs_what_the_motion_lasts(rig: ut.Mechanism, quick: ut.S
     assert run.cost == pytest.approx(run.time, rel=1e-12)
 
 
+def test_the_compiled_stage_cost_is_the_formula() -> None:
+    """Φ of a state and an input, parameters of another cost in it: as SymPy has it."""
+    rig = ut.mechanisms.rotary_pendulum()
+    goal = ut.Objective("work", lambda v: (v.voltage * v.theta_dot) ** 2 + v.m * v.phi**2)
+    numbers = np.random.default_rng(3).normal(size=5)
+    at = dict(zip([*rig.x, *rig.u], numbers.tolist(), strict=True)) | rig.substitution
+    exact = float(goal.stage_cost(rig).subs(at))
+    np.testing.assert_allclose(goal.stage_function(rig)(*numbers)[0], exact, rtol=1e-14)
+
+
 def test_the_users_own_stage_cost_and_constraint_are_compiled_in(
     rig: ut.Mechanism, quick: ut.Surface
 ) -> None:

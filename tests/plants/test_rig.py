@@ -306,3 +306,12 @@ def test_a_knock_changes_momentum_once() -> None:
     before = rig.truth
     rig.write([0.0])
     assert np.abs((rig.truth - before)[2:]).max() < 0.05 * np.abs(change).max()
+
+
+def test_a_delay_is_shared_out_and_nothing_is_lost(arm: ut.Mechanism) -> None:
+    """From a measurement to its effect it takes what was asked for, whatever stood there before."""
+    bench = Bench(arm).with_timing(period=0.002, input_delay=0.004).with_delay(0.005)
+    timing = bench.timing
+    assert timing.input_delay + timing.measurement_delay == pytest.approx(0.005, rel=1e-15)
+    assert min(timing.input_delay, timing.measurement_delay) > 0
+    assert timing.period == 0.002

@@ -27,7 +27,7 @@ from undertow.studies.certification import (
     certify_appendix,
     certify_run,
     decide,
-    figure,
+    figures,
     region_figure,
     run_report,
     subject_report,
@@ -160,7 +160,7 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.slow
 def test_the_picture_names_its_axes_in_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figure, "GRID", 9)
+    monkeypatch.setattr(figures, "GRID", 9)
     drawn = region_figure(region(), ut.ReachingLaw(), "a title")
     left, right = drawn.axes
     assert left.get_xlabel() == "φ (°)"
@@ -185,7 +185,7 @@ def test_what_the_actuators_can_keep_on_the_surface() -> None:
     x[2] = float((surface.lambda_u * x[1] / -surface.alpha_a).item())
     law = ut.SlidingModeLaw(motion.mechanism, surface)(0.0, x)
     assert float(law.s[0]) == pytest.approx(0.0, abs=1e-12)
-    spare = figure.held(motion, np.array([surface.sliding_coordinates(x), np.zeros(3)]))
+    spare = figures.held(motion, np.array([surface.sliding_coordinates(x), np.zeros(3)]))
     assert spare[0] == pytest.approx(1 - abs(law.demand[0]) / 15)
     assert spare[0] < 0
     assert spare[1] == 1.0
@@ -194,7 +194,7 @@ def test_what_the_actuators_can_keep_on_the_surface() -> None:
 @pytest.mark.slow  # draws
 def test_the_picture_of_a_region_has_the_input_limit_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """It names the limit, and is as wide as what comes home: less with a weaker motor."""
-    monkeypatch.setattr(figure, "GRID", 9)
+    monkeypatch.setattr(figures, "GRID", 9)
     one, fastest = region(20.0), []
     assert isinstance(one.motion, SurfaceMotion)
     for volts in (15.0, 1.0):

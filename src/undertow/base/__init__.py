@@ -53,7 +53,7 @@ from undertow.base.errors import (
     require_extra,
 )
 from undertow.base.files import check_file, file_hash, parse_json, read_file
-from undertow.base.progress import Progress, duration, no_progress
+from undertow.base.progress import Progress, duration, each, no_progress
 from undertow.base.verdict import Verdict, inward
 
 __all__ = [
@@ -82,6 +82,7 @@ __all__ = [
     "check_replaces",
     "checked",
     "duration",
+    "each",
     "error_text",
     "facts",
     "file_hash",

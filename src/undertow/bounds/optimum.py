@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from undertow.bounds.guesses import built_in, recorded
 from undertow.bounds.mesh import hermite
 from undertow.bounds.programme import Programme, Solution
 from undertow.closed_loop import Trajectory
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, StateLike
 from undertow.objective import Objective
 
 
@@ -112,7 +112,7 @@ class Bound:
 def bound(
     mechanism: Mechanism,
     objective: Objective,
-    x0: ArrayLike | Mapping[str, float] | None = None,
+    x0: StateLike | None = None,
     *,
     horizon: float | None = None,
     intervals: int = 100,

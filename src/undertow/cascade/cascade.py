@@ -49,7 +49,7 @@ from undertow.law import (
     Target,
     check_surface,
 )
-from undertow.models import TIME, FloatArray, Mechanism, number_of
+from undertow.models import TIME, FloatArray, Mechanism, StateLike, number_of
 from undertow.objective import Objective, objective_for
 from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Proposal
 
@@ -847,7 +847,7 @@ class Cascade:
     @checked
     def simulate(
         self,
-        x0: ArrayLike | Mapping[str, float] | None = None,
+        x0: StateLike | None = None,
         *,
         plant: Mechanism | Mapping[float, Mechanism] | None = None,
         duration: float | None = None,

@@ -1,8 +1,8 @@
 """The command line: parse and dispatch only, one file for each group of commands.
 
-A command is a function under ``@command`` (:mod:`.terminal`); options that several share are in
-:mod:`.options`, words of users become values in :mod:`.parsing`. The work is done in
-:mod:`undertow.studies` and below.
+A command is a function under ``@command`` (:mod:`.terminal`), its help its docstring; options that
+several share are in :mod:`.options`, words of users become values in :mod:`.parsing`. The work is
+done in :mod:`undertow.studies` and below.
 """
 
 from __future__ import annotations

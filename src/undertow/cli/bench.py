@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated
 
 from rich.console import Group
 
 from undertow.base import InvalidInputError
 from undertow.cli import options
-from undertow.cli.options import folder, option
 from undertow.cli.parsing import mechanism_named
 from undertow.cli.terminal import (
     check_out,
@@ -32,37 +30,33 @@ from undertow.models.importers.python_file import in_a_file
 )
 def bench(
     name: options.AnyName,
-    rig: Annotated[
-        str,
-        option(
-            "realistic: a simulated bench with friction, delay and encoders. ideal: the "
-            "model. FILE.py:NAME: your own driver, a class or a function that returns one.",
-            metavar="RIG",
-        ),
-    ] = "realistic",
-    fault: Annotated[
-        list[str] | None,
-        option(
-            "Wire the simulated rig wrongly: INPUT=-1 or COORDINATE=2 (a factor, 0: cable "
-            "off), swap=COORDINATE,COORDINATE (two encoders), delay=0.002 (s, besides its own, "
-            "whole periods), friction=12 (times the realistic rig's own). Each once. Repeatable.",
-            metavar="PART=VALUE",
-        ),
-    ] = None,
-    delay: Annotated[
-        float | None,
-        option(
-            "From a write to its effect in a reading, s, as it should be. Default: the "
-            "simulated rig's own. On your own rig, without this option, the delay is measured "
-            "and not judged."
-        ),
-    ] = None,
-    quick: Annotated[bool, option("--quick", "Check signs, scales and breakaway only.")] = False,
+    rig: str = "realistic",
+    fault: list[str] | None = None,
+    delay: float | None = None,
+    quick: bool = False,
     setting: options.Settings = None,
     seed: options.Seed = 0,
-    out: Annotated[Path | None, folder("findings.json, motion.csv and motion.png")] = None,
+    out: Path | None = None,
 ) -> None:
-    """Check a rig at rest by small safe motions: signs, scales, delay, friction, parameters."""
+    """Check a rig at rest by small safe motions: signs, scales, delay, friction, parameters.
+
+    Parameters
+    ----------
+    rig : RIG
+        realistic: a simulated bench with friction, delay and encoders. ideal: the model.
+        FILE.py:NAME: your own driver, a class or a function that returns one.
+    fault : PART=VALUE
+        Wire the simulated rig wrongly: INPUT=-1 or COORDINATE=2 (a factor, 0: cable off),
+        swap=COORDINATE,COORDINATE (two encoders), delay=0.002 (s, besides its own, whole periods),
+        friction=12 (times the realistic rig's own). Each once. Repeatable.
+    delay
+        From a write to its effect in a reading, s, as it should be. Default: the simulated rig's
+        own. On your own rig, without this option, the delay is measured and not judged.
+    quick
+        Check signs, scales and breakaway only.
+    out
+        Folder for findings.json, motion.csv and motion.png.
+    """
     from undertow.bring_up import bring_up, miswired, rest_state
     from undertow.bring_up.faults import rig_named
     from undertow.plants import RealisticRig

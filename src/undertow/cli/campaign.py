@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from undertow.base import InvalidInputError, write_file
-from undertow.cli.options import option
 from undertow.cli.terminal import command, completed, end_interrupted, exit_unless, show
 
 if TYPE_CHECKING:
@@ -26,51 +25,55 @@ if TYPE_CHECKING:
     "undertow campaign league.toml --out league.zarr --tables",
 )
 def campaign(
-    file: Annotated[
-        Path, typer.Argument(help="The definition, TOML: see docs/campaigns.md.", metavar="FILE")
-    ],
-    out: Annotated[Path, option("Folder of the store, zarr.", metavar="STORE")],
-    mechanism: Annotated[
-        str | None,
-        option("Mechanism instead of the file's; the only way to name FILE.py:NAME, which is run."),
-    ] = None,
-    entrant: Annotated[
-        list[str] | None,
-        option("Controller of your own for a league, FILE.py:NAME, which is run; repeatable."),
-    ] = None,
-    threads: Annotated[int, option("Threads of this process.", min=1, max=1024)] = 1,
-    workers: Annotated[
-        int, option("Processes on this machine instead, dask's; extra campaign.", min=0, max=1024)
-    ] = 0,
-    scheduler: Annotated[
-        str, option("Address of a dask scheduler instead, which must see the same folder.")
-    ] = "",
-    limit: Annotated[
-        float | None,
-        option(
-            "Time after which a worker's shard counts as hanging, s; needs --workers or "
-            "--scheduler, for a thread cannot be ended.",
-            min=0.1,
-        ),
-    ] = None,
-    resume: Annotated[bool, option("--resume", "Go on with the store that is there.")] = False,
-    status: Annotated[bool, option("--status", "Show how far it is, and nothing else.")] = False,
-    shard: Annotated[
-        int | None,
-        option("Compute this shard alone, in this process, and compare it with the store.", min=0),
-    ] = None,
-    tables: Annotated[
-        bool, option("--tables", "Print what the store has, of any version, and nothing else.")
-    ] = False,
-    picture: Annotated[
-        Path | None, option("Draw what the store has into this PNG, and nothing else.")
-    ] = None,
-    proof: Annotated[
-        Path | None,
-        option("Certificate whose region on the surface, or terminal set, the picture shows."),
-    ] = None,
+    file: Path,
+    out: Annotated[Path, typer.Option("--out")],
+    mechanism: str | None = None,
+    entrant: list[str] | None = None,
+    threads: Annotated[int, typer.Option(min=1, max=1024)] = 1,
+    workers: Annotated[int, typer.Option(min=0, max=1024)] = 0,
+    scheduler: str = "",
+    limit: Annotated[float | None, typer.Option(min=0.1)] = None,
+    resume: bool = False,
+    status: bool = False,
+    shard: Annotated[int | None, typer.Option(min=0)] = None,
+    tables: bool = False,
+    picture: Path | None = None,
+    proof: Path | None = None,
 ) -> None:
-    """Compute many shards of work, and keep them in a store that survives interruptions."""
+    """Compute many shards of work, and keep them in a store that survives interruptions.
+
+    Parameters
+    ----------
+    file : FILE
+        The definition, TOML: see docs/campaigns.md.
+    out : STORE
+        Folder of the store, zarr.
+    mechanism
+        Mechanism instead of the file's; the only way to name FILE.py:NAME, which is run.
+    entrant
+        Controller of your own for a league, FILE.py:NAME, which is run; repeatable.
+    threads
+        Threads of this process.
+    workers
+        Processes on this machine instead, dask's; extra campaign.
+    scheduler
+        Address of a dask scheduler instead, which must see the same folder.
+    limit
+        Time after which a worker's shard counts as hanging, s; needs --workers or --scheduler, for
+        a thread cannot be ended.
+    resume
+        Go on with the store that is there.
+    status
+        Show how far it is, and nothing else.
+    shard
+        Compute this shard alone, in this process, and compare it with the store.
+    tables
+        Print what the store has, of any version, and nothing else.
+    picture
+        Draw what the store has into this PNG, and nothing else.
+    proof
+        Certificate whose region on the surface, or terminal set, the picture shows.
+    """
     from undertow.studies.campaign import Campaign, Definition, executor_for
     from undertow.studies.campaign.report import alone, report
     from undertow.studies.campaign.report import status as status_of

@@ -12,7 +12,6 @@ import typer
 from undertow.base import InvalidInputError, Progress, one_of
 from undertow.cascade import Cascade
 from undertow.cli import options
-from undertow.cli.options import folder, option
 from undertow.cli.parsing import (
     mechanism_named,
     parse_start,
@@ -59,51 +58,44 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
 )
 def certify(
     name: options.OneName = None,
-    surface: Annotated[
-        str | None,
-        option(
-            "The surface: 'lambda_a=-0.5 alpha_u=5 lambda_u=10'. Default: the designed one.",
-            metavar="BLOCKS",
-        ),
-    ] = None,
+    surface: str | None = None,
     start: options.Start = None,
     setting: options.Settings = None,
-    run: Annotated[
-        bool, option("--run", "Simulate a cascade and certify what it applied.")
-    ] = False,
-    appendix: Annotated[bool, option("--appendix", "The paper's five cases instead.")] = False,
+    run: bool = False,
+    appendix: bool = False,
     objective: options.Goal = "energy",
     horizon: options.Horizon = 60.0,
-    seconds: Annotated[
-        float | None,
-        option("Time to search for each region on the surface, s; 0 skips the search."),
-    ] = None,
-    loop: Annotated[
-        bool,
-        option(
-            "--loop",
-            "Also prove from how far the closed loop converges when it starts at rest: up to "
-            "the start state, or as far as the proof goes. Takes minutes.",
-        ),
-    ] = False,
-    hold: Annotated[
-        int,
-        option("With --loop: how long the input is held, whole ms; 0 is a continuous input."),
-    ] = 0,
-    within: Annotated[
-        list[str] | None,
-        option(
-            "A parameter of the plant that the law knows to so many per cent only: for the "
-            "region on the surface once more, and for the loop. Repeatable.",
-            metavar="NAME=PERCENT",
-        ),
-    ] = None,
+    seconds: float | None = None,
+    loop: bool = False,
+    hold: int = 0,
+    within: list[str] | None = None,
     seed: options.Seed = 0,
-    out: Annotated[Path | None, folder("certificate.json and the figures")] = None,
+    out: Path | None = None,
 ) -> None:
     """Prove what can be proved: stability, domain, disturbances, terminal sets, regions.
 
     Exit status 0 when local stability at least is proved for every surface, else 1.
+
+    Parameters
+    ----------
+    surface : BLOCKS
+        The surface: 'lambda_a=-0.5 alpha_u=5 lambda_u=10'. Default: the designed one.
+    run
+        Simulate a cascade and certify what it applied.
+    appendix
+        The paper's five cases instead.
+    seconds
+        Time to search for each region on the surface, s; 0 skips the search.
+    loop
+        Also prove from how far the closed loop converges when it starts at rest: up to the start
+        state, or as far as the proof goes. Takes minutes.
+    hold
+        With --loop: how long the input is held, whole ms; 0 is a continuous input.
+    within : NAME=PERCENT
+        A parameter of the plant that the law knows to so many per cent only: for the region on the
+        surface once more, and for the loop. Repeatable.
+    out
+        Folder for certificate.json and the figures.
     """
     from undertow.proofs import certified_gate
     from undertow.studies import certification
@@ -189,30 +181,11 @@ def _files(
     "undertow verify proof/certificate.json --set m=0.125",
 )
 def verify(
-    file: Annotated[
-        Path, typer.Argument(help="Certificate written by undertow certify.", metavar="FILE")
-    ],
-    mechanism: Annotated[
-        str | None,
-        option(
-            "Mechanism that the certificate is about: a name of the library, or FILE.py:NAME "
-            "for your own, whose parameters must equal the certificate's. Default: the "
-            "library's mechanism of that name.",
-            metavar="MECHANISM",
-        ),
-    ] = None,
-    setting: Annotated[
-        list[str] | None,
-        option(
-            "--set",
-            "Value that a parameter must have in the certificate, SI units. Repeatable.",
-            metavar="NAME=VALUE",
-        ),
-    ] = None,
-    both: Annotated[
-        bool, option("Ask the second checker too (make checker), and fail where they differ.")
-    ] = False,
-    seconds: Annotated[float, option("With --both: time limit of the second checker, s.")] = 600.0,
+    file: Path,
+    mechanism: str | None = None,
+    setting: Annotated[list[str] | None, typer.Option("--set")] = None,
+    both: Annotated[bool, typer.Option("--both/--no-both")] = False,
+    seconds: float = 600.0,
 ) -> None:
     """Check a certificate again, from the file and the mechanism alone.
 
@@ -220,6 +193,21 @@ def verify(
     decided for the model of the file.
 
     Exit status 0 when every claim is proved again, else 1.
+
+    Parameters
+    ----------
+    file : FILE
+        Certificate written by undertow certify.
+    mechanism : MECHANISM
+        Mechanism that the certificate is about: a name of the library, or FILE.py:NAME for your
+        own, whose parameters must equal the certificate's. Default: the library's mechanism of that
+        name.
+    setting : NAME=VALUE
+        Value that a parameter must have in the certificate, SI units. Repeatable.
+    both
+        Ask the second checker too (make checker), and fail where they differ.
+    seconds
+        With --both: time limit of the second checker, s.
     """
     from undertow.proofs import check_settings, read_certificate
     from undertow.proofs import verify as decide

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import typer
+
 from undertow.base import InvalidInputError
 from undertow.cascade import Cascade, Gate
 from undertow.cli import options
-from undertow.cli.options import folder, option
 from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task, parse_values
 from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
 from undertow.closed_loop import ClosedLoop
@@ -37,63 +38,50 @@ def simulate(
     start: options.Start = None,
     target: options.Target = None,
     objective: options.Goal = USUAL,
-    control: Annotated[
-        str | None,
-        option(
-            "cascade, the default: re-optimised every period. one-time: optimised at the "
-            "start. designed: the designed surface, not optimised.",
-            metavar="WORD",
-        ),
-    ] = None,
+    control: str | None = None,
     surface: options.SurfaceText = None,
     setting: options.Settings = None,
-    plant: Annotated[
-        list[str] | None,
-        option(
-            "Parameter of the true plant that the controller does not know, SI units. Repeatable.",
-            metavar="NAME=VALUE",
-        ),
-    ] = None,
+    plant: list[str] | None = None,
     limit: options.Limits = None,
     hard_input: options.HardInput = False,
     box: options.Box = None,
     horizon: options.Horizon = 60.0,
-    period: Annotated[float, option("Time between re-optimisations, s.")] = 0.1,
-    accept: Annotated[
-        list[str] | None,
-        option(
-            "Evidence that the cascade asks for before it applies a new surface, besides the "
-            "default gate (stable, feasible, cost not raised). region: the present state is "
-            "in a proved region. dual: the predicted motion enters one. sampled: motions from "
-            "nearby states reach the target. local: stability near the target. Repeatable. "
-            "Default: none.",
-            metavar="EVIDENCE",
-        ),
-    ] = None,
-    known: Annotated[
-        Literal["usual", "exact"] | None,
-        option(
-            "--belief",
-            "What the cascade takes for known. usual: parameters within their tolerances, learnt "
-            "as it goes. exact: the model, as in the paper. Default: usual; with --accept, whose "
-            "evidence is of one model, exact.",
-        ),
-    ] = None,
-    schedule: Annotated[
-        float,
-        option(
-            "Surfaces one after another with free reaching laws; for least time each for so long "
-            "at most, s, following the earliest motion over all inputs. The model is taken for "
-            "the plant. 0.1, the period, is usual. 0: one surface at a time.",
-        ),
-    ] = 0.0,
+    period: float = 0.1,
+    accept: list[str] | None = None,
+    known: Annotated[Literal["usual", "exact"] | None, typer.Option("--belief")] = None,
+    schedule: float = 0.0,
     seed: options.Seed = 0,
-    out: Annotated[Path | None, folder("motion.csv, motion.png and manifest.json")] = None,
+    out: Path | None = None,
 ) -> None:
     """Simulate a mechanism under its sliding-mode law, from a start to the target.
 
     A target that moves is followed to the end of the horizon, or until the last set-point is
     reached.
+
+    Parameters
+    ----------
+    control : WORD
+        cascade, the default: re-optimised every period. one-time: optimised at the start. designed:
+        the designed surface, not optimised.
+    plant : NAME=VALUE
+        Parameter of the true plant that the controller does not know, SI units. Repeatable.
+    period
+        Time between re-optimisations, s.
+    accept : EVIDENCE
+        Evidence that the cascade asks for before it applies a new surface, besides the default gate
+        (stable, feasible, cost not raised). region: the present state is in a proved region. dual:
+        the predicted motion enters one. sampled: motions from nearby states reach the target.
+        local: stability near the target. Repeatable. Default: none.
+    known
+        What the cascade takes for known. usual: parameters within their tolerances, learnt as it
+        goes. exact: the model, as in the paper. Default: usual; with --accept, whose evidence is of
+        one model, exact.
+    schedule
+        Surfaces one after another with free reaching laws; for least time each for so long at most,
+        s, following the earliest motion over all inputs. The model is taken for the plant. 0.1, the
+        period, is usual. 0: one surface at a time.
+    out
+        Folder for motion.csv, motion.png and manifest.json.
     """
     request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.studies.motion import motion_files, motion_report
@@ -184,13 +172,19 @@ def optimise(
     hard_input: options.HardInput = False,
     box: options.Box = None,
     horizon: options.Horizon = 60.0,
-    evaluations: Annotated[
-        int | None, option("Largest number of rollouts of the search; by default as it needs.")
-    ] = None,
+    evaluations: int | None = None,
     seed: options.Seed = 0,
-    out: Annotated[Path | None, folder("proposal.json")] = None,
+    out: Path | None = None,
 ) -> None:
-    """Find the best surface from a start: one global optimisation, with its margins."""
+    """Find the best surface from a start: one global optimisation, with its margins.
+
+    Parameters
+    ----------
+    evaluations
+        Largest number of rollouts of the search; by default as it needs.
+    out
+        Folder for proposal.json.
+    """
     request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.studies.motion import proposal_files, proposal_report
 

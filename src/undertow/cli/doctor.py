@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from undertow.base import table
-from undertow.cli.options import option
 from undertow.cli.terminal import command, exit_unless, progress_bar, show
 
 
 @command("undertow doctor", "undertow doctor --no-test")
 def doctor(
-    test: Annotated[bool, option("Run the self-test, ten seconds.")] = True,
+    test: bool = True,
 ) -> None:
     """Tell what is installed, what each extra would add, and test that it works here.
 
     Exit status 1 when a test fails.
+
+    Parameters
+    ----------
+    test
+        Run the self-test, ten seconds.
     """
     from undertow.studies.doctor import extras, facts_of_machine, self_test
 

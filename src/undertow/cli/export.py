@@ -12,7 +12,7 @@ from rich.text import Text
 
 from undertow.base import InvalidInputError, one_of
 from undertow.cli import options
-from undertow.cli.options import folder, option
+from undertow.cli.options import option
 from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
 from undertow.cli.terminal import (
     Application,
@@ -54,55 +54,21 @@ app.add_typer(export, name="export")
 )
 def export_c(
     name: options.OneName = None,
-    every: Annotated[bool, option("--all", "Export all mechanisms of the library.")] = False,
-    out: Annotated[Path | None, folder("NAME.c, NAME.h and what tests them")] = None,
-    check: Annotated[bool, option("--check", "Compile it and run its self-test.")] = False,
-    report: Annotated[
-        bool,
-        option(
-            "--report",
-            "Print a table: agreement with Python, instructions of a step, size.",
-        ),
-    ] = False,
-    rigs: Annotated[
-        int,
-        option(
-            "Also run it on this many realistic rigs, as a separate process over a pipe.",
-            min=0,
-        ),
-    ] = 0,
-    bit_flips: Annotated[
-        bool,
-        option(
-            "--bit-flips",
-            "Also flip every bit of its memory, one in each run on a realistic rig, in double "
-            "and in float. Takes minutes.",
-        ),
-    ] = False,
-    platforms: Annotated[
-        list[str] | None,
-        option(
-            "--for",
-            "Also write what carries it elsewhere: fmi: co-simulation units of controller and "
-            "plant, FMI 3.0, built here. ros2: a package with a ros2_control controller. "
-            "simulink: a Level-2 S-function. May be repeated.",
-            metavar="WORD",
-        ),
-    ] = None,
-    control: Annotated[
-        str | None,
-        option(
-            "designed, the default: the designed surface. one-time: optimised at the start.",
-            metavar="WORD",
-        ),
-    ] = None,
+    every: Annotated[bool, typer.Option("--all")] = False,
+    out: Path | None = None,
+    check: bool = False,
+    report: bool = False,
+    rigs: Annotated[int, typer.Option(min=0)] = 0,
+    bit_flips: bool = False,
+    platforms: Annotated[list[str] | None, typer.Option("--for")] = None,
+    control: str | None = None,
     surface: options.SurfaceText = None,
     start: options.Start = None,
     objective: options.Goal = "energy",
-    eta: Annotated[float, option("Reaching gain.")] = 20.0,
-    layer: Annotated[float, option("Half-width of the boundary layer.")] = 0.1,
-    real: Annotated[Literal["double", "float"], option("Floating-point type of the C.")] = "double",
-    period: Annotated[float, option("Sample period, s.")] = 0.001,
+    eta: float = 20.0,
+    layer: float = 0.1,
+    real: Literal["double", "float"] = "double",
+    period: float = 0.001,
     velocity: Annotated[
         str,
         option(
@@ -111,29 +77,65 @@ def export_c(
             metavar="WORD",
         ),
     ] = "derivative",
-    time_constant: Annotated[
-        float | None, option("derivative: time constant of its filter, s. Default: 0.01.")
-    ] = None,
-    acceleration: Annotated[
-        float | None,
-        option(
-            "super-twisting: bound on every coordinate's acceleration, rad/s² or m/s². "
-            "Default: 200."
-        ),
-    ] = None,
-    slew: Annotated[
-        float | None,
-        option("Largest rate of change of an input, in its unit per second. Default: no limit."),
-    ] = None,
-    missed: Annotated[int, option("Sample periods without a measurement that are bridged.")] = 5,
-    rows: Annotated[int, option("Largest number of surfaces in a plan.", min=1)] = 1,
-    prefix: Annotated[str, option("Prefix of every C name.")] = "ut",
-    compiler: Annotated[str, option("C compiler for --check, --report, --for fmi.")] = "gcc",
-    states: Annotated[int, option("Number of random states for --report.", min=1)] = 100_000,
+    time_constant: float | None = None,
+    acceleration: float | None = None,
+    slew: float | None = None,
+    missed: int = 5,
+    rows: Annotated[int, typer.Option(min=1)] = 1,
+    prefix: str = "ut",
+    compiler: str = "gcc",
+    states: Annotated[int, typer.Option(min=1)] = 100_000,
     setting: options.Settings = None,
     seed: options.Seed = 0,
 ) -> None:
-    """Write the inner loop in C99: no heap, no dependencies, limits, estimator, surface table."""
+    """Write the inner loop in C99: no heap, no dependencies, limits, estimator, surface table.
+
+    Parameters
+    ----------
+    every
+        Export all mechanisms of the library.
+    out
+        Folder for NAME.c, NAME.h and what tests them.
+    check
+        Compile it and run its self-test.
+    report
+        Print a table: agreement with Python, instructions of a step, size.
+    rigs
+        Also run it on this many realistic rigs, as a separate process over a pipe.
+    bit_flips
+        Also flip every bit of its memory, one in each run on a realistic rig, in double and in
+        float. Takes minutes.
+    platforms : WORD
+        Also write what carries it elsewhere: fmi: co-simulation units of controller and plant, FMI
+        3.0, built here. ros2: a package with a ros2_control controller. simulink: a Level-2
+        S-function. May be repeated.
+    control : WORD
+        designed, the default: the designed surface. one-time: optimised at the start.
+    eta
+        Reaching gain.
+    layer
+        Half-width of the boundary layer.
+    real
+        Floating-point type of the C.
+    period
+        Sample period, s.
+    time_constant
+        derivative: time constant of its filter, s. Default: 0.01.
+    acceleration
+        super-twisting: bound on every coordinate's acceleration, rad/s² or m/s². Default: 200.
+    slew
+        Largest rate of change of an input, in its unit per second. Default: no limit.
+    missed
+        Sample periods without a measurement that are bridged.
+    rows
+        Largest number of surfaces in a plan.
+    prefix
+        Prefix of every C name.
+    compiler
+        C compiler for --check, --report, --for fmi.
+    states
+        Number of random states for --report.
+    """
     from undertow.studies.rigs.export import csv, flip_bits, held_on_rigs, measure, notes, tables
 
     options.check_control(control, ("designed", "one-time"), surface)
@@ -270,15 +272,21 @@ def _estimator(
     of=export,
 )
 def export_log(
-    log: Annotated[Path, typer.Argument(help="Log of a run.", metavar="LOG")],
-    mcap: Annotated[
-        Path | None, option("MCAP file, for PlotJuggler and Foxglove.", metavar="FILE")
-    ] = None,
-    parquet: Annotated[
-        Path | None, option("Parquet file, for pandas and the like.", metavar="FILE")
-    ] = None,
+    log: Path,
+    mcap: Path | None = None,
+    parquet: Path | None = None,
 ) -> None:
-    """Write the log of a run for other programs, with units: every step, answer and event."""
+    """Write the log of a run for other programs, with units: every step, answer and event.
+
+    Parameters
+    ----------
+    log : LOG
+        Log of a run.
+    mcap : FILE
+        MCAP file, for PlotJuggler and Foxglove.
+    parquet : FILE
+        Parquet file, for pandas and the like.
+    """
     from undertow.runtime import read_log, to_mcap, to_parquet
 
     wanted = [(to_mcap, mcap), (to_parquet, parquet)]

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from undertow.cascade import problem_words
 from undertow.cli import options
-from undertow.cli.options import folder, option
 from undertow.cli.parsing import mechanism_named, parse_task
 from undertow.cli.terminal import carry_out, check_out, command, progress_bar, show, terminal, write
 from undertow.closed_loop import ClosedLoop
@@ -19,9 +17,15 @@ from undertow.optimiser import Optimiser
 
 @command("undertow mechanisms", "undertow mechanisms --out pictures", name="mechanisms")
 def list_mechanisms(
-    out: Annotated[Path | None, folder("mechanisms.png and .gif: all on their way")] = None,
+    out: Path | None = None,
 ) -> None:
-    """List the mechanisms of the library; with --out also draw them."""
+    """List the mechanisms of the library; with --out also draw them.
+
+    Parameters
+    ----------
+    out
+        Folder for mechanisms.png and .gif: all on their way.
+    """
     from undertow.studies.gallery import library_files, mechanism_table
 
     width = max(terminal().width, 80)
@@ -41,10 +45,18 @@ def list_mechanisms(
 )
 def derive(
     name: options.AnyName,
-    latex: Annotated[bool, option("--latex", "Print a LaTeX document.")] = False,
-    out: Annotated[Path | None, folder("NAME.txt and NAME.tex")] = None,
+    latex: bool = False,
+    out: Path | None = None,
 ) -> None:
-    """Show M, f, the law and the surface conditions as formulas."""
+    """Show M, f, the law and the surface conditions as formulas.
+
+    Parameters
+    ----------
+    latex
+        Print a LaTeX document.
+    out
+        Folder for NAME.txt and NAME.tex.
+    """
     from undertow.display.derivation import derivation
 
     mechanism = mechanism_named(name)
@@ -64,23 +76,27 @@ def derive(
     "undertow survey --objective time",
 )
 def survey(
-    only: Annotated[
-        list[str] | None, option("Survey this mechanism only. Repeatable.", metavar="NAME")
-    ] = None,
-    objective: Annotated[
-        list[str] | None,
-        option(
-            "What is minimised, as for simulate; energy, then time. Repeatable.", metavar="WORD"
-        ),
-    ] = None,
+    only: list[str] | None = None,
+    objective: list[str] | None = None,
     horizon: options.Horizon = 60.0,
-    bounds: Annotated[bool, option("Also compute the optimal-control bounds.")] = True,
+    bounds: bool = True,
     seed: options.Seed = 0,
-    out: Annotated[Path | None, folder("survey.csv and survey.md")] = None,
+    out: Path | None = None,
 ) -> None:
     """Bring every mechanism to its target: costs, bound and gaps of all in one table.
 
     The cascade takes the mechanism for the plant; free: it may choose the reaching law, too.
+
+    Parameters
+    ----------
+    only : NAME
+        Survey this mechanism only. Repeatable.
+    objective : WORD
+        What is minimised, as for simulate; energy, then time. Repeatable.
+    bounds
+        Also compute the optimal-control bounds.
+    out
+        Folder for survey.csv and survey.md.
     """
     request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.studies import survey as study
@@ -94,19 +110,22 @@ def survey(
 
 @command("undertow models robots", "undertow models robots --no-simulate --out tables")
 def models(
-    folder_of_files: Annotated[
-        Path, typer.Argument(help="Folder with URDF and MJCF files.", metavar="FOLDER")
-    ],
-    simulate: Annotated[
-        bool,
-        typer.Option(
-            "--simulate/--no-simulate", help="Also balance what can be, as simulate FILE does."
-        ),
-    ] = True,
+    folder_of_files: Path,
+    simulate: bool = True,
     seed: options.Seed = 0,
-    out: Annotated[Path | None, folder("models.csv and models.md")] = None,
+    out: Path | None = None,
 ) -> None:
-    """Read every URDF and MJCF file of a folder: what is balanced, and what is not and why."""
+    """Read every URDF and MJCF file of a folder: what is balanced, and what is not and why.
+
+    Parameters
+    ----------
+    folder_of_files : FOLDER
+        Folder with URDF and MJCF files.
+    simulate
+        Also balance what can be, as simulate FILE does.
+    out
+        Folder for models.csv and models.md.
+    """
     from undertow.studies import model_files as study
 
     work = study.model_files(folder_of_files, simulate=simulate, seed=seed)
@@ -126,14 +145,23 @@ def animate(
     hard_input: options.HardInput = False,
     box: options.Box = None,
     horizon: options.Horizon = 20.0,
-    speed: Annotated[float, option("Seconds of motion per second of film.")] = 1.0,
-    longest: Annotated[float, option("Longest film, s. A longer motion is cut there.")] = 8.0,
+    speed: float = 1.0,
+    longest: float = 8.0,
     seed: options.Seed = 0,
-    out: Annotated[Path, folder("NAME.gif and NAME.png")] = Path("."),
+    out: Path = Path("."),
 ) -> None:
     """Draw a mechanism on its way to the target, under a surface optimised at the start.
 
     The film ends where the motion has settled, or after 8 s, see --longest.
+
+    Parameters
+    ----------
+    speed
+        Seconds of motion per second of film.
+    longest
+        Longest film, s. A longer motion is cut there.
+    out
+        Folder for NAME.gif and NAME.png.
     """
     request = {k: v for k, v in locals().items() if k != "out"}
     from undertow.display.animation import Film, check_film, film_files

@@ -17,11 +17,6 @@ def option(*names_and_help: str, **more: Any) -> Any:
     return typer.Option(*names, help=words, **more)
 
 
-def folder(what: str) -> Any:
-    """Return the option that names the folder of these files."""
-    return option(f"Folder for {what}.")
-
-
 OneName = Annotated[
     str | None,
     typer.Argument(

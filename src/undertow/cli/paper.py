@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 from undertow.cli import options
-from undertow.cli.options import folder, option
 from undertow.cli.terminal import carry_out, command
 
 
@@ -16,15 +14,20 @@ from undertow.cli.terminal import carry_out, command
     "undertow reproduce --quick",
 )
 def reproduce(
-    out: Annotated[Path, folder("tables, figures and manifest")] = Path("results"),
+    out: Path = Path("results"),
     seed: options.Seed = 0,
-    quick: Annotated[
-        bool, option("--quick", "Quick look: one condition, short searches, no bounds.")
-    ] = False,
+    quick: bool = False,
 ) -> None:
     """Run the paper's experiment: Tables 1 and 2 beside the paper's, Figures 3 to 6.
 
     Also its appendix, corrected: tables of the five cases and Figures 7 to 11 (not with --quick).
+
+    Parameters
+    ----------
+    out
+        Folder for tables, figures and manifest.
+    quick
+        Quick look: one condition, short searches, no bounds.
     """
     from undertow.studies.paper import Effort, reproduction
 

@@ -20,7 +20,6 @@ from rich.console import RenderableType
 from undertow.base import InvalidInputError, printable
 from undertow.cascade import problem_words
 from undertow.cli import options
-from undertow.cli.options import folder, option
 from undertow.cli.parsing import (
     aimed,
     mechanism_named,
@@ -64,65 +63,20 @@ def run(
     name: options.AnyName,
     start: options.Start = None,
     target: options.Target = None,
-    seconds: Annotated[float, option("Length of the run, s.", min=0.001)] = 10.0,
-    rig: Annotated[
-        str,
-        option(
-            "ideal: the model. realistic: a bench with friction, delay and encoders. mujoco: "
-            "the physics engine. FILE.xml: your own MJCF. FILE.py:NAME: your own driver, a "
-            "class or a function that returns one.",
-            metavar="RIG",
-        ),
-    ] = "ideal",
+    seconds: Annotated[float, typer.Option(min=0.001)] = 10.0,
+    rig: str = "ideal",
     objective: options.Goal = "bench-energy",
-    swing_up: Annotated[
-        bool, option("--swing-up", "Begin hanging at rest: swing up, catch, balance.")
-    ] = False,
+    swing_up: bool = False,
     setting: options.Settings = None,
-    known: Annotated[
-        Literal["usual", "exact"],
-        option(
-            "--belief",
-            "What the controller takes for known. usual: parameters within their tolerances, "
-            "learnt as it runs. exact: the model.",
-        ),
-    ] = "usual",
-    period: Annotated[float, option("Period of the fast loop, s.")] = 0.001,
-    lead: Annotated[
-        float,
-        option(
-            "Shortest time from a request to the optimiser until its answer is applied, s; it "
-            "is increased when answers arrive late. A short one keeps the optimiser busy."
-        ),
-    ] = 0.1,
-    worker: Annotated[
-        Literal["process", "thread"], option("Where the optimiser runs.")
-    ] = "process",
-    lockstep: Annotated[
-        bool, option("Compute every step a second time and compare: this keeps caches warm.")
-    ] = True,
-    supervisor: Annotated[
-        bool | None,
-        typer.Option(
-            "--supervisor/--no-supervisor",
-            help="Drive the rig from a separate process, which sets the output to zero when this "
-            "one hangs or dies. Default: for FILE.py:NAME, where the system can fork.",
-        ),
-    ] = None,
-    simulated: Annotated[
-        bool, option("--simulated", "Run in simulated time, as fast as possible.")
-    ] = False,
-    log: Annotated[
-        Path | None, option("File for the log, an SQLite database.", metavar="FILE")
-    ] = None,
-    watch: Annotated[
-        bool,
-        option(
-            "--show",
-            "Show the run on a live page while it goes on: from a process of its own, which reads "
-            "the log and reaches nothing else.",
-        ),
-    ] = False,
+    known: Annotated[Literal["usual", "exact"], typer.Option("--belief")] = "usual",
+    period: float = 0.001,
+    lead: float = 0.1,
+    worker: Literal["process", "thread"] = "process",
+    lockstep: bool = True,
+    supervisor: bool | None = None,
+    simulated: bool = False,
+    log: Path | None = None,
+    watch: Annotated[bool, typer.Option("--show")] = False,
     seed: options.Seed = 0,
 ) -> None:
     """Run the two-rate controller on a rig, against the clock, and time every step.
@@ -136,6 +90,39 @@ def run(
     reads or writes failed, or unsound answers.
     7: the device did not take an output of zero at the end.
     1 and 2: no run, for the reason that is printed.
+
+    Parameters
+    ----------
+    seconds
+        Length of the run, s.
+    rig : RIG
+        ideal: the model. realistic: a bench with friction, delay and encoders. mujoco: the physics
+        engine. FILE.xml: your own MJCF. FILE.py:NAME: your own driver, a class or a function that
+        returns one.
+    swing_up
+        Begin hanging at rest: swing up, catch, balance.
+    known
+        What the controller takes for known. usual: parameters within their tolerances, learnt as it
+        runs. exact: the model.
+    period
+        Period of the fast loop, s.
+    lead
+        Shortest time from a request to the optimiser until its answer is applied, s; it is
+        increased when answers arrive late. A short one keeps the optimiser busy.
+    worker
+        Where the optimiser runs.
+    lockstep
+        Compute every step a second time and compare: this keeps caches warm.
+    supervisor
+        Drive the rig from a separate process, which sets the output to zero when this one hangs or
+        dies. Default: for FILE.py:NAME, where the system can fork.
+    simulated
+        Run in simulated time, as fast as possible.
+    log : FILE
+        File for the log, an SQLite database.
+    watch
+        Show the run on a live page while it goes on: from a process of its own, which reads the log
+        and reaches nothing else.
     """
     from undertow.runtime import Recipe, Settings, session
     from undertow.runtime.processes import check_resources
@@ -291,16 +278,8 @@ def _say_where_to_ask(log: Path, deaf: str, free: Sequence[Coordinate]) -> None:
     "undertow target run.db",
 )
 def target(
-    log: Annotated[Path, typer.Argument(help="Log of a run that goes on.", metavar="LOG")],
-    points: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Set-points, with units: x=1m, or x=-1m@8s for 8 s from now. They take the place "
-            "of those that are not reached yet; coordinates that are not named stay where the "
-            "target is. Without any: say where the target is.",
-            metavar="STATE=VALUE[@TIME]",
-        ),
-    ] = None,
+    log: Path,
+    points: Annotated[list[str] | None, typer.Argument()] = None,
 ) -> None:
     """Give a run that goes on another target.
 
@@ -308,6 +287,15 @@ def target(
     the target first. One where it cannot rest, or past its travel, is refused
     with the reason, and nothing changes. The target jumps once the optimiser
     has a plan for it, usually after a second.
+
+    Parameters
+    ----------
+    log : LOG
+        Log of a run that goes on.
+    points : STATE=VALUE[@TIME]
+        Set-points, with units: x=1m, or x=-1m@8s for 8 s from now. They take the place of those
+        that are not reached yet; coordinates that are not named stay where the target is. Without
+        any: say where the target is.
     """
     from undertow.runtime import send_target, target_of_run
 
@@ -338,19 +326,25 @@ def _places(run: RunTarget, q: Mapping[str, float]) -> str:
     "undertow replay run.db --mechanism my_arm.py:arm",
 )
 def replay(
-    log: Annotated[Path, typer.Argument(help="Log of a run.", metavar="FILE")],
-    mechanism: Annotated[
-        str | None,
-        option(
-            "Your own mechanism that the log is about, FILE.py:NAME. The file that a log "
-            "names is never run by itself.",
-            metavar="MECHANISM",
-        ),
-    ] = None,
-    decisions: Annotated[bool, option("Also judge the recorded answers by the gate again.")] = True,
-    out: Annotated[Path | None, folder("motion.png, latency.png, chatter.png")] = None,
+    log: Path,
+    mechanism: str | None = None,
+    decisions: bool = True,
+    out: Path | None = None,
 ) -> None:
-    """Replay a log with the same build, and compare the outputs bit for bit."""
+    """Replay a log with the same build, and compare the outputs bit for bit.
+
+    Parameters
+    ----------
+    log : FILE
+        Log of a run.
+    mechanism : MECHANISM
+        Your own mechanism that the log is about, FILE.py:NAME. The file that a log names is never
+        run by itself.
+    decisions
+        Also judge the recorded answers by the gate again.
+    out
+        Folder for motion.png, latency.png, chatter.png.
+    """
     from undertow import runtime
     from undertow.studies.rigs import runs
 
@@ -376,33 +370,25 @@ def replay(
     "undertow drill --only write:17:always:ideal",
 )
 def drill(
-    live: Annotated[
-        bool, option("Also inject the faults that need real time and processes.")
-    ] = True,
-    kills: Annotated[
-        int | None,
-        option(
-            "Instead: kill this many runs at random moments (kill -9), and replay their logs.",
-            min=1,
-        ),
-    ] = None,
-    systematic: Annotated[
-        bool,
-        option(
-            "--systematic",
-            "Instead: let the n-th call of every kind fail, once or from then on, for every n.",
-        ),
-    ] = False,
-    only: Annotated[
-        list[str] | None,
-        option(
-            "Instead: inject these systematic faults only. Repeatable.",
-            metavar="OPERATION:N:once|always:RIG",
-        ),
-    ] = None,
+    live: bool = True,
+    kills: Annotated[int | None, typer.Option(min=1)] = None,
+    systematic: bool = False,
+    only: list[str] | None = None,
     seed: options.Seed = 0,
 ) -> None:
-    """Inject faults into runs on the realistic rig, one at a time, and report what happened."""
+    """Inject faults into runs on the realistic rig, one at a time, and report what happened.
+
+    Parameters
+    ----------
+    live
+        Also inject the faults that need real time and processes.
+    kills
+        Instead: kill this many runs at random moments (kill -9), and replay their logs.
+    systematic
+        Instead: let the n-th call of every kind fail, once or from then on, for every n.
+    only : OPERATION:N:once|always:RIG
+        Instead: inject these systematic faults only. Repeatable.
+    """
     from undertow.studies import fault_injection
 
     if systematic or only:

@@ -12,7 +12,6 @@ import typer
 
 from undertow.base import InvalidInputError, check_folder, require_extra, write_file
 from undertow.cli import options
-from undertow.cli.options import option
 from undertow.cli.parsing import mechanism_named, parse_start
 from undertow.cli.terminal import command, progress_bar
 from undertow.cli.terminal import show as say
@@ -77,33 +76,31 @@ def show(
     objective: options.Goal = "bench-energy",
     setting: options.Settings = None,
     limit: options.Limits = None,
-    period: Annotated[float, option("Time between re-optimisations, s.")] = 0.1,
-    port: Annotated[
-        int | None,
-        option("Port of 127.0.0.1; 0: any free one. Default: 8417, or another if that is taken."),
-    ] = None,
-    browser: Annotated[bool, option("Open the page in the browser of this machine.")] = True,
-    mechanism: Annotated[
-        str | None,
-        option(
-            "Your own mechanism that a log is about, FILE.py:NAME. The file that a log names is "
-            "never run by itself.",
-            metavar="MECHANISM",
-        ),
-    ] = None,
-    save: Annotated[
-        Path | None,
-        option(
-            "Write one file that replays the log, or a simulated motion to the target, in any "
-            "browser, and end.",
-            metavar="FILE.html",
-        ),
-    ] = None,
+    period: float = 0.1,
+    port: int | None = None,
+    browser: bool = True,
+    mechanism: str | None = None,
+    save: Path | None = None,
     seed: options.Seed = 0,
 ) -> None:
     """Show a mechanism and its controller on a live page, on this machine alone.
 
     Poke it with the mouse, change its plant and its target, watch the surface jump. Ctrl-C ends it.
+
+    Parameters
+    ----------
+    period
+        Time between re-optimisations, s.
+    port
+        Port of 127.0.0.1; 0: any free one. Default: 8417, or another if that is taken.
+    browser
+        Open the page in the browser of this machine.
+    mechanism : MECHANISM
+        Your own mechanism that a log is about, FILE.py:NAME. The file that a log names is never run
+        by itself.
+    save : FILE.html
+        Write one file that replays the log, or a simulated motion to the target, in any browser,
+        and end.
     """
     from undertow.display.live import saved_page, serve
     from undertow.runtime import GrowingLog

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 import textwrap
@@ -10,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec, get_args, get_origin
 
 import typer
 from rich import progress as bars
@@ -94,20 +95,49 @@ app = Application()
 def command(
     *examples: str, name: str | None = None, of: Application = app
 ) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Register a command: its errors are one line, its help ends with the examples.
+    """Register a command: its errors are one line, its help is its docstring, and the examples.
 
     The examples are lines as they are typed; the name is the function's by default; it belongs to
     the group ``of``.
     """
 
     def register(function: Callable[P, None]) -> Callable[P, None]:
+        words, signature = _documented(function)
+        guarded: Any = _with_errors_in_one_line(function)
+        guarded.__signature__ = signature
         end = folded(*examples)
-        made: Callable[P, None] = of.command(name, cls=_Command, epilog=end)(
-            _with_errors_in_one_line(function)
-        )
+        made: Callable[P, None] = of.command(name, cls=_Command, help=words, epilog=end)(guarded)
         return made
 
     return register
+
+
+def _documented(function: Callable[..., None]) -> tuple[str, inspect.Signature]:
+    """Return the help of a command, and its signature with the help of its own options.
+
+    Under *Parameters* in its docstring they stand as ``name``, or as ``name : VALUE`` where the
+    help has a word for the value.
+    """
+    words, _, listed = inspect.cleandoc(function.__doc__ or "").partition("\n\nParameters\n---")
+    signature = inspect.signature(function, eval_str=True)
+    said = {}
+    for entry in re.split(r"\n(?=\w)", listed)[1:]:
+        head, _, text = entry.partition("\n")
+        name, _, value = head.partition(" : ")
+        said[name] = " ".join(text.split()), value or None
+    parameters = []
+    for name, given in signature.parameters.items():
+        kind, info = given.annotation, None
+        if get_origin(kind) is Annotated:
+            kind, info = get_args(kind)
+        if info is None:
+            alone = [f"--{name.replace('_', '-')}"] * (given.default is False)
+            needed = given.default is inspect.Parameter.empty
+            info = typer.Argument() if needed else typer.Option(*alone)
+        if name in said:
+            info.help, info.metavar = said[name]
+        parameters.append(given.replace(annotation=Annotated[kind, info]))
+    return words, signature.replace(parameters=parameters)
 
 
 def folded(*examples: str) -> str:

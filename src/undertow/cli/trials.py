@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from undertow.base import InvalidInputError
-from undertow.cli.options import option
 from undertow.cli.terminal import carry_out, command
-
-#: Options that some experiments have, and which.
-TAKEN_BY = {
-    "--seeds": ("balance", "swing-up", "estimators", "library", "coverage"),
-    "--angle": ("balance",),
-    "--rigs": ("robustness",),
-    "--single": ("robustness",),
-    "--limits": ("balance",),
-    "--quick": ("balance", "swing-up", "robustness", "estimators", "library", "coverage"),
-    "--fresh": ("swing-up",),
-}
 
 
 @command(
@@ -37,101 +26,71 @@ TAKEN_BY = {
 def trials(
     what: Annotated[
         Literal["balance", "swing-up", "mujoco", "robustness", "estimators", "library", "coverage"],
-        typer.Argument(
-            help="balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at "
-            "rest to balanced. mujoco: MuJoCo as the truth, no retuning. "
-            "robustness: random rigs, and which single change makes each controller fail. "
-            "estimators: the same law with each estimator. "
-            "library: every mechanism through the runtime. coverage: how often the intervals that "
-            "undertow bench identifies hold the truth.",
-            metavar="WHAT",
-            show_choices=False,
-        ),
+        typer.Argument(show_choices=False),
     ],
-    seeds: Annotated[
-        int | None,
-        option(
-            "Rigs, one for each seed; not for robustness and mujoco. Default: 20; 5 for "
-            "estimators and library.",
-            min=1,
-            show_default=False,
-        ),
-    ] = None,
-    angle: Annotated[
-        float | None,
-        option(
-            "balance: start of the pendulum, degrees from the upright. Default: 35.",
-            show_default=False,
-        ),
-    ] = None,
-    rigs: Annotated[
-        int | None,
-        option("robustness: random rigs. Default: 200.", min=1, show_default=False),
-    ] = None,
-    single: Annotated[
-        bool | None,
-        option(
-            "--single/--no-single",
-            "robustness: also look for the largest single change that is survived. Default: yes.",
-            show_default=False,
-        ),
-    ] = None,
-    limits: Annotated[
-        bool | None,
-        option(
-            "--limits/--no-limits",
-            "balance: also search for the catch limits, which takes longest. Default: yes.",
-            show_default=False,
-        ),
-    ] = None,
-    quick: Annotated[
-        bool,
-        option(
-            "--quick",
-            "Quick look: three seeds, ten random rigs, no search for limits; not for mujoco.",
-        ),
-    ] = False,
-    fresh: Annotated[
-        int | None,
-        option(
-            "swing-up: search for new gains with this seed, in place of the library's.",
-            metavar="SEED",
-            min=0,
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        option(
-            "Folder for the table as text. balance: for balance.csv and the figures too. "
-            "swing-up: for gains.json too, the gains as the library keeps them. robustness and "
-            "coverage: for robustness.jsonl or coverage.jsonl alone. Each result is kept there as "
-            "it is found; after an interruption the same command goes on."
-        ),
-    ] = None,
+    seeds: Annotated[int | None, typer.Option(min=1)] = None,
+    angle: float | None = None,
+    rigs: Annotated[int | None, typer.Option(min=1)] = None,
+    single: bool | None = None,
+    limits: bool | None = None,
+    quick: bool = False,
+    fresh: Annotated[int | None, typer.Option(min=0)] = None,
+    out: Path | None = None,
 ) -> None:
-    """Run controllers on realistic rigs with many seeds, and show the results as tables."""
-    from undertow.studies.trials.experiments import experiment
+    """Run controllers on realistic rigs with many seeds, and show the results as tables.
 
+    Parameters
+    ----------
+    what : WHAT
+        balance: the paper's experiment on the SRV02 bench. swing-up: from hanging at rest to
+        balanced. mujoco: MuJoCo as the truth, no retuning. robustness: random rigs, and which
+        single change makes each controller fail. estimators: the same law with each estimator.
+        library: every mechanism through the runtime. coverage: how often the intervals that
+        undertow bench identifies hold the truth.
+    seeds
+        Rigs, one for each seed; not for robustness and mujoco. Default: 20; 5 for estimators and
+        library.
+    angle
+        balance: start of the pendulum, degrees from the upright. Default: 35.
+    rigs
+        robustness: random rigs. Default: 200.
+    single
+        robustness: also look for the largest single change that is survived. Default: yes.
+    limits
+        balance: also search for the catch limits, which takes longest. Default: yes.
+    quick
+        Quick look: three seeds, ten random rigs, no search for limits; not for mujoco.
+    fresh : SEED
+        swing-up: search for new gains with this seed, in place of the library's.
+    out
+        Folder for the table as text. balance: for balance.csv and the figures too. swing-up: for
+        gains.json too, the gains as the library keeps them. robustness and coverage: for
+        robustness.jsonl or coverage.jsonl alone. Each result is kept there as it is found; after an
+        interruption the same command goes on.
+    """
+    from undertow.studies.trials.experiments import EXPERIMENTS
+
+    takes = {name: {*inspect.signature(make).parameters} for name, make in EXPERIMENTS.items()}
+    for own in takes.values():
+        own.update({"quick"} if own else ())
     given = {
-        "--seeds": seeds, "--angle": angle, "--rigs": rigs, "--single": single,
-        "--limits": limits, "--quick": quick or None, "--fresh": fresh,
+        "seeds": seeds, "angle": angle, "rigs": rigs, "single": single, "limits": limits,
+        "quick": quick or None, "fresh": fresh,
     }  # fmt: skip
-    for name, value in given.items():
-        takers = TAKEN_BY[name]
-        if value is not None and what not in takers:
+    asked = {option: value for option, value in given.items() if value is not None}
+    for option, value in asked.items():
+        takers = [name for name, own in takes.items() if option in own]
+        if what not in takers:
             raise InvalidInputError(
-                f"{name} with undertow trials {what}",
+                f"--{option} with undertow trials {what}",
                 value=value,
                 limit=f"an option of {', '.join(takers)}",
-                remedy=f"Leave {name} out",
+                remedy=f"Leave --{option} out",
             )
-    work = experiment(
-        what,
-        seeds=min(seeds or 3, 3) if quick else seeds,
-        angle=math.radians(35.0 if angle is None else angle),
-        limits=limits is not False and not quick,
-        rigs=min(rigs or 10, 10) if quick else rigs or 200,
-        single=single is not False and not quick,
-        fresh=fresh,
-    )
-    carry_out(work, out)
+    if angle is not None:
+        asked["angle"] = math.radians(angle)
+    if asked.pop("quick", False):
+        brief: dict[str, Any] = {"seeds": min(seeds or 3, 3), "rigs": min(rigs or 10, 10)}
+        brief |= {"single": False, "limits": False}
+        asked |= {option: brief[option] for option in takes[what] & {*brief}}
+    carry_out(EXPERIMENTS[what](**asked), out)

@@ -6,7 +6,13 @@ a motion narrows it; :mod:`.recorded_run` tries an estimator in simulated time.
 """
 
 from undertow.estimators.belief import Belief, ParameterEstimate
-from undertow.estimators.interface import Estimator, FilteredDerivative, Measured, SuperTwisting
+from undertow.estimators.interface import (
+    Estimator,
+    FilteredDerivative,
+    MakeEstimator,
+    Measured,
+    SuperTwisting,
+)
 from undertow.estimators.kalman import KalmanFilter
 from undertow.estimators.recorded_run import Record, StateFeedback, compensated, run_recorded
 
@@ -15,6 +21,7 @@ __all__ = [
     "Estimator",
     "FilteredDerivative",
     "KalmanFilter",
+    "MakeEstimator",
     "Measured",
     "ParameterEstimate",
     "Record",

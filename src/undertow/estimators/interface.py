@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.models import FloatArray, Mechanism
-from undertow.plants import Measurement
+from undertow.plants import Bench, Measurement
 from undertow.symbolic import numba
 
 if TYPE_CHECKING:
@@ -103,6 +104,10 @@ class Estimator(ABC):
         numpy.ndarray
             The estimator's own array: the next call writes it over.
         """
+
+
+#: What makes the estimator of a belief for a bench.
+MakeEstimator: TypeAlias = Callable[[Mechanism, Bench], Estimator]
 
 
 class Measured(Estimator):

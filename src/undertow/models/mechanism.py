@@ -36,6 +36,7 @@ from undertow.models.quantities import (
     FloatArray,
     Input,
     Parameter,
+    StateLike,
     number_of,
     numbers,
     with_value,
@@ -573,9 +574,7 @@ class Mechanism:
         return self.check_state(x)
 
     @checked
-    def initial_state(
-        self, x0: ArrayLike | Mapping[str, float] | None, names: Mapping[str, float]
-    ) -> FloatArray:
+    def initial_state(self, x0: StateLike | None, names: Mapping[str, float]) -> FloatArray:
         """Return an initial state, (2n,), from a vector, from names, or the usual one.
 
         Names may also be a mapping in the place of the vector: one that is a keyword of the

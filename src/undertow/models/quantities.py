@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from numbers import Real
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from undertow.base import InvalidInputError, one_of
 
 FloatArray = NDArray[np.float64]
+
+#: A state: all of its numbers, (2n,), or those that are not zero, by name.
+StateLike: TypeAlias = ArrayLike | Mapping[str, float]
 
 #: The symbol of time in disturbances, s.
 TIME = sp.Symbol("t", real=True)

@@ -564,6 +564,17 @@ class Objective:
     def __deepcopy__(self, _memo: object) -> Self:
         return self
 
+    def stage_function(self, mechanism: Mechanism) -> Callable[..., Any]:
+        """Return [Φ] as a function of the states and inputs, one by one, for a mechanism's numbers.
+
+        Raises
+        ------
+        InvalidInputError
+            As for :meth:`stage_cost`.
+        """
+        stage = self.stage_cost(mechanism).subs(mechanism.substitution)
+        return compile_expressions([*mechanism.x, *mechanism.u], [stage])
+
     @checked
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
         """Return Φ(x, u) as an expression.

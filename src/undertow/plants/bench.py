@@ -323,6 +323,10 @@ class Bench:
         """Return the bench with another period, jitter or delay."""
         return replace(self, timing=replace(self.timing, **changes))
 
+    def with_delay(self, delay: float) -> Self:
+        """Return the bench with a delay, s: three fifths at the inputs, two in the readings."""
+        return self.with_timing(input_delay=0.6 * delay, measurement_delay=0.4 * delay)
+
 
 SRV02 = "Quanser, SRV02 Rotary Servo Base Unit User Manual: specifications"
 PENDULUM = "Quanser, SRV02 Rotary Pendulum User Manual: specifications"

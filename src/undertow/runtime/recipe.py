@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
@@ -14,7 +14,7 @@ import numpy as np
 from undertow.base import InvalidInputError, UndertowError, check_fields, one_of
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
-from undertow.estimators import Estimator
+from undertow.estimators import Estimator, MakeEstimator
 from undertow.law import Plan, ReachingLaw, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
@@ -128,7 +128,7 @@ class Recipe:
     learns: bool = True
     settings: Settings = field(default_factory=Settings)
     design: Cascade | None = None
-    estimator: Callable[[Mechanism, Bench], Estimator] | None = None
+    estimator: MakeEstimator | None = None
 
     def __repr__(self) -> str:
         """Show what is run, for what, and where."""

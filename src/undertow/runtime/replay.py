@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 
 from undertow.base import ArtefactError, UndertowError, checked, error_text, file_hash, versions
-from undertow.estimators import Estimator
+from undertow.estimators import MakeEstimator
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
-from undertow.plants import Bench
 from undertow.runtime.controller import Controller, Inputs
 from undertow.runtime.encoding import (
     TOLD,
@@ -110,7 +109,7 @@ def replay(
     path: str | Path,
     *,
     mechanism: str | Mechanism | None = None,
-    estimator: Callable[[Mechanism, Bench], Estimator] | None = None,
+    estimator: MakeEstimator | None = None,
     decisions: bool = True,
 ) -> Replay:
     """Replay a log that carries its recipe.
@@ -146,7 +145,7 @@ def replay(
 def recorded_recipe(
     recording: Recording,
     mechanism: str | Mechanism | None = None,
-    estimator: Callable[[Mechanism, Bench], Estimator] | None = None,
+    estimator: MakeEstimator | None = None,
 ) -> tuple[Recipe, tuple[str, ...]]:
     """Return the recipe that a log carries, and what else is to be known of it, in sentences.
 

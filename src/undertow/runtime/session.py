@@ -9,17 +9,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from numpy.typing import ArrayLike
-
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
-from undertow.estimators import Estimator
+from undertow.estimators import MakeEstimator
 from undertow.law import Reference, SetPoints, Target
 from undertow.mechanisms.named import origin
-from undertow.models import Mechanism
+from undertow.models import StateLike
 from undertow.models.importers.formats import FORMATS, MJCF
 from undertow.models.importers.python_file import in_a_file
-from undertow.plants import Bench, IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
+from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
 from undertow.runtime.clock import SimulatedClock, WallClock
 from undertow.runtime.encoding import Columns
 from undertow.runtime.log import Log, check_log
@@ -192,13 +190,13 @@ def run(
     rig: Rig | None = None,
     *,
     seconds: float = 20.0,
-    x0: ArrayLike | Mapping[str, float] | None = None,
+    x0: StateLike | None = None,
     log: str | Path | None = None,
     simulated: bool = False,
     processes: int = 3,
     settings: Settings | None = None,
     target: Mapping[str, float] | Target | None = None,
-    estimator: Callable[[Mechanism, Bench], Estimator] | None = None,
+    estimator: MakeEstimator | None = None,
     progress: Callable[[str, float], None] | None = None,
     **state: float,
 ) -> Report:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.base import Progress, error_text, no_progress, versions
+from undertow.base import Progress, each, error_text, no_progress, versions
 from undertow.cascade import Cascade
 from undertow.checks import check_mechanism
 from undertow.closed_loop import ClosedLoop, Event
@@ -179,11 +179,10 @@ def self_test(progress: Progress = no_progress) -> Iterator[Result]:
         "the exported C against Python": _c,
         f"{RUN:g} s against the clock, 1 kHz": _clock,
     }
-    for number, (name, test) in enumerate(tests.items()):
-        progress(name, number / len(tests))
+    for name in each(tests, progress, str):
         began = time.perf_counter()
         try:
-            passed, words, *warning = test(mechanism)
+            passed, words, *warning = tests[name](mechanism)
         except Exception as error:  # whatever is wrong here is what is asked for
             passed, words, warning = False, error_text(error), []
         yield Result(name, passed, words, time.perf_counter() - began, *warning)

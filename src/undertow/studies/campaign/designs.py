@@ -14,7 +14,7 @@ from undertow.law import Plan
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.studies.campaign.definition import Settings
-from undertow.studies.campaign.study import Arrays, Study, Variable, axes_of
+from undertow.studies.campaign.study import Arrays, Study, Variable, axes_of, start_of
 
 
 class Designs(Study):
@@ -40,8 +40,7 @@ class Designs(Study):
         self.plants = settings.count("plants", 64, high=10**5)
         self.spread = settings.number("spread", 0.2, low=0.0, high=0.9)
         self.seed = settings.count("seed", 0, low=0)
-        start = settings.table("start").by_name(mechanism.state_names)
-        self.start = mechanism.state(**start) if start else mechanism.usual_start
+        self.start = start_of(mechanism, settings)
         self.most = settings.count("shard", 1, high=10**6)
         for corner in (0, -1):  # bounds of the parameters are refused before any work
             mechanism.with_parameters(**{a.name: float(a.values[corner]) for a in self.axes})
@@ -59,11 +58,7 @@ class Designs(Study):
         for entry in zip(*values, strict=True):
             named = {axis.name: float(v) for axis, v in zip(self.axes, entry, strict=True)}
             rows.append(self._design(self.mechanism.with_parameters(**named)))
-        columns = np.array(rows).T
-        return {
-            name: column.reshape(shape)
-            for name, column in zip(self.variables, columns, strict=True)
-        }
+        return self.arrays(shape, np.array(rows).T)
 
     def _design(self, mechanism: Mechanism) -> tuple[float, float, float]:
         energy, time = (self._run(mechanism, goal) for goal in ("energy", "time"))

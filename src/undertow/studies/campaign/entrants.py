@@ -110,43 +110,29 @@ class Feedback:
     def reset(self, x0: FloatArray) -> None:
         """Begin a run."""
         self.step: StateFeedback = self.begin(x0)
+        if isinstance(self.step, CascadeSteering):
+            self.listen = self.step.listen
 
 
 @lru_cache(maxsize=4)
 def _started(
-    mechanism: Mechanism, objective: Objective, start: bytes
+    mechanism: Mechanism, objective: Objective
 ) -> tuple[Cascade, tuple[CascadeState, Proposal]]:
     cascade = Cascade(mechanism, objective)
-    return cascade, cascade.start(np.frombuffer(start))
+    return cascade, cascade.start(mechanism.usual_start)
 
 
-class OurCascade:
-    """The cascade as it is without further arguments: ensemble, learning, gate, 10 decisions/s."""
-
-    def __init__(self, mechanism: Mechanism, objective: Objective) -> None:
-        self.given = mechanism, objective
-
-    def reset(self, x0: FloatArray) -> None:
-        """Optimise the first surface, before anything moves."""
-        usual = self.given[0].usual_start
-        cascade, first = _started(*self.given, usual.tobytes())
-        self.steering = CascadeSteering(cascade, first)
-
-    def listen(self, estimator: Estimator) -> None:
-        """Learn with the estimator."""
-        self.steering.listen(estimator)
-
-    def step(self, t: float, x: FloatArray) -> FloatArray:
-        """Return the input."""
-        return self.steering(t, x)
+def steered(mechanism: Mechanism, objective: Objective) -> Feedback:
+    """Return the cascade as it is by default: ensemble, learning, gate, 10 decisions a second."""
+    return Feedback(lambda _: CascadeSteering(*_started(mechanism, objective)))
 
 
 def kept(mechanism: Mechanism, objective: Objective) -> Feedback:
     """Return the cascade's first optimum, kept."""
 
     def begin(_: FloatArray) -> StateFeedback:
-        cascade, first = _started(mechanism, objective, mechanism.usual_start.tobytes())
-        return steady(InnerLoop(mechanism, first[0].surface, cascade.reaching))
+        cascade, (first, _proposal) = _started(mechanism, objective)
+        return steady(InnerLoop(mechanism, first.surface, cascade.reaching))
 
     return Feedback(begin)
 
@@ -175,7 +161,7 @@ class NMPC10(Feedback):
 
 #: The library's entrants by name.
 OURS: dict[str, Maker] = {
-    "cascade": OurCascade,
+    "cascade": steered,
     "kept": kept,
     "designed": designed,
     "lqr": regulator,

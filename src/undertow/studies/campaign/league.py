@@ -30,7 +30,7 @@ from undertow.studies.campaign.entrants import (
     Setting,
     spent,
 )
-from undertow.studies.campaign.study import Arrays, Axis, Study, Variable
+from undertow.studies.campaign.study import Arrays, Axis, Study, Variable, tolerances
 from undertow.studies.trials.trial import Outcome, trial, undisturbed
 
 #: Of the definition of tasks and scores: a change of either makes it another one.
@@ -136,11 +136,12 @@ class League(Study):
         usual, ideal = bench_for(mechanism), undisturbed(mechanism)
         match task:
             case "plants":
-                return replace(ideal, tolerance=tolerances(mechanism))
+                varied = (p for p in mechanism.parameters if p.name != "g" and p.value)
+                return replace(ideal, tolerance=tolerances(varied, SPREAD))
             case "friction":
                 return replace(ideal, friction=usual.with_friction(FRICTION).friction)
             case "delay":
-                return ideal.with_timing(input_delay=0.6 * DELAY, measurement_delay=0.4 * DELAY)
+                return ideal.with_delay(DELAY)
             case "noise":
                 return replace(
                     ideal, encoders={c.name: _coarse(c.unit) for c in mechanism.coordinates}
@@ -156,11 +157,7 @@ class League(Study):
         place = self.part(shard)
         number, who = place[0].start, place[1].start
         mechanism, objective = self.mechanisms[number], self.objectives[number]
-        shape = (1, 1, len(self.tasks), self.plants)
-        found: Arrays = {
-            name: np.full(shape, variable.missing, variable.dtype)
-            for name, variable in self.variables.items()
-        }
+        found = self.unknown((1, 1, len(self.tasks), self.plants))
         chosen = 0
         if who:
             entry = self.entries[who - 1]
@@ -244,15 +241,6 @@ class League(Study):
 def bounded(mechanism: Mechanism, objective: Objective, start: bytes) -> float:
     """Return the least cost that optimal control finds from a start, (2n,) float64."""
     return bound(mechanism, objective, np.frombuffer(start)).cost
-
-
-def tolerances(mechanism: Mechanism) -> dict[str, float]:
-    """Return half-widths of the parameters but gravity: 10 %, or what their bounds leave."""
-    return {
-        p.name: min(SPREAD, 0.99 * min(p.high - p.value, p.value - p.low) / abs(p.value))
-        for p in mechanism.parameters
-        if p.name != "g" and p.value
-    }
 
 
 def home(mechanism: Mechanism) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -73,22 +74,21 @@ def _scores(names: list[str], won: NDArray[Any], ratio: FloatArray, data: Any) -
         low, high = wilson(wins, runs)
         good = ratio[:, k][np.isfinite(ratio[:, k])]
         middle, least, largest = median_interval(good)
-        worst = float(good.max()) if len(good) else math.nan
         forfeits[name] = int((fault[:, k] > 0).sum())
         rows.append((
-            -wins / max(runs, 1), middle,
+            -wins / max(runs, 1), middle if len(good) else math.inf,
             [
                 name, f"{wins} of {runs}", f"{100 * low:.0f}-{100 * high:.0f}",
                 number(middle, ".2f"), f"{least:.2f}-{largest:.2f}" if len(good) else "—",
-                number(worst, ".2f"), number(1e6 * _mean(mean[:, k]), ".0f"),
-                number(1e3 * _most(most[:, k]), ".1f"),
+                number(_over(good, np.max), ".2f"), number(1e6 * _over(mean[:, k], np.mean), ".0f"),
+                number(1e3 * _over(most[:, k], np.max), ".1f"),
             ],
         ))  # fmt: skip
     gave_none = ", ".join(f"{name} in {count}" for name, count in forfeits.items() if count)
     heads = ["entrant", "won", "95 %", "cost", "95 %", "worst", "step, µs", "most, ms"]
     return table(
         heads,
-        [cells for *_, cells in sorted(rows, key=lambda row: (row[0], _last(row[1])))],
+        [cells for *_, cells in sorted(rows, key=lambda row: row[:2])],
         whole=heads,
         title=f"Entrants: {len(names)}. Mechanisms: {data.sizes['mechanism']}",
         note="cost: of won runs, over the plant's own bound: median, 95 % of it, worst\n"
@@ -129,15 +129,7 @@ def _best(
     )  # fmt: skip
 
 
-def _mean(values: FloatArray) -> float:
+def _over(values: FloatArray, what: Callable[[FloatArray], Any]) -> float:
+    """Return the mean, say, of the values that are known; NaN of none."""
     good = values[np.isfinite(values)]
-    return float(good.mean()) if len(good) else math.nan
-
-
-def _most(values: FloatArray) -> float:
-    good = values[np.isfinite(values)]
-    return float(good.max()) if len(good) else math.nan
-
-
-def _last(value: float) -> float:
-    return value if math.isfinite(value) else math.inf
+    return float(what(good)) if len(good) else math.nan

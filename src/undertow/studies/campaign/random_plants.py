@@ -15,7 +15,7 @@ from undertow.optimiser import Proposal
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
 from undertow.studies.campaign.definition import Settings, objective_of
-from undertow.studies.campaign.study import Arrays, Axis, Study, Variable
+from undertow.studies.campaign.study import Arrays, Axis, Study, Variable, start_of, tolerances
 from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, steady
 from undertow.studies.trials.trial import MakeController, trial
 
@@ -48,8 +48,7 @@ class RandomPlants(Study):
         self.delay = settings.number("delay", 0.005, low=0.0, high=1.0)
         self.length = settings.number("seconds", 10.0, low=0.01, high=1e4)
         self.seed = settings.count("seed", 0, low=0)
-        start = settings.table("start").by_name(mechanism.state_names)
-        self.start = mechanism.state(**start) if start else mechanism.usual_start
+        self.start = start_of(mechanism, settings)
         self.most = settings.count("shard", 4, high=10**6)
         plants = np.arange(settings.count("plants", 200))
         self.axes = (Axis("plant", plants, "1"),)
@@ -67,19 +66,11 @@ class RandomPlants(Study):
         """Return the bench of a number, but for what its own seed draws."""
         rng = np.random.default_rng([self.seed, number])
         bench = self.bench.with_friction(rng.uniform(0.0, self.friction))
-        delay = rng.uniform(0.0, self.delay)
-        bench = bench.with_timing(input_delay=0.6 * delay, measurement_delay=0.4 * delay)
-        return replace(bench, tolerance=self._tolerance)
-
-    @cached_property
-    def _tolerance(self) -> dict[str, float]:
-        """Half-widths of the parameters: the spread, or what room their bounds leave."""
-        room = {
-            p.name: 0.99 * min(p.high - p.value, p.value - p.low) / abs(p.value)
-            for p in self.mechanism.parameters
-            if p.name in self.bench.tolerance
-        }
-        return {name: min(self.spread, most) for name, most in room.items()}
+        varied = (p for p in self.mechanism.parameters if p.name in bench.tolerance)
+        return replace(
+            bench.with_delay(rng.uniform(0.0, self.delay)),
+            tolerance=tolerances(varied, self.spread),
+        )
 
     @cached_property
     def _first(self) -> tuple[Cascade, tuple[CascadeState, Proposal]]:
@@ -100,10 +91,7 @@ class RandomPlants(Study):
         """Try every contender on the plants of a shard."""
         (part,) = self.part(shard)
         numbers = range(part.start, part.stop)
-        found: Arrays = {
-            name: np.empty(len(numbers), variable.dtype)
-            for name, variable in self.variables.items()
-        }
+        found = self.unknown((len(numbers),))
         for name in self.controllers:
             make = self.controller(name)
             for row, number in enumerate(numbers):

@@ -94,8 +94,4 @@ class RegionMap(Study):
             home = batch.event == Event.REACHED
             came = [np.where(home, v, np.nan) for v in (batch.time, batch.cost)]
             rows.append([batch.event.astype(float), *came])
-        columns = np.concatenate(rows, axis=1)
-        return {
-            name: column.astype(variable.dtype).reshape(shape)
-            for (name, variable), column in zip(self.variables.items(), columns, strict=True)
-        }
+        return self.arrays(shape, np.concatenate(rows, axis=1))

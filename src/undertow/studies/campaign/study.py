@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import RenderableType
 
 from undertow.base import InvalidInputError
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, Parameter
 from undertow.studies.campaign.definition import Settings
 
 #: What a shard computes: arrays by the names of the variables.
@@ -120,6 +120,17 @@ class Study(ABC):
         """Every mechanism that results depend on."""
         return self.mechanisms or (self.mechanism,)
 
+    def unknown(self, shape: tuple[int, ...]) -> Arrays:
+        """Return arrays of this size for every variable, with nothing in them yet."""
+        return {name: np.full(shape, v.missing, v.dtype) for name, v in self.variables.items()}
+
+    def arrays(self, shape: tuple[int, ...], columns: Any) -> Arrays:
+        """Return every variable from its flat column, in the order in which they are declared."""
+        return {
+            name: column.astype(v.dtype).reshape(shape)
+            for (name, v), column in zip(self.variables.items(), columns, strict=True)
+        }
+
     def same_bits(self, arrays: Arrays) -> Arrays:
         """Return the arrays that the definition alone decides."""
         return {k: v for k, v in arrays.items() if not self.variables[k].measured}
@@ -176,6 +187,20 @@ def axes_of(settings: Settings, units: Mapping[str, str]) -> tuple[Axis, ...]:
         table.finish()
         axes.append(Axis(name, values, units[name]))
     return tuple(axes)
+
+
+def start_of(mechanism: Mechanism, settings: Settings) -> FloatArray:
+    """Take ``start``, states by name, as (2n,); the mechanism's usual one by default."""
+    start = settings.table("start").by_name(mechanism.state_names)
+    return mechanism.state(**start) if start else mechanism.usual_start
+
+
+def tolerances(parameters: Iterable[Parameter], spread: float) -> dict[str, float]:
+    """Return half-widths of parameters by name: the spread, or what room their bounds leave."""
+    return {
+        p.name: min(spread, 0.99 * min(p.high - p.value, p.value - p.low) / abs(p.value))
+        for p in parameters
+    }
 
 
 def state_units(mechanism: Mechanism) -> dict[str, str]:

@@ -6,9 +6,8 @@ from undertow.studies.certification.decide import (
     certify_run,
     certify_surface,
 )
-from undertow.studies.certification.figure import region_figure
+from undertow.studies.certification.figures import loop_figure, region_figure
 from undertow.studies.certification.interface import Verification, certify, verify
-from undertow.studies.certification.loop_figure import loop_figure
 from undertow.studies.certification.report import (
     appendix_report,
     certificate_files,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from undertow.base import Progress, UndertowError, Verdict, inward, no_progress
+from undertow.base import Progress, UndertowError, Verdict, each, inward, no_progress
 from undertow.cascade import Run
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, ReachingLaw, Surface
@@ -102,12 +102,6 @@ def certify_surface(
     is for tables, the surface itself by default.
     """
     began = time.perf_counter()
-    claims: list[StatedClaim] = []
-    remarks: list[Verdict] = []
-
-    def keep(claim: Claim | None, verdict: Verdict) -> None:
-        _keep(mechanism, claim, verdict, claims, remarks)
-
     most = FIRST + seconds + (LOOP if loop else 0.0) + (LAST if predict else 0.0)
 
     def tell(what: str, after: float) -> None:
@@ -116,9 +110,10 @@ def certify_surface(
 
     tell("stability", 0.0)
     decide = _Decisions(mechanism, surface, reaching_law, start, dict(uncertain or {}))
+    keep = decide.keep
     keep(*decide.own(StabilityClaim()))
     region = None
-    if claims:
+    if decide.claims:
         tell("terminal set", 0.3 * FIRST)
         keep(*decide.ellipsoid())
         tell("non-singularity", 0.5 * FIRST)
@@ -140,26 +135,12 @@ def certify_surface(
             tell("prediction", most - LAST)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
             horizon = closed.objective.horizon
-            remarks.append(assess(closed, Plan.of(surface), start, horizon, GatePolicy()))
+            remark = assess(closed, Plan.of(surface), start, horizon, GatePolicy())
             tell("random starts", most - 0.5 * LAST)
-            remarks += _sampled(closed, surface, start)
-    subject = Subject(surface, reaching_law, tuple(claims), tuple(remarks))
+            decide.remarks.extend([remark, *_sampled(closed, surface, start)])
+    subject = Subject(surface, reaching_law, tuple(decide.claims), tuple(decide.remarks))
     seconds = time.perf_counter() - began
     return Certified(title or str(surface), subject, region, seconds=seconds)
-
-
-def _keep(
-    mechanism: Mechanism,
-    claim: Claim | None,
-    verdict: Verdict,
-    claims: list[StatedClaim],
-    remarks: list[Verdict],
-) -> None:
-    """Add to the claims what is proved, to the remarks what is not."""
-    if claim is not None and verdict:
-        claims.append(StatedClaim(claim.stated(mechanism, verdict), verdict))
-    else:
-        remarks.append(verdict)
 
 
 def _box(mechanism: Mechanism, start: FloatArray) -> dict[str, tuple[float, float]]:
@@ -176,13 +157,22 @@ _Decided = tuple[Claim | None, Verdict]
 
 @dataclass(frozen=True, eq=False)
 class _Decisions:
-    """The claims on one surface, each with its verdict."""
+    """The claims on one surface, each with its verdict; what is kept of them, and what is not."""
 
     mechanism: Mechanism
     surface: Surface
     law: ReachingLaw
     start: FloatArray
     uncertain: Box
+    claims: list[StatedClaim] = field(default_factory=list)
+    remarks: list[Verdict] = field(default_factory=list)
+
+    def keep(self, claim: Claim | None, verdict: Verdict) -> None:
+        """Add to the claims what is proved, to the remarks what is not."""
+        if claim is not None and verdict:
+            self.claims.append(StatedClaim(claim.stated(self.mechanism, verdict), verdict))
+        else:
+            self.remarks.append(verdict)
 
     @property
     def box(self) -> Box:
@@ -322,14 +312,13 @@ def certify_run(
         verdicts = seen.setdefault(update.plan.surfaces[-1], [])
         if update.admission.accepted and update.admission.verdict is not None:
             verdicts.append(update.admission.verdict)
-    certified = []
-    for index, (surface, verdicts) in enumerate(seen.items()):
-        progress("surfaces of the run", index / len(seen))
+    certified: list[Certified] = []
+    for surface in each(seen, progress, lambda _: "surfaces of the run"):
         base = certify_surface(
-            mechanism, surface, np.zeros(2 * mechanism.n), title=f"surface {index + 1}",
+            mechanism, surface, np.zeros(2 * mechanism.n), title=f"surface {len(certified) + 1}",
             seconds=0.0, predict=False,
         )  # fmt: skip
-        remarks = (*base.subject.remarks, *(v for v in verdicts if not v))
+        remarks = (*base.subject.remarks, *(v for v in seen[surface] if not v))
         certified.append(replace(base, subject=replace(base.subject, remarks=remarks)))
     return tuple(certified)
 
@@ -362,15 +351,18 @@ def certify_appendix(
         )  # fmt: skip
         P, _ = search_rate(case.reduced(constants), case.half_width)
         interval = two_vertex(case.reduced(constants), P, case.half_width)
-        claims, remarks = list(base.subject.claims), list(base.subject.remarks)
+        subject = base.subject
         if loop:
             law = ReachingLaw()
             closed = ClosedLoop(mechanism, MinimumEnergy(horizon=80.0), law, tail_rtol=1e-3)
             sampled = sampled_extent(closed, case.surface, "phi", FAR)
             limit = mechanism.state(phi=float(sampled.details["extent"]))
             decide = _Decisions(mechanism, case.surface, law, limit, dict(uncertain or {}))
-            _keep(mechanism, *decide.loop(hold), claims, remarks)
-            remarks.append(sampled)
-        subject = replace(base.subject, claims=tuple(claims), remarks=tuple(remarks))
+            decide.keep(*decide.loop(hold))
+            subject = replace(
+                subject,
+                claims=(*subject.claims, *decide.claims),
+                remarks=(*subject.remarks, *decide.remarks, sampled),
+            )
         certified.append(replace(base, subject=subject, interval=interval))
     return tuple(certified)

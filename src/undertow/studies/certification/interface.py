@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from undertow.base import Progress, checked, no_progress, positive, versions
 from undertow.law import ReachingLaw, Surface
-from undertow.models import Mechanism
+from undertow.models import Mechanism, StateLike
 from undertow.proofs import Certificate, read_certificate
 from undertow.proofs.claims.verify import Checked
 from undertow.proofs.claims.verify import verify as decide
@@ -22,7 +21,7 @@ from undertow.studies.certification.decide import certify_surface
 def certify(
     mechanism: Mechanism,
     surface: Surface,
-    x0: ArrayLike | Mapping[str, float] | None = None,
+    x0: StateLike | None = None,
     *,
     reaching: ReachingLaw = ReachingLaw(),
     seconds: float = 60.0,

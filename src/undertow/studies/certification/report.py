@@ -45,10 +45,6 @@ def _margin(verdict: Verdict) -> str:
     return f"{inward(verdict.margin)} {verdict.unit}".rstrip()
 
 
-def _witness(verdict: Verdict) -> str:
-    return ", ".join(f"{k} = {v:.4g}" for k, v in verdict.witness.items())
-
-
 def _claims(certified: Certified) -> Table:
     """Verdict and margin beside each claim; its worst point and its method below it."""
     table = _claims_table()
@@ -56,7 +52,8 @@ def _claims(certified: Certified) -> Table:
     for verdict in (*(c.verdict for c in subject.claims), *subject.remarks):
         words = Text(verdict.claim)
         if verdict.witness:
-            words.append(f"\nat {_witness(verdict)}", style="dim")
+            where = ", ".join(f"{k} = {v:.4g}" for k, v in verdict.witness.items())
+            words.append(f"\nat {where}", style="dim")
         words.append(f"\n{verdict.method}", style="dim")
         table.add_row(_kind(verdict), words, _margin(verdict))
     return table

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.base import ArtefactError, Progress, no_progress
+from undertow.base import ArtefactError, Progress, each, no_progress
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, RigWrapper
 from undertow.runtime import (
@@ -26,8 +26,6 @@ from undertow.runtime import (
     Mode,
     Recipe,
     Recording,
-    Report,
-    Runtime,
     Settings,
     SupervisedRig,
     read_log,
@@ -79,26 +77,14 @@ def _patient_recipe() -> Recipe:
     return replace(drill_recipe(), settings=Settings(max_step_interval=1.0))
 
 
-def _children(runtime: Runtime) -> list[int]:
-    worker = runtime.worker
-    assert isinstance(worker, BackgroundWorker)
-    return worker.processes
-
-
-def _hurt_optimiser(number: signal.Signals) -> tuple[Report, OutputMonitor]:
+def _optimiser(number: signal.Signals) -> Happened:
     """Send a signal to the process that optimises, half a second into a run."""
     recipe = _patient_recipe()
-    rig = recipe.make_rig()
-    monitor = OutputMonitor(rig, *recipe.output_bounds)
+    monitor = OutputMonitor(recipe.make_rig(), *recipe.output_bounds)
     with session(recipe, rig=monitor, processes=2) as runtime:
-        (victim, *_) = _children(runtime)
-        timer = threading.Timer(0.5, os.kill, (victim, number))
-        timer.start()
-        return runtime.run(2.5), monitor
-
-
-def _optimiser(number: signal.Signals) -> Happened:
-    report, monitor = _hurt_optimiser(number)
+        assert isinstance(runtime.worker, BackgroundWorker)
+        threading.Timer(0.5, os.kill, (runtime.worker.processes[0], number)).start()
+        report = runtime.run(2.5)
     gave_up = report.answers["never came"]
     later = [t for t, _, text in report.events if "applied" in text and t > 1.3]
     held = report.stopped_by == "operator: stop" and not monitor.faults
@@ -404,8 +390,4 @@ LIVE: dict[tuple[str, str], Callable[[], Happened]] = {
 
 def live_drill(progress: Progress = no_progress) -> tuple[LiveResult, ...]:
     """Run the live part of the drill."""
-    outcomes = []
-    for number, ((part, name), run) in enumerate(LIVE.items()):
-        progress(f"{part}: {name}", number / len(LIVE))
-        outcomes.append(LiveResult(part, name, *run()))
-    return tuple(outcomes)
+    return tuple(LiveResult(*fault, *LIVE[fault]()) for fault in each(LIVE, progress, ": ".join))

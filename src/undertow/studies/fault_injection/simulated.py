@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import tempfile
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import Progress, no_progress
+from undertow.base import Progress, each, no_progress
 from undertow.cascade import CascadeState
 from undertow.estimators import Estimator
 from undertow.models import FloatArray
@@ -222,11 +221,7 @@ def drill(
     recipe = drill_recipe(seed)
     memory, _ = recipe.cascade.start(recipe.x0)
     outcomes = []
-    with tempfile.TemporaryDirectory() as folder:
-        for number, case in enumerate(cases):
-            progress(f"{case.part}: {case.name}", number / len(cases))
-            log = Path(folder) / f"{number}.db"
-            outcomes.append(run_case(case, recipe, memory, log))
-            with contextlib.suppress(OSError):
-                log.unlink()
+    for case in each(cases, progress, lambda case: f"{case.part}: {case.name}"):
+        with tempfile.TemporaryDirectory() as folder:
+            outcomes.append(run_case(case, recipe, memory, Path(folder) / "log.db"))
     return tuple(outcomes)

@@ -30,7 +30,7 @@ from types import FrameType
 
 import numpy as np
 
-from undertow.base import InvalidInputError, Progress, UndertowError, error_text, no_progress
+from undertow.base import InvalidInputError, Progress, UndertowError, each, error_text, no_progress
 from undertow.cascade import CascadeState
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, RigWrapper
@@ -276,12 +276,9 @@ class Systematic:
         self, faults: Sequence[Fault] | None = None, progress: Progress = no_progress
     ) -> tuple[FaultResult, ...]:
         """Run faults, all by default, in turn."""
-        cases = []
-        faults = self.faults() if faults is None else faults
-        for number, fault in enumerate(faults):
-            progress(f"{fault.operation}, {fault.rig} rig", number / len(faults))
-            cases.append(self.run(fault))
-        return tuple(cases)
+        asked = self.faults() if faults is None else faults
+        told = each(asked, progress, lambda fault: f"{fault.operation}, {fault.rig} rig")
+        return tuple(map(self.run, told))
 
     # -- one run -----------------------------------------------------------------------------
 

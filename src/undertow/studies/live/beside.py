@@ -27,7 +27,6 @@ from undertow.objective import Objective
 from undertow.proofs import search_for
 from undertow.runtime import background_worker
 from undertow.studies.live.planner import Task, cascade_for
-from undertow.symbolic import compile_expressions
 
 #: Cells of a map on each side; intervals of the first mesh of a bound; how nice both are, of 19.
 SIDE, INTERVALS, NICE = 17, 50, 19
@@ -106,10 +105,7 @@ def bound_message(found: Bound, objective: Objective, t: float = 0.0) -> Message
 
 def cost_to_go(found: Bound, objective: Objective) -> FloatArray:
     """Return what is left to pay at the nodes of a bound's motion, (2N+1,): its cost first."""
-    mechanism = found.mechanism
-    symbols = [*mechanism.x, *mechanism.u]
-    stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
-    rate = compile_expressions(symbols, [stage])
+    rate = objective.stage_function(found.mechanism)
     paid = np.array([rate(*x, *u)[0] for x, u in zip(found.x, found.u, strict=True)], dtype=float)
     # Simpson's rule over each interval, whose middle is a node, too.
     steps = np.diff(found.t[::2])

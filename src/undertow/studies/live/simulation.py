@@ -38,7 +38,6 @@ from undertow.studies.live.controls import OBJECTIVE, PERIOD, PUSH, Control, con
 from undertow.studies.live.hands import Hands
 from undertow.studies.live.messages import described, frame_message, plan_message, plausible
 from undertow.studies.live.planner import Job, Task, cascade_for, planner
-from undertow.symbolic import compile_expressions
 
 #: Period of the fast loop, s.
 STEP = 0.001
@@ -347,9 +346,7 @@ class Simulation:
         word = self._task.objective
         if word not in self._costs:
             objective = cascade_for(self.mechanism, self._task).objective
-            symbols = [*self.mechanism.x, *self.mechanism.u]
-            stage = objective.stage_cost(self.mechanism).subs(self.mechanism.substitution)
-            self._costs[word] = objective, compile_expressions(symbols, [stage])
+            self._costs[word] = objective, objective.stage_function(self.mechanism)
         objective, stage_of = self._costs[word]
         if np.linalg.norm(error) > objective.terminal_radius:
             self._spent += STEP * float(stage_of(*error, *u)[0])

@@ -361,14 +361,7 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
             )
         smallest = float(np.linalg.eigvalsh(np.array(P.matrix(), dtype=float))[0])
         if _positive(P.matrix()) is not True:
-            return Verdict(
-                claim,
-                "refuted",
-                smallest,
-                "",
-                {},
-                "P is not positive",
-            )
+            return Verdict(claim, "refuted", smallest, "", {}, "P is not positive")
         R = reduced.R(P)
         ends = [(0.0, reduced.xi(0)), (width, reduced.xi(Fraction(half_width)))]
         bound = _proved_smallest(R, [xi for _, xi in ends])

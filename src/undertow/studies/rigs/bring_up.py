@@ -91,7 +91,7 @@ class CoverageRow:
     deviation: float
 
 
-def coverage(seeds: int) -> Experiment[Deviations, list[CoverageRow]]:
+def coverage(seeds: int = 20) -> Experiment[Deviations, list[CoverageRow]]:
     """Return the experiment that counts how often 95 % intervals hold the truth.
 
     Of ``seeds`` rigs for each of ``NOISES``.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import tempfile
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from undertow.base import Progress, no_progress, table, to_csv
+from undertow.base import Progress, each, no_progress, table, to_csv
 from undertow.export import Agreement, EmbeddedController, Footprint
 from undertow.export.host import FLAGS, NEAREST, Build, is_held, run_on_rig, version
 from undertow.export.sources import render
@@ -218,7 +218,7 @@ COST = ("mechanism", "instr.", "code", "const", "state", "stack", "calls")
 
 
 def measure(
-    controllers: Iterable[EmbeddedController],
+    controllers: Sequence[EmbeddedController],
     *,
     states: int = 100_000,
     compiler: str = "gcc",
@@ -233,10 +233,8 @@ def measure(
     MissingExtraError
         When the compiler, ``size``, ``nm`` or ``valgrind`` is not installed.
     """
-    chosen = list(controllers)
     entries = []
-    for index, controller in enumerate(chosen):
-        progress(controller.mechanism.name, index / len(chosen))
+    for controller in each(controllers, progress, lambda one: one.mechanism.name):
         with tempfile.TemporaryDirectory(prefix="undertow-") as folder:
             build = Build(controller, Path(folder), compiler)
             passed, said = build.self_test()
@@ -301,8 +299,7 @@ def held_on_rigs(
     held = 0
     with tempfile.TemporaryDirectory(prefix="undertow-") as folder:
         build = Build(one, Path(folder), compiler)
-        for seed in range(rigs):
-            progress(f"rigs of {one.mechanism.name}", seed / rigs)
+        for seed in each(range(rigs), progress, lambda _: f"rigs of {one.mechanism.name}"):
             with build.start() as process:
                 held += run_on_rig(process, RealisticRig(bench, x0, seed), SECONDS).held
     return held

@@ -9,13 +9,12 @@ from html import escape
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, at_least, checked, positive, require_extra
 from undertow.cascade import Cascade
 from undertow.estimators import Belief
 from undertow.law import InnerLoop, Surface
-from undertow.models import Mechanism
+from undertow.models import Mechanism, StateLike
 from undertow.objective import Objective
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
@@ -139,7 +138,7 @@ def compare(
     *,
     plants: Sequence[Bench | Mechanism] | Mapping[str, Bench | Mechanism] = (),
     objective: Objective | None = None,
-    x0: ArrayLike | Mapping[str, float] | None = None,
+    x0: StateLike | None = None,
     seconds: float = 10.0,
     seed: int = 0,
     **state: float,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.estimators import Estimator, FilteredDerivative, KalmanFilter, Measured, SuperTwisting
+from undertow.estimators import Estimator, KalmanFilter, MakeEstimator, Measured
+from undertow.export.estimate import STEPS
 from undertow.law import InnerLoop, first_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Measurement, srv02_rig
@@ -20,13 +20,17 @@ from undertow.studies.trials.trial import Outcome, trial, undisturbed
 #: What nothing but exact states would give: the model itself, sampled.
 EXACT = "exact states"
 
+
+def _exported(name: str, gain: float) -> MakeEstimator:
+    """Return what makes the estimator that the exported C has under a name."""
+    return lambda belief, bench: STEPS[name](gain).estimator(belief, bench.timing.period)
+
+
 #: The estimators that are compared, by name, each made for a belief and a bench.
-ESTIMATORS: dict[str, Callable[[Mechanism, Bench], Estimator]] = {
+ESTIMATORS: dict[str, MakeEstimator] = {
     EXACT: lambda belief, _: Measured(belief),
-    "filtered derivative": lambda belief, bench: FilteredDerivative(
-        belief, bench.timing.period, 0.005
-    ),
-    "super-twisting": lambda belief, bench: SuperTwisting(belief, bench.timing.period, 100.0),
+    "filtered derivative": _exported("derivative", 0.005),
+    "super-twisting": _exported("super-twisting", 100.0),
     "Kalman": lambda belief, bench: KalmanFilter(belief, bench.timing.period),
     "Kalman, delay": lambda belief, bench: estimator_for(belief, bench, drift=0.0),
     "Kalman, delay and d̂": estimator_for,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
@@ -18,78 +19,78 @@ from undertow.studies.trials import estimation, library, report, robustness, upr
 from undertow.studies.trials.balance import Balance
 from undertow.studies.trials.trial import Result
 
-#: Experiments with a row for each name: type of a line, what gives a row, names, the table.
-ROWS: dict[str, tuple[Any, Callable[..., Any], Collection[str], Callable[[Any], RenderableType]]]
-ROWS = {
-    "swing-up": (
-        tuple[str, upright.SwingResult], upright.searched, upright.SWINGING, report.swing_report,
-    ),
-    "mujoco": (
-        tuple[str, upright.EngineResult], upright.engine_trial, upright.ENGINES,
+
+def balance(
+    *, seeds: int = 20, angle: float = math.radians(35), limits: bool = True
+) -> Experiment[Any, Any]:
+    """Return the paper's experiment on the SRV02, see :class:`.balance.Balance`."""
+    asked = Balance(angle=angle, seeds=seeds, limits=limits)
+    return Experiment(
+        "balance", tuple[str, str, int, Result | float], asked.tasks(), {"asked": asked},
+        lambda found: [report.balance_report(asked, found)],
+        partial(report.balance_files, asked), gather=grouped,
+    )  # fmt: skip
+
+
+def random_rigs(*, rigs: int = 200, single: bool = True) -> Experiment[Any, Any]:
+    """Return the controllers on rigs that they do not know, see :func:`.robustness.robustness`."""
+    constants = robustness.ANGLE, robustness.BUDGET, robustness.SECONDS, robustness.SINGLE
+    return Experiment(
+        "robustness", tuple[str, str, int, Result | robustness.Breaking],
+        robustness.robustness(rigs, single),
+        {"constants": constants, "model": srv02_rig().mechanism.fingerprint},
+        lambda found: [report.robustness_report(found)], gather=grouped, whole=True,
+    )  # fmt: skip
+
+
+def swing_ups(*, seeds: int = 20, fresh: int | None = None) -> Experiment[Any, Any]:
+    """Return swing-ups with the library's gains, or with those of a new search, by its seed."""
+    return _table_of(
+        "swing-up", tuple[str, upright.SwingResult], upright.searched, upright.SWINGING,
+        report.swing_report, seeds=seeds, fresh=fresh,
+    )  # fmt: skip
+
+
+def engines() -> Experiment[Any, Any]:
+    """Return the cascade in MuJoCo."""
+    return _table_of(
+        "mujoco", tuple[str, upright.EngineResult], upright.engine_trial, upright.ENGINES,
         report.engine_report,
-    ),
-    "estimators": (
-        tuple[str, estimation.EstimatorRow], estimation.compared, estimation.ESTIMATORS,
-        report.estimator_report,
-    ),
-    "library": (
-        tuple[str, library.LibraryRow], library.through_the_runtime, LIBRARY, report.library_report,
-    ),
+    )  # fmt: skip
+
+
+def estimators(*, seeds: int = 5) -> Experiment[Any, Any]:
+    """Return the same law with each estimator."""
+    return _table_of(
+        "estimators", tuple[str, estimation.EstimatorRow], estimation.compared,
+        estimation.ESTIMATORS, report.estimator_report, seeds=seeds,
+    )  # fmt: skip
+
+
+def mechanisms(*, seeds: int = 5) -> Experiment[Any, Any]:
+    """Return every mechanism through the runtime."""
+    return _table_of(
+        "library", tuple[str, library.LibraryRow], library.through_the_runtime, LIBRARY,
+        report.library_report, seeds=seeds,
+    )  # fmt: skip
+
+
+#: By name, each made with the options that it takes.
+EXPERIMENTS: dict[str, Callable[..., Experiment[Any, Any]]] = {
+    "balance": balance, "swing-up": swing_ups, "mujoco": engines, "robustness": random_rigs,
+    "estimators": estimators, "library": mechanisms, "coverage": coverage,
 }  # fmt: skip
 
 
-def experiment(
+def _table_of(
     what: str,
-    *,
-    seeds: int | None = None,
-    angle: float = 0.0,
-    limits: bool = True,
-    rigs: int = 200,
-    single: bool = True,
-    fresh: int | None = None,
+    line: Any,
+    task: Callable[..., Any],
+    names: Collection[str],
+    shown: Callable[[Any], RenderableType],
+    **given: Any,
 ) -> Experiment[Any, Any]:
-    """Return one of the experiments.
-
-    Parameters
-    ----------
-    what
-        Its name.
-    seeds
-        Rigs, one for each seed: ``None`` for five with ``estimators`` and ``library``, else 20.
-    angle
-        ``balance``: φ(0), rad.
-    limits
-        ``balance``: also search for the catch limits.
-    rigs, single
-        ``robustness``: random rigs, and whether to look for the largest single changes.
-    fresh
-        ``swing-up``: seed of a new search for gains; ``None`` takes those of the library.
-    """
-    if seeds is None:
-        seeds = 5 if what in ("estimators", "library") else 20
-    if what == "coverage":
-        return coverage(seeds)
-    if what == "balance":
-        asked = Balance(angle=angle, seeds=seeds, limits=limits)
-        return Experiment(
-            what, tuple[str, str, int, Result | float], asked.tasks(), {"asked": asked},
-            lambda found: [report.balance_report(asked, found)],
-            partial(report.balance_files, asked), gather=grouped,
-        )  # fmt: skip
-    if what == "robustness":
-        constants = robustness.ANGLE, robustness.BUDGET, robustness.SECONDS, robustness.SINGLE
-        return Experiment(
-            what, tuple[str, str, int, Result | robustness.Breaking],
-            robustness.robustness(rigs, single),
-            {"constants": constants, "model": srv02_rig().mechanism.fingerprint},
-            lambda found: [report.robustness_report(found)], gather=grouped, whole=True,
-        )  # fmt: skip
-    line, task, names, shown = ROWS[what]
-    given: dict[str, Any] = {"seeds": seeds}
-    if what == "mujoco":
-        given = {}
-    if what == "swing-up":
-        given = {"seeds": seeds, "fresh": fresh}
+    """Return an experiment with a row for each name: ``line`` is the type of a ledger's line."""
     return Experiment(
         what, line, {(name,): partial(task, name, **given) for name in names}, given,
         lambda rows: [shown(rows)],

@@ -41,10 +41,6 @@ RANDOM = "random"
 NAMES = ("cascade", "fixed surface", "clipped LQR", "NMPC, 10 Hz")
 
 
-def _with_delay(bench: Bench, delay: float) -> Bench:
-    return bench.with_timing(input_delay=0.6 * delay, measurement_delay=0.4 * delay)
-
-
 def _with_mass(bench: Bench, change: float) -> Bench:
     values = {p.name: p.value for p in bench.mechanism.parameters}
     heavier = {name: values[name] * (1 + change) for name in ("m", "I_e")}
@@ -60,7 +56,7 @@ FACTORS: dict[str, tuple[Callable[[Bench, float], Bench], float, str, float]] = 
     "Coulomb friction of the arm": (
         lambda bench, value: bench.with_friction(value / 0.03, ("theta",)), 1.28, "mN m", 1e3,
     ),
-    "delay in all": (_with_delay, 0.032, "ms", 1e3),
+    "delay in all": (Bench.with_delay, 0.032, "ms", 1e3),
     "pendulum and arm heavier": (_with_mass, 3.2, "%", 100.0),
     "pendulum and arm lighter": (lambda bench, value: _with_mass(bench, -value), 0.96, "%", 100.0),
     "knock on the pendulum": (_with_push, 0.064, "mN m s", 1e3),
@@ -71,7 +67,7 @@ def random_bench(bench: Bench, seed: int) -> Bench:
     """Return a bench that differs from a given one in all respects at once."""
     rng = np.random.default_rng([seed, 2])
     changed = bench.with_friction(rng.uniform(0.0, FRICTION))
-    changed = _with_delay(changed, rng.uniform(0.0, DELAY))
+    changed = changed.with_delay(rng.uniform(0.0, DELAY))
     push = Push(rng.uniform(3.0, 6.0), "phi", IMPULSE * rng.uniform(-1.0, 1.0))
     tolerance = dict(bench.tolerance) | {"m": MASSES, "I_e": MASSES}
     return replace(changed, pushes=(push,), tolerance=tolerance)

@@ -15,7 +15,6 @@ from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.plants import Bench, RealisticRig
 from undertow.runtime import estimator_for
-from undertow.symbolic import compile_expressions
 
 #: Belief and estimated start, (2n,), to a controller for one run.
 MakeController = Callable[[FloatArray], StateFeedback]
@@ -137,13 +136,12 @@ def _settled(record: Record, home: FloatArray) -> float:
 
 def _cost(mechanism: Mechanism, objective: Objective, record: Record) -> float:
     """Integrate the stage cost from sample to sample, until the terminal set is reached."""
-    stage = objective.stage_cost(mechanism).subs(mechanism.substitution)
-    function = compile_expressions([*mechanism.x, *mechanism.u], [stage])
     radius = np.linalg.norm(record.truth, axis=1)
     inside = np.flatnonzero(radius <= objective.terminal_radius)
     end = int(inside[0]) if len(inside) else len(record.t)
     if end == 0:
         return 0.0
+    function = objective.stage_function(mechanism)
     values = np.broadcast_to(function(*record.truth.T, *record.u.T)[0], record.t.shape)
     steps = np.diff(record.t, append=2 * record.t[-1] - record.t[-2])
     return float((values * steps)[:end].sum())

@@ -17,7 +17,8 @@ from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
 from undertow.optimiser import Budget
-from undertow.plants import Bench, MuJoCoRig, plausible_rig, srv02_rig
+from undertow.plants import Bench, MuJoCoRig
+from undertow.plants.bench import bench_for
 from undertow.runtime import default_gate, estimator_for
 from undertow.studies.trials.steering import CascadeSteering
 from undertow.studies.trials.trial import Outcome, Result, judge, trial
@@ -27,13 +28,6 @@ SWING_SECONDS = 30.0
 #: Mechanisms of the library that a swing-up is shown for, and that MuJoCo stands in for.
 SWINGING = ("rotary_pendulum", "cart_pendulum", "pendubot")
 ENGINES = ("rotary_pendulum", "cart_pendulum", "double_pendulum_on_a_cart")
-
-
-def bench_of(mechanism: Mechanism) -> Bench:
-    """Return the SRV02 for the rotary pendulum, a bench of usual quality for any other."""
-    if mechanism.name == "rotary_pendulum":
-        return replace(srv02_rig(), mechanism=mechanism)
-    return plausible_rig(mechanism)
 
 
 @dataclass(frozen=True)
@@ -116,7 +110,7 @@ def swing_trials(
 
     The energy law has the ``gains``; a run takes ``seconds``, s.
     """
-    bench, region = bench_of(mechanism), CatchRegion(mechanism)
+    bench, region = bench_for(mechanism), CatchRegion(mechanism)
     swing = SwingUp(mechanism, tuple(one.gains for one in gains))
     runs = [swing_trial(bench, swing, region, seed=seed, seconds=seconds) for seed in range(seeds)]
     return SwingResult(
