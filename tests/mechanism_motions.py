@@ -8,13 +8,15 @@ set of the claim's hint and 1 s more; one that is not home then, or leaves the s
 followed in finer steps before it counts.
 
 ``python tests/mechanism_motions.py tests/data/mechanism_loops/*.json`` follows 400 from each claim.
-With ``--limit`` it prints instead how much of what comes home by simulation is claimed.
+With ``--limit`` it prints instead what is claimed, how much that is of what comes home by
+simulation, and how many tubes the hint begins with.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,13 +40,14 @@ BINARY = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divid
 
 @dataclass(frozen=True)
 class Claimed:
-    """One claim of a closed loop: its model, its law, its starts (2n, 2) and its terminal set."""
+    """One claim of a closed loop: model, law, starts (2n, 2), terminal set, parts of the starts."""
 
     model: dict[str, Any]
     law: dict[str, Any]
     starts: FloatArray
     W: FloatArray
     radius: float
+    parts: int
 
     @cached_property
     def nodes(self) -> list[Any]:
@@ -64,6 +67,13 @@ class Claimed:
         keys = ("alpha_a", "lambda_a", "alpha_u", "lambda_u", "eta", "layer")
         limits = [number(i["limit"]) if i["limit"] else np.inf for i in self.model["inputs"]]
         return [*(numbers(self.law[k]) for k in keys), np.array(limits)]
+
+    @property
+    def words(self) -> str:
+        """Return the starts in words."""
+        names = [p["name"] for p in self.model["positions"]]
+        ends = zip([*names, *(f"{k}_dot" for k in names)], self.starts[:, 1], strict=True)
+        return ", ".join(f"|{k}| ≤ {v:.4g}" for k, v in ends if v)
 
     @cached_property
     def sizes(self) -> tuple[int, int]:
@@ -139,7 +149,7 @@ class Claimed:
                 been |= now
                 last = min(last, t + WATCHED) if been.all() else last
                 lost = np.isnan(x).any(axis=1)
-                if t >= last or (been | lost).all() and lost.any():
+                if t >= last or ((been | lost).all() and lost.any()):
                     break
         return left | ~self.inside(x)
 
@@ -177,7 +187,12 @@ def claims(document: dict[str, Any]) -> list[Claimed]:
             assert not any(map(number, claim["disturbance"]))
             end, law = claim["hint"]["terminal"], subject["law"]
             starts = box_of(claim["starts"], states, np.zeros(len(states)))
-            found.append(Claimed(model, law, starts, numbers(end["W"]), number(end["radius"])))
+            cuts = [[number(v) for v in claim["hint"]["boxes"].get(k, ())] for k in states
+                    if k in claim["starts"]] if "boxes" in claim["hint"] else [[]]  # fmt: skip
+            cuts[0] = [v for v in cuts[0] if v > 0]  # the loops are odd: one side will do
+            parts = math.prod(1 + len(v) for v in cuts)
+            W, radius = numbers(end["W"]), number(end["radius"])
+            found.append(Claimed(model, law, starts, W, radius, parts))
     return found
 
 
@@ -193,7 +208,8 @@ def main() -> int:
         for claim in claims(json.loads(path.read_text())):
             rng = np.random.default_rng(5)
             if given.limit:
-                print(f"{path.stem}: {claim.share(rng, 16):.0%} of what comes home", flush=True)
+                print(f"{path.stem}: {claim.words}: {claim.share(rng, 16):.0%} of what comes home, "
+                      f"{claim.parts} tubes", flush=True)  # fmt: skip
                 continue
             bad = claim.tried(rng, given.count)
             print(f"{path.stem}: {given.count} motions, {bad} failed", flush=True)

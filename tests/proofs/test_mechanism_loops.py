@@ -83,13 +83,21 @@ def test_the_motions_are_those_of_the_mechanism(name: str) -> None:
     assert (np.abs(u.demand) > rig.input_limits).any()
 
 
+def finely(claim: Claimed, x: FloatArray, duration: float) -> FloatArray:
+    def rate(t: float, x: FloatArray) -> FloatArray:
+        found: FloatArray = claim.rates(x[None])[0]
+        return found
+
+    found = solve_ivp(rate, (0.0, duration), x, method="DOP853", rtol=1e-10, atol=1e-12)
+    return np.asarray(found.y[:, -1])
+
+
 @pytest.mark.parametrize("name", sorted(KEPT))
 def test_steps_are_fine_enough(name: str) -> None:
     """From the outermost start, by another method to 1e-10, over clip and edge of the layer."""
     for claim in kept(name):
         x = claim.starts[None, :, 1].copy()
-        end = solve_ivp(lambda t, y, c=claim: c.rates(y[None])[0], (0.0, 0.3), x[0], "DOP853",
-                        rtol=1e-10, atol=1e-12).y[:, -1]  # fmt: skip
+        end = finely(claim, x[0], 0.3)
         for _ in range(round(0.3 / STEP)):
             x = claim.moved(x, STEP)
         assert x[0] == pytest.approx(end, rel=1e-3, abs=1e-3 * np.abs(end).max())
