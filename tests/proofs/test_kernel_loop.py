@@ -208,6 +208,14 @@ def test_another_mechanism_is_proved_by_the_same_code() -> None:
     assert found.verdict.margin > 0.1
 
 
+@pytest.mark.slow
+def test_a_box_that_is_lost_is_made_thinner_whatever_the_reach() -> None:
+    """Of a known plant there is nothing else to cut: the search got stuck at 0.026 rad here."""
+    crane = ut.mechanisms.overhead_crane()
+    found = prove_loop(crane, ut.first_surface(crane), coordinate="theta", reach=1.0, seconds=12)
+    assert found.verdict.margin > 0.04
+
+
 def test_starts_of_full_dimension_converge() -> None:
     """A box of states, all four off the target, is one tube."""
     loop = ContinuousLoop(MODEL, NUMBERS, terminal().W, terminal().radius, STEP)

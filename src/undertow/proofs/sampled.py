@@ -108,7 +108,8 @@ def sampled_region(
     worst = int(np.argmax(batch.time + np.where(failed, 1e9, 0.0)))
     bound = failure_bound(count, trials, confidence)
     witness = dict(zip(loop.mechanism.state_names, x0[worst].tolist(), strict=True))
-    claim = f"{what} converge under the clipped law"
+    horizon = f"{loop.objective.horizon:g} s"
+    claim = f"{what} arrive within {horizon} under the clipped law, constraints and travel kept"
     details = {
         "trials": trials,
         "failures": count,

@@ -52,6 +52,7 @@ class Loop:
     """
 
     model: Model
+    law: Law
     field: Field
     fixed: FloatArray
     step: FloatArray
@@ -65,7 +66,28 @@ class Loop:
         return Tube.of(self.fixed, box)
 
     def advance(self, tube: Tube) -> bool:
-        """Move a set on by a step; whether it stays where model and law are regular."""
+        """Move a set on by a step; whether it stays where model and law are regular.
+
+        Across an edge of the layer s_i moves by parts too (Lemma 13).
+        """
+        reach = dict[int, FloatArray]()
+        for k, layer in enumerate(self.law.layer, 2 * self.model.n - self.model.m):
+            edge, ends = float(layer) * (1 - EDGE), tube.hull[k]
+            cuts = sorted({*ends, *np.clip([-edge, edge], *ends)})
+            parts = [replace(tube) for _ in cuts[1:]]
+            for part, low, high in zip(parts, cuts, cuts[1:], strict=False):
+                part.restrict(k, low, high)
+            if len(parts) > 1 and all(map(self._advance, parts)):
+                reach[k] = np.array([part.hull[k] for part in parts])
+        if not self._advance(tube):
+            return False
+        for k, ends in reach.items():
+            low, high = np.clip([ends.min(), ends.max()], *tube.hull[k])
+            if high - low < np.ptp(tube.hull[k]):
+                tube.restrict(k, low, high)
+        return True
+
+    def _advance(self, tube: Tube) -> bool:
         stay = self.field.advance(tube, float(self.step[1]))
         return stay is not None and self.kept(stay, self.fixed)
 
@@ -117,7 +139,7 @@ class ContinuousLoop(Loop):
 
     def __init__(self, model: Model, law: Law, W: Matrix, radius: Fraction, step: Fraction) -> None:
         own, plain = System(model, law, momenta=True), system(model, law)
-        self.model = model
+        self.model, self.law = model, law
         self.field, self.fixed = Field(own.graph, own.sliding()), own.fixed()
         self.step = np.full(2, float(step))
         self.aim(own.graph, own.x, W, radius)
@@ -165,25 +187,6 @@ class HeldLoop(Loop):
         self.inside = self.held.by_states(self.demand)
         self.regular = graph.program([*at.regular, *known.regular])
         self.coordinates = start.program([*plain.momentum_and_surface(), *start.inputs[2 * n :]])
-
-    def advance(self, tube: Tube) -> bool:
-        """Move a set on by a period; s_i by parts too, across an edge of the layer (Lemma 13)."""
-        reach = dict[int, FloatArray]()
-        for k, layer in enumerate(self.law.layer, self.size - self.model.m):
-            edge, ends = float(layer) * (1 - EDGE), tube.hull[k]
-            cuts = sorted({*ends, *np.clip([-edge, edge], *ends)})
-            parts = [replace(tube) for _ in cuts[1:]]
-            for part, low, high in zip(parts, cuts, cuts[1:], strict=False):
-                part.restrict(k, low, high)
-            if len(parts) > 1 and all(map(self._advance, parts)):
-                reach[k] = np.array([part.hull[k] for part in parts])
-        if not self._advance(tube):
-            return False
-        for k, ends in reach.items():
-            low, high = np.clip([ends.min(), ends.max()], *tube.hull[k])
-            if high - low < np.ptp(tube.hull[k]):
-                tube.restrict(k, low, high)
-        return True
 
     def _advance(self, tube: Tube) -> bool:
         stay = self.held.advance(tube, self.step)

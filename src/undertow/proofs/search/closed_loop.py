@@ -34,8 +34,11 @@ from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_fo
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.
 MOTIONS, THINNEST = 24, 2.0**-13
 
-#: Steps that a tube may take beyond twice those of the longest before it: then it is too wide.
-PATIENCE = 500
+#: Time that a tube may take beyond twice that of the longest before it, s: then it is too wide.
+PATIENCE = 0.5
+
+#: How a box of starts grows after one whose tube arrived, and shrinks after one that was lost.
+WIDER, THINNER = 1.25, 0.5
 
 #: Parts that a box of plants is cut into before a start is given up.
 MOST_PARTS = 64
@@ -181,24 +184,24 @@ def prove_loop(
     weight = np.abs(surface.position_row[:, index]).max()
     width = min(reach / 32, 0.15 * float(np.min(law.layer)) / max(weight, 1e-12))
     edges, box = [0.0], np.zeros((2 * mechanism.n, 2))
-    parts, latest = _sliced(task.box, 0), 0
+    parts, latest, patience = _sliced(task.box, 0), 0, int(PATIENCE / loop.step[1])
     while edges[-1] < reach and width > reach * THINNEST:
         box[index] = edges[-1], min(edges[-1] + width, reach)
         if time.process_time() - started > seconds:
             break
-        there, most = True, 2 * latest + PATIENCE if len(edges) > 1 else MOST_OF_ONE
+        there, most = True, 2 * latest + patience if len(edges) > 1 else MOST_OF_ONE
         for part in parts:
             taken, there = loop.follow(np.vstack([box, part]), most)
             if not there:
                 break
             latest = max(latest, taken)
-        if not there and len(parts) < MOST_PARTS and width < reach / 128:
+        if task.plant and not there and len(parts) < MOST_PARTS and width < reach / 128:
             parts, width = _sliced(task.box, len(parts)), 2 * width
         if there:
             edges.append(float(box[index, 1]))
             if progress is not None and len(edges) % 20 == 0:
                 progress(f"proved up to {coordinate} = {edges[-1]:.4g}")
-        width *= 1.5 if there else 0.5
+        width *= WIDER if there else THINNER
     if len(edges) < 2:
         raise InfeasibleError(
             f"proved starts of the loop with {surface}",
