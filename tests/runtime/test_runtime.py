@@ -387,6 +387,16 @@ def test_an_answer_for_another_state_is_refused_at_its_time(controller: Controll
 # -- other mechanisms ---------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("period", "least"), [(0.004, 10), (0.01, 3)])
+def test_a_slow_loop_is_optimised_as_a_quick_one_is(period: float, least: int) -> None:
+    """At 250 and 100 Hz plans are admitted, and the output does not chatter between samples."""
+    with session(replace(RECIPE, period=period), simulated=True) as runtime:
+        report = runtime.run(2.0)
+    assert report.verdict.ending == "balanced"
+    assert report.answers["applied"] >= least
+    assert report.total_variation[0] < 4 * 15.0
+
+
 @pytest.mark.slow
 def test_a_mechanism_with_two_inputs_is_held_on_its_realistic_rig() -> None:
     """Motors that stick, encoders too coarse for the paper's boundary layer: held to the end.
