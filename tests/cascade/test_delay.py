@@ -100,12 +100,12 @@ def test_what_an_estimator_does_not_know_comes_out_as_input(
 def test_the_boundary_layer_is_as_thick_as_the_sensors_need(arm: ut.Mechanism) -> None:
     """The paper's where that is quiet; else the thinnest that is, of halves."""
     assert reaching_for(estimator_for(arm, srv02_rig())) == ut.ReachingLaw()
-    crane = ut.mechanisms.overhead_crane()
-    estimator = estimator_for(crane, plausible_rig(crane))
+    beam = ut.mechanisms.ball_and_beam()
+    estimator = estimator_for(beam, plausible_rig(beam))
     law, P = reaching_for(estimator), estimator.steady_covariance()[:4, :4]
-    surface = ut.first_surface(crane)
+    surface = ut.first_surface(beam)
     thinner = ut.ReachingLaw(layer=float(np.max(law.layer)) / 2)
-    assert noise_share(crane, surface, P, law) <= NOISE < noise_share(crane, surface, P, thinner)
+    assert noise_share(beam, surface, P, law) <= NOISE < noise_share(beam, surface, P, thinner)
 
 
 @pytest.mark.parametrize("period", [0.0005, 0.001, 0.002, 0.005, 0.01])

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
+from undertow.cascade.robustness import delay_margin
 from undertow.estimators import Belief, Estimator, KalmanFilter
 from undertow.law import ReachingLaw, first_surface
 from undertow.models import Mechanism
@@ -23,8 +24,8 @@ from undertow.plants import Bench, Encoder
 #: sensors may take, standard deviation.
 BEARS, LEAST, RESERVE, NOISE = 6, 2, 0.15, 0.2
 
-#: The paper's boundary layer ε, η/ε = 200 per second, which asks for a sample each ``SAMPLE``, s:
-#: with longer periods ε grows as they do.  And how often it may be doubled for the noise.
+#: The paper's boundary layer ε, η/ε = 200 per second, for a sample each ``SAMPLE``, s; and how
+#: often it may be doubled for the noise; for the delay once more with a period of twice that.
 LAYER, SAMPLE, DOUBLED = 0.1, 0.001, 3
 
 #: Density of the drift of a matched disturbance, parts of the smallest input limit per √s.
@@ -79,12 +80,17 @@ def default_gate(estimator: Estimator | None = None) -> Gate:
     if estimator is None:
         return cost_gate
     return robustness_gate(
-        max(LEAST * estimator.period, BEARS * min(SAMPLE, estimator.period)),
+        _delay(estimator.period, BEARS),
         RESERVE,
         period=estimator.period,
         covariance=estimator.steady_covariance(),
         noise=NOISE,
     )
+
+
+def _delay(period: float, periods: float) -> float:
+    """So many periods, of no more than ``SAMPLE`` each, or ``LEAST`` whole ones, s."""
+    return max(LEAST * period, periods * min(SAMPLE, period))
 
 
 def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
@@ -99,13 +105,20 @@ def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
 def reaching_for(estimator: Estimator) -> ReachingLaw:
     """Return the paper's reaching law, its boundary layer as thick as samples and sensors need.
 
-    The gains near the target go with η/ε: ε is ``LAYER``, more where the estimator's period is
-    longer than ``SAMPLE``, and doubled until what the estimator does not know takes no more than
-    ``NOISE`` of the input on the first surface, ``DOUBLED`` times at most.
+    The gains near the target go with η/ε: ε is doubled until the first surface bears the delay that
+    the gate asks for, less a period, and what the estimator does not know takes no more than
+    ``NOISE`` of the input on it, for which it is doubled to ``DOUBLED`` times at most.
     """
     mechanism, covariance = estimator.mechanism, estimator.steady_covariance()
+    period, least = estimator.period, _delay(estimator.period, BEARS - 1)
     surface = first_surface(mechanism)
-    thinnest = LAYER * max(1.0, estimator.period / SAMPLE)
-    laws = [ReachingLaw(layer=thinnest * 2**k) for k in range(DOUBLED + 1)]
-    quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)
-    return next(quiet, laws[-1])
+    most = DOUBLED + math.ceil(math.log2(max(1.0, period / SAMPLE)))
+    laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(most + 1)]
+    borne = [
+        k
+        for k, law in enumerate(laws)
+        if delay_margin(mechanism, surface, law, period=period, longest=least) >= least - 1e-9
+    ] or [0]
+    able = [laws[k] for k in borne if k <= max(DOUBLED, borne[0])]
+    quiet = (law for law in able if noise_share(mechanism, surface, covariance, law) <= NOISE)
+    return next(quiet, able[-1])
