@@ -308,6 +308,13 @@ def test_degrees_are_a_number(angle: Any) -> None:
     assert ut.deg(180) == math.pi
 
 
+def test_complex_numbers_are_no_states(rig: ut.Mechanism) -> None:
+    """Their imaginary part is not dropped: numbers and arrays are refused alike."""
+    for x in (np.full(4, 0.1 + 0.2j), [0.1j, 0.0, 0.0, 0.0], 1j):
+        with pytest.raises(InvalidInputError, match="must be numbers"):
+            rig.f(x)
+
+
 def test_a_mapping_is_told_by_its_keys_and_values(rig: ut.Mechanism) -> None:
     """Plants by time are no names; a target is not to be written as text."""
     cascade = ut.Cascade(rig)

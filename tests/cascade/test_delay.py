@@ -11,11 +11,22 @@ import scipy.linalg
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cascade import CascadeState, noise_share, robustness_gate
-from undertow.cascade.robustness import DelayGate, _exponential, delay_margin, sticking_distance
+from undertow.cascade.robustness import (
+    BenchGate,
+    DelayGate,
+    _exponential,
+    delay_margin,
+    sticking_distance,
+)
 from undertow.law import InnerLoop, Plan
 from undertow.objective import objective_for
 from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
-from undertow.runtime.controller_defaults import NOISE, estimator_for, reaching_for
+from undertow.runtime.controller_defaults import (
+    NOISE,
+    default_gate,
+    estimator_for,
+    reaching_for,
+)
 
 #: Nearly singular (37): excellent on the model, enormous gains.
 KEEN = ut.Surface(-1, -3.561, 1.051, 8.234)
@@ -89,12 +100,23 @@ def test_what_an_estimator_does_not_know_comes_out_as_input(
 def test_the_boundary_layer_is_as_thick_as_the_sensors_need(arm: ut.Mechanism) -> None:
     """The paper's where that is quiet; else the thinnest that is, of halves."""
     assert reaching_for(estimator_for(arm, srv02_rig())) == ut.ReachingLaw()
-    crane = ut.mechanisms.overhead_crane()
-    estimator = estimator_for(crane, plausible_rig(crane))
+    beam = ut.mechanisms.ball_and_beam()
+    estimator = estimator_for(beam, plausible_rig(beam))
     law, P = reaching_for(estimator), estimator.steady_covariance()[:4, :4]
-    surface = ut.first_surface(crane)
+    surface = ut.first_surface(beam)
     thinner = ut.ReachingLaw(layer=float(np.max(law.layer)) / 2)
-    assert noise_share(crane, surface, P, law) <= NOISE < noise_share(crane, surface, P, thinner)
+    assert noise_share(beam, surface, P, law) <= NOISE < noise_share(beam, surface, P, thinner)
+
+
+@pytest.mark.parametrize("period", [0.0005, 0.001, 0.002, 0.005, 0.01])
+def test_the_boundary_layer_suits_the_samples(arm: ut.Mechanism, period: float) -> None:
+    """Held for a whole period, the first surface bears the delay that its gate asks for."""
+    estimator = estimator_for(arm, srv02_rig().with_timing(period=period))
+    gate, law = default_gate(estimator), reaching_for(estimator)
+    assert isinstance(gate, BenchGate)
+    least = gate.late.least
+    assert delay_margin(arm, ut.first_surface(arm), law, period=period) >= least - 1e-9
+    assert least >= 2 * period
 
 
 @pytest.mark.slow

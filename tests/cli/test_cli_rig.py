@@ -42,7 +42,7 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
     words = ("--start", "phi=15deg", "--seconds", "0.5", "--simulated", "--log", str(log))
     code, out, _ = run("run", "rotary_pendulum", *words)
     assert code == 0
-    assert "operator: stop" in out
+    assert "end of the time asked for" in out
     assert "Verdict: balanced, settled for 0.2 s, converging to the target; ‖x‖ = " in out
     code, out, _ = run("replay", str(log), "--out", str(tmp_path / "figures"))
     assert code == 0

@@ -207,7 +207,7 @@ def test_the_runtime_drives_the_example_from_the_command_line(tmp_path: Path) ->
     )
     assert result.exit_code == 0, result.stderr
     assert "BALANCE" in result.stdout
-    assert "operator: stop" in result.stdout
+    assert "end of the time asked for" in result.stdout
     assert CliRunner().invoke(app, ["replay", str(log)]).exit_code == 0
 
 

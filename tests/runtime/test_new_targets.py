@@ -163,7 +163,7 @@ def test_where_there_is_no_plan_the_target_stays_and_the_run_goes_on(
     assert all(0.9 < after - before < 1.3 for before, after in itertools.pairwise(stays))
     assert report.answers["applied"] > 10
     assert runtime.target.now == {}
-    with pytest.raises(InvalidInputError, match="the run has stopped: operator: stop"):
+    with pytest.raises(InvalidInputError, match="the run has stopped: end of the time asked for"):
         runtime.retarget({"theta": 0.5})
 
 

@@ -68,11 +68,12 @@ def successor(mode: Mode, command: Command = Command.NONE, **guards: bool) -> tu
 def test_faults_and_the_operator_come_before_everything(mode: Mode) -> None:
     assert successor(mode, fault=True, inside=True) == (Mode.SAFE_STOP, Reason.FAULT)
     assert successor(mode, Command.STOP, inside=True) == (Mode.SAFE_STOP, Reason.STOP)
+    assert successor(mode, Command.END, inside=True) == (Mode.SAFE_STOP, Reason.END)
 
 
 def test_nothing_but_the_operator_leads_out_of_a_safe_stop() -> None:
     every = partial(successor, Mode.SAFE_STOP, ready=True, inside=True, settled=True, swings=True)
-    for command in (Command.NONE, Command.START, Command.STOP):
+    for command in (Command.NONE, Command.START, Command.STOP, Command.END):
         assert every(command) == (Mode.SAFE_STOP, Reason.NONE)
     assert every(Command.RESET) == (Mode.IDLE, Reason.RESET)
     assert every(Command.RESET, fault=True) == (Mode.SAFE_STOP, Reason.NONE)
@@ -124,7 +125,7 @@ def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path:
     assert states[:4] == [
         "IDLE → BRING_UP", "BRING_UP → SWING_UP", "SWING_UP → CATCH", "CATCH → BALANCE",
     ]  # fmt: skip
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
     assert math.cos(end[1]) > 0.999
     again = replay(str(tmp_path / "run.db"))
     assert again.identical
@@ -172,7 +173,7 @@ def test_thrown_out_it_swings_up_again_within_limits() -> None:
     report = Runtime(controller, witness, worker, clock=SimulatedClock()).run(9.0)
     assert not witness.faults
     assert report.entered["SWING_UP"] >= 2
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
     assert math.cos(rig.truth[1]) > 0.999
 
 
@@ -386,6 +387,16 @@ def test_an_answer_for_another_state_is_refused_at_its_time(controller: Controll
 # -- other mechanisms ---------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("period", "least"), [(0.004, 10), (0.01, 3)])
+def test_a_slow_loop_is_optimised_as_a_quick_one_is(period: float, least: int) -> None:
+    """At 250 and 100 Hz plans are admitted, and the output does not chatter between samples."""
+    with session(replace(RECIPE, period=period), simulated=True) as runtime:
+        report = runtime.run(2.0)
+    assert report.verdict.ending == "balanced"
+    assert report.answers["applied"] >= least
+    assert report.total_variation[0] < 4 * 15.0
+
+
 @pytest.mark.slow
 def test_a_mechanism_with_two_inputs_is_held_on_its_realistic_rig() -> None:
     """Motors that stick, encoders too coarse for the paper's boundary layer: held to the end.
@@ -395,7 +406,7 @@ def test_a_mechanism_with_two_inputs_is_held_on_its_realistic_rig() -> None:
     recipe = Recipe(mechanism="two_motor_three_link", rig="realistic", evaluations=256, seed=2)
     with session(recipe, simulated=True) as runtime:
         report = runtime.run(6.0)
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
     assert "BALANCE" in report.entered
     assert float(np.max(recipe.cascade.reaching.layer)) > 0.1
 

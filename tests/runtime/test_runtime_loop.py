@@ -73,7 +73,7 @@ def test_deadlines_are_counted_and_missed_periods_skipped(controller: Controller
     assert report.steps == 200 - 2 + 1  # the last one stops
     assert report.response_times.longest == pytest.approx(3.5e-3)
     assert sum(report.response_times.between((0.0, 1e-3, math.inf))) == report.steps
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
 
 
 def test_a_stalled_loop_stops_safely(controller: Controller) -> None:
@@ -130,7 +130,7 @@ def test_a_careless_rig_changes_neither_the_run_nor_its_log(
         columns = Columns.of(RECIPE.belief)
         with Log(path, columns, about(controller, RECIPE), threaded=False) as log:
             runtime = Runtime(controller, rig, worker, clock=SimulatedClock(), log=log)
-            assert runtime.run(0.3).stopped_by == "operator: stop"
+            assert runtime.run(0.3).stopped_by == "end of the time asked for"
         assert replay(path).identical
         outputs.append(read_log(path)["voltage"])
     np.testing.assert_array_equal(outputs[0], outputs[1])
@@ -157,7 +157,7 @@ class Broken:
 
 def test_a_worker_that_fails_leaves_the_last_plan(controller: Controller) -> None:
     report = Runtime(controller, RECIPE.make_rig(), Broken(), clock=SimulatedClock()).run(0.8)
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
     assert ("optimiser", "OSError: no line") in {(what, text) for _, what, text in report.events}
 
 
@@ -187,7 +187,7 @@ def test_what_is_no_whole_answer_is_not_looked_at(
             controller, RECIPE.make_rig(), InlineWorker(compute), clock=SimulatedClock(), log=log
         )
         report = runtime.run(0.3)
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
     assert any("no whole answer" in text for _, _, text in report.events)
     assert replay(path).identical
 

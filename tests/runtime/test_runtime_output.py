@@ -34,6 +34,7 @@ from undertow.runtime import (
     replay,
 )
 from undertow.runtime.clock import FailureRatio, RigClock
+from undertow.runtime.sensors import SOUND, SensorMonitor
 from undertow.runtime.session import session
 from undertow.runtime.settings import Settings
 from undertow.runtime.supervisor import SupervisedRig
@@ -297,7 +298,7 @@ def test_reads_that_fail_too_often_stop_the_run(controller: Controller) -> None:
     report = driven(controller, failing(3)).report
     assert "of the reads failed, read: OSError: no answer" in report.stopped_by
     rare = driven(RECIPE.make_controller(controller.memory), failing(10)).report
-    assert rare.stopped_by == "operator: stop"
+    assert rare.stopped_by == "end of the time asked for"
     assert rare.verdict.ending == "degraded"
     assert "reads failed" in str(rare.verdict)
 
@@ -335,7 +336,7 @@ def test_a_reading_that_is_missing_now_and_then_does_not_keep_the_law_from_takin
     report = driven(controller, device).report
     assert report.entered["CATCH"] >= 1
     assert abs(device.rig.truth[1]) < 0.3
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
 
 
 def test_bring_up_ends_after_a_stated_time_with_what_is_missing(memory: CascadeState) -> None:
@@ -410,7 +411,7 @@ def test_deadlines_missed_beyond_a_share_of_a_second_stop_the_run(
         assert report.stopped_by.startswith("deadlines missed in 30% of the last second")
         assert verdict.exit_code == EXIT_CODES["stopped"]
     else:
-        assert report.stopped_by == "operator: stop"
+        assert report.stopped_by == "end of the time asked for"
         assert verdict.ending in ("balanced", "caught", "degraded")
     assert not device.accepted.any()
     assert replay(tmp_path / "run.db").identical
@@ -453,12 +454,66 @@ def test_a_rigs_clock_may_jump_jitter_and_stop_with_the_host() -> None:
     assert "runs 2 times as fast" in texts[first]
 
 
+@pytest.mark.parametrize(
+    ("stamps", "times"),
+    [
+        ((0, 1, 2, math.nan, 4, 5), (1, 2, 3, 4, 5, 6)),  # one is lost
+        ((0, 1, 2, -50, 4, 5), (1, 2, 3, 4, 5, 6)),  # one runs back
+        ((500, 501, 502, 0, 1, 2), (1, 2, 3, 4, 5, 6)),  # somebody sets the clock
+        ((500, 501, math.nan, 0, math.nan, 2), (1, 2, 3, 4, 5, 6)),
+        ((0, 0, 2, 2, 4, 4, 6), (1, 2, 3, 4, 5, 6, 7)),  # a sensor slower than the loop
+        ((0, 1, 11, 12), (1, 2, 12, 13)),  # nothing was read for a while
+    ],
+)
+def test_no_time_is_counted_twice(stamps: tuple[float, ...], times: tuple[float, ...]) -> None:
+    """What passes without a reading whose time makes sense is counted once, in ms."""
+    monitor, x, u = SensorMonitor(RECIPE.belief, Settings(), 0.001), np.zeros(4), np.zeros(1)
+    counted = []
+    for stamp in stamps:
+        accepted, found, _ = monitor.check(Measurement(1e-3 * stamp, np.zeros(2)), x, u)
+        assert accepted is not None
+        assert found == SOUND
+        counted.append(1e3 * accepted.t)
+    assert counted == pytest.approx(times)
+
+
+def test_a_read_that_fails_once_is_no_knock(controller: Controller) -> None:
+    """The velocities have not jumped: the plan in use goes on, the input changes little."""
+
+    def read(k: int, m: Measurement) -> Measurement:
+        if k == 400:
+            message = "bus"
+            raise OSError(message)
+        if k == 500:
+            m.t -= 0.05
+        return m
+
+    report = driven(controller, Device(read=read)).report
+    assert report.steps_with_missing_readings == 2
+    assert not [text for _, kind, text in report.events if kind == "jump"]
+
+
+@pytest.mark.parametrize("told", [lambda t: 1e3 * t, lambda t: min(t, 0.1), lambda _: math.nan])
+def test_a_clock_that_makes_no_sense_is_named(
+    told: Callable[[float], float], controller: Controller
+) -> None:
+    """Milliseconds for seconds, a time that stands still, none: no sensor is lost but the clock."""
+
+    def read(k: int, m: Measurement) -> Measurement:
+        m.t = told(m.t) if k > 1 else m.t
+        return m
+
+    why = driven(controller, Device(read=read)).report.stopped_by
+    assert "the rig's clock made no sense for 2" in why
+    assert "later than the last one's, by 0.1 s at most" in why
+
+
 # -- how it ended ----------------------------------------------------------------------------------
 
 
 GOOD = Report(
-    steps=10_000, stopped_by="operator: stop", mode_before_stop=Mode.BALANCE, settled_time=8.0,
-    final_error=0.01, target_radius=0.35, convergence_time=5.0, cost=3.0,
+    steps=10_000, stopped_by="end of the time asked for", mode_before_stop=Mode.BALANCE,
+    settled_time=8.0, final_error=0.01, target_radius=0.35, convergence_time=5.0, cost=3.0,
 )  # fmt: skip
 
 
@@ -476,7 +531,7 @@ GOOD = Report(
         ({"stopped_by": "thrown out"}, "lost", 4, "thrown out"),
         ({"stopped_by": "'phi' at 3, past its travel"}, "lost", 4, "travel"),
         ({"mode_before_stop": Mode.BRING_UP}, "stopped", 5, "before the law took over"),
-        ({"stopped_early": True}, "stopped", 5, "before the end"),
+        ({"stopped_by": "operator: stop"}, "stopped", 5, "before the end"),
         ({"stopped_by": "sensor 'phi' frozen"}, "stopped", 5, "frozen"),
         ({"missed_deadlines": 900}, "degraded", 6, "9% of the deadlines"),
         ({"lockstep_mismatches": 1}, "degraded", 6, "lockstep"),
@@ -512,7 +567,7 @@ def test_rows_lost_from_the_log_are_told_and_degrade_the_run(
             controller, Device(), InlineWorker(RECIPE.respond), clock=SimulatedClock(), log=book
         )
         report = runtime.run(1.0)
-    assert report.stopped_by == "operator: stop"
+    assert report.stopped_by == "end of the time asked for"
     assert any(kind == "log" and "rows are lost" in text for _, kind, text in report.events)
     assert report.lost_rows > 0
     assert report.verdict.ending == "degraded"

@@ -487,6 +487,7 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
         ({"shards": 3}, "Did you mean shard?"),
         ({"shard": 0}, "a whole number from 1"),
         ({"horizon": "long"}, "a number from"),
+        ({"axes": {"phi": {"from": np.nan, "to": 1.0, "count": 2}}}, "axes.phi.from.*finite"),
         ({"axes": {"psi": {"from": 0.0, "to": 1.0, "count": 2}}}, "theta, phi"),
         ({"axes": {"phi": {"from": 0.0, "to": 1.0}}}, "axes.phi.count"),
         ({"axes": {}}, "states among theta"),

@@ -378,7 +378,8 @@ def _is_array(value: Any) -> bool:
     if value is None or isinstance(value, str):
         return False
     try:
-        return np.asarray(value, dtype=np.float64) is not None
+        given = np.asarray(value)  # of a complex number the imaginary part would be dropped
+        return given.dtype.kind != "c" and np.asarray(given, dtype=np.float64) is not None
     except (TypeError, ValueError):
         return False
 

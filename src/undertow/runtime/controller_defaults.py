@@ -12,19 +12,21 @@ from dataclasses import replace
 import numpy as np
 
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
+from undertow.cascade.robustness import delay_margin
 from undertow.estimators import Belief, Estimator, KalmanFilter
 from undertow.law import ReachingLaw, first_surface
 from undertow.models import Mechanism
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
 
-#: What every admitted surface must bear: periods of delay, and so much less of the input; and
-#: the part of the input that noise of the sensors may take, standard deviation.
-BEARS, RESERVE, NOISE = 6, 0.15, 0.2
+#: What every admitted surface must bear: periods of delay, of no more than ``SAMPLE``, s, each, and
+#: ``LEAST`` whole ones; so much less of the input; and the part of the input that noise of the
+#: sensors may take, standard deviation.
+BEARS, LEAST, RESERVE, NOISE = 6, 2, 0.15, 0.2
 
-#: The paper's boundary layer ε, and how often it may be doubled for the noise: η/ε from 200 to
-#: 25 per second.
-LAYER, DOUBLED = 0.1, 3
+#: The paper's boundary layer ε, η/ε = 200 per second, for a sample each ``SAMPLE``, s; and how
+#: often it may be doubled for the noise; for the delay once more with a period of twice that.
+LAYER, SAMPLE, DOUBLED = 0.1, 0.001, 3
 
 #: Density of the drift of a matched disturbance, parts of the smallest input limit per √s.
 DRIFT = 0.1
@@ -67,9 +69,10 @@ def default_gate(estimator: Estimator | None = None) -> Gate:
     """Return the gate that a surface must pass where nobody asks for another: everywhere.
 
     With exact states, :func:`undertow.cascade.cost_gate`: stable, feasible from here, the cost
-    not raised.  Before a rig may meet a surface the same, and the surface must bear ``BEARS`` = 6
-    periods of delay, do with ``RESERVE`` = 15 % less input, and spend no more than ``NOISE`` = 20 %
-    of the input on noise.
+    not raised.  Before a rig may meet a surface the same, and the surface must bear a delay of
+    ``BEARS`` = 6 periods (6 ms where they are longer than 1 ms, and ``LEAST`` = 2 periods in any
+    case), do with ``RESERVE`` = 15 % less input, and spend no more than ``NOISE`` = 20 % of the
+    input on noise.
 
     The estimator is that of the rig: its period, and what it does not know of the state at the
     target; ``None``: states are exact, as in a simulation.
@@ -77,12 +80,17 @@ def default_gate(estimator: Estimator | None = None) -> Gate:
     if estimator is None:
         return cost_gate
     return robustness_gate(
-        BEARS * estimator.period,
+        _delay(estimator.period, BEARS),
         RESERVE,
         period=estimator.period,
         covariance=estimator.steady_covariance(),
         noise=NOISE,
     )
+
+
+def _delay(period: float, periods: float) -> float:
+    """So many periods, of no more than ``SAMPLE`` each, or ``LEAST`` whole ones, s."""
+    return max(LEAST * period, periods * min(SAMPLE, period))
 
 
 def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
@@ -95,13 +103,22 @@ def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
 
 
 def reaching_for(estimator: Estimator) -> ReachingLaw:
-    """Return the paper's reaching law, its boundary layer as thick as the sensors need.
+    """Return the paper's reaching law, its boundary layer as thick as samples and sensors need.
 
-    The gains near the target go with η/ε: ε is doubled until what the estimator does not know
-    takes no more than ``NOISE`` of the input on the first surface, ``DOUBLED`` times at most.
+    The gains near the target go with η/ε: ε is doubled until the first surface bears the delay that
+    the gate asks for, less a period, and what the estimator does not know takes no more than
+    ``NOISE`` of the input on it, for which it is doubled to ``DOUBLED`` times at most.
     """
     mechanism, covariance = estimator.mechanism, estimator.steady_covariance()
+    period, least = estimator.period, _delay(estimator.period, BEARS - 1)
     surface = first_surface(mechanism)
-    laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(DOUBLED + 1)]
-    quiet = (law for law in laws if noise_share(mechanism, surface, covariance, law) <= NOISE)
-    return next(quiet, laws[-1])
+    most = DOUBLED + math.ceil(math.log2(max(1.0, period / SAMPLE)))
+    laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(most + 1)]
+    borne = [
+        k
+        for k, law in enumerate(laws)
+        if delay_margin(mechanism, surface, law, period=period, longest=least) >= least - 1e-9
+    ] or [0]
+    able = [laws[k] for k in borne if k <= max(DOUBLED, borne[0])]
+    quiet = (law for law in able if noise_share(mechanism, surface, covariance, law) <= NOISE)
+    return next(quiet, able[-1])

@@ -201,7 +201,7 @@ class Runtime:
         )
 
     def run(self, seconds: float) -> Report:
-        """Run from start to a safe stop; the operator's stop comes after ``seconds``.
+        """Run from start to a safe stop, which comes after ``seconds`` by itself.
 
         The run ends once a safe stop has brought the output to zero: the device is asked to take
         zero until it does, for ``Settings.zero_output_timeout`` at most, and is closed.  Whether it
@@ -334,8 +334,7 @@ class Runtime:
                 alarm = f"no step for {1e3 * (began - last):.0f} ms"
             command = Command.START if k == 0 else Command.NONE
             if (self._stopping or t >= seconds) and self.controller.mode != Mode.SAFE_STOP:
-                command = Command.STOP
-                report.stopped_early = t < seconds
+                command = Command.END if t >= seconds else Command.STOP
             measurement, alarm = self._read(alarm)
             read = clock.now()
             told = self._asked_for.popleft() if self._asked_for else ()

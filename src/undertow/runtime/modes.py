@@ -25,12 +25,13 @@ class Mode(IntEnum):
 
 
 class Command(IntEnum):
-    """What the operator asks for."""
+    """What the operator asks for; ``END``: the time that was asked for is over."""
 
     NONE = 0
     START = 1
     STOP = 2
     RESET = 3
+    END = 4
 
 
 class Reason(IntEnum):
@@ -46,6 +47,7 @@ class Reason(IntEnum):
     THROWN_OUT = 7
     SETTLED = 8
     DISTURBED = 9
+    END = 10
 
     @property
     def text(self) -> str:
@@ -56,15 +58,16 @@ class Reason(IntEnum):
 _WORDS = (
     "", "operator: start", "operator: stop", "operator: reset", "fault",
     "inside the region of the law", "outside the region of the law", "thrown out", "settled",
-    "disturbed",
+    "disturbed", "end of the time asked for",
 )  # fmt: skip
 
 # Compiled code knows them as numbers.
 _IDLE, _BRING_UP, _SWING_UP, _CATCH, _BALANCE, _SAFE_STOP = map(int, Mode)
-_NO_COMMAND, _START, _STOP, _RESET = map(int, Command)
-_STAY, _BY_START, _BY_STOP, _BY_RESET, _FAULT, _INSIDE, _OUTSIDE, _THROWN, _SETTLED, _DISTURBED = (
-    map(int, Reason)
-)
+_NO_COMMAND, _START, _STOP, _RESET, _END = map(int, Command)
+(
+    _STAY, _BY_START, _BY_STOP, _BY_RESET, _FAULT, _INSIDE, _OUTSIDE, _THROWN, _SETTLED, _DISTURBED,
+    _BY_END,
+) = map(int, Reason)  # fmt: skip
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -100,6 +103,8 @@ def transition(
         return mode, _STAY
     if command == _STOP:
         return _SAFE_STOP, _BY_STOP
+    if command == _END:
+        return _SAFE_STOP, _BY_END
     if mode == _IDLE:
         if command == _START:
             return _BRING_UP, _BY_START

@@ -30,17 +30,18 @@ REST = 0.3
 PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
 
 #: What :meth:`SensorMonitor.check` found: nothing wrong; no sound reading yet; none for too long; a
-#: sensor lost for too long; one that stands still; one that is missing too often.  What comes
-#: after the second is a fault.
-SOUND, NOT_YET, NEVER, LOST, FROZEN, SPARSE = range(6)
+#: sensor lost for too long; one that stands still; one that is missing too often; a clock that
+#: makes no sense.  What comes after the second is a fault.
+SOUND, NOT_YET, NEVER, LOST, FROZEN, SPARSE, TIMELESS = range(7)
 LAST_HARMLESS = NOT_YET
 
 #: What the watch remembers; settings: period, jump, frozen, patience, stall, weight of a step in a
-#: share, largest share; clock: the rig's at the last reading, ours, time waited, whether there was
-#: a sound reading at all; shares: part of the readings that was missing of late; offs: how far the
-#: readings of the last step were off what was expected, 0 where they were not accepted.
+#: share, largest share; clock: time waited, whether there was a sound reading at all, our time, the
+#: rig's and ours at the last reading whose time made sense, and at the last one at all; shares:
+#: part of the readings that was missing of late; offs: how far the readings of the last step were
+#: off what was expected, 0 where they were not accepted.
 _LAYOUT = {
-    "settings": "7", "clock": "4", "q": "n", "v": "n", "band": "m", "gain": "n",
+    "settings": "7", "clock": "7", "q": "n", "v": "n", "band": "m", "gain": "n",
     "parameters": "p", "viscous": "n", "W": "n * n", "last": "n", "gaps": "n", "ages": "n",
     "offs": "n",
     "counts": "n", "shares": "n", "quiet": "1", "expected": "2 * n",
@@ -131,40 +132,44 @@ def check(stamp, x, u, block):
     # missing, whether this is the first, the time, and what to probe with.  A clock that makes
     # no sense spoils a reading.
 {unpacked(_LAYOUT)}
-    elapsed = settings[0]
-    usable = abs(stamp) < math.inf
+    # It counts from the last reading whose time made sense, so that no period is counted twice that
+    # passed without one; or from the last one at all, if somebody has set the clock.
+    now, soonest = clock[2] + settings[0], clock[2] + 1e-3 * settings[0]
+    usable = clock[5] == -math.inf and abs(stamp) < math.inf
+    for k in (3, 5):
+        if not usable and 0.0 < stamp - clock[k] <= settings[4]:
+            now, usable = max(soonest, clock[k + 1] + stamp - clock[k]), True
+    clock[2] = now
     if usable:
-        if clock[0] > -math.inf:
-            elapsed = stamp - clock[0]
-            usable = 0.0 < elapsed <= settings[4]
-        clock[0] = stamp
-    clock[1] += elapsed if usable else settings[0]
+        clock[3], clock[4] = stamp, now
+    if abs(stamp) < math.inf:
+        clock[5], clock[6] = stamp, now
     size = 0.0
     for i in range(n):
         q[i] = q[i] + 0.0 if usable else math.nan  # no −0: a log does not keep its sign
         v[i] = v[i] + 0.0 if usable else math.nan
         size += abs(q[i])
-    if clock[3] == 0.0 and size < math.inf:
-        clock[3] = 1.0
+    if clock[1] == 0.0 and size < math.inf:
+        clock[1] = 1.0
         for i in range(n):
             last[i] = q[i]
             for j in range(n):
                 free[i, j], free[i, n + j] = q[j], 0.0
-        return {SOUND}, 0, 0, True, clock[1], 0.0
-    if clock[3] == 0.0:
-        clock[2] += settings[0]
-        return ({NEVER} if clock[2] > settings[3] else {NOT_YET}), 0, n, False, clock[1], 0.0
+        return {SOUND}, 0, 0, True, now, 0.0
+    if clock[1] == 0.0:
+        clock[0] += settings[0]
+        return ({NEVER} if clock[0] > settings[3] else {NOT_YET}), 0, n, False, now, 0.0
     missing, worst, still = gate_measurement(x, u, block)
     beyond = quiet[0] - {PROBE}
     probe = 0.0 if beyond < 0.0 else 1.0 - 2.0 * (int(beyond / {SIDE}) % 2)
     if gaps[worst] > settings[3]:
-        return {LOST}, worst, missing, False, clock[1], probe
+        return ({LOST} if usable else {TIMELESS}), worst, missing, False, now, probe
     if still >= 0:
-        return {FROZEN}, still, missing, False, clock[1], probe
+        return {FROZEN}, still, missing, False, now, probe
     for i in range(n):
         if shares[i] > settings[6]:
-            return {SPARSE}, i, missing, False, clock[1], probe
-    return {SOUND}, 0, missing, False, clock[1], probe
+            return {SPARSE}, i, missing, False, now, probe
+    return {SOUND}, 0, missing, False, now, probe
 """
 
 
@@ -197,13 +202,14 @@ class SensorMonitor:
         memory["counts"][:] = 0.01
         memory["band"][:] = settings.bands(mechanism)
         self._q, self._v, self._window = memory["q"], memory["v"], settings.fault_window
+        self._stall = settings.max_step_interval
         self._accepted = Measurement(0.0, self._q)
         self.forget()
 
     def forget(self) -> None:
         """Start afresh: the next sound reading is the first."""
         self.missing, self.first, self.probe = 0, False, 0.0
-        self._clock[:] = -math.inf, 0.0, 0.0, 0.0
+        self._clock[:] = 0.0, 0.0, 0.0, -math.inf, 0.0, -math.inf, 0.0
         self._gaps[:] = self._ages[:] = self._quiet[:] = self._shares[:] = 0.0
 
     def check(
@@ -252,6 +258,12 @@ class SensorMonitor:
             return "no sound reading yet"
         if found == LOST:
             return f"sensor '{self.names[where]}' lost for {1e3 * self._gaps[where]:.0f} ms"
+        if found == TIMELESS:
+            gap, last = 1e3 * (self._clock[2] - self._clock[4]), self._clock[5]
+            return (
+                f"the rig's clock made no sense for {gap:.0f} ms, last at {last:g} s: the time of "
+                f"a reading must be later than the last one's, by {self._stall:g} s at most"
+            )
         if found == SPARSE:
             return f"sensor {self._missing(where, self._shares[where])}"
         return f"sensor '{self.names[where]}' frozen" if found == FROZEN else ""

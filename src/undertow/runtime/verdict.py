@@ -63,8 +63,6 @@ class Report:
         Total variation of the inputs, Σ|u_k − u_{k−1}|, (m,).
     mode_before_stop, settled_time
         State before the stop, and for how long it had been *balance* then, s.
-    stopped_early
-        Whether the operator stopped the run before its time.
     failed_reads, failed_writes, steps_with_missing_readings
         Reads and writes of the rig that failed; steps in which a reading was missing, or not
         accepted.
@@ -104,7 +102,6 @@ class Report:
     total_variation: FloatArray = field(default_factory=lambda: np.zeros(0))
     mode_before_stop: Mode = Mode.IDLE
     settled_time: float = 0.0
-    stopped_early: bool = False
     failed_reads: int = 0
     failed_writes: int = 0
     steps_with_missing_readings: int = 0
@@ -196,13 +193,13 @@ def _ending(report: Report) -> tuple[Ending, list[str]]:
     why, last = report.stopped_by, report.mode_before_stop
     if why == Reason.THROWN_OUT.text or why.endswith("past its travel"):
         return "lost", [why]
-    if why != Reason.STOP.text:
+    if why not in (Reason.STOP.text, Reason.END.text):
         return "stopped", [why]
     if last == Mode.SWING_UP:
         return "lost", ["not caught by the end"]
     if last not in (Mode.CATCH, Mode.BALANCE):
-        return "stopped", [f"{why} before the law took over"]
-    if report.stopped_early:
+        return "stopped", [f"{why}, before the law took over"]
+    if why == Reason.STOP.text:
         return "stopped", [f"{why} before the end, {last.name.lower()}"]
     if last == Mode.CATCH or report.settled_time < SETTLED:
         return "caught", ["not settled at the end"]

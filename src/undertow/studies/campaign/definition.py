@@ -88,10 +88,10 @@ class Definition:
     def of(cls, mechanism: str, **said: Any) -> Definition:
         """Return the definition with these settings, plain numbers, words, lists and tables."""
         try:
-            return cls(mechanism, json.dumps(said, allow_nan=False))
+            return cls(mechanism, json.dumps(said))
         except (TypeError, ValueError) as error:
             raise InvalidInputError(
-                "settings of a campaign", value=str(error), limit="finite numbers and words"
+                "settings of a campaign", value=str(error), limit="numbers, words, lists and tables"
             ) from error
 
     @property
@@ -167,7 +167,7 @@ class Settings:
         limit = "a finite number"
         if low > -math.inf or high < math.inf:
             limit = f"a number from {low:g} to {high:g}"
-        fits = lambda v: type(v) in (int, float) and low <= v <= high  # noqa: E731
+        fits = lambda v: type(v) in (int, float) and math.isfinite(v) and low <= v <= high  # noqa: E731
         return float(self._take(name, default, limit, fits))
 
     def count(self, name: str, default: int = _NEEDED, *, low: int = 1, high: int = 10**9) -> int:

@@ -53,7 +53,8 @@ class Store:
                 f"store '{path}'",
                 value="none",
                 limit="a campaign's",
-                remedy="Name that of an earlier campaign, or begin one without --resume",
+                remedy="Name that of an earlier campaign, or begin one, without --resume, "
+                "--status, --tables and --picture",
             )
         try:
             self._group: Any = _zarr().open_group(str(path), mode="r+")

@@ -32,6 +32,7 @@ from undertow.runtime import (
     replay,
     session,
 )
+from undertow.runtime.modes import Reason
 from undertow.runtime.processes import fork
 from undertow.studies.fault_injection.cases import OutputMonitor
 from undertow.studies.fault_injection.simulated import drill_recipe
@@ -87,7 +88,7 @@ def _optimiser(number: signal.Signals) -> Happened:
         report = runtime.run(2.5)
     gave_up = report.answers["never came"]
     later = [t for t, _, text in report.events if "applied" in text and t > 1.3]
-    held = report.stopped_by == "operator: stop" and not monitor.faults
+    held = report.stopped_by == Reason.END.text and not monitor.faults
     happened = (
         f"{'held to the end' if held else report.stopped_by}; {gave_up} never came, the one "
         f"standing by gave {len(later)} more"
@@ -151,7 +152,7 @@ def _process_stands_still() -> Happened:
         gap = float(np.diff(recording["clock"]).max())
         reason = _ending(recording, Columns.of(recipe.belief))
         same = replay(log).identical
-    held = reason == "operator: stop"
+    held = reason == Reason.STOP.text
     happened = f"no step for {1e3 * gap:.0f} ms; {'held to the end' if held else reason}"
     right = held if gap <= recipe.settings.max_step_interval else reason.startswith("no step for")
     return (happened, right and same and gap > 0.03)

@@ -30,6 +30,7 @@ from undertow.runtime import (
     replay_controller,
     respond,
 )
+from undertow.runtime.modes import Reason
 from undertow.studies.fault_injection.cases import (
     CASES,
     Case,
@@ -183,13 +184,13 @@ def run_case(
         report = runtime.run(seconds)
     stopped = [t for t, what, text in report.events if what == "state" and "SAFE_STOP" in text]
     free = plant.truth[recipe.belief.m : recipe.belief.n]
-    by_operator = report.stopped_by == "operator: stop" and not case.operator
+    held = report.stopped_by == Reason.END.text
     answers = ", ".join(f"{n} {what}" for what, n in report.answers.most_common(2))
     return CaseResult(
         case,
         report.stopped_by,
-        math.nan if by_operator or not stopped else max(0.0, stopped[0] - since),
-        by_operator and bool((np.abs(free) <= HELD).all()),
+        math.nan if held or not stopped else max(0.0, stopped[0] - since),
+        held and bool((np.abs(free) <= HELD).all()),
         tuple(monitor.faults),
         monitor.largest,
         report.mode == Mode.SAFE_STOP and not monitor.last.any(),

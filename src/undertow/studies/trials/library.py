@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.runtime import Recipe, session
+from undertow.runtime.modes import Reason
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def through_the_runtime(
         recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=evaluations)
         with session(recipe, simulated=True) as runtime:
             report = runtime.run(seconds)
-        if not report.stopped_by.startswith("operator"):
+        if report.stopped_by != Reason.END.text:
             ends[report.stopped_by] += 1
             continue
         applied.append(report.answers.get("applied", 0))
