@@ -21,6 +21,7 @@ from undertow.cascade.robustness import (
 from undertow.law import InnerLoop, Plan
 from undertow.objective import objective_for
 from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
+from undertow.runtime import controller_defaults
 from undertow.runtime.controller_defaults import (
     NOISE,
     default_gate,
@@ -106,6 +107,17 @@ def test_the_boundary_layer_is_as_thick_as_the_sensors_need(arm: ut.Mechanism) -
     surface = ut.first_surface(beam)
     thinner = ut.ReachingLaw(layer=float(np.max(law.layer)) / 2)
     assert noise_share(beam, surface, P, law) <= NOISE < noise_share(beam, surface, P, thinner)
+
+
+@pytest.mark.slow
+def test_where_no_layer_bears_the_delay_noise_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The beam's layer is thick for its noise alone: it bears the delay at any thickness."""
+    beam = ut.mechanisms.ball_and_beam()
+    estimator = estimator_for(beam, plausible_rig(beam))
+    law = reaching_for(estimator)
+    assert law != ut.ReachingLaw()
+    monkeypatch.setattr(controller_defaults, "delay_margin", lambda *_, **__: -1.0)
+    assert reaching_for(estimator) == law
 
 
 @pytest.mark.parametrize("period", [0.0005, 0.001, 0.002, 0.005, 0.01])

@@ -107,7 +107,8 @@ def reaching_for(estimator: Estimator) -> ReachingLaw:
 
     The gains near the target go with η/ε: ε is doubled until the first surface bears the delay that
     the gate asks for, less a period, and what the estimator does not know takes no more than
-    ``NOISE`` of the input on it, for which it is doubled to ``DOUBLED`` times at most.
+    ``NOISE`` of the input on it, for which it is doubled to ``DOUBLED`` times at most.  Where no
+    layer bears that delay, noise alone decides.
     """
     mechanism, covariance = estimator.mechanism, estimator.steady_covariance()
     period, least = estimator.period, _delay(estimator.period, BEARS - 1)
@@ -118,7 +119,7 @@ def reaching_for(estimator: Estimator) -> ReachingLaw:
         k
         for k, law in enumerate(laws)
         if delay_margin(mechanism, surface, law, period=period, longest=least) >= least - 1e-9
-    ] or [0]
+    ] or range(DOUBLED + 1)
     able = [laws[k] for k in borne if k <= max(DOUBLED, borne[0])]
     quiet = (law for law in able if noise_share(mechanism, surface, covariance, law) <= NOISE)
     return next(quiet, able[-1])
