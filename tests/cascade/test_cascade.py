@@ -434,3 +434,27 @@ def test_what_is_no_planner_or_no_verdict_of_a_gate_is_refused(rig: ut.Mechanism
     cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact", gate=silent, cold=Budget(32))
     with pytest.raises(InvalidInputError, match=r"gate of the cascade returned.*None.*Admission"):
         cascade.simulate(phi=0.2, duration=0.1)
+
+
+@pytest.mark.parametrize(("x_dot", "farthest"), [(0.0, 0.36), (0.4, 0.52)])
+def test_a_state_beyond_a_constraint_is_planned_back(x_dot: float, farthest: float) -> None:
+    """As after a push on a rig: plans are admitted out there, and lead back inside."""
+    cart = ut.mechanisms.cart_pendulum()
+    box = ut.state_box(x=0.3)
+    cascade = ut.Cascade(cart, ut.MinimumEnergy(constraints=box), belief="exact")
+    state, _ = cascade.start(cart.state(x=0.1))
+    x, admitted = cart.state(x=0.33, x_dot=x_dot), 0
+    places = [x[0]]
+    free = ut.ClosedLoop(cart, ut.MinimumEnergy(travel=False))
+    for k in range(20):
+        t = 0.1 * k
+        proposal = cascade.propose(state, x, t)
+        state, admission = cascade.apply_gate(state, proposal, x)
+        admitted += admission.accepted
+        assert "constraint" not in admission.reason
+        motion = free.simulate(x, state.at(t), duration=0.1, terminal=0.0)
+        x = motion.x[-1]
+        places += [*motion["x"]]
+    assert admitted > 1
+    assert abs(x[0]) < 0.3
+    assert max(places) < farthest  # to go back it leans that way first

@@ -907,3 +907,41 @@ def test_a_plant_that_is_another_mechanism_is_refused(rig: ut.Mechanism, other: 
     ):
         with pytest.raises(InvalidInputError, match=r"must be theta .rad., phi .rad., voltage"):
             made()
+
+
+def test_a_motion_that_begins_outside_of_a_constraint_may_come_back_once() -> None:
+    """It pays ∫ Φ(0, u_max) w/|w(0)| dt until it is inside; after that the constraint counts.
+
+    Against the motions of the same loop without constraints, and the trapezoidal rule.
+    """
+    cart = ut.mechanisms.cart_pendulum()
+    edge = 0.5
+    objective = ut.MinimumEnergy(constraints=ut.state_box(x=edge))
+    strict = ut.ClosedLoop(cart, objective, tail_rtol=1e-3)
+    returning = replace(strict, returning=True)
+    free = ut.ClosedLoop(cart, ut.MinimumEnergy(travel=False))
+    rng = np.random.default_rng(1)
+    base = ut.first_surface(cart).vector
+    surfaces = base * (1 + 0.3 * rng.standard_normal((48, base.size)))
+    x = cart.state(x=edge + 0.02, phi=0.05, x_dot=0.2)
+    seen = set()
+    for precise in (False, True):
+        assert (strict.batch(x, surfaces, precise=precise).time == 0).all()
+        batch = returning.batch(x, surfaces, precise=precise)
+        for k in range(len(surfaces)):
+            motion = free.simulate(x, ut.Surface(*surfaces[k]))
+            excess = np.maximum(np.abs(motion["x"]) - edge, 0.0)
+            inside = np.flatnonzero(excess == 0)
+            back = inside[0] if len(inside) else len(excess)
+            again = (excess[back:] > 1e-6).any()
+            if motion.event == Event.REACHED and not again:
+                assert batch.event[k] == Event.REACHED
+                price = 20.0**2 / edge * np.trapezoid(excess[: back + 1], motion.t[: back + 1])
+                rel = 1e-5 if precise else 5e-3
+                assert batch.cost[k] == pytest.approx(motion.cost + price, rel=rel)
+                assert -batch.path[k, 0] == pytest.approx(excess.max(), rel=5e-3)
+            elif again:
+                assert batch.event[k] == Event.CONSTRAINT
+                assert batch.time[k] > motion.t[back]
+            seen.add(int(batch.event[k]))
+    assert {int(Event.REACHED), int(Event.CONSTRAINT)} <= seen

@@ -311,6 +311,7 @@ class Cascade:
             ensemble=None if belief is None else belief.ensemble(belief.prior),
             covariance=self.covariance,
             rtol=self.rtol,
+            returning=True,
         )
 
     @checked

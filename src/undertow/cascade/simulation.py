@@ -250,7 +250,9 @@ def moving_loops(
     for t in plants:
         positive("time of a plant, s", t, "Plants change after the start, at 0", zero=True)
     return {
-        round(t / cascade.stride): replace(cascade.loop, plant=moving or usual, ensemble=None)
+        round(t / cascade.stride): replace(
+            cascade.loop, plant=moving or usual, ensemble=None, returning=False
+        )
         for t, moving in sorted({0.0: None, **plants}.items())
     }
 

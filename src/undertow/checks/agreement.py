@@ -232,10 +232,11 @@ def kernel(subject: Subject, *, sampled: bool = False) -> Iterator[Difference]:
     buffers.fill(subject.states, subject.surface.vector)
     record = np.zeros((buffers.padded, 1, 2 * n + 2 * m + 2))
     parameters, limits = mechanism.parameter_values, mechanism.input_limits
+    prices = np.zeros(len(objective.constraints))
     kernels.rollout(
         0, buffers.padded, buffers.states, buffers.live, buffers.lanes, np.zeros(1, dtype=np.int64),
         parameters, parameters, limits, buffers.quiet,
-        0.0, STEP, 1, 1, 0.0, math.inf, math.inf, 0.0, 1, 1, record, buffers.out,
+        0.0, STEP, 1, 1, 0.0, math.inf, math.inf, 0.0, prices, 1, 1, record, buffers.out,
     )  # fmt: skip
     after = buffers.batch(0.0)
     stage = objective.stage_cost(mechanism)

@@ -104,6 +104,16 @@ def _event(margins, least, cost, radius, terminal, escape, cap):  # type: ignore
 
 
 @_inlined
+def _penalty(margins, least, prices):  # type: ignore[no-untyped-def]
+    """What it costs a second to be outside of those constraints that do not count yet."""
+    total = 0.0
+    for j in range(len(prices)):
+        if least[2 + j] == -math.inf:
+            total += prices[j] * max(0.0, -margins[2 + j])
+    return total
+
+
+@_inlined
 def _distance(x):  # type: ignore[no-untyped-def]
     """‖x‖₂ of a state with the cost behind it."""
     total = 0.0
@@ -172,7 +182,7 @@ def _dip(x, slopes, new, size, terminal, at):  # type: ignore[no-untyped-def]
 
 def _follow(  # type: ignore[no-untyped-def]
     look, decide, count, x0, live, lanes, switch, plant, belief, limits, noise, start, step, length,
-    zoh_steps, least, nu, terminal, escape, cap, rtol, every, record, out,
+    zoh_steps, usual_least, nu, terminal, escape, cap, rtol, prices, every, record, out,
 ):  # fmt: skip
     """Integrate lanes one after the other; arguments and results are those of a rollout kernel.
 
@@ -186,18 +196,28 @@ def _follow(  # type: ignore[no-untyped-def]
     )  # fmt: skip
     slopes, u = np.empty((7, size_x + 1)), np.empty(m)
     seen, low = np.empty(2 * m + 2 + paths), np.empty(2 + paths)
-    margins = seen[2 * m :]
+    margins, least = seen[2 * m :], np.empty(2 + paths)
     pace = every if every > 0 else (PACE if paths > 0 else steps + 1)
     for b in range(count):
         for j in range(size_x):
             x[j] = x0[b, j]
         x[size_x] = 0.0
         for j in range(len(low)):
-            low[j] = math.inf
+            low[j], least[j] = math.inf, usual_least[j]
         radius = _distance(x)
         code = _REACHED if radius <= terminal else (_HORIZON if live[b] > 0.0 else _UNSTABLE)
         t, tick, segment, row, taken, held = 0.0, 0, 0, 0, 0, 0
         usual, lane = step, lanes[b, 0]
+        outside = False  # of a path constraint as it begins: at a price until it is inside
+        if prices.any():
+            for j in range(size_x + 1):
+                new[j] = x[j]
+            if zoh_steps > 0:
+                decide(start, new, lane, plant, belief, limits, u, seen, rates)
+            look(start, new, lane, plant, belief, limits, u, seen, rates)
+            for j in range(2, len(low)):
+                if not margins[j] >= least[j]:
+                    least[j], outside = -math.inf, True
         while code == _HORIZON and tick < steps:
             # Surfaces change, and samples are taken, at whole steps of the loop.
             if segment < len(switch) and tick == switch[segment]:
@@ -226,6 +246,8 @@ def _follow(  # type: ignore[no-untyped-def]
                             new[j] = x[j] + size * slope
                         clock = start + t + WHEN[i] * size
                         look(clock, new, lane, plant, belief, limits, u, seen, slopes[i])
+                        if outside:
+                            slopes[i, size_x] += _penalty(margins, least, prices)
                         if i == 0:
                             held = _marks(seen, least, radius, layers, limits, terminal, escape)
                             code = _event(margins, least, x[size_x], radius, terminal, escape, cap)
@@ -285,6 +307,10 @@ def _follow(  # type: ignore[no-untyped-def]
                         longer = size * min(5.0, 0.9 * max(off, 1e-10) ** -0.2)
                         longer = longer if longer >= LEAST * step else LEAST * step
                         usual = longer if size >= usual else max(usual, longer)
+                    if outside:
+                        for j in range(2, len(low)):
+                            inside = margins[j] >= usual_least[j]
+                            least[j] = usual_least[j] if inside else least[j]
                     row, held, code, radius = instant, now, ends, outer
                     t = stop if size >= stop - t else t + size
                     for j in range(size_x + 1):
@@ -308,15 +334,15 @@ def follow() -> Any:
     """Return the integrator, compiled for any mechanism: it calls what it is given.
 
     Its arguments are those of a rollout kernel, behind the mechanism's ``look`` and ``decide`` and
-    the number of lanes, but for ``length``, s; ``zoh_steps`` is 0 for a continuous loop, ``least``
-    the margins of (37), a hard input limit and the path below which a motion has broken them, and
-    ``nu`` the objective's terminal radius.
+    the number of lanes, but for ``length``, s; ``zoh_steps`` is 0 for a continuous loop,
+    ``usual_least`` the margins of (37), a hard input limit and the path below which a motion has
+    broken them, and ``nu`` the objective's terminal radius.
     """
     whole, real, look = numba.int64, numba.float64, numba.types.FunctionType(LOOK)
     table, block = numba.float64[:, ::1], numba.float64[:, :, ::1]
     signature = numba.void(
         look, look, whole, table, _ROW, block, numba.int64[::1], _ROW, _ROW, _ROW, block, real,
-        real, real, whole, _ROW, *[real] * 5, whole, block, table,
+        real, real, whole, _ROW, *[real] * 5, _ROW, whole, block, table,
     )  # fmt: skip
     return compiled(signature)(_follow)
 

@@ -36,7 +36,8 @@ PARAMETERS: Mapping[str, str] = {
     "x0": "2", "live": "1", "lanes": "3", "switch": "1", "plant": "1", "belief": "1",
     "limits": "1", "noise": "3", "start": "double", "h": "double", "steps": "long long",
     "zoh_steps": "long long", "terminal": "double", "escape": "double", "cap": "double",
-    "seek": "double", "calm_from": "long long", "every": "long long", "record": "3", "out": "2",
+    "seek": "double", "prices": "1", "calm_from": "long long", "every": "long long", "record": "3",
+    "out": "2",
 }  # fmt: skip
 
 #: Arrays that a rollout writes.

@@ -94,6 +94,7 @@ class _Writer:
             *(f"{row} = 1.0" for row in r.smallest),
             *(f"{row} = math.inf" for _, row in self.watched),
             *(f"{row} = 0.0" for row in [*r.u, *r.s, *r.path]),
+            *(f"{row} = -1.0 if prices[{k}] > 0.0 else -2.0" for k, row in enumerate(r.outside)),
             f"{r.singular} = 1.0",
         ]
 
@@ -237,17 +238,38 @@ class _Writer:
         ]
 
     def break_off(self) -> list[str]:
-        """Stop the lanes that have a negative margin."""
+        """Stop the lanes that have a negative margin, but for motions that are on their way back.
+
+        Those have been outside of a path constraint with a price ever since they began: the row
+        ``outside`` holds the last step in which they were.
+        """
         r, now = self.rows, [row for row, _ in self.watched]
+        margins = [row for row in now if row not in r.path]
         return [
             f"active, code, end = {r.active}, {r.code}, {r.end}",
-            "sound = " + " & ".join(f"({row} >= 0.0)" for row in now),
+            "sound = " + " & ".join(f"({row} >= 0.0)" for row in margins),
+            *(f"since_{j}, path_{j} = {o}, {p}" for j, (o, p) in enumerate(self._paths())),
+            *(f"back_{j} = since_{j} == step - 1.0" for j, _ in enumerate(r.path)),
+            *(f"sound = sound & ((path_{j} >= 0.0) | back_{j})" for j, _ in enumerate(r.path)),
+            *(
+                f"{o} = step if back_{j} & (not path_{j} >= 0.0) else since_{j}"
+                for j, (o, _) in enumerate(self._paths())
+            ),
+            *[
+                f"{r.cost} = {r.cost} + (h * prices[{j}] * max(0.0, -path_{j}) "
+                "if active > 0.0 else 0.0)"
+                for j, _ in enumerate(r.path)
+            ],
             "stops = (active > 0.0) & (not sound)",
             f"kind = {code(Event.CONSTRAINT)} if {now[0]} >= 0.0 else {code(Event.SINGULAR)}",
             f"{r.end} = {self.time} if stops else end",
             f"{r.code} = kind if stops else code",
             f"{r.active} = 0.0 if stops else active",
         ]
+
+    def _paths(self) -> list[tuple[str, str]]:
+        """Last step outside, and margin, of each path constraint."""
+        return list(zip(self.rows.outside, self.rows.path, strict=True))
 
     def hand_over(self) -> list[str]:
         """Stop a lane (code ``HANDED_OVER``) that is well inside its boundary layer and its limits.
@@ -428,7 +450,7 @@ import numpy as np
 )
 def rollout(
     from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
-    start, h, steps, zoh_steps, terminal, escape, cap, seek, calm_from, every, record, out,
+    start, h, steps, zoh_steps, terminal, escape, cap, seek, prices, calm_from, every, record, out,
 ):
 {textwrap.indent(chr(10).join(w.constants()), "    ")}
 {w.rows.allocate()}

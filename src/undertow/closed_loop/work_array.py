@@ -67,7 +67,7 @@ class WorkArray:
         self.kept = dict(zip(kept, self._take(len(kept)), strict=True))
         self.u, self.s = self._take(m), self._take(m)
         self.singular, self.input = self._take(2)
-        self.path = self._take(nw)
+        self.path, self.outside = self._take(nw), self._take(nw)
         self.smallest = self._take(2 + nw)
         self.linear = [self._take(nx) for _ in range(nx // 2)]
         self.value = [self._take(nx) for _ in range(nx)]
