@@ -146,6 +146,7 @@ class Controller:
         self.cascade, self.estimator, self.period = cascade, estimator, period
         self.settings, self.swing_up = settings, swing_up
         fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
+        self._fall_angle = fall_angle
         moving = [motion for _, motion in legs if motion.moves]
         self.reference = moving[0] if moving else None
         acted_on = error_dynamics(mechanism) if moving else mechanism
@@ -345,6 +346,8 @@ class Controller:
             if why == Reason.FAULT:
                 reason = inputs.alarm or sensors.describe(found, sensor)
                 reason = reason or waited or self._describe(wrong, place)
+            elif why == Reason.THROWN_OUT:
+                reason = f"{reason}: {self._why_thrown_out()}"
             self._change(t, Mode(number), reason)
             mode = self.mode
         if mode is Mode.SWING_UP:
@@ -427,6 +430,18 @@ class Controller:
         lacking = self.sensors.worst(self._t - self._began)
         what = f"{what} within {settings.bring_up_timeout:g} s"
         return f"bring-up: {what}{lacking and f'; {lacking}'}"
+
+    def _why_thrown_out(self) -> str:
+        """Return in words what the law cannot hold at the present state."""
+        m = len(self.u)
+        coordinates, away = self.cascade.mechanism.coordinates[m:], np.abs(self.wrapped[m:])
+        for c, angle in zip(coordinates, away, strict=False):
+            if c.unit == "rad" and angle > self._fall_angle:
+                return f"{c.name} is {angle:.3g} rad off the target, past {self._fall_angle:.3g}"
+        norm = float(np.linalg.norm(self.wrapped))
+        if not norm < self.settings.max_state_norm:
+            return f"‖x‖ = {norm:.3g}, past {self.settings.max_state_norm:g}"
+        return "the law is singular here, (37)"
 
     def _proceed(self, t: float) -> None:
         """Go on to the surface of a schedule that is in force at the time t."""

@@ -191,7 +191,7 @@ class RunVerdict:
 def _ending(report: Report) -> tuple[Ending, list[str]]:
     """Return how the motion ended, before what went wrong on the way is looked at."""
     why, last = report.stopped_by, report.mode_before_stop
-    if why == Reason.THROWN_OUT.text or why.endswith("past its travel"):
+    if why.startswith(Reason.THROWN_OUT.text) or why.endswith("past its travel"):
         return "lost", [why]
     if why not in (Reason.STOP.text, Reason.END.text):
         return "stopped", [why]
