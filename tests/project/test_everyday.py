@@ -192,7 +192,8 @@ def kept(run: ut.Run) -> list[Any]:
     return [
         RIG, ut.first_surface(RIG), ut.ReachingLaw(), ut.MinimumTime(), formula,
         ut.MinimumEnergy(constraints=(arm, *ut.state_box(phi=1.0))), ut.Cascade(RIG, formula), run,
-        run.trajectory, Recipe(RIG, objective=ut.MinimumTime()), Recipe(),
+        run.trajectory, Recipe(RIG, objective=ut.MinimumTime()), Recipe(), ut.lqr(RIG),
+        ut.Reference.sine(0.5, theta=0.3),
     ]  # fmt: skip
 
 
@@ -213,6 +214,19 @@ def test_everything_is_pickled_and_read_in_a_fresh_process(
         encoding="utf-8", env={**__import__("os").environ, "PYTHONIOENCODING": "utf-8"},
     )  # fmt: skip
     assert done.stdout.splitlines() == [repr(item) for item in items]
+
+
+def test_a_regulator_that_was_pickled_gives_the_same_inputs() -> None:
+    x, make = RIG.state(phi=0.1), ut.lqr(RIG)
+    again = pickle.loads(pickle.dumps(make))
+    np.testing.assert_array_equal(again(x)(0.0, x), make(x)(0.0, x))
+
+
+def test_a_predictive_controller_that_was_pickled_gives_the_same_inputs() -> None:
+    pytest.importorskip("casadi")
+    x, make = RIG.state(phi=0.1), ut.nmpc(RIG, ut.MinimumEnergy())
+    again = pickle.loads(pickle.dumps(make))
+    np.testing.assert_array_equal(again(x)(0.0, x), make(x)(0.0, x))
 
 
 def test_reprs_are_short_and_notebooks_show_formulas(names: dict[str, Any]) -> None:

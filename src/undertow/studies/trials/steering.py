@@ -9,7 +9,7 @@ cascade's answers come a period late.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -217,16 +217,41 @@ def _terminal(belief: Mechanism, objective: Objective) -> FloatArray:
     return np.asarray(scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R), np.float64)
 
 
+@dataclass(frozen=True, eq=False)
+class LinearFeedback:
+    """u = u_0 + K x within the inputs' limits: u_0 and ``limits`` (m,), ``gains`` K (m, 2n)."""
+
+    rest: FloatArray
+    gains: FloatArray
+    limits: FloatArray
+
+    def __call__(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at (t, x), (m,)."""
+        return np.clip(self.rest + self.gains @ x, -self.limits, self.limits)
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A maker of controllers that gives the same one to each run, set back; with a name."""
+
+    label: str
+    controller: StateFeedback = field(repr=False)
+
+    @property
+    def __name__(self) -> str:
+        """Its name, as that of a function that makes controllers."""
+        return self.label
+
+    def __call__(self, start: FloatArray) -> StateFeedback:
+        """Return the controller of a run from ``start``."""
+        if isinstance(self.controller, NMPC):
+            self.controller.reset()
+        return self.controller
+
+
 def predictive(belief: Mechanism, objective: Objective, **settings: Any) -> MakeController:
     """Return the maker of an NMPC controller: the same one for each run, set back."""
-    controller = NMPC(belief, objective, **settings)
-
-    def make(_start: FloatArray) -> NMPC:
-        controller.reset()
-        return controller
-
-    make.__name__ = "NMPC"
-    return make
+    return Made("NMPC", NMPC(belief, objective, **settings))
 
 
 def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
@@ -253,8 +278,4 @@ def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
     if not slowest < -UNCONTROLLABLE * np.linalg.norm(lin.A, 2):  # a mode that k does not reach
         raise uncontrollable(belief)
 
-    def make(_start: FloatArray) -> StateFeedback:
-        return lambda t, x: np.clip(rest + k @ x, -limit, limit)
-
-    make.__name__ = "LQR, clipped"
-    return make
+    return Made("LQR, clipped", LinearFeedback(rest, np.asarray(k, np.float64), limit))
