@@ -22,7 +22,7 @@ from functools import cache
 
 import numpy as np
 
-from undertow.closed_loop import INADMISSIBLE, LANES
+from undertow.closed_loop import INADMISSIBLE, LANES, UNSTABLE
 from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
@@ -127,6 +127,9 @@ def global_search(task: Optimisation) -> Iterator[bool]:
     drawn = task.firsts[0] + task.space.steps(rng, np.ones(draws))
     drawn = drawn[: max(1, task.left)]
     z, scores = np.vstack([z, drawn]), np.concatenate([scores, task.cost(drawn)])
+    if not scores.min() < UNSTABLE:  # not one that may be rolled out: nothing to go by
+        yield False
+        return
     starts = z[np.argsort(scores, kind="stable")[:3]]
     share = (total - len(z)) // 4
     for start in starts:
