@@ -524,8 +524,8 @@ class ClosedLoop:
                 "step for the gains (13) that the disturbance bounds ask for",
                 value=f"{period:g} s at k/ε = {rate.max():.4g} 1/s",
                 limit=f"below 2 ε/k = {2 / rate.max():.3g} s",
-                remedy="Use a shorter step, a thicker boundary layer or smaller bounds; a file's dry "
-                "friction in joints without a motor is a bound, too",
+                remedy="Use a shorter step, a thicker boundary layer or smaller bounds; a file's "
+                "dry friction in joints without a motor is a bound, too",
             )
 
     @checked
