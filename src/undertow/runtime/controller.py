@@ -156,7 +156,7 @@ class Controller:
         self._row: FloatArray = fast["parameters"][own:]
         self._learning: Estimator | None = None
         self._jumps, self._early = 0, False
-        if estimator.belief and cascade.known:
+        if cascade.learns_from(estimator):
             self._learning = estimator
             self._bears = InnerLoop(mechanism, memory.surface, cascade.reaching)
         self.u: FloatArray = fast["output"]

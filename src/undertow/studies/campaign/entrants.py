@@ -20,6 +20,7 @@ from undertow.models.importers.python_file import in_a_file, named_in_file
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
 from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, predictive, steady
+from undertow.studies.trials.trial import introduce
 
 #: Settings of a controller by name: what it is made with besides mechanism and objective.
 Setting = Mapping[str, Any]
@@ -30,8 +31,8 @@ class Entrant(Protocol):
 
     It knows the mechanism as it is in the library and the objective that is scored.  What makes it
     may have an attribute ``settings``, a list of keyword arguments to choose from: the league tries
-    at most :data:`MOST_SETTINGS` of them on plants that are not scored, and takes the best.  Where
-    it has a method ``listen``, it is given the estimator.
+    at most :data:`MOST_SETTINGS` of them on plants that are not scored, and takes the best.  One
+    that is a :class:`undertow.studies.trials.trial.TakesEstimator` is given the estimator.
     """
 
     def reset(self, x0: FloatArray) -> None:
@@ -63,14 +64,24 @@ class Refereed:
     """An entrant in a run: its inputs are checked, its processor time is counted.
 
     ``seconds`` has the processor time of every step, s.
+
+    Raises
+    ------
+    ForfeitError
+        When the entrant raises, or has not both methods of an :class:`Entrant`.
     """
 
     def __init__(self, entrant: Entrant, x0: FloatArray, m: int) -> None:
         self.entrant, self.m = entrant, m
         self.seconds: list[float] = []
+        for method in ("reset", "step"):
+            if not callable(getattr(entrant, method, None)):
+                raise ForfeitError(1, f"{type(entrant).__name__} has no method {method}")
         self._call(entrant.reset, x0.copy())
-        if hasattr(entrant, "listen"):
-            self.listen: Callable[[Estimator], None] = entrant.listen
+
+    def listen(self, estimator: Estimator) -> None:
+        """Hand the estimator to an entrant that listens."""
+        self._call(introduce, self.entrant, estimator)
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x).
@@ -109,9 +120,15 @@ class Feedback:
 
     def reset(self, x0: FloatArray) -> None:
         """Begin a run."""
-        self.step: StateFeedback = self.begin(x0)
-        if isinstance(self.step, CascadeSteering):
-            self.listen = self.step.listen
+        self._feedback = self.begin(x0)
+
+    def listen(self, estimator: Estimator) -> None:
+        """Hand the estimator to a state feedback that listens."""
+        introduce(self._feedback, estimator)
+
+    def step(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at (t, x)."""
+        return self._feedback(t, x)
 
 
 @lru_cache(maxsize=4)

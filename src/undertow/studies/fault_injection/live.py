@@ -24,6 +24,7 @@ from undertow.runtime import (
     BackgroundWorker,
     Columns,
     Mode,
+    Reason,
     Recipe,
     Recording,
     Settings,
@@ -32,7 +33,6 @@ from undertow.runtime import (
     replay,
     session,
 )
-from undertow.runtime.modes import Reason
 from undertow.runtime.processes import fork
 from undertow.studies.fault_injection.cases import OutputMonitor
 from undertow.studies.fault_injection.simulated import drill_recipe

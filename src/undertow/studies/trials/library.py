@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.runtime import Recipe, session
-from undertow.runtime.modes import Reason
+from undertow.runtime import Reason, Recipe, session
 
 
 @dataclass(frozen=True)

@@ -71,12 +71,8 @@ class CascadeSteering:
 
     def listen(self, estimator: Estimator) -> None:
         """Hear of jumps, and go on with the parameters that are learnt for the same belief."""
-        known = self.cascade.known
         self.estimator, self.jumps = estimator, estimator.jumps
-        if known is None or estimator.belief is None:
-            return
-        if estimator.belief.tolerances == known.tolerances:
-            self.learning = estimator
+        self.learning = estimator if self.cascade.learns_from(estimator) else None
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x)."""
@@ -96,15 +92,12 @@ class CascadeSteering:
         return self.law(x)
 
     def _use(self, t: float) -> None:
-        surface, reaching = self.memory.plan.at(t - self.memory.since)
-        reaching = reaching or self.cascade.reaching
-        if (surface, reaching) != (self.law.surface, self.law.reaching):
-            self.law.use(surface, reaching)
+        self.law.follow(self.memory.plan, t - self.memory.since, self.cascade.reaching)
 
     def _take_reserve(self, t: float, x: FloatArray) -> None:
         """Go on with the strongest plan in reserve, where its law exists."""
         plan = self.cascade.reserve[-1]
-        self.law.use(plan.surfaces[0], plan.laws(self.cascade.reaching)[0])
+        self.law.follow(plan, 0.0, self.cascade.reaching)
         self.law(x)
         if self.law.margin[0] > Settings().min_margin:
             self.memory = replace(self.memory, plan=plan, since=t)
@@ -128,9 +121,8 @@ class CascadeSteering:
         if self.estimator is not None:
             felt = tuple(self.estimator.felt.tolist())
             self.memory = replace(self.memory, disturbance=felt)
-        loop = self.cascade.loop_at(self.memory, t)
-        ahead = loop.batch(x, self.memory.at(t), duration=later - t, terminal=0.0)
-        self.waiting = self.cascade.propose(self.memory, ahead.x[0], later)
+        ahead = self.cascade.predicted_error(self.memory, x, t, later)
+        self.waiting = self.cascade.propose(self.memory, ahead, later)
 
 
 class NMPC:
