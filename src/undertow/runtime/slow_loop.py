@@ -73,6 +73,32 @@ class Answer:
 Compute = Callable[[Request], Answer]
 
 
+class LeadTime:
+    """How far ahead answers are asked for, ``seconds``: from a request to the use of its answer.
+
+    It grows by half after an answer that came late, to ``most`` s at most, and shrinks by a tenth
+    after one that came early, to ``least`` s, in whole ``step``, s.
+    """
+
+    def __init__(
+        self, seconds: float, most: float, step: float, least: float | None = None
+    ) -> None:
+        self.seconds, self.most, self.step = seconds, most, step
+        self.least = seconds if least is None else least
+
+    def late(self) -> None:
+        """Take note of an answer that came late, or never."""
+        self._scale(1.5)
+
+    def early(self) -> None:
+        """Take note of an answer that came in less than half of the time."""
+        self._scale(0.9)
+
+    def _scale(self, factor: float) -> None:
+        seconds = max(self.least, min(self.most, factor * self.seconds))
+        self.seconds = math.ceil(seconds / self.step - 1e-9) * self.step
+
+
 def is_answer(said: object) -> TypeGuard[Answer]:
     """Whether what a worker gave has all that a step reads of an answer, of the right types."""
     return (
