@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.closed_loop import Event, Trajectory
 from undertow.estimators import Belief, Estimator, Record, StateFeedback, compensated, run_recorded
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
@@ -186,26 +185,3 @@ def spread(outcomes: Sequence[Result], what: str) -> Spread:
     if not values:
         return Spread(math.nan, math.nan)
     return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0)
-
-
-def motion(mechanism: Mechanism, record: Record, every: int = 5) -> Trajectory:
-    """Return the true motion of a record for plotting, every so many samples."""
-    rows = slice(None, None, every)
-    count, m = len(record.t[rows]), mechanism.m
-    nothing = np.zeros(count)
-    return Trajectory(
-        mechanism,
-        record.t[rows],
-        record.truth[rows],
-        record.u[rows],
-        np.zeros((count, m)),
-        nothing,
-        np.ones(count),
-        Event.HORIZON,
-    )
-
-
-def undisturbed(mechanism: Mechanism, period: float = 0.001) -> Bench:
-    """Return the bench that moves as the belief says, sampled at the same period."""
-    bench = Bench(mechanism)
-    return replace(bench, timing=replace(bench.timing, period=period))
