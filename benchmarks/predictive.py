@@ -137,7 +137,7 @@ class _Task:
         self.low, self.high = ends(mechanism, box)
         self.boxed = np.flatnonzero(np.isfinite(self.low) | np.isfinite(self.high))
         self.lengths = self.left(0.0)
-        rate = np.abs(np.linalg.eigvals(linearise(mechanism).A)).max()
+        rate = linearise(mechanism).fastest
         self.substeps = np.ceil(self.lengths * rate / RESOLVED).astype(int).clip(1, 40)
         self.radius = radius
         self.seconds: list[float] = []

@@ -50,7 +50,14 @@ from undertow.runtime import estimator_for
 from undertow.studies.trials.balance import controllers
 from undertow.studies.trials.robustness import NAMES, random_bench
 from undertow.studies.trials.steering import predictive
-from undertow.studies.trials.trial import MakeController, Outcome, balanced, spread, trial
+from undertow.studies.trials.trial import (
+    MakeController,
+    Outcome,
+    balanced,
+    introduce,
+    spread,
+    trial,
+)
 
 BENCH = srv02_rig()
 MODEL = BENCH.mechanism
@@ -126,8 +133,10 @@ class Timed:
 
     def __init__(self, steering: Any, seconds: list[float]) -> None:
         self.steering, self.seconds = steering, seconds
-        if hasattr(steering, "listen"):
-            self.listen = steering.listen
+
+    def listen(self, estimator: Estimator) -> None:
+        """Hand the estimator to a controller that listens."""
+        introduce(self.steering, estimator)
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at t."""

@@ -13,7 +13,7 @@ import sympy as sp
 import undertow as ut
 from undertow.base import InfeasibleError, InvalidInputError
 from undertow.cascade import CascadeState, cost_gate
-from undertow.estimators import ParameterEstimate
+from undertow.estimators import KalmanFilter, Measured, ParameterEstimate
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
 
@@ -331,3 +331,13 @@ def test_without_a_belief_nothing_is_learnt(pendulum: ut.Mechanism) -> None:
     assert memory.estimate is None
     assert cascade.loop_at(memory) is cascade.loop
     assert cascade.learn(memory, np.arange(2.0), np.array([x, x]), np.zeros((2, 1))) is memory
+
+
+def test_a_cascade_learns_from_who_has_its_own_tolerances(pendulum: ut.Mechanism) -> None:
+    """What is learnt counts in tolerances: those of another belief would be read as others."""
+    wide, narrow = (ut.Belief.relative(pendulum, m=part) for part in (0.2, 0.1))
+    cascade = ut.Cascade(pendulum, ut.MinimumTime(), belief=wide)
+    filters = [KalmanFilter(pendulum, belief=belief) for belief in (wide, narrow, None)]
+    assert [cascade.learns_from(one) for one in filters] == [True, False, False]
+    assert not cascade.learns_from(Measured(pendulum))
+    assert not replace(cascade, belief="exact").learns_from(filters[0])

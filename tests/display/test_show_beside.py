@@ -50,6 +50,9 @@ class Now:
     def take(self, t: float) -> Message | None:
         return self.answers.pop(0) if self.answers else None
 
+    def replace(self) -> bool:
+        return False
+
     def close(self) -> None:
         pass
 

@@ -247,7 +247,7 @@ def test_controls_do_what_they_say(simulation: Simulation) -> None:
     assert plant.mechanism.substitution[RIG.parameters[2].symbol] == 0.2
     assert plant.friction["theta"].coulomb == 0.1
     simulation.hear({"do": "defaults"}, 1)
-    assert simulation.plant.parameter_values.tolist() == RIG.parameter_values.tolist()
+    assert simulation.controls.plant.parameter_values.tolist() == RIG.parameter_values.tolist()
     for name, value in (("plant m", 99.0), ("plant m", "heavy"), ("nothing", 1.0),
                         ("objective", "glory"), ("period", math.nan)):  # fmt: skip
         with pytest.raises(InvalidInputError):

@@ -34,7 +34,7 @@ from undertow.runtime import (
 )
 from undertow.runtime.modes import Reason, transition
 from undertow.runtime.session import session
-from undertow.runtime.slow_loop import Answer, Request
+from undertow.runtime.slow_loop import Answer, LeadTime, Request
 from undertow.studies.fault_injection.cases import OutputMonitor
 
 #: A run from hanging: its surfaces, and the regions where they catch, are computed once for all.
@@ -418,3 +418,16 @@ def test_a_pendulum_that_falls_is_let_go_of() -> None:
     with session(recipe, simulated=True) as runtime:
         report = runtime.run(3.0)
     assert re.fullmatch(r"thrown out: phi is \S+ rad off the target, past 1.57", report.stopped_by)
+
+
+@given(st.lists(st.booleans(), max_size=60))
+def test_a_lead_time_grows_with_late_answers_and_shrinks_with_early_ones(lates: list[bool]) -> None:
+    """In whole steps, between its bounds; what is late is asked for farther ahead."""
+    lead = LeadTime(0.1, 0.5, 0.002, least=0.02)
+    for late in lates:
+        before = lead.seconds
+        (lead.late if late else lead.early)()
+        assert 0.02 - 1e-12 <= lead.seconds <= 0.5 + 1e-12
+        assert abs(lead.seconds / 0.002 - round(lead.seconds / 0.002)) < 1e-9
+        bound = 0.5 if late else 0.02
+        assert (lead.seconds > before) == late or lead.seconds in (before, pytest.approx(bound))

@@ -47,7 +47,7 @@ from undertow.runtime.encoding import answer_from, answer_row, memory_from, memo
 from undertow.runtime.log import part_path
 from undertow.runtime.replay import build
 from undertow.runtime.slow_loop import Request
-from undertow.studies.rigs.runs import chatter_figure, latency_figure, motion_figure
+from undertow.studies.rigs.figures import pictures
 
 RECIPE = Recipe(rig="realistic", evaluations=64, start=(0.0, 0.2, 0.0, 0.0))
 MEMORY = CascadeState(Plan.of(ut.Surface(alpha_a=-1, lambda_a=-0.25, alpha_u=1.6, lambda_u=17.3)))
@@ -603,5 +603,6 @@ def test_answers_and_memories_survive_the_log_exactly() -> None:
 
 def test_the_pictures_of_a_log_are_pictures(logged: Path) -> None:
     recording = read_log(logged)
-    for figure in (motion_figure, latency_figure, chatter_figure):
-        assert figure(recording).startswith(b"\x89PNG")
+    drawn = pictures(recording)
+    assert set(drawn) == {"motion.png", "latency.png", "chatter.png"}
+    assert all(content.startswith(b"\x89PNG") for content in drawn.values())

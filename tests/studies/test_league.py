@@ -72,6 +72,14 @@ class Raises(Idle):
         return 1 / 0
 
 
+class Unbegun:
+    def __init__(self, mechanism, objective):
+        pass
+
+    def step(self, t, x):
+        return np.zeros(1)
+
+
 class Wide(Idle):
     def step(self, t, x):
         return np.zeros(2)
@@ -115,7 +123,10 @@ def found(definition: Definition, *names: str) -> dict[str, dict[str, Any]]:
 
 
 def test_what_an_entrant_does_wrong_costs_it_alone(file: Path) -> None:
-    wrong = {"Raises": "raised", "Wide": "wrong_shape", "Nothing": "not_finite", "Unmade": "raised"}
+    wrong = {
+        "Raises": "raised", "Unmade": "raised", "Unbegun": "raised", "Wide": "wrong_shape",
+        "Nothing": "not_finite",
+    }  # fmt: skip
     others = *wrong, "Idle", "Huge"
     rows = found(entered(file, *others, seconds=2.0), *others)
     for name, fault in wrong.items():

@@ -129,7 +129,7 @@ def test_appendix_used_another_b() -> None:
             assert ratio == pytest.approx(1 / 2.46)
             assert epsilon == pytest.approx(ratio * 4 / 3 * 0.125 * 0.1675**2 / b, rel=1e-6)
     assert degrees(singular_angle(appendix, CASES["5 last of cascade, time"])) < 19
-    reach = {case: catch_limit(appendix, [surface]) for case, surface in CASES.items()}
+    reach = {case: catch_limit(appendix, surface) for case, surface in CASES.items()}
     assert max(reach.values()) < radians(40)  # none could have caught 40°
 
 
@@ -138,14 +138,14 @@ def test_appendix_used_another_b() -> None:
 )
 def test_catch_limits_at_the_printed_damping(case: str, limit: float) -> None:
     """From rest, d_e = 0.073, 15 V: the limits of an independent search on a 0.25° grid."""
-    found = degrees(catch_limit(AS_PRINTED, [CASES[case]]))
+    found = degrees(catch_limit(AS_PRINTED, CASES[case]))
     assert limit < found <= limit + 0.25
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_catch_limit_is_tight(case: str) -> None:
     """Just below it the motion arrives; just above it does not."""
-    limit = catch_limit(AS_PRINTED, [CASES[case]])
+    limit = catch_limit(AS_PRINTED, CASES[case])
     loop = ut.ClosedLoop(AS_PRINTED, ut.MinimumTime(horizon=200.0))
     below, above = (
         loop.simulate(AS_PRINTED.state(phi=limit + radians(step)), CASES[case], every=500)

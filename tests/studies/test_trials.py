@@ -15,9 +15,8 @@ import undertow as ut
 from undertow.base import ArtefactError
 from undertow.estimators import Record
 from undertow.estimators.recorded_run import subtract_disturbance
-from undertow.law import InnerLoop
 from undertow.objective import objective_for
-from undertow.plants import Friction, Push, srv02_rig
+from undertow.plants import Bench, Friction, Push, srv02_rig
 from undertow.runtime.controller_defaults import estimator_for
 from undertow.studies.experiment import grouped
 from undertow.studies.ledger import Ledger
@@ -27,10 +26,10 @@ from undertow.studies.trials.robustness import breaking_point, random_bench
 from undertow.studies.trials.steering import (
     CascadeSteering,
     clipped_regulator,
+    keeping,
     predictive,
-    steady,
 )
-from undertow.studies.trials.trial import Outcome, Result, judge, spread, trial, undisturbed
+from undertow.studies.trials.trial import Outcome, Result, judge, spread, trial
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +41,9 @@ def arm() -> ut.Mechanism:
 def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
     """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
     x0, goal = arm.state(phi=ut.deg(35)), objective_for(arm, "bench-energy")
-    made = controllers(arm, undisturbed(arm), goal, x0, budget=128)
+    made = controllers(arm, Bench(arm), goal, x0, budget=128)
     costs = {
-        row: trial(arm, undisturbed(arm), made[row], x0, 8.0, 0, objective=goal).cost
+        row: trial(arm, Bench(arm), made[row], x0, 8.0, 0, objective=goal).cost
         for row in ("one-time", "cascade")
     }
     assert costs["cascade"] < costs["one-time"] * 1.002
@@ -99,7 +98,7 @@ def test_a_run_is_balanced_only_if_it_stays_so(arm: ut.Mechanism) -> None:
 
 def test_a_fixed_law_is_that_of_the_formulas(arm: ut.Mechanism, base: ut.Surface) -> None:
     """At any time, and clipped where it asks for more than there is."""
-    formulas, controller = ut.SlidingModeLaw(arm, base), steady(InnerLoop(arm, base))
+    formulas, controller = ut.SlidingModeLaw(arm, base), keeping(arm, base)(arm.state())
     for t, angle, speed in ((0.0, 0.1, 0.0), (3.0, -0.02, 1.0), (7.0, 0.7, 50.0)):
         x = arm.state(phi=angle, theta_dot=speed)
         np.testing.assert_allclose(controller(t, x), formulas(t, x).u, rtol=1e-9)
@@ -145,13 +144,13 @@ def test_random_benches_stay_within_what_is_declared() -> None:
 
 def test_a_clipped_regulator_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
     x0 = arm.state(phi=ut.deg(10))
-    assert trial(arm, undisturbed(arm), clipped_regulator(arm), x0, 6.0, 0).balanced
+    assert trial(arm, Bench(arm), clipped_regulator(arm), x0, 6.0, 0).balanced
 
 
 def test_predictive_control_holds_the_ideal_rig(arm: ut.Mechanism) -> None:
     pytest.importorskip("casadi")
     make = predictive(arm, objective_for(arm, "bench-energy"))
-    run = trial(arm, undisturbed(arm), make, arm.state(phi=ut.deg(30)), 4.0, 0)
+    run = trial(arm, Bench(arm), make, arm.state(phi=ut.deg(30)), 4.0, 0)
     assert run.caught
     assert np.abs(run.record.u).max() <= 15.0
 
@@ -187,7 +186,7 @@ def test_the_observed_disturbance_frees_an_arm_that_stiction_holds(arm: ut.Mecha
     ends = []
     for drift in (0.0, None):
         run = trial(
-            arm, rough, lambda _: steady(InnerLoop(arm, soft)), x0, 10.0, 0,
+            arm, rough, keeping(arm, soft), x0, 10.0, 0,
             estimator=estimator_for(arm, bench, drift),
         )  # fmt: skip
         assert run.caught

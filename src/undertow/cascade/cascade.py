@@ -38,7 +38,7 @@ from undertow.cascade.simulation import (
 from undertow.cascade.targets import LoopsAbout, legs_of
 from undertow.closed_loop import INADMISSIBLE, RTOL, ClosedLoop, Event, Trajectory, simulate_along
 from undertow.closed_loop.gate import Admission, Gate, cost_gate
-from undertow.estimators import Belief, ParameterEstimate
+from undertow.estimators import Belief, Estimator, ParameterEstimate
 from undertow.law import (
     Control,
     Plan,
@@ -350,6 +350,11 @@ class Cascade:
             return prior.believing(belief.believed(estimate), belief.ensemble(estimate))
 
         return loop
+
+    def learns_from(self, estimator: Estimator) -> bool:
+        """Whether an estimator learns what this cascade's belief leaves open, in its units."""
+        known, its = self.known, estimator.belief
+        return known is not None and its is not None and its.tolerances == known.tolerances
 
     @checked
     def learn(self, state: CascadeState, t: ArrayLike, x: ArrayLike, u: ArrayLike) -> CascadeState:
@@ -680,6 +685,31 @@ class Cascade:
             x = state.error(t, self.mechanism.check_state(x))
             believed = state.target.error_dynamics(believed, t)
         return SlidingModeLaw(believed, surface, law or self.reaching)(t, x)
+
+    @checked
+    def predicted_error(
+        self, state: CascadeState, error: FloatArray, t: float, until: float
+    ) -> FloatArray:
+        """Return how far off the target the plan in use will have left the state, (2n,).
+
+        Parameters
+        ----------
+        state
+            Memory of the cascade.
+        error
+            How far the state is off the target, (2n,), at the time t, s.
+        t, until
+            From when to when, s.  NaN where a motion along a reference breaks off before.
+        """
+        plan, target = state.at(t), state.target
+        if target is None or not target.moves:
+            batch = self.loop_at(state, t).batch(error, plan, duration=until - t, terminal=0.0)
+            return np.asarray(batch.x[0])
+        loop, x = self.loop_at(replace(state, target=None)), state.absolute(t, error)
+        motion = simulate_along(loop, x, plan, target, duration=until - t, start=t)
+        if motion.event not in (Event.HORIZON, Event.REACHED):
+            return np.full_like(error, math.nan)
+        return state.error(until, motion.x[-1])
 
     @checked
     def propose(

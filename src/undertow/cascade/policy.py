@@ -125,9 +125,7 @@ class _PlanEpisode:
         self._law = InnerLoop(loop.mechanism, plan.surfaces[0], loop.reaching)
 
     def __call__(self, x: FloatArray) -> FloatArray:
-        if len(self._plan.surfaces) > 1:
-            surface, reaching = self._plan.at(self._k * self._period)
-            self._law.use(surface, reaching or self._reaching)
+        self._law.follow(self._plan, self._k * self._period, self._reaching)
         self._k += 1
         return self._law(x).copy()
 

@@ -352,12 +352,13 @@ def replay(
     with progress_bar() as progress:
         progress("replaying", 0.0)
         result = runtime.replay(log, mechanism=mechanism, decisions=decisions)
-    pictures = {
-        "motion.png": runs.motion_figure,
-        "latency.png": runs.latency_figure,
-        "chatter.png": runs.chatter_figure,
-    }
-    written = write(out, lambda: {k: draw(result.recording) for k, draw in pictures.items()})
+
+    def pictures() -> dict[str, bytes]:
+        from undertow.studies.rigs.figures import pictures  # takes time, which no table is worth
+
+        return pictures(result.recording)
+
+    written = write(out, pictures)
     show(runs.replay_table(result), *written)
     exit_unless(result.identical and result.gap is None)
 

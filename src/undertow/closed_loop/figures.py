@@ -21,7 +21,8 @@ from matplotlib.figure import Figure
 
 from undertow.base import InvalidInputError
 from undertow.closed_loop.trajectory import Trajectory
-from undertow.models import FloatArray, Mechanism
+from undertow.models import Coordinate, FloatArray, Mechanism
+from undertow.symbolic.formulas import plain_symbol
 
 #: Okabe and Ito (2008), without yellow, which is too faint for lines.
 COLOURS = {
@@ -39,10 +40,6 @@ COLOURS = {
 _STYLE: Any = mpl.rc_params_from_file(
     Path(__file__).with_name("undertow.mplstyle"), use_default_template=False
 )
-
-_GREEK = {
-    "alpha": "α", "beta": "β", "gamma": "γ", "theta": "θ", "phi": "φ", "psi": "ψ",
-}  # fmt: skip
 
 _LINES: tuple[dict[str, Any], ...] = (
     {"color": COLOURS["grey"], "linestyle": (0, (4, 2))},
@@ -72,13 +69,19 @@ def display(unit: str, rate: bool = False) -> tuple[float, str]:
 def symbol_of(name: str, rate: bool = False) -> str:
     """Return a coordinate, or its rate, as it is written on plots.
 
-    >>> symbol_of("phi"), symbol_of("q_1", rate=True)
-    ('φ', 'dq_1/dt')
+    >>> symbol_of("phi_2"), symbol_of("rod_1", rate=True)
+    ('φ₂', 'drod₁/dt')
     """
-    symbol = _GREEK.get(name, name)
+    symbol, dotted = plain_symbol(name), plain_symbol(f"{name}_dot")
     if not rate:
         return symbol
-    return f"{symbol}\N{COMBINING DOT ABOVE}" if len(symbol) == 1 else f"d{symbol}/dt"
+    return f"d{symbol}/dt" if dotted.endswith("_dot") else dotted
+
+
+def label_of(coordinate: Coordinate, rate: bool = False) -> tuple[float, str]:
+    """Return the factor to display units, and the label of an axis for a coordinate or its rate."""
+    factor, unit = display(coordinate.unit, rate)
+    return factor, f"{symbol_of(coordinate.name, rate)} ({unit})"
 
 
 def axis(trajectory: Trajectory, name: str) -> tuple[FloatArray, str]:
@@ -87,8 +90,8 @@ def axis(trajectory: Trajectory, name: str) -> tuple[FloatArray, str]:
     coordinates = trajectory.mechanism.coordinates
     index = trajectory.mechanism.state_names.index(name) % len(coordinates)
     rate = name == str(coordinates[index].velocity)
-    factor, unit = display(coordinates[index].unit, rate)
-    return factor * values, f"{symbol_of(coordinates[index].name, rate)} ({unit})"
+    factor, label = label_of(coordinates[index], rate)
+    return factor * values, label
 
 
 def state_series(axes: Axes, trajectory: Trajectory, name: str, **line: Any) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from undertow.law.schedule import Plan
 from undertow.law.sliding import LawSymbols, SlidingModeLaw, build_law_graph
 from undertow.law.surface import ReachingLaw, Surface, Switching
 from undertow.models import FloatArray, Mechanism
@@ -79,6 +80,16 @@ class InnerLoop:
         law = SlidingModeLaw(self.mechanism, surface, reaching or self.reaching)
         self.lane = pack_law_parameters(law)
         self.surface, self.reaching = surface, law.reaching
+
+    def follow(self, plan: Plan, elapsed: float, otherwise: ReachingLaw) -> None:
+        """Go on with the surface of a plan that is in force so long after its start, s.
+
+        ``otherwise`` is the reaching law of a surface for which the plan has none.
+        """
+        surface, reaching = plan.at(elapsed)
+        reaching = reaching or otherwise
+        if (surface, reaching) != (self.surface, self.reaching):
+            self.use(surface, reaching)
 
     def believe(self, parameters: FloatArray, x: FloatArray, least: float = 0.0) -> bool:
         """Go on with other values of the parameters, (P,), if the surface bears them at x, (2n,).

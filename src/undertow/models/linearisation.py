@@ -51,6 +51,11 @@ class Linearisation:
         return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
 
     @property
+    def fastest(self) -> float:
+        """Rate of the fastest mode, the largest |eigenvalue| of A, 1/s."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
+
+    @property
     def input(self) -> FloatArray:
         """Input matrix of ẋ = A x + B u, (2n, m)."""
         n, m = len(self.M), len(self.B)

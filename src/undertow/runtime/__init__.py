@@ -21,7 +21,7 @@ from undertow.runtime.encoding import Columns
 from undertow.runtime.log import Log
 from undertow.runtime.log_files import column_units, to_mcap, to_parquet
 from undertow.runtime.loop import Runtime
-from undertow.runtime.modes import Command, Mode
+from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.recording import GrowingLog, Recording, read_log
 from undertow.runtime.replay import Replay, about, replay, replay_controller
@@ -47,6 +47,7 @@ __all__ = [
     "Inputs",
     "Log",
     "Mode",
+    "Reason",
     "Recipe",
     "Recording",
     "Replay",

@@ -29,7 +29,7 @@ from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.plan_check import PlanCheck
 from undertow.runtime.sensors import LAST_HARMLESS, SensorMonitor
 from undertow.runtime.settings import Settings
-from undertow.runtime.slow_loop import Answer, Request, law_vectors_of
+from undertow.runtime.slow_loop import Answer, LeadTime, Request, law_vectors_of
 from undertow.runtime.steps import (
     BEYOND_TRAVEL,
     all_finite,
@@ -40,9 +40,9 @@ from undertow.runtime.steps import (
     step_module,
 )
 
-#: Least time from asking for a catch to its use, s; and how far the state may be off the one
-#: it was made for, in units of 1 + |entry|.
-CATCH_LEAD, CATCH_PREDICTION_ERROR = 0.02, 0.1
+#: Least and longest time from asking for a catch to its use, s; and how far the state may be off
+#: the one it was made for, in units of 1 + |entry|.
+CATCH_LEAD, MOST_CATCH_LEAD, CATCH_PREDICTION_ERROR = 0.02, 0.1, 0.1
 
 #: Time from asking for the first plan to another target to its use, s: a global search; and the
 #: most that it grows to, when answers are late.
@@ -157,7 +157,7 @@ class Controller:
         self._row: FloatArray = fast["parameters"][own:]
         self._learning: Estimator | None = None
         self._jumps, self._early = 0, False
-        if estimator.belief and cascade.known:
+        if cascade.learns_from(estimator):
             self._learning = estimator
             self._bears = InnerLoop(mechanism, memory.surface, cascade.reaching)
         self.u: FloatArray = fast["output"]
@@ -191,8 +191,10 @@ class Controller:
         self._used: Answer | None = None
         self._followed, self._free, self._t = True, False, 0.0
         self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
-        self._lead = settings.lead_time
-        self._catch_lead, self._jump_lead = CATCH_LEAD, JUMP_LEAD
+        most = max(settings.lead_time, settings.max_lead_time)
+        self._lead = LeadTime(settings.lead_time, most, cascade.step)
+        self._catch_lead = LeadTime(CATCH_LEAD, MOST_CATCH_LEAD, cascade.step)
+        self._jump_lead = JUMP_LEAD
         self._jump_error = relative_error(self.x, self.x)  # compiled before a step needs it
         self._ahead, self._not_before = list(legs[1:]), 0.0
         if swing_up is not None and legs and legs[0][1].q.any():
@@ -269,7 +271,7 @@ class Controller:
         ):
             return
         if asked is not None:
-            self._sequence, self._asked = max(self._sequence, asked.sequence), None
+            self._close(asked.sequence)
         number, use = self._sequence + 1, t + self.period
         plan = self.cascade.reserve[-1]
         before, why = self.memory, "a plan in reserve: the velocities have jumped"
@@ -405,7 +407,7 @@ class Controller:
         self._ahead, self._not_before = [(t + begin, motion) for begin, motion in legs], t
         asked, pending = self._asked, self._pending
         if asked is not None and asked.target is not None:
-            self._sequence, self._asked = max(self._sequence, asked.sequence), None
+            self._close(asked.sequence)
         if pending is not None and pending.jump:
             self._sequence, self._pending = max(self._sequence, pending.sequence), None
         for begin, motion in self._ahead:
@@ -485,9 +487,9 @@ class Controller:
         if self._asked is not None:
             if t > self._asked.use + self.settings.optimiser_timeout:
                 self.notes.append(Note("answer", f"{self._asked.sequence}: never came"))
-                self._sequence = max(self._sequence, self._asked.sequence)
-                self._adapt_lead_time(1.5)
-                self._asked, self.optimiser_timed_out = None, True
+                self._was_late()
+                self._close(self._asked.sequence)
+                self.optimiser_timed_out = True
             return
         if self._pending is not None:
             return
@@ -504,10 +506,10 @@ class Controller:
             use = t + math.ceil(max(self._jump_lead, begin - t) / step - 1e-9) * step
             self._asked = Request(t, self.wrapped.copy(), use, self.memory, -1, motion)
         elif self.mode is not Mode.SWING_UP:
-            lead = EARLY_LEAD if self._early else self._lead
+            lead = EARLY_LEAD if self._early else self._lead.seconds
             self._asked, self._early = Request(t, self.wrapped.copy(), t + lead, self.memory), False
         elif self.swing_up is not None and self.swing_up.worth_asking(self.x):
-            use = t + self._catch_lead
+            use = t + self._catch_lead.seconds
             self._asked = Request(t, self.x.copy(), use, self.memory, self._gains_in_use(t))
         self.request = self._asked
 
@@ -515,22 +517,23 @@ class Controller:
         """Whether the next request is for a plan to another target."""
         if not self._ahead or t < self._not_before or self.mode is Mode.SWING_UP:
             return False
-        early = t < self._ahead[0][0] - self._jump_lead - 2 * self._lead
+        early = t < self._ahead[0][0] - self._jump_lead - 2 * self._lead.seconds
         return not early and (self.swing_up is None or self.mode is Mode.BALANCE)
 
-    def _adapt_lead_time(self, factor: float) -> None:
-        """Change how far ahead proposals are computed, in whole steps of the predictions."""
-        step, settings = self.cascade.step, self.settings
+    @property
+    def _lead_in_use(self) -> LeadTime:
+        return self._catch_lead if self.mode is Mode.SWING_UP else self._lead
+
+    def _was_late(self) -> None:
+        """Ask the next time farther ahead for what came late this time."""
         if self._ahead and self._asked is not None and self._asked.target is not None:
-            self._jump_lead = min(MOST_JUMP_LEAD, max(JUMP_LEAD, 2 * self._jump_lead))
-            return
-        most = max(settings.lead_time, settings.max_lead_time)
-        if self.mode is Mode.SWING_UP:
-            lead = max(CATCH_LEAD, min(0.1, factor * self._catch_lead))
-            self._catch_lead = math.ceil(lead / step - 1e-9) * step
-            return
-        lead = max(settings.lead_time, min(most, factor * self._lead))
-        self._lead = math.ceil(lead / step - 1e-9) * step
+            self._jump_lead = min(MOST_JUMP_LEAD, 2 * self._jump_lead)
+        else:
+            self._lead_in_use.late()
+
+    def _close(self, number: int) -> None:
+        """Ask for nothing any more: what had this number is answered, or given up."""
+        self._sequence, self._asked = max(self._sequence, number), None
 
     def _take_answer(self, t: float, answer: Answer) -> None:
         """Keep an answer for its time of use, or refuse it: the first line of defence."""
@@ -542,18 +545,17 @@ class Controller:
             self.notes.append(Note("answer", f"{answer.sequence}: refused, {fault}"))
             if self._asked is not None and answer.sequence == self._asked.sequence:
                 if t > self._asked.use:
-                    self._adapt_lead_time(1.5)
-                self._sequence = max(self._sequence, answer.sequence)
-                self._asked = None
+                    self._was_late()
+                self._close(answer.sequence)
         elif self._asked is not None and self._asked.target is not None and not answer.jump:
-            self._sequence, self._asked = max(self._sequence, answer.sequence), None
+            self._close(answer.sequence)
             self._not_before = t + JUMP_RETRY
             why = answer.proposal.message
             self.notes.append(Note("answer", f"{answer.sequence}: kept the old plan, {why}"))
             self.notes.append(Note("target", f"stays, there is no plan for another: {why}"))
         else:
-            if answer.use - t > 0.5 * self._lead and not answer.jump:
-                self._adapt_lead_time(0.9)
+            if answer.use - t > 0.5 * self._lead.seconds and not answer.jump:
+                self._lead_in_use.early()
             self._asked, self._pending = None, answer
             self._make_ready(answer)
 

@@ -33,7 +33,7 @@ from undertow.runtime.encoding import TOLD, Stamps, answer_row, legs_to
 from undertow.runtime.log import Log
 from undertow.runtime.modes import Command, Mode
 from undertow.runtime.processes import Background, resource_errors
-from undertow.runtime.slow_loop import Answer, is_answer
+from undertow.runtime.slow_loop import Answer, Request, is_answer
 from undertow.runtime.steps import limit_output, stage_module
 from undertow.runtime.targets import RunTarget, legs_from_here, named_positions
 from undertow.runtime.verdict import Report
@@ -87,7 +87,7 @@ class Runtime:
         self,
         controller: Controller,
         rig: Rig,
-        worker: Worker,
+        worker: Worker[Request, Answer],
         *,
         clock: Clock | None = None,
         log: Log | None = None,

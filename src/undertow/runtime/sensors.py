@@ -35,11 +35,17 @@ PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
 SOUND, NOT_YET, NEVER, LOST, FROZEN, SPARSE, TIMELESS = range(7)
 LAST_HARMLESS = NOT_YET
 
-#: What the watch remembers; settings: period, jump, frozen, patience, stall, weight of a step in a
-#: share, largest share; clock: time waited, whether there was a sound reading at all, our time, the
-#: rig's and ours at the last reading whose time made sense, and at the last one at all; shares:
-#: part of the readings that was missing of late; offs: how far the readings of the last step were
-#: off what was expected, 0 where they were not accepted.
+#: Where the settings of the watch stand: period, s; weight of a step in a share; and what
+#: :class:`.settings.Settings` calls max_innovation, frozen_threshold, sensor_timeout,
+#: max_step_interval and max_dropout_ratio.
+PERIOD, INNOVATION, STANDSTILL, TIMEOUT, STALL, WEIGHT, DROPOUT = range(7)
+
+#: And its times, s: how long it has waited for a first reading; 1 once there was one; our time; the
+#: rig's and ours at the last reading whose time made sense; and at the last one at all.
+WAITED, BEGUN, NOW, RIG_SOUND, OUR_SOUND, RIG_LAST, OUR_LAST = range(7)
+
+#: What the watch remembers; shares: part of the readings that was missing of late; offs: how far
+#: the readings of the last step were off what was expected, 0 where they were not accepted.
 _LAYOUT = {
     "settings": "7", "clock": "7", "q": "n", "v": "n", "band": "m", "gain": "n",
     "parameters": "p", "viscous": "n", "W": "n * n", "last": "n", "gaps": "n", "ages": "n",
@@ -81,7 +87,7 @@ def gate_measurement(x, u, block):
     # What cannot be accepted becomes NaN; returns how many are missing, where the longest gap
     # is, and which reading is frozen (-1: none).
 {unpacked(_LAYOUT)}
-    h, jump, frozen = settings[0], settings[1], settings[2]
+    h, jump, frozen = settings[{PERIOD}], settings[{INNOVATION}], settings[{STANDSTILL}]
     for i in range(2 * n):
         expected[i] = x[i]
     heun_step(h, expected, u, viscous, parameters, work)
@@ -94,11 +100,11 @@ def gate_measurement(x, u, block):
         offs[i] = 0.0
         if min(abs(off), abs(off - before)) <= jump + 2.0 * h * abs(expected[n + i]):
             gaps[i], offs[i] = 0.0, off
-            shares[i] -= settings[5] * shares[i]
+            shares[i] -= settings[{WEIGHT}] * shares[i]
         else:
             q[i] = v[i] = math.nan
             gaps[i] += h
-            shares[i] += settings[5] * (1.0 - shares[i])
+            shares[i] += settings[{WEIGHT}] * (1.0 - shares[i])
             missing += 1
         if gaps[i] > gaps[worst]:
             worst = i
@@ -134,40 +140,42 @@ def check(stamp, x, u, block):
 {unpacked(_LAYOUT)}
     # It counts from the last reading whose time made sense, so that no period is counted twice that
     # passed without one; or from the last one at all, if somebody has set the clock.
-    now, soonest = clock[2] + settings[0], clock[2] + 1e-3 * settings[0]
-    usable = clock[5] == -math.inf and abs(stamp) < math.inf
-    for k in (3, 5):
-        if not usable and 0.0 < stamp - clock[k] <= settings[4]:
-            now, usable = max(soonest, clock[k + 1] + stamp - clock[k]), True
-    clock[2] = now
+    now = clock[{NOW}] + settings[{PERIOD}]
+    soonest = clock[{NOW}] + 1e-3 * settings[{PERIOD}]
+    usable = clock[{RIG_LAST}] == -math.inf and abs(stamp) < math.inf
+    for rig, ours in (({RIG_SOUND}, {OUR_SOUND}), ({RIG_LAST}, {OUR_LAST})):
+        if not usable and 0.0 < stamp - clock[rig] <= settings[{STALL}]:
+            now, usable = max(soonest, clock[ours] + stamp - clock[rig]), True
+    clock[{NOW}] = now
     if usable:
-        clock[3], clock[4] = stamp, now
+        clock[{RIG_SOUND}], clock[{OUR_SOUND}] = stamp, now
     if abs(stamp) < math.inf:
-        clock[5], clock[6] = stamp, now
+        clock[{RIG_LAST}], clock[{OUR_LAST}] = stamp, now
     size = 0.0
     for i in range(n):
         q[i] = q[i] + 0.0 if usable else math.nan  # no −0: a log does not keep its sign
         v[i] = v[i] + 0.0 if usable else math.nan
         size += abs(q[i])
-    if clock[1] == 0.0 and size < math.inf:
-        clock[1] = 1.0
+    if clock[{BEGUN}] == 0.0 and size < math.inf:
+        clock[{BEGUN}] = 1.0
         for i in range(n):
             last[i] = q[i]
             for j in range(n):
                 free[i, j], free[i, n + j] = q[j], 0.0
         return {SOUND}, 0, 0, True, now, 0.0
-    if clock[1] == 0.0:
-        clock[0] += settings[0]
-        return ({NEVER} if clock[0] > settings[3] else {NOT_YET}), 0, n, False, now, 0.0
+    if clock[{BEGUN}] == 0.0:
+        clock[{WAITED}] += settings[{PERIOD}]
+        late = clock[{WAITED}] > settings[{TIMEOUT}]
+        return ({NEVER} if late else {NOT_YET}), 0, n, False, now, 0.0
     missing, worst, still = gate_measurement(x, u, block)
     beyond = quiet[0] - {PROBE}
     probe = 0.0 if beyond < 0.0 else 1.0 - 2.0 * (int(beyond / {SIDE}) % 2)
-    if gaps[worst] > settings[3]:
+    if gaps[worst] > settings[{TIMEOUT}]:
         return ({LOST} if usable else {TIMELESS}), worst, missing, False, now, probe
     if still >= 0:
         return {FROZEN}, still, missing, False, now, probe
     for i in range(n):
-        if shares[i] > settings[6]:
+        if shares[i] > settings[{DROPOUT}]:
             return {SPARSE}, i, missing, False, now, probe
     return {SOUND}, 0, missing, False, now, probe
 """
@@ -193,7 +201,7 @@ class SensorMonitor:
         memory = Workspace(_LAYOUT, n=n, m=mechanism.m, p=len(mechanism.parameters))
         self._block, self._clock, self._gaps = memory.block, memory["clock"], memory["gaps"]
         self._ages, self._quiet, self._shares = memory["ages"], memory["quiet"], memory["shares"]
-        memory["settings"][:] = (
+        memory["settings"][[PERIOD, INNOVATION, STANDSTILL, TIMEOUT, STALL, WEIGHT, DROPOUT]] = (
             period, settings.max_innovation, settings.frozen_threshold, settings.sensor_timeout,
             settings.max_step_interval, min(1.0, period / settings.fault_window),
             settings.max_dropout_ratio,
@@ -209,7 +217,8 @@ class SensorMonitor:
     def forget(self) -> None:
         """Start afresh: the next sound reading is the first."""
         self.missing, self.first, self.probe = 0, False, 0.0
-        self._clock[:] = 0.0, 0.0, 0.0, -math.inf, 0.0, -math.inf, 0.0
+        self._clock[:] = 0.0
+        self._clock[[RIG_SOUND, RIG_LAST]] = -math.inf
         self._gaps[:] = self._ages[:] = self._quiet[:] = self._shares[:] = 0.0
 
     def check(
@@ -259,10 +268,11 @@ class SensorMonitor:
         if found == LOST:
             return f"sensor '{self.names[where]}' lost for {1e3 * self._gaps[where]:.0f} ms"
         if found == TIMELESS:
-            gap, last = 1e3 * (self._clock[2] - self._clock[4]), self._clock[5]
+            gap, last = self._clock[NOW] - self._clock[OUR_SOUND], self._clock[RIG_LAST]
             return (
-                f"the rig's clock made no sense for {gap:.0f} ms, last at {last:g} s: the time of "
-                f"a reading must be later than the last one's, by {self._stall:g} s at most"
+                f"the rig's clock made no sense for {1e3 * gap:.0f} ms, last at {last:g} s: "
+                "the time of a reading must be later than the last one's, by "
+                f"{self._stall:g} s at most"
             )
         if found == SPARSE:
             return f"sensor {self._missing(where, self._shares[where])}"

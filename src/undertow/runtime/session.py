@@ -32,6 +32,7 @@ from undertow.runtime.processes import (
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.replay import about
 from undertow.runtime.settings import Settings
+from undertow.runtime.slow_loop import Answer, Request
 from undertow.runtime.supervisor import SupervisedRig
 from undertow.runtime.targets import Listener
 from undertow.runtime.verdict import Report
@@ -164,7 +165,7 @@ def session(
             meta, book = about(controller, recipe, simulated=simulated), None
             with signals_deferred():  # what is opened is closed
                 # First the processes are forked, then threads begin.
-                worker: Worker = InlineWorker(recipe.respond)
+                worker: Worker[Request, Answer] = InlineWorker(recipe.respond)
                 if not simulated:
                     moving = [] if recipe.reference is None else [recipe.reference]
                     worker = background_worker(recipe.respond, processes=processes, shared=moving)

@@ -18,8 +18,6 @@ import numpy as np
 from undertow.base import error_text
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
-from undertow.closed_loop import Event
-from undertow.closed_loop.along_reference import simulate_along
 from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, pack_law_parameters
 from undertow.models import FloatArray
 from undertow.optimiser import Proposal
@@ -73,6 +71,32 @@ class Answer:
 
 
 Compute = Callable[[Request], Answer]
+
+
+class LeadTime:
+    """How far ahead answers are asked for, ``seconds``: from a request to the use of its answer.
+
+    It grows by half after an answer that came late, to ``most`` s at most, and shrinks by a tenth
+    after one that came early, to ``least`` s, in whole ``step``, s.
+    """
+
+    def __init__(
+        self, seconds: float, most: float, step: float, least: float | None = None
+    ) -> None:
+        self.seconds, self.most, self.step = seconds, most, step
+        self.least = seconds if least is None else least
+
+    def late(self) -> None:
+        """Take note of an answer that came late, or never."""
+        self._scale(1.5)
+
+    def early(self) -> None:
+        """Take note of an answer that came in less than half of the time."""
+        self._scale(0.9)
+
+    def _scale(self, factor: float) -> None:
+        seconds = max(self.least, min(self.most, factor * self.seconds))
+        self.seconds = math.ceil(seconds / self.step - 1e-9) * self.step
 
 
 def is_answer(said: object) -> TypeGuard[Answer]:
@@ -205,20 +229,9 @@ def judge(
 
 
 def _predicted(cascade: Cascade, request: Request) -> FloatArray:
-    memory, plan, span = request.memory, request.memory.at(request.t), request.use - request.t
-    target = memory.target
-    if span == 0.0:
+    if request.use == request.t:
         return request.x.copy()
     try:
-        if target is not None and target.moves:
-            still = cascade.loop_at(replace(memory, target=None))
-            x = memory.absolute(request.t, request.x)
-            motion = simulate_along(still, x, plan, target, duration=span, start=request.t)
-            if motion.event not in (Event.HORIZON, Event.REACHED):  # it broke off before
-                return np.full_like(request.x, math.nan)
-            return memory.error(request.use, motion.x[-1])
-        loop = cascade.loop_at(request.memory, request.t)
-        batch = loop.batch(request.x, plan, duration=span, terminal=0.0)
-        return np.asarray(batch.x[0])
+        return cascade.predicted_error(request.memory, request.x, request.t, request.use)
     except Exception:  # then the optimiser fails on it too, and says so
         return np.full_like(request.x, math.nan)

@@ -60,14 +60,19 @@ class Packer:
 OTHERS = tuple(number for number in STOPPING if number != signal.SIGTERM)
 
 
-class Worker(Protocol):
+#: What a worker is asked, and what it answers.
+Asked_contra = TypeVar("Asked_contra", contravariant=True)
+Said_co = TypeVar("Said_co", covariant=True)
+
+
+class Worker(Protocol[Asked_contra, Said_co]):
     """Who computes answers: the fast loop asks, and takes what is there, never waiting."""
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: Asked_contra) -> None:
         """Hand over a request."""
         ...
 
-    def take(self, t: float) -> Answer | None:
+    def take(self, t: float) -> Said_co | None:
         """Return the next answer that has arrived by the time t, s, if there is one."""
         ...
 

@@ -49,6 +49,9 @@ ADDS = {
     "compare": "what the benchmarks compare with",
 }
 
+#: Where this package is.
+PLACE = Path(__file__).parents[1]
+
 #: Those for who changes this package.
 OWN = ("docs", "dev")
 
@@ -112,7 +115,7 @@ def facts_of_machine() -> dict[str, str]:
     ours = [f"{name} {found[name]}" for name in ("numpy", "scipy", "sympy", "numba", "matplotlib")]
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     lines = {
-        "undertow": f"{found['undertow'] or 'from source, not installed'}, {_place()}",
+        "undertow": f"{found['undertow'] or 'from source, not installed'}, {PLACE}",
         "Python": f"{platform.python_version()}, {sys.executable}",
         "packages": ", ".join(ours),
         "machine": f"{found['machine']}, {usable} processors",
@@ -125,10 +128,6 @@ def facts_of_machine() -> dict[str, str]:
         ", ".join(compilers) or "none: exported C can be written, not tried; no FMI units"
     )
     return lines
-
-
-def _place() -> Path:
-    return Path(__file__).parents[1]
 
 
 def _cache() -> str:

@@ -11,7 +11,10 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from undertow.base.errors import CertificateError, MissingExtraError
+from rich.table import Table
+
+from undertow.base import MissingExtraError, table
+from undertow.base.errors import CertificateError
 
 NAME = "undertow-checker"
 BUILT = Path(__file__).parents[3] / "build" / NAME
@@ -72,17 +75,17 @@ def agreement_table(
     kinds: Sequence[str],
     first: Sequence[tuple[str, float]],
     second: Sequence[tuple[str, float]],
-) -> tuple[str, bool]:
-    """Return a table of text, claim by claim, and whether both checkers agree on all.
+) -> tuple[Table, bool]:
+    """Return a table for the terminal, claim by claim, and whether both checkers agree on all.
 
     ``first`` and ``second`` are verdict and time, s, of each claim, by the kernel and by the second
     checker.
     """
-    lines = [f"{'claim':<20} {'kernel':<20} {'second checker':<20}"]
+    rows, heads = [], ("claim", "kernel", "second checker", "")
     fine = len(kinds) == len(first) == len(second)
     for kind, (a, s), (b, t) in zip(kinds, first, second, strict=False):
         one_alone = "undecided" in (a, b)
         word = "agree" if agree(a, b) else "proved by one alone" if one_alone else "DISAGREE"
-        lines.append(f"{kind:<20} {f'{a}, {s:.3f} s':<20} {f'{b}, {t:.3f} s':<20} {word}")
+        rows.append((kind, f"{a}, {s:.3f} s", f"{b}, {t:.3f} s", word))
         fine = fine and agree(a, b)
-    return "\n".join(lines), fine
+    return table(heads, rows, left=heads), fine

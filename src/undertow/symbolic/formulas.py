@@ -108,7 +108,8 @@ def _parts(name: str) -> tuple[str, str, str]:
     return stem, index, dots
 
 
-def _plain_symbol(name: str) -> str:
+def plain_symbol(name: str) -> str:
+    """Return a name with Greek letters, dots and lowered numbers: φ̇₁ of ``phi_1_dot``."""
     stem, index, dots = _parts(name)
     if len(stem) > 1 and stem not in _GREEK and dots:
         return name  # a dot over the last letter of a word says nothing
@@ -137,7 +138,7 @@ class _Plain(StrPrinter):  # type: ignore[misc]  # SymPy is untyped
     """One line of text with Greek letters, dots and raised powers; a space multiplies."""
 
     def _print_Symbol(self, expr: sp.Symbol) -> str:
-        return _plain_symbol(expr.name)
+        return plain_symbol(expr.name)
 
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
         base, exponent = expr.args

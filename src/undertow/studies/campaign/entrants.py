@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from undertow.base import InvalidInputError, error_text
 from undertow.cascade import Cascade, CascadeState
-from undertow.estimators import Estimator, StateFeedback
-from undertow.law import InnerLoop, first_surface
+from undertow.estimators import Estimator
+from undertow.law import first_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file, named_in_file
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
-from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, predictive, steady
+from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, keeping, predictive
+from undertow.studies.trials.trial import MakeController, introduce
 
 #: Settings of a controller by name: what it is made with besides mechanism and objective.
 Setting = Mapping[str, Any]
@@ -30,8 +31,8 @@ class Entrant(Protocol):
 
     It knows the mechanism as it is in the library and the objective that is scored.  What makes it
     may have an attribute ``settings``, a list of keyword arguments to choose from: the league tries
-    at most :data:`MOST_SETTINGS` of them on plants that are not scored, and takes the best.  Where
-    it has a method ``listen``, it is given the estimator.
+    at most :data:`MOST_SETTINGS` of them on plants that are not scored, and takes the best.  One
+    that is a :class:`undertow.studies.trials.trial.TakesEstimator` is given the estimator.
     """
 
     def reset(self, x0: FloatArray) -> None:
@@ -63,14 +64,24 @@ class Refereed:
     """An entrant in a run: its inputs are checked, its processor time is counted.
 
     ``seconds`` has the processor time of every step, s.
+
+    Raises
+    ------
+    ForfeitError
+        When the entrant raises, or has not both methods of an :class:`Entrant`.
     """
 
     def __init__(self, entrant: Entrant, x0: FloatArray, m: int) -> None:
         self.entrant, self.m = entrant, m
         self.seconds: list[float] = []
+        for method in ("reset", "step"):
+            if not callable(getattr(entrant, method, None)):
+                raise ForfeitError(1, f"{type(entrant).__name__} has no method {method}")
         self._call(entrant.reset, x0.copy())
-        if hasattr(entrant, "listen"):
-            self.listen: Callable[[Estimator], None] = entrant.listen
+
+    def listen(self, estimator: Estimator) -> None:
+        """Hand the estimator to an entrant that listens."""
+        self._call(introduce, self.entrant, estimator)
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x).
@@ -104,14 +115,20 @@ class Refereed:
 class Feedback:
     """An entrant made of a state feedback that is begun anew for each run."""
 
-    def __init__(self, begin: Callable[[FloatArray], StateFeedback]) -> None:
+    def __init__(self, begin: MakeController) -> None:
         self.begin = begin
 
     def reset(self, x0: FloatArray) -> None:
         """Begin a run."""
-        self.step: StateFeedback = self.begin(x0)
-        if isinstance(self.step, CascadeSteering):
-            self.listen = self.step.listen
+        self._feedback = self.begin(x0)
+
+    def listen(self, estimator: Estimator) -> None:
+        """Hand the estimator to a state feedback that listens."""
+        introduce(self._feedback, estimator)
+
+    def step(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at (t, x)."""
+        return self._feedback(t, x)
 
 
 @lru_cache(maxsize=4)
@@ -129,44 +146,23 @@ def steered(mechanism: Mechanism, objective: Objective) -> Feedback:
 
 def kept(mechanism: Mechanism, objective: Objective) -> Feedback:
     """Return the cascade's first optimum, kept."""
-
-    def begin(_: FloatArray) -> StateFeedback:
-        cascade, (first, _proposal) = _started(mechanism, objective)
-        return steady(InnerLoop(mechanism, first.surface, cascade.reaching))
-
-    return Feedback(begin)
+    cascade, (first, _) = _started(mechanism, objective)
+    return Feedback(keeping(mechanism, first.surface, cascade.reaching))
 
 
 def designed(mechanism: Mechanism, objective: Objective) -> Feedback:
     """Return sliding mode on the designed surface, which nothing optimises."""
-    return Feedback(lambda _: steady(InnerLoop(mechanism, first_surface(mechanism))))
+    return Feedback(keeping(mechanism, first_surface(mechanism)))
 
 
-def regulator(mechanism: Mechanism, objective: Objective, *, free: float = 10.0) -> Feedback:
+def regulator(mechanism: Mechanism, objective: Objective, free: float) -> Feedback:
     """Return a linear-quadratic regulator, its output clipped; ``free`` weighs q_u."""
     return Feedback(clipped_regulator(mechanism, free=free))
 
 
-regulator.settings = [{"free": w} for w in (1.0, 10.0, 100.0, 1000.0)]  # type: ignore[attr-defined]
-
-
-class NMPC10(Feedback):
-    """Nonlinear model-predictive control, IPOPT, ten solutions a second, open loop in between."""
-
-    settings: ClassVar = [{"horizon": h} for h in (0.8, 1.2, 2.0, 3.0)]
-
-    def __init__(self, mechanism: Mechanism, objective: Objective, horizon: float = 1.2) -> None:
-        super().__init__(predictive(mechanism, objective.on(mechanism), horizon=horizon))
-
-
-#: The library's entrants by name.
-OURS: dict[str, Maker] = {
-    "cascade": steered,
-    "kept": kept,
-    "designed": designed,
-    "lqr": regulator,
-    "nmpc": NMPC10,
-}
+def predictive_at_10_hz(mechanism: Mechanism, objective: Objective, horizon: float) -> Feedback:
+    """Return nonlinear model-predictive control, IPOPT, open loop between two solutions."""
+    return Feedback(predictive(mechanism, objective.on(mechanism), horizon=horizon))
 
 
 @dataclass(frozen=True)
@@ -175,7 +171,7 @@ class Entry:
 
     name: str
     make: Maker
-    settings: list[Setting] = field(default_factory=list)
+    settings: Sequence[Setting] = ({},)
 
     @classmethod
     def of(cls, name: str) -> Entry:
@@ -186,7 +182,9 @@ class Entry:
         InvalidInputError
             When it cannot be called, or its settings are none.
         """
-        make = named_in_file(name, "entrant") if in_a_file(name) else OURS[name]
+        if not in_a_file(name):
+            return OURS[name]
+        make = named_in_file(name, "entrant")
         if not callable(make):
             raise InvalidInputError(
                 f"entrant '{name}'",
@@ -202,6 +200,19 @@ class Entry:
                 limit=f"a list of 1 to {MOST_SETTINGS} mappings of keyword arguments",
             )
         return cls(name.rpartition(":")[2], make, list(settings))
+
+
+#: The library's entrants by name.
+OURS = {
+    entry.name: entry
+    for entry in (
+        Entry("cascade", steered),
+        Entry("kept", kept),
+        Entry("designed", designed),
+        Entry("lqr", regulator, [{"free": weight} for weight in (1.0, 10.0, 100.0, 1000.0)]),
+        Entry("nmpc", predictive_at_10_hz, [{"horizon": s} for s in (0.8, 1.2, 2.0, 3.0)]),
+    )
+}
 
 
 def spent(seconds: list[float]) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from undertow.base import InvalidInputError
-from undertow.closed_loop.figures import COLOURS, display, figure_bytes, style
+from undertow.closed_loop.figures import COLOURS, figure_bytes, label_of, style
 from undertow.models import FloatArray
 from undertow.proofs.claims.certificate import read_certificate
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
@@ -40,8 +40,6 @@ LOST = {
 
 #: What a certificate proves of a map's states: of those on the surface, or of any.
 Proved = LyapunovFunction | TerminalEllipsoid
-
-_GREEK = {"theta": "θ", "phi": "φ", "psi": "ψ"}
 
 
 def picture(campaign: Campaign, proved: Proved | None = None) -> Figure:
@@ -294,12 +292,7 @@ def _label(study: Any, name: str) -> tuple[float, str]:
         axis = next(axis for axis in study.axes if axis.name == name)
         return 1.0, f"{name} ({axis.unit})"
     index, n = names.index(name), study.mechanism.n
-    coordinate, rate = study.mechanism.coordinates[index % n], index >= n
-    factor, unit = display(coordinate.unit, rate)
-    stem, _, number = coordinate.name.partition("_")
-    symbol = _GREEK.get(stem, stem)
-    symbol = f"{symbol}\N{COMBINING DOT ABOVE}" if rate else symbol
-    return factor, f"{symbol}{number.translate(_LOW)} ({unit})"
+    return label_of(study.mechanism.coordinates[index % n], index >= n)
 
 
 def _said(study: Any, name: str, value: float, relation: str = "=") -> str:
@@ -308,9 +301,6 @@ def _said(study: Any, name: str, value: float, relation: str = "=") -> str:
     symbol, _, unit = label.partition(" (")
     space = "" if unit.startswith("°") else " "
     return f"{symbol} {relation} {factor * value:.3g}{space}{unit[:-1]}"
-
-
-_LOW = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def _title(study: Any, data: Any) -> str:

@@ -31,7 +31,7 @@ from undertow.studies.campaign.entrants import (
     spent,
 )
 from undertow.studies.campaign.study import Arrays, Axis, Study, Variable, tolerances
-from undertow.studies.trials.trial import Outcome, trial, undisturbed
+from undertow.studies.trials.trial import Outcome, trial
 
 #: Of the definition of tasks and scores: a change of either makes it another one.
 VERSION = 1
@@ -133,7 +133,7 @@ class League(Study):
         of noise; ``push``: after 3 s an impulse on the first free coordinate, which alone would
         bring it as far as half of the start; ``bench``: the usual bench, with all it has.
         """
-        usual, ideal = bench_for(mechanism), undisturbed(mechanism)
+        usual, ideal = bench_for(mechanism), Bench(mechanism)
         match task:
             case "plants":
                 varied = (p for p in mechanism.parameters if p.name != "g" and p.value)
@@ -259,8 +259,7 @@ def _coarse(unit: str) -> Encoder:
 def _push(mechanism: Mechanism) -> Push:
     """Return an impulse on the first free coordinate that moves it by half of the start."""
     n, m = mechanism.n, mechanism.m
-    fastest = float(np.abs(np.linalg.eigvals(linearise(mechanism).A)).max())
-    speed = 0.5 * fastest * float(np.abs(mechanism.usual_start[:n]).max())
+    speed = 0.5 * linearise(mechanism).fastest * float(np.abs(mechanism.usual_start[:n]).max())
     inertia = mechanism.M(np.zeros(n))
     # An impulse J on one coordinate changes the velocities by M⁻¹ e J.
     return Push(PUSHED, mechanism.coordinates[m].name, speed / float(np.linalg.inv(inertia)[m, m]))

@@ -31,11 +31,11 @@ def wilson(won: int, runs: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def median_interval(values: FloatArray, seed: int = 0) -> tuple[float, float, float]:
+def median_interval(values: FloatArray) -> tuple[float, float, float]:
     """Return the median and its 95 % interval by the bootstrap; NaN of nothing."""
     if not len(values):
         return math.nan, math.nan, math.nan
-    draws = np.random.default_rng(seed).choice(values, (DRAWS, len(values)))
+    draws = np.random.default_rng(0).choice(values, (DRAWS, len(values)))
     low, high = np.quantile(np.median(draws, axis=1), [0.025, 0.975])
     return float(np.median(values)), float(low), float(high)
 

@@ -9,14 +9,13 @@ from typing import ClassVar
 import numpy as np
 
 from undertow.cascade import Cascade, CascadeState
-from undertow.law import InnerLoop
 from undertow.models import Mechanism
 from undertow.optimiser import Proposal
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
 from undertow.studies.campaign.definition import Settings, objective_of
 from undertow.studies.campaign.study import Arrays, Axis, Study, Variable, start_of, tolerances
-from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, steady
+from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, keeping
 from undertow.studies.trials.trial import MakeController, trial
 
 #: Contenders by the word for each.
@@ -84,8 +83,7 @@ class RandomPlants(Study):
         cascade, first = self._first
         if name == "cascade":
             return lambda _: CascadeSteering(cascade, first)
-        kept = first[0].surface
-        return lambda _: steady(InnerLoop(self.mechanism, kept, cascade.reaching))
+        return keeping(self.mechanism, first[0].surface, cascade.reaching)
 
     def compute(self, shard: int) -> Arrays:
         """Try every contender on the plants of a shard."""

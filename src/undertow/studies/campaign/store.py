@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -185,14 +185,9 @@ class Store:
         except (OSError, ValueError, RuntimeError):  # one of them is damaged: one by one
             found = np.zeros(self._done.shape, dtype=np.uint64)
             for shard in range(len(found)):
-                found[shard] = self._mark(shard)
+                with suppress(OSError, ValueError, RuntimeError):
+                    found[shard] = self._done[shard]
         return found
-
-    def _mark(self, shard: int) -> int:
-        try:
-            return int(self._done[shard])
-        except (OSError, ValueError, RuntimeError):
-            return 0
 
     def repair(self, study: Study) -> list[int]:
         """Unmark finished shards whose chunks are not what was written; return their numbers.

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from undertow.closed_loop import ClosedLoop
-from undertow.closed_loop.figures import COLOURS, display, style, symbol_of
+from undertow.closed_loop.figures import COLOURS, display, label_of, style, symbol_of
 from undertow.law import ReachingLaw, SlidingModeLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import MinimumTime
@@ -198,9 +198,7 @@ def _units(motion: SurfaceMotion, index: int) -> tuple[float, str]:
     mechanism = motion.mechanism
     m, free = mechanism.m, mechanism.n - mechanism.m
     if index < 2 * free:
-        coordinate = mechanism.coordinates[m + index % free]
-        factor, unit = display(coordinate.unit, index >= free)
-        return factor, f"{symbol_of(coordinate.name, index >= free)} ({unit})"
+        return label_of(mechanism.coordinates[m + index % free], index >= free)
     coordinate = mechanism.coordinates[index - 2 * free]
     factor, unit = display(coordinate.unit)
     other = symbol_of(mechanism.coordinates[m].name) if free == 1 else "q_u"

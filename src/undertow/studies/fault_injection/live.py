@@ -24,6 +24,7 @@ from undertow.runtime import (
     BackgroundWorker,
     Columns,
     Mode,
+    Reason,
     Recipe,
     Recording,
     Settings,
@@ -32,7 +33,6 @@ from undertow.runtime import (
     replay,
     session,
 )
-from undertow.runtime.modes import Reason
 from undertow.runtime.processes import fork
 from undertow.studies.fault_injection.cases import OutputMonitor
 from undertow.studies.fault_injection.simulated import drill_recipe
@@ -52,21 +52,32 @@ class LiveResult:
 Happened = tuple[str, bool]
 
 
-class _Blocking(RigWrapper):
-    """A rig whose read does not return for a while."""
+class _Struck(RigWrapper):
+    """A rig to which something happens when it is read half a second into a run."""
 
-    def __init__(self, rig: Rig, since: float, seconds: float) -> None:
+    def __init__(self, rig: Rig) -> None:
         super().__init__(rig)
-        self.seconds = seconds
-        self.left, self.let_go = round(since / rig.period), 0.0
-        self.blocked = 0.0
+        self._left = round(0.5 / rig.period)
+
+    def happen(self) -> None:
+        """Let it happen."""
+        raise NotImplementedError
 
     def read(self) -> Measurement:
-        self.left -= 1
-        if self.left == 0:
-            self.blocked = time.perf_counter()
-            time.sleep(self.seconds)
+        self._left -= 1
+        if self._left == 0:
+            self.happen()
         return self.rig.read()
+
+
+class _Blocking(_Struck):
+    """A rig whose read does not return for a second."""
+
+    blocked = let_go = 0.0
+
+    def happen(self) -> None:
+        self.blocked = time.perf_counter()
+        time.sleep(1.0)
 
     def close(self) -> None:
         self.let_go = self.let_go or time.perf_counter()
@@ -98,7 +109,7 @@ def _optimiser(number: signal.Signals) -> Happened:
 
 def _blocking_read() -> Happened:
     recipe = drill_recipe()
-    rig = _Blocking(recipe.make_rig(), 0.5, 1.0)
+    rig = _Blocking(recipe.make_rig())
     with session(recipe, rig=rig, processes=1) as runtime:
         report = runtime.run(2.0)
     after = rig.let_go - rig.blocked
@@ -106,25 +117,24 @@ def _blocking_read() -> Happened:
     return (happened, 0 < after < 0.5)
 
 
-class _StandsStill(SupervisedRig):
-    """A rig whose supervisor is stopped for 0.4 s, half a second into a run."""
+class _StandsStill(_Struck):
+    """A rig whose supervisor is stopped for 0.4 s."""
 
-    left = 0
+    def __init__(self, rig: SupervisedRig) -> None:
+        super().__init__(rig)
+        self.process = rig.process
 
-    def read(self) -> Measurement:
-        self.left -= 1
-        if self.left == 0 and self.process.pid is not None:
-            os.kill(self.process.pid, signal.SIGSTOP)
-            threading.Timer(0.4, os.kill, (self.process.pid, signal.SIGCONT)).start()
-        return super().read()
+    def happen(self) -> None:
+        assert self.process.pid is not None  # it has begun
+        os.kill(self.process.pid, signal.SIGSTOP)
+        threading.Timer(0.4, os.kill, (self.process.pid, signal.SIGCONT)).start()
 
 
 def _supervisor() -> Happened:
     """Stop the supervisor for a while: the controller is blind, and must not go on."""
     recipe = drill_recipe()
     recipe.make_rig().write(np.zeros(recipe.belief.m))
-    rig = _StandsStill(recipe.make_rig, recipe.period, *recipe.output_bounds)
-    rig.left = round(0.5 / recipe.period)
+    rig = _StandsStill(SupervisedRig(recipe.make_rig, recipe.period, *recipe.output_bounds))
     with session(recipe, rig=rig, processes=1) as runtime:
         report = runtime.run(2.0)
     told = "supervisor does not answer" in report.stopped_by
@@ -264,23 +274,16 @@ def _first_line(log: Path, victim: ForkProcess) -> float:
     raise ArtefactError(f"log '{log}'", value=value)
 
 
-class _Hungry(RigWrapper):
-    """A rig that takes all memory that there is, half a second into a run, and keeps it."""
+class _Hungry(_Struck):
+    """A rig that takes all memory that there is, and keeps it."""
 
-    def __init__(self, rig: Rig, after: float) -> None:
+    def __init__(self, rig: Rig) -> None:
         super().__init__(rig)
-        self.left = round(after / rig.period)
         self.taken: list[bytearray] = []
         self.closed = False  # by another thread, when a read takes too long
         self.u = np.zeros(1)
 
-    def read(self) -> Measurement:
-        self.left -= 1
-        if self.left == 0:
-            self._eat()
-        return self.rig.read()
-
-    def _eat(self) -> None:
+    def happen(self) -> None:
         import resource
 
         pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -307,7 +310,7 @@ class _Hungry(RigWrapper):
 
 
 def _starved(recipe: Recipe, record: Path) -> None:
-    rig = _Hungry(recipe.make_rig(), 0.5)
+    rig = _Hungry(recipe.make_rig())
     with session(recipe, rig=rig, processes=1) as runtime:
         report = runtime.run(1.5)
     verdict = report.verdict

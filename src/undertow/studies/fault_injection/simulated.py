@@ -21,6 +21,7 @@ from undertow.runtime import (
     Controller,
     Log,
     Mode,
+    Reason,
     Recipe,
     Runtime,
     RunVerdict,
@@ -30,7 +31,6 @@ from undertow.runtime import (
     replay_controller,
     respond,
 )
-from undertow.runtime.modes import Reason
 from undertow.studies.fault_injection.cases import (
     CASES,
     Case,

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from undertow.law import ReachingLaw, SlidingModeLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.proofs import search_for
-from undertow.runtime import background_worker
+from undertow.runtime import Worker, background_worker
 from undertow.studies.live.planner import Task, cascade_for
 
 #: Cells of a map on each side; intervals of the first mesh of a bound; how nice both are, of 19.
@@ -160,25 +160,6 @@ def _proved(mechanism: Mechanism, surface: Surface, reaching: ReachingLaw) -> li
     return []
 
 
-Asked_contra = TypeVar("Asked_contra", contravariant=True)
-
-
-class Aside(Protocol[Asked_contra]):
-    """Who computes what is shown beside a motion: asked, and looked after, never waited for."""
-
-    def ask(self, request: Asked_contra) -> None:
-        """Hand over a question."""
-        ...
-
-    def take(self, t: float) -> Message | None:
-        """Return an answer that has arrived."""
-        ...
-
-    def close(self) -> None:
-        """Stop computing."""
-        ...
-
-
 class Beside:
     """Asks for bounds and maps, one of each at a time, and hands out what came of them.
 
@@ -188,7 +169,11 @@ class Beside:
         Who computes; ``None``: nobody does.
     """
 
-    def __init__(self, bounds: Aside[BoundAsked] | None, maps: Aside[MapAsked] | None) -> None:
+    def __init__(
+        self,
+        bounds: Worker[BoundAsked, Message] | None,
+        maps: Worker[MapAsked, Message] | None,
+    ) -> None:
         self._bounds, self._maps = bounds, maps
         self._wanted: BoundAsked | None = None  # once the one before has been answered
         self._bounding = self._stale = False

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from undertow.base import between, one_of
 from undertow.closed_loop.figures import display
-from undertow.models import Mechanism, Parameter, invariant_coordinates, number_of
+from undertow.models import FloatArray, Mechanism, Parameter, invariant_coordinates, number_of
 from undertow.objective import Goal
 from undertow.objective.named import finite_limits
+from undertow.plants import Bench
+from undertow.plants.bench import Friction
+from undertow.studies.live.planner import Task
 
 #: Whose a control is: the controller's, the true plant's, or the hand's that pokes it.
 Group = Literal["controller", "plant", "hand"]
@@ -65,7 +68,7 @@ class Control:
     usual: float | str = 0.0
     unit: str = ""
     factor: float = 1.0
-    choices: tuple[str, ...] = field(default=())
+    choices: tuple[str, ...] = ()
     main: bool = True
 
     @property
@@ -96,8 +99,59 @@ class Control:
         return {name: value for name, value in asdict(self).items() if name != "factor"}
 
 
-def controls_of(mechanism: Mechanism, objective: str, period: float) -> dict[str, Control]:
-    """Return the controls of a mechanism, by name."""
+class Controls(dict[str, Control]):
+    """Controls by name, and what they make of a mechanism as they stand.
+
+    Parameters
+    ----------
+    mechanism
+        What the controller believes in.
+    controls
+        All of them.
+    """
+
+    def __init__(self, mechanism: Mechanism, controls: Iterable[Control]) -> None:
+        super().__init__({control.name: control for control in controls})
+        self.mechanism = mechanism
+
+    def _si(self, kind: str, name: str, otherwise: float) -> float:
+        """Return the value of a control, if there is such a one, in SI units."""
+        control = self.get(f"{kind} {name}")
+        return otherwise if control is None else control.si
+
+    @property
+    def task(self) -> Task:
+        """What the controller shall be best at."""
+        limits = tuple(self._si("limit", c.name, c.limit) for c in self.mechanism.inputs)
+        period = round(self[PERIOD].si / 0.002) * 0.002
+        return Task(str(self[OBJECTIVE].value), limits, period)
+
+    @property
+    def target(self) -> FloatArray:
+        """Where it shall go, (n,)."""
+        return np.array([self._si("target", c.name, 0.0) for c in self.mechanism.coordinates])
+
+    @property
+    def plant(self) -> Mechanism:
+        """The true plant."""
+        names = (p.name for p in self.mechanism.parameters if f"plant {p.name}" in self)
+        values = {name: self[f"plant {name}"].si for name in names}
+        return self.mechanism.with_parameters(**values).with_input_limit(*self.task.limits)
+
+    @property
+    def bench(self) -> Bench:
+        """The true plant with its dry friction."""
+        names = (c.name for c in self.mechanism.coordinates if f"friction {c.name}" in self)
+        friction = {name: Friction(coulomb=self[f"friction {name}"].si) for name in names}
+        return Bench(self.plant, friction=friction)
+
+    def changed(self, changed: Iterable[Control]) -> Controls:
+        """Return them with some changed."""
+        return Controls(self.mechanism, (self | {c.name: c for c in changed}).values())
+
+
+def controls_of(mechanism: Mechanism, objective: str, period: float) -> Controls:
+    """Return the controls of a mechanism as they stand at first."""
     made = [
         *_targets(mechanism),
         Control(
@@ -119,7 +173,7 @@ def controls_of(mechanism: Mechanism, objective: str, period: float) -> dict[str
         *_parameters(mechanism.parameters),
         Control(PUSH, "strength of a push", "hand", 1.0, 0.1, 5.0, 1.0, "×"),
     ]  # fmt: skip
-    return {control.name: control for control in made}
+    return Controls(mechanism, made)
 
 
 def _targets(mechanism: Mechanism) -> list[Control]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -29,12 +29,12 @@ from undertow.law import Plan, ReferenceMotion, first_surface
 from undertow.law.inner_loop import InnerLoop
 from undertow.models import FloatArray, Mechanism, number_of
 from undertow.objective import Objective
-from undertow.plants import Bench, RealisticRig
-from undertow.plants.bench import Friction
-from undertow.runtime import Answer, Settings, Worker, background_worker
+from undertow.plants import RealisticRig
+from undertow.runtime import Answer, Request, Settings, Worker, background_worker
 from undertow.runtime.processes import Background
+from undertow.runtime.slow_loop import LeadTime
 from undertow.studies.live.beside import Beside, BoundAsked, MapAsked, beside
-from undertow.studies.live.controls import OBJECTIVE, PERIOD, PUSH, Control, controls_of
+from undertow.studies.live.controls import PUSH, Control, controls_of
 from undertow.studies.live.hands import Hands
 from undertow.studies.live.messages import described, frame_message, plan_message, plausible
 from undertow.studies.live.planner import Job, Task, cascade_for, planner
@@ -60,6 +60,9 @@ PICTURE = 1.0 / 60.0
 
 #: A mechanism that has fallen is caught when its free angles are so near again, rad, and as slow.
 CATCH, SLOW = 0.45, 5.0
+
+#: Least time from asking for a plan to its use, s.
+LEAST_LEAD = 0.01
 
 #: An answer that has not come after so long is given up, s: what is new has to be compiled first.
 GIVE_UP = 300.0
@@ -135,17 +138,18 @@ class Simulation:
         objective: str = GOAL,
         period: float = DELTA,
         seed: int = 0,
-        worker: Worker | None = None,
+        worker: Worker[Request, Answer] | None = None,
         beside: Beside | None = None,
     ) -> None:
         self.mechanism, self.scene = mechanism, Scene(mechanism, figure)
         self._x0 = mechanism.initial_state(x0, {})
         self.controls = controls_of(mechanism, objective, period)
-        cascade = cascade_for(mechanism, self.task, seed)  # refused here, not in another process
+        # What cannot be is refused here, not in another process.
+        cascade = cascade_for(mechanism, self.controls.task, seed)
         cascade.objective.check_start(mechanism, self._x0)
         self._belief = Belief.usual(mechanism)
-        fastest = float(np.abs(np.linalg.eigvals(mechanism.linearise().A)).max())
-        carried = PUSHED_PART * fastest * float(np.abs(self._x0[: mechanism.n]).max())
+        far = float(np.abs(self._x0[: mechanism.n]).max())
+        carried = PUSHED_PART * mechanism.linearise().fastest * far
         self._usual_push = min(PUSHED[mechanism.coordinates[-1].unit], carried or math.inf)
         self._settings = Settings()
         surface = first_surface(mechanism)
@@ -158,7 +162,9 @@ class Simulation:
         self._bound: Message = {}
         self._region: Message = {}
         self.paused, self.speed, self.mode = False, 1.0, WAITING
-        self._sequence, self._lead, self._clock = 0, self._settings.lead_time, 0.0
+        lead, most = self._settings.lead_time, self._settings.max_lead_time
+        self._lead = LeadTime(lead, most, STEP, least=LEAST_LEAD)
+        self._sequence, self._clock = 0, 0.0
         self._firsts: dict[Task, Answer] = {}
         self.hands = Hands(self.scene)
         self._fresh: list[Message] = []
@@ -172,35 +178,6 @@ class Simulation:
 
     # -- what it is ---------------------------------------------------------------------------
 
-    @property
-    def task(self) -> Task:
-        """What the controller shall be best at, as the controls stand."""
-        limits = tuple(
-            self.controls[f"limit {c.name}"].si if math.isfinite(c.limit) else c.limit
-            for c in self.mechanism.inputs
-        )
-        period = round(self.controls[PERIOD].si / 0.002) * 0.002
-        return Task(str(self.controls[OBJECTIVE].value), limits, period)
-
-    @property
-    def target(self) -> FloatArray:
-        """Where it shall go, as the controls stand, (n,)."""
-        q = np.zeros(self.mechanism.n)
-        for i, c in enumerate(self.mechanism.coordinates):
-            if f"target {c.name}" in self.controls:
-                q[i] = self.controls[f"target {c.name}"].si
-        return q
-
-    @property
-    def plant(self) -> Mechanism:
-        """The true plant, as the controls stand."""
-        values = {
-            p.name: self.controls[f"plant {p.name}"].si
-            for p in self.mechanism.parameters
-            if f"plant {p.name}" in self.controls
-        }
-        return self.mechanism.with_parameters(**values).with_input_limit(*self.task.limits)
-
     def _rig(self, x: FloatArray) -> RealisticRig:
         """Return the plant at a state, as the controls stand.
 
@@ -209,19 +186,15 @@ class Simulation:
         InvalidInputError
             Where no such plant can be: M is not positive.
         """
-        plant = self.plant
+        bench = self.controls.bench
+        plant = bench.mechanism
         if not np.linalg.eigvalsh(plant.M(x[: plant.n])).min() > 0:
             raise InvalidInputError(
                 f"plant of '{plant.name}'", value="a mass matrix that is not positive",
                 limit="masses and inertias that a body can have",
                 remedy="Move the slider back",
             )  # fmt: skip
-        friction = {
-            c.name: Friction(coulomb=self.controls[f"friction {c.name}"].si)
-            for c in plant.coordinates
-            if f"friction {c.name}" in self.controls
-        }
-        rig = RealisticRig(Bench(plant, friction=friction).with_timing(period=STEP), x)
+        rig = RealisticRig(bench.with_timing(period=STEP), x)
         self._parameters = plant.parameter_values
         return rig
 
@@ -418,11 +391,12 @@ class Simulation:
                 self._asked = None
                 alive = self._worker.replace()
                 words = "another one takes over" if alive else "its last plan stays in use"
-                self._note(f"the optimiser has not answered for {GIVE_UP:g} s: {words}")
+                note = f"the optimiser has not answered for {GIVE_UP:g} s: {words}"
+                self._fresh.append({"kind": "note", "text": note})
             return
         if self._waiting is not None or self.mode == FALLEN:
             return
-        task, goal = self.task, self.target
+        task, goal = self.controls.task, self.controls.target
         first = self.memory is None
         if first and task in self._firsts and not goal.any():
             self._task = task
@@ -433,7 +407,7 @@ class Simulation:
             return
         x = self.rig.truth
         # Before there is a first plan nothing moves, so that is for this very state.
-        lead = 0.0 if first else max(STEP, math.ceil(self._lead * self.speed / STEP) * STEP)
+        lead = 0.0 if first else max(STEP, math.ceil(self._lead.seconds * self.speed / STEP) * STEP)
         use = round((self.t + lead) / STEP) * STEP
         memory = self._idle if first else self.memory
         assert memory is not None  # idle is one
@@ -467,12 +441,12 @@ class Simulation:
             if not job.target or not any(job.target.position(0.0)):
                 self._firsts[job.task] = answer
         elif self.t <= answer.use + 1.5 * PICTURE * self.speed:
-            if answer.seconds < 0.5 * self._lead:
-                self._lead = max(0.9 * self._lead, 0.01)
+            if answer.seconds < 0.5 * self._lead.seconds:
+                self._lead.early()
             self._task, self._waiting = job.task, answer
             return
         elif not answer.jump:  # what is for another task may be late: the state is looked at
-            self._lead = min(1.5 * self._lead, self._settings.max_lead_time)
+            self._lead.late()
             self._decide(answer, False, f"late by {1e3 * (self.t - answer.use):.0f} ms")
             return
         self._task = job.task
@@ -560,9 +534,6 @@ class Simulation:
             self._history.append(frame)
         self._fresh.append(frame)
 
-    def _note(self, text: str) -> None:
-        self._fresh.append({"kind": "note", "text": text})
-
     # -- what viewers do ----------------------------------------------------------------------
 
     def hear(self, said: Message, viewer: int) -> None:
@@ -580,7 +551,9 @@ class Simulation:
             "speed": lambda: self._go(number_of("speed", said.get("to"))),
             "reset": self.reset,
             "push": lambda: self._push(-1.0 if said.get("side") == -1 else 1.0),
-            "grab": lambda: self.hands.grab(viewer, self.plant, here, _place(said.get("at"))),
+            "grab": lambda: self.hands.grab(
+                viewer, self.controls.plant, here, _place(said.get("at"))
+            ),
             "drag": lambda: self.hands.move(viewer, _place(said.get("at"))),
             "release": lambda: self.gone(viewer),
             "look": lambda: self._set_look(said.get("axis"), said.get("reach")),
@@ -602,7 +575,7 @@ class Simulation:
         self.t = self._debt = self._due = self._spent = 0.0
         self._asked = self._waiting = None  # what is still computed is for what is over
         self._anew = self._touched = False
-        self._task, self._goal = self.task, np.zeros(self.mechanism.n)
+        self._task, self._goal = self.controls.task, np.zeros(self.mechanism.n)
         self._u = np.zeros(self.mechanism.m)
         self._limit(self._task.limits)
         self.law.parameters[:] = self.mechanism.parameter_values
@@ -628,7 +601,7 @@ class Simulation:
 
     def _push(self, side: float) -> None:
         n = self.mechanism.n
-        inverse = np.linalg.inv(self.plant.M(self.rig.truth[:n]))
+        inverse = np.linalg.inv(self.controls.plant.M(self.rig.truth[:n]))
         change = self._usual_push * self.controls[PUSH].si
         impulse = np.zeros(n)
         impulse[-1] = side * change / inverse[-1, -1]
@@ -638,20 +611,19 @@ class Simulation:
 
     def _set(self, name: str, value: object) -> None:
         one_of("control", name, self.controls)
-        before = self.controls[name]
-        self._put({name: before.put(value)})
+        self._put([self.controls[name].put(value)])
 
     def _defaults(self) -> None:
-        self._put({name: replace(c, value=c.usual) for name, c in self.controls.items()})
+        self._put([replace(c, value=c.usual) for c in self.controls.values()])
 
-    def _put(self, changed: dict[str, Control]) -> None:
+    def _put(self, changed: Sequence[Control]) -> None:
         """Change controls; where no such plant or task can be, all stay as they were."""
         before = self.controls
-        self.controls = before | changed
+        self.controls = before.changed(changed)
         try:
-            if any(c.group == "plant" or c.name.startswith("limit") for c in changed.values()):
+            if any(c.group == "plant" or c.name.startswith("limit") for c in changed):
                 self.rig = self._rig(self.rig.truth)
-                self._limit(self.task.limits)
+                self._limit(self.controls.task.limits)
                 self._end_bound()
         except UndertowError as error:
             self.controls = before
@@ -659,7 +631,7 @@ class Simulation:
                 "control", value=str(error), limit="values that go together"
             ) from error
         finally:
-            shown = [self.controls[name].shown() for name in changed]
+            shown = [self.controls[c.name].shown() for c in changed]
             self._fresh.append({"kind": "controls", "controls": shown})
 
     def _warm_up(self) -> None:

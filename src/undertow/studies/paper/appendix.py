@@ -22,15 +22,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from undertow.base.errors import InvalidInputError, MissingExtraError
-from undertow.base.verdict import Kind, Verdict, inward
+from undertow.base import InvalidInputError, Verdict, inward, require_extra
+from undertow.base.verdict import Kind
 from undertow.law import Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.stability import exact_linearisation
@@ -41,22 +41,16 @@ BallMatrix = NDArray[np.object_]
 BITS = 200
 
 
+@cache
 def flint() -> Any:
-    """Import python-flint, or say in one line what to install.
+    """Return the module python-flint.
 
     Raises
     ------
     MissingExtraError
-        When python-flint is not there.
+        When it is not installed.
     """
-    try:
-        import flint as module
-    except ImportError as error:
-        raise MissingExtraError(
-            "ball arithmetic needs python-flint",
-            remedy="Install the extra: pip install 'undertow[appendix]'",
-        ) from error
-    return module
+    return require_extra("flint", "appendix", "ball arithmetic needs python-flint")
 
 
 def ball(value: float | Fraction) -> Any:

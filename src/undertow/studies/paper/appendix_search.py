@@ -102,9 +102,11 @@ def _attempt(reduced: Reduced, width: float, sigma: float) -> Lyapunov | None:
     return _rounded(x[:5])
 
 
-def search_rate(
-    reduced: Reduced, half_width: float | Fraction, tolerance: float = 1e-3
-) -> tuple[Lyapunov, Verdict]:
+#: Part of the interval that is searched at which a bisection ends.
+TOLERANCE = 1e-3
+
+
+def search_rate(reduced: Reduced, half_width: float | Fraction) -> tuple[Lyapunov, Verdict]:
     """Find the P of form (A18) with the largest proved decay rate on |y₁| ≤ half_width.
 
     For each σ a semidefinite program at the two vertices (γ is linear in p₂₂); bisection
@@ -121,7 +123,7 @@ def search_rate(
     low, high = 0.0, 2 * reduced.slowest_rate
     best: tuple[Lyapunov, Verdict] | None = None
     ceiling = high
-    while high - low > tolerance * ceiling:
+    while high - low > TOLERANCE * ceiling:
         middle = 0.5 * (low + high)
         P = _attempt(reduced, float(half_width), middle)
         verdict = None if P is None else decay_rate(reduced, P, half_width)
@@ -141,13 +143,13 @@ def search_rate(
     return best
 
 
-def search_interval(reduced: Reduced, tolerance: float = 1e-3) -> tuple[float, Lyapunov, Verdict]:
+def search_interval(reduced: Reduced) -> tuple[float, Lyapunov, Verdict]:
     """Find the P of form (A18) with R ≻ 0 on the widest interval, by bisection.
 
     Returns
     -------
     half_width, P, verdict
-        The widest proved half-width, to ``tolerance`` of arccos ε.
+        The widest proved half-width, to :data:`TOLERANCE` of arccos ε.
 
     Raises
     ------
@@ -165,7 +167,7 @@ def search_interval(reduced: Reduced, tolerance: float = 1e-3) -> tuple[float, L
         raise InfeasibleError(
             "search for P of form (A18)", value="no P at y₁ = 0", limit="P ≻ 0 and R(0) ≻ 0"
         )
-    while high - low > tolerance * reduced.limit:
+    while high - low > TOLERANCE * reduced.limit:
         middle = 0.5 * (low + high)
         found = attempt(middle)
         if found is None:

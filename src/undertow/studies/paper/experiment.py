@@ -152,6 +152,10 @@ class Effort:
         return cls(Budget(768), Budget(64), False, False, ("matched",))
 
 
+#: All of it.
+FULL = Effort()
+
+
 @dataclass(frozen=True, eq=False)
 class Reproduction:
     """Everything that one run found.
@@ -198,14 +202,13 @@ def printed_motion(condition: Condition, objective: str, row: str) -> Motion:
 
 
 def own_optimum(
-    condition: Condition, objective: str, *, seed: int = 0, effort: Effort | None = None
+    condition: Condition, objective: str, *, seed: int = 0, effort: Effort = FULL
 ) -> OwnOptimum:
     """Optimise: the designed first surface, the one-time optimum, the cascade.
 
     Our *base* is the surface that :func:`undertow.first_surface` designs, as the paper's
     base case is the feasible surface that its optimisation starts from.
     """
-    effort = Effort() if effort is None else effort
     rig = condition.mechanism
     motions = {"base": Motion.of(condition, objective, [first_surface(rig)])}
     cascade = Cascade(
@@ -262,7 +265,7 @@ def tasks(seed: int, effort: Effort) -> dict[Key, Callable[[], Any]]:
     for d in DAMPINGS:
         rig = rotary_pendulum(d_e=d)
         for case, surface in CASES.items():
-            found["catch limit", case, f"{d:g}"] = partial(catch_limit, rig, [surface])
+            found["catch limit", case, f"{d:g}"] = partial(catch_limit, rig, surface)
         found["reach", "", f"{d:g}"] = partial(own_reach, rig, seed=seed, budget=Budget(512))
     for key, goal in product(effort.conditions, OBJECTIVES):
         place = CONDITIONS[key], goal

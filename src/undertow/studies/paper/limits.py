@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import acos, radians
 
@@ -51,27 +50,19 @@ def singular_angle(mechanism: Mechanism, surface: Surface) -> float:
     return acos(float(np.clip(ratio, -1.0, 1.0)))
 
 
-def catch_limit(
-    mechanism: Mechanism,
-    surfaces: Sequence[Surface],
-    switch_times: Sequence[float] = (0.0,),
-) -> float:
+def catch_limit(mechanism: Mechanism, surface: Surface) -> float:
     """Return the first φ(0), rad, at rest, from which the motion does not come to the target.
 
     A grid of 0.25° finds the first failure, and finer grids bisect it to 0.001°.  Given
     200 s, so that a slow surface is not taken for one that fails.
     """
     loop = ClosedLoop(mechanism, MinimumTime(horizon=200.0))
-    schedule = np.stack([surface.vector for surface in surfaces])
     low, step, count = 0.0, radians(0.25), 352
     while True:
         angles = low + step * np.arange(1, count + 1)
         starts = np.zeros((count, 2 * mechanism.n))
         starts[:, mechanism.state_names.index("phi")] = angles
-        batch = loop.batch(
-            starts, np.broadcast_to(schedule, (count, *schedule.shape)), switch_times=switch_times
-        )
-        failed = np.flatnonzero(~batch.reached)
+        failed = np.flatnonzero(~loop.batch(starts, surface).reached)
         if failed.size == 0 or step < radians(0.001):
             return float(angles[failed[0]] if failed.size else angles[-1])
         low += step * float(failed[0])

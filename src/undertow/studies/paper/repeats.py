@@ -36,8 +36,8 @@ class Repeats:
     repeats: tuple[Trajectory, ...]
 
 
-def noisy_repeats(condition: Condition, *, seed: int, count: int = 3) -> Repeats:
-    """Simulate Figure 3: Table 2's one-time surface, ideal, and ``count`` disturbed repeats.
+def noisy_repeats(condition: Condition, *, seed: int) -> Repeats:
+    """Simulate Figure 3: Table 2's one-time surface, ideal, and three disturbed repeats.
 
     The repeats run the law at 1 kHz with its input held, see noisy states, start with a
     spread by hand, and move a plant with Coulomb friction that the law does not know.
@@ -52,7 +52,7 @@ def noisy_repeats(condition: Condition, *, seed: int, count: int = 3) -> Repeats
     ideal = ClosedLoop(rig).simulate(condition.start, surfaces, duration=duration, terminal=0.0)
     loop = ClosedLoop(rig, plant=truth, step=sample / 2, zoh_steps=2)
     repeats = []
-    for number in range(count):
+    for number in range(3):
         rng = np.random.default_rng([seed, number])
         start = condition.start
         start[1] += START_SPREAD * rng.standard_normal()

@@ -14,11 +14,11 @@ from rich.text import Text
 
 from undertow.base import facts, number, table, to_csv, to_json, versions
 from undertow.closed_loop.figures import figure_files
-from undertow.optimiser import Budget
 from undertow.studies.experiment import Experiment
 from undertow.studies.paper import appendix_report
 from undertow.studies.paper.data import CASES, CONDITIONS, OBJECTIVES, PERIOD, ROWS
 from undertow.studies.paper.experiment import (
+    FULL,
     Effort,
     LowerBound,
     OwnOptimum,
@@ -72,10 +72,6 @@ def reasons(result: Reproduction) -> list[dict[str, str]]:
     ]
 
 
-def _budget(budget: Budget | None) -> str:
-    return "the cascade's own" if budget is None else f"{budget.evaluations} rollouts"
-
-
 def manifest(result: Reproduction) -> dict[str, Any]:
     """Return what the run was made with, and its results besides the tables."""
     return {
@@ -83,8 +79,8 @@ def manifest(result: Reproduction) -> dict[str, Any]:
         "versions": versions(),
         "seed": result.seed,
         "effort": {
-            "first optimisation": _budget(result.effort.cold),
-            "re-optimisations": _budget(result.effort.warm),
+            "first optimisation": f"{result.effort.cold.evaluations} rollouts",
+            "re-optimisations": f"{result.effort.warm.evaluations} rollouts",
             "bounds": result.effort.bounds,
         },
         "period_s": PERIOD,
@@ -274,13 +270,12 @@ def files(result: Reproduction) -> dict[str, bytes]:
     }
 
 
-def reproduction(*, seed: int = 0, effort: Effort | None = None) -> Experiment[Any, Reproduction]:
+def reproduction(*, seed: int = 0, effort: Effort = FULL) -> Experiment[Any, Reproduction]:
     """Return the whole experiment.
 
     ``seed`` is that of the searches and of the noise; the effort is full by default,
     :meth:`Effort.quick` is for a look.
     """
-    effort = Effort() if effort is None else effort
     return Experiment(
         "reproduce",
         tuple[str, str, str, float | OwnOptimum | LowerBound | str],
@@ -294,6 +289,6 @@ def reproduction(*, seed: int = 0, effort: Effort | None = None) -> Experiment[A
     )
 
 
-def reproduce(*, seed: int = 0, effort: Effort | None = None) -> Reproduction:
+def reproduce(*, seed: int = 0, effort: Effort = FULL) -> Reproduction:
     """Run the whole experiment, see :func:`reproduction`."""
     return reproduction(seed=seed, effort=effort).run()

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from undertow.base import manifest, number, table, to_csv
 from undertow.bring_up import BringUp, Identification, doublets, identify, perform, rest_state
-from undertow.closed_loop.figures import display, figure_bytes, style
+from undertow.closed_loop.figures import figure_bytes, label_of, style
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Encoder, Friction, RealisticRig, Timing
@@ -252,10 +252,10 @@ def _picture(belief: Mechanism, found: BringUp) -> bytes:
         axes = figure.subplots(belief.n + 1, 1, sharex=True)
         t = record.t - record.t[0]
         for i, (axis, c) in enumerate(zip(axes, belief.coordinates, strict=False)):
-            factor, unit = display(c.unit)
+            factor, label = label_of(c)
             axis.plot(t, factor * record.moved[:, i], lw=2.4, alpha=0.45, label="measured")
             axis.plot(t, factor * identified.predicted[:, i], lw=1.0, label="identified model")
-            axis.set_ylabel(f"{c.name} ({unit})")
+            axis.set_ylabel(label)
         for j, channel in enumerate(belief.inputs):
             axes[-1].step(t, record.u[:, j], where="post", lw=1.0, label=channel.name)
         axes[0].legend(loc="upper right", ncols=2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -10,17 +9,26 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from undertow.base import InvalidInputError, at_least, checked, positive, require_extra
+from undertow.base import (
+    InvalidInputError,
+    as_text,
+    at_least,
+    checked,
+    number,
+    positive,
+    require_extra,
+    table,
+)
 from undertow.cascade import Cascade
 from undertow.estimators import Belief
-from undertow.law import InnerLoop, Surface
+from undertow.law import Surface
 from undertow.models import Mechanism, StateLike
 from undertow.objective import Objective
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
 from undertow.runtime import estimator_for
-from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, predictive, steady
-from undertow.studies.trials.trial import MakeController, Outcome, trial, undisturbed
+from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, keeping, predictive
+from undertow.studies.trials.trial import MakeController, Outcome, trial
 
 #: What :func:`compare` takes for a controller.
 Contender = Cascade | Surface | MakeController
@@ -104,7 +112,7 @@ class Comparison:
                 row["plant"],
                 "yes" if row["balanced"] else "no",
                 f"{row['settled_s']:.3g}",
-                "—" if math.isnan(row["cost"]) else f"{row['cost']:.4g}",
+                number(row["cost"], ".4g"),
             ]
             for row in self.rows
         ]
@@ -112,12 +120,8 @@ class Comparison:
 
     def __str__(self) -> str:
         """Return the table as text."""
-        cells = self._cells()
-        widths = [max(len(line[k]) for line in cells) for k in range(len(cells[0]))]
-        return "\n".join(
-            "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
-            for line in cells
-        )
+        heads, *lines = self._cells()
+        return as_text(table(heads, lines, left=heads[:3])).decode().rstrip()
 
     def __repr__(self) -> str:
         """Show how many balanced."""
@@ -199,7 +203,7 @@ def compare(
     for name, controller in named.items():
         make = _maker(mechanism, controller, start)
         for place, plant in meets.items():
-            bench = undisturbed(plant) if isinstance(plant, Mechanism) else plant
+            bench = Bench(plant) if isinstance(plant, Mechanism) else plant
             mechanism.check_plant(bench.mechanism)
             known = controller.known if isinstance(controller, Cascade) else Belief.usual(mechanism)
             outcomes[name, place] = trial(
@@ -217,7 +221,7 @@ def _maker(
         first = controller.start(start)
         return lambda _: CascadeSteering(controller, first)
     if isinstance(controller, Surface):
-        return lambda _: steady(InnerLoop(mechanism, controller))
+        return keeping(mechanism, controller)
     return controller
 
 

@@ -10,15 +10,18 @@ import numpy as np
 
 from undertow.estimators import Estimator, KalmanFilter, MakeEstimator, Measured
 from undertow.export.estimate import STEPS
-from undertow.law import InnerLoop, first_surface
+from undertow.law import first_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Measurement, srv02_rig
 from undertow.runtime import estimator_for
-from undertow.studies.trials.steering import steady
-from undertow.studies.trials.trial import Outcome, trial, undisturbed
+from undertow.studies.trials.steering import keeping
+from undertow.studies.trials.trial import Outcome, trial
 
 #: What nothing but exact states would give: the model itself, sampled.
 EXACT = "exact states"
+
+#: Length of a run, s.
+SECONDS = 8.0
 
 
 def _exported(name: str, gain: float) -> MakeEstimator:
@@ -67,19 +70,18 @@ def _cost(estimator: Estimator, belief: Mechanism, calls: int = 5000) -> float:
     return 1e6 * (time.process_time() - began) / calls
 
 
-def compared(name: str, *, seeds: int = 5, seconds: float = 8.0) -> EstimatorRow:
+def compared(name: str, *, seeds: int) -> EstimatorRow:
     """Balance the SRV02 with the designed surface and one of the ``ESTIMATORS``."""
     bench = srv02_rig()
     belief = bench.mechanism
     x0 = belief.state(phi=math.radians(20))
-    surface = first_surface(belief)
-    law = lambda _: steady(InnerLoop(belief, surface))  # noqa: E731
+    law = keeping(belief, first_surface(belief))
     exact = name == EXACT
-    ideal = Bench(belief, tachometers={}, timing=undisturbed(belief).timing)
+    ideal = Bench(belief, tachometers={})
     make = ESTIMATORS[name]
     runs = [
         trial(
-            belief, ideal if exact else bench, law, x0, seconds, seed, estimator=make(belief, bench)
+            belief, ideal if exact else bench, law, x0, SECONDS, seed, estimator=make(belief, bench)
         )
         for seed in range(seeds)
     ]

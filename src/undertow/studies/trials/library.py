@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.runtime import Recipe, session
-from undertow.runtime.modes import Reason
+from undertow.runtime import Reason, Recipe, session
 
 
 @dataclass(frozen=True)
@@ -31,25 +30,24 @@ class LibraryRow:
     chatter: float
 
 
-def through_the_runtime(
-    name: str, *, seeds: int = 5, seconds: float = 10.0, evaluations: int = 256
-) -> LibraryRow:
-    """Run a mechanism from its usual start, on its realistic rigs.
+#: Length of a run, s, and rollouts that a re-optimisation may spend.
+SECONDS, BUDGET = 10.0, 256
 
-    On ``seeds`` of them, for ``seconds``, s; a re-optimisation may spend ``evaluations`` rollouts.
-    """
+
+def through_the_runtime(name: str, *, seeds: int) -> LibraryRow:
+    """Run a mechanism from its usual start on so many of its realistic rigs."""
     ends: Counter[str] = Counter()
     applied, chatter = [], []
     for seed in range(seeds):
-        recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=evaluations)
+        recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=BUDGET)
         with session(recipe, simulated=True) as runtime:
-            report = runtime.run(seconds)
+            report = runtime.run(SECONDS)
         if report.stopped_by != Reason.END.text:
             ends[report.stopped_by] += 1
             continue
         applied.append(report.answers.get("applied", 0))
         limits = recipe.settings.limits(recipe.belief)
-        chatter.append(float((report.total_variation / limits).max() / seconds))
+        chatter.append(float((report.total_variation / limits).max() / SECONDS))
     return LibraryRow(
         name,
         recipe.belief.m,

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from undertow.base import as_text, finite, number, table, to_csv
 from undertow.cascade import problem_words
-from undertow.closed_loop import Trajectory
+from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import figure_files
 from undertow.mechanisms import LIBRARY
 from undertow.objective import Goal, objective_for
@@ -25,7 +25,7 @@ from undertow.studies.trials.balance import GOALS, IDEAL, LIMIT, ROWS, Balance
 from undertow.studies.trials.estimation import EstimatorRow
 from undertow.studies.trials.library import LibraryRow
 from undertow.studies.trials.robustness import FACTORS, RANDOM, SEEDS, SINGLE
-from undertow.studies.trials.trial import Outcome, Result, balanced, motion, spread
+from undertow.studies.trials.trial import Outcome, Result, balanced, spread
 from undertow.studies.trials.upright import SWING_SECONDS, EngineResult, SwingResult
 
 
@@ -159,7 +159,11 @@ def comparison_figure(asked: Balance) -> Figure:
 
 
 def _motion(outcome: Outcome) -> Trajectory:
-    return motion(srv02_rig().mechanism, outcome.record, 2)
+    """Return the true motion of a run for plotting, every second sample."""
+    record = outcome.record
+    t, x, u = record.t[::2], record.truth[::2], record.u[::2]
+    s, nothing, margin = np.zeros_like(u), np.zeros_like(t), np.ones_like(t)
+    return Trajectory(srv02_rig().mechanism, t, x, u, s, nothing, margin, Event.HORIZON)
 
 
 def _until_fallen(run: Trajectory) -> Trajectory:

@@ -8,7 +8,6 @@ cascade's answers come a period late.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,7 +19,7 @@ from undertow.base import require_extra
 from undertow.bounds.expressions import dynamics
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, StateFeedback
-from undertow.law import InnerLoop
+from undertow.law import InnerLoop, ReachingLaw, Surface
 from undertow.models import (
     UNCONTROLLABLE,
     FloatArray,
@@ -33,16 +32,20 @@ from undertow.models.importers import holding_input
 from undertow.objective import Objective, finite_limits
 from undertow.optimiser import Proposal
 from undertow.runtime import Settings
+from undertow.runtime.controller import EARLY_LEAD
 from undertow.studies.trials.trial import MakeController
 
 
-def steady(law: InnerLoop) -> Callable[[float, FloatArray], FloatArray]:
-    """Return the controller that keeps one surface."""
-    return lambda t, x: law(x)
+def keeping(
+    mechanism: Mechanism, surface: Surface, reaching: ReachingLaw = ReachingLaw()
+) -> MakeController:
+    """Return the maker of a controller that keeps one surface."""
 
+    def make(_start: FloatArray) -> StateFeedback:
+        law = InnerLoop(mechanism, surface, reaching)
+        return lambda t, x: law(x)
 
-#: Time from a jump of the velocities to the next decision, s: a search takes so long.
-EARLY = 0.02
+    return make
 
 
 class CascadeSteering:
@@ -51,8 +54,8 @@ class CascadeSteering:
     Every period the answer asked for one period ago is judged from the present state, then the
     next one is asked for: for the state predicted one period ahead.  After a jump of the velocities
     a plan in reserve takes over at once, what was asked for before is given up, and the next answer
-    is there after ``EARLY``.  Where it has a belief, its estimator learns what that leaves open,
-    see :meth:`listen`.
+    is there after :data:`.EARLY_LEAD`.  Where it has a belief, its estimator learns what that
+    leaves open, see :meth:`listen`.
 
     The first optimisation, ``start``, was made before the run by :meth:`Cascade.start`, as on a
     bench. ``admitted`` answers passed the gate, ``refused`` did not.
@@ -71,12 +74,8 @@ class CascadeSteering:
 
     def listen(self, estimator: Estimator) -> None:
         """Hear of jumps, and go on with the parameters that are learnt for the same belief."""
-        known = self.cascade.known
         self.estimator, self.jumps = estimator, estimator.jumps
-        if known is None or estimator.belief is None:
-            return
-        if estimator.belief.tolerances == known.tolerances:
-            self.learning = estimator
+        self.learning = estimator if self.cascade.learns_from(estimator) else None
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x)."""
@@ -85,7 +84,7 @@ class CascadeSteering:
         due = self.began + self.ticks * self.cascade.period
         if self.estimator is not None and self.estimator.jumps > self.jumps:
             self.jumps = self.estimator.jumps
-            self.began, self.ticks = t + EARLY, 0
+            self.began, self.ticks = t + EARLY_LEAD, 0
             self._take_reserve(t, x)
             self._ask(t, x, self.began)
         elif t >= due - 1e-9:
@@ -96,15 +95,12 @@ class CascadeSteering:
         return self.law(x)
 
     def _use(self, t: float) -> None:
-        surface, reaching = self.memory.plan.at(t - self.memory.since)
-        reaching = reaching or self.cascade.reaching
-        if (surface, reaching) != (self.law.surface, self.law.reaching):
-            self.law.use(surface, reaching)
+        self.law.follow(self.memory.plan, t - self.memory.since, self.cascade.reaching)
 
     def _take_reserve(self, t: float, x: FloatArray) -> None:
         """Go on with the strongest plan in reserve, where its law exists."""
         plan = self.cascade.reserve[-1]
-        self.law.use(plan.surfaces[0], plan.laws(self.cascade.reaching)[0])
+        self.law.follow(plan, 0.0, self.cascade.reaching)
         self.law(x)
         if self.law.margin[0] > Settings().min_margin:
             self.memory = replace(self.memory, plan=plan, since=t)
@@ -128,9 +124,8 @@ class CascadeSteering:
         if self.estimator is not None:
             felt = tuple(self.estimator.felt.tolist())
             self.memory = replace(self.memory, disturbance=felt)
-        loop = self.cascade.loop_at(self.memory, t)
-        ahead = loop.batch(x, self.memory.at(t), duration=later - t, terminal=0.0)
-        self.waiting = self.cascade.propose(self.memory, ahead.x[0], later)
+        ahead = self.cascade.predicted_error(self.memory, x, t, later)
+        self.waiting = self.cascade.propose(self.memory, ahead, later)
 
 
 class NMPC:

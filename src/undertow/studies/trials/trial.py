@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.closed_loop import Event, Trajectory
 from undertow.estimators import Belief, Estimator, Record, StateFeedback, compensated, run_recorded
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
@@ -18,6 +18,21 @@ from undertow.runtime import estimator_for
 
 #: Belief and estimated start, (2n,), to a controller for one run.
 MakeController = Callable[[FloatArray], StateFeedback]
+
+
+@runtime_checkable
+class TakesEstimator(Protocol):
+    """A controller that goes by what an estimator knows besides the state."""
+
+    def listen(self, estimator: Estimator) -> None:
+        """Take the estimator of the run that begins."""
+
+
+def introduce(controller: object, estimator: Estimator) -> None:
+    """Let a controller that listens know its estimator."""
+    if isinstance(controller, TakesEstimator):
+        controller.listen(estimator)
+
 
 #: Within these of the target a coordinate counts as home: free ones, driven ones (rad or m).
 HOME_FREE, HOME_DRIVEN = math.radians(2.0), math.radians(20.0)
@@ -80,7 +95,7 @@ def trial(
 
     The estimator is by default that of :func:`undertow.runtime.controller_defaults.estimator_for`
     the bench, or the one that it is ``told`` of instead, which learns the usual parameters; a
-    controller that has a method ``listen`` is given it. What it knows of a matched disturbance is
+    :class:`TakesEstimator` is given it. What it knows of a matched disturbance is
     taken off the output in each step in which ``compensates`` says so. ``home`` is as for
     :func:`judge`.
     """
@@ -90,8 +105,7 @@ def trial(
         estimator = estimator_for(belief, told or bench, known=Belief.usual(belief))
     estimator.reset(seen)
     steering = make(seen)
-    if hasattr(steering, "listen"):
-        steering.listen(estimator)
+    introduce(steering, estimator)
     controller = compensated(steering, estimator, belief.input_limits, compensates)
     record = run_recorded(rig, estimator, controller, seconds)
     return judge(belief, record, seed, objective, home)
@@ -171,26 +185,3 @@ def spread(outcomes: Sequence[Result], what: str) -> Spread:
     if not values:
         return Spread(math.nan, math.nan)
     return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0)
-
-
-def motion(mechanism: Mechanism, record: Record, every: int = 5) -> Trajectory:
-    """Return the true motion of a record for plotting, every so many samples."""
-    rows = slice(None, None, every)
-    count, m = len(record.t[rows]), mechanism.m
-    nothing = np.zeros(count)
-    return Trajectory(
-        mechanism,
-        record.t[rows],
-        record.truth[rows],
-        record.u[rows],
-        np.zeros((count, m)),
-        nothing,
-        np.ones(count),
-        Event.HORIZON,
-    )
-
-
-def undisturbed(mechanism: Mechanism, period: float = 0.001) -> Bench:
-    """Return the bench that moves as the belief says, sampled at the same period."""
-    bench = Bench(mechanism)
-    return replace(bench, timing=replace(bench.timing, period=period))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from undertow.cascade import Cascade
 from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
 from undertow.cascade.swing_up.search import RatedGains, designs_for
-from undertow.estimators import Estimator, StateFeedback, compensated, run_recorded
+from undertow.estimators import Estimator, compensated, run_recorded
 from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
@@ -81,12 +80,12 @@ def swing_trial(
     run = trial(
         mechanism,
         bench,
-        partial(_given, controller),
+        lambda _: controller,
         hanging(mechanism),
         seconds,
         seed,
         estimator=estimator,
-        compensates=partial(getattr, controller, "balancing"),
+        compensates=lambda: controller.balancing,
     )
     truth = run.record.truth - controller.offset
     edges = np.array([[c.low, c.high] for c in mechanism.coordinates])
@@ -164,7 +163,3 @@ def engine_trial(name: str, *, seconds: float = 10.0, budget: int = 256) -> Engi
     outcome = judge(mechanism, record, 0, objective)
     final = record.truth[-1, : mechanism.n]
     return EngineResult(mechanism.name, outcome.numbers, final, steering.admitted)
-
-
-def _given(controller: StateFeedback, _start: FloatArray) -> StateFeedback:
-    return controller
