@@ -21,11 +21,9 @@ PREAMBLE = "import math\n\nimport numba\nimport numpy as np\n"
 
 #: Decorator of every function that is compiled: no lock of the interpreter, no exceptions.  What
 #: another one calls is inlined there: else the process that compiles it calls it in its own
-#: library, later ones the copy that was stored with its caller, and the two round otherwise.
-COMPILED = (
-    "@numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True, "
-    "fastmath={'contract', 'nsz', 'arcp'})"
-)
+#: library, later ones the copy that was stored with its caller, and the two round otherwise.  Every
+#: operation is rounded by itself: which ones a compiler would fuse depends on what went before.
+COMPILED = "@numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)"
 
 
 def function_source(
