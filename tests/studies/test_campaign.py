@@ -401,6 +401,47 @@ def test_a_shard_that_raises_is_named_and_others_go_on(
     assert content(path) == content(serial)
 
 
+OWN = """
+import sympy as sp
+import undertow as ut
+
+x, a = ut.Coordinate("x", "m", low=-0.8, high=0.8), ut.Coordinate("a", "rad")
+mass = ut.Parameter("m", 0.3, "kg", low=0.0)
+m, v, w, c = mass.symbol, x.velocity, a.velocity, sp.cos(a.symbol)
+own = ut.Mechanism.from_energies(
+    "own", [x, a], [ut.Input("F", "N", 9.0)],
+    kinetic=(1 + m) * v**2 / 2 + m * c * v * w / 4 + m * w**2 / 24, potential=2.5 * m * c,
+    parameters=(mass,), start={"a": 0.1},
+)
+"""
+
+
+@pytest.mark.parametrize(
+    ("said", "edited"),
+    [
+        ("low=-0.8", "low=-0.7"),
+        ('"x", "m"', '"x", "rad"'),
+        ("0.3, ", "0.31, "),
+        ("low=0.0", "low=0.1"),
+        ("9.0", "8.0"),
+        ("0.1}", "0.2}"),
+    ],
+)
+def test_another_mechanism_in_the_same_file_is_another_campaign(
+    said: str, edited: str, tmp_path: Path
+) -> None:
+    """Its travel and units decide results as its equations do: edited, they were the same store."""
+    axes = {"a": {"from": -0.1, "to": 0.1, "count": 2}}
+    keys = []
+    for folder, text in (("one", OWN), ("two", OWN.replace(said, edited))):
+        path = tmp_path / folder / "own.py"
+        path.parent.mkdir()
+        path.write_text(text)
+        definition = Definition.of(f"{path}:own", kind="region", axes=axes)
+        keys.append(Campaign(definition, tmp_path / "map.zarr").key)
+    assert len({*keys}) == 2
+
+
 def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "store"
     campaign = Campaign(MAP, path)
@@ -490,6 +531,12 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
         ({"axes": {"phi": {"from": np.nan, "to": 1.0, "count": 2}}}, "axes.phi.from.*finite"),
         ({"axes": {"psi": {"from": 0.0, "to": 1.0, "count": 2}}}, "theta, phi"),
         ({"axes": {"phi": {"from": 0.0, "to": 1.0}}}, "axes.phi.count"),
+        ({"axes": {"phi": {"from": 0.0, "to": 1.0, "count": 1}}}, "axes.phi.count.*1 from 0 to 1"),
+        ({"axes": {"phi": {"from": 1.0, "to": 1.0, "count": 9}}}, "axes.phi.count.*9 from 1 to 1"),
+        (
+            {"axes": {a: {"from": 0.0, "to": 1.0, "count": 10**7} for a in ("phi", "theta")}},
+            "shards of the campaign.*1e\\+06",
+        ),
         ({"axes": {}}, "states among theta"),
         ({"at": {"phi": 0.1}}, "one of theta"),
         ({"surface": [1.0, 2.0]}, "4 numbers"),
