@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from undertow.base import (
     InvalidInputError,
-    ModelError,
     at_least,
     between,
     check_fields,
@@ -28,7 +27,7 @@ from undertow.closed_loop import LANES, Event
 from undertow.estimators import FilteredDerivative
 from undertow.export.balancing_kernel import driven_plants
 from undertow.mechanisms.named import named
-from undertow.models import FloatArray, Mechanism, linearise
+from undertow.models import FloatArray, Mechanism, longest_step
 from undertow.objective import Objective, objective_for
 from undertow.plants import Bench, RealisticRig
 from undertow.plants.bench import bench_for
@@ -37,9 +36,8 @@ from undertow.symbolic import compile_expressions
 if TYPE_CHECKING:
     from undertow.export.gym import Environment, VectorEnvironment
 
-#: Longest Runge-Kutta step of an ideal plant, s, and in time constants of its fastest mode: in
-#: that mode a step is off by 3e-6 of it.
-STEP, OF_FASTEST = 0.0025, 0.2
+#: Longest Runge-Kutta step of an ideal plant, s; a fast mode asks for shorter ones.
+STEP = 0.0025
 
 #: Horizon of the objective that is taken where none is given, or a word for one, s.
 HORIZON = 10.0
@@ -193,19 +191,6 @@ class BalancingTask:
         return np.asarray(-cost - self.paid * lost)
 
 
-def longest_step(mechanism: Mechanism) -> float:
-    """Return how long Runge-Kutta steps of a plant may be, s: short beside its fastest mode, too.
-
-    A motor's back-EMF or a damped joint may be a thousand times as fast as the balancing.  Where
-    there is no linear model, the force having a kink, nothing is known of its modes.
-    """
-    try:
-        rates = np.abs(np.linalg.eigvals(linearise(mechanism).A))
-    except ModelError:
-        return STEP
-    return OF_FASTEST / max(float(rates.max()), OF_FASTEST / STEP)
-
-
 class Lanes:
     """Ideal plants, many at once: integrated in blocks by one compiled call.
 
@@ -231,7 +216,7 @@ class Lanes:
         self._t, self._cost, self._margin = np.zeros((3, padded))
         self.u = self._inputs[:, :count]
         self._values = task.mechanism.parameter_values
-        self._steps = math.ceil(task.period / longest_step(task.mechanism) - 1e-9)
+        self._steps = math.ceil(task.period / longest_step(task.mechanism, STEP) - 1e-9)
 
     @property
     def x(self) -> FloatArray:

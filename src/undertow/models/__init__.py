@@ -21,6 +21,7 @@ from undertow.models.linearisation import (
     linear_accelerations,
     linear_numbers,
     linearise,
+    longest_step,
     uncontrollable,
 )
 from undertow.models.mechanism import Mechanism
@@ -74,6 +75,7 @@ __all__ = [
     "linear_accelerations",
     "linear_numbers",
     "linearise",
+    "longest_step",
     "normal_name",
     "number_of",
     "numbers",
