@@ -250,10 +250,12 @@ def test_a_plant_with_a_fast_motor_is_followed(tmp_path: Path) -> None:
         with loaded(tmp_path, f"{controller.stem}_plant", start) as plant:
             plant.step(0.0, 0.004)
             found = plant.read(names)
-        true = solve_ivp(
-            lambda _t, x, of=mechanism: [*x[of.n :], *of.accelerations(0.0, x, np.zeros(of.m))],
-            (0.0, 0.004), mechanism.state(**start), "LSODA", rtol=1e-10, atol=1e-12,
-        )  # fmt: skip
+
+        def rates(_t: float, x: Any, of: ut.Mechanism = mechanism) -> Any:
+            return np.append(x[of.n :], of.accelerations(0.0, x, np.zeros(of.m)))
+
+        x0 = mechanism.state(**start)
+        true = solve_ivp(rates, (0.0, 0.004), x0, "LSODA", rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(found, true.y[:, -1], rtol=2e-4, atol=1e-6)
         assert np.isfinite(run_positions(controller)[0]).all()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,7 +75,11 @@ def test_the_unit_of_a_cost_does_not_matter(rig: ut.Mechanism) -> None:
     """Costs from 1e8 on, ∫u² dt of kilonewtons, were taken for those of motions that fail."""
     x, found = rig.state(phi=0.3), []
     for unit in (1.0, 2.0**40):
-        goal = ut.Objective("energy", lambda v, unit=unit: unit * v.voltage**2)
+
+        def stage(v: Any, unit: float = unit) -> Any:
+            return unit * v.voltage**2
+
+        goal = ut.Objective("energy", stage)
         answer = ut.Optimiser(ut.ClosedLoop(rig, goal)).propose(x, budget=ut.Budget(512))
         assert answer.surface is not None
         again = ut.ClosedLoop(rig, goal).batch(x, answer.surface).cost[0]

@@ -161,18 +161,23 @@ def linear_numbers(
     return mass.reshape(count, n, n), slopes, _gain(mechanism, values)
 
 
-def longest_step(mechanism: Mechanism, most: float) -> float:
-    """Return how long Runge-Kutta steps may be, s: ``most``, or less where a mode is fast.
+def fastest_rate(mechanism: Mechanism) -> float:
+    """Return the largest |λ| of the linear model, 1/s.
 
     A motor's back-EMF or a damped joint may be a thousand times as fast as the balancing, and a
     step that is long beside it is off, or unstable.  Where there is no linear model, the force
-    having a kink, nothing is known of modes.
+    having a kink, nothing is known of modes: then it is 0.
     """
     try:
-        fastest = float(np.abs(np.linalg.eigvals(linearise(mechanism).A)).max())
+        return float(np.abs(np.linalg.eigvals(linearise(mechanism).A)).max())
     except ModelError:
-        return most
-    return min(most, OF_FASTEST / fastest) if fastest > 0 else most
+        return 0.0
+
+
+def longest_step(mechanism: Mechanism, most: float) -> float:
+    """Return how long Runge-Kutta steps may be, s: ``most``, or less where a mode is fast."""
+    rate = fastest_rate(mechanism)
+    return OF_FASTEST / rate if rate * most > OF_FASTEST else most
 
 
 def linear_accelerations(mechanism: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:

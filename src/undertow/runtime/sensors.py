@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 from undertow.base import InvalidInputError
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, fastest_rate
 from undertow.plants import Measurement
 from undertow.plants.stepping import compiled_module
 from undertow.runtime.settings import Settings
@@ -36,12 +36,12 @@ SOUND, NOT_YET, NEVER, LOST, FROZEN, SPARSE, TIMELESS = range(7)
 LAST_HARMLESS = NOT_YET
 
 #: What the watch remembers; settings: period, jump, frozen, patience, stall, weight of a step in a
-#: share, largest share; clock: time waited, whether there was a sound reading at all, our time, the
-#: rig's and ours at the last reading whose time made sense, and at the last one at all; shares:
-#: part of the readings that was missing of late; offs: how far the readings of the last step were
-#: off what was expected, 0 where they were not accepted.
+#: share, largest share, parts of a period; clock: time waited, whether there was a sound reading at
+#: all, our time, the rig's and ours at the last reading whose time made sense, and at the last one
+#: at all; shares: part of the readings that was missing of late; offs: how far the readings of the
+#: last step were off what was expected, 0 where they were not accepted.
 _LAYOUT = {
-    "settings": "7", "clock": "7", "q": "n", "v": "n", "band": "m", "gain": "n",
+    "settings": "8", "clock": "7", "q": "n", "v": "n", "band": "m", "gain": "n",
     "parameters": "p", "viscous": "n", "W": "n * n", "last": "n", "gaps": "n", "ages": "n",
     "offs": "n",
     "counts": "n", "shares": "n", "quiet": "1", "expected": "2 * n",
@@ -50,18 +50,21 @@ _LAYOUT = {
 
 _BODY = f"""
 {COMPILED}
-def heun_step(h, x, u, viscous, parameters, work):
-    # Heun's step of the belief, in place: readings are compared to far less than its error.
+def heun_step(h, parts, x, u, viscous, parameters, work):
+    # Heun's step of the belief, in place, in parts that are short beside its fastest mode:
+    # readings are compared to far less than its error.
     n = x.shape[0] // 2
     first, second, ahead = work[0], work[1], work[2]
-    forward(0.0, x, u, viscous, parameters, first)
-    for i in range(n):
-        ahead[i] = x[i] + h * x[n + i]
-        ahead[n + i] = x[n + i] + h * first[i]
-    forward(0.0, ahead, u, viscous, parameters, second)
-    for i in range(n):
-        x[i] += 0.5 * h * (x[n + i] + ahead[n + i])
-        x[n + i] += 0.5 * h * (first[i] + second[i])
+    part = h / parts
+    for _ in range(int(parts)):
+        forward(0.0, x, u, viscous, parameters, first)
+        for i in range(n):
+            ahead[i] = x[i] + part * x[n + i]
+            ahead[n + i] = x[n + i] + part * first[i]
+        forward(0.0, ahead, u, viscous, parameters, second)
+        for i in range(n):
+            x[i] += 0.5 * part * (x[n + i] + ahead[n + i])
+            x[n + i] += 0.5 * part * (first[i] + second[i])
 
 
 {COMPILED}
@@ -84,7 +87,7 @@ def gate_measurement(x, u, block):
     h, jump, frozen = settings[0], settings[1], settings[2]
     for i in range(2 * n):
         expected[i] = x[i]
-    heun_step(h, expected, u, viscous, parameters, work)
+    heun_step(h, settings[7], expected, u, viscous, parameters, work)
     gains(parameters, gain)
     missing, worst, still, moved = 0, 0, -1, False
     probing = quiet[0] >= {PROBE}
@@ -103,7 +106,7 @@ def gate_measurement(x, u, block):
         if gaps[i] > gaps[worst]:
             worst = i
         if q[i] == last[i]:
-            heun_step(h, free[i], u, viscous, parameters, work)
+            heun_step(h, settings[7], free[i], u, viscous, parameters, work)
             coulomb_impulse(h, free[i], band, gain, parameters, W)
             ages[i] += h
             if abs(free[i, i] - q[i]) > frozen:
@@ -196,7 +199,7 @@ class SensorMonitor:
         memory["settings"][:] = (
             period, settings.max_innovation, settings.frozen_threshold, settings.sensor_timeout,
             settings.max_step_interval, min(1.0, period / settings.fault_window),
-            settings.max_dropout_ratio,
+            settings.max_dropout_ratio, max(1, math.ceil(period * fastest_rate(mechanism) - 1e-9)),
         )  # fmt: skip
         memory["parameters"][:] = mechanism.parameter_values
         memory["counts"][:] = 0.01
