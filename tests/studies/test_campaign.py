@@ -552,6 +552,23 @@ def test_wrong_settings_are_refused_by_name(change: dict[str, Any], words: str) 
         Campaign(Definition.of(RIG, **REGION | change), Path("nowhere"))
 
 
+def test_steps_that_a_fast_mode_makes_unstable_are_refused() -> None:
+    """A pendulum in oil: its map said that nothing comes home, and simulated motions did."""
+    crane = ut.mechanisms.overhead_crane()
+    oil, axes = {"b_p": 500.0}, {"x": {"from": 0.2, "to": 0.4, "count": 2}}
+    asked: dict[str, Any] = {"kind": "region", "parameters": oil, "axes": axes}
+    with pytest.raises(InvalidInputError, match=r"'step'.*got 0\.002 s, must be at most"):
+        study_of(Definition.of("overhead_crane", **asked))
+    fine: Any = study_of(Definition.of("overhead_crane", **asked, step=1e-4))
+    found = fine.compute(0)
+    for x, event, home in zip((0.2, 0.4), found["event"], found["time"], strict=True):
+        damped = crane.with_parameters(**oil)
+        loop = ClosedLoop(damped, fine.loop.objective)
+        motion = loop.simulate(damped.state(x=x), fine.surface)
+        assert (event, motion.event) == (Event.REACHED, Event.REACHED)
+        assert home == pytest.approx(motion.time, rel=1e-3)
+
+
 def test_names_of_ones_own_are_spelt_as_they_are_or_refused(tmp_path: Path) -> None:
     """The µ of keyboards is the Greek one; a state called like what is recorded was a traceback."""
     code = tmp_path / "own.py"
