@@ -42,6 +42,7 @@ from undertow.studies.campaign.figures import (
     proved_set,
 )
 from undertow.studies.campaign.run import study_of
+from undertow.studies.survey import survey
 
 pytest.importorskip("zarr")
 distributed = pytest.importorskip("distributed")
@@ -432,14 +433,15 @@ def test_another_mechanism_in_the_same_file_is_another_campaign(
 ) -> None:
     """Its travel and units decide results as its equations do: edited, they were the same store."""
     axes = {"a": {"from": -0.1, "to": 0.1, "count": 2}}
-    keys = []
+    keys, surveyed = [], []
     for folder, text in (("one", OWN), ("two", OWN.replace(said, edited))):
         path = tmp_path / folder / "own.py"
         path.parent.mkdir()
         path.write_text(text)
         definition = Definition.of(f"{path}:own", kind="region", axes=axes)
         keys.append(Campaign(definition, tmp_path / "map.zarr").key)
-    assert len({*keys}) == 2
+        surveyed += survey([f"{path}:own"], bounds=False).settings["models"]
+    assert len({*keys}) == len({*surveyed}) == 2
 
 
 def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
