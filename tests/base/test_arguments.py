@@ -308,6 +308,14 @@ def test_degrees_are_a_number(angle: Any) -> None:
     assert ut.deg(180) == math.pi
 
 
+def test_masked_numbers_are_no_states(rig: ut.Mechanism) -> None:
+    """What is behind a mask was taken: an old reading, or anything."""
+    x = np.ma.masked_array([0.1, 0.2, 0.0, 0.0], mask=[False, True, False, False])
+    with pytest.raises(InvalidInputError, match=r"masked_array[\s\S]*must be numbers"):
+        rig.check_state(x)
+    assert rig.check_state(np.ma.masked_array(x.data)).tolist() == [0.1, 0.2, 0.0, 0.0]
+
+
 def test_complex_numbers_are_no_states(rig: ut.Mechanism) -> None:
     """Their imaginary part is not dropped: numbers and arrays are refused alike."""
     for x in (np.full(4, 0.1 + 0.2j), [0.1j, 0.0, 0.0, 0.0], 1j):

@@ -24,7 +24,7 @@ from support import (
 )
 from undertow.base import InvalidInputError
 from undertow.closed_loop import INADMISSIBLE, UNSTABLE, Event, simulate_along
-from undertow.closed_loop.trajectory import Batch
+from undertow.closed_loop.trajectory import PENALTY, Batch
 from undertow.law import Plan
 from undertow.models import TIME, FloatArray
 from undertow.plants import IdealRig
@@ -550,20 +550,20 @@ def test_scores_rank_admissible_then_slow_then_broken(
     batch = loop.batch(x0, [quick, base, base, base], duration=10.0)
     scores = batch.score(10.0)
     assert batch.event.tolist()[:1] == [ut.Event.REACHED]
-    assert scores[0] == batch.cost[0] < 1e9
+    assert scores[0] == batch.cost[0] < INADMISSIBLE
     broken = batch.event == ut.Event.SINGULAR
     assert broken.sum() >= 2
-    assert (scores[broken] > 2e9 - 1).all()
+    assert (scores[broken] >= 2 * PENALTY).all()
     order = np.argsort(batch.time[broken])
     assert (np.diff(scores[broken][order]) <= 0).all()
     slow = loop.batch(np.array([rig.state(phi=0.1), rig.state(phi=0.6)]), [quick], duration=0.4)
     assert slow.event.tolist() == [ut.Event.HORIZON] * 2
-    assert 1e9 < slow.score(0.4).min() < slow.score(0.4).max() <= 2e9
+    assert PENALTY < slow.score(0.4).min() < slow.score(0.4).max() <= 2 * PENALTY
     assert slow.score(0.4).argmax() == slow.radius.argmax()
 
 
 def test_scores_grade_every_end() -> None:
-    """Costs as they are; late 1e9 to 2e9 by distance; broken 2e9 to 3e9 by time; unstable above."""
+    """Costs as they are; late 1 to 2 penalties by distance; broken 2 to 3 by time, unstable."""
     late, broken = Event.HORIZON, [Event.CONSTRAINT, Event.SINGULAR, Event.DIVERGED, Event.COSTLY]
     events = [Event.REACHED, *[late] * 5, *broken * 3, Event.UNSTABLE]
     count = len(events)
@@ -575,12 +575,13 @@ def test_scores_grade_every_end() -> None:
         nothing[:, None], nothing, nothing, nothing[:, None], nothing[:, None], nothing,
     )  # fmt: skip
     scores = batch.score(8.0)
+    parts = scores / PENALTY
     assert scores[0] == 7.5
-    np.testing.assert_allclose(scores[1:6] - 1e9, 1e9 * np.array([0, *np.tanh([0.5, 3]), 1, 1]))
-    np.testing.assert_allclose(scores[6:10], 3e9)
-    np.testing.assert_allclose(scores[10:14], 2.75e9)
-    np.testing.assert_allclose(scores[14:18], 2e9)
-    assert scores[18] == UNSTABLE > 3e9
+    np.testing.assert_allclose(parts[1:6] - 1, [0, *np.tanh([0.5, 3]), 1, 1])
+    np.testing.assert_allclose(parts[6:10], 3)
+    np.testing.assert_allclose(parts[10:14], 2.75)
+    np.testing.assert_allclose(parts[14:18], 2)
+    assert scores[18] == UNSTABLE > 3 * PENALTY
     assert (batch.reached == (scores < INADMISSIBLE)).all()
     assert (scores[~batch.reached] > INADMISSIBLE).all()
 

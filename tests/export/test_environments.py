@@ -74,6 +74,30 @@ def test_a_step_is_the_motion_of_the_mechanism_and_costs_what_it_costs() -> None
         np.testing.assert_allclose(-reward, z[-1] - before, rtol=1e-6)
 
 
+@pytest.mark.parametrize("damping", [0.0, 2000.0])
+def test_a_fast_mode_is_followed_too(damping: float) -> None:
+    """Motors are fast: the wheels' back-EMF decays by 241/s, a cart's may by thousands."""
+    from scipy.integrate import solve_ivp
+
+    mine = ut.mechanisms.wheeled_inverted_pendulum()
+    if damping:
+        mine = ut.mechanisms.cart_pendulum().with_parameters(b_c=damping).with_input_limit(1e4)
+    n, u, env = mine.n, mine.input_limits * 0.3, ut.environment(mine)
+    x, _ = env.reset(seed=0)
+    stage = env.task.problem.stage_function(mine)
+
+    def rates(_t: float, z: Any) -> Any:
+        x = z[:-1]
+        return [*x[n:], *mine.accelerations(0.0, x, u), *stage(*x, *u)]
+
+    for _ in range(20):
+        z = solve_ivp(rates, (0, 0.005), [*x, 0.0], "LSODA", rtol=1e-10, atol=1e-12).y[:, -1]
+        x, reward, terminated, *_ = env.step(np.full(mine.m, 0.3))
+        assert not terminated
+        np.testing.assert_allclose(x, z[:-1], rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(-reward, z[-1], rtol=1e-3)
+
+
 @pytest.mark.parametrize("name", ["rotary_pendulum", "cart_pendulum"])
 def test_each_of_many_is_as_it_would_be_alone(name: str) -> None:
     """Gymnasium's own vector of single ones, over ends and new beginnings, to the last bit."""

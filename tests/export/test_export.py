@@ -1167,6 +1167,10 @@ def test_bad_requests_are_refused_with_value_and_limit() -> None:
         (lambda: EmbeddedController(rig, s, differentiator=DerivativeStep(0.0)), "> 0"),
         (lambda: EmbeddedController(rig, s, differentiator=KalmanStep(-1.0)), "position_noise"),
         (lambda: EmbeddedController(rig, Plan((s, s), (0.0, 1e7))), "2^32"),
+        (
+            lambda: KalmanStep().gains(LIBRARY["wheeled_inverted_pendulum"](), 0.01),
+            "below 0.00829 s, twice the time constant",
+        ),
     )
     for build, words in requests:
         with pytest.raises(InvalidInputError, match=re.escape(words)):

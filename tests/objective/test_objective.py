@@ -303,3 +303,6 @@ def test_a_cost_is_asked_for_at_the_target(rig: ut.Mechanism) -> None:
     dent = ut.Objective("dent", lambda v: v.voltage**2 + v.phi**2 - 1e-6)
     with pytest.raises(InvalidInputError, match=r"stage cost of 'dent': got -1e-06"):
         dent.stage_cost(rig)
+    pole = ut.Objective("pole", lambda v: 1 / v.theta**2)  # the cost of a motion from rest was NaN
+    with pytest.raises(InvalidInputError, match=r"stage cost of 'pole': got nan"):
+        pole.stage_cost(rig)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,6 +69,23 @@ def test_three_seeds_agree_at_41_degrees(rig: ut.Mechanism, name: str, at_most: 
     costs = ut.ClosedLoop(rig, OBJECTIVES[name]).batch(x, surfaces).cost  # integrated to the end
     assert costs.max() <= at_most
     assert np.ptp(costs) <= 0.01 * costs.min()
+
+
+def test_the_unit_of_a_cost_does_not_matter(rig: ut.Mechanism) -> None:
+    """Costs from 1e8 on, ∫u² dt of kilonewtons, were taken for those of motions that fail."""
+    x, found = rig.state(phi=0.3), []
+    for unit in (1.0, 2.0**40):
+
+        def stage(v: Any, unit: float = unit) -> Any:
+            return unit * v.voltage**2
+
+        goal = ut.Objective("energy", stage)
+        answer = ut.Optimiser(ut.ClosedLoop(rig, goal)).propose(x, budget=ut.Budget(512))
+        assert answer.surface is not None
+        again = ut.ClosedLoop(rig, goal).batch(x, answer.surface).cost[0]
+        assert answer.cost == pytest.approx(again, rel=1e-3)
+        found.append(answer.cost / unit)
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
 
 
 def test_proposal_depends_on_seed_and_number_alone(optimisers: dict[str, ut.Optimiser]) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from undertow.base import InvalidInputError
+from undertow.closed_loop import UNSTABLE
 from undertow.models import FloatArray
 from undertow.optimiser import CMAES
 from undertow.optimiser.cma_es import minimise
@@ -55,7 +56,7 @@ def test_penalties_and_nan_stay_out_of_the_model() -> None:
     """A wall through the region leaves the best admissible candidate, and never a NaN."""
 
     def walled(x: FloatArray) -> FloatArray:
-        cost = np.where(x[:, 0] > 0.1, 1e9, _bowl(x))
+        cost = np.where(x[:, 0] > 0.1, UNSTABLE, _bowl(x))
         return np.where(x[:, 1] > 0.9, np.nan, cost)
 
     search = TrustRegion(np.zeros(3), 0.2, 16, np.random.default_rng(1))

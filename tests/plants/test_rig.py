@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.law import InnerLoop
+from undertow.models import FloatArray
 from undertow.plants import (
     Amplifier,
     Backlash,
@@ -57,6 +59,25 @@ def test_an_ideal_rig_moves_like_the_sampled_closed_loop(
     loop = ut.ClosedLoop(arm, step=0.001, zoh_steps=1)
     ideal = loop.simulate(x0, base, duration=1.5, terminal=0.0)
     np.testing.assert_allclose(rig.truth, ideal.x[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("period", [0.001, 0.01])
+def test_a_rig_with_a_fast_motor_moves_like_its_equations(period: float) -> None:
+    """Damping that decays by thousands per second: Runge-Kutta's steps of a period blew up."""
+    from scipy.integrate import solve_ivp
+
+    cart = ut.mechanisms.cart_pendulum().with_parameters(b_c=4000.0).with_input_limit(1e4)
+    rig = IdealRig(cart, cart.state(phi=0.1, x_dot=0.5), period)
+    x = rig.truth
+    for k in range(10):
+        u = np.array([2000.0 * (-1) ** k])
+        rig.write(u)
+
+        def rates(_t: float, z: Any, u: FloatArray = u) -> Any:
+            return np.append(z[2:], cart.accelerations(0.0, z, u))
+
+        x = solve_ivp(rates, (0.0, period), x, "LSODA", rtol=1e-10, atol=1e-12).y[:, -1]
+        np.testing.assert_allclose(rig.truth, x, rtol=1e-3, atol=1e-4)
 
 
 def test_same_seed_same_bits_other_seed_other_motion(arm: ut.Mechanism) -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import chdir
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +131,9 @@ def test_a_run_from_objects_is_replayed_where_they_have_names(tmp_path: Path) ->
     )  # fmt: skip
     mine = ut.Objective("mine", lambda v: v.voltage**2 + v.phi**2)
     assert Recipe(rig, objective=mine).in_names() is None
+    arm, *rest = rig.coordinates  # another travel is another mechanism, whatever the equations
+    shorter = replace(rig, coordinates=(replace(arm, low=-1.0, high=1.0), *rest))
+    assert Recipe(shorter, objective="bench-energy").in_names() is None
     assert Recipe(rig, design=ut.Cascade(rig, step=0.001)).in_names() is None
 
 

@@ -43,6 +43,21 @@ def test_units_are_those_of_the_mechanism(recording: Recording) -> None:
     assert (unknown["theta"], unknown["theta_dot"], unknown["voltage"]) == ("", "", "V")
 
 
+def test_a_coordinate_called_like_a_column_of_the_loop_does_not_lend_it_its_unit(
+    recording: Recording,
+) -> None:
+    """A coordinate 'margin' made the law's margin radians; an input 's_0' made s newtons."""
+    names = ("clock", "margin")
+    columns = ["k", "t", "clock", "margin", "s_0", *(f"{n}_" for n in names)]
+    columns += [f"{n}__measured" for n in names] + ["margin_dot", "margin_dot_measured"]
+    columns += ["clock_dot", "clock_dot_measured", "s_0_", "s_0__demand"]
+    meta = {"coordinates": dict.fromkeys(names, "rad"), "units": {"s_0": "N"}}
+    units = column_units(replace(recording, columns=tuple(columns), meta=meta))
+    assert (units["margin"], units["clock"], units["s_0"]) == ("", "s", "")
+    assert (units["margin_"], units["clock__measured"], units["s_0__demand"]) == ("rad", "rad", "N")
+    assert units["margin_dot"] == units["clock_dot_measured"] == "rad/s"
+
+
 def test_a_log_is_not_written_over(recording: Recording) -> None:
     """`undertow export log run.db --mcap run.db` took the log away, and so did `show --save`."""
     before = recording.path.read_bytes()

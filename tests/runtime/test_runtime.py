@@ -398,6 +398,16 @@ def test_a_slow_loop_is_optimised_as_a_quick_one_is(period: float, least: int) -
 
 
 @pytest.mark.slow
+def test_a_motor_that_is_faster_than_the_samples_is_run() -> None:
+    """At 100 Hz the wheels' back-EMF, 241/s, made the estimate wrong and the pendulum fall."""
+    mechanism = "wheeled_inverted_pendulum"
+    recipe = Recipe(mechanism=mechanism, rig="realistic", evaluations=64, period=0.01)
+    with session(recipe, simulated=True) as runtime:
+        report = runtime.run(6.0)
+    assert report.verdict.ending == "balanced"
+
+
+@pytest.mark.slow
 def test_a_mechanism_with_two_inputs_is_held_on_its_realistic_rig() -> None:
     """Motors that stick, encoders too coarse for the paper's boundary layer: held to the end.
 

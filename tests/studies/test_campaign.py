@@ -42,6 +42,7 @@ from undertow.studies.campaign.figures import (
     proved_set,
 )
 from undertow.studies.campaign.run import study_of
+from undertow.studies.survey import survey
 
 pytest.importorskip("zarr")
 distributed = pytest.importorskip("distributed")
@@ -401,6 +402,48 @@ def test_a_shard_that_raises_is_named_and_others_go_on(
     assert content(path) == content(serial)
 
 
+OWN = """
+import sympy as sp
+import undertow as ut
+
+x, a = ut.Coordinate("x", "m", low=-0.8, high=0.8), ut.Coordinate("a", "rad")
+mass = ut.Parameter("m", 0.3, "kg", low=0.0)
+m, v, w, c = mass.symbol, x.velocity, a.velocity, sp.cos(a.symbol)
+own = ut.Mechanism.from_energies(
+    "own", [x, a], [ut.Input("F", "N", 9.0)],
+    kinetic=(1 + m) * v**2 / 2 + m * c * v * w / 4 + m * w**2 / 24, potential=2.5 * m * c,
+    parameters=(mass,), start={"a": 0.1},
+)
+"""
+
+
+@pytest.mark.parametrize(
+    ("said", "edited"),
+    [
+        ("low=-0.8", "low=-0.7"),
+        ('"x", "m"', '"x", "rad"'),
+        ("0.3, ", "0.31, "),
+        ("low=0.0", "low=0.1"),
+        ("9.0", "8.0"),
+        ("0.1}", "0.2}"),
+    ],
+)
+def test_another_mechanism_in_the_same_file_is_another_campaign(
+    said: str, edited: str, tmp_path: Path
+) -> None:
+    """Its travel and units decide results as its equations do: edited, they were the same store."""
+    axes = {"a": {"from": -0.1, "to": 0.1, "count": 2}}
+    keys, surveyed = [], []
+    for folder, text in (("one", OWN), ("two", OWN.replace(said, edited))):
+        path = tmp_path / folder / "own.py"
+        path.parent.mkdir()
+        path.write_text(text)
+        definition = Definition.of(f"{path}:own", kind="region", axes=axes)
+        keys.append(Campaign(definition, tmp_path / "map.zarr").key)
+        surveyed += survey([f"{path}:own"], bounds=False).settings["models"]
+    assert len({*keys}) == len({*surveyed}) == 2
+
+
 def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "store"
     campaign = Campaign(MAP, path)
@@ -490,6 +533,12 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
         ({"axes": {"phi": {"from": np.nan, "to": 1.0, "count": 2}}}, "axes.phi.from.*finite"),
         ({"axes": {"psi": {"from": 0.0, "to": 1.0, "count": 2}}}, "theta, phi"),
         ({"axes": {"phi": {"from": 0.0, "to": 1.0}}}, "axes.phi.count"),
+        ({"axes": {"phi": {"from": 0.0, "to": 1.0, "count": 1}}}, "axes.phi.count.*1 from 0 to 1"),
+        ({"axes": {"phi": {"from": 1.0, "to": 1.0, "count": 9}}}, "axes.phi.count.*9 from 1 to 1"),
+        (
+            {"axes": {a: {"from": 0.0, "to": 1.0, "count": 10**7} for a in ("phi", "theta")}},
+            "shards of the campaign.*1e\\+06",
+        ),
         ({"axes": {}}, "states among theta"),
         ({"at": {"phi": 0.1}}, "one of theta"),
         ({"surface": [1.0, 2.0]}, "4 numbers"),
@@ -503,6 +552,23 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
 def test_wrong_settings_are_refused_by_name(change: dict[str, Any], words: str) -> None:
     with pytest.raises((InvalidInputError, ModelError), match=words):
         Campaign(Definition.of(RIG, **REGION | change), Path("nowhere"))
+
+
+def test_steps_that_a_fast_mode_makes_unstable_are_refused() -> None:
+    """A pendulum in oil: its map said that nothing comes home, and simulated motions did."""
+    crane = ut.mechanisms.overhead_crane()
+    oil, axes = {"b_p": 500.0}, {"x": {"from": 0.2, "to": 0.4, "count": 2}}
+    asked: dict[str, Any] = {"kind": "region", "parameters": oil, "axes": axes}
+    with pytest.raises(InvalidInputError, match=r"'step'.*got 0\.002 s, must be at most"):
+        study_of(Definition.of("overhead_crane", **asked))
+    fine: Any = study_of(Definition.of("overhead_crane", **asked, step=1e-4))
+    found = fine.compute(0)
+    for x, event, home in zip((0.2, 0.4), found["event"], found["time"], strict=True):
+        damped = crane.with_parameters(**oil)
+        loop = ClosedLoop(damped, fine.loop.objective)
+        motion = loop.simulate(damped.state(x=x), fine.surface)
+        assert (event, motion.event) == (Event.REACHED, Event.REACHED)
+        assert home == pytest.approx(motion.time, rel=1e-3)
 
 
 def test_names_of_ones_own_are_spelt_as_they_are_or_refused(tmp_path: Path) -> None:

@@ -90,6 +90,16 @@ class Nothing(Idle):
         return [np.nan if t > 0.5 else 0.0]
 
 
+class Complex(Idle):
+    def step(self, t, x):
+        return [0.1 + 0.1j]
+
+
+class Leaves(Idle):
+    def step(self, t, x):
+        raise SystemExit
+
+
 class Huge(Idle):
     def step(self, t, x):
         return [1e9]
@@ -125,7 +135,7 @@ def found(definition: Definition, *names: str) -> dict[str, dict[str, Any]]:
 def test_what_an_entrant_does_wrong_costs_it_alone(file: Path) -> None:
     wrong = {
         "Raises": "raised", "Unmade": "raised", "Unbegun": "raised", "Wide": "wrong_shape",
-        "Nothing": "not_finite",
+        "Nothing": "not_finite", "Complex": "wrong_shape", "Leaves": "raised",
     }  # fmt: skip
     others = *wrong, "Idle", "Huge"
     rows = found(entered(file, *others, seconds=2.0), *others)
@@ -252,6 +262,26 @@ def test_wrong_entries_are_refused_before_any_work(file: Path) -> None:
         study_of(entered(file, "Idle", "Idle"))
     with pytest.raises(InvalidInputError, match="class or function"):
         study_of(entered(file, "OTHER"))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"limits": {"voltage": 5.0}}, {"parameters": {"m": 0.2}}, {"mechanisms": ["acrobot", RIG]}],
+)
+def test_what_only_a_single_mechanism_can_have_is_refused_beside_a_list(
+    file: Path, changes: dict[str, Any]
+) -> None:
+    """They were taken, kept in the store's definition, and not used."""
+    with pytest.raises(InvalidInputError, match=r"'mechanisms'.*besides"):
+        study_of(entered(file, **changes))
+    alone = study_of(entered(file, **changes | {"mechanisms": []}))
+    assert [m.name for m in alone.studied] == [RIG]
+
+
+def test_a_run_that_ends_before_the_push_is_refused(file: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"'seconds'.*3\.5.*from 4"):
+        study_of(entered(file, tasks=["exact", "push"], seconds=3.5))
+    assert study_of(entered(file, tasks=["exact"], seconds=3.5)).shards == 2
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def floats(what: str, values: ArrayLike, remedy: str = BY_NAME) -> np.typing.NDA
     InvalidInputError
         With what was given instead.
     """
-    if _is_array(values):
+    if _is_array(values) and not np.ma.is_masked(values):  # NumPy would hand over what is hidden
         return np.asarray(values, dtype=np.float64)
     raise InvalidInputError(
         what,

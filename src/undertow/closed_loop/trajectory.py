@@ -19,9 +19,10 @@ from undertow.symbolic import compiled
 if TYPE_CHECKING:
     from undertow.closed_loop.figures import MotionFigure
 
-#: Scores from here on mark inadmissible motions, see :meth:`Batch.score`; the highest an unstable
-#: surface.
-INADMISSIBLE, UNSTABLE = 1e8, 1e10
+#: Scores from here on mark inadmissible motions, see :meth:`Batch.score`: those that break off or
+#: do not arrive, and the highest, an unstable surface's.  No cost comes near, whatever its unit:
+#: that of a crane's kilonewtons, ∫u² dt, is 1e9 N² s.
+INADMISSIBLE, PENALTY, UNSTABLE = 1e100, 1e101, 1e102
 
 #: Rows at either end of a trajectory that a notebook shows.
 SHOWN = 3
@@ -80,7 +81,7 @@ class Batch:
         return np.asarray(self.event == Event.REACHED)
 
     def score(self, horizon: float) -> FloatArray:
-        """Return the cost where admissible, else a graded penalty above 1e9.
+        """Return the cost where admissible, else a graded penalty from ``PENALTY`` on.
 
         The penalty falls with survival time and then with the final distance, so that a
         search can climb out of a region without admissible surfaces.
@@ -97,11 +98,11 @@ def _score(cost, time, event, radius, horizon, scores):  # type: ignore[no-untyp
             scores[i] = cost[i]
         elif event[i] == Event.HORIZON:
             near = math.tanh(radius[i]) if math.isfinite(radius[i]) else 1.0
-            scores[i] = 1e9 * (1.0 + near)
+            scores[i] = PENALTY * (1.0 + near)
         elif event[i] == Event.UNSTABLE:
             scores[i] = UNSTABLE
         else:
-            scores[i] = 1e9 * (3.0 - time[i] / horizon)
+            scores[i] = PENALTY * (3.0 - time[i] / horizon)
 
 
 @dataclass(frozen=True, eq=False)

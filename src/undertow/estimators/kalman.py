@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.estimators.belief import EVEN, Belief, ParameterEstimate
 from undertow.estimators.interface import Estimator
-from undertow.models import FloatArray, Mechanism, require_smooth
+from undertow.models import FloatArray, Mechanism, fastest_rate, require_smooth
 from undertow.plants import Measurement
 from undertow.plants.stepping import compiled_module
 from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
@@ -157,14 +157,14 @@ def readings_after_jump(
 
 
 #: What the filter remembers: ``size`` numbers are estimated, the last ``known`` of them offsets of
-#: parameters, in tolerances; inputs act ``lead`` periods late.
+#: parameters, in tolerances; inputs act ``lead`` periods late; ``fastest``: rate of a mode, 1/s.
 _LAYOUT = {
     "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
     "counts": "n", "late": "1", "now": "n", "share": "n",
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
     "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
-    "excited": "n", "felt": "m",
+    "excited": "n", "felt": "m", "fastest": "1",
 }  # fmt: skip
 
 _BODY = f"""
@@ -229,17 +229,21 @@ def estimate(h, q, u, block, size, lead, known):
     for i in range(m):
         past[start % (lead + 1), i] = max(-limits[i], min(limits[i], u[i]))
     then = past[(start + 1) % (lead + 1)]
-    jacobian(
-        h, x, then, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous, driven
-    )
-    move(h, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
-    moving, louder = learnt, 0.0
-    for i in range(m if disturbed else 0):
-        louder = max(louder, abs(x[2 * n + i]) / limits[i])
-    for i in range(n):
-        if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
-            moving = size
-    predict_covariance(F, P, A, noise, h, moving)
+    parts = max(1, math.ceil(h * fastest[0] - 1e-9))  # of a period: short beside the fastest mode
+    part = h / parts
+    for _ in range(parts):
+        jacobian(
+            part, x, then, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous,
+            driven
+        )
+        move(part, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
+        moving, louder = learnt, 0.0
+        for i in range(m if disturbed else 0):
+            louder = max(louder, abs(x[2 * n + i]) / limits[i])
+        for i in range(n):
+            if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
+                moving = size
+        predict_covariance(F, P, A, noise, part, moving)
     for i in range(n):
         now[i] = variance[i] + (x[n + i] * late[0]) ** 2
         share[i] = 0.0
@@ -259,7 +263,8 @@ def estimate(h, q, u, block, size, lead, known):
         out[i] = x[i]
     for k in range(lead):
         then = past[(start + 2 + k) % (lead + 1)]
-        move(h, out, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
+        for _ in range(parts):
+            move(part, out, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
 """
 
 
@@ -393,7 +398,8 @@ class KalmanFilter(Estimator):
         counts[:] = one_for_each("resolution", resolution, n, zero=True)
         noise = one_for_each("position_noise", position_noise, n)
         self._variance[:] = noise**2 + counts**2 / 12.0
-        memory["late"][0] = time_noise
+        memory["late"][0], memory["fastest"][0] = time_noise, fastest_rate(mechanism)
+        self._parts = max(1, math.ceil(period * memory["fastest"][0] - 1e-9))
         unknown = one_for_each("acceleration_noise", acceleration_noise, n)
         memory["noise"][n : 2 * n] = unknown**2
         memory["noise"][2 * n : self._learnt] = disturbance_drift**2
@@ -482,7 +488,7 @@ class KalmanFilter(Estimator):
         """
         rest, n = self._at_rest(), self.mechanism.n
         size = self._learnt  # parameters stay as they are at rest
-        F, P = rest._F[:size, :size], rest._P[:size, :size]
+        F, P = np.linalg.matrix_power(rest._F[:size, :size], self._parts), rest._P[:size, :size]
         R = np.diag(rest._variance)
         gain = P[:, :n] @ np.linalg.inv(R)  # of a covariance after its update
         ahead = np.linalg.matrix_power(F, self._lead)

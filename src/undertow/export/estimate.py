@@ -20,10 +20,10 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base import one_for_each
+from undertow.base import InvalidInputError, one_for_each
 from undertow.estimators import Estimator, FilteredDerivative, KalmanFilter, SuperTwisting
 from undertow.export.names import LARGEST, macros, template
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, fastest_rate
 from undertow.plants import Measurement
 from undertow.symbolic import C99Emitter, Real, Tape, literal
 
@@ -176,7 +176,14 @@ class KalmanStep:
 
     def gains(self, mechanism: Mechanism, period: float) -> FloatArray:
         """Return K, (2n, n), settled at the target."""
-        n = mechanism.n
+        n, fastest = mechanism.n, fastest_rate(mechanism)
+        if not period * fastest < 2.0:  # its step of the velocities is Euler's
+            raise InvalidInputError(
+                f"period of an exported Kalman filter for '{mechanism.name}'",
+                value=f"{period:g} s",
+                limit=f"below {2.0 / fastest:.3g} s, twice the time constant of its fastest mode",
+                remedy="Use a shorter period, or a differentiator: --velocity derivative",
+            )
         noise, unknown = self.noises(n)
         filter_ = KalmanFilter(mechanism, period, position_noise=noise, acceleration_noise=unknown)
         return np.asarray(filter_.steady_covariance()[:, :n] / noise**2)

@@ -15,7 +15,7 @@ from undertow.export.co_simulation import Groups, Unit, Variable
 from undertow.export.controller import EmbeddedController, plan_numbers
 from undertow.export.estimate import acceleration_code
 from undertow.export.sources import common, controller_files, helpers
-from undertow.models import Coordinate, Mechanism
+from undertow.models import Coordinate, Mechanism, longest_step
 
 
 def _states(coordinates: Sequence[Coordinate]) -> list[tuple[str, str, str]]:
@@ -101,8 +101,8 @@ def controller_variables(controller: EmbeddedController) -> Groups:
 def plant_unit(controller: EmbeddedController, start: ArrayLike | None = None) -> Unit:
     """Return the plant's unit: the controller's belief as it moves, no limit on the inputs.
 
-    The longest internal step is the controller's period; ``start`` is where it starts, (2n,), by
-    default the mechanism's usual start.
+    The longest internal step is the controller's period, or shorter where a mode of the plant is
+    fast; ``start`` is where it starts, (2n,), by default the mechanism's usual start.
     """
     mechanism = controller.mechanism
     parameters = {p.symbol: f"p[{i}]" for i, p in enumerate(mechanism.parameters)}
@@ -123,7 +123,7 @@ def plant_unit(controller: EmbeddedController, start: ArrayLike | None = None) -
         "unit_plant.c",
         values,
         {},
-        controller.period,
+        longest_step(mechanism, controller.period),
         True,
         controller.prefix,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -11,7 +12,7 @@ from undertow.export.controller import EmbeddedController, plan_text
 from undertow.export.estimate import KalmanStep
 from undertow.export.names import LARGEST, STALE_SPAN, PlanAnswer, Status
 from undertow.law import Control, Plan, SlidingModeLaw, Surface
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, longest_step
 from undertow.plants import Measurement
 from undertow.symbolic import literal
 
@@ -161,13 +162,15 @@ def run_positions(controller: EmbeddedController) -> FloatArray:
     twin = Twin(controller)
     x = 0.1 * mechanism.state(**mechanism.start)
     resolution = 2 * np.pi / 2**16
-    rows = np.empty((PERIODS, n))
+    steps = math.ceil(T / longest_step(mechanism, T) - 1e-9)
+    h, rows = T / steps, np.empty((PERIODS, n))
     for k in range(PERIODS):
         rows[k] = np.round(x[:n] / resolution) * resolution
         u, _ = twin.step(rows[k])
-        slope = np.concatenate([x[n:], mechanism.accelerations(0.0, x, u)])
-        middle = x + T / 2 * slope
-        x = x + T * np.concatenate([middle[n:], mechanism.accelerations(0.0, middle, u)])
+        for _ in range(steps):
+            slope = np.concatenate([x[n:], mechanism.accelerations(0.0, x, u)])
+            middle = x + h / 2 * slope
+            x = x + h * np.concatenate([middle[n:], mechanism.accelerations(0.0, middle, u)])
     rows[SHORT, 0] = np.nan
     rows[LONG] = np.nan
     return rows

@@ -20,6 +20,10 @@ from undertow.models.validity import kinks, require_smooth, shortened
 #: Largest |f_u| at a target, as a part of :func:`force_scale`.
 AT_REST = 1e-9
 
+#: Longest Runge-Kutta step in time constants of the fastest mode: a step of the fourth order is off
+#: by 8e-6 of what that mode then has.
+OF_FASTEST = 0.25
+
 #: What counts as no distance from an uncontrollable pair, see :func:`controllability`.
 UNCONTROLLABLE = 1e-9
 
@@ -160,6 +164,25 @@ def linear_numbers(
         else found[1]
     )
     return mass.reshape(count, n, n), slopes, _gain(mechanism, values)
+
+
+def fastest_rate(mechanism: Mechanism) -> float:
+    """Return the largest |λ| of the linear model, 1/s.
+
+    A motor's back-EMF or a damped joint may be a thousand times as fast as the balancing, and a
+    step that is long beside it is off, or unstable.  Where there is no linear model, the force
+    having a kink, nothing is known of modes: then it is 0.
+    """
+    try:
+        return linearise(mechanism).fastest
+    except ModelError:
+        return 0.0
+
+
+def longest_step(mechanism: Mechanism, most: float) -> float:
+    """Return how long Runge-Kutta steps may be, s: ``most``, or less where a mode is fast."""
+    rate = fastest_rate(mechanism)
+    return OF_FASTEST / rate if rate * most > OF_FASTEST else most
 
 
 def linear_accelerations(mechanism: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:

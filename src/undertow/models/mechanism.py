@@ -536,6 +536,16 @@ class Mechanism:
         return hashlib.sha256(f"{self.structure} {values} {limits}".encode()).hexdigest()
 
     @property
+    def identity(self) -> str:
+        """Hash of all that a result can depend on.
+
+        Besides :attr:`fingerprint` these are units and travel of the coordinates, bounds and
+        tolerances of the parameters, and the usual start.
+        """
+        declared = (self.coordinates, self.inputs, self.parameters, dict(self.start))
+        return hashlib.sha256(f"{self.fingerprint} {declared!r}".encode()).hexdigest()
+
+    @property
     def usual_start(self) -> FloatArray:
         """The usual initial state, (2n,).
 

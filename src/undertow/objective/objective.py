@@ -799,7 +799,7 @@ def _failed(what: str, error: Exception) -> InvalidInputError:
 def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
     """Return the smallest of a stage cost's values at the target and at 255 random places.
 
-    NaN where one is no number.
+    NaN where one is no number, or that at the target not finite: nothing could end there.
     """
     rng = np.random.default_rng(0)
     symbols = [*mechanism.x, *mechanism.u]
@@ -809,4 +809,5 @@ def _lowest(mechanism: Mechanism, stage: sp.Expr) -> float:
     samples = rng.uniform(-1, 1, (256, len(symbols))) * reach
     samples[0] = 0.0  # where most costs are least
     with np.errstate(all="ignore"):
-        return float(np.min(np.real_if_close(function(*samples.T)[0])))
+        values = np.broadcast_to(np.real_if_close(function(*samples.T)[0]), len(samples))
+    return float(np.min(values)) if np.isfinite(values[0]) else math.nan

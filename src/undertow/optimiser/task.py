@@ -135,7 +135,7 @@ class Optimisation:
         Rollouts that cost ``hopeless`` times as much as the best one are given up.
 
         What is returned guides a search: admissible plans at their cost; unstable ones at
-        ``UNSTABLE``, others at 1e9 up, see ``Batch.score``; those that just miss the terminal set
+        ``UNSTABLE``, others below it, see ``Batch.score``; those that just miss the terminal set
         or the deadline a little above what they would cost without the miss, which keeps the
         score continuous where the best plans lie.
         """

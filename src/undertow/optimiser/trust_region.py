@@ -14,14 +14,12 @@ import math
 import numpy as np
 from scipy.linalg import lapack
 
+from undertow.closed_loop import INADMISSIBLE
 from undertow.optimiser.cma_es import FloatArray, check_start
 from undertow.symbolic import compiled
 
 #: Lengths tried along a step of the model.
 STRETCHES = np.array([0.35, 0.7, 1.0, 1.4, 2.0, 3.0])
-
-#: Costs from here on are penalties and stay out of the model.
-PENALTY = 1e8
 
 
 class TrustRegion:
@@ -132,7 +130,7 @@ def _learn(x, f, known_x, known_f, count):  # type: ignore[no-untyped-def]
     for k in range(len(f)):
         if f[k] < np.inf and (best < 0 or f[k] < f[best]):
             best = k
-        if f[k] < PENALTY:
+        if f[k] < INADMISSIBLE:  # from there on penalties stay out of the model
             for j in range(x.shape[1]):
                 known_x[count, j] = x[k, j]
             known_f[count] = f[k]

@@ -186,7 +186,8 @@ class Timing:
     measurement_delay
         Age of what is read, s.
     steps
-        Integration steps per period; delays are rounded to one of these.
+        Integration steps per period; delays are rounded to one of these.  Each is divided where a
+        mode of the mechanism is fast.
     source
         Where the numbers come from.
     """

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, at_least
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, longest_step
 from undertow.plants.bench import Amplifier, Backlash, Bench, Encoder, Friction, Timing
 from undertow.plants.interface import Measurement
 from undertow.plants.stepping import RIG_LAYOUT, measure, stepping
@@ -75,7 +75,9 @@ class RealisticRig:
         self._use(Workspace(RIG_LAYOUT, n=n, m=m, p=len(self.mechanism.parameters), **self._sizes))
         memory = self._memory
         memory["x"][:], memory["past"][:] = x0, x0[: self._sizes["seen"]]
-        memory["counts"][1], memory["phase"][:] = timing.steps, draw.uniform(0.0, 1.0, n)
+        fine = math.ceil(timing.step / longest_step(self.mechanism, timing.step) - 1e-9)
+        memory["counts"][1], memory["counts"][3] = timing.steps, fine
+        memory["phase"][:] = draw.uniform(0.0, 1.0, n)
         memory["parameters"][:] = self.mechanism.parameter_values
         self._fill_tables()
         self._t, self._lateness, self._samples = 0.0, 0.0, 0
@@ -229,7 +231,7 @@ class IdealRig(RealisticRig):
     period
         Period of the inner loop, s.
     steps
-        Runge-Kutta steps per period.
+        Runge-Kutta steps per period; more where a mode of the model is fast.
 
     Examples
     --------

@@ -236,10 +236,10 @@ def rk4_step(t, h, elapse, n, x, u, viscous, parameters, stage, total, qdd):
 
 #: What a rig is like and remembers; ``late`` and ``old``: delays of inputs and of readings, in
 #: steps; ``seen``: how many numbers of the state are kept for readings; ``knocks``: how many pushes
-#: there may be.  counts: index of the step, steps per period, stops run into; friction, stops,
-#: amplifier, gap and encoder as :class:`undertow.plants.Bench` has them.
+#: there may be.  counts: index of the step, steps per period, stops run into, Runge-Kutta steps per
+#: step; friction, stops, amplifier, gap and encoder as :class:`undertow.plants.Bench` has them.
 RIG_LAYOUT = {
-    "x": "2 * n", "counts": "3", "u": "m", "drive": "5, m", "held": "late + 1, m",
+    "x": "2 * n", "counts": "4", "u": "m", "drive": "5, m", "held": "late + 1, m",
     "past": "old + 1, seen", "parameters": "p", "friction": "n, 4", "stops": "n, 2",
     "amplifier": "m, 4", "gap": "m, 2", "encoder": "n, 2", "phase": "n",
     "pushes": "knocks, 1 + n", "q": "n", "applied": "m", "work": "8, n * n + 2 * n",
@@ -251,6 +251,7 @@ def advance(t, length, noise, block, late, old, seen, knocks):
     # One period, with the noise of its reading.
 {unpacked(RIG_LAYOUT)}
     h = length / counts[1]
+    fine = h / counts[3]
     W, before, impulse, viscous, gain = work[3], work[4], work[5], work[6], work[7]
     gains(parameters, gain)
     rough, bounded, loose = False, False, False
@@ -274,7 +275,9 @@ def advance(t, length, noise, block, late, old, seen, knocks):
             before[i] = x[i]
         if rough or bounded or loose:
             mobility(x, parameters, W)
-        rk4_step(t, h, 1.0, n, x, applied, viscous, parameters, work[0], work[1], work[2])
+        for k in range(int(counts[3])):
+            rk4_step(t + k * fine, fine, 1.0, n, x, applied, viscous, parameters,
+                     work[0], work[1], work[2])
         if loose:
             backlash_separation(h, x, before, drive, gap, W)
         if rough:

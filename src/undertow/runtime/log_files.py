@@ -61,12 +61,16 @@ def column_units(recording: Recording) -> dict[str, str]:
     if not coordinates and name in LIBRARY:
         coordinates = {c.name: c.unit for c in LIBRARY[name]().coordinates}
     known = {**coordinates, **meta.get("units", {})}
-    found = {}
+    groups, found = Columns.groups(recording.columns), {}
+    own = {name for topic in ("state", "measured", "input", "demand") for name in groups[topic]}
     for column in recording.columns:
+        if column in _UNITS or column not in own:  # the loop's, whatever a coordinate is called
+            found[column] = _UNITS.get(column, "")
+            continue
         plain = Columns.quantity(column)
         plain = plain if plain in known else plain.rstrip("_")
         rate = known.get(plain.removesuffix("_dot"), "") if plain.endswith("_dot") else ""
-        found[column] = known.get(plain) or (f"{rate}/s" if rate else _UNITS.get(column, ""))
+        found[column] = known.get(plain) or (f"{rate}/s" if rate else "")
     return found
 
 

@@ -178,7 +178,10 @@ class Recipe:
                 return None
             values = {p.name: p.value for p in belief.parameters}
             made = replace(made, mechanism=belief.name, parameters=values)
-            if made.belief.fingerprint != belief.fingerprint:
+            if any(
+                getattr(made.belief, part) != getattr(belief, part)
+                for part in ("fingerprint", "coordinates", "parameters")
+            ):
                 return None
         goal = self.objective
         if isinstance(goal, Objective):

@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 from undertow.base import InvalidInputError
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, fastest_rate
 from undertow.plants import Measurement
 from undertow.plants.stepping import compiled_module
 from undertow.runtime.settings import Settings
@@ -35,10 +35,10 @@ PROBE, PROBES, SIDE = 0.2, 0.1, 0.02
 SOUND, NOT_YET, NEVER, LOST, FROZEN, SPARSE, TIMELESS = range(7)
 LAST_HARMLESS = NOT_YET
 
-#: Where the settings of the watch stand: period, s; weight of a step in a share; and what
-#: :class:`.settings.Settings` calls max_innovation, frozen_threshold, sensor_timeout,
+#: Where the settings of the watch stand: period, s; weight of a step in a share; parts of a period;
+#: and what :class:`.settings.Settings` calls max_innovation, frozen_threshold, sensor_timeout,
 #: max_step_interval and max_dropout_ratio.
-PERIOD, INNOVATION, STANDSTILL, TIMEOUT, STALL, WEIGHT, DROPOUT = range(7)
+PERIOD, INNOVATION, STANDSTILL, TIMEOUT, STALL, WEIGHT, DROPOUT, PARTS = range(8)
 
 #: And its times, s: how long it has waited for a first reading; 1 once there was one; our time; the
 #: rig's and ours at the last reading whose time made sense; and at the last one at all.
@@ -47,7 +47,7 @@ WAITED, BEGUN, NOW, RIG_SOUND, OUR_SOUND, RIG_LAST, OUR_LAST = range(7)
 #: What the watch remembers; shares: part of the readings that was missing of late; offs: how far
 #: the readings of the last step were off what was expected, 0 where they were not accepted.
 _LAYOUT = {
-    "settings": "7", "clock": "7", "q": "n", "v": "n", "band": "m", "gain": "n",
+    "settings": "8", "clock": "7", "q": "n", "v": "n", "band": "m", "gain": "n",
     "parameters": "p", "viscous": "n", "W": "n * n", "last": "n", "gaps": "n", "ages": "n",
     "offs": "n",
     "counts": "n", "shares": "n", "quiet": "1", "expected": "2 * n",
@@ -56,18 +56,21 @@ _LAYOUT = {
 
 _BODY = f"""
 {COMPILED}
-def heun_step(h, x, u, viscous, parameters, work):
-    # Heun's step of the belief, in place: readings are compared to far less than its error.
+def heun_step(h, parts, x, u, viscous, parameters, work):
+    # Heun's step of the belief, in place, in parts that are short beside its fastest mode:
+    # readings are compared to far less than its error.
     n = x.shape[0] // 2
     first, second, ahead = work[0], work[1], work[2]
-    forward(0.0, x, u, viscous, parameters, first)
-    for i in range(n):
-        ahead[i] = x[i] + h * x[n + i]
-        ahead[n + i] = x[n + i] + h * first[i]
-    forward(0.0, ahead, u, viscous, parameters, second)
-    for i in range(n):
-        x[i] += 0.5 * h * (x[n + i] + ahead[n + i])
-        x[n + i] += 0.5 * h * (first[i] + second[i])
+    part = h / parts
+    for _ in range(int(parts)):
+        forward(0.0, x, u, viscous, parameters, first)
+        for i in range(n):
+            ahead[i] = x[i] + part * x[n + i]
+            ahead[n + i] = x[n + i] + part * first[i]
+        forward(0.0, ahead, u, viscous, parameters, second)
+        for i in range(n):
+            x[i] += 0.5 * part * (x[n + i] + ahead[n + i])
+            x[n + i] += 0.5 * part * (first[i] + second[i])
 
 
 {COMPILED}
@@ -90,7 +93,7 @@ def gate_measurement(x, u, block):
     h, jump, frozen = settings[{PERIOD}], settings[{INNOVATION}], settings[{STANDSTILL}]
     for i in range(2 * n):
         expected[i] = x[i]
-    heun_step(h, expected, u, viscous, parameters, work)
+    heun_step(h, settings[{PARTS}], expected, u, viscous, parameters, work)
     gains(parameters, gain)
     missing, worst, still, moved = 0, 0, -1, False
     probing = quiet[0] >= {PROBE}
@@ -109,7 +112,7 @@ def gate_measurement(x, u, block):
         if gaps[i] > gaps[worst]:
             worst = i
         if q[i] == last[i]:
-            heun_step(h, free[i], u, viscous, parameters, work)
+            heun_step(h, settings[{PARTS}], free[i], u, viscous, parameters, work)
             coulomb_impulse(h, free[i], band, gain, parameters, W)
             ages[i] += h
             if abs(free[i, i] - q[i]) > frozen:
@@ -201,10 +204,10 @@ class SensorMonitor:
         memory = Workspace(_LAYOUT, n=n, m=mechanism.m, p=len(mechanism.parameters))
         self._block, self._clock, self._gaps = memory.block, memory["clock"], memory["gaps"]
         self._ages, self._quiet, self._shares = memory["ages"], memory["quiet"], memory["shares"]
-        memory["settings"][[PERIOD, INNOVATION, STANDSTILL, TIMEOUT, STALL, WEIGHT, DROPOUT]] = (
+        memory["settings"][:] = (  # in the order of their names
             period, settings.max_innovation, settings.frozen_threshold, settings.sensor_timeout,
             settings.max_step_interval, min(1.0, period / settings.fault_window),
-            settings.max_dropout_ratio,
+            settings.max_dropout_ratio, max(1, math.ceil(period * fastest_rate(mechanism) - 1e-9)),
         )  # fmt: skip
         memory["parameters"][:] = mechanism.parameter_values
         memory["counts"][:] = 0.01

@@ -122,7 +122,7 @@ def survey(
         tasks[name, goal] = partial(
             survey_one, mechanism, objective, goal=goal, seed=seed, bounds=bounds, name=name
         )
-    models = [mechanism.fingerprint for mechanism in chosen.values()]
+    models = [mechanism.identity for mechanism in chosen.values()]
     settings = {"horizon": horizon, "seed": seed, "bounds": bounds, "models": models}
     return Experiment(
         "survey", tuple[str, str, Entry], tasks, settings, report,

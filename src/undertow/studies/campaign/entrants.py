@@ -95,6 +95,8 @@ class Refereed:
         answer = self._call(self.entrant.step, t, x.copy())
         self.seconds.append(time.process_time() - began)
         try:
+            if np.iscomplexobj(answer):  # NumPy would drop the imaginary part
+                raise TypeError("complex numbers")
             u = np.asarray(answer, dtype=float).reshape(-1)
         except (TypeError, ValueError) as error:
             raise ForfeitError(2, f"no numbers: {str(answer)[:80]}") from error
@@ -108,7 +110,7 @@ class Refereed:
     def _call(what: Callable[..., Any], *given: Any) -> Any:
         try:
             return what(*given)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ForfeitError(1, error_text(error)) from error
 
 

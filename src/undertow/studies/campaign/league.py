@@ -36,11 +36,7 @@ from undertow.studies.trials.trial import Outcome, trial
 #: Of the definition of tasks and scores: a change of either makes it another one.
 VERSION = 1
 
-#: The mechanisms, and the tasks: see :meth:`League.bench`.
-MECHANISMS = (
-    "rotary_pendulum", "cart_pendulum", "double_pendulum_on_a_cart", "pendubot", "acrobot",
-    "overhead_crane", "tora", "wheeled_inverted_pendulum", "two_motor_three_link",
-)  # fmt: skip
+#: The tasks: see :meth:`League.bench`.
 TASKS = ("exact", "plants", "friction", "delay", "noise", "push", "bench")
 
 #: Entrants that are scored by hindsight: what the plant itself allows.
@@ -71,7 +67,7 @@ class League(Study):
     :func:`home`.  The cost is that of the objective, along the true motion; entrant ``bound`` is
     what the plant itself allows with hindsight, without friction, noise, delay or push.
 
-    Settings: ``mechanisms``, names, by default nine of the library; ``tasks`` and ``entrants``,
+    Settings: ``mechanisms``, names, by default the one of the campaign; ``tasks`` and ``entrants``,
     lists, by default all; ``plants`` of each task; ``objective``, by default ``effort``;
     ``horizon`` and ``seconds`` of a run; ``seed``.  A shard is one entrant on one mechanism.
     """
@@ -83,9 +79,17 @@ class League(Study):
         self.mechanism = mechanism
         names = settings.names("mechanisms")
         self.mechanisms = tuple(named(name) for name in names) or (mechanism,)
+        if mechanism.identity != self.mechanisms[0].identity:
+            raise InvalidInputError(
+                settings.what("mechanisms"),
+                value=f"{', '.join(names)} besides a 'mechanism', 'parameters' or 'limits'",
+                limit="the mechanisms as the library or their files have them",
+                remedy="Name a changed one alone, with mechanism = …",
+            )
         self.tasks = settings.words("tasks", TASKS)
         self.plants = settings.count("plants", 8, high=10**5)
-        self.length = settings.number("seconds", 10.0, low=1.5, high=1e4)
+        least = 1.5 if "push" not in self.tasks else PUSHED + 1.0
+        self.length = settings.number("seconds", 10.0, low=least, high=1e4)
         horizon = settings.number("horizon", 60.0, low=1e-3, high=1e4)
         word = settings.word("objective", get_args(Goal), "effort")
         self.objectives = tuple(objective_for(m, word, horizon=horizon) for m in self.mechanisms)
@@ -202,7 +206,10 @@ class League(Study):
             entrant = entry.make(mechanism, objective, **setting)
         except MissingExtraError:
             raise
-        except Exception:  # of somebody's code: it has no controller for this mechanism
+        except (
+            Exception,
+            SystemExit,
+        ):  # of somebody's code: it has no controller for this mechanism
             return {"won": 0, "fault": 1}
         referee: list[Refereed] = []
 

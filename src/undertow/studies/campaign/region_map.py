@@ -9,8 +9,8 @@ import numpy as np
 
 from undertow.base import InvalidInputError
 from undertow.closed_loop import ClosedLoop, Event
-from undertow.law import Surface, first_surface
-from undertow.models import FloatArray, Mechanism
+from undertow.law import Surface, feedback_at_target, first_surface
+from undertow.models import FloatArray, Mechanism, fastest_rate, linearise
 from undertow.studies.campaign.definition import Settings, objective_of
 from undertow.studies.campaign.study import Arrays, Study, Variable, axes_of, state_units
 
@@ -48,6 +48,14 @@ class RegionMap(Study):
         )
         step = settings.number("step", 0.002, low=1e-6, high=1.0)
         self.loop = ClosedLoop(mechanism, objective, step=step, tail_rtol=TAIL)
+        fastest = self._fastest()
+        if not step * fastest <= 1.0:
+            raise InvalidInputError(
+                settings.what("step"),
+                value=f"{step:g} s",
+                limit=f"at most {1.0 / fastest:.2g} s, the time constant of the fastest mode",
+                remedy="Longer steps are unstable, and states that come home would seem not to",
+            )
         self.sliding = settings.flag("sliding")
         names = mechanism.state_names
         driven = names[n : n + m] if self.sliding else ()
@@ -67,6 +75,20 @@ class RegionMap(Study):
             "time": Variable("s", "when the motion came home", "float32"),
             "cost": Variable(objective.unit or "1", "what it cost to come home", "float32"),
         }
+
+    def _fastest(self) -> float:
+        """Return the largest |λ| of the linear models, 1/s: the inputs held, and under the law.
+
+        0 where there is no linear model.
+        """
+        rate = fastest_rate(self.mechanism)
+        if not rate > 0:
+            return rate
+        lin = linearise(self.mechanism)
+        under = lin.A + lin.input @ feedback_at_target(
+            self.mechanism, self.surface, self.loop.reaching
+        )
+        return max(rate, float(np.abs(np.linalg.eigvals(under)).max()))
 
     @property
     def _names(self) -> list[str]:

@@ -21,6 +21,7 @@ from undertow.base import (
     Progress,
     ResourceError,
     UndertowError,
+    between,
     error_text,
     no_progress,
     printable,
@@ -45,6 +46,9 @@ KINDS: dict[str, type[Study]] = {
 
 #: Failures after which a campaign ends: what they have in common will not pass.
 MOST_FAILURES = 20
+
+#: Shards of a campaign, at most: each is a file of every array.
+MOST_SHARDS = 10**6
 
 #: How often a worker may die of a shard before it counts as failed.
 DEATHS = 2
@@ -71,6 +75,10 @@ def study_of(definition: Definition) -> Study:
         if definition.code:
             study.enter(definition.code)
         settings.finish()
+        between(
+            "shards of the campaign", study.shards, 1, MOST_SHARDS,
+            remedy="Put more into each with 'shard', or take fewer values along the axes",
+        )  # fmt: skip
         for axis in study.axes:
             if axis.name in (*study.variables, DONE, SHARD):
                 raise InvalidInputError(
@@ -90,11 +98,7 @@ def key_of(definition: Definition) -> str:
         json.dumps(definition.said, sort_keys=True),
         repr([axis.name for axis in study.axes]),  # in the order in which they stand there
         *definition.code_hashes,
-        *(
-            text
-            for mechanism in study.studied
-            for text in (mechanism.fingerprint, repr(mechanism.parameters), repr(mechanism.start))
-        ),
+        *(mechanism.identity for mechanism in study.studied),
     )
 
 
@@ -202,7 +206,7 @@ class Campaign:
         return {
             "title": f"{self.study.kind} of {', '.join(m.name for m in studied)}",
             "definition": self.definition.said | {"mechanism": self.definition.mechanism},
-            "mechanism_fingerprint": " ".join(m.fingerprint for m in studied),
+            "mechanism_identity": " ".join(m.identity for m in studied),
             "seed": self.study.seed,
         } | ({"code": list(self.definition.code), "code_hashes": list(code)} if code else {})
 

@@ -183,7 +183,14 @@ def axes_of(settings: Settings, units: Mapping[str, str]) -> tuple[Axis, ...]:
     axes = []
     for name, table in settings.table("axes").tables(units).items():
         first, last = table.number("from"), table.number("to")
-        values = np.linspace(first, last, table.count("count", low=1, high=10**7))
+        count = table.count("count", low=1, high=10**7)
+        if (first == last) != (count == 1):
+            raise InvalidInputError(
+                table.what("count"),
+                value=f"{count} from {first:g} to {last:g}",
+                limit="1 where both ends are the same, else at least 2",
+            )
+        values = np.linspace(first, last, count)
         table.finish()
         axes.append(Axis(name, values, units[name]))
     return tuple(axes)
