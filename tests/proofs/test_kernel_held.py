@@ -393,8 +393,7 @@ def test_simulated_motions_hold_their_input() -> None:
 def test_a_proved_line_of_the_sampled_loop_is_found() -> None:
     for period, plant, reach in ((0.002, {}, 0.02), (0.001, {"m": (0.124, 0.126)}, 0.01)):
         found = prove_loop(
-            RIG, SURFACE, LAW, coordinate="phi", reach=reach, period=period, plant=plant,
-            duration=4.0,
+            RIG, SURFACE, LAW, starts={"phi": reach}, period=period, plant=plant, duration=4.0,
         )  # fmt: skip
         assert found.verdict, found.verdict
         assert found.verdict.margin == reach
@@ -408,7 +407,7 @@ def test_a_search_refuses_what_it_cannot_be_about() -> None:
         ("plant in a box", {"plant": {"m": (0.1, 0.2)}}),
     ):
         with pytest.raises(InvalidInputError, match=words):
-            prove_loop(RIG, SURFACE, LAW, coordinate="phi", reach=0.1, **more)
+            prove_loop(RIG, SURFACE, LAW, starts={"phi": 0.1}, **more)
 
 
 # -- what is kept ---------------------------------------------------------------------------------

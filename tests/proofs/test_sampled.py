@@ -53,6 +53,8 @@ def test_sampled_starts_converge_or_are_refuted_with_a_witness() -> None:
         (["--hold", "1"], "without --loop"),
         (["--loop", "--hold", "-1"], "0 to 100"),
         (["--seconds", "0", "--within", "m=5"], "without a region"),
+        (["--loop-seconds", "60"], "without --loop"),
+        (["--loop", "--loop-seconds", "0"], "in (0, 100000)"),
         (["--loop", "--within", "m=5"], "a held input"),
         (["--loop", "--hold", "1", "--within", "mass=5"], "mass=5"),
         (["--loop", "--hold", "1", "--within", "m=120"], "m=120"),

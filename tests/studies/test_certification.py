@@ -145,7 +145,7 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
     claim, sound = LoopClaim(stated.claim.data()), Verdict("starts", "proved", 0.68, "rad")
     reaches: list[float] = []
 
-    def prove(asked: decide._Decisions, hold: int) -> tuple[LoopClaim, Verdict]:
+    def prove(asked: decide._Decisions, hold: int, seconds: float) -> tuple[LoopClaim, Verdict]:
         reaches.append(np.degrees(asked.start[1]))
         return claim, sound
 

@@ -50,6 +50,7 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
     "undertow certify cart_pendulum --seconds 30 --out proof",
     "undertow certify rotary_pendulum --run --start phi=40deg --set d_e=0.025 --out proof",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=20deg --out proof",
+    "undertow certify tora --loop --seconds 0 --start theta=0.3rad --start x=0.12m --out proof",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=10deg --hold 1",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=5deg --hold 1 --within m=2",
     "undertow certify --appendix",
@@ -67,6 +68,7 @@ def certify(
     horizon: options.Horizon = 60.0,
     seconds: float | None = None,
     loop: bool = False,
+    loop_seconds: float | None = None,
     hold: int = 0,
     within: list[str] | None = None,
     seed: options.Seed = 0,
@@ -87,8 +89,12 @@ def certify(
     seconds
         Time to search for each region on the surface, s; 0 skips the search.
     loop
-        Also prove from how far the closed loop converges when it starts at rest: up to the start
-        state, or as far as the proof goes. Takes minutes.
+        Also prove from how far off the target the closed loop converges: along a line up to the
+        start where that names one state, else in a box of all that it names, each with both signs;
+        as much of it as the search gets to.
+    loop_seconds
+        With --loop: time to search for that, s; 300 by default. The proof takes about as much
+        again.
     hold
         With --loop: how long the input is held, whole ms; 0 is a continuous input.
     within : NAME=PERCENT
@@ -102,13 +108,16 @@ def certify(
 
     given = f"{name or 'no mechanism'}{' and --appendix' if appendix else ''}"
     alone, whole = "one of them: a run has its own surfaces", "whole ms, 0 to 100"
-    timed = seconds is None or 0 <= seconds < 1e5
+    timed, own = seconds is None or 0 <= seconds < 1e5, "an option of the loop's proof"
+    effort = certification.LOOP_SECONDS if loop_seconds is None else loop_seconds
     region = not run and (bool(seconds) if seconds is not None or appendix else True)
     for good, what, value, limit in (
         (appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix"),
         (not (run and surface is not None), "--surface with --run", surface, alone),
         (timed, "--seconds", seconds, "in [0, 100000)"),
-        (loop or not hold, "--hold", "without --loop", "an option of the loop's proof"),
+        (0 < effort < 1e5, "--loop-seconds", loop_seconds, "in (0, 100000)"),
+        (loop or loop_seconds is None, "--loop-seconds", "without --loop", own),
+        (loop or not hold, "--hold", "without --loop", own),
         (
             loop or region or not within,
             "--within",
@@ -126,7 +135,7 @@ def certify(
         if appendix:
             mechanism = mechanism_named("rotary_pendulum", setting)
             cases = certification.certify_appendix(
-                mechanism, seconds=seconds or 0.0, loop=loop, hold=hold,
+                mechanism, seconds=seconds or 0.0, loop=loop, loop_seconds=effort, hold=hold,
                 uncertain=_box(mechanism, within), progress=progress,
             )  # fmt: skip
             certified, report = cases, certification.appendix_report(cases)
@@ -142,7 +151,8 @@ def certify(
             used = parse_surface(mechanism, surface) if surface else first_surface(mechanism)
             one = certification.certify_surface(
                 mechanism, used, x0, seconds=60.0 if seconds is None else seconds,
-                loop=loop, hold=hold, uncertain=_box(mechanism, within), progress=progress,
+                loop=loop, loop_seconds=effort, hold=hold, uncertain=_box(mechanism, within),
+                progress=progress,
             )  # fmt: skip
             certified, report = (one,), certification.subject_report(mechanism, one)
         written = write(out, lambda: _files(mechanism, certified, progress))

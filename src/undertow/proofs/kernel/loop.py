@@ -130,7 +130,7 @@ class Loop:
             at = int((width / size).argmax())
             if steps > MOST_STEPS or not width[at] > size[at] * THINNEST:
                 return Arrival(False, part.mean(axis=1), tubes, steps, latest * unit)
-            todo += _halves(part, at)
+            todo += halves(part, at)
         return Arrival(True, np.empty(0), tubes, steps, latest * unit)
 
 
@@ -231,7 +231,7 @@ class HeldLoop(Loop):
             if not len(part) or tried > MOST_PLANTS:
                 return why, margin
             width = (part[:, 1] - part[:, 0]) / (whole[:, 1] - whole[:, 0] + 1e-300)
-            todo += _halves(part, int(width.argmax()))
+            todo += halves(part, int(width.argmax()))
         return "", least
 
     def slopes(self, X: FloatArray) -> tuple[FloatArray, Sampled]:
@@ -262,7 +262,7 @@ class HeldLoop(Loop):
         return ("" if margin > 0.0 else "|W z| is not shown to fall"), margin
 
 
-def _halves(box: FloatArray, at: int) -> list[FloatArray]:
+def halves(box: FloatArray, at: int) -> list[FloatArray]:
     """Return a box (N, 2) cut across one side."""
     lower, upper = box.copy(), box.copy()
     lower[at, 1] = upper[at, 0] = 0.5 * box[at, 0] + 0.5 * box[at, 1]

@@ -1,4 +1,4 @@
-"""The search behind a proof of the closed loop: a terminal set, and how to cut a line of starts.
+"""The search behind a proof of the closed loop: a terminal set, and how to cut the starts.
 
 Nothing here proves anything: what is found is decided by
 :meth:`undertow.proofs.LoopClaim.decide`, from its numbers alone.
@@ -7,12 +7,12 @@ Nothing here proves anything: what is found is decided by
 from __future__ import annotations
 
 import itertools
+import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
@@ -26,13 +26,13 @@ from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import STEP
-from undertow.proofs.kernel.loop import MOST_OF_ONE, ContinuousLoop, HeldLoop, Loop
-from undertow.proofs.kernel.model import Law, Model, scale_of
+from undertow.proofs.kernel.loop import MOST_OF_ONE, ContinuousLoop, HeldLoop, Loop, halves
+from undertow.proofs.kernel.model import Law, Model, scale_of, system
 from undertow.proofs.require import require
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.
-MOTIONS, THINNEST = 24, 2.0**-13
+MOTIONS, THINNEST = 24, 2.0**-16
 
 #: Time that a tube may take beyond twice that of the longest before it, s: then it is too wide.
 PATIENCE = 0.5
@@ -40,13 +40,17 @@ PATIENCE = 0.5
 #: How a box of starts grows after one whose tube arrived, and shrinks after one that was lost.
 WIDER, THINNER = 1.25, 0.5
 
-#: Parts that a box of plants is cut into before a start is given up.
-MOST_PARTS = 64
+#: Parts that a box of plants is cut into before a start is given up; the part of a box of starts
+#: that is tried first, and the pieces that it may be cut into.
+MOST_PARTS, FIRST_BOX, MOST_PIECES = 64, 2.0**-5, 10_000
+
+#: By how many times the pieces of a box may become more for one that is larger; its least growth.
+MORE_PIECES, LEAST_WIDER = 8, 1.02
 
 
 @dataclass(frozen=True)
 class ProvedLoop:
-    """A line of starts.
+    """Starts from which the loop converges.
 
     Parameters
     ----------
@@ -124,22 +128,21 @@ def prove_loop(
     surface: Surface,
     reaching: ReachingLaw | None = None,
     *,
-    coordinate: str,
-    reach: float,
+    starts: Mapping[str, float],
     period: float = 0.0,
     plant: Mapping[str, tuple[float, float]] | None = None,
     duration: float = 15.0,
     seconds: float = 300.0,
     progress: Callable[[str], None] | None = None,
 ) -> ProvedLoop:
-    """Prove that the loop converges from rest, one coordinate off the target, as far as it can.
+    """Prove that the loop converges from as far off the target as it can.
 
     Parameters
     ----------
-    coordinate
-        Which one.
-    reach
-        Starts beyond this are not tried, SI units.
+    starts
+        States that are off the target, and by how much at most, SI units; the others are 0. With
+        one, a line of starts grows piece by piece; with several, a box of this shape, all of them
+        at once, grows as a whole.
     period
         The law's input is held for so long, s, as the decimal that it is written as; 0: renewed at
         every instant.
@@ -159,15 +162,21 @@ def prove_loop(
     Raises
     ------
     InvalidInputError
-        For a coordinate that the mechanism does not have, a reach that is not positive, or a plant
-        in a box whose input is not held.
+        For a state that the mechanism does not have, a size that is not positive, or a plant in a
+        box whose input is not held.
     InfeasibleError
         When not even the first box could be proved.
     """
-    started, names = time.process_time(), [c.name for c in mechanism.coordinates]
-    require(coordinate in names, "coordinate of the starts", coordinate, ", ".join(names))
-    for what, value in (("reach of the starts", reach), ("duration", duration)):
-        require(np.isfinite(value) and value > 0, what, value, "finite, > 0")
+    started = time.process_time()
+    names = [c.name for c in mechanism.coordinates]
+    names += [f"{name}_dot" for name in names]
+    require(bool(starts), "starts of the loop", "none", "one state or more")
+    for name, value in starts.items():
+        require(name in names, "state of the starts", name, ", ".join(names))
+        good = bool(np.isfinite(value) and value > 0)
+        require(good, f"size of the starts in {name}", value, "finite, > 0")
+    good = bool(np.isfinite(duration) and duration > 0)
+    require(good, "duration", duration, "finite, > 0")
     good = np.isfinite(period) and 0 <= period <= 0.1
     require(good, "period of a held input", period, "0 to 0.1 s")
     remedy = "Take the period of the sampler, such as 0.001 s"
@@ -176,19 +185,38 @@ def prove_loop(
     )
     law = ReachingLaw() if reaching is None else reaching
     task = _Task(
-        mechanism, surface, law, coordinate, reach, Fraction(repr(float(period))), dict(plant or {})
+        mechanism, surface, law, dict(starts), Fraction(repr(float(period))), dict(plant or {})
     )
     loop, known = task.aimed(duration)
-    index = names.index(coordinate)
+    grow = _longest_line if len(starts) == 1 else _largest_box
+    part, cuts = grow(task, loop, started + seconds, progress or (lambda _: None))
+    if not part:
+        raise InfeasibleError(
+            f"proved starts of the loop with {surface}",
+            value="no tube ended in the terminal set",
+            limit=f"boxes down to {THINNEST:.2g} of what was asked for",
+            remedy="Give smaller starts, or more time",
+        )
+    found = LoopClaim(task.claim(known, part, cuts).data())
+    verdict = found.decide(mechanism, surface, law)
+    return ProvedLoop(found, verdict, time.process_time() - started)
+
+
+#: How much of the starts a search has, and where they and the plants are cut.
+_Grown = tuple[float, dict[str, list[float]]]
+
+
+def _longest_line(task: _Task, loop: Loop, until: float, progress: Callable[[str], None]) -> _Grown:
+    """Put one piece after another along one state, as wide as its tube bears, until a time."""
+    ((name, reach),) = task.starts.items()
+    index = task.model.states.index(name)
     # Around the edge of the layer a box is a small part of it, or its tube crosses for long.
-    weight = np.abs(surface.position_row[:, index]).max()
-    width = min(reach / 32, 0.15 * float(np.min(law.layer)) / max(weight, 1e-12))
-    edges, box = [0.0], np.zeros((2 * mechanism.n, 2))
+    weight = np.abs(task.surface.matrix[:, index]).max()
+    width = min(reach / 32, 0.15 * float(np.min(task.law.layer)) / max(weight, 1e-12))
+    edges, box = [0.0], np.zeros((len(task.model.states), 2))
     parts, latest, patience = _sliced(task.box, 0), 0, int(PATIENCE / loop.step[1])
-    while edges[-1] < reach and width > reach * THINNEST:
+    while edges[-1] < reach and width > reach * THINNEST and time.process_time() < until:
         box[index] = edges[-1], min(edges[-1] + width, reach)
-        if time.process_time() - started > seconds:
-            break
         there, most = True, 2 * latest + patience if len(edges) > 1 else MOST_OF_ONE
         for part in parts:
             taken, there = loop.follow(np.vstack([box, part]), most)
@@ -199,23 +227,76 @@ def prove_loop(
             parts, width = _sliced(task.box, len(parts)), 2 * width
         if there:
             edges.append(float(box[index, 1]))
-            if progress is not None and len(edges) % 20 == 0:
-                progress(f"proved up to {coordinate} = {edges[-1]:.4g}")
+            if len(edges) % 20 == 0:
+                progress(f"proved up to {name} = {edges[-1]:.4g}")
         width *= WIDER if there else THINNER
-    if len(edges) < 2:
-        raise InfeasibleError(
-            f"proved starts of the loop with {surface}",
-            value="no tube ended in the terminal set",
-            limit=f"boxes down to {reach * THINNEST:.2g} of {coordinate}",
-            remedy="Give a smaller reach",
-        )
-    cuts = {coordinate: tuple(Fraction(v) for v in edges[1:-1])}
-    for j, name in enumerate(task.varied):
-        ends = sorted({Fraction(float(v)) for part in parts for v in part[j]})
-        cuts[name] = tuple(ends[1:-1])
-    found = LoopClaim(task.claim(known, Fraction(edges[-1]), cuts).data())
-    verdict = found.decide(mechanism, surface, law)
-    return ProvedLoop(found, verdict, time.process_time() - started)
+    cuts = {name: edges[1:-1]}
+    for j, varied in enumerate(task.varied):
+        cuts[varied] = sorted({float(v) for part in parts for v in part[j]})[1:-1]
+    return edges[-1] / reach, cuts
+
+
+def _largest_box(task: _Task, loop: Loop, until: float, progress: Callable[[str], None]) -> _Grown:
+    """Grow a box of states, cut into a grid of pieces, until a time.
+
+    Where one of them is lost, all are cut more finely: across the state, or the parameter, whose
+    halves of that piece get farthest.  Where that is not enough a few times, the box is to grow by
+    less.
+    """
+    names, size = (*task.model.states, *task.varied), len(task.model.states)
+    ends = [task.starts.get(name, 0.0) for name in task.model.states]
+    whole = np.vstack([np.column_stack([np.negative(ends), ends]), task.box])
+    wide = np.flatnonzero(np.ptp(whole, axis=1)).tolist()
+    odd = system(task.model, task.numbers).odd
+    if odd:  # one side of one state will do (Lemma 9)
+        whole[wide[0], 0] = 0.0
+    count, part, near = np.ones(len(whole), dtype=int), FIRST_BOX, whole[:, 1]
+    done, most = (0.0, dict[str, list[float]]()), MOST_OF_ONE
+    wider, proved = WIDER, count
+    while count.prod() <= MOST_PIECES and wider > LEAST_WIDER:
+        box = np.vstack([part * whole[:size], task.box])
+        edges = [np.linspace(a, b, n + 1) for (a, b), n in zip(box, count, strict=True)]
+        pieces = np.array([*itertools.product(*map(itertools.pairwise, edges))])
+        # The next one that is lost is most likely to be where the last one was.
+        away = np.abs(pieces.mean(axis=-1) - near)[:, wide] / np.ptp(box, axis=1)[wide]
+        pieces = pieces[np.argsort(away.max(axis=1), kind="stable")]
+        bad, latest = _first_lost(loop, pieces, most, until)
+        if time.process_time() > until:
+            break
+        if bad is None:
+            if odd:
+                edges[wide[0]] = np.concatenate([-edges[wide[0]][:0:-1], edges[wide[0]]])
+            cuts = {names[j]: edges[j][1:-1].tolist() for j in wide if len(edges[j]) > 2}
+            done, most = (part, cuts), 2 * latest + int(PATIENCE / loop.step[1])
+            progress(f"proved {part:.3g} of the box, by {len(pieces)} tubes")
+            if part == 1.0:
+                break
+            part, proved = min(1.0, wider * part), count.copy()
+        elif done[0] and count.prod() >= MORE_PIECES * proved.prod():
+            wider, count = wider**0.5, proved.copy()
+            part = min(1.0, wider * done[0])
+        else:
+            halved = [_first_lost(loop, halves(bad, j), most, until) for j in wide]
+            far = [np.inf if lost is None else steps for lost, steps in halved]
+            finer = wide[int(np.argmax(far))]
+            count[finer] = math.ceil(1.5 * count[finer])
+            near = bad.mean(axis=-1)
+    return done
+
+
+def _first_lost(
+    loop: Loop, boxes: Iterable[FloatArray], most: int, until: float
+) -> tuple[FloatArray | None, int]:
+    """The first box whose tube is lost, and after how many steps; else the most that one takes."""
+    latest = 0
+    for box in boxes:
+        taken, there = loop.follow(box, most)
+        if not there:
+            return box, taken
+        latest = max(latest, taken)
+        if time.process_time() > until:
+            break
+    return None, latest
 
 
 def _sliced(box: FloatArray, before: int) -> list[FloatArray]:
@@ -236,8 +317,7 @@ class _Task:
     mechanism: Mechanism
     surface: Surface
     law: ReachingLaw
-    coordinate: str
-    reach: float
+    starts: Mapping[str, float]
     period: Fraction
     plant: Mapping[str, tuple[float, float]]
 
@@ -264,12 +344,13 @@ class _Task:
         return {k: (Fraction(float(a)), Fraction(float(b))) for k, (a, b) in self.plant.items()}
 
     def claim(
-        self, end: kernel.TerminalEllipsoid, reach: Fraction, cuts: dict[str, Any]
+        self, end: kernel.TerminalEllipsoid, part: float, cuts: Mapping[str, Sequence[float]]
     ) -> kernel.ClosedLoop:
-        """Return the claim about starts at rest up to a reach."""
-        still, starts = (Fraction(0),) * self.mechanism.n, {self.coordinate: (-reach, reach)}
-        zero = Fraction(0)
-        return kernel.ClosedLoop(starts, self.period, self.exact_box, still, zero, end, cuts)
+        """Return the claim about a part of the starts."""
+        zero, most = Fraction(0), {k: Fraction(part * v) for k, v in self.starts.items()}
+        starts, still = {k: (-v, v) for k, v in most.items()}, (zero,) * self.mechanism.n
+        where = {k: tuple(map(Fraction, v)) for k, v in cuts.items()}
+        return kernel.ClosedLoop(starts, self.period, self.exact_box, still, zero, end, where)
 
     def aimed(self, duration: float) -> tuple[Loop, kernel.TerminalEllipsoid]:
         """Return the loop with a proved terminal set that simulated motions enter early.
@@ -282,8 +363,10 @@ class _Task:
         n, period = self.mechanism.n, float(self.period)
         steered = SlidingModeLaw(self.mechanism, self.surface, self.law)
         x = np.zeros((MOTIONS, 2 * n))
-        index = [c.name for c in self.mechanism.coordinates].index(self.coordinate)
-        x[:, index] = np.linspace(self.reach / MOTIONS, self.reach, MOTIONS)
+        for j, (name, size) in enumerate(self.starts.items()):
+            signs = 1 - 2 * (np.arange(MOTIONS) >> j & 1)  # of corners, in turn
+            ends = np.linspace(size / MOTIONS, size, MOTIONS)
+            x[:, self.model.states.index(name)] = signs * ends
         every = max(1, round(0.005 / period)) if period else 4
         path = follow(steered, x, duration, every, period)[0]
         if not period:
@@ -313,8 +396,8 @@ class _Task:
         raise InfeasibleError(
             f"terminal set of {self.surface}",
             value="no motion enters a proved ellipsoid",
-            limit=f"from rest up to {self.coordinate} = {self.reach:.4g}, within {duration:g} s",
-            remedy="Take a longer duration, a smaller reach, a shorter period or a smaller box",
+            limit=f"starts up to {self.starts}, within {duration:g} s",
+            remedy="Take a longer duration, smaller starts, a shorter period or a smaller box",
         )
 
     def _coordinates(self, x: FloatArray) -> FloatArray:

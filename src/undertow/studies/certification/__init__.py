@@ -1,6 +1,7 @@
 """What `undertow certify` and `undertow verify` do: claims composed, shown, drawn, written."""
 
 from undertow.studies.certification.decide import (
+    LOOP_SECONDS,
     Certified,
     certify_appendix,
     certify_run,
@@ -17,6 +18,7 @@ from undertow.studies.certification.report import (
 )
 
 __all__ = [
+    "LOOP_SECONDS",
     "Certified",
     "Verification",
     "appendix_report",

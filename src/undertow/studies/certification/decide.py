@@ -53,11 +53,14 @@ MOST_BOXES = 3_000_000
 #: How far random starts of the appendix's cases are looked for, rad.
 FAR = math.radians(46)
 
+#: Process time of a search for starts of the whole closed loop, s; their proof takes as much again.
+LOOP_SECONDS = 300.0
+
 #: Part of what one disturbance alone may be that is claimed: rounding away from the edge.
 CLAIMED = 0.999
 
-#: About how long what comes first takes, the whole closed loop, and what is sampled at last, s.
-FIRST, LOOP, LAST = 0.6, 120.0, 5.0
+#: About how long what comes first takes, and what is sampled at last, s.
+FIRST, LAST = 0.6, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +88,7 @@ def certify_surface(
     title: str = "",
     seconds: float = 60.0,
     loop: bool = False,
+    loop_seconds: float = LOOP_SECONDS,
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
     predict: bool = True,
@@ -94,15 +98,16 @@ def certify_surface(
 
     The positions of ``start``, (2n,), with both signs, span the region in which the law must exist,
     and say which way the region of attraction should reach; ``seconds``, s, is the effort for its
-    search, 0 leaves it out. ``loop`` also proves how far off the target the full closed loop may
-    start at rest, which takes minutes; for that the input is held for ``hold`` ms (0: renewed at
-    every instant). ``uncertain`` plant parameters lie in [low, high] instead of being the law's
+    search, 0 leaves it out. ``loop`` also proves from how much of the start the full closed loop
+    converges, all of its states at once with both signs, in a search of ``loop_seconds`` and a
+    proof of about as long; for that the input is held for ``hold`` ms (0: renewed at every
+    instant). ``uncertain`` plant parameters lie in [low, high] instead of being the law's
     own: for the closed loop with a held input, and for a second region on the surface. ``predict``
     also predicts the motion from the start, and from random ones up to it (sampled). The ``title``
     is for tables, the surface itself by default.
     """
     began = time.perf_counter()
-    most = FIRST + seconds + (LOOP if loop else 0.0) + (LAST if predict else 0.0)
+    most = FIRST + seconds + (2 * loop_seconds if loop else 0.0) + (LAST if predict else 0.0)
 
     def tell(what: str, after: float) -> None:
         """Say what comes after so many of the seconds that all may take."""
@@ -130,7 +135,7 @@ def certify_surface(
                 keep(*decide.region_in_box(region))
         if loop:
             tell("the whole closed loop", FIRST + seconds)
-            keep(*decide.loop(hold))
+            keep(*decide.loop(hold, loop_seconds))
         if predict and start.any():
             tell("prediction", most - LAST)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
@@ -255,20 +260,22 @@ class _Decisions:
             return None, Verdict(words, "undecided", method="no start is shown inside")
         return self.own(RegionClaim(chain, point, box))
 
-    def loop(self, hold: int) -> _Decided:
-        """How far off the target the first free coordinate that starts there may start at rest."""
-        mechanism = self.mechanism
-        free = mechanism.coordinates[mechanism.m :]
-        away = np.abs(self.start[mechanism.m : mechanism.n])
-        index = int(np.argmax(away))
-        reach = float(away[index]) or (1.0 if free[index].unit == "rad" else 0.5)
-        about, name = (mechanism, self.surface, self.law), free[index].name
+    def loop(self, hold: int, seconds: float) -> _Decided:
+        """How far off the target the states that the start is off may be, all at once."""
+        mechanism, names = self.mechanism, [c.name for c in self.mechanism.coordinates]
+        names += [f"{name}_dot" for name in names]
+        off = zip(names, np.abs(self.start).tolist(), strict=True)
+        starts = {name: size for name, size in off if size}
+        if not starts:
+            free = mechanism.coordinates[mechanism.m]
+            starts = {free.name: 1.0 if free.unit == "rad" else 0.5}
         try:
             proved = prove_loop(
-                *about, coordinate=name, reach=reach, period=hold / 1000, plant=self.uncertain
-            )
+                mechanism, self.surface, self.law, starts=starts, period=hold / 1000,
+                plant=self.uncertain, seconds=seconds,
+            )  # fmt: skip
         except UndertowError as error:
-            words = "the full closed loop converges from rest"
+            words = "the full closed loop converges from around the target"
             return None, Verdict(words, "undecided", method=str(error))
         return proved.claim, proved.verdict
 
@@ -328,16 +335,17 @@ def certify_appendix(
     *,
     seconds: float = 0.0,
     loop: bool = False,
+    loop_seconds: float = LOOP_SECONDS,
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
     progress: Progress = no_progress,
 ) -> tuple[Certified, ...]:
     """Decide the appendix's five cases, with a P of our own, for a rotary pendulum.
 
-    ``seconds``, ``hold`` and ``uncertain`` are as for :func:`certify_surface`. ``loop`` also proves
-    how far off the target the full closed loop may start at rest, up to where random starts of the
-    law at every instant, on the plant that it knows, still converge; their verdict is a remark.
-    Minutes for each case.
+    ``seconds``, ``loop_seconds``, ``hold`` and ``uncertain`` are as for :func:`certify_surface`.
+    ``loop`` also proves how far off the target the full closed loop may start at rest, up to where
+    random starts of the law at every instant, on the plant that it knows, still converge; their
+    verdict is a remark. Minutes for each case.
     """
     constants = Constants.of(mechanism)
     certified = []
@@ -358,7 +366,7 @@ def certify_appendix(
             sampled = sampled_extent(closed, case.surface, "phi", FAR)
             limit = mechanism.state(phi=float(sampled.details["extent"]))
             decide = _Decisions(mechanism, case.surface, law, limit, dict(uncertain or {}))
-            decide.keep(*decide.loop(hold))
+            decide.keep(*decide.loop(hold, loop_seconds))
             subject = replace(
                 subject,
                 claims=(*subject.claims, *decide.claims),

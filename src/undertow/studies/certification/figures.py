@@ -217,17 +217,17 @@ FOLLOWED = 15.0
 def loop_figure(
     mechanism: Mechanism, surface: Surface, reaching: ReachingLaw, claim: LoopClaim, title: str
 ) -> Figure:
-    """Draw proved and unproved starts at rest with their motions under the clipped law.
+    """Draw proved and unproved starts with their motions under the clipped law.
 
-    Left: the first coordinate that varies, over time.  Right: the same coordinate and its rate,
+    Motions begin on the way to the outermost corner of the starts, and beyond it.  Left: the first
+    coordinate that varies, itself or its rate, over time.  Right: the same coordinate and its rate,
     with the shadow of the terminal set, until a motion enters it.
     """
     box, (W, radius) = claim.box(mechanism), claim.terminal(mechanism, surface)
-    index = int((box[:, 1] > box[:, 0]).argmax())
-    extent = float(box[index, 1])
+    index = int((box[:, 1] > box[:, 0]).argmax()) % mechanism.n
+    partner = mechanism.n + index
     ratio = np.linspace(0.0, BEYOND, STARTS + 1)[1:]
-    x = np.zeros((STARTS, 2 * mechanism.n))
-    x[:, index] = ratio * extent
+    x = ratio[:, None] * box[:, 1]
     law = SlidingModeLaw(mechanism, surface, reaching)
     path, times = follow(law, x, FOLLOWED, every=1, period=claim.period)
     with np.errstate(all="ignore"):
@@ -244,23 +244,25 @@ def loop_figure(
     with style():
         figure = Figure(figsize=(8.6, 4.0), layout="constrained")
         left, right = figure.subplots(1, 2)
-        partner = mechanism.n + index
         for k in range(1, last, max(1, last // 16)):
             _line(left, times, factor * path[:, k, index], ratio[k], bool(home[k]))
             _line(right, factor * path[:, k, index], rate * path[:, k, partner], ratio[k], True)
         if not home.all():
             _line(left, times, factor * path[:, last, index], ratio[last], False)
-        wide = factor * extent
-        bar = {"color": COLOURS["blue"], "solid_capstyle": "butt"}
+        wide, high = factor * box[index, 1], rate * box[partner, 1]
+        bar = {"color": COLOURS["blue"], "solid_capstyle": "butt", "solid_joinstyle": "bevel"}
         left.plot([0, 0], [-wide, wide], lw=6, clip_on=False, zorder=4, **bar)
-        shown = factor * path[:, :last, index]
-        left.set_ylim(1.1 * min(shown.min(), -wide), 1.1 * factor * x[last, index])
+        shown = factor * path[times <= shown_time, :last, index]
+        farthest = max(shown.max(), factor * x[last, index])
+        left.set_ylim(1.1 * min(shown.min(), -wide), 1.1 * farthest)
         left.set_xlim(0.0, shown_time)
         left.set_xlabel("t (s)")
         left.set_ylabel(f"{name} ({unit})")
-        right.plot([-wide, wide], [0.0, 0.0], lw=4, **bar)
+        corners = [wide, wide, -wide, -wide, wide], [-high, high, high, -high, -high]
+        right.plot(*corners, lw=4, **bar)
         edge = _shadow(np.asarray(radius * np.linalg.inv(W)[[index, partner]]))
         right.fill(factor * edge[0], rate * edge[1], color=COLOURS["green"], zorder=5)
+        right.set_xlim(left.get_ylim())
         right.set_xlabel(f"{name} ({unit})")
         right.set_ylabel(f"d{name}/dt ({rate_unit})")
         handles = [

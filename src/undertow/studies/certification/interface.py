@@ -14,7 +14,7 @@ from undertow.models import Mechanism, StateLike
 from undertow.proofs import Certificate, read_certificate
 from undertow.proofs.claims.verify import Checked
 from undertow.proofs.claims.verify import verify as decide
-from undertow.studies.certification.decide import certify_surface
+from undertow.studies.certification.decide import LOOP_SECONDS, certify_surface
 
 
 @checked
@@ -26,6 +26,7 @@ def certify(
     reaching: ReachingLaw = ReachingLaw(),
     seconds: float = 60.0,
     loop: bool = False,
+    loop_seconds: float = LOOP_SECONDS,
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
     progress: Progress | None = None,
@@ -46,7 +47,10 @@ def certify(
     seconds
         Effort for the region on the surface, s; 0 leaves it out.
     loop
-        Also prove how far off the target the full closed loop may start at rest: minutes.
+        Also prove how much of x0 the full closed loop may start at: along a line where x0 has one
+        state that is not 0, else in a box, all of them at once with both signs.
+    loop_seconds
+        Process time of the search for that, s; the proof takes about as much again.
     hold, uncertain
         For that proof: the input is held for so many steps of 1 ms (0: at every instant), and
         plant parameters lie in [low, high] instead of being the law's own.
@@ -73,6 +77,7 @@ def certify(
     'stability'
     """
     positive("time of the search, s", seconds, zero=True)
+    positive("time of the loop's search, s", loop_seconds)
     known = x0 is not None or state or mechanism.start
     start = mechanism.initial_state(x0, state) if known else np.zeros(2 * mechanism.n)
     certified = certify_surface(
@@ -82,6 +87,7 @@ def certify(
         reaching_law=reaching,
         seconds=seconds,
         loop=loop,
+        loop_seconds=loop_seconds,
         hold=hold,
         uncertain=uncertain,
         progress=progress or no_progress,
