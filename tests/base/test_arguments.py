@@ -22,6 +22,7 @@ from sympy.physics import mechanics
 
 import undertow as ut
 from undertow.base import InvalidInputError, ModelError, UndertowError
+from undertow.estimators import KalmanFilter
 
 #: What is given instead of each argument.
 WRONG: tuple[Any, ...] = (None, "a", math.nan, math.inf, -1, [], [[]], {}, object(), True)
@@ -116,7 +117,8 @@ def parts() -> dict[str, Any]:
         "certificate": ut.certify(rig, surface, seconds=0.0), "folder": "firmware",
         "tolerances": {"m": 0.01}, "estimate": belief.prior, "offsets": [0.0],
         "values": rig.parameter_values, "path": "run.db",
-        "seconds": 0.01, "simulated": True, "intervals": 8,
+        "seconds": 0.01, "simulated": True, "intervals": 8, "error": x, "until": 0.01,
+        "estimator": KalmanFilter(rig, period=0.001, position_noise=1e-3),
     }  # fmt: skip
 
 

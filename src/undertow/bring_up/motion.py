@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.base import InfeasibleError, UndertowError
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, longest_step
 from undertow.plants import Rig, control_loop
 from undertow.plants.stepping import RIG_LAYOUT, stepping
 from undertow.symbolic import Workspace
@@ -153,7 +153,7 @@ def ramp(level: float, seconds: float, period: float) -> FloatArray:
     return np.linspace(0.0, level, max(2, round(seconds / period)))
 
 
-#: Integration steps per sample.
+#: Integration steps per sample; each is divided where a mode of the mechanism is fast.
 STEPS = 2
 
 #: Speed at which breaking away turns into sliding, rad/s or m/s.
@@ -193,7 +193,9 @@ class Predictor:
         n, memory = self.mechanism.n, self._memory
         memory["x"][:] = self.x0 if start is None else start
         memory["past"][:], memory["drive"][:] = memory["x"][:n], 0.0
-        memory["counts"][:], memory["parameters"][:] = (0, STEPS, 0), parameters
+        step = float(np.diff(record.t).max()) / STEPS
+        fine = math.ceil(step / longest_step(self.mechanism, step) - 1e-9)
+        memory["counts"][:], memory["parameters"][:] = (0, STEPS, 0, fine), parameters
         memory["friction"][:] = np.column_stack([*coulomb, np.full(n, STRIBECK), viscous])
         rows, noise = np.empty((len(record), 2 * n)), np.zeros(n)
         self._module.play(

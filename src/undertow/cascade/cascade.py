@@ -351,6 +351,7 @@ class Cascade:
 
         return loop
 
+    @checked
     def learns_from(self, estimator: Estimator) -> bool:
         """Whether an estimator learns what this cascade's belief leaves open, in its units."""
         known, its = self.known, estimator.belief
