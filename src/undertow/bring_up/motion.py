@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from undertow.base import InfeasibleError, UndertowError
-from undertow.models import FloatArray, Mechanism, longest_step
+from undertow.models import FloatArray, Mechanism, steps_in
 from undertow.plants import Rig, control_loop
 from undertow.plants.stepping import RIG_LAYOUT, stepping
 from undertow.symbolic import Workspace
@@ -194,7 +194,7 @@ class Predictor:
         memory["x"][:] = self.x0 if start is None else start
         memory["past"][:], memory["drive"][:] = memory["x"][:n], 0.0
         step = float(np.diff(record.t).max()) / STEPS
-        fine = math.ceil(step / longest_step(self.mechanism, step) - 1e-9)
+        fine = steps_in(self.mechanism, step, step)
         memory["counts"][:], memory["parameters"][:] = (0, STEPS, 0, fine), parameters
         memory["friction"][:] = np.column_stack([*coulomb, np.full(n, STRIBECK), viscous])
         rows, noise = np.empty((len(record), 2 * n)), np.zeros(n)

@@ -245,31 +245,28 @@ class _Writer:
         """
         r, now = self.rows, [row for row, _ in self.watched]
         margins = [row for row in now if row not in r.path]
+        paths = list(enumerate(zip(r.outside, r.path, strict=True)))
         return [
             f"active, code, end = {r.active}, {r.code}, {r.end}",
             "sound = " + " & ".join(f"({row} >= 0.0)" for row in margins),
-            *(f"since_{j}, path_{j} = {o}, {p}" for j, (o, p) in enumerate(self._paths())),
-            *(f"back_{j} = since_{j} == step - 1.0" for j, _ in enumerate(r.path)),
-            *(f"sound = sound & ((path_{j} >= 0.0) | back_{j})" for j, _ in enumerate(r.path)),
+            *(f"since_{j}, path_{j} = {o}, {p}" for j, (o, p) in paths),
+            *(f"back_{j} = since_{j} == step - 1.0" for j, _ in paths),
+            *(f"sound = sound & ((path_{j} >= 0.0) | back_{j})" for j, _ in paths),
             *(
                 f"{o} = step if back_{j} & (not path_{j} >= 0.0) else since_{j}"
-                for j, (o, _) in enumerate(self._paths())
+                for j, (o, _) in paths
             ),
-            *[
+            *(
                 f"{r.cost} = {r.cost} + (h * prices[{j}] * max(0.0, -path_{j}) "
                 "if active > 0.0 else 0.0)"
-                for j, _ in enumerate(r.path)
-            ],
+                for j, _ in paths
+            ),
             "stops = (active > 0.0) & (not sound)",
             f"kind = {code(Event.CONSTRAINT)} if {now[0]} >= 0.0 else {code(Event.SINGULAR)}",
             f"{r.end} = {self.time} if stops else end",
             f"{r.code} = kind if stops else code",
             f"{r.active} = 0.0 if stops else active",
         ]
-
-    def _paths(self) -> list[tuple[str, str]]:
-        """Last step outside, and margin, of each path constraint."""
-        return list(zip(self.rows.outside, self.rows.path, strict=True))
 
     def hand_over(self) -> list[str]:
         """Stop a lane (code ``HANDED_OVER``) that is well inside its boundary layer and its limits.

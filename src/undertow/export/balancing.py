@@ -27,7 +27,7 @@ from undertow.closed_loop import LANES, Event
 from undertow.estimators import FilteredDerivative
 from undertow.export.balancing_kernel import driven_plants
 from undertow.mechanisms.named import named
-from undertow.models import FloatArray, Mechanism, longest_step
+from undertow.models import FloatArray, Mechanism, steps_in
 from undertow.objective import Objective, objective_for
 from undertow.plants import Bench, RealisticRig
 from undertow.plants.bench import bench_for
@@ -216,7 +216,7 @@ class Lanes:
         self._t, self._cost, self._margin = np.zeros((3, padded))
         self.u = self._inputs[:, :count]
         self._values = task.mechanism.parameter_values
-        self._steps = math.ceil(task.period / longest_step(task.mechanism, STEP) - 1e-9)
+        self._steps = steps_in(task.mechanism, task.period, STEP)
 
     @property
     def x(self) -> FloatArray:

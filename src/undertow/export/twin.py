@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -12,7 +11,7 @@ from undertow.export.controller import EmbeddedController, plan_text
 from undertow.export.estimate import KalmanStep
 from undertow.export.names import LARGEST, STALE_SPAN, PlanAnswer, Status
 from undertow.law import Control, Plan, SlidingModeLaw, Surface
-from undertow.models import FloatArray, Mechanism, longest_step
+from undertow.models import FloatArray, Mechanism, steps_in
 from undertow.plants import Measurement
 from undertow.symbolic import literal
 
@@ -162,7 +161,7 @@ def run_positions(controller: EmbeddedController) -> FloatArray:
     twin = Twin(controller)
     x = 0.1 * mechanism.state(**mechanism.start)
     resolution = 2 * np.pi / 2**16
-    steps = math.ceil(T / longest_step(mechanism, T) - 1e-9)
+    steps = steps_in(mechanism, T, T)
     h, rows = T / steps, np.empty((PERIODS, n))
     for k in range(PERIODS):
         rows[k] = np.round(x[:n] / resolution) * resolution

@@ -23,6 +23,7 @@ from undertow.models.linearisation import (
     linear_numbers,
     linearise,
     longest_step,
+    steps_in,
     uncontrollable,
 )
 from undertow.models.mechanism import Mechanism
@@ -84,6 +85,7 @@ __all__ = [
     "reference_names",
     "require_smooth",
     "shortened",
+    "steps_in",
     "uncontrollable",
     "vocabulary",
     "with_positions",

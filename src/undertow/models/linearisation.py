@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -183,6 +184,11 @@ def longest_step(mechanism: Mechanism, most: float) -> float:
     """Return how long Runge-Kutta steps may be, s: ``most``, or less where a mode is fast."""
     rate = fastest_rate(mechanism)
     return OF_FASTEST / rate if rate * most > OF_FASTEST else most
+
+
+def steps_in(mechanism: Mechanism, seconds: float, most: float) -> int:
+    """Return how many Runge-Kutta steps a length takes, none longer than :func:`longest_step`."""
+    return math.ceil(seconds / longest_step(mechanism, most) - 1e-9)
 
 
 def linear_accelerations(mechanism: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:

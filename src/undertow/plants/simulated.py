@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, at_least
-from undertow.models import FloatArray, Mechanism, longest_step
+from undertow.models import FloatArray, Mechanism, steps_in
 from undertow.plants.bench import Amplifier, Backlash, Bench, Encoder, Friction, Timing
 from undertow.plants.interface import Measurement
 from undertow.plants.stepping import RIG_LAYOUT, measure, stepping
@@ -75,7 +75,7 @@ class RealisticRig:
         self._use(Workspace(RIG_LAYOUT, n=n, m=m, p=len(self.mechanism.parameters), **self._sizes))
         memory = self._memory
         memory["x"][:], memory["past"][:] = x0, x0[: self._sizes["seen"]]
-        fine = math.ceil(timing.step / longest_step(self.mechanism, timing.step) - 1e-9)
+        fine = steps_in(self.mechanism, timing.step, timing.step)
         memory["counts"][1], memory["counts"][3] = timing.steps, fine
         memory["phase"][:] = draw.uniform(0.0, 1.0, n)
         memory["parameters"][:] = self.mechanism.parameter_values

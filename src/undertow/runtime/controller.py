@@ -145,12 +145,11 @@ class Controller:
         settings = Settings() if settings is None else settings
         self.cascade, self.estimator, self.period = cascade, estimator, period
         self.settings, self.swing_up = settings, swing_up
-        fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
-        self._fall_angle = fall_angle
+        self._fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
         moving = [motion for _, motion in legs if motion.moves]
         self.reference = moving[0] if moving else None
         acted_on = error_dynamics(mechanism) if moving else mechanism
-        fast = step_memory(acted_on, settings, period, fall_angle)
+        fast = step_memory(acted_on, settings, period, self._fall_angle)
         self._block = fast.block
         own = len(mechanism.parameters)
         self._parameters: FloatArray = fast["parameters"][:own]

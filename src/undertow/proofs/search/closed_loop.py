@@ -168,8 +168,7 @@ def prove_loop(
         When not even the first box could be proved.
     """
     started = time.process_time()
-    names = [c.name for c in mechanism.coordinates]
-    names += [f"{name}_dot" for name in names]
+    names = mechanism.state_names
     require(bool(starts), "starts of the loop", "none", "one state or more")
     for name, value in starts.items():
         require(name in names, "state of the starts", name, ", ".join(names))

@@ -206,10 +206,8 @@ class League(Study):
             entrant = entry.make(mechanism, objective, **setting)
         except MissingExtraError:
             raise
-        except (
-            Exception,
-            SystemExit,
-        ):  # of somebody's code: it has no controller for this mechanism
+        # Of somebody's code: it has no controller for this mechanism.
+        except (Exception, SystemExit):
             return {"won": 0, "fault": 1}
         referee: list[Refereed] = []
 

@@ -262,9 +262,8 @@ class _Decisions:
 
     def loop(self, hold: int, seconds: float) -> _Decided:
         """How far off the target the states that the start is off may be, all at once."""
-        mechanism, names = self.mechanism, [c.name for c in self.mechanism.coordinates]
-        names += [f"{name}_dot" for name in names]
-        off = zip(names, np.abs(self.start).tolist(), strict=True)
+        mechanism = self.mechanism
+        off = zip(mechanism.state_names, np.abs(self.start).tolist(), strict=True)
         starts = {name: size for name, size in off if size}
         if not starts:
             free = mechanism.coordinates[mechanism.m]
