@@ -5,8 +5,8 @@
 shard of a campaign of very small ones, less that of the same work without a store (wanted: 20 ms
 at most).  *two* compares two threads with one, and two of dask's workers with one, for the three
 kinds of campaign, started before the clock is (wanted: 1.85 times as fast, on two free cores).
-*check* integrates random states of the map by SciPy, from the formulas, and counts where motions
-end otherwise than in the map.
+*check* integrates random states of maps by NumPy, from the formulas, and counts where motions
+end otherwise than in the map: of the maps in ``examples/campaigns``, or those of ``--maps``.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
-from accuracy import Case, Point, Reference, solve
 from undertow.closed_loop import Event
-from undertow.law import Plan
 from undertow.models import FloatArray
 from undertow.studies.campaign import Campaign, Definition, compute, executor_for
 
@@ -39,6 +39,19 @@ MEMORY, OVERHEAD, FASTER = 1e9, 0.020, 1.85
 #: Time of arrival and cost agree where they differ by less, relative: both are single precision,
 #: and the map's steps are of a search's tolerance.
 AGREE = 0.02
+
+#: Step of the motions that maps are checked by, s.
+STEP = 5e-4
+
+#: Shards of a map from which states are drawn, at most.
+SHARDS = 10
+
+#: The maps of the documentation.
+MAPS = sorted(
+    path
+    for path in (Path(__file__).parents[1] / "examples" / "campaigns").glob("*.toml")
+    if path.stem != "league"
+)
 
 PARTS = ("map", "overhead", "two", "check")
 
@@ -163,64 +176,121 @@ def two(shards: int, folder: Path) -> list[str]:
     return lines
 
 
-def motion(study: Any, x0: FloatArray) -> tuple[float, float] | None:
-    """Integrate a motion from the formulas; return its time, s, and cost, None where it is lost."""
-    objective, surface = study.loop.objective, study.surface
-    reference = Reference(Case(RIG, study.mechanism, objective, x0, Plan.of(surface)))
-    law = study.loop.reaching.vector(study.mechanism.m)
+class Formulas:
+    """A map's mechanism under its law, by NumPy from the formulas, for N states at once."""
 
-    def at(x: FloatArray) -> Point:
-        return reference.evaluate(x, surface, law, reference.modes(x, surface, law))
+    def __init__(self, study: Any) -> None:
+        rig, loop = study.mechanism, study.loop
+        assert not any(rig.disturbance_bounds)  # the gains (13) are η
+        self.n, self.m, self.surface, self.problem = rig.n, rig.m, study.surface, loop.objective
+        self.limits, self.law = rig.input_limits, np.split(loop.reaching.vector(rig.m), 2)
+        values, both = rig.substitution, [*rig.x, *rig.u]
+        margins = sp.Matrix([self.problem.path_margins(rig)])
+        self.M, self.f, self.B, self.stage, self.path = (
+            _numpy(symbols, sp.Matrix(formula).subs(values))
+            for symbols, formula in (
+                (rig.x, rig.mass_matrix), (rig.x, rig.force), (rig.x, rig.input_matrix),
+                (both, [self.problem.stage_cost(rig)]), (both, margins),
+            )
+        )  # fmt: skip
+        self.at_target = np.linalg.det(self._partial(np.zeros((1, 2 * rig.n)))[0])
 
-    def lost(_: float, x: FloatArray) -> float:
-        try:
-            return float(np.min(at(x).margins))
-        except np.linalg.LinAlgError:  # at the singularity itself
-            return 0.0
+    def _partial(self, x: FloatArray) -> tuple[FloatArray, ...]:
+        """Return Γ, M, f, B, and the drift of the free joints, of states (N, 2n)."""
+        m, surface = self.m, self.surface
+        M, f, B = self.M(x), self.f(x), self.B(x)
+        solved = np.linalg.solve(M[:, m:, m:], np.concatenate([M[:, m:, :m], f[:, m:]], axis=2))
+        X, drift = solved[:, :, :m], solved[:, :, m]
+        return surface.alpha_a - surface.alpha_u @ X, M, f[:, :, 0], B, X, drift
 
-    def arrives(_: float, x: FloatArray) -> float:
-        return float(np.linalg.norm(x[:-1])) - float(objective.terminal_radius)
+    def __call__(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the rates of x = (state, cost), (N, 2n + 1), and the least margins, (N,)."""
+        n, m, surface, (eta, layer), state = self.n, self.m, self.surface, self.law, x[:, :-1]
+        gamma, M, f, B, X, drift = self._partial(state)
+        q_a, q_u, v_a, v_u = np.split(state, [m, n, n + m], axis=1)
+        s = v_a @ surface.alpha_a.T + q_a @ surface.lambda_a.T
+        s = s + v_u @ surface.alpha_u.T + q_u @ surface.lambda_u.T
+        drive = drift @ surface.alpha_u.T + v_a @ surface.lambda_a.T + v_u @ surface.lambda_u.T
+        drive = drive + eta * np.clip(s / layer, -1, 1)
+        wanted = -np.linalg.solve(gamma, drive[:, :, None])[:, :, 0]
+        force = np.einsum("kij,kj->ki", M[:, :m, :m] - M[:, :m, m:] @ X, wanted) - f[:, :m]
+        force += np.einsum("kij,kj->ki", M[:, :m, m:], drift)
+        u = np.clip(np.linalg.solve(B, force[:, :, None])[:, :, 0], -self.limits, self.limits)
+        pushed = f.copy()
+        pushed[:, :m] += np.einsum("kij,kj->ki", B, u)
+        accelerations = np.linalg.solve(M, pushed[:, :, None])[:, :, 0]
+        both = np.concatenate([state, u], axis=1)
+        stage, path = self.stage(both)[:, :, 0], self.path(both)[:, 0]
+        singular = np.linalg.det(gamma)[:, None] / self.at_target
+        margins = np.concatenate([singular, path], axis=1)
+        return np.concatenate([state[:, n:], accelerations, stage], axis=1), margins.min(axis=1)
 
-    lost.terminal = arrives.terminal = True  # type: ignore[attr-defined]  # as SciPy wants it
-    start = np.append(x0, 0.0)
-    if lost(0.0, start) <= 0:
-        return None
-    found = solve(
-        lambda _, x: at(x).rates, (0.0, objective.horizon), start, method="DOP853", rtol=1e-7,
-        atol=1e-9, events=[lost, arrives], first_step=1e-4, max_step=0.05,
-    )  # fmt: skip
-    if not found.success:
-        sys.exit(f"error: SciPy, from {x0}: {found.message}")
-    return (float(found.t[-1]), float(found.y[-1, -1])) if len(found.t_events[1]) else None
+
+def _numpy(symbols: Sequence[sp.Symbol], matrix: sp.Matrix) -> Any:
+    """Return a function from numbers (N, symbols) to matrices (N, rows, columns)."""
+    entries = sp.lambdify(symbols, [*matrix], "numpy", cse=True)
+
+    def at(x: FloatArray) -> FloatArray:
+        columns = [np.broadcast_to(v, len(x)) for v in entries(*x.T)]
+        return np.reshape(np.array(columns, dtype=float).T, (len(x), *matrix.shape))
+
+    return at
 
 
-def check(states: int, folder: Path) -> list[str]:
-    """Integrate random states of a map by another integrator."""
-    definition = region(200, 40_000)
-    study: Any = Campaign(definition, folder / "none").study
-    arrays = compute(definition, 0)
-    _, x0 = study.states(0)
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(len(x0), states, replace=False)
-    ends, off = 0, [0.0, 0.0]
-    for k in progress(chosen.tolist(), "check"):
-        exact = motion(study, x0[k])
-        home = exact is not None
-        if home != (arrays["event"].flat[k] == Event.REACHED):
-            ends += 1
-        elif exact is not None:
-            time_off = abs(float(arrays["time"].flat[k]) / exact[0] - 1)
-            cost_off = abs(float(arrays["cost"].flat[k]) / exact[1] - 1)
-            off = [max(off[0], time_off), max(off[1], cost_off)]
-    row = [str(states), str(ends), f"{100 * off[0]:.2f}", f"{100 * off[1]:.2f}"]
-    table(
-        "random states, integrated by SciPy", ["states", "other ends", "time, %", "cost, %"], [row]
-    )
-    good = "yes" if ends == 0 and max(off) <= AGREE else "no"
-    return [
-        f"check: {ends} of {states} end otherwise, at most {100 * max(off):.2f} % off in time and "
-        f"cost (wanted: none, {100 * AGREE:g}): {good}"
-    ]
+def motions(study: Any, x0: FloatArray) -> FloatArray:
+    """Return times of arrival, s, and costs, (N, 2), or NaN, by Runge and Kutta's method."""
+    rates, radius = Formulas(study), float(study.loop.objective.terminal_radius)
+    found, alive = np.full((len(x0), 2), np.nan), np.arange(len(x0))
+    x = np.pad(x0, [(0, 0), (0, 1)])
+    k, margin = rates(x)
+    for step in progress(range(round(study.loop.objective.horizon / STEP)), study.mechanism.name):
+        alive, x, k = (v[margin > 0] for v in (alive, x, k))
+        if not len(alive):
+            break
+        total, slope = k / 6, k
+        for part, weight in ((0.5, 3), (0.5, 3), (1.0, 6)):
+            slope, _ = rates(x + part * STEP * slope)
+            total = total + slope / weight
+        before, x = np.linalg.norm(x[:, :-1], axis=1), x + STEP * total
+        after = np.linalg.norm(x[:, :-1], axis=1)
+        k, margin = rates(x)
+        home = (after <= radius) & (margin > 0)
+        part = np.clip((before - radius) / np.maximum(before - after, 1e-300), 0, 1)
+        cost = x[:, -1] - (1 - part) * STEP * k[:, -1]
+        found[alive[home]] = np.stack([(step + part) * STEP, cost], axis=1)[home]
+        margin[home] = -1.0
+    return found
+
+
+def check(maps: Sequence[Path], states: int, folder: Path) -> list[str]:
+    """Integrate random states of maps from the formulas."""
+    rows, lines = [], []
+    for path in maps:
+        definition, rng = Definition.read(path), np.random.default_rng(0)
+        study: Any = Campaign(definition, folder / "none").study
+        shards = rng.choice(study.shards, min(SHARDS, study.shards), replace=False)
+        drawn, mapped = [], []
+        for shard in shards.tolist():
+            arrays, (_, x0) = compute(definition, shard), study.states(shard)
+            k = rng.choice(len(x0), min(math.ceil(states / len(shards)), len(x0)), replace=False)
+            drawn.append(x0[k])
+            mapped.append(np.array([arrays[what].flat[k] for what in ("event", "time", "cost")]).T)
+        x0, (event, *came) = np.concatenate(drawn)[:states], np.concatenate(mapped)[:states].T
+        exact = motions(study, x0)
+        reached, home = event == Event.REACHED, np.isfinite(exact[:, 0])
+        other = int((reached != home).sum())
+        both = reached & home
+        off = np.abs(np.stack(came, axis=1)[both] / exact[both] - 1).max(axis=0, initial=0.0)
+        cells = [len(x0), int(home.sum()), other, *(f"{100 * v:.2f}" for v in off)]
+        rows.append([path.stem, *map(str, cells)])
+        good = "yes" if other == 0 and off.max() <= AGREE else "no"
+        lines.append(
+            f"check, {path.stem}: {other} of {len(x0)} end otherwise, at most "
+            f"{100 * off.max():.2f} % off in time and cost (wanted: none, {100 * AGREE:g}): {good}"
+        )
+    heads = ["", "states", "come home", "other ends", "time, %", "cost, %"]
+    table("random states, integrated from the formulas", heads, rows)
+    return lines
 
 
 def main() -> int:
@@ -231,7 +301,9 @@ def main() -> int:
     parser.add_argument("--rollouts", type=float, default=1e6, help="of the map (10⁶)")
     parser.add_argument("--threads", type=int, default=2, help="of the map (2)")
     parser.add_argument("--shards", type=int, default=8, help="of each kind in two (8)")
-    parser.add_argument("--states", type=int, default=1000, help="that are checked (1000)")
+    parser.add_argument("--states", type=int, default=1000, help="of each map (1000)")
+    told = "definitions of the maps that are checked (those of examples/campaigns)"
+    parser.add_argument("--maps", nargs="+", type=Path, default=MAPS, metavar="FILE", help=told)
     options = parser.parse_args()
     for part in options.parts:
         if part not in PARTS:
@@ -248,7 +320,7 @@ def main() -> int:
         if "two" in parts:
             lines += two(2 if quick else options.shards, folder)
         if "check" in parts:
-            lines += check(5 if quick else options.states, folder)
+            lines += check(options.maps, 5 if quick else options.states, folder)
     print("", *lines, sep="\n")
     return 0
 

@@ -35,7 +35,12 @@ def test_mechanisms_of_several_sizes_have_kept_claims() -> None:
         document = read(path.read_bytes())
         assert document.model == model_of(rig)
         (subject,) = document.subjects
-        assert subject.law == law_of(rig, ut.first_surface(rig), ReachingLaw())
+        designed = law_of(rig, ut.first_surface(rig), ReachingLaw())
+        of_file, of_library = (list(map(float, law.numbers)) for law in (subject.law, designed))
+        # A processor's linear algebra decides the last digits of a design.
+        np.testing.assert_allclose(of_file, of_library, rtol=1e-12)
+        assert subject.law.switching == designed.switching
+        assert subject.law.disturbance == designed.disturbance
         assert {claim["kind"] for claim in subject.claims} == {"closed loop"}
         sizes.append((rig.n, rig.m))
     assert len(KEPT) >= 6
