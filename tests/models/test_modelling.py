@@ -133,6 +133,13 @@ def test_travel_that_a_combination_takes_the_place_of_is_not_lost_in_silence() -
     assert [c.name for c in pair.coordinates] == ["x_plus_y", "load", "y"]
 
 
+def test_a_combination_is_measured_as_what_it_is_most_of() -> None:
+    """A belt moves a cart and turns its roller a little: metres, and no angle."""
+    turn, x = ut.Coordinate("turn", "rad"), ut.Coordinate("x", "m")
+    form = modelling.actuate([turn, x], sp.eye(2), sp.zeros(2, 1), sp.Matrix([0.1, 2]))
+    assert [(c.name, c.unit) for c in form.coordinates] == [("stroke_1", "m"), ("turn", "rad")]
+
+
 def test_coordinates_in_another_order() -> None:
     """Claim: M, f and B in any order of the coordinates give the same mechanism, names kept."""
     rig = ut.mechanisms.double_pendulum_on_a_cart()

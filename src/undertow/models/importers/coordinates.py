@@ -248,7 +248,8 @@ def _named(
             simple = len(plus) + len(minus) == len(nonzero)
             name = "_plus_".join(plus) + "".join(f"_minus_{k}" for k in minus)
             text = sp.sstr(sum(column[i] * coordinates[i].symbol for i in nonzero))
-            unit = coordinates[nonzero[0]].unit
+            leading = next((i for i in nonzero if column[i] == 1), nonzero[0])
+            unit = coordinates[leading].unit
             named.append(Coordinate(name if simple else f"stroke_{j + 1}", unit, text))
     return named
 
