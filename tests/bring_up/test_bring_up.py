@@ -30,6 +30,8 @@ from undertow.bring_up import (
     rubbing,
 )
 from undertow.bring_up.fit import Fit, correlated, counted, dwell, readings
+from undertow.bring_up.motion import MotionRecord, Predictor
+from undertow.bring_up.wiring import estimate_wiring, push_response
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
 from undertow.plants import (
@@ -283,6 +285,26 @@ def test_encoder_scales_near_a_known_one_are_that_one() -> None:
     for measured, setting in ((0.206, 0.25), (0.6, 0.5), (-3.3, -4.0), (50.0, 180 / np.pi)):
         _, found = explain(np.array([[1.0, measured]]), np.ones((1, 2), dtype=bool))
         assert found.encoders[1] == setting
+
+
+@pytest.mark.parametrize(("pushed", "dead"), [(0.02, False), (0.5, True)])
+def test_a_joint_that_sways_more_than_a_push_moves_it_is_not_called_dead(
+    pushed: float, *, dead: bool
+) -> None:
+    """The pendulum hangs and sways by 0.1 rad, whatever the arm does to it."""
+    rig = ut.mechanisms.rotary_pendulum()
+    rest = rest_state(rig)
+    predictor = Predictor(rig, rest)
+    t = 0.002 * np.arange(300, dtype=np.float64)
+    u = np.where((t > 0.1) & (t < 0.3), 15.0 * pushed, 0.0)[:, None]
+    still = MotionRecord(t, np.tile(rest[:2], (300, 1)), u)
+    nothing = np.zeros((2, 2)), np.zeros(2), np.ones(1)
+    q = predictor.positions(still, predictor.states(still, rig.parameter_values, *nothing), 0.003)
+    q[:, 1] = rest[1] + 0.05 * np.sin(10 * t)
+    response = push_response(predictor, MotionRecord(t, q, u), 0, np.array([0.0, 0.1]))
+    found = estimate_wiring([response], np.array([0.001, 0.001]))
+    assert (found.wiring.encoders == [1.0, 1.0 - dead]).all()
+    assert (found.known == [[True, dead]]).all()
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ def test_targets_are_refused_before_anything_moves(cascade: ut.Cascade) -> None:
     for target, words in (
         ({"x": 2.0}, "got x = 2 m, must be .x. ≤ 1.425 m: 95 % of the travel"),
         ({"y": 1.0}, "'y', must be one of x, theta"),
-        ({"theta": 0.2}, "theta = 0.2, must be moved along x"),
+        ({"theta": 0.2}, "= 0.2, must be moved along x.*move_target.mechanism, theta=0.2"),
         ({"x_dot": 1.0}, "x_dot = 1, must be velocity 0.*Reference"),
         ({"x": float("nan")}, "nan"),
         (ut.SetPoints([(0, {"x": 1.0}), (3, {"x": -2.0})]), "at 3 s: got x = -2 m"),

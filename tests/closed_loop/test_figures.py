@@ -77,6 +77,13 @@ def test_nothing_to_draw_is_refused() -> None:
         figures.motion_figure({})
 
 
+def test_inputs_have_their_names_in_a_motion_too(motion: ut.Trajectory) -> None:
+    assert np.array_equal(motion["voltage"], motion.u[:, 0])
+    assert np.array_equal(motion["phi_dot"], motion.x[:, 3])
+    with pytest.raises(InvalidInputError, match=r"'volt', must be one of theta, .*, voltage"):
+        motion["volt"]
+
+
 def test_unknown_state_is_refused(motion: ut.Trajectory) -> None:
     """The names that exist are listed."""
     with pytest.raises(InvalidInputError, match="theta, phi"):

@@ -946,3 +946,17 @@ def test_a_motion_that_begins_outside_of_a_constraint_may_come_back_once() -> No
                 assert batch.time[k] > motion.t[back]
             seen.add(int(batch.event[k]))
     assert {int(Event.REACHED), int(Event.CONSTRAINT)} <= seen
+
+
+def test_a_motion_that_begins_outside_of_a_constraint_on_the_input_ends_there(
+    rig: ut.Mechanism, watched: ut.Objective, quick: ut.Surface
+) -> None:
+    """What the input does is the plan's own choice: no price lets it break w(x, u) ≤ 0."""
+    loop = ut.ClosedLoop(rig, replace(watched, hard_input=False), returning=True)
+    turning = rig.state(phi=0.8, theta_dot=-4.0)
+    assert ut.SlidingModeLaw(rig, quick)(0.0, turning).u[0] * -4.0 > 40.0  # W: the power
+    slow = interpreted(loop)
+    for precise in (False, True):
+        batch = slow.batch(turning, [quick], duration=0.004, precise=precise)
+        assert batch.event[0] == Event.CONSTRAINT
+        assert batch.time[0] == 0.0

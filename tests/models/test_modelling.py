@@ -109,6 +109,37 @@ def test_differential_torques() -> None:
     assert check_mechanism(rig, compiled=False).passed
 
 
+def sliding_pair(B: sp.Matrix) -> ut.Mechanism:
+    """A load between two sliders with travel, joined to both by springs."""
+    q = [ut.Coordinate("load", "m"), *(ut.Coordinate(k, "m", "", -1, 2) for k in ("x", "y"))]
+    T = sum(c.velocity**2 for c in q) / 2
+    V = sum((q[0].symbol - c.symbol) ** 2 for c in q[1:])
+    inputs = [ut.Input(f"u_{j}", "N", 9.0) for j in range(B.cols)]
+    return modelling.from_energies("pair", q, inputs, T, V, B)
+
+
+def test_coordinates_that_inputs_act_on_together_are_kept() -> None:
+    """Two winches pull two sliders, both both: what moves is x and y all the same, with travel."""
+    pair = sliding_pair(sp.Matrix([[0, 0], [1, -1], [2, 3]]))
+    assert [c.name for c in pair.coordinates] == ["y", "x", "load"]
+    assert [(c.low, c.high) for c in pair.coordinates[:2]] == [(-1, 2)] * 2
+    pushed = pair.accelerations(0.0, np.zeros(6), [1.0, 2.0])  # masses of 1 kg
+    np.testing.assert_allclose(pushed, [2 * 1 + 3 * 2, 1 - 2, 0], atol=1e-15)
+
+
+def test_travel_that_a_combination_takes_the_place_of_is_not_lost_in_silence() -> None:
+    with pytest.warns(UserWarning, match="travel of 'x', -1 to 2 m, is not kept: x = x_plus_y - y"):
+        pair = sliding_pair(sp.Matrix([0, 1, 1]))
+    assert [c.name for c in pair.coordinates] == ["x_plus_y", "load", "y"]
+
+
+def test_a_combination_is_measured_as_what_it_is_most_of() -> None:
+    """A belt moves a cart and turns its roller a little: metres, and no angle."""
+    turn, x = ut.Coordinate("turn", "rad"), ut.Coordinate("x", "m")
+    form = modelling.actuate([turn, x], sp.eye(2), sp.zeros(2, 1), sp.Matrix([0.1, 2]))
+    assert [(c.name, c.unit) for c in form.coordinates] == [("stroke_1", "m"), ("turn", "rad")]
+
+
 def test_coordinates_in_another_order() -> None:
     """Claim: M, f and B in any order of the coordinates give the same mechanism, names kept."""
     rig = ut.mechanisms.double_pendulum_on_a_cart()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import undertow as ut
 from undertow.base import InvalidInputError
@@ -89,6 +90,23 @@ def test_joints_and_motors_of_a_file_are_found_by_their_names(tmp_path: Path) ->
     rig = MuJoCoRig(read, x0, scene=nameless, target=target, period=T)
     rig.write(u)
     np.testing.assert_allclose((rig.truth[3:] - x0[3:]) / T, moved, rtol=1e-6)
+
+
+def test_motors_are_found_by_joints_where_inputs_come_in_another_order() -> None:
+    """Two sliders and a rider: the first input is the second slider's, by B."""
+    x, y, ride = (ut.Coordinate(name, "m") for name in ("x", "y", "ride"))
+    T = sum(c.velocity**2 for c in (x, y, ride)) / 2
+    V = (ride.symbol - x.symbol) ** 2 / 2
+    inputs = [ut.Input("on_y", "N", 9.0), ut.Input("on_x", "N", 9.0)]
+    B = sp.Matrix([[0, 1], [1, 0]])
+    pair = ut.Mechanism.from_energies("pair", [x, y, ride], inputs, T, V, input_matrix=B)
+    body = """<body><joint name="{0}" type="slide" axis="1 0 0"/>
+        <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>"""
+    scene = f"""<mujoco><worldbody>{"".join(map(body.format, ("x", "y", "ride")))}</worldbody>
+        <actuator><motor name="a" joint="x"/><motor name="b" joint="y"/></actuator></mujoco>"""
+    rig = MuJoCoRig(pair, np.zeros(6), scene=scene)
+    rig.write(np.array([1.0, 0.0]))
+    assert rig.read().q[1] > 0.0 == rig.read().q[0]
 
 
 def test_a_range_in_the_file_is_an_end_stop(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import undertow as ut
 from undertow.base import InvalidInputError
@@ -269,6 +270,17 @@ def test_a_usual_bench_can_be_made_of_any_mechanism(name: str) -> None:
     rig = RealisticRig(plausible_rig(mechanism), seed=1)
     path = _run(rig, np.zeros((50, mechanism.m)))
     assert np.isfinite(path).all()
+
+
+def test_the_friction_of_a_plausible_rig_is_of_what_drives_the_joint() -> None:
+    """2 % of the inputs' limits, through B, in whatever order they come."""
+    q = [ut.Coordinate(name, "m") for name in ("x", "y", "ride")]
+    T, V = sum(c.velocity**2 for c in q) / 2, (q[2].symbol - q[0].symbol) ** 2 / 2
+    inputs = [ut.Input("on_y", "N", 4.0), ut.Input("on_both", "N", 15.0)]
+    B = sp.Matrix([[0, 2], [1, -1]])
+    pair = ut.Mechanism.from_energies("pair", q, inputs, T, V, input_matrix=B)
+    found = {name: part.coulomb for name, part in plausible_rig(pair).friction.items()}
+    assert found == pytest.approx({"x": 0.02 * 30, "y": 0.02 * (4 + 15)})
 
 
 def test_a_copy_of_a_rig_goes_on_by_itself() -> None:

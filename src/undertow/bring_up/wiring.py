@@ -185,16 +185,18 @@ class Response:
     """The motion that a push makes.
 
     ``moved``: measured, (N, n), and ``predicted``: the model's, by level of dry friction, (L, N,
-    n), each about its start.
+    n), each about its start.  ``sway``: how large a predicted motion of each coordinate has to be
+    to show beside what moved before the push, (n,).
     """
 
     moved: FloatArray
     predicted: FloatArray
+    sway: FloatArray
 
     @classmethod
     def none(cls, n: int) -> Self:
         """Return the response to a push that was not made."""
-        return cls(np.zeros((1, n)), np.zeros((1, 1, n)))
+        return cls(np.zeros((1, n)), np.zeros((1, 1, n)), np.zeros(n))
 
     @cached_property
     def likeness(self) -> FloatArray:
@@ -214,10 +216,10 @@ def push_response(predictor: Predictor, record: MotionRecord, i: int, calm: Floa
     """Return measured and predicted motion of a push on input i.
 
     Where nothing moves much more than while it was watched before, ``calm``, (n,), the push has
-    not moved it.
+    not moved it: a fault only where twice as much was predicted, for a joint may still swing.
     """
     belief, n = predictor.mechanism, predictor.mechanism.n
-    full = input_gains(belief).diagonal() * belief.input_limits
+    full = input_gains(belief) @ belief.input_limits
     push = float(np.abs(record.u[:, i]).max()) / belief.input_limits[i]
     predicted = []
     for shares in itertools.product(LEVELS, repeat=belief.m):
@@ -229,7 +231,8 @@ def push_response(predictor: Predictor, record: MotionRecord, i: int, calm: Floa
         late = 1.5 * float(np.median(np.diff(record.t)))
         predicted.append(predictor.positions(record, states, late) - predictor.x0[:n])
     stirred = np.abs(record.moved).max(axis=0) > STIRRED * calm
-    return Response(record.moved * stirred, np.array(predicted))
+    sway = np.where(stirred, 0.0, 2 * STIRRED * calm)
+    return Response(record.moved * stirred, np.array(predicted), sway)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +268,8 @@ def estimate_wiring(responses: Sequence[Response], enough: FloatArray) -> Wiring
             far = response.reach > LEAST * enough
             level = int(np.argmax(alike[:, far].sum(axis=1)))
             moved, predicted = response.moved[:, order], response.predicted[level]
-            known[i] = np.abs(predicted).max(axis=0) > LEAST * enough
+            enough_to_tell = np.maximum(LEAST * enough, response.sway[list(order)])
+            known[i] = np.abs(predicted).max(axis=0) > enough_to_tell
             power = np.maximum((predicted**2).sum(axis=0), 1e-300)
             gain[i] = (moved * predicted).sum(axis=0) / power
             unlike += float((1 - alike[level, far]).sum()) / len(responses)

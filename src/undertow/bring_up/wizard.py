@@ -269,7 +269,7 @@ class _Wizard:
                 )  # fmt: skip
                 continue
             if j >= 0 and not reached[j]:
-                by_hand = "No input moves it from rest: check it by hand"
+                by_hand = "No push moves it, beside how it sways: check it by hand"
                 self._add(kind, name, "nothing reaches it", "moves", "unclear", by_hand)
                 continue
             seen = abs(factor) * self._typical(found, index)

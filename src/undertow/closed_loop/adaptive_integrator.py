@@ -216,7 +216,7 @@ def _follow(  # type: ignore[no-untyped-def]
                 decide(start, new, lane, plant, belief, limits, u, seen, rates)
             look(start, new, lane, plant, belief, limits, u, seen, rates)
             for j in range(2, len(low)):
-                if not margins[j] >= least[j]:
+                if prices[j - 2] > 0.0 and not margins[j] >= least[j]:
                     least[j], outside = -math.inf, True
         while code == _HORIZON and tick < steps:
             # Surfaces change, and samples are taken, at whole steps of the loop.

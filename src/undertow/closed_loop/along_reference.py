@@ -23,7 +23,7 @@ _BODY = f"""
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def along(
     x, reference, lanes, segments, belief, plant, limits, start, h, steps, hold, radius, escape,
-    hard, returning, record,
+    hard, prices, record,
 ):
     # Fills a row of record at each step: x, u, s, cost, det Γ(q)/det Γ(0); returns how many, and
     # the event.
@@ -35,7 +35,7 @@ def along(
     at, slope, total = np.empty(2 * n), np.empty(2 * n), np.empty(2 * n)
     own = belief.shape[0] - 3 * n
     cost, code = 0.0, {Event.HORIZON:d}
-    outside = np.full(PATH, -1 if returning else -2)  # the last row that was, since the first
+    outside = np.where(prices > 0.0, -1, -2)  # the last row that was, since the first
     for k in range(steps + 1):
         lane = lanes[segments[min(k, steps - 1)]]
         total[:], spent = 0.0, 0.0
@@ -181,7 +181,7 @@ def simulate_along(
         np.array(x, dtype=float), motion.rows(halves), lanes, segments,
         np.append(plain.parameter_values, np.zeros(3 * plain.n)), plant.parameter_values,
         loop.input_limits, start, step, steps, loop.zoh_steps,
-        loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, loop.returning,
+        loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, loop.prices,
         record,
     )  # fmt: skip
     t = start + np.arange(rows) * step

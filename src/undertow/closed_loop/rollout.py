@@ -137,10 +137,11 @@ class ClosedLoop:
         Threads that integrate a large batch, with the same results to the last bit however many:
         one for each processor that is free.  1, for the real-time loops.
     returning
-        Whether a motion that begins outside of a path constraint w(x, u) ≤ 0 may come back inside;
-        the constraint counts from then on.  Until then its cost rises by Φ(0, u_max) w/|w(0, 0)|
+        Whether a motion that begins outside of a path constraint w(x) ≤ 0 may come back inside;
+        the constraint counts from then on.  Until then its cost rises by Φ(0, u_max) w/|w(0)|
         per second, so that the shortest way back is the best.  So plans are compared on a rig,
-        where a push may carry the state outside.  False: such a motion ends where it begins.
+        where a push may carry the state outside.  False: such a motion ends where it begins, as it
+        does where w depends on the input: that is for the plan to choose.
     covariance
         Of the error of the estimated state, (2n, 2n), that the law acts on.  Batches count the cost
         of what it makes of it near the target, tr(R K P Kᵀ) per second for a quarter of their time,
@@ -308,7 +309,7 @@ class ClosedLoop:
     def _changed(self, without: set[str], **fields: Any) -> ClosedLoop:
         """Return a copy with other fields, unchecked, and without some of what was computed."""
         assert self._kernels is not None  # found once, for all copies
-        assert self._prices is not None
+        assert self.prices is not None
         other = object.__new__(type(self))
         other.__dict__.update(
             {k: v for k, v in vars(self).items() if k not in without | {"_alone"}}, **fields
@@ -400,7 +401,7 @@ class ClosedLoop:
                 0, part.padded, part.states, live, part.lanes, switches, numbers.plant,
                 numbers.belief, numbers.limits, part.quiet if noise is None else noise, start,
                 self.step, steps, max(1, self.zoh_steps), radius, self.escape, cap,
-                1.0 if seek else 0.0, self._prices, calm_from, every, record, out,
+                1.0 if seek else 0.0, self.prices, calm_from, every, record, out,
             )  # fmt: skip
             if goes_on and prepared is not None and end is not None:
                 integrate = shared(self._kernels.etd_integrate, self.threads, part.padded, steps)
@@ -443,7 +444,7 @@ class ClosedLoop:
             self._switch_steps(switch_times), numbers.plant, numbers.belief, numbers.limits,
             buffers.quiet if noise is None else noise, start, self.step,
             self._length(duration), self.zoh_steps, least, nu, nu if terminal is None else terminal,
-            self.escape, cap, self.rtol, self._prices, every, record, buffers.out,
+            self.escape, cap, self.rtol, self.prices, every, record, buffers.out,
         )  # fmt: skip
         if noisy and self.linear_end is not None and self.linear_end.counts_cost:
             self._count_noise(buffers, start)
@@ -468,20 +469,22 @@ class ClosedLoop:
         buffers.out[:, 0] += NEAR * rate * (buffers.out[:, 1] - start)
 
     @cached_property
-    def _prices(self) -> FloatArray:
+    def prices(self) -> FloatArray:
         """What it costs to be outside of each path constraint, (w,), cost per s and unit; or zero.
 
         The whole margin at the target costs what the whole input costs, or 1 where that is free.
+        No price lets a plan break a constraint on the input, which no push can do.
         """
         mechanism, objective = self.mechanism, self.objective
         if not self.returning:
             return np.zeros(len(objective.constraints))
+        margins, inputs = objective.path_margins(mechanism), {*mechanism.u}
         known = mechanism.substitution | dict.fromkeys([*mechanism.x], 0.0)
         full = known | dict(zip(mechanism.u, self.input_limits.tolist(), strict=True))
         rate = float(objective.stage_cost(mechanism).subs(full))
         room = [
-            float(margin.subs(known | dict.fromkeys(mechanism.u, 0.0)))
-            for margin in objective.path_margins(mechanism)
+            math.inf if margin.free_symbols & inputs else float(margin.subs(known))
+            for margin in margins
         ]
         return (rate if 0.0 < rate < math.inf else 1.0) / np.maximum(room, LEAST_ROOM)
 

@@ -175,9 +175,10 @@ class Trajectory:
         return float(self.t[-1])
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Return the time series of a named state."""
-        one_of("state of a trajectory", name, self.mechanism.state_names)
-        return np.asarray(self.x[:, self.mechanism.state_names.index(name)])
+        """Return the time series of a named state or input."""
+        names = [*self.mechanism.state_names, *(i.name for i in self.mechanism.inputs)]
+        one_of("state or input of a trajectory", name, names)
+        return np.hstack([self.x, self.u])[:, names.index(name)]
 
     @property
     def columns(self) -> dict[str, tuple[FloatArray, str]]:

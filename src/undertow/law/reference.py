@@ -272,18 +272,20 @@ def _refuse_velocity(mechanism: Mechanism, name: str, value: float) -> None:
         )
 
 
-def _check_invariant(mechanism: Mechanism, name: str, value: float) -> None:
-    """Refuse to move the target along a coordinate on which the equations depend."""
+def _check_invariant(mechanism: Mechanism, name: str, value: float | None = None) -> None:
+    """Refuse a target, or a reference, along a coordinate on which the equations depend."""
     free = invariant_coordinates(mechanism)
     if name not in free:
         raise InvalidInputError(
             f"target of '{mechanism.name}'",
-            value=f"{name} = {value:g}",
+            value=f"a reference of '{name}'" if value is None else f"{name} = {value:g}",
             limit=f"moved along {', '.join(free)}, on which neither M nor f depends"
             if free
             else "x = 0: its equations depend on all of its coordinates",
-            remedy="Another equilibrium is the target of a mechanism whose coordinates and inputs "
-            "are measured from it: write them so in Mechanism.from_energies",
+            remedy=""
+            if value is None
+            else "Another equilibrium is the target of a mechanism of its own: "
+            f"undertow.modelling.move_target(mechanism, {name}={value!r})",
         )
 
 
@@ -548,7 +550,7 @@ class Reference:
         inside = np.ones(count, bool) if self.period else (t >= 0) & (t <= seconds)
         for name, path in by_names(f"reference of '{mechanism.name}'", self.paths).items():
             one_of(f"reference of '{mechanism.name}'", name, names[: mechanism.m])
-            _check_invariant(mechanism, name, 0.0)
+            _check_invariant(mechanism, name)
             k = names.index(name)
             self._check_unit(mechanism, k)
             at = t if self.period else np.clip(t, 0.0, seconds)

@@ -378,18 +378,15 @@ def plausible_rig(mechanism: Mechanism) -> Bench:
     """Return a bench of usual quality for any mechanism: encoders, friction, delay, spread.
 
     4096 counts per turn or 20 µm per count; Coulomb friction of the actuated joints 2 % of
-    the input's limit, breakaway a third above; 1 ms from measurement to action with 0.1 ms
+    what their inputs can do, breakaway a third above; 1 ms from measurement to action with 0.1 ms
     of jitter; a 12-bit converter; every parameter but gravity within ±3 %.
     """
+    limits = mechanism.input_limits
+    most = np.abs(mechanism.B) @ np.where(np.isfinite(limits), limits, 0.0)
     loads = {
-        c.name: 0.02 * i.limit * abs(float(b))
-        for c, i, b in zip(
-            mechanism.coordinates,
-            mechanism.inputs,
-            mechanism.input_matrix.subs(mechanism.substitution).diagonal(),
-            strict=False,
-        )
-        if math.isfinite(i.limit)
+        c.name: 0.02 * float(load)
+        for c, load in zip(mechanism.coordinates, most, strict=False)
+        if load > 0.0
     }
     return Bench(
         mechanism,

@@ -116,7 +116,9 @@ class MuJoCoRig:
         channels = [channel.name for channel in mechanism.inputs]
         motors = [identifier(model.actuator(k).name or f"u_{k + 1}") for k in range(model.nu)]
         if set(motors) != set(channels):  # then by the joints that they drive
-            driven = dict(zip(coordinates, channels, strict=False))
+            acts = mechanism.B != 0.0
+            alone = np.outer(acts.sum(axis=1) == 1, acts.sum(axis=0) == 1) & acts
+            driven = {coordinates[i]: channels[j] for i, j in np.argwhere(alone)}
             on_joint = model.actuator_trntype == int(self._engine.mjtTrn.mjTRN_JOINT)
             places = [
                 joints[i] if on_joint[k] else "" for k, i in enumerate(model.actuator_trnid[:, 0])

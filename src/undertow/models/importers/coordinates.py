@@ -10,6 +10,8 @@ the free ones are n − m of the old ones.
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -83,7 +85,7 @@ def actuate(
     actuated
         Names, units and descriptions of the m new coordinates, in the order of the inputs;
         derived from the old ones by default, or where None.  A coordinate that an input acts
-        on alone keeps its name.
+        on alone keeps its name; so do m coordinates that m inputs act on together.
     gains
         Factors k_j, one per input, so that column j of B is k_j d_j and the new coordinate is
         d_jᵀ q; by default (or where None) the column's largest entry.
@@ -97,6 +99,11 @@ def actuate(
     ------
     ModelError
         When B depends on the state, or when two inputs push the same way.
+
+    Warns
+    -----
+    UserWarning
+        Of travel that is not kept: that of a coordinate in whose place a combination stands.
 
     Examples
     --------
@@ -151,6 +158,10 @@ def actuate(
             for s, k in zip(scales, gains, strict=True)
         ]
     directions = sp.Matrix.hstack(*((B[:, j] / scales[j]).applyfunc(number) for j in range(m)))
+    driven = sp.diag(*scales)
+    acted = [i for i in range(n) if any(entry != 0 for entry in B[i, :])]
+    if len(acted) == m and actuated is None and gains is None:
+        directions, driven = sp.eye(n)[:, pivots], B[pivots, :]
     kept = [i for i in range(n) if i not in pivots]
     J = sp.Matrix.vstack(directions.T, *(sp.eye(n)[i, :] for i in kept))
     T = J.inv()
@@ -160,6 +171,14 @@ def actuate(
     new_q = T * sp.Matrix([c.symbol for c in new])
     new_v = T * sp.Matrix([c.velocity for c in new])
     change = dict(zip([*old_q, *old_v], [*new_q, *new_v], strict=True))
+    for i in pivots if actuated is None else ():
+        if (c := coordinates[i]) not in new and math.isfinite(min(c.high, -c.low)):
+            warnings.warn(
+                f"the travel of '{c.name}', {c.low:g} to {c.high:g} {c.unit}, is not kept: "
+                f"{c.name} = {new_q[i]} is no coordinate of the result. Bound it by an "
+                "undertow.Constraint, or name what the inputs act on with its travel, actuated=",
+                stacklevel=2,
+            )
     plain = all(entry in (0, 1) for entry in T)
 
     def substitute(matrix: sp.Matrix) -> sp.Matrix:
@@ -173,7 +192,7 @@ def actuate(
         coordinates=new,
         mass_matrix=mass if plain else mass.applyfunc(tidy),
         force=T.T * substitute(equations[1]),
-        input_matrix=sp.diag(*scales),
+        input_matrix=driven,
         transform=T,
         potential=None if energy is None else energy.xreplace(change),
     )
@@ -229,7 +248,8 @@ def _named(
             simple = len(plus) + len(minus) == len(nonzero)
             name = "_plus_".join(plus) + "".join(f"_minus_{k}" for k in minus)
             text = sp.sstr(sum(column[i] * coordinates[i].symbol for i in nonzero))
-            unit = coordinates[nonzero[0]].unit
+            leading = next((i for i in nonzero if column[i] == 1), nonzero[0])
+            unit = coordinates[leading].unit
             named.append(Coordinate(name if simple else f"stroke_{j + 1}", unit, text))
     return named
 

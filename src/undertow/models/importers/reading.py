@@ -52,6 +52,10 @@ def described(mechanism: Mechanism, tree: Tree, how: str, frozen: Sequence[str])
     if any(mechanism.disturbance_bounds):
         left += ", dry friction (a bound on the disturbance)"
     left += "".join(f", {words}" for actuator in tree.actuators for words in actuator.left_out)
+    said = " ".join(c.description for c in mechanism.coordinates)
+    for joint in tree.moving:
+        if f"joint '{joint.name}'" not in said and math.isfinite(min(joint.high, -joint.low)):
+            left += f", the range of {joint.name}, which no input moves alone"
     if frozen:
         left += f"; frozen {', '.join(frozen)}"
     lines = (how, f"joints {joints}", f"inputs {'; '.join(inputs)}", f"left out {left}")
