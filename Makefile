@@ -10,7 +10,8 @@ BIN   := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS  := $(VENV)/.installed-docs
 
-CHECKER := build/undertow-checker
+CHECKER  := build/undertow-checker
+OPTIMISE := -O2
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -57,7 +58,7 @@ $(CHECKER): checker/checker.cpp $(wildcard checker/*.hpp)
 	    echo "Install g++ or clang++ (12 or newer), or name one: make checker CXX=/path/to/c++"; \
 	    exit 1; } >&2
 	@mkdir -p $(@D)
-	$(CXX) -std=c++17 -O2 -frounding-math -ffp-contract=off -Wall -Wextra -o $@ checker/checker.cpp
+	$(CXX) -std=c++17 $(OPTIMISE) -frounding-math -ffp-contract=off -Wall -Wextra -o $@ checker/checker.cpp
 
 clean: ## remove .venv, caches and results/
 	rm -rf $(VENV) results dist build docs/api docs/gallery

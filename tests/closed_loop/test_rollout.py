@@ -916,7 +916,7 @@ def test_a_motion_that_begins_outside_of_a_constraint_may_come_back_once() -> No
     Against the motions of the same loop without constraints, and the trapezoidal rule.
     """
     cart = ut.mechanisms.cart_pendulum()
-    edge = 0.5
+    edge = 0.3
     objective = ut.MinimumEnergy(constraints=ut.state_box(x=edge))
     strict = ut.ClosedLoop(cart, objective, tail_rtol=1e-3)
     returning = replace(strict, returning=True)

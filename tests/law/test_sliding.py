@@ -14,13 +14,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import undertow as ut
-from support import SHAPES, corners, random_mechanism, random_states, random_surface, runge_kutta
+from support import (
+    SHAPES,
+    corners,
+    random_mechanism,
+    random_states,
+    random_surface,
+    rest_slow,
+    runge_kutta,
+)
 from undertow.base import InvalidInputError, SingularSurfaceError, UndertowError
 from undertow.law import Switching, gains_at_target
 from undertow.law.sliding import singularity
 from undertow.models import TIME, FloatArray
 
-shapes = pytest.mark.parametrize(("n", "m"), SHAPES)
+shapes = pytest.mark.parametrize(("n", "m"), rest_slow(SHAPES, *SHAPES[:-1]))
 switchings = pytest.mark.parametrize("switching", ["saturation", "tanh", "sign"])
 
 SWITCHING_FUNCTIONS: dict[str, Callable[[FloatArray], FloatArray]] = {

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError
 from undertow.optimiser.proposal import motion_margins
 from undertow.studies.paper import CASES
@@ -60,7 +61,9 @@ def test_never_worse_than_the_incumbent(
         )
 
 
-@pytest.mark.parametrize(("name", "at_most"), [("energy", 12.0), ("time", 1.15)])
+@pytest.mark.parametrize(
+    ("name", "at_most"), rest_slow([("energy", 12.0), ("time", 1.15)], ("energy", 12.0))
+)
 def test_three_seeds_agree_at_41_degrees(rig: ut.Mechanism, name: str, at_most: float) -> None:
     """One-time optimum at 41°, d_e = 0.025: ≤ 12.0 V² s and ≤ 1.15 s, within 1 %."""
     loop = ut.ClosedLoop(rig, OBJECTIVES[name], tail_rtol=5e-3)
@@ -74,9 +77,9 @@ def test_three_seeds_agree_at_41_degrees(rig: ut.Mechanism, name: str, at_most: 
 def test_the_unit_of_a_cost_does_not_matter(rig: ut.Mechanism) -> None:
     """Costs from 1e8 on, ∫u² dt of kilonewtons, were taken for those of motions that fail."""
     x, found = rig.state(phi=0.3), []
-    for unit in (1.0, 2.0**40):
+    for unit in (1, 2**40):
 
-        def stage(v: Any, unit: float = unit) -> Any:
+        def stage(v: Any, unit: int = unit) -> Any:
             return unit * v.voltage**2
 
         goal = ut.Objective("energy", stage)

@@ -94,8 +94,7 @@ def without_posix(code: str, folder: Path) -> None:
 @pytest.mark.parametrize(
     "code",
     [
-        pytest.param(IMPORT_ALL, id="import"),
-        pytest.param(USE, id="simulate"),
+        pytest.param(IMPORT_ALL + USE, id="import and simulate"),
         pytest.param(EXPORT, id="export", marks=pytest.mark.slow),
         pytest.param(CERTIFY, id="certify", marks=pytest.mark.slow),
     ],

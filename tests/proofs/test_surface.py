@@ -11,6 +11,7 @@ import scipy.linalg
 import sympy as sp
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.law import (
     ReachingLaw,
@@ -72,13 +73,20 @@ def test_floats_count_as_the_binary_numbers_that_they_are() -> None:
 # -- stability -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("symbolic", [False, True])
 @pytest.mark.parametrize(
-    ("n", "m"),
-    [
-        *((2, 1), (3, 1), (3, 2), (4, 2)),
-        *(pytest.param(5, m, marks=pytest.mark.slow) for m in (2, 3)),
-    ],
+    ("n", "m", "symbolic"),
+    rest_slow(
+        [
+            (*size, kind)
+            for size in ((2, 1), (3, 1), (3, 2), (4, 2), (5, 2), (5, 3))
+            for kind in (False, True)
+        ],
+        (2, 1, False),
+        (3, 1, False),
+        (3, 2, False),
+        (4, 2, False),
+        (3, 2, True),
+    ),
 )
 def test_hurwitz_agrees_with_the_pencil(n: int, m: int, symbolic: bool) -> None:
     """Exact verdict and margin equal those of the pencil's finite eigenvalues."""

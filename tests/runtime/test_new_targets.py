@@ -9,6 +9,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 
 import undertow as ut
 from undertow.base import ArtefactError, InvalidInputError
+from undertow.cascade import CascadeState
 from undertow.law import ReferenceMotion
 from undertow.plants import Measurement
 from undertow.runtime import (
@@ -38,6 +40,13 @@ from undertow.runtime.targets import MOST_BYTES, Listener, address_path, legs_fr
 from undertow.runtime.verdict import Report
 
 RECIPE = Recipe(start=(0.0, 0.2, 0.0, 0.0), evaluations=64)
+
+
+@cache
+def begun() -> tuple[Recipe, CascadeState]:
+    """A recipe, and what its cascade starts with."""
+    recipe = Recipe(start=(0.0, 0.05, 0.0, 0.0), evaluations=32)
+    return recipe, recipe.first()
 
 
 def run_and_ask(
@@ -182,8 +191,8 @@ def test_an_answer_for_another_target_is_refused(
     asked: bool, jump: bool, target: ReferenceMotion | None
 ) -> None:
     """A jump that nobody asked for, one that goes elsewhere, and a target that slips in."""
-    recipe = Recipe(start=(0.0, 0.05, 0.0, 0.0), evaluations=32)
-    controller, rig = recipe.make_controller(recipe.first()), recipe.make_rig()
+    recipe, memory = begun()
+    controller, rig = recipe.make_controller(memory), recipe.make_rig()
     told = ((0.0, HERE),) if asked else ()
     answer, said, asks = None, [], 0
     for k in range(1200):

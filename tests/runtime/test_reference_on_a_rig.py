@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import undertow as ut
 from runs import run
 from undertow.base import InvalidInputError
+from undertow.cascade import CascadeState
 from undertow.law import ReferenceMotion
 from undertow.runtime import Recipe, Request, Settings, send_target, session
 from undertow.runtime.encoding import memory_from, memory_to, reference_from, reference_to
@@ -24,6 +26,12 @@ RECIPE = Recipe(start=(0.0, 0.1, 0.0, 0.0), evaluations=64, horizon=8.0, target=
 def motion() -> ReferenceMotion:
     assert RECIPE.reference is not None
     return RECIPE.reference
+
+
+@cache
+def first() -> CascadeState:
+    """What a run begins with."""
+    return RECIPE.first()
 
 
 def off(log: Path, after: float) -> tuple[float, float]:
@@ -117,7 +125,7 @@ def test_a_step_finds_the_reference_where_the_library_does() -> None:
 
 def test_the_slow_loop_predicts_along_the_reference() -> None:
     """On it the error stays zero to the next use, while the target moves on by degrees."""
-    memory = RECIPE.first()
+    memory = first()
     assert memory.target is motion()
     answer = RECIPE.respond(Request(1.0, np.zeros(4), 1.3, memory))
     moved = motion().state(1.3) - motion().state(1.0)
@@ -128,7 +136,7 @@ def test_the_slow_loop_predicts_along_the_reference() -> None:
 
 def test_what_both_processes_have_goes_by_number() -> None:
     """A request is as short with an hour's reference as without one; what comes is the object."""
-    memory = RECIPE.first()
+    memory = first()
     packer, plain = Packer([motion()]), Packer()
     request = Request(0.0, np.zeros(4), 0.1, memory)
     packed = packer.pack(request)
@@ -162,7 +170,7 @@ def test_a_recipe_with_a_reference_is_data(reference: ut.Reference) -> None:
 
 
 def test_a_log_of_a_target_that_moves_needs_the_reference() -> None:
-    memory = RECIPE.first()
+    memory = first()
     written = memory_to(memory)
     assert written["target"] == "reference"
     assert memory_from(written, motion()).target is motion()

@@ -171,7 +171,7 @@ def test_a_worker_that_fails_leaves_the_last_plan(controller: Controller) -> Non
     ),
 )
 def test_what_is_no_whole_answer_is_not_looked_at(
-    wrong: dict[str, object] | None, tmp_path: Path
+    wrong: dict[str, object] | None, memory: CascadeState, tmp_path: Path
 ) -> None:
     """Of whatever types a worker's answers are: the last plan stays, and the replay agrees."""
 
@@ -179,7 +179,7 @@ def test_what_is_no_whole_answer_is_not_looked_at(
         answer = RECIPE.respond(request)
         return replace(answer, **wrong) if wrong else "later"  # type: ignore[arg-type, return-value]
 
-    controller = RECIPE.make_controller(RECIPE.first())
+    controller = RECIPE.make_controller(memory)
     path = tmp_path / "run.db"
     meta = about(controller, RECIPE)
     with Log(path, Columns.of(RECIPE.belief), meta, threaded=False) as log:

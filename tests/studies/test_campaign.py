@@ -555,18 +555,17 @@ def test_wrong_settings_are_refused_by_name(change: dict[str, Any], words: str) 
 
 
 def test_steps_that_a_fast_mode_makes_unstable_are_refused() -> None:
-    """A pendulum in oil: its map said that nothing comes home, and simulated motions did."""
-    crane = ut.mechanisms.overhead_crane()
-    oil, axes = {"b_p": 500.0}, {"x": {"from": 0.2, "to": 0.4, "count": 2}}
+    """An arm in oil: its map said that nothing comes home, and simulated motions did."""
+    oil, axes = {"d_e": 10.0}, {"phi": {"from": 0.002, "to": 0.004, "count": 2}}
     asked: dict[str, Any] = {"kind": "region", "parameters": oil, "axes": axes}
     with pytest.raises(InvalidInputError, match=r"'step'.*got 0\.002 s, must be at most"):
-        study_of(Definition.of("overhead_crane", **asked))
-    fine: Any = study_of(Definition.of("overhead_crane", **asked, step=1e-4))
+        study_of(Definition.of(RIG, **asked))
+    fine: Any = study_of(Definition.of(RIG, **asked, step=1e-4))
     found = fine.compute(0)
-    for x, event, home in zip((0.2, 0.4), found["event"], found["time"], strict=True):
-        damped = crane.with_parameters(**oil)
+    for phi, event, home in zip((0.002, 0.004), found["event"], found["time"], strict=True):
+        damped = ut.mechanisms.rotary_pendulum().with_parameters(**oil)
         loop = ClosedLoop(damped, fine.loop.objective)
-        motion = loop.simulate(damped.state(x=x), fine.surface)
+        motion = loop.simulate(damped.state(phi=phi), fine.surface)
         assert (event, motion.event) == (Event.REACHED, Event.REACHED)
         assert home == pytest.approx(motion.time, rel=1e-3)
 

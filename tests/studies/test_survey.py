@@ -101,6 +101,7 @@ def test_documented_gaps_are_those_of_the_rows(goal: str) -> None:
         assert float(worst) == pytest.approx(max(gaps), abs=0.06)
 
 
+@pytest.mark.slow
 def test_bound_is_below_the_cascade() -> None:
     """Claim: the bound of the quick mechanism is below its cascades, by what the page says."""
     pytest.importorskip("casadi")
@@ -158,9 +159,8 @@ def test_table_and_files_say_what_was_found() -> None:
 
 
 def test_survey_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Claim: one command prints the table, here of a line found above, and leaves it as files."""
-    pytest.importorskip("casadi")
-    line = entry(PROMPT, bounds=True)
+    """Claim: one command prints the table, here of a line of ours, and leaves it as files."""
+    line = made(PROMPT, start="phi = 35°")
     monkeypatch.setattr(survey, "survey_one", lambda *_, **__: line)
     words = ["survey", "--only", PROMPT, "--no-bounds", "--objective", "energy"]
     words += ["--out", str(tmp_path)]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numba
@@ -34,7 +35,8 @@ BINARY = (ADD, SUB, MUL, DIV, MAX, MIN)
 _STEP, _TINY, _MOST = 2.0**-52, 2.3e-308, 1.7976931348623157e308
 _NAN, _INF = math.nan, math.inf
 
-_njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")  # no fast-math anywhere
+#: No fast-math anywhere, and no functions for callers in C.
+_njit: Any = partial(numba.njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
 def enclose(value: Fraction) -> tuple[float, float]:
@@ -455,8 +457,7 @@ def jets(code, constants, low, high, rates, order, seeds):  # type: ignore[no-un
     the first inputs x, whose coefficients follow from x' = ẋ; other inputs are constant.
     """
     inputs, first = len(low), len(low) + len(constants)
-    total = first + len(code)
-    J = np.zeros((total, order + 1, 1 + seeds.shape[1], 2))
+    J = np.zeros((first + len(code), order + 1, 1 + seeds.shape[1], 2))
     for i in range(inputs):
         J[i, 0, 0, 0], J[i, 0, 0, 1] = low[i], high[i]
         for v in range(seeds.shape[1] if i < len(seeds) else 0):
@@ -512,8 +513,11 @@ def product(A, B):  # type: ignore[no-untyped-def]
 
 @_njit
 def points(A):  # type: ignore[no-untyped-def]
-    """Doubles as intervals."""
-    return np.repeat(A, 2).reshape((*A.shape, 2))
+    """A matrix of doubles as intervals."""
+    out = np.empty((*A.shape, 2))
+    for (i, j), value in np.ndenumerate(A):
+        out[i, j, 0], out[i, j, 1] = value, value
+    return out
 
 
 @_njit
@@ -805,22 +809,22 @@ def _composed(op, A, C, V, J):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         c, n, m, e = A[0, lane], A[E + 1, lane], A[E + 2, lane], A[E, lane]
         r = (n + m + e) * _GROW
-        J[0, 0, 0], J[0, 1, 0], d = c, 1.0, 0.0
+        J[0, 0, 0, 0], J[0, 0, 0, 1], J[0, 1, 0, 0], J[0, 1, 0, 1], d = c, c, 1.0, 1.0, 0.0
         for last in range(2):
             if last:
                 J[0, 0, 0, 0], J[0, 0, 0, 1] = down(c - r), up(c + r)
             if op == DIV:
                 p, q = reciprocal(J[0, 0, 0, 0], J[0, 0, 0, 1])
                 s, t = sqr(p, q)
-                J[2, 0, 0], J[2, 1, 0] = (p, q), (-t, -s)
-                J[2, 2, 0], J[2, 3, 0] = mul(p, q, s, t), sqr(s, t)
+                J[2, 0, 0, 0], J[2, 0, 0, 1], J[2, 1, 0, 0], J[2, 1, 0, 1] = p, q, -t, -s
+                J[2, 2, 0, 0], J[2, 2, 0, 1] = mul(p, q, s, t)
+                J[2, 3, 0, 0], J[2, 3, 0, 1] = sqr(s, t)
             elif last and op in (SIN, COS):
-                J[2, 3, 0] = 1.0 / 6.0 + 1e-16
+                J[2, 3, 0, 0], J[2, 3, 0, 1] = 1.0 / 6.0 + 1e-16, 1.0 / 6.0 + 1e-16
             else:
                 for k in range(4 if last else 3):
-                    _line(J, op, 2, k, 0, 3)
-                    if op in (SIN, COS):  # they stand together
-                        _line(J, SIN + COS - op, 3, k, 0, 2)
+                    for at in range(2, 4 if op in (SIN, COS) else 3):  # those stand together
+                        _line(J, op if at == 2 else SIN + COS - op, at, k, 0, 5 - at)
             for k in range(0 if last else 3):
                 f[k] = 0.5 * (J[2, k, 0, 0] + J[2, k, 0, 1])
                 d += J[2, k, 0, 1] - J[2, k, 0, 0]
@@ -848,8 +852,7 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
     """
     V, boxes = low.shape
     first, E = V + len(constants), 1 + V + V * (V + 1) // 2
-    total = first + len(code)
-    T, J = np.zeros((total + 1, E + 3, LANES)), np.zeros((4, 4, 1, 2))
+    T, J = np.zeros((first + len(code) + 1, E + 3, LANES)), np.zeros((4, 4, 1, 2))
     for i in range(len(constants)):
         T[V + i, 0] = constants[i, 0]
         T[V + i, E] = (constants[i, 1] - constants[i, 0]) * _GROW + _LITTLE
@@ -877,11 +880,10 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
                 _plus(T[a], T[b], 1.0 if op == ADD else -1.0, C, V)
             elif op == NEG:
                 _multiple(T[a], -1.0, -1.0, C, V)
-            elif op == DIV:
-                _composed(DIV, T[b], T[total], V, J)
-                _times(T[a], T[total], C, V)
-            elif op in (SQRT, SIN, COS, EXP, LOG):
-                _composed(op, T[a], C, V, J)
+            elif op in (DIV, SQRT, SIN, COS, EXP, LOG):
+                _composed(op, T[b if op == DIV else a], T[-1] if op == DIV else C, V, J)
+                if op == DIV:
+                    _times(T[a], T[-1], C, V)
             else:
                 C[:] = _NAN
         for lane in range(min(LANES, boxes - start)):
@@ -944,7 +946,7 @@ def excluded(models, V):  # type: ignore[no-untyped-def]
         ab, bb = (a * b).sum(), (b * b).sum()
         gap = aa * bb - ab * ab + _LITTLE
         for kind in range(4):
-            trial[:] = 1.0, 0.0, 0.0
+            trial[0], trial[1], trial[2] = 1.0, 0.0, 0.0
             if kind == 0:
                 trial[1] = -max(fa / (aa + _LITTLE), 0.0)
             elif kind == 1:
@@ -953,7 +955,7 @@ def excluded(models, V):  # type: ignore[no-untyped-def]
                 trial[1] = -max((fa * bb - fb * ab) / gap, 0.0)
                 trial[2] = max((fa * ab - fb * aa) / gap, 0.0)
             else:
-                trial[:] = 0.0, -1.0, max(ab / (bb + _LITTLE), 0.0)
+                trial[0], trial[1], trial[2] = 0.0, -1.0, max(ab / (bb + _LITTLE), 0.0)
             shift = -trial[1] - trial[2]
             total[:] = 0.0
             total[0], size = shift, abs(trial[1]) + abs(trial[2])
