@@ -244,7 +244,8 @@ def motions(study: Any, x0: FloatArray) -> FloatArray:
     x = np.pad(x0, [(0, 0), (0, 1)])
     k, margin = rates(x)
     for step in progress(range(round(study.loop.objective.horizon / STEP)), study.mechanism.name):
-        alive, x, k = (v[margin > 0] for v in (alive, x, k))
+        go_on = margin > 0
+        alive, x, k = alive[go_on], x[go_on], k[go_on]
         if not len(alive):
             break
         total, slope = k / 6, k
