@@ -107,13 +107,10 @@ class Optimiser:
         """The coordinates of the search, around that surface."""
         return SearchSpace(self.loop, self.anchor, self.freedom)
 
-    @cached_property
+    @property
     def counts_time(self) -> bool:
         """Whether the cost is the time of arrival, a discontinuous function of the plan."""
-        end = self.loop.linear_end
-        if end is None or end.stage is None:
-            return False
-        return end.stage.rest > 0 and not end.counts_cost
+        return self.loop.counts_time
 
     @cached_property
     def aims(self) -> bool:
@@ -227,8 +224,8 @@ class Optimiser:
             raise InvalidInputError(
                 "schedule",
                 value=f"{self.freedom.schedule:g} s",
-                limit="for least time, a model that is taken for the plant",
-                remedy='Give the cascade belief="exact", or leave schedule out',
+                limit="for least time, one plant",
+                remedy="Leave the ensemble out, or schedule",
             )
         early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
         return Optimisation(
