@@ -9,8 +9,8 @@ one.  States are exact; every controller meets the same plants and knows the mod
 *kept* is the optimum for the model from the start, small errors of state and surface allowed for,
 kept to the end; *exact* the cascade that takes its model for the plant; *belief* the cascade with a
 belief: an ensemble of what is plausible, learnt as it goes, every 20 ms; *free* the same that may
-choose the reaching law, too; *schedule* one that chooses surfaces with reaching laws, one after
-another.  Their law acts continuously.
+choose the reaching law, too; *schedule* one that chooses surfaces with reaching laws, each for
+0.05 s.  Their law acts continuously.
 
 *lqr* is clipped linear-quadratic feedback, continuous too, the best on the model of 39 weights,
 by hindsight.  *predictive* plans anew a hundred times a second and holds its input in between: for
@@ -81,7 +81,7 @@ RADIUS = 0.01
 FREEDOMS = {
     "belief": ut.DecisionVariables(),
     "free": ut.DecisionVariables(reaching=True),
-    "schedule": ut.DecisionVariables(reaching=True, schedule=0.1),
+    "schedule": ut.DecisionVariables(reaching=True, schedule=0.05),
 }
 OURS = ("kept", "exact", "belief", "free", "schedule")
 PEERS = ("lqr", "predictive", "learnt", "scenario")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -663,7 +663,7 @@ class Cascade:
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
             if loop is not whole:  # every plausible plant lives to see the next decision
-                lives = self._survives if loop.ensemble else self._recoverable
+                lives = self._survives if loop.ensemble is not None else self._recoverable
                 good &= lives(here, x, plan)
             if loop.ensemble is None and self.planner is None:
                 good &= cost <= AGREES * proposal.cost
@@ -822,14 +822,15 @@ class Cascade:
             span = self.objective.horizon if horizon is None else horizon
             here, loop, used = replace(state, since=t), self.loop_at(state, t), state.at(t)
 
-            def proposal(exact: ClosedLoop, incumbent: Plan) -> Proposal:
+            def proposal(exact: ClosedLoop, incumbent: Plan, **how: Any) -> Proposal:
                 return self._planner(exact, state.target, t).propose(
                     error, incumbent=incumbent, horizon=horizon, sequence=sequence, computed_for=t,
-                    resolution=self.resolution * state.scale,
+                    resolution=self.resolution * state.scale, **how,
                 )  # fmt: skip
 
             if self._recourse:
-                found = proposal(self._estimated(state.estimate), used)
+                admits = partial(self._recoverable, loop, error)
+                found = proposal(self._estimated(state.estimate), used, admits=admits)
                 plans = [used] if found.plan is None else [found.plan, used]
                 if any(self._mendable(here, loop, plan, error, span) for plan in plans):
                     return found

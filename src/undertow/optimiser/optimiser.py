@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -155,6 +155,7 @@ class Optimiser:
         computed_for: float = 0.0,
         resolution: float = 0.0,
         budget: Budget | None = None,
+        admits: Callable[[Plan], bool] | None = None,
     ) -> Proposal:
         """Optimise the plan from the state x.
 
@@ -173,6 +174,9 @@ class Optimiser:
             Differences in cost below this are not worth a search.
         budget
             Overrides ``warm`` or ``cold``.
+        admits
+            Whether a schedule that arrives is admissible besides; where the incumbent is not, the
+            answer may be worse.
 
         Returns
         -------
@@ -183,6 +187,7 @@ class Optimiser:
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
         task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
+        task.admits = admits or task.admits
         if incumbent is None:
             *_, converged = global_search(task)
         elif self.counts_time:
