@@ -437,6 +437,12 @@ class Cascade:
         """Who is asked for plans: ``planner``, or else the optimiser of a predicted closed loop."""
         if self.planner is not None:
             return self.planner
+        return self._optimiser_of(exact, target, t)
+
+    def _optimiser_of(
+        self, exact: ClosedLoop, target: ReferenceMotion | None, t: float
+    ) -> Optimiser:
+        """The optimiser of a predicted closed loop, about a target."""
         optimiser = self.optimiser if exact.ensemble is None else self._robust
         if exact is not self.loop:
             optimiser = optimiser.on(self._for_search(exact))
@@ -821,21 +827,22 @@ class Cascade:
             error = state.error(t, self.mechanism.check_state(x))
             span = self.objective.horizon if horizon is None else horizon
             here, loop, used = replace(state, since=t), self.loop_at(state, t), state.at(t)
-
-            def proposal(exact: ClosedLoop, incumbent: Plan, **how: Any) -> Proposal:
-                return self._planner(exact, state.target, t).propose(
-                    error, incumbent=incumbent, horizon=horizon, sequence=sequence, computed_for=t,
-                    resolution=self.resolution * state.scale, **how,
-                )  # fmt: skip
-
+            ask: dict[str, Any] = {
+                "horizon": horizon,
+                "sequence": sequence,
+                "computed_for": t,
+                "resolution": self.resolution * state.scale,
+            }
             if self._recourse:
+                optimiser = self._optimiser_of(self._estimated(state.estimate), state.target, t)
                 admits = partial(self._recoverable, loop, error)
-                found = proposal(self._estimated(state.estimate), used, admits=admits)
+                found = optimiser.propose(error, incumbent=used, admits=admits, **ask)
                 plans = [used] if found.plan is None else [found.plan, used]
                 if any(self._mendable(here, loop, plan, error, span) for plan in plans):
                     return found
+            planner = self._planner(self._loops(state.estimate), state.target, t)
             standing = self._standing(here, loop, used, error, span)
-            return proposal(self._loops(state.estimate), standing)
+            return planner.propose(error, incumbent=standing, **ask)
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             said = error_text(error)
             return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
