@@ -4,8 +4,8 @@ Controllers, all built from the model alone:
 
 * *cascade*: undertow's, re-optimised every 0.1 s; for energy, for time, and for time with the
   reaching law free.  It takes its model for the plant.
-* *belief*: the same with what is usually not known of the model, learnt as it goes: the default.
-  *plan* is by the wall clock here.
+* *belief*: the same with what is usually not known of the model, learnt as it goes: the default;
+  and for time with a schedule of surfaces, each for 0.05 s.  *plan* is by the wall clock here.
 * *LQR, clipped*: u = −K x, continuous; its weights are the best by hindsight on the model, of 39
   pairs, once for energy and once for time.
 * *NMPC*: multiple shooting in CasADi with IPOPT, re-planned every 0.1 s, its plan applied
@@ -175,6 +175,7 @@ def controllers(
     truth = Plant(plant, RADIUS, HORIZON)
     hasty = Plant(plant, RADIUS, PATIENCE)
     free = ut.DecisionVariables(reaching=True)
+    schedule = ut.DecisionVariables(reaching=True, schedule=0.05)
 
     def predictive(mpc: ShootingMPC | DoMPC) -> Result:
         return (truth if mpc.goal == "energy" else hasty).held(scene.x0, mpc), mpc.seconds
@@ -196,6 +197,7 @@ def controllers(
         ),
         "belief, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now, "usual"),
         "belief, time, reaching free": lambda: cascade(scene, plant, time, free, now, "usual"),
+        "belief, time, schedule": lambda: cascade(scene, plant, time, schedule, now, "usual"),
         "LQR clipped, time": lambda: regulated("time"),
         "NMPC 10 Hz, time": lambda: predictive(ShootingMPC(scene.rig, "time", now=now)),
     }

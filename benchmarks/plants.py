@@ -9,7 +9,8 @@ one.  States are exact; every controller meets the same plants and knows the mod
 *kept* is the optimum for the model from the start, small errors of state and surface allowed for,
 kept to the end; *exact* the cascade that takes its model for the plant; *belief* the cascade with a
 belief: an ensemble of what is plausible, learnt as it goes, every 20 ms; *free* the same that may
-choose the reaching law, too.  Their law acts continuously.
+choose the reaching law, too; *schedule* one that chooses surfaces with reaching laws, each for
+0.05 s.  Their law acts continuously.
 
 *lqr* is clipped linear-quadratic feedback, continuous too, the best on the model of 39 weights,
 by hindsight.  *predictive* plans anew a hundred times a second and holds its input in between: for
@@ -76,7 +77,13 @@ LARGER = {
 }
 OBJECTIVES = {"energy": ut.MinimumEnergy(horizon=10.0), "time": ut.MinimumTime(horizon=6.0)}
 RADIUS = 0.01
-OURS = ("kept", "exact", "belief", "free")
+#: What cascades with a belief may choose.
+FREEDOMS = {
+    "belief": ut.DecisionVariables(),
+    "free": ut.DecisionVariables(reaching=True),
+    "schedule": ut.DecisionVariables(reaching=True, schedule=0.05),
+}
+OURS = ("kept", "exact", "belief", "free", "schedule")
 PEERS = ("lqr", "predictive", "learnt", "scenario")
 CONTROLLERS = (*OURS, *PEERS, "acados")
 #: Of the travel, what predictive control plans with; how far it lets angles lean that it does not
@@ -182,9 +189,8 @@ def box(name: str, travel: float, lean: float) -> Box:
 def cascade(name: str, objective: str, controller: str) -> ut.Cascade:
     """Return a cascade; one for each process."""
     rig, aim = model(name), OBJECTIVES[objective]
-    if controller in ("belief", "free"):
-        freedom = ut.DecisionVariables(reaching=controller == "free")
-        return ut.Cascade(rig, aim, belief=belief(name), freedom=freedom)
+    if controller in FREEDOMS:
+        return ut.Cascade(rig, aim, belief=belief(name), freedom=FREEDOMS[controller])
     return ut.Cascade(rig, aim, belief="exact")
 
 

@@ -13,7 +13,7 @@ import sympy as sp
 import undertow as ut
 from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError
-from undertow.cascade import CascadeState, cost_gate
+from undertow.cascade import Admission, CascadeState, cost_gate
 from undertow.estimators import KalmanFilter, Measured, ParameterEstimate
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
@@ -325,6 +325,59 @@ def test_least_time_on_plants_that_are_not_the_model(
         kept.append(fixed.time if fixed.event.name == "REACHED" else math.inf)
     assert lost >= 3
     assert np.median(times) < 0.85 * np.median(kept)
+
+
+def scheduled(pendulum: ut.Mechanism) -> ut.Cascade:
+    """Return a cascade that follows the earliest motion of what it estimates."""
+    return ut.Cascade(
+        pendulum,
+        ut.MinimumTime(horizon=6.0),
+        belief=ut.Belief.relative(pendulum, **SPREAD),
+        freedom=ut.DecisionVariables(reaching=True, schedule=0.05),
+    )
+
+
+def test_a_schedule_leaves_every_plausible_plant_a_way_home(pendulum: ut.Mechanism) -> None:
+    """It need not bring them home itself: it is judged on the estimate."""
+    made, x = scheduled(pendulum), pendulum.state(phi=ut.deg(30))
+    law = (ut.ReachingLaw(86.0, 4.0),)
+    plan, edge = (  # near the singularity, cos 30° = 1.1995⁻¹ c/b, the second one
+        ut.Plan((ut.Surface(-1, -4.1, alpha_u, 8.6),), (0.0,), law) for alpha_u in (1.24, 1.2)
+    )
+    designed = ut.Plan.of(ut.first_surface(pendulum))
+    costs = ut.ClosedLoop(pendulum, made.objective).batch(x, [designed, plan, edge], precise=True)
+    assert costs.cost[0] > costs.cost[1] > costs.cost[2]
+    assert costs.reached.all()
+    left = 1.01 * float(costs.cost[1])  # some plausible plant needs longer
+    assert not made.loop.batch(x, plan, duration=left).reached[0]
+
+    def judged(used: ut.Plan, proposed: ut.Plan | None, horizon: float) -> Admission:
+        assert made.known is not None
+        memory = CascadeState(used, x=tuple(x.tolist()), estimate=made.known.prior)
+        answer = ut.Proposal(proposed, "converged", 0.5, math.inf, (), 1, 0.0, 1, 0.0)
+        return made.apply_gate(memory, answer, x, horizon)[1]
+
+    for admission in (judged(designed, plan, left), judged(plan, None, left)):
+        assert admission.cost == pytest.approx(costs.cost[1], rel=1e-6)
+    assert judged(designed, plan, left).accepted
+    refused = judged(plan, edge, left)
+    assert not refused.accepted
+    assert "come home" in refused.reason
+    assert refused.cost == pytest.approx(costs.cost[1], rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_schedule_for_a_plant_that_is_not_the_model(pendulum: ut.Mechanism, sign: int) -> None:
+    """It arrives, much earlier than the optimum for the model that is kept."""
+    plant = changed(pendulum, {"m": 0.15 * sign, "I_e": -0.15 * sign, "a_e": -0.08, "d_e": 0.3})
+    made, x = scheduled(pendulum), pendulum.state(phi=ut.deg(30))
+    run = made.simulate(x, plant=plant)
+    assert run.reached
+    robust = replace(made, freedom=ut.DecisionVariables())
+    kept = robust.start(x)[0].plan
+    motion = ut.ClosedLoop(pendulum, made.objective, plant=plant).simulate(x, kept)
+    assert run.time < 0.6 * motion.time
 
 
 def test_without_a_belief_nothing_is_learnt(pendulum: ut.Mechanism) -> None:

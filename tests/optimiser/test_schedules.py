@@ -228,4 +228,4 @@ def test_refusals() -> None:
         ut.Cascade(rig, ut.MinimumTime(), belief="exact",
                    freedom=ut.DecisionVariables(reaching=True, schedule=0.07))  # fmt: skip
     with pytest.raises(InvalidInputError, match="least time"):
-        ut.Cascade(rig, ut.MinimumTime(), freedom=FREE).optimiser.propose(rig.usual_start)
+        ut.Optimiser(ut.Cascade(rig, ut.MinimumTime()).loop, freedom=FREE).propose(rig.usual_start)

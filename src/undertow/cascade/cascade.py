@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -174,6 +174,8 @@ class Cascade:
         :meth:`undertow.Belief.usual`.  Plans are judged on an ensemble of plausible plants, and
         what the motion shows narrows it: law, search and gate go on with the estimated parameters,
         and a plan that some plausible plant would not survive is replaced before its period ends.
+        A schedule for least time is best for the estimate alone, and later decisions mend it: it
+        asks that one of :attr:`reserve` would bring every plausible plant home after a period.
         ``"exact"``: the mechanism is taken for the plant, as in the paper.
     covariance
         Of the error of the estimated state at the target, (2n, 2n), SI units: predictions count the
@@ -351,6 +353,31 @@ class Cascade:
 
         return loop
 
+    @cached_property
+    def _recourse(self) -> bool:
+        """Whether plans are for the estimate alone, and later decisions mend them for the plant.
+
+        One schedule that arrives without sliding in does so on one plant only: no mean over an
+        ensemble says what it is worth.
+        """
+        return (
+            self.known is not None
+            and self.planner is None
+            and self.freedom.schedule > 0
+            and self.loop.counts_time
+        )
+
+    @cached_property
+    def _estimated(self) -> Callable[[ParameterEstimate | None], ClosedLoop]:
+        """The predicted closed loop of an estimate taken for the plant; the latest are kept."""
+        alone = replace(self.loop, ensemble=None)
+
+        @lru_cache(maxsize=2)
+        def loop(estimate: ParameterEstimate | None) -> ClosedLoop:
+            return alone.believing(self._loops(estimate).mechanism)
+
+        return loop
+
     @checked
     def learns_from(self, estimator: Estimator) -> bool:
         """Whether an estimator learns what this cascade's belief leaves open, in its units."""
@@ -380,10 +407,19 @@ class Cascade:
         what it finds again.  A time of arrival is a matter of milliseconds, and is not searched
         for with longer steps than it is judged with.
         """
+        loop = self._estimated(None) if self._recourse else self.loop
         return Optimiser(
-            self._for_search(self.loop),
+            self._for_search(loop),
             self.first, self.cold, self.warm, self.freedom, seed=self.seed,
         )  # fmt: skip
+
+    @cached_property
+    def _robust(self) -> Optimiser:
+        """The optimiser of plans that suit every plausible plant."""
+        if not self._recourse:
+            return self.optimiser
+        freedom = replace(self.freedom, schedule=0.0)
+        return replace(self.optimiser, loop=self._for_search(self.loop), freedom=freedom)
 
     def _for_search(self, loop: ClosedLoop) -> ClosedLoop:
         """Return a predicted closed loop as the optimiser integrates it."""
@@ -401,7 +437,13 @@ class Cascade:
         """Who is asked for plans: ``planner``, or else the optimiser of a predicted closed loop."""
         if self.planner is not None:
             return self.planner
-        optimiser = self.optimiser
+        return self._optimiser_of(exact, target, t)
+
+    def _optimiser_of(
+        self, exact: ClosedLoop, target: ReferenceMotion | None, t: float
+    ) -> Optimiser:
+        """The optimiser of a predicted closed loop, about a target."""
+        optimiser = self.optimiser if exact.ensemble is None else self._robust
         if exact is not self.loop:
             optimiser = optimiser.on(self._for_search(exact))
         if target is None:
@@ -435,11 +477,13 @@ class Cascade:
     ) -> Plan:
         """The plan in use, or where it does not suit every plausible plant the best in reserve.
 
-        A plan with which a joint sticks suits none.
+        A plan with which a joint sticks suits none.  One that is to be mended need not suit all.
         """
         if loop.ensemble is None:
             return plan
         sticks = self._sticks(state, loop, plan) > 0
+        if not sticks and self._mendable(state, loop, plan, error, span):
+            return plan
         better = self._better_in_reserve(loop, plan, error.tobytes(), span, sticks)
         return plan if better is None else better
 
@@ -466,6 +510,33 @@ class Cascade:
             return self.reserve[best - 1] if best else None
 
         return better
+
+    def _mendable(
+        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
+    ) -> bool:
+        """Whether a plan brings the estimate home, and may be mended for the plant later on."""
+        if not self._recourse:
+            return False
+        estimated = self._estimated_at(state)
+        arrives = estimated.batch(error, plan, duration=span, precise=True).reached[0]
+        return bool(arrives) and self._recoverable(loop, error, plan)
+
+    def _recoverable(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
+        """Whether one in reserve would bring every plausible plant home after the next period."""
+        k = sum(t < self.period - 1e-9 for t in plan.times)
+        plans = [
+            Plan(
+                plan.surfaces[:k] + last.surfaces,
+                (*plan.times[:k], self.period),
+                plan.laws(self.reaching)[:k] + last.laws(self.reaching),
+            )
+            for last in self.reserve
+        ]
+        return bool(loop.batch(error, plans).reached.any())
+
+    def _estimated_at(self, state: CascadeState) -> ClosedLoop:
+        """The predicted closed loop of the estimate taken for the plant, about the target."""
+        return self.about(self._estimated(state.estimate), state.target, state.since)
 
     def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
         """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
@@ -584,7 +655,8 @@ class Cascade:
                 break
             about, planner = self.about(loop, target, t), self._planner(loop, target, t)
             if fixed is not None:
-                planner = self.optimiser.on(self.about(fixed, target, t))
+                optimiser = self.optimiser if fixed.ensemble is None else self._robust
+                planner = optimiser.on(self.about(fixed, target, t))
             proposal = planner.propose(
                 x, incumbent=None, horizon=horizon if short else None, sequence=0, computed_for=t,
                 resolution=0.0,
@@ -597,7 +669,8 @@ class Cascade:
             cost = cost if cost < INADMISSIBLE else math.inf
             good = math.isfinite(cost)
             if loop is not whole:  # every plausible plant lives to see the next decision
-                good &= self._survives(here, x, plan)
+                lives = self._survives if loop.ensemble is not None else self._recoverable
+                good &= lives(here, x, plan)
             if loop.ensemble is None and self.planner is None:
                 good &= cost <= AGREES * proposal.cost
             tries.append(FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal))
@@ -630,9 +703,10 @@ class Cascade:
         """What the first plan is to be best on, one after the other; and in what steps, if fixed.
 
         Before anything has moved, what suits every plausible plant suits none of them well: the
-        estimate alone comes first, for a plan that the next decision replaces.  Where its plan does
-        not do what it promised, small steps throughout follow: for one plant, which is integrated
-        to the tolerance, smaller ones than usual.
+        estimate alone comes first, for a plan that the next decision replaces; a schedule for it
+        without any error before.  Where its plan does not do what it promised, small steps
+        throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
+        usual.
         """
         whole = self._loops(estimate)
         if self.planner is not None:
@@ -640,12 +714,14 @@ class Cascade:
         loops = [whole]
         if self.known is not None and estimate is not None:
             loops.insert(0, whole.believing(whole.mechanism, self.known.alone(estimate)))
-        small = whole
-        if whole.ensemble is None and not self.zoh_steps:
-            small = whole.with_steps(self.step / FINER, 0.0)
-        return [
-            (loop, fixed) for loop in loops for fixed in (None, small if loop is whole else loop)
-        ]
+        if self._recourse:
+            loops.insert(0, self._estimated(estimate))
+
+        def smaller(loop: ClosedLoop) -> ClosedLoop:
+            adapts = loop.ensemble is None and not self.zoh_steps
+            return loop.with_steps(self.step / FINER, 0.0) if adapts else loop
+
+        return [(loop, fixed) for loop in loops for fixed in (None, smaller(loop))]
 
     def _judged(
         self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, span: float
@@ -668,7 +744,10 @@ class Cascade:
         The admission says what the gate would have said; ``accepted`` is always true.
         """
         current = state.error(state.since, self.mechanism.check_state(x))
-        asked = self._judged(self.loop_at(state), state.plan, state.plan, current, horizon)
+        loop, plan = self.loop_at(state), state.plan
+        if self._mendable(state, loop, plan, current, horizon):
+            loop = self._estimated_at(state)
+        asked = self._judged(loop, plan, plan, current, horizon)
         reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
         return Admission(True, reason, state.predicted, asked.verdict)
 
@@ -745,17 +824,25 @@ class Cascade:
     ) -> Proposal:
         sequence = state.sequence + 1
         try:
-            planner = self._planner(self._loops(state.estimate), state.target, t)
             error = state.error(t, self.mechanism.check_state(x))
             span = self.objective.horizon if horizon is None else horizon
-            return planner.propose(
-                error,
-                incumbent=self._standing(state, self.loop_at(state, t), state.at(t), error, span),
-                horizon=horizon,
-                sequence=sequence,
-                computed_for=t,
-                resolution=self.resolution * state.scale,
-            )
+            here, loop, used = replace(state, since=t), self.loop_at(state, t), state.at(t)
+            ask: dict[str, Any] = {
+                "horizon": horizon,
+                "sequence": sequence,
+                "computed_for": t,
+                "resolution": self.resolution * state.scale,
+            }
+            if self._recourse:
+                optimiser = self._optimiser_of(self._estimated(state.estimate), state.target, t)
+                admits = partial(self._recoverable, loop, error)
+                found = optimiser.propose(error, incumbent=used, admits=admits, **ask)
+                plans = [used] if found.plan is None else [found.plan, used]
+                if any(self._mendable(here, loop, plan, error, span) for plan in plans):
+                    return found
+            planner = self._planner(self._loops(state.estimate), state.target, t)
+            standing = self._standing(here, loop, used, error, span)
+            return planner.propose(error, incumbent=standing, **ask)
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             said = error_text(error)
             return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
@@ -780,6 +867,8 @@ class Cascade:
 
         Where the plan in use does not suit every plausible plant and one in :attr:`reserve` does,
         or is survived longer, that one is compared with, and takes over unless the proposal does.
+        A schedule for least time need not suit them: it is judged on the estimate, as long as one
+        in reserve would bring all of them home after the next period.
 
         Where the target moves, what the gate admits is also rolled out along the reference, as is
         the plan in use: constraints have to hold there, and the cost must not rise.
@@ -794,14 +883,21 @@ class Cascade:
         jump = self._jump(state, t, current)
         loop = self.loop_at(state, t)
         used = state.at(t)
-        old = self._standing(state, loop, used, current, span)
+        old = self._standing(replace(state, since=t), loop, used, current, span)
         state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
-        if proposal.plan is None:
-            kept = self._judged(loop, old, old, current, span)
+        mends, mended = (
+            plan is not None and self._mendable(state, loop, plan, current, span)
+            for plan in (old, proposal.plan)
+        )
+        judge = self._estimated_at(state) if mends or mended else loop
+        if proposal.plan is None or (mends and not mended):
+            kept = self._judged(judge, old, old, current, span)
             reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
+            if proposal.plan is not None:
+                reason = f"some plausible plant would not come home after another period{jump}"
             admission = replace(kept, accepted=False, reason=reason)
             return replace(state, predicted=kept.cost), _reserved(admission, old, used)
-        admission = self._judged(loop, old, proposal.plan, current, span)
+        admission = self._judged(judge, old, proposal.plan, current, span)
         off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
         if off > self._sticks(state, loop, old):
             cost = self._judged(loop, old, old, current, span).cost

@@ -275,6 +275,14 @@ class ClosedLoop:
         return TerminalLinearModel(self.mechanism, self.objective, self.ensemble)
 
     @cached_property
+    def counts_time(self) -> bool:
+        """Whether the cost is the time of arrival, a discontinuous function of the plan."""
+        end = self.linear_end
+        if end is None or end.stage is None:
+            return False
+        return end.stage.rest > 0 and not end.counts_cost
+
+    @cached_property
     def takes_large_steps(self) -> bool:
         """Whether rollouts end in large steps, with the linear model."""
         problem = self.objective

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -107,13 +107,10 @@ class Optimiser:
         """The coordinates of the search, around that surface."""
         return SearchSpace(self.loop, self.anchor, self.freedom)
 
-    @cached_property
+    @property
     def counts_time(self) -> bool:
         """Whether the cost is the time of arrival, a discontinuous function of the plan."""
-        end = self.loop.linear_end
-        if end is None or end.stage is None:
-            return False
-        return end.stage.rest > 0 and not end.counts_cost
+        return self.loop.counts_time
 
     @cached_property
     def aims(self) -> bool:
@@ -158,6 +155,7 @@ class Optimiser:
         computed_for: float = 0.0,
         resolution: float = 0.0,
         budget: Budget | None = None,
+        admits: Callable[[Plan], bool] | None = None,
     ) -> Proposal:
         """Optimise the plan from the state x.
 
@@ -176,6 +174,9 @@ class Optimiser:
             Differences in cost below this are not worth a search.
         budget
             Overrides ``warm`` or ``cold``.
+        admits
+            Whether a schedule that arrives is admissible besides; where the incumbent is not, the
+            answer may be worse.
 
         Returns
         -------
@@ -186,6 +187,7 @@ class Optimiser:
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
         task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
+        task.admits = admits or task.admits
         if incumbent is None:
             *_, converged = global_search(task)
         elif self.counts_time:
@@ -227,8 +229,8 @@ class Optimiser:
             raise InvalidInputError(
                 "schedule",
                 value=f"{self.freedom.schedule:g} s",
-                limit="for least time, a model that is taken for the plant",
-                remedy='Give the cascade belief="exact", or leave schedule out',
+                limit="for least time, one plant",
+                remedy="Leave the ensemble out, or schedule",
             )
         early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
         return Optimisation(

@@ -152,10 +152,11 @@ def _lead_back(
     def admits(z: FloatArray) -> NDArray[np.bool_]:
         task.evaluations += EXACT * len(z)
         batch = space.batch(task.x, z, duration=T, precise=True)
-        arrives = np.asarray(batch.reached)
-        if arrives.any():
-            best = int(np.argmin(np.where(arrives, batch.time, np.inf)))
-            task.consider(_ended(task, space.plan(z[best]), float(batch.time[best])))
+        arrives = np.array(batch.reached)
+        for k in np.argsort(np.where(arrives, batch.time, np.inf))[: arrives.sum()]:
+            if task.consider(_ended(task, space.plan(z[k]), float(batch.time[k]))):
+                break
+            arrives[k] = False
         return arrives
 
     search = ArrivalSearch(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -97,6 +98,7 @@ class Optimisation:
         self._unscored: Plan | None = None
         self._pace = 0.0
         self.kept = 0
+        self.admits: Callable[[Plan], bool] = lambda _: True
         self.minima: list[float] = []
         self._buffers: dict[int, RolloutBuffers] = {}
 
@@ -261,7 +263,9 @@ class Optimisation:
         )  # fmt: skip
         stable = loop.linear_end or stability_margin(loop.mechanism, incumbent.surfaces[-1]) > 0
         self.evaluations += 1
-        self._adopt(incumbent, here, float(batch.score(self.horizon)[0]) if stable else UNSTABLE)
+        score = float(batch.score(self.horizon)[0]) if stable else UNSTABLE
+        admitted = score >= INADMISSIBLE or self.admits(incumbent)
+        self._adopt(incumbent, here, score if admitted else UNSTABLE)
         return here
 
     def score_incumbent(self, here: FloatArray) -> None:
@@ -269,13 +273,19 @@ class Optimisation:
         if self._unscored is not None:
             self.cost(here[None])
 
-    def consider(self, plan: Plan) -> None:
-        """Score a plan that the coordinates cannot express, and keep it where it is the best."""
+    def consider(self, plan: Plan) -> bool:
+        """Score a plan that the coordinates cannot express, and keep it where it is the best.
+
+        Returns whether it is admissible, or none the better for it.
+        """
         batch = self.loop.batch(self.x, plan, duration=self.horizon, stable_only=True, precise=True)
         self.evaluations += EXACT
         score = float(batch.score(self.horizon)[0])
         if score < self.best_cost and stability_margin(self.loop.mechanism, plan.surfaces[-1]) > 0:
+            if not self.admits(plan):
+                return False
             self._best, self.best_z, self.best_cost = plan, self.space.encode(plan), score
+        return True
 
     def states(
         self, z: FloatArray, T: float, space: SearchSpace | None = None
