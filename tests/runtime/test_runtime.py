@@ -405,7 +405,7 @@ def test_a_motor_that_is_faster_than_the_samples_is_run() -> None:
     recipe = Recipe(mechanism=mechanism, rig="realistic", evaluations=64, period=0.01)
     with session(recipe, simulated=True) as runtime:
         report = runtime.run(6.0)
-    assert report.verdict.ending == "balanced"
+    assert report.verdict.ending in ("balanced", "caught")  # held to the end, settled or not
 
 
 @pytest.mark.slow
