@@ -404,8 +404,8 @@ def test_a_motor_that_is_faster_than_the_samples_is_run() -> None:
     mechanism = "wheeled_inverted_pendulum"
     recipe = Recipe(mechanism=mechanism, rig="realistic", evaluations=64, period=0.01)
     with session(recipe, simulated=True) as runtime:
-        report = runtime.run(6.0)
-    assert report.verdict.ending in ("balanced", "caught")  # held to the end, settled or not
+        report = runtime.run(10.0)
+    assert report.verdict.ending == "balanced"
 
 
 @pytest.mark.slow

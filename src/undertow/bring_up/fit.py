@@ -22,8 +22,9 @@ import scipy.optimize
 import scipy.signal
 
 from undertow.base import InvalidInputError, Progress
-from undertow.bring_up.motion import MotionRecord, Predictor, input_gains
+from undertow.bring_up.motion import MotionRecord, Predictor
 from undertow.models import FloatArray, Mechanism, Parameter
+from undertow.plants import full_forces
 
 #: Encoder zeros from which a predicted motion is counted.
 ZEROS = 200
@@ -149,7 +150,7 @@ def candidates(mechanism: Mechanism, coulomb: float, record: MotionRecord) -> li
     Delay, dry friction, damping, inertias and motor constants first; then damping that the
     model leaves out, factors of the inputs, lengths, and masses last.
     """
-    levels = input_gains(mechanism) @ mechanism.input_limits
+    levels = full_forces(mechanism)
     what = "from a write to its effect in a reading"
     variables = [Quantity("delay", "s", what, 1e-3, 1e-3, high=0.1)]
     for i, c in enumerate(mechanism.coordinates):

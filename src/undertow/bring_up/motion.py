@@ -60,11 +60,6 @@ def _growth(mechanism: Mechanism, x: FloatArray) -> float:
     return float(np.linalg.eigvals(A).real.max())
 
 
-def input_gains(mechanism: Mechanism) -> FloatArray:
-    """Return |B| with the model's parameters, (m, m): what the inputs do to the driven joints."""
-    return np.asarray(np.abs(mechanism.B))
-
-
 class GuardError(UndertowError):
     """A coordinate left the range that was allowed to it; the inputs were set to zero."""
 

@@ -17,9 +17,9 @@ from typing import Self
 
 import numpy as np
 
-from undertow.bring_up.motion import MotionRecord, Predictor, input_gains
+from undertow.bring_up.motion import MotionRecord, Predictor
 from undertow.models import FloatArray
-from undertow.plants import Measurement, Rig, RigWrapper
+from undertow.plants import Measurement, Rig, RigWrapper, full_forces
 
 #: A factor within this ratio of 1 is within the tolerance of parameters and friction.
 TOLERANCE = 1.45
@@ -219,12 +219,11 @@ def push_response(predictor: Predictor, record: MotionRecord, i: int, calm: Floa
     not moved it: a fault only where twice as much was predicted, for a joint may still swing.
     """
     belief, n = predictor.mechanism, predictor.mechanism.n
-    full = input_gains(belief) @ belief.input_limits
     push = float(np.abs(record.u[:, i]).max()) / belief.input_limits[i]
     predicted = []
     for shares in itertools.product(LEVELS, repeat=belief.m):
         coulomb = np.zeros((2, n))
-        coulomb[:, : belief.m] = push * full * shares
+        coulomb[:, : belief.m] = push * full_forces(belief) * shares
         states = predictor.states(
             record, belief.parameter_values, coulomb, np.zeros(n), np.ones(belief.m)
         )

@@ -16,7 +16,6 @@ from undertow.bring_up.motion import (
     MotionRecord,
     Predictor,
     doublets,
-    input_gains,
     perform,
     ramp,
     rest_state,
@@ -320,7 +319,7 @@ class _Wizard:
         """Return inputs small enough for what the model says they do: within half the guards."""
         belief, n = self.belief, self.belief.n
         coulomb = np.zeros((2, n))
-        coulomb[:, : belief.m] = input_gains(belief) @ self.breakaway
+        coulomb[:, : belief.m] = np.abs(belief.B) @ self.breakaway
         t = np.arange(len(u), dtype=np.float64) * self.rig.period
         for _ in range(20):
             states = self.predictor.states(

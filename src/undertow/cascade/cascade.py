@@ -439,11 +439,15 @@ class Cascade:
             return self.planner
         return self._optimiser_of(exact, target, t)
 
+    def _suited(self, loop: ClosedLoop) -> Optimiser:
+        """The optimiser for one plant, or for an ensemble of plausible ones."""
+        return self.optimiser if loop.ensemble is None else self._robust
+
     def _optimiser_of(
         self, exact: ClosedLoop, target: ReferenceMotion | None, t: float
     ) -> Optimiser:
         """The optimiser of a predicted closed loop, about a target."""
-        optimiser = self.optimiser if exact.ensemble is None else self._robust
+        optimiser = self._suited(exact)
         if exact is not self.loop:
             optimiser = optimiser.on(self._for_search(exact))
         if target is None:
@@ -655,8 +659,7 @@ class Cascade:
                 break
             about, planner = self.about(loop, target, t), self._planner(loop, target, t)
             if fixed is not None:
-                optimiser = self.optimiser if fixed.ensemble is None else self._robust
-                planner = optimiser.on(self.about(fixed, target, t))
+                planner = self._suited(fixed).on(self.about(fixed, target, t))
             proposal = planner.propose(
                 x, incumbent=None, horizon=horizon if short else None, sequence=0, computed_for=t,
                 resolution=0.0,

@@ -13,6 +13,7 @@ from undertow.plants.bench import (
     Friction,
     Push,
     Timing,
+    full_forces,
     plausible_rig,
     srv02_rig,
 )
@@ -47,6 +48,7 @@ __all__ = [
     "Timing",
     "check_rig",
     "control_loop",
+    "full_forces",
     "plausible_rig",
     "rig_from_file",
     "srv02_rig",

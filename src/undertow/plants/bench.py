@@ -374,6 +374,16 @@ def srv02_rig() -> Bench:
     )
 
 
+def full_forces(mechanism: Mechanism) -> FloatArray:
+    """Return what the full inputs do at most to each driven joint, (m,), N or N m.
+
+    An input without a limit does not count.
+    """
+    limits = mechanism.input_limits
+    forces: FloatArray = np.abs(mechanism.B) @ np.where(np.isfinite(limits), limits, 0.0)
+    return forces
+
+
 def plausible_rig(mechanism: Mechanism) -> Bench:
     """Return a bench of usual quality for any mechanism: encoders, friction, delay, spread.
 
@@ -381,11 +391,9 @@ def plausible_rig(mechanism: Mechanism) -> Bench:
     what their inputs can do, breakaway a third above; 1 ms from measurement to action with 0.1 ms
     of jitter; a 12-bit converter; every parameter but gravity within ±3 %.
     """
-    limits = mechanism.input_limits
-    most = np.abs(mechanism.B) @ np.where(np.isfinite(limits), limits, 0.0)
     loads = {
         c.name: 0.02 * float(load)
-        for c, load in zip(mechanism.coordinates, most, strict=False)
+        for c, load in zip(mechanism.coordinates, full_forces(mechanism), strict=False)
         if load > 0.0
     }
     return Bench(
