@@ -511,6 +511,14 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
     assert "the same bits as in the store" in again.output
     found = digest(compute(MAP, 4))
     assert f"{found:016x}" in again.output
+    campaign = Campaign(Definition.read(file), out)
+    arrays = compute(campaign.definition, 4)
+    arrays["cost"] = arrays["cost"].astype(float) * 1.001
+    Store(out).write(campaign.study, 4, arrays)
+    Store(out)._group.attrs["processor"] = "an older one"
+    changed = " ".join(runner.invoke(app, [*told, "--shard", "4"]).output.split())
+    assert re.search(r"the store has other bits: cost at \d+ of 16, by \S+ at most; ", changed)
+    assert "another processor, an older one; this is" in changed
     for wrong, words in (
         (["--shard", "6"], "0 to 5"),
         (["--limit", "3"], "--workers 1"),

@@ -21,7 +21,7 @@ _BLOCK = 4096
 
 
 class RealisticRig:
-    """A simulated bench: the same seed and the same inputs give the same bits.
+    """A simulated bench: the same seed and inputs give the same bits on processors of one kind.
 
     Parameters
     ----------

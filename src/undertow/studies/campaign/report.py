@@ -10,6 +10,8 @@ from rich.console import RenderableType
 from undertow.base import duration, number, table
 from undertow.studies.campaign.run import Campaign, CampaignResult, compute
 from undertow.studies.campaign.store import Store, digest
+from undertow.studies.campaign.study import Arrays
+from undertow.symbolic import processor
 
 #: Numbers of shards that a sentence lists.
 LISTED = 8
@@ -29,14 +31,32 @@ def alone(campaign: Campaign, shard: int) -> list[str]:
     found = digest(campaign.study.same_bits(arrays))
     said = "there is no store"
     if campaign.path.exists():
-        mark = int(Store(campaign.path, campaign.key).marks()[shard])
-        said = "the same bits as in the store" if mark == found else "the store has other bits"
-        said = said if mark else "the store has it not"
+        store = Store(campaign.path, campaign.key)
+        mark = int(store.marks()[shard])
+        said = "the same bits as in the store" if mark else "the store has it not"
+        if mark not in (0, found):
+            said = f"the store has other bits: {_difference(campaign, store, shard, arrays)}"
     return [
         f"shard {shard} of {campaign.study.shards}, seed {campaign.study.seed}: "
         f"digest {found:016x}, {said}",
         *(f"  {name}: {_range(values)}" for name, values in arrays.items()),
     ]
+
+
+def _difference(campaign: Campaign, store: Store, shard: int, arrays: Arrays) -> str:
+    """Return where a shard is not what the store has, by how much, and on what processor."""
+    there = campaign.study.same_bits(store.read(campaign.study, shard))
+    parts = []
+    for name, values in campaign.study.same_bits(arrays).items():
+        here, other = values.astype(float), there[name].astype(float)
+        unlike = ~((here == other) | (np.isnan(here) & np.isnan(other)))
+        if unlike.any():
+            most = np.abs(here - other)[unlike].max()
+            parts.append(f"{name} at {unlike.sum()} of {unlike.size}, by {most:.2g} at most")
+    begun, this = store.about.get("processor", "not recorded"), processor()["processor"]
+    if begun != this:
+        parts.append(f"it was begun on another processor, {begun}; this is {this}")
+    return "; ".join(parts) or "its mark is not that of its arrays"
 
 
 def report(campaign: Campaign, outcome: CampaignResult) -> list[RenderableType]:

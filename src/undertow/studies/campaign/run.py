@@ -37,6 +37,7 @@ from undertow.studies.campaign.region_map import RegionMap
 from undertow.studies.campaign.store import DONE, SHARD, Store, dataset, digest
 from undertow.studies.campaign.study import Arrays, Study
 from undertow.studies.experiment import Serial, ended
+from undertow.symbolic import processor
 from undertow.symbolic.store import content_key
 
 #: Kinds of campaigns by the word for each.
@@ -197,7 +198,8 @@ class Campaign:
         """
         if resume:
             return Store(self.path, self.key)
-        return Store.create(self.path, self.study, self.key, self.about | {"versions": versions()})
+        made_by = {"versions": versions(), "processor": processor()["processor"]}
+        return Store.create(self.path, self.study, self.key, self.about | made_by)
 
     @property
     def about(self) -> dict[str, Any]:

@@ -63,7 +63,8 @@ class Study(ABC):
     """One kind of campaign, made from a mechanism and settings: its result is a grid of arrays.
 
     The grid is cut into shards along its first axes, so that a shard has at most ``most`` entries
-    where the last axes allow it.  Equal settings and shard number give the same bits anywhere.
+    where the last axes allow it.  Equal settings and shard number give the same bits on
+    processors of one kind.
 
     Attributes
     ----------
