@@ -15,6 +15,7 @@ from undertow.base import InvalidInputError, UndertowError, UnstableSurfaceError
 from undertow.cascade import Update
 from undertow.models import TIME
 from undertow.optimiser.search import POLISH
+from undertow.studies.motion import ended
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -60,6 +61,23 @@ def test_a_coordinate_may_be_called_x() -> None:
     run = loop.simulate(cart.state(x=0.49, x_dot=1.0), ut.first_surface(cart), duration=0.1)
     assert run.event == ut.Event.CONSTRAINT
     assert run["x"][-2] <= 0.5 < run["x"][-1]
+    assert run.ending == "constraint |x| ≤ 0.5"
+
+
+def test_a_motion_names_what_it_breaks_of_what_bounds_its_input(rig: ut.Mechanism) -> None:
+    """Of two constraints the one on the input; where all hold it is the hard limit."""
+    small = ut.Constraint("small voltage", lambda v: v.voltage**2 - 1)
+    large = ut.Constraint("large voltage", lambda v: v.voltage**2 - 1e4)
+    for bounds, ending in (
+        ((small, large), "constraint small voltage"),
+        ((large,), "constraint the hard input limit"),
+    ):
+        goal = ut.MinimumTime(constraints=bounds, hard_input=True)
+        loop = interpreted(ut.ClosedLoop(rig, goal))
+        run = loop.simulate(rig.state(phi=0.8), ut.first_surface(rig), duration=0.02)
+        assert run.ending == ending
+        assert f", {ending}, cost" in repr(run)
+        assert ended(run, goal) == f"broke {ending.removeprefix('constraint ')}, at 0.000 s"
 
 
 @pytest.mark.parametrize("evaluations", [300, 6000])

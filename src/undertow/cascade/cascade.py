@@ -303,10 +303,10 @@ class Cascade:
     @cached_property
     def loop(self) -> ClosedLoop:
         """The predicted closed loop, belief as plant, integrated to its end: the gate's."""
-        belief = self.known
+        belief, objective = self.known, self.objective
         return ClosedLoop(
             self.mechanism,
-            self.objective,
+            objective if belief is None else objective.guarded(self.mechanism),
             self.reaching,
             step=self.step,
             zoh_steps=self.zoh_steps,
@@ -542,6 +542,26 @@ class Cascade:
         """The predicted closed loop of the estimate taken for the plant, about the target."""
         return self.about(self._estimated(state.estimate), state.target, state.since)
 
+    @cached_property
+    def _bounds_input(self) -> bool:
+        """Whether a plan may break a bound on the input between two steps of a prediction."""
+        return self.known is not None and (
+            self.objective.hard_input or self.loop.objective != self.objective
+        )
+
+    def _breaks(
+        self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
+    ) -> FloatArray:
+        """When each plan breaks a constraint on the estimate, s; infinite where none does.
+
+        An input that changes with the plan may pass its bound and be back within a step: what suits
+        every plausible plant at the steps of an ensemble is integrated to the tolerance on one.
+        """
+        if not self._bounds_input:
+            return np.full(len(plans), math.inf)
+        motion = self._estimated_at(state).batch(error, plans, duration=span, precise=True)
+        return np.where(motion.event == Event.CONSTRAINT, motion.time, math.inf)
+
     def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
         """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
         if not state.disturbance or loop.ensemble is None:
@@ -670,7 +690,8 @@ class Cascade:
                 continue
             cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
-            good = math.isfinite(cost)
+            begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
+            good = math.isfinite(cost) and math.isinf(self._breaks(begun, [plan], x, horizon)[0])
             if loop is not whole:  # every plausible plant lives to see the next decision
                 lives = self._survives if loop.ensemble is not None else self._recoverable
                 good &= lives(here, x, plan)
@@ -907,6 +928,12 @@ class Cascade:
             most = f"{self.objective.terminal_radius:g} at most"
             words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
             admission = Admission(False, words, cost)
+        if admission.accepted:
+            kept_until, breaks = self._breaks(state, [old, proposal.plan], current, span)
+            if breaks < kept_until:
+                cost = self._judged(loop, old, old, current, span).cost
+                words = f"breaks a constraint between two steps, at {breaks:.3g} s"
+                admission = Admission(False, words, cost)
         if state.target is not None and state.target.moves:
             admission = self._along(state, old, proposal.plan, admission, span)
         admission = replace(admission, reason=f"{admission.reason}{jump}")

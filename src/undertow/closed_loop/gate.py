@@ -56,8 +56,10 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
     if not stability > 0:
         return Admission(False, f"unstable: margin {stability:.3g} 1/s", old_cost)
     if new_cost >= INADMISSIBLE:
-        event = Event(int(pair.event[1])).name.lower()
-        broken = f"{event} at {pair.time[1]:.3g} s"
+        event = Event(int(pair.event[1]))
+        named = zip(loop.objective.constraints, pair.path[1], strict=True)
+        names = [c.name for c, margin in named if event == Event.CONSTRAINT and not margin >= 0]
+        broken = " ".join([event.name.lower(), *names, f"at {pair.time[1]:.3g} s"])
         if loop.ensemble is not None and new_cost < old_score:  # of two that fail, the later
             return Admission(
                 True, f"suits not every plausible plant, but longer: {broken}", old_cost

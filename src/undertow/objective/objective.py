@@ -48,6 +48,10 @@ TRAVEL = 0.95
 #: :mod:`undertow.closed_loop.exponential_integrator`.
 SPARE = 0.05
 
+#: Part of the room of a constraint on the input, of that at the target, that predictions keep where
+#: they are about plausible plants.
+GUARD = 0.01
+
 #: Radius of a terminal set, at most, over the range of a state.
 WIDEST = 10.0
 
@@ -199,6 +203,17 @@ class _Shifted:
     def __call__(self, v: Names) -> sp.Expr:
         moved = {getattr(v, x): getattr(v, x) + getattr(v, target) for x, target in self.targets}
         return sp.sympify(self.formula(v)).xreplace(moved)
+
+
+@dataclass(frozen=True)
+class _Guarded:
+    """w of a constraint that is kept by some margin."""
+
+    formula: Formula
+    margin: float
+
+    def __call__(self, v: Names) -> sp.Expr:
+        return self.formula(v) + self.margin
 
 
 def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
@@ -463,6 +478,25 @@ class Objective:
         return replace(self, constraints=constraints, travel=False)
 
     @checked
+    def guarded(self, mechanism: Mechanism) -> Self:
+        """Return the problem with 1 % of the room of each constraint on the input kept.
+
+        The room is −w(0, 0), the margin at the target.  What the input of a law is follows the
+        state: a plan that goes up to such a constraint on one plant breaks it on the next, where
+        one that goes up to a bound of a state is a little late, if anything.
+        """
+        at_target = mechanism.substitution | dict.fromkeys([*mechanism.x, *mechanism.u], 0.0)
+
+        def kept(c: Constraint, margin: sp.Expr) -> Constraint:
+            room = margin.subs(at_target)
+            if not (margin.free_symbols & {*mechanism.u} and room.is_finite and room > 0):
+                return c
+            return replace(c, formula=_Guarded(c.formula, GUARD * float(room)))
+
+        margins = self.path_margins(mechanism)
+        return replace(self, constraints=tuple(map(kept, self.constraints, margins)))
+
+    @checked
     def range_of(self, mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
         """Return the least and the largest value of each state, (2n,), that boxes among them allow.
 
@@ -619,6 +653,26 @@ class Objective:
                 return ()
             found.append((bounded[0], constraint.formula.spare))
         return tuple(found)
+
+    @checked
+    def broken(self, mechanism: Mechanism, x: FloatArray, u: FloatArray) -> str:
+        """Return the names of the constraints that a state breaks under an input, or nothing.
+
+        Parameters
+        ----------
+        mechanism
+            Whose state it is.
+        x, u
+            State, (2n,), and input, (m,), SI units.
+        """
+        values = zip([*mechanism.x, *mechanism.u], [*x.tolist(), *u.tolist()], strict=True)
+        known = mechanism.substitution | dict(values)
+        margins = [margin.subs(known) for margin in self.path_margins(mechanism)]
+        return " and ".join(
+            constraint.words
+            for constraint, margin in zip(self.constraints, margins, strict=True)
+            if not (margin.is_real and margin >= 0)
+        )
 
     @checked
     def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
