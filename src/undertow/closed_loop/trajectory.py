@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from undertow.base import at_least, checked, one_of, require_extra
 from undertow.models import FloatArray, Mechanism
-from undertow.objective import Objective
+from undertow.objective.objective import Objective, broken_constraints
 from undertow.symbolic import compiled
 
 if TYPE_CHECKING:
@@ -297,7 +297,7 @@ def recorded(
     x, u, s, cost, margin = parts
     broken = ""
     if event == Event.CONSTRAINT:
-        broken = objective.broken(mechanism, x[-1], u[-1]) or INPUT_LIMIT
+        broken = broken_constraints(objective, mechanism, x[-1], u[-1]) or INPUT_LIMIT
     return Trajectory(
         mechanism, t, x, u, s, cost[:, 0], margin[:, 0], Event(event), objective.unit, broken
     )

@@ -655,26 +655,6 @@ class Objective:
         return tuple(found)
 
     @checked
-    def broken(self, mechanism: Mechanism, x: FloatArray, u: FloatArray) -> str:
-        """Return the names of the constraints that a state breaks under an input, or nothing.
-
-        Parameters
-        ----------
-        mechanism
-            Whose state it is.
-        x, u
-            State, (2n,), and input, (m,), SI units.
-        """
-        values = zip([*mechanism.x, *mechanism.u], [*x.tolist(), *u.tolist()], strict=True)
-        known = mechanism.substitution | dict(values)
-        margins = [margin.subs(known) for margin in self.path_margins(mechanism)]
-        return " and ".join(
-            constraint.words
-            for constraint, margin in zip(self.constraints, margins, strict=True)
-            if not (margin.is_real and margin >= 0)
-        )
-
-    @checked
     def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
         """Refuse an initial state that breaks a path constraint, whatever the input does.
 
@@ -837,6 +817,20 @@ class MinimumTime(Objective):
     stage: Formula = _one
     unit: str = "s"
     formula: str = "∫ 1 dt"
+
+
+def broken_constraints(
+    objective: Objective, mechanism: Mechanism, x: FloatArray, u: FloatArray
+) -> str:
+    """Return the names of the constraints that a state, (2n,), breaks under an input, (m,)."""
+    values = zip([*mechanism.x, *mechanism.u], [*x.tolist(), *u.tolist()], strict=True)
+    known = mechanism.substitution | dict(values)
+    margins = [margin.subs(known) for margin in objective.path_margins(mechanism)]
+    return " and ".join(
+        constraint.words
+        for constraint, margin in zip(objective.constraints, margins, strict=True)
+        if not (margin.is_real and margin >= 0)
+    )
 
 
 def _failed(what: str, error: Exception) -> InvalidInputError:

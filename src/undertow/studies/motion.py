@@ -15,7 +15,7 @@ from undertow.closed_loop.figures import display, figure_bytes, motion_figure, s
 from undertow.closed_loop.trajectory import INPUT_LIMIT
 from undertow.law import Surface, Target
 from undertow.models import FloatArray, Mechanism
-from undertow.objective import Objective
+from undertow.objective.objective import Objective, broken_constraints
 from undertow.optimiser import Proposal
 
 _ENDINGS = {
@@ -80,8 +80,8 @@ def _ended(
     broken = ""
     if motion.event == Event.CONSTRAINT:
         mechanism = motion.mechanism
-        broken = objective.on(mechanism).broken(mechanism, motion.x[-1], motion.u[-1])
-        broken = broken or INPUT_LIMIT
+        problem = objective.on(mechanism)
+        broken = broken_constraints(problem, mechanism, motion.x[-1], motion.u[-1]) or INPUT_LIMIT
     radius, norm = objective.terminal_radius, float(np.linalg.norm(error))
     said = words[motion.event].format(off=off, radius=radius, norm=norm, broken=broken)
     return f"{said}, at {motion.time:.3f} s"
