@@ -110,7 +110,7 @@ class LoopsAbout:
         moved = None if loop.plant is None else self._mechanism(loop.plant, positions)
         key = (
             loop.reaching, loop.step, loop.zoh_steps, loop.rtol, loop.tail_rtol, loop.escape,
-            loop.plant, loop.ensemble is None, loop.threads, loop.objective,
+            loop.plant, loop.ensemble is None, loop.threads, loop.objective, loop.returning,
         )  # fmt: skip
         if moved is not None or key not in self._prototypes:
             problem = loop.objective.about(self.mechanism, self.names)
