@@ -663,6 +663,13 @@ def test_a_target_a_little_off_names_the_nearest_equilibrium() -> None:
         linearise(pair(3 + sp.sin(ANGLE)))
 
 
+@pytest.mark.parametrize("word", ["hanging", "upright", "nearest"])
+def test_a_mechanism_without_an_equilibrium_is_refused_as_one(word: str) -> None:
+    """Whichever is asked for: there is nothing to take instead."""
+    with pytest.raises(ModelError, match="equilibria of 'pair': got none that was found"):
+        modelling.at_equilibrium(pair(3 + sp.sin(ANGLE)), word)
+
+
 def test_an_input_matrix_takes_no_time_and_a_force_has_all_rows() -> None:
     both = [ut.Coordinate("x", "m"), ut.Coordinate("phi")]
     push = [ut.Input("push", "N", 5.0)]
