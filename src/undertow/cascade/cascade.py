@@ -37,7 +37,7 @@ from undertow.cascade.simulation import (
 )
 from undertow.cascade.targets import LoopsAbout, legs_of
 from undertow.closed_loop import INADMISSIBLE, RTOL, ClosedLoop, Event, Trajectory, simulate_along
-from undertow.closed_loop.gate import Admission, Gate, cost_gate
+from undertow.closed_loop.gate import Admission, Gate, broken_by, cost_gate
 from undertow.estimators import Belief, Estimator, ParameterEstimate
 from undertow.law import (
     Control,
@@ -551,16 +551,19 @@ class Cascade:
 
     def _breaks(
         self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
-    ) -> FloatArray:
-        """When each plan breaks a constraint on the estimate, s; infinite where none does.
+    ) -> list[tuple[float, str]]:
+        """When each plan breaks a constraint on the estimate, s, and which; infinite: none does.
 
         An input that changes with the plan may pass its bound and be back within a step: what suits
         every plausible plant at the steps of an ensemble is integrated to the tolerance on one.
         """
         if not self._bounds_input:
-            return np.full(len(plans), math.inf)
-        motion = self._estimated_at(state).batch(error, plans, duration=span, precise=True)
-        return np.where(motion.event == Event.CONSTRAINT, motion.time, math.inf)
+            return [(math.inf, "")] * len(plans)
+        loop = self._estimated_at(state)
+        motions = loop.batch(error, plans, duration=span, precise=True)
+        names = [broken_by(loop, motions, k) for k in range(len(plans))]
+        ends = zip(motions.time.tolist(), names, strict=True)
+        return [(t if name else math.inf, name) for t, name in ends]
 
     def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
         """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
@@ -691,7 +694,7 @@ class Cascade:
             cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
             begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
-            good = math.isfinite(cost) and math.isinf(self._breaks(begun, [plan], x, horizon)[0])
+            good = math.isfinite(cost) and math.isinf(self._breaks(begun, [plan], x, horizon)[0][0])
             if loop is not whole:  # every plausible plant lives to see the next decision
                 lives = self._survives if loop.ensemble is not None else self._recoverable
                 good &= lives(here, x, plan)
@@ -929,10 +932,10 @@ class Cascade:
             words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
             admission = Admission(False, words, cost)
         if admission.accepted:
-            kept_until, breaks = self._breaks(state, [old, proposal.plan], current, span)
-            if breaks < kept_until:
+            (before, _), (end, name) = self._breaks(state, [old, proposal.plan], current, span)
+            if end < before:
                 cost = self._judged(loop, old, old, current, span).cost
-                words = f"breaks a constraint between two steps, at {breaks:.3g} s"
+                words = f"breaks {name} between two steps, at {end:.3g} s"
                 admission = Admission(False, words, cost)
         if state.target is not None and state.target.moves:
             admission = self._along(state, old, proposal.plan, admission, span)
