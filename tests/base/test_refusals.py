@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,8 +14,11 @@ import undertow as ut
 from support import interpreted
 from undertow.base import InvalidInputError, UndertowError, UnstableSurfaceError
 from undertow.cascade import Update
+from undertow.closed_loop.gate import broken_by
+from undertow.closed_loop.trajectory import Batch
 from undertow.models import TIME
 from undertow.optimiser.search import POLISH
+from undertow.studies.motion import ended
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -60,6 +64,34 @@ def test_a_coordinate_may_be_called_x() -> None:
     run = loop.simulate(cart.state(x=0.49, x_dot=1.0), ut.first_surface(cart), duration=0.1)
     assert run.event == ut.Event.CONSTRAINT
     assert run["x"][-2] <= 0.5 < run["x"][-1]
+    assert run.ending == "constraint |x| ≤ 0.5"
+
+
+def test_a_motion_names_what_it_breaks_of_what_bounds_its_input(rig: ut.Mechanism) -> None:
+    """Of two constraints the one on the input; where all hold it is the hard limit."""
+    small = ut.Constraint("small voltage", lambda v: v.voltage**2 - 1)
+    large = ut.Constraint("large voltage", lambda v: v.voltage**2 - 1e4)
+    for bounds, ending in (
+        ((small, large), "constraint small voltage"),
+        ((large,), "constraint the hard input limit"),
+    ):
+        goal = ut.MinimumTime(constraints=bounds, hard_input=True)
+        loop = interpreted(ut.ClosedLoop(rig, goal))
+        run = loop.simulate(rig.state(phi=0.8), ut.first_surface(rig), duration=0.02)
+        assert run.ending == ending
+        assert f", {ending}, cost" in repr(run)
+        assert ended(run, goal) == f"broke {ending.removeprefix('constraint ')}, at 0.000 s"
+
+
+def test_a_gate_names_what_a_prediction_breaks(rig: ut.Mechanism) -> None:
+    """The constraint with a margin that is not ≥ 0; the hard limit where all are; else nothing."""
+    bounds = ut.state_box(theta=1.0, phi=0.5)
+    loop = ut.ClosedLoop(rig, ut.MinimumTime(constraints=bounds))
+    path = np.array([[0.1, -0.01], [0.1, np.nan], [0.1, 0.2], [-0.1, 0.2]])
+    event = np.array([ut.Event.CONSTRAINT] * 3 + [ut.Event.REACHED])
+    batch = cast(Batch, SimpleNamespace(event=event, path=path))
+    found = [broken_by(loop, batch, k) for k in range(4)]
+    assert found == ["|phi| ≤ 0.5", "|phi| ≤ 0.5", "the hard input limit", ""]
 
 
 @pytest.mark.parametrize("evaluations", [300, 6000])

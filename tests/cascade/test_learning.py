@@ -14,6 +14,7 @@ import undertow as ut
 from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError
 from undertow.cascade import Admission, CascadeState, cost_gate
+from undertow.cascade.simulation import moving_loops
 from undertow.estimators import KalmanFilter, Measured, ParameterEstimate
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
@@ -281,6 +282,17 @@ def test_usual_tolerances_and_those_that_parameters_carry(pendulum: ut.Mechanism
         replace(pendulum.parameters[0], name="m", tolerance=-1.0)
 
 
+def test_the_unit_of_a_parameter_may_be_typed(pendulum: ut.Mechanism) -> None:
+    """``kg*m^2`` is an inertia, and ``m/s^2`` is gravity, whatever its name is."""
+    typed = {"I_e": "kg*m^2", "g": "m/s^2", "d_e": "N*m*s/rad"}
+    other = replace(
+        pendulum,
+        parameters=tuple(replace(p, unit=typed.get(p.name, p.unit)) for p in pendulum.parameters),
+    )
+    assert ut.Belief.usual(other).tolerances == ut.Belief.usual(pendulum).tolerances
+    assert other.parameters == pendulum.parameters
+
+
 @pytest.mark.slow
 def test_least_energy_on_plants_that_are_not_the_model(pendulum: ut.Mechanism) -> None:
     """Four drawn plants from 37°: close to what each would need if it were known."""
@@ -378,6 +390,39 @@ def test_a_schedule_for_a_plant_that_is_not_the_model(pendulum: ut.Mechanism, si
     kept = robust.start(x)[0].plan
     motion = ut.ClosedLoop(pendulum, made.objective, plant=plant).simulate(x, kept)
     assert run.time < 0.6 * motion.time
+
+
+def test_predictions_about_plausible_plants_keep_room_of_a_constraint_on_the_input(
+    pendulum: ut.Mechanism,
+) -> None:
+    """1 % of what there is at the target; the truth, and an exact belief, may use all of it.
+
+    Bounds of states, whatever their form, are theirs to use.
+    """
+    strong = ut.Constraint("strength", lambda v: v.voltage**2 - 49)
+    fast = ut.Constraint("speed", lambda v: v.theta_dot**2 - 36)
+    goal = ut.MinimumTime(constraints=(strong, fast))
+    whole = goal.path_margins(pendulum)
+    for belief, kept in (("usual", 0.49), ("exact", 0)):
+        cascade = ut.Cascade(pendulum, goal, belief=belief)  # type: ignore[arg-type]
+        margins = cascade.loop.objective.path_margins(pendulum)
+        off = [float(a - b) for a, b in zip(whole, margins, strict=True)]
+        assert off == pytest.approx([kept, 0])
+        assert moving_loops(cascade, None)[0].objective.path_margins(pendulum) == whole
+
+
+@pytest.mark.slow
+def test_a_bound_on_power_is_kept_between_the_steps_of_predictions() -> None:
+    """A heavier cart: at 0.4 s the best plan at the steps passes 5 W 0.4 ms after it takes over."""
+    cart = ut.mechanisms.cart_pendulum()
+    power = ut.Constraint("power", lambda v: v.force * v.x_dot - 5)
+    goal = ut.MinimumTime(horizon=6.0, constraints=(power,))
+    mass = cart.parameters[0]
+    truth = cart.with_parameters(**{mass.name: 1.1 * mass.value})
+    for angle in (10, 15):
+        run = ut.Cascade(cart, goal).simulate(phi=ut.deg(angle), plant=truth)
+        assert run.reached
+        assert (run.trajectory["force"] * run.trajectory["x_dot"]).max() <= 5 * (1 + 1e-4)
 
 
 def test_without_a_belief_nothing_is_learnt(pendulum: ut.Mechanism) -> None:

@@ -83,6 +83,11 @@ def test_words_that_are_no_set_points_are_refused(words: list[str], reason: str)
         parse_new_target(UNITS, words)
 
 
+def test_a_run_whose_target_cannot_move_says_so() -> None:
+    with pytest.raises(InvalidInputError, match="x = 0: the mechanism's equations depend on all"):
+        parse_new_target({}, ["x=1m"])
+
+
 @pytest.mark.slow
 def test_a_run_says_how_it_is_steered(tmp_path: Path) -> None:
     """With a log, against the clock; and a swing-up goes on to the set-points."""

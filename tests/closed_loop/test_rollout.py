@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -960,3 +961,29 @@ def test_a_motion_that_begins_outside_of_a_constraint_on_the_input_ends_there(
         batch = slow.batch(turning, [quick], duration=0.004, precise=precise)
         assert batch.event[0] == Event.CONSTRAINT
         assert batch.time[0] == 0.0
+
+
+def test_a_batch_divides_its_step_beside_a_mode_that_is_faster() -> None:
+    """A weight on a damped spring, 2000 1/s: in steps of 2 ms it would be gone for ever."""
+    x, w = ut.Coordinate("x", "m"), ut.Coordinate("w", "m")
+    m, rate = 0.05, 2000.0
+    T = x.velocity**2 / 2 + m * (x.velocity + w.velocity) ** 2 / 2
+    V, D = m * rate**2 * w.symbol**2 / 2, m * rate * w.velocity**2
+    carriage = ut.Mechanism.from_energies(
+        "carriage", [x, w], [ut.Input("force", "N", 10.0)], T, V, dissipation=D
+    )
+    surface, x0 = ut.first_surface(carriage), carriage.state(x=0.1)
+    loop = interpreted(ut.ClosedLoop(carriage))
+    assert loop.substeps == 4
+    assert loop.with_steps(1e-4, 0.0).substeps == 1
+    batch = loop.batch(x0, surface, duration=0.03)
+    law = ut.SlidingModeLaw(carriage, surface)
+
+    def slope(_t: float, at: Any) -> Any:
+        return np.append(at[2:], carriage.accelerations(0.0, at, law(0.0, at).u))
+
+    true = solve_ivp(slope, (0.0, 0.03), x0, "LSODA", rtol=1e-9, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(batch.x[0], true, atol=1e-5)  # corners of the law
+    rows = loop.simulate(x0, surface, duration=0.03)
+    np.testing.assert_allclose(np.diff(rows.t), 0.002, rtol=1e-9)
+    np.testing.assert_array_equal(rows.x[-1], batch.x[0])

@@ -654,12 +654,20 @@ def test_a_target_a_little_off_names_the_nearest_equilibrium() -> None:
     with pytest.raises(ModelError, match=r"off by phi=0\.002") as off:
         linearise(leaning)
     assert "off by phi=0.002" in str(check_mechanism(leaning, compiled=False))
-    with pytest.raises(ModelError, match=r"off by phi=-0\.09"):
+    with pytest.raises(ModelError, match=r"off by phi=-0\.09\d*: add this") as moved:
         modelling.move_target(leaning, phi=0.1)
+    assert "move_target" not in str(moved.value)  # of the mechanism that nobody has
     found = float(str(off.value).rsplit("phi=", 1)[1].rstrip(")."))
     assert linearise(modelling.move_target(leaning, phi=found)).F[1, 1] == pytest.approx(3.0)
     with pytest.raises(ModelError, match="No equilibrium was found"):
         linearise(pair(3 + sp.sin(ANGLE)))
+
+
+@pytest.mark.parametrize("word", ["hanging", "upright", "nearest"])
+def test_a_mechanism_without_an_equilibrium_is_refused_as_one(word: str) -> None:
+    """Whichever is asked for: there is nothing to take instead."""
+    with pytest.raises(ModelError, match="equilibria of 'pair': got none that was found"):
+        modelling.at_equilibrium(pair(3 + sp.sin(ANGLE)), word)
 
 
 def test_an_input_matrix_takes_no_time_and_a_force_has_all_rows() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy as sp
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 import undertow as ut
 from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError
-from undertow.optimiser.proposal import motion_margins
+from undertow.optimiser.proposal import Proposal, motion_margins
 from undertow.studies.paper import CASES
 
 OBJECTIVES = {"energy": ut.MinimumEnergy(), "time": ut.MinimumTime()}
@@ -270,3 +271,17 @@ def test_state_that_is_not_a_number_is_refused(optimisers: dict[str, ut.Optimise
     """NaN from a sensor is named, not optimised."""
     with pytest.raises(InvalidInputError, match="'phi'"):
         optimisers["time"].propose([0.0, np.nan, 0.0, 0.0])
+
+
+def test_a_start_beyond_half_a_turn_is_told_what_it_is_but_for_a_turn(rig: ut.Mechanism) -> None:
+    """350° of the pendulum are −10°; where a spring counts the turns nothing is said."""
+    nothing = Proposal(None, "infeasible", math.inf, math.inf, (), 1, 0.0, 0, 0.0, "no", "Wait")
+    loop = ut.ClosedLoop(rig, ut.MinimumTime())
+    with pytest.raises(InfeasibleError, match=r"phi = 350° is -10° but for a turn"):
+        nothing.required(loop, rig.state(phi=ut.deg(350)))
+    phi = rig.coordinates[1].symbol
+    wound = replace(rig, force=rig.force - sp.Matrix([0, phi / 100]), potential=None)
+    for model, angle in ((wound, 350), (rig, 170)):
+        with pytest.raises(InfeasibleError) as caught:
+            nothing.required(ut.ClosedLoop(model, ut.MinimumTime()), model.state(phi=ut.deg(angle)))
+        assert "but for a turn" not in str(caught.value)

@@ -283,6 +283,27 @@ def test_the_friction_of_a_plausible_rig_is_of_what_drives_the_joint() -> None:
     assert found == pytest.approx({"x": 0.02 * 30, "y": 0.02 * (4 + 15)})
 
 
+def test_a_plausible_rig_has_the_parameters_that_are_known() -> None:
+    """Gravity is known by its unit, not by its name; a tolerance below 3 % counts."""
+    x, phi = ut.Coordinate("x", "m"), ut.Coordinate("phi")
+    given = [
+        ut.Parameter("a", 9.81, "m/s^2"),
+        ut.Parameter("g", 5.0, "", "gear"),
+        ut.Parameter("mass", 2.0, "kg", tolerance=0.02),
+        ut.Parameter("bob", 0.5, "kg", tolerance=0.25),
+        ut.Parameter("l", 0.3, "m", tolerance=0.0),
+    ]
+    a, gear, mass, bob, rod = (p.symbol for p in given)
+    v, w = x.velocity, phi.velocity
+    T = mass * v**2 / 2 + bob * (v**2 / 2 + rod * sp.cos(phi.symbol) * v * w + (rod * w) ** 2 / 2)
+    V = bob * a * rod * sp.cos(phi.symbol)
+    cart = ut.Mechanism.from_energies(
+        "cart", [x, phi], [ut.Input("u", "N m", 4.0)], T, V,
+        input_matrix=sp.Matrix([gear]), parameters=given,
+    )  # fmt: skip
+    assert plausible_rig(cart).tolerance == pytest.approx({"g": 0.03, "mass": 0.01, "bob": 0.03})
+
+
 def test_a_copy_of_a_rig_goes_on_by_itself() -> None:
     """The same inputs give the same bits, noise and delays included, and leave the other alone."""
     bench = replace(srv02_rig(), tachometers={"theta": 0.01}, pushes=(Push(0.2, "phi", 0.001),))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from undertow.mechanisms import LIBRARY
 from undertow.models import linearise
 from undertow.plants import RealisticRig
 from undertow.studies.campaign import Campaign, Definition, compute, dataset, executor_for
+from undertow.studies.campaign.definition import Settings
 from undertow.studies.campaign.entrants import FAULTS, ForfeitError, Refereed
-from undertow.studies.campaign.league import TASKS, home
+from undertow.studies.campaign.league import TASKS, League, home
 from undertow.studies.campaign.league_report import median_interval, wilson
 from undertow.studies.campaign.run import study_of
 
@@ -119,6 +121,14 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("others") / "others.py"
     path.write_text(OTHERS, encoding="utf-8")
     return path
+
+
+def test_a_mechanism_without_a_start_is_refused_before_any_work() -> None:
+    """Not shard by shard."""
+    still = replace(LIBRARY[RIG](), start={})
+    settings = Settings({k: LEAGUE[k] for k in ("entrants", "tasks", "plants")}, "")
+    with pytest.raises(InvalidInputError, match="start of 'rotary_pendulum': got none"):
+        League(still, settings)
 
 
 def entered(file: Path, *names: str, **changes: Any) -> Definition:

@@ -37,7 +37,7 @@ from undertow.cascade.simulation import (
 )
 from undertow.cascade.targets import LoopsAbout, legs_of
 from undertow.closed_loop import INADMISSIBLE, RTOL, ClosedLoop, Event, Trajectory, simulate_along
-from undertow.closed_loop.gate import Admission, Gate, cost_gate
+from undertow.closed_loop.gate import Admission, Gate, broken_by, cost_gate
 from undertow.estimators import Belief, Estimator, ParameterEstimate
 from undertow.law import (
     Control,
@@ -303,10 +303,10 @@ class Cascade:
     @cached_property
     def loop(self) -> ClosedLoop:
         """The predicted closed loop, belief as plant, integrated to its end: the gate's."""
-        belief = self.known
+        belief, objective = self.known, self.objective
         return ClosedLoop(
             self.mechanism,
-            self.objective,
+            objective if belief is None else objective.guarded(self.mechanism),
             self.reaching,
             step=self.step,
             zoh_steps=self.zoh_steps,
@@ -542,6 +542,29 @@ class Cascade:
         """The predicted closed loop of the estimate taken for the plant, about the target."""
         return self.about(self._estimated(state.estimate), state.target, state.since)
 
+    @cached_property
+    def _bounds_input(self) -> bool:
+        """Whether a plan may break a bound on the input between two steps of a prediction."""
+        return self.known is not None and (
+            self.objective.hard_input or self.loop.objective != self.objective
+        )
+
+    def _breaks(
+        self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
+    ) -> list[tuple[float, str]]:
+        """When each plan breaks a constraint on the estimate, s, and which; infinite: none does.
+
+        An input that changes with the plan may pass its bound and be back within a step: what suits
+        every plausible plant at the steps of an ensemble is integrated to the tolerance on one.
+        """
+        if not self._bounds_input:
+            return [(math.inf, "")] * len(plans)
+        loop = self._estimated_at(state)
+        motions = loop.batch(error, plans, duration=span, precise=True)
+        names = [broken_by(loop, motions, k) for k in range(len(plans))]
+        ends = zip(motions.time.tolist(), names, strict=True)
+        return [(t if name else math.inf, name) for t, name in ends]
+
     def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
         """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
         if not state.disturbance or loop.ensemble is None:
@@ -670,7 +693,8 @@ class Cascade:
                 continue
             cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
-            good = math.isfinite(cost)
+            begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
+            good = math.isfinite(cost) and math.isinf(self._breaks(begun, [plan], x, horizon)[0][0])
             if loop is not whole:  # every plausible plant lives to see the next decision
                 lives = self._survives if loop.ensemble is not None else self._recoverable
                 good &= lives(here, x, plan)
@@ -907,6 +931,12 @@ class Cascade:
             most = f"{self.objective.terminal_radius:g} at most"
             words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
             admission = Admission(False, words, cost)
+        if admission.accepted:
+            (before, _), (end, name) = self._breaks(state, [old, proposal.plan], current, span)
+            if end < before:
+                cost = self._judged(loop, old, old, current, span).cost
+                words = f"breaks {name} between two steps, at {end:.3g} s"
+                admission = Admission(False, words, cost)
         if state.target is not None and state.target.moves:
             admission = self._along(state, old, proposal.plan, admission, span)
         admission = replace(admission, reason=f"{admission.reason}{jump}")

@@ -88,7 +88,7 @@ class Run:
         """Show how it ended."""
         admitted = sum(update.admission.accepted for update in self.updates)
         return (
-            f"Run({self.trajectory.mechanism.name}, {self.trajectory.event.name.lower()} at "
+            f"Run({self.trajectory.mechanism.name}, {self.trajectory.ending} at "
             f"{self.time:.4g} s, cost {self.cost:.6g}, {len(self.updates)} decisions, "
             f"{admitted} admitted)"
         )
@@ -115,7 +115,7 @@ class Run:
         """
         motion = self.trajectory
         cost = f"{self.cost:.4g} {motion.cost_unit}".strip()
-        end = f"{motion.event.name.lower()} at {self.time:.4g} s"
+        end = f"{motion.ending} at {self.time:.4g} s"
         figure = motion.plot(f"{motion.mechanism.name}: {end}, cost {cost}")
         figure.axes[-1].set_xlabel("time (s); dotted: another surface takes over")
         for before, update in itertools.pairwise(self.updates):
@@ -251,7 +251,11 @@ def moving_loops(
         positive("time of a plant, s", t, "Plants change after the start, at 0", zero=True)
     return {
         round(t / cascade.stride): replace(
-            cascade.loop, plant=moving or usual, ensemble=None, returning=False
+            cascade.loop,
+            objective=cascade.objective,
+            plant=moving or usual,
+            ensemble=None,
+            returning=False,
         )
         for t, moving in sorted({0.0: None, **plants}.items())
     }

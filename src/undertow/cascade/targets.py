@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import sympy as sp
@@ -81,7 +81,7 @@ class LoopsAbout:
     """
 
     def __init__(self, mechanism: Mechanism, objective: Objective) -> None:
-        self.mechanism, self.objective = mechanism, objective
+        self.mechanism = mechanism
         known = set().union(*(w.free_symbols for w in objective.path_margins(mechanism)))
         symbols = {c.name: c.symbol for c in mechanism.coordinates}
         self.names = tuple(n for n in invariant_coordinates(mechanism) if symbols[n] in known)
@@ -90,10 +90,6 @@ class LoopsAbout:
         self._prototypes: dict[object, ClosedLoop] = {}
         self.loop = lru_cache(maxsize=8)(self._loop)
         self.optimiser = lru_cache(maxsize=2)(self._optimiser)
-
-    @cached_property
-    def _problem(self) -> Objective:
-        return self.objective.about(self.mechanism, self.names)
 
     def _mechanism(self, mechanism: Mechanism, positions: FloatArray) -> Mechanism:
         key = mechanism.structure, mechanism.name, mechanism.input_limits.tobytes()
@@ -114,11 +110,12 @@ class LoopsAbout:
         moved = None if loop.plant is None else self._mechanism(loop.plant, positions)
         key = (
             loop.reaching, loop.step, loop.zoh_steps, loop.rtol, loop.tail_rtol, loop.escape,
-            loop.plant, loop.ensemble is None, loop.threads,
+            loop.plant, loop.ensemble is None, loop.threads, loop.objective, loop.returning,
         )  # fmt: skip
         if moved is not None or key not in self._prototypes:
+            problem = loop.objective.about(self.mechanism, self.names)
             made = replace(
-                loop, mechanism=believed, ensemble=ensemble, plant=moved, objective=self._problem
+                loop, mechanism=believed, ensemble=ensemble, plant=moved, objective=problem
             )
             return made if moved is not None else self._prototypes.setdefault(key, made)
         return self._prototypes[key].believing(believed, ensemble)

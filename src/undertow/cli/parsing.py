@@ -276,6 +276,14 @@ def parse_new_target(units: Mapping[str, str], words: Sequence[str]) -> SetPoint
         one_of("target", name, tuple(units))
         return _units_like(units[name])
 
+    if not units:
+        raise InvalidInputError(
+            "target of a run that goes on",
+            value=" ".join(words),
+            limit="x = 0: the mechanism's equations depend on all of its coordinates",
+            remedy="Another equilibrium is the target of a mechanism of its own: "
+            "undertow.modelling.move_target",
+        )
     found = _target_of_words(words, units_of, "")
     if isinstance(found, Reference):
         raise InvalidInputError(

@@ -170,6 +170,8 @@ def simulate_along(
     """
     loop = loop if loop.ensemble is None else replace(loop, ensemble=None)
     steps, step = loop.equal_steps(duration)
+    parts = loop.substeps
+    steps, step = parts * steps, step / parts
     plain, plant, m = loop.mechanism, loop.truth, loop.mechanism.m
     laws = zip(plan.surfaces, plan.laws(loop.reaching), strict=True)
     lanes = np.stack([pack_law_parameters(SlidingModeLaw(plain, s, law)) for s, law in laws])
@@ -180,9 +182,9 @@ def simulate_along(
     rows, code = _module(loop).along(
         np.array(x, dtype=float), motion.rows(halves), lanes, segments,
         np.append(plain.parameter_values, np.zeros(3 * plain.n)), plant.parameter_values,
-        loop.input_limits, start, step, steps, loop.zoh_steps,
+        loop.input_limits, start, step, steps, parts * loop.zoh_steps,
         loop.objective.terminal_radius, loop.escape, loop.objective.hard_input, loop.prices,
         record,
     )  # fmt: skip
-    t = start + np.arange(rows) * step
-    return recorded(plant, t, record[:rows], code, loop.objective.unit)
+    kept = np.append(np.arange(0, rows - 1, parts), rows - 1)
+    return recorded(plant, start + kept * step, record[kept], code, loop.objective)

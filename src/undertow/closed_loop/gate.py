@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from undertow.base import Verdict
 from undertow.closed_loop.rollout import ClosedLoop
-from undertow.closed_loop.trajectory import INADMISSIBLE, Event
+from undertow.closed_loop.trajectory import INADMISSIBLE, INPUT_LIMIT, Batch, Event
 from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
@@ -39,6 +39,14 @@ class Admission:
 Gate = Callable[[ClosedLoop, Plan, Plan, FloatArray, float], Admission]
 
 
+def broken_by(loop: ClosedLoop, batch: Batch, k: int) -> str:
+    """Return the names of the constraints that ended motion k of a batch; none did: nothing."""
+    if batch.event[k] != Event.CONSTRAINT:
+        return ""
+    named = zip(loop.objective.constraints, batch.path[k], strict=True)
+    return " and ".join(c.name for c, margin in named if not margin >= 0) or INPUT_LIMIT
+
+
 def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:
     """Admit a plan that is stable, feasible from x, and does not raise the cost.
 
@@ -57,7 +65,8 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
         return Admission(False, f"unstable: margin {stability:.3g} 1/s", old_cost)
     if new_cost >= INADMISSIBLE:
         event = Event(int(pair.event[1])).name.lower()
-        broken = f"{event} at {pair.time[1]:.3g} s"
+        broken = " ".join(filter(None, (event, broken_by(loop, pair, 1))))
+        broken += f" at {pair.time[1]:.3g} s"
         if loop.ensemble is not None and new_cost < old_score:  # of two that fail, the later
             return Admission(
                 True, f"suits not every plausible plant, but longer: {broken}", old_cost

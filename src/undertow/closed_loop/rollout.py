@@ -48,7 +48,7 @@ from undertow.law import (
     coupling,
     gains_at_target,
 )
-from undertow.models import FloatArray, Mechanism, has_linear_model
+from undertow.models import FloatArray, Mechanism, fastest_rate, has_linear_model
 from undertow.objective import MinimumEnergy, Objective
 
 #: Relative tolerance of motions that are shown, and that decide.
@@ -57,6 +57,10 @@ RTOL = 1e-9
 #: The least and the largest that may be asked for: below rounding no step is short enough, and a
 #: coarse one sees neither corner nor constraint.
 TOLERANCES = 1e-13, 1e-2
+
+#: Longest Runge-Kutta step of a batch in time constants of the plant's fastest mode: beyond 2.7 of
+#: them what has long died out would grow.
+OF_FASTEST = 1.5
 
 #: The smallest margin at the target that the price of being outside of a constraint is made from.
 LEAST_ROOM = 1e-9
@@ -114,7 +118,8 @@ class ClosedLoop:
         The truth.  The belief itself by default; must have the same coordinates and inputs.  Its
         motors may be weaker than the belief says; stronger ones are not asked for more.
     step
-        Runge-Kutta step of batches, and between the rows of a recorded motion, s.
+        Runge-Kutta step of batches, and between the rows of a recorded motion, s.  Where a mode of
+        the plant is faster, batches divide it.
     zoh_steps
         Sampled inner loop: the law is evaluated every ``zoh_steps`` steps and held.
         0: continuous law, evaluated in every Runge-Kutta stage.
@@ -291,6 +296,11 @@ class ClosedLoop:
         end = self.linear_end
         return end is not None and end.stage is not None
 
+    @cached_property
+    def substeps(self) -> int:
+        """Runge-Kutta steps of a batch in one step of the loop: several where a mode is fast."""
+        return max(1, math.ceil(fastest_rate(self.truth) * self.step / OF_FASTEST))
+
     @checked
     def believing(self, mechanism: Mechanism, ensemble: Ensemble | None = None) -> ClosedLoop:
         """Return this loop with other parameters believed, and another ensemble of its kind.
@@ -312,12 +322,13 @@ class ClosedLoop:
         """Return this loop integrated with other steps; what does not depend on them is shared."""
         if step != self.step:  # may be too long for the boundary layer
             replace(self, step=step)
-        return self._changed({"takes_large_steps"}, step=step, tail_rtol=tail_rtol)
+        return self._changed({"takes_large_steps", "substeps"}, step=step, tail_rtol=tail_rtol)
 
     def _changed(self, without: set[str], **fields: Any) -> ClosedLoop:
         """Return a copy with other fields, unchecked, and without some of what was computed."""
         assert self._kernels is not None  # found once, for all copies
         assert self.prices is not None
+        assert self.substeps > 0
         other = object.__new__(type(self))
         other.__dict__.update(
             {k: v for k, v in vars(self).items() if k not in without | {"_alone"}}, **fields
@@ -370,7 +381,9 @@ class ClosedLoop:
         noise
             Measurement noise, (samples, N, 2n).
         """
-        switches, steps = self._switch_steps(switch_times), self._steps(duration)
+        switches, steps, parts = (
+            self._switch_steps(switch_times), self._steps(duration), self.substeps
+        )  # fmt: skip
         if self.ensemble is not None and not len(buffers.member):
             members, size = buffers.spread(), len(self.ensemble)
             plans, out = np.arange(buffers.count), buffers.out
@@ -406,10 +419,11 @@ class ClosedLoop:
             prepared = self._begun(part, stable_only, goes_on or (noisy and part is buffers))
             integrate = shared(self._kernels.rollout, self.threads, part.padded, steps)
             integrate(
-                0, part.padded, part.states, live, part.lanes, switches, numbers.plant,
+                0, part.padded, part.states, live, part.lanes, parts * switches, numbers.plant,
                 numbers.belief, numbers.limits, part.quiet if noise is None else noise, start,
-                self.step, steps, max(1, self.zoh_steps), radius, self.escape, cap,
-                1.0 if seek else 0.0, self.prices, calm_from, every, record, out,
+                self.step / parts, parts * steps, parts * max(1, self.zoh_steps), radius,
+                self.escape, cap, 1.0 if seek else 0.0, self.prices, parts * calm_from,
+                parts * every, record, out,
             )  # fmt: skip
             if goes_on and prepared is not None and end is not None:
                 integrate = shared(self._kernels.etd_integrate, self.threads, part.padded, steps)
@@ -812,8 +826,7 @@ class ClosedLoop:
             rows = last[None].copy()
         rows = np.vstack([rows, last])
         t = np.append(times[: len(rows) - 1], end)
-        ended, unit = int(batch.event[0]), self.objective.unit
-        return recorded(self.truth, t + start, rows, ended, unit)
+        return recorded(self.truth, t + start, rows, int(batch.event[0]), self.objective)
 
 
 def _covariance(given: FloatArray, size: int) -> FloatArray:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from undertow.base import at_least, checked, one_of, require_extra
 from undertow.models import FloatArray, Mechanism
+from undertow.objective.objective import Objective, broken_constraints
 from undertow.symbolic import compiled
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 #: do not arrive, and the highest, an unstable surface's.  No cost comes near, whatever its unit:
 #: that of a crane's kilonewtons, ∫u² dt, is 1e9 N² s.
 INADMISSIBLE, PENALTY, UNSTABLE = 1e100, 1e101, 1e102
+
+#: What a motion broke that broke none of its path constraints.
+INPUT_LIMIT = "the hard input limit"
 
 #: Rows at either end of a trajectory that a notebook shows.
 SHOWN = 3
@@ -127,6 +131,8 @@ class Trajectory:
         Why it ended.
     cost_unit
         Unit of the cost, as text.
+    broken
+        The constraints that ended it, by name, where some did.
     """
 
     mechanism: Mechanism
@@ -138,12 +144,13 @@ class Trajectory:
     margin: FloatArray
     event: Event
     cost_unit: str = ""
+    broken: str = ""
 
     def __repr__(self) -> str:
         """Show whose it is, how long it is and how it ended."""
         return (
             f"Trajectory({self.mechanism.name}, {len(self.t)} rows, {self.t[0]:g} to "
-            f"{self.time:.4g} s, {self.event.name.lower()}, "
+            f"{self.time:.4g} s, {self.ending}, "
             f"cost {self.cost:.6g}{f' {self.cost_unit}' if self.cost_unit else ''})"
         )
 
@@ -163,6 +170,11 @@ class Trajectory:
 
         body = "".join(line(row) for row in shown)
         return f"<p>{escape(repr(self))}</p><table><tr>{heads}</tr>{body}</table>"
+
+    @property
+    def ending(self) -> str:
+        """Why it ended, in words: the event, and what was broken."""
+        return f"{self.event.name.lower()} {self.broken}".strip()
 
     @property
     def cost(self) -> float:
@@ -272,14 +284,20 @@ class Trajectory:
             accumulated_cost=np.concatenate(costs),
             event=pieces[-1].event,
             cost_unit=first.cost_unit,
+            broken=pieces[-1].broken,
         )
 
 
 def recorded(
-    mechanism: Mechanism, t: FloatArray, rows: FloatArray, event: int, cost_unit: str
+    mechanism: Mechanism, t: FloatArray, rows: FloatArray, event: int, objective: Objective
 ) -> Trajectory:
     """Return the motion of a kernel's record: x, u, s, cost, margin, (N, 2n + 2m + 2)."""
     n, m = mechanism.n, mechanism.m
     parts = np.split(rows, [2 * n, 2 * n + m, 2 * n + 2 * m, 2 * n + 2 * m + 1], axis=1)
     x, u, s, cost, margin = parts
-    return Trajectory(mechanism, t, x, u, s, cost[:, 0], margin[:, 0], Event(event), cost_unit)
+    broken = ""
+    if event == Event.CONSTRAINT:
+        broken = broken_constraints(objective, mechanism, x[-1], u[-1]) or INPUT_LIMIT
+    return Trajectory(
+        mechanism, t, x, u, s, cost[:, 0], margin[:, 0], Event(event), objective.unit, broken
+    )

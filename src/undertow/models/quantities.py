@@ -83,6 +83,16 @@ def _name(what: str, given: object) -> str:
     return name
 
 
+def normal_unit(unit: str) -> str:
+    """Return a unit as it is written here: ``kg m²`` for ``kg*m^2``, ``kg·m2`` or ``kg m**2``.
+
+    >>> normal_unit("kg*m^2/s")
+    'kg m²/s'
+    """
+    squares = re.sub(r"(?<=[A-Za-z])(?:\^|\*\*)?([23])(?!\d)", lambda n: "²³"[int(n[1]) - 2], unit)
+    return re.sub(r"\s*[*·⋅.]\s*", " ", squares).strip()
+
+
 def number_of(what: str, value: object, *, limit: str = "a number", remedy: str = "") -> float:
     """Return a real number as a float; refuse everything else: text, None, arrays, booleans.
 
@@ -138,6 +148,11 @@ class _Named:
         object.__setattr__(self, "spelling", self.name)
         object.__setattr__(self, "name", _name(f"{what} name", self.name))
 
+    def _take_unit(self, unit: object) -> None:
+        """Keep a unit in its usual spelling: what is usual of a parameter depends on it."""
+        if isinstance(unit, str):
+            object.__setattr__(self, "unit", normal_unit(unit))
+
 
 @dataclass(frozen=True)
 class Parameter(_Named):
@@ -152,7 +167,7 @@ class Parameter(_Named):
     value
         The value, in ``unit``.
     unit
-        SI unit, as text ("kg m²").
+        SI unit, as text ("kg m²"; "kg*m^2" is the same).
     description
         What it is, in words.
     low, high
@@ -177,6 +192,7 @@ class Parameter(_Named):
     def __post_init__(self) -> None:
         """Refuse a value that is not finite or not inside its interval."""
         self._take_name("parameter")
+        self._take_unit(self.unit)
         for end in ("value", "low", "high"):
             given = getattr(self, end)
             number = number_of(
@@ -201,6 +217,11 @@ class Parameter(_Named):
             if not 0 <= tolerance < math.inf:
                 raise InvalidInputError(what, value=tolerance, limit="finite and ≥ 0")
             object.__setattr__(self, "tolerance", tolerance)
+
+    @property
+    def is_gravity(self) -> bool:
+        """Whether it is an acceleration, m/s²: no rig has another gravity than its model."""
+        return self.unit == "m/s²"
 
 
 def with_value(parameter: Parameter, value: float) -> Parameter:
@@ -285,6 +306,7 @@ class Input(_Named):
     def __post_init__(self) -> None:
         """Refuse a name that is not an identifier and a limit that is not positive."""
         self._take_name("input")
+        self._take_unit(self.unit)
         whose = f"limit of input '{self.name}'"
         remedy = "Give the largest magnitude that the actuator can deliver, in its unit"
         if not number_of(whose, self.limit, remedy=remedy) > 0:

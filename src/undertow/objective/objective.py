@@ -48,6 +48,10 @@ TRAVEL = 0.95
 #: :mod:`undertow.closed_loop.exponential_integrator`.
 SPARE = 0.05
 
+#: Part of the room of a constraint on the input, of that at the target, that predictions keep where
+#: they are about plausible plants.
+GUARD = 0.01
+
 #: Radius of a terminal set, at most, over the range of a state.
 WIDEST = 10.0
 
@@ -199,6 +203,17 @@ class _Shifted:
     def __call__(self, v: Names) -> sp.Expr:
         moved = {getattr(v, x): getattr(v, x) + getattr(v, target) for x, target in self.targets}
         return sp.sympify(self.formula(v)).xreplace(moved)
+
+
+@dataclass(frozen=True)
+class _Guarded:
+    """w of a constraint that is kept by some margin."""
+
+    formula: Formula
+    margin: float
+
+    def __call__(self, v: Names) -> sp.Expr:
+        return self.formula(v) + self.margin
 
 
 def state_box(**bounds: float | tuple[float, float]) -> tuple[Constraint, ...]:
@@ -461,6 +476,25 @@ class Objective:
 
         constraints = tuple(moved(c) for c in self.on(mechanism).constraints)
         return replace(self, constraints=constraints, travel=False)
+
+    @checked
+    def guarded(self, mechanism: Mechanism) -> Self:
+        """Return the problem with 1 % of the room of each constraint on the input kept.
+
+        The room is −w(0, 0), the margin at the target.  What the input of a law is follows the
+        state: a plan that goes up to such a constraint on one plant breaks it on the next, where
+        one that goes up to a bound of a state is a little late, if anything.
+        """
+        at_target = mechanism.substitution | dict.fromkeys([*mechanism.x, *mechanism.u], 0.0)
+
+        def kept(c: Constraint, margin: sp.Expr) -> Constraint:
+            room = margin.subs(at_target)
+            if not (margin.free_symbols & {*mechanism.u} and room.is_finite and room > 0):
+                return c
+            return replace(c, formula=_Guarded(c.formula, GUARD * float(room)))
+
+        margins = self.path_margins(mechanism)
+        return replace(self, constraints=tuple(map(kept, self.constraints, margins)))
 
     @checked
     def range_of(self, mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
@@ -783,6 +817,20 @@ class MinimumTime(Objective):
     stage: Formula = _one
     unit: str = "s"
     formula: str = "∫ 1 dt"
+
+
+def broken_constraints(
+    objective: Objective, mechanism: Mechanism, x: FloatArray, u: FloatArray
+) -> str:
+    """Return the names of the constraints that a state, (2n,), breaks under an input, (m,)."""
+    values = zip([*mechanism.x, *mechanism.u], [*x.tolist(), *u.tolist()], strict=True)
+    known = mechanism.substitution | dict(values)
+    margins = [margin.subs(known) for margin in objective.path_margins(mechanism)]
+    return " and ".join(
+        constraint.words
+        for constraint, margin in zip(objective.constraints, margins, strict=True)
+        if not (margin.is_real and margin >= 0)
+    )
 
 
 def _failed(what: str, error: Exception) -> InvalidInputError:

@@ -11,7 +11,7 @@ import numpy as np
 from undertow.base import InfeasibleError, InvalidInputError, SingularSurfaceError, check_fields
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Margin, Plan, Surface, surface_margins
-from undertow.models import FloatArray
+from undertow.models import FloatArray, Mechanism
 from undertow.models.importers import holding_input, least_peak
 
 Status = Literal["converged", "budget spent", "infeasible", "failed"]
@@ -120,7 +120,9 @@ class Proposal:
                 value=self.message,
                 limit="every margin ≥ 0 and the terminal set reached within "
                 f"{loop.objective.horizon:g} s",
-                remedy=_in_degrees(loop, x) or _too_weak(loop) or _too_far(loop, x) + self.remedy,
+                remedy=_in_degrees(loop, x)
+                or _too_weak(loop)
+                or _turned(loop.mechanism, x) + _too_far(loop, x) + self.remedy,
             )
         return self
 
@@ -132,6 +134,23 @@ def _in_degrees(loop: ClosedLoop, x: FloatArray) -> str:
         if c.unit == "rad" and abs(angle) > 2 * math.pi:
             turns = f"{c.name} = {angle:.4g} rad is {math.degrees(angle):.4g}°"
             return f"{turns}: if degrees are meant, give undertow.deg({angle:.4g})"
+    return ""
+
+
+def _turned(mechanism: Mechanism, x: FloatArray) -> str:
+    """What to do where a free joint begins more than half a turn off, if a turn changes nothing."""
+    for i, c in enumerate(mechanism.coordinates[mechanism.m :], mechanism.m):
+        if c.unit == "rad" and abs(x[i]) > math.pi + 1e-6:
+            states = np.random.default_rng(0).uniform(-1.0, 1.0, (4, 2 * mechanism.n))
+            turned = states + 2 * math.pi * np.eye(2 * mechanism.n)[i]
+            still = np.zeros((4, mechanism.m))
+            before, after = (mechanism.accelerations(0.0, at, still) for at in (states, turned))
+            if np.allclose(before, after, rtol=1e-9, atol=1e-9):
+                given, nearer = math.degrees(x[i]), math.degrees(math.remainder(x[i], 2 * math.pi))
+                return (
+                    f"{c.name} = {given:.4g}° is {nearer:.4g}° but for a turn, which it would have "
+                    "to undo: where it may turn freely, start there. "
+                )
     return ""
 
 

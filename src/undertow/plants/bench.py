@@ -389,7 +389,8 @@ def plausible_rig(mechanism: Mechanism) -> Bench:
 
     4096 counts per turn or 20 µm per count; Coulomb friction of the actuated joints 2 % of
     what their inputs can do, breakaway a third above; 1 ms from measurement to action with 0.1 ms
-    of jitter; a 12-bit converter; every parameter but gravity within ±3 %.
+    of jitter; a 12-bit converter; every parameter but gravity within ±3 %, or its own tolerance
+    where that is less.
     """
     loads = {
         c.name: 0.02 * float(load)
@@ -411,7 +412,7 @@ def plausible_rig(mechanism: Mechanism) -> Bench:
             if math.isfinite(i.limit)
         },
         timing=Timing(0.001, 1e-4, 0.5e-3, 0.5e-3, source=CHOSEN),
-        tolerance={p.name: _spread(p) for p in mechanism.parameters if p.name != "g" and p.value},
+        tolerance={p.name: _spread(p) for p in mechanism.parameters if p.value and _spread(p)},
         hand={c.name: math.radians(0.5) for c in mechanism.coordinates if c.unit == "rad"},
         source=CHOSEN,
     )
@@ -425,6 +426,9 @@ def bench_for(mechanism: Mechanism) -> Bench:
 
 
 def _spread(parameter: Parameter) -> float:
-    """Return 3 %, or what room the parameter's bounds leave: no efficiency exceeds 1."""
-    room = min(parameter.high - parameter.value, parameter.value - parameter.low)
-    return min(0.03, 0.99 * room / abs(parameter.value))
+    """Return 3 %, or what tolerance and bounds of the parameter leave: no efficiency exceeds 1."""
+    if parameter.is_gravity:
+        return 0.0
+    room = 0.99 * min(parameter.high - parameter.value, parameter.value - parameter.low)
+    known = math.inf if parameter.tolerance is None else parameter.tolerance
+    return min(0.03, min(room, known) / abs(parameter.value))

@@ -12,9 +12,10 @@ from undertow.base import facts, finite, manifest, mark, table, to_csv
 from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
+from undertow.closed_loop.trajectory import INPUT_LIMIT
 from undertow.law import Surface, Target
 from undertow.models import FloatArray, Mechanism
-from undertow.objective import Objective
+from undertow.objective.objective import Objective, broken_constraints
 from undertow.optimiser import Proposal
 
 _ENDINGS = {
@@ -76,25 +77,14 @@ def _ended(
     error: FloatArray,
     off: str,
 ) -> str:
-    broken = _broken(motion, objective) if motion.event == Event.CONSTRAINT else ""
+    broken = ""
+    if motion.event == Event.CONSTRAINT:
+        mechanism = motion.mechanism
+        problem = objective.on(mechanism)
+        broken = broken_constraints(problem, mechanism, motion.x[-1], motion.u[-1]) or INPUT_LIMIT
     radius, norm = objective.terminal_radius, float(np.linalg.norm(error))
     said = words[motion.event].format(off=off, radius=radius, norm=norm, broken=broken)
     return f"{said}, at {motion.time:.3f} s"
-
-
-def _broken(motion: Trajectory, objective: Objective) -> str:
-    """Return the constraints that the last state of a motion breaks, whatever the input is."""
-    mechanism = motion.mechanism
-    at_end = mechanism.substitution | dict(zip(mechanism.x, motion.x[-1].tolist(), strict=True))
-    objective = objective.on(mechanism)
-    margins = [margin.subs(at_end) for margin in objective.path_margins(mechanism)]
-    names = [
-        constraint.words
-        for constraint, margin in zip(objective.constraints, margins, strict=True)
-        if margin.is_number and margin < 0
-    ]
-    hard = "the hard input limit" if objective.hard_input else "a constraint on the input"
-    return " and ".join(names) or hard
 
 
 def motion_report(

@@ -161,14 +161,15 @@ def check_balanced(mechanism: Mechanism) -> None:
             f"target of '{mechanism.name}'",
             value=f"a force of {residual.max():.4g} on '{worst}', which no input balances",
             limit=f"an equilibrium, |f_u| ≤ {limit:.2g}",
-            remedy=nearest_equilibrium(mechanism),
+            remedy=nearest_equilibrium(mechanism, "add this to what was given"),
         )
 
 
-def nearest_equilibrium(mechanism: Mechanism) -> str:
+def nearest_equilibrium(mechanism: Mechanism, then: str = "") -> str:
     """Return a remedy for a target that is no equilibrium: the one that is found near it.
 
-    Values are errors from the target, in the mechanism's own coordinates.
+    Values are errors from the target, in the mechanism's own coordinates.  ``then`` is what to do
+    about it; by default to move the target of this mechanism.
     """
     q, left = _newton(mechanism)
     if not (left <= AT_REST and np.abs(q).max() <= NEAR):
@@ -178,11 +179,8 @@ def nearest_equilibrium(mechanism: Mechanism) -> str:
         )
     free = zip(mechanism.coordinates, q, strict=True)
     named = ", ".join(f"{c.name}={float(v)!r}" for c, v in list(free)[mechanism.m :])
-    return (
-        "The nearest equilibrium that was found is off by "
-        f"{named}: add this to what was given, or take "
-        f"undertow.models.importers.move_target(mechanism, {named})"
-    )
+    then = then or f"take undertow.modelling.move_target(mechanism, {named})"
+    return f"The nearest equilibrium that was found is off by {named}: {then}"
 
 
 def _newton(mechanism: Mechanism) -> tuple[FloatArray, float]:

@@ -151,12 +151,7 @@ def where(mechanism: Mechanism, target: str | Mapping[str, float]) -> tuple[dict
         if target or controllability(moved) > _UNREACHED:
             return at, "the nearest equilibrium"
     if q is None:
-        raise ModelError(
-            f"equilibria of '{mechanism.name}'",
-            value="none that was found",
-            limit="a pose inside the travel of the joints, which the inputs hold within limits",
-            remedy=_adrift(mechanism) or "Say where one is: JOINT=ANGLE for every joint",
-        )
+        raise _none_found(mechanism)
     raise ModelError(
         f"linear models of '{mechanism.name}' at its equilibria",
         value="motions that no input reaches",
@@ -184,15 +179,27 @@ def _nearest_first(mechanism: Mechanism) -> Iterator[FloatArray]:
     yield from (e.q for e in _equilibria(mechanism) if np.any(e.q) or not rests)
 
 
+def _none_found(mechanism: Mechanism) -> ModelError:
+    """The refusal of a mechanism without an equilibrium."""
+    return ModelError(
+        f"equilibria of '{mechanism.name}'",
+        value="none that was found",
+        limit="a pose inside the travel of the joints, which the inputs hold within limits",
+        remedy=_adrift(mechanism) or "Say where one is: JOINT=ANGLE for every joint",
+    )
+
+
 def _standing(mechanism: Mechanism, target: str) -> FloatArray:
     """Return the upright or hanging equilibrium, (n,)."""
     high, found = target == "upright", list(_equilibria(mechanism))
+    if not found:
+        raise _none_found(mechanism)
     stands = [e for e in found if e.stable is (not high)]
     if not stands:
         raise ModelError(
             f"{target} equilibrium of '{mechanism.name}'",
             value="none that was found",
-            limit="one of " + ("; ".join(_position(mechanism, e.q) for e in found) or "none"),
+            limit="one of " + "; ".join(_position(mechanism, e.q) for e in found),
             remedy="Take the nearest, or say where: JOINT=ANGLE",
         )
     chosen = (max if high else min)(stands, key=lambda e: e.energy)

@@ -87,7 +87,7 @@ class Designs(Study):
         """Return the parameters of random plants, (K, P): the same changes for every design."""
         rng = np.random.default_rng(self.seed)
         off = self.spread * rng.uniform(-1.0, 1.0, (self.plants, len(mechanism.parameters)))
-        off[:, [p.name == "g" for p in mechanism.parameters]] = 0.0
+        off[:, [p.is_gravity for p in mechanism.parameters]] = 0.0
         low, high = np.array([(p.low, p.high) for p in mechanism.parameters]).T
         values: FloatArray = np.clip(mechanism.parameter_values * (1.0 + off), low, high)
         return values

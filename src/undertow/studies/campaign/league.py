@@ -93,6 +93,8 @@ class League(Study):
         horizon = settings.number("horizon", 60.0, low=1e-3, high=1e4)
         word = settings.word("objective", get_args(Goal), "effort")
         self.objectives = tuple(objective_for(m, word, horizon=horizon) for m in self.mechanisms)
+        for m, objective in zip(self.mechanisms, self.objectives, strict=True):
+            objective.check_start(m, m.usual_start)
         self._axes([Entry.of(name) for name in settings.words("entrants", OURS)])
         self.variables = {
             "won": Variable("1", "home for the last second", "int8"),
@@ -140,7 +142,7 @@ class League(Study):
         usual, ideal = bench_for(mechanism), Bench(mechanism)
         match task:
             case "plants":
-                varied = (p for p in mechanism.parameters if p.name != "g" and p.value)
+                varied = (p for p in mechanism.parameters if p.value and not p.is_gravity)
                 return replace(ideal, tolerance=tolerances(varied, SPREAD))
             case "friction":
                 return replace(ideal, friction=usual.with_friction(FRICTION).friction)

@@ -32,8 +32,8 @@ class RandomPlants(Study):
     Settings: ``plants``, how many; ``controllers``, a list of ``cascade``, ``kept``, ``lqr``;
     ``spread``, half-width of the parameters, as a part of each; ``friction``, the most that it is
     of the bench's; ``delay``, the longest in all, s; ``objective``, ``horizon``, s; ``start``,
-    states by name, by default the mechanism's; ``seconds`` of a trial; ``budget``, rollouts of a
-    re-optimisation; ``seed``; ``shard``, plants in each.
+    states by name, by default the mechanism's; ``seconds`` of a trial; ``seed``; ``shard``,
+    plants in each.
     """
 
     kind: ClassVar[str] = "plants"
