@@ -92,10 +92,21 @@ class Optimiser:
 
     def on(self, loop: ClosedLoop) -> Optimiser:
         """Return this optimiser for a loop of the same structure, with the same first surface."""
+        return self._with(loop=loop)
+
+    def _with(self, **changed: object) -> Optimiser:
+        """Return this optimiser with some fields changed, and the same first surface."""
         other = object.__new__(type(self))
-        kept = {k: v for k, v in vars(self).items() if k not in ("space", "firsts", "aims")}
-        other.__dict__.update(kept, loop=loop, anchor=self.anchor, designs=self.designs)
+        derived = ("space", "firsts", "aims", "plainer")
+        kept = {k: v for k, v in vars(self).items() if k not in derived}
+        other.__dict__.update(kept, anchor=self.anchor, designs=self.designs, **changed)
         return other
+
+    @cached_property
+    def plainer(self) -> Optimiser | None:
+        """The optimiser of a plainer set of decision variables; ``None`` for the plainest."""
+        freedom = self.freedom.plainer
+        return None if freedom is None else self._with(freedom=freedom, cold=None)
 
     @cached_property
     def anchor(self) -> Surface:
@@ -131,18 +142,22 @@ class Optimiser:
 
     def _budget(self, warm: bool) -> Budget:
         given = self.warm if warm else self.cold
-        if given is not None:
-            return given
+        return given or self.usual_budget(warm)
+
+    def usual_budget(self, warm: bool) -> Budget:
+        """What a re-optimisation, or a global one with all plainer ones in it, needs."""
         size, schedule = self.space.size, self.freedom.schedule > 0
         if warm and schedule and self.counts_time:
             return Budget(16384 // self.loop.mechanism.n)
         if warm:
             return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
+        plainer = 0 if self.plainer is None else self.plainer.usual_budget(False).evaluations
         if self.counts_time:
-            return Budget(16384 * size)
+            return Budget(plainer + 16384 * size)
         size //= self.space.segments
         several = schedule or self.space.segments > 1
-        return Budget(single_budget(size) + (FINE * size if several else restart_budget(size)))
+        more = FINE * size if several else restart_budget(size)
+        return Budget(plainer + single_budget(size) + more)
 
     @checked
     def propose(

@@ -27,6 +27,7 @@ from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
+from undertow.optimiser.proposal import Budget
 from undertow.optimiser.schedules import WIDE, WORTHWHILE, follow_earliest, lead_back
 from undertow.optimiser.switching import SwitchingSurfaces
 from undertow.optimiser.task import Optimisation
@@ -95,6 +96,32 @@ def _descend(
 
 
 def global_search(task: Optimisation) -> Iterator[bool]:
+    """Search, then take over what a plainer set of decision variables allows, where that is better.
+
+    What it allows this one allows, too: no answer is worse than that of a plainer set.  Yields
+    for each answer whether it has converged.
+    """
+    plainer, converged = task.plainer(), False
+    for converged in _own_search(task):
+        yield converged
+    if plainer is None or task.late():
+        return
+    before = task.best_cost
+    *_, done = global_search(plainer)
+    task.budget = Budget(task.budget.evaluations + plainer.budget.evaluations, task.budget.seconds)
+    task.evaluations += plainer.evaluations
+    task.minima.append(plainer.best_cost)
+    if plainer.best is not None:
+        task.consider(plainer.best)
+    if task.best_cost < before:
+        converged = done
+        if task.optimiser.counts_time and task.optimiser.freedom.schedule:
+            for converged in follow_earliest(task):
+                yield converged
+    yield converged
+
+
+def _own_search(task: Optimisation) -> Iterator[bool]:
     """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
     several = len(task.space.freedom.times) > 1 or task.optimiser.freedom.schedule > 0
     several &= not task.optimiser.counts_time
